@@ -1,0 +1,74 @@
+"""The few BLAS and LAPACK routines that the observers stand on, from scipy, on sub-matrices in place.
+
+scipy publishes the addresses of its BLAS and LAPACK for other compiled code (`scipy.linalg.cython_blas`). Called
+through ctypes they work on any part of a column-major matrix without a copy, and without the interpreter lock, so
+that two modes run on two cores. scipy's own Python wrappers do neither.
+
+Every matrix here is float64 in column-major (Fortran) order, or a rectangular part of one, and only lower
+triangles of symmetric matrices are read or written.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cython_blas, cython_lapack
+
+Array = NDArray[np.float64]
+
+_api = ctypes.pythonapi
+_name, _pointer = _api.PyCapsule_GetName, _api.PyCapsule_GetPointer
+_name.restype, _name.argtypes = ctypes.c_char_p, [ctypes.py_object]
+_pointer.restype, _pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+
+
+def _routine(module: object, name: str, n_arguments: int):  # noqa: ANN202
+    """A Fortran routine by name: every argument an address."""
+    capsule = module.__pyx_capi__[name]  # type: ignore[attr-defined]
+    return ctypes.CFUNCTYPE(None, *([ctypes.c_void_p] * n_arguments))(_pointer(capsule, _name(capsule)))
+
+
+_potrf = _routine(cython_lapack, "dpotrf", 5)
+_trsm = _routine(cython_blas, "dtrsm", 11)
+_syrk = _routine(cython_blas, "dsyrk", 10)
+
+_keep: list[ctypes._SimpleCData] = []  # what the addresses below point at
+
+
+@lru_cache(maxsize=None)
+def _int(value: int) -> int:
+    _keep.append(ctypes.c_int(value))
+    return ctypes.addressof(_keep[-1])
+
+
+@lru_cache(maxsize=None)
+def _real(value: float) -> int:
+    _keep.append(ctypes.c_double(value))
+    return ctypes.addressof(_keep[-1])
+
+
+@lru_cache(maxsize=None)
+def _char(value: bytes) -> int:
+    _keep.append(ctypes.c_char(value))
+    return ctypes.addressof(_keep[-1])
+
+
+def eliminate(S: Array, n: int) -> None:
+    """Eliminate the first `n` rows and columns of the symmetric S (N, N), in place.
+
+    The lower triangle of S[n:, n:] becomes the Schur complement S22 - S21 S11^-1 S12; the first n columns are used
+    up. Raises numpy.linalg.LinAlgError where S11 is not positive definite.
+    """
+    size = S.shape[0]
+    lead, here, item = _int(S.strides[1] // S.itemsize), S.ctypes.data, S.itemsize
+    below, corner = here + n * item, here + n * (S.strides[1] + item)
+    info = ctypes.c_int(0)
+    rest = _int(size - n)
+    _potrf(_char(b"L"), _int(n), here, lead, ctypes.addressof(info))
+    if info.value:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    _trsm(_char(b"R"), _char(b"L"), _char(b"T"), _char(b"N"), rest, _int(n), _real(1.0), here, lead, below, lead)
+    _syrk(_char(b"L"), _char(b"N"), rest, _int(n), _real(-1.0), below, lead, _real(1.0), corner, lead)

@@ -1,0 +1,131 @@
+"""`Disturbance`: turbulence and vibration of one run, made from a scenario.
+
+A new source of either is one more function in `TURBULENCE` or `VIBRATION`, under the name the
+scenario's `source` setting knows it by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wfsobs.ar2 import Ar2, turbulence_corner
+from wfsobs.scenario import Peak, Scenario
+from wfsobs.spectrum import bin_edges, bin_frequencies, random_phase_signal, resonance_power, table_power
+
+Array = NDArray[np.float64]
+Source = Callable[[Scenario, int, int, np.random.Generator], Array]
+"""(scenario, mode index, number of steps, generator) -> one signal [um], shape (n_steps,)."""
+
+MIN_AR2_DAMPING = 1e-6
+"""A pure line has no stationary AR(2) process; this damping stands for it."""
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """Turbulence and vibration [um], each of shape (n_steps, n_modes)."""
+
+    turbulence: Array
+    vibration: Array
+
+    @property
+    def total(self) -> Array:
+        """phi_dist = phi_turb + phi_vib [um] (paper, eq. 5b)."""
+        return self.turbulence + self.vibration
+
+
+def make_disturbance(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> Disturbance:
+    """Both disturbances over `n_steps`. Every source and mode has a random stream of its own, so
+    changing one setting leaves the others' numbers as they were."""
+    turbulence_rng, vibration_rng = rng.spawn(2)
+    return Disturbance(
+        _columns(TURBULENCE[scenario.turbulence.source], scenario, n_steps, turbulence_rng),
+        _columns(VIBRATION[scenario.vibration.source], scenario, n_steps, vibration_rng),
+    )
+
+
+def _columns(source: Source, scenario: Scenario, n_steps: int, rng: np.random.Generator) -> Array:
+    streams = rng.spawn(len(scenario.modes))
+    return np.column_stack([source(scenario, mode, n_steps, stream) for mode, stream in enumerate(streams)])
+
+
+def turbulence_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
+    """The AR(2) turbulence of one mode (paper, eq. 1), sampled every `dt` [s], rms in [um]."""
+    t = scenario.turbulence
+    corner = turbulence_corner(t.wind_speed, scenario.telescope.diameter, scenario.modes[mode].radial_order)
+    return Ar2(corner, t.damping, t.rms, dt)
+
+
+def peak_rms(peak_rms_list: list[float], mode: int) -> float:
+    """The rms [um] of a peak in one mode: 0 beyond the end of its list."""
+    return peak_rms_list[mode] if mode < len(peak_rms_list) else 0.0
+
+
+def vibration_variance(scenario: Scenario, mode: int) -> float:
+    """Variance [um^2] that the scenario's vibration has in one mode."""
+    v = scenario.vibration
+    if v.source == "none":
+        return 0.0
+    if v.source == "ar2":
+        return float(sum(peak_rms(peak.rms, mode) ** 2 for peak in v.peaks))
+    lines = sum(peak_rms(peak.rms, mode) ** 2 for peak in _pure_lines(scenario))
+    return float(_bin_power(scenario, mode, scenario.n_steps).sum() + lines)
+
+
+def _no_disturbance(_scenario: Scenario, _mode: int, n: int, _rng: np.random.Generator) -> Array:
+    return np.zeros(n)
+
+
+def _ar2_turbulence(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
+    return turbulence_process(scenario, mode, scenario.dt).sample(n, rng)
+
+
+def _ar2_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
+    """Each peak as an AR(2) process (paper, eq. 2)."""
+    out = np.zeros(n)
+    for peak, stream in zip(scenario.vibration.peaks, rng.spawn(len(scenario.vibration.peaks)), strict=True):
+        damping = max(peak.damping, MIN_AR2_DAMPING)
+        out += Ar2(2.0 * np.pi * peak.frequency, damping, peak_rms(peak.rms, mode), scenario.dt).sample(n, stream)
+    return out
+
+
+def _dft_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
+    """Inverse DFT of the spectrum below the cut-off, plus the pure lines at their own frequencies."""
+    phases, *line_streams = rng.spawn(1 + len(scenario.vibration.peaks))
+    out = random_phase_signal(_bin_power(scenario, mode, n), n, phases)
+    t = np.arange(n) * scenario.dt
+    for peak, stream in zip(_pure_lines(scenario), line_streams, strict=False):
+        amplitude = np.sqrt(2.0) * peak_rms(peak.rms, mode)
+        out += amplitude * np.cos(2.0 * np.pi * (peak.frequency * t + stream.random()))
+    return out
+
+
+def _pure_lines(scenario: Scenario) -> list[Peak]:
+    v = scenario.vibration
+    return [p for p in v.peaks if p.damping == 0 and p.frequency <= v.cutoff] if v.source == "peaks" else []
+
+
+def _bin_power(scenario: Scenario, mode: int, n: int) -> Array:
+    """Variance [um^2] in each DFT bin: that of the damped peaks or of the PSD table, up to the cut-off."""
+    v, dt = scenario.vibration, scenario.dt
+    power = np.zeros(n // 2 + 1)
+    if v.source == "psd":
+        density = getattr(v.psd, scenario.modes[mode].name, None)
+        if density is not None:
+            power = table_power(v.psd.frequency, density, n, dt)
+    else:
+        edges = bin_edges(n, dt)
+        for peak in v.peaks:
+            if peak.damping > 0:
+                power = power + peak_rms(peak.rms, mode) ** 2 * resonance_power(peak.frequency, peak.damping, edges)
+    f = bin_frequencies(n, dt)
+    return np.where((f > 0) & (f <= v.cutoff) & (f < 0.5 / dt), power, 0.0)
+
+
+TURBULENCE: dict[str, Source] = {"ar2": _ar2_turbulence, "none": _no_disturbance}
+VIBRATION: dict[str, Source] = {
+    "peaks": _dft_vibration, "psd": _dft_vibration, "ar2": _ar2_vibration, "none": _no_disturbance,
+}

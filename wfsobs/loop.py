@@ -1,0 +1,71 @@
+"""The control loop: from a disturbance and its measurements to a `Record`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from wfsobs.disturbance import make_disturbance
+from wfsobs.record import Record, Training, delayed, frame_mean
+from wfsobs.scenario import Scenario
+from wfsobs.sensing import measure
+
+Array = NDArray[np.float64]
+
+TRAINING_MARGIN = 500
+"""Steps that a training record has beyond its last window, so that the end of the zero-phase filter
+stays out of the targets."""
+
+
+def integrator(open_loop_y: Array, gain: float, leak: float) -> Array:
+    """Commands of the integrator u[k] = leak u[k-1] - g y[k] on y[k] = open_loop_y[k] + u[k-2].
+
+    The loop is linear, so it is one recursive filter of the open-loop measurement,
+    u = -g / (1 - leak q^-1 + g q^-2) y_OL. Stable for 0 <= g < 1 and 0 <= leak <= 1.
+    """
+    return lfilter([-gain], [1.0, -leak, gain], open_loop_y, axis=0)
+
+
+def simulate(scenario: Scenario, rng: np.random.Generator | None = None) -> Record:
+    """Run the loop over the scenario's duration and return its record, training record included.
+
+    rng : source of every random number; by default one seeded with `scenario.run.seed`.
+    Raises SettingError where settings do not go together.
+    """
+    scenario.validate()
+    rng = np.random.default_rng(scenario.run.seed) if rng is None else rng
+    record_rng, training_rng = rng.spawn(2)
+    record = _run(scenario, scenario.n_steps, record_rng)
+    return Record(**{**vars(record), "training": _training(scenario, training_rng)})
+
+
+def _run(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> Record:
+    disturbance_rng, sensor_rng = rng.spawn(2)
+    disturbance = make_disturbance(scenario, n_steps, disturbance_rng)
+    seen = measure(scenario, disturbance, sensor_rng)
+    u = np.zeros_like(seen.lgs)
+    if scenario.loop.closed:
+        u = integrator(seen.lgs, scenario.loop.gain, scenario.loop.leak)
+    n = scenario.sensors.exposure_ratio
+    return Record(
+        y_lgs=seen.lgs + delayed(u, 2),
+        u=u,
+        dt=scenario.dt,
+        y_ngs=seen.ngs + frame_mean(delayed(u, 1), n),
+        ratio=n,
+        turbulence=disturbance.turbulence,
+        vibration=disturbance.vibration,
+        open_loop_y=seen.lgs,
+    )
+
+
+def _training(scenario: Scenario, rng: np.random.Generator) -> Training:
+    """A record of the same scenario with random numbers of its own, cut to start after the warm-up:
+    the loop has settled, and it is as long as the offline GPR needs."""
+    g = scenario.gpr_offline
+    settle = round(scenario.run.warm_up * scenario.sensors.lgs_rate)
+    needed = g.training_size + g.depth + TRAINING_MARGIN
+    record = _run(scenario, settle + needed, rng)
+    assert record.open_loop_y is not None
+    return Training(record.y_lgs[settle:], record.u[settle:], record.open_loop_y[settle:])

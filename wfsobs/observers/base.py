@@ -1,0 +1,58 @@
+"""What an observer is: a name, what it estimates, what it needs, and a function.
+
+phi_hat[k], its estimate of the target at step k, may use y[0..k] and u[0..k-1], nothing later and
+never the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.watch import Watch
+
+Array = NDArray[np.float64]
+
+TURBULENCE, VIBRATION = "turbulence", "vibration"
+TARGETS = (TURBULENCE, VIBRATION)
+
+
+@dataclass(frozen=True)
+class Observer:
+    """An entry of the registry.
+
+    id, label : for tables and files, and for people
+    targets   : what it estimates, of "turbulence" and "vibration"
+    run       : (record, scenario, watch) -> {target: (n_steps, n_modes) [um]}, NaN where there is no estimate yet
+    needs     : record fields without which it cannot run
+    causal    : false only for a reference that looks ahead
+    weight    : its computing time relative to a Kalman filter's, for progress and to run the quick ones first
+    """
+
+    id: str
+    label: str
+    targets: tuple[str, ...]
+    run: Callable[[Record, Scenario, Watch], dict[str, Array]]
+    needs: tuple[str, ...] = ()
+    causal: bool = True
+    weight: float = 1.0
+
+    def missing(self, record: Record) -> tuple[str, ...]:
+        """The needed fields that a record does not have."""
+        return tuple(name for name in self.needs if getattr(record, name) is None)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What one observer says of one target: values (n_steps, n_modes) [um], NaN where it says nothing,
+    and its computing time per step and mode [s]."""
+
+    observer: str
+    target: str
+    values: Array
+    seconds_per_step: float

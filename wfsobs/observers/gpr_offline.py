@@ -1,0 +1,101 @@
+"""Offline Gaussian process regression: trained once, on a record of its own (paper, Algorithms 2 and 3).
+
+The target of a window is the zero-phase Butterworth reference of the training record's open-loop twin at the
+window's last step; without a twin, that of its z. With w = a - b c and c = (delta.a) / (1 / s2 + delta.b) (`kernels` has
+a, b, delta), a prediction is
+
+    mean = kappa.w + delta_t c.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from wfsobs.observers.base import VIBRATION
+from wfsobs.observers.gpr_online import kernel_of, window_signals
+from wfsobs.observers.kernels import SquaredExponential, band, sliding_products, square_from_band, squared_norms
+from wfsobs.observers.reference import open_loop_reference
+from wfsobs.record import Record, RecordError, Training, pseudo_open_loop
+from wfsobs.scenario import Scenario
+from wfsobs.watch import Watch
+
+Array = NDArray[np.float64]
+
+ROWS = 256
+"""Steps predicted at a time."""
+
+
+@dataclass(frozen=True)
+class TrainedGpr:
+    """What training leaves: signals (d + m - 1, channels) that the m windows are cut from, their squared norms and
+    weights (m,), and the constant c."""
+
+    signals: Array
+    depth: int
+    norm2: Array
+    weights: Array
+    constant: float
+    kernel: SquaredExponential
+
+    def predict(self, signals: Array, watch: Watch | None = None) -> Array:
+        """Mean at every step of signals (n, channels), (n,); NaN before the first full window."""
+        n, m, d = signals.shape[0], self.weights.size, self.depth
+        out = np.full(n, np.nan)
+        norm2 = squared_norms(signals, d)
+        for start in range(d - 1, n, ROWS):
+            if watch:
+                watch.step(start / n)
+            rows = min(ROWS, n - start)
+            # products[r, c] of test window start + r and training window c + r - rows + 1
+            products = sliding_products(signals, self.signals, d, start, d - rows, rows, m + rows - 1)
+            row, item = products.strides
+            G = as_strided(products[:, rows - 1 :], (rows, m), (row - item, item))
+            here = norm2[start : start + rows]
+            self.kernel.split(G, here[:, None], self.norm2)
+            out[start : start + rows] = G @ self.weights + self.kernel.delta(here) * self.constant
+        return out
+
+
+def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential) -> TrainedGpr:
+    """Fit the first m windows of signals (n, channels) to targets (n,), one per step.
+
+    Raises RecordError where the record is too short, LinAlgError where sigma_n is too small for the precision.
+    """
+    if signals.shape[0] < depth + m:
+        raise RecordError(f"the training record has {signals.shape[0]} steps, depth + training size need {depth + m}")
+    first = depth - 1
+    V, delta = band(signals, depth, kernel, first, m, m - 1)
+    norm2 = squared_norms(signals[: first + m], depth)[first:]
+    delta = delta[:m]
+    factor = cho_factor(square_from_band(V, 0, m), lower=True, check_finite=False)
+    a, b = cho_solve(factor, np.column_stack([targets[first : first + m], delta]), check_finite=False).T
+    constant = (delta @ a) / (1.0 / kernel.variance + delta @ b)
+    return TrainedGpr(signals[: first + m], depth, norm2, a - b * constant, float(constant), kernel)
+
+
+def training_targets(training: Training, scenario: Scenario, dt: float) -> Array:
+    """The vibration reference of the training record, (n, n_modes) [um]; NaN at the last step."""
+    twin = training.open_loop_y
+    return open_loop_reference(scenario, pseudo_open_loop(training.y_lgs, training.u) if twin is None else twin, dt)
+
+
+def gpr_offline(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """Train on the record's training record and predict over the record, all modes at the same time."""
+    g, training = scenario.gpr_offline, record.training
+    assert training is not None
+    targets = training_targets(training, scenario, record.dt)
+    training_z = pseudo_open_loop(training.y_lgs, training.u)
+
+    def one(mode: int) -> Array:
+        signals = window_signals(g, training.y_lgs, training.u, training_z, mode)
+        model = train(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g))
+        return model.predict(window_signals(g, record.y_lgs, record.u, record.z, mode), watch)
+
+    with ThreadPoolExecutor(record.n_modes) as pool:
+        return {VIBRATION: np.column_stack(list(pool.map(one, range(record.n_modes))))}

@@ -1,0 +1,110 @@
+"""Online Gaussian process regression: trained anew at every step on the last m windows (paper, Algorithm 4).
+
+At step k the newest training pair is (x[k-1], target[k-1]). The target of window j is the vibration at step j: the
+causal Butterworth bank on z, of which value j + 1 belongs to step j and is known at step j + 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wfsobs.observers.base import VIBRATION
+from wfsobs.observers.kernels import SquaredExponential, band, square_from_band
+from wfsobs.observers.reference import online_reference
+from wfsobs.observers.sliding import LEAF, finish, run_lengths, slide
+from wfsobs.record import Record
+from wfsobs.scenario import OfflineGpr, OnlineGpr, Scenario
+from wfsobs.watch import Watch
+
+Array = NDArray[np.float64]
+
+BAND_ENTRIES = 4_000_000
+"""Covariances kept at a time (32 MB)."""
+
+
+def kernel_of(settings: OfflineGpr | OnlineGpr) -> SquaredExponential:
+    """The kernel with the numbers of the settings."""
+    return SquaredExponential(settings.signal_std, settings.length_scale, settings.noise_std)
+
+
+def window_signals(settings: OfflineGpr | OnlineGpr, y: Array, u: Array, z: Array, mode: int) -> Array:
+    """The channels of a window, (n_steps, channels): u and y_lgs (paper, eq. 12), or z."""
+    return z[:, [mode]] if settings.inputs == "z" else np.column_stack([u[:, mode], y[:, mode]])
+
+
+def gpr_online(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """The online GPR over a record, all modes at the same time, delivered block by block."""
+    g = scenario.gpr_online
+    f = online_reference(scenario, record.z, record.dt)
+    targets = np.vstack([f[1:], np.zeros((1, record.n_modes))])
+    values = np.full((record.n_steps, record.n_modes), np.nan)
+    done = np.zeros(record.n_modes)
+
+    def deliver(mode: int) -> Callable[[int, int, Array], None]:
+        def block(start: int, stop: int, mean: Array) -> None:
+            values[start:stop, mode] = mean
+            done[mode] = stop / record.n_steps
+            watch.step(float(done.mean()))
+            watch.partial(VIBRATION, values)
+        return block
+
+    def one(mode: int) -> None:
+        signals = window_signals(g, record.y_lgs, record.u, record.z, mode)
+        predict_sliding(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), deliver(mode))
+
+    with ThreadPoolExecutor(record.n_modes) as pool:
+        list(pool.map(one, range(record.n_modes)))
+    return {VIBRATION: values}
+
+
+def predict_sliding(
+    signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential,
+    deliver: Callable[[int, int, Array], None] | None = None,
+) -> tuple[Array, Array]:
+    """Predict at every step from the m windows before it.
+
+    signals (n, channels), targets (n,): target of the window ending at each step; step k uses targets k - m ... k - 1.
+    deliver : told (start, stop, mean) of each block of steps as it is done.
+    Returns (mean, variance), each (n,), NaN before step depth + m - 1; variance is that of a noisy target.
+    """
+    n = signals.shape[0]
+    mean, variance = np.full(n, np.nan), np.full(n, np.nan)
+    lengths = run_lengths(m)
+    run = lengths[0] if lengths else 256
+    leaf_window = lengths[-1] - 1 if lengths else m
+    # As many runs at a time as the band has room for: their windows overlap.
+    chunk = run * max(1, (BAND_ENTRIES // (m + 1) - m) // run)
+    for start in range(depth + m - 1, n, chunk):
+        stop = min(start + chunk, n)
+        runs = -(-(stop - start) // run)
+        V, delta = band(signals, depth, kernel, start - m, m + runs * run, m)
+        for r in range(runs):
+            at = start + r * run
+            to = min(at + run, n)
+            leaves = np.empty((leaf_window + 3, leaf_window + 3, run))
+            S, f = _whole_run(V, delta, targets, kernel, at, r * run, m, run)
+            slide(S, f, m, lengths, leaves, 0)
+            values, spread = finish(leaves, leaf_window)
+            mean[at:to], variance[at:to] = values[: to - at], spread[: to - at]
+            if deliver:
+                deliver(at, to, mean[at:to])
+    return mean, variance
+
+
+def _whole_run(
+    V: Array, delta: Array, targets: Array, kernel: SquaredExponential, at: int, row: int, m: int, run: int
+) -> tuple[Array, Array]:
+    """The matrix over [m + run points | f | delta] of the steps at ... at + run - 1, and the points' targets."""
+    n = m + run
+    S = np.zeros((n + 2, n + 2), order="F")
+    S[:n, :n] = square_from_band(V, row, n)
+    S[n + 1, :n] = delta[row : row + n]
+    S[n + 1, n + 1] = -1.0 / kernel.variance
+    f = np.zeros(n)
+    known = targets[at - m : at + run]
+    f[: known.size] = known
+    return S, f

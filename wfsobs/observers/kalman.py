@@ -1,0 +1,124 @@
+"""Steady-state Kalman filters on LGS or NGS measurements (paper, section 2.2).
+
+    x_pred[k+1] = A x_hat[k],    x_hat[k] = x_pred[k] + L (z[k] - C x_pred[k])
+
+with the filter gain L = P C' (C P C' + R)^-1; the paper's eq. 10 is the predictor form with K = A L, which uses
+y up to k - 1. Here phi_hat[k] uses y[k] too, like the GPR. The mirror's part is known and taken off before.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wfsobs.ar2 import Ar2, turbulence_corner
+from wfsobs.disturbance import vibration_variance
+from wfsobs.lifted import PeriodicFilter
+from wfsobs.observers.base import TARGETS
+from wfsobs.record import Record
+from wfsobs.riccati import SteadyState, steady_state
+from wfsobs.scenario import Scenario
+from wfsobs.statespace import MIN_MODEL_DAMPING, DisturbanceModel, disturbance_model
+from wfsobs.watch import Watch
+
+Array = NDArray[np.float64]
+
+MIN_NOISE = 1e-6
+"""Floor of a modelled measurement noise [um]: a filter for perfect measurements has no Riccati solution."""
+
+
+def modelled_processes(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2, Ar2]:
+    """The turbulence and the one vibration peak of the model, sampled every `dt` [s] (paper, Tables 1 and 2)."""
+    k, t = scenario.kalman, scenario.turbulence
+    matched = k.process_noise == "matched"
+    turbulence_rms = (t.rms if t.source != "none" else 0.0) if matched else k.turbulence_rms
+    vibration_rms = float(np.sqrt(vibration_variance(scenario, mode))) if matched else k.vibration_rms
+    corner = turbulence_corner(t.wind_speed, scenario.telescope.diameter, scenario.modes[mode].radial_order)
+    vibration_damping = max(k.damping, MIN_MODEL_DAMPING)
+    return Ar2(corner, t.damping, turbulence_rms, dt), Ar2(2.0 * np.pi * k.frequency, vibration_damping, vibration_rms, dt)
+
+
+def kalman_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
+    """The state-space model of the two processes."""
+    turbulence, vibration = modelled_processes(scenario, mode, dt)
+    return disturbance_model([turbulence], [vibration])
+
+
+def measurement_noise(scenario: Scenario) -> tuple[float, float]:
+    """Standard deviation of the modelled noise [um] of the mean LGS measurement and of an NGS frame."""
+    k, s = scenario.kalman, scenario.sensors
+    if k.measurement_noise == "manual":
+        return k.lgs_noise, k.ngs_noise
+    return max(s.lgs_noise / np.sqrt(s.lgs_count), MIN_NOISE), max(s.ngs_noise, MIN_NOISE)
+
+
+def filter_step(model: DisturbanceModel, L: Array, C: Array) -> tuple[Array, Array, Array, Array]:
+    """(F, G, H, J) of one step with filter gain L (n, m) and measurement rows C (m, n), state x_pred[k],
+    outputs the targets of x_hat[k]."""
+    reduced = np.eye(len(model.A)) - L @ C
+    rows = np.array([model.outputs[target] for target in TARGETS])
+    return model.A @ reduced, model.A @ L, rows @ reduced, rows @ L
+
+
+def steady_filter(model: DisturbanceModel, noise: float) -> tuple[PeriodicFilter, SteadyState]:
+    """The steady-state filter of z (1 input) to every target, and its covariances; noise [um]."""
+    steady = steady_state(model.A, model.C, model.Q, np.array(noise**2))
+    return PeriodicFilter([filter_step(model, steady.L, np.atleast_2d(model.C))]), steady
+
+
+def kf_lgs(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """The Kalman filter on the LGS measurement, at every fast step."""
+    z, noise = record.z, measurement_noise(scenario)[0]
+    columns = []
+    for mode in range(record.n_modes):
+        watch.step(mode / record.n_modes)
+        kalman, _ = steady_filter(kalman_model(scenario, mode, record.dt), noise)
+        columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
+    return by_target(columns)
+
+
+def kf_ngs(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """The Kalman filter on NGS frames, with the coefficients for T_NGS.
+
+    A frame at k = n i measures slow step i - 1 (fast steps k - n ... k - 1); the estimate is that of slow
+    step i, the fast steps k ... k + n - 1. It is held over them, or spread by the fast model.
+    """
+    assert record.ratio is not None
+    n, noise = record.ratio, measurement_noise(scenario)[1]
+    frames = record.z_ngs[n::n]
+    columns = []
+    for mode in range(record.n_modes):
+        watch.step(mode / record.n_modes)
+        kalman, _ = steady_filter(kalman_model(scenario, mode, n * record.dt), noise)
+        slow = kalman.run(frames[:, None, mode, None])[:, :, 0]
+        fast = np.full((record.n_steps, len(TARGETS)), np.nan)
+        for target, process in enumerate(modelled_processes(scenario, mode, record.dt)):
+            spread = between_frames(process, n, scenario.kalman.ngs_between_frames)
+            before = np.concatenate([[0.0], slow[:-1, target]])
+            values = np.outer(slow[:, target], spread[:, 0]) + np.outer(before, spread[:, 1])
+            fast[n:, target] = values.ravel()[: record.n_steps - n]
+        columns.append(fast)
+    return by_target(columns)
+
+
+def between_frames(process: Ar2, n: int, how: str) -> Array:
+    """Weights (n, 2) of the slow estimates i and i - 1 in the estimates of the fast steps of slow step i.
+
+    hold: (1, 0). propagate: the conditional mean of phi[n i + j] given the two slow means under the fast
+    model, Cov(phi, s) Cov(s)^-1.
+    """
+    if how == "hold" or process.rms == 0:
+        return np.column_stack([np.ones(n), np.zeros(n)])
+    r = process.autocovariance(2 * n)
+    lag = np.abs(np.subtract.outer(np.arange(2 * n), np.arange(2 * n)))
+    covariance = r[lag]  # of fast steps n (i - 1) ... n (i + 1) - 1
+    means = np.kron(np.eye(2), np.full((1, n), 1.0 / n))[::-1]  # rows: slow step i, slow step i - 1
+    cross, between = covariance[n:] @ means.T, means @ covariance @ means.T
+    return np.linalg.lstsq(between, cross.T, rcond=1e-14)[0].T
+
+
+def by_target(columns: list[Array]) -> dict[str, Array]:
+    """Per-mode results (n_steps, n_targets) as {target: (n_steps, n_modes)}."""
+    stacked = np.stack(columns, axis=-1)
+    return {target: stacked[:, i] for i, target in enumerate(TARGETS)}
+

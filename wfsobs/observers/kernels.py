@@ -1,0 +1,122 @@
+"""Squared-exponential covariances of sliding windows, split so that nothing is ill conditioned.
+
+A point x_j is a window: the last `depth` samples up to step j of every channel. With G_ij = <x_i, x_j>,
+delta_i = exp(-|x_i|^2 / 2 l^2) and s2 = sigma_SE^2, the kernel of the paper's eq. 11 is
+
+    k(x_i, x_j) = s2 exp(-|x_i - x_j|^2 / 2 l^2) = M_ij + s2 delta_i delta_j,
+    M_ij = s2 delta_i delta_j expm1(G_ij / l^2).
+
+M is a covariance of its own (a sum of powers of G). With l far above the windows' norm, K is a huge constant
+plus a small signal, cond(K + sigma_n^2 I) = 5e7 at the paper's numbers; M + sigma_n^2 I has 1e2 to 1e5, and the constant is
+a rank-one border: with a = M^-1 f, b = M^-1 delta, kappa_i = M_ti (M now with sigma_n^2 on its diagonal),
+
+    mean = kappa.a + (delta_t - kappa.b) (delta.a) / (1 / s2 + delta.b).
+
+Inner products slide: G(i, j) = G(i-1, j-1) + s[i] s[j] - s[i-d] s[j-d], at a cost that depth does not enter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided, sliding_window_view
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SquaredExponential:
+    """The kernel's numbers, all in [um]: signal_std sigma_SE, length_scale l, noise_std sigma_n."""
+
+    signal_std: float
+    length_scale: float
+    noise_std: float
+
+    @property
+    def variance(self) -> float:
+        """s2 = sigma_SE^2 [um^2]."""
+        return self.signal_std**2
+
+    def delta(self, norm2: Array) -> Array:
+        """exp(-|x|^2 / 2 l^2) from squared norms [um^2]."""
+        return np.exp(-0.5 * norm2 / self.length_scale**2)
+
+    def split(self, G: Array, norm_i: Array, norm_j: Array) -> None:
+        """Turn inner products G into M (without the noise), in place; squared norms broadcast to its shape.
+
+        While |x|^2 < l^2 that is delta_i delta_j expm1(G / l^2). Beyond, where the factors could overflow, it is
+        the same number as exp(max(g, 0) - (n_i + n_j) / 2 l^2) times (1 - exp(-|g|)) with the sign of g = G / l^2.
+        """
+        scale = 1.0 / self.length_scale**2
+        G *= scale
+        if max(norm_i.max(), norm_j.max()) * scale < 1.0:
+            np.expm1(G, out=G)
+            G *= self.variance * self.delta(norm_i)
+            G *= self.delta(norm_j)
+            return
+        exponent = np.maximum(G, 0.0) - (0.5 * scale) * (norm_i + norm_j)
+        np.copysign(np.expm1(-np.abs(G)), G, out=G)
+        G *= self.variance * np.exp(exponent)
+
+
+def squared_norms(signals: Array, depth: int) -> Array:
+    """|x_j|^2 of the window ending at every step, samples before the start being zero, (n,); signals (n, channels)."""
+    energy = np.concatenate([np.zeros(depth), np.cumsum(np.square(signals).sum(axis=1))])
+    return energy[depth:] - energy[: signals.shape[0]]
+
+
+def sliding_products(a: Array, b: Array, depth: int, i0: int, j0: int, rows: int, offsets: int) -> Array:
+    """Inner products of windows of `a` with windows of `b` along diagonals, shape (rows, offsets).
+
+    out[r, c] = <window of a ending at i0 + r, window of b ending at j0 + r + c>; a, b (n, channels), samples
+    outside the records are zero. The first row is direct dot products, the others slide from it.
+    """
+    out = np.zeros((rows, offsets))
+    work = np.empty((rows - 1, offsets))
+    for channel in range(a.shape[1]):
+        one = _cut(a[:, channel], i0 - depth, depth + rows)  # samples i0 - depth ... i0 + rows - 1
+        other = _cut(b[:, channel], j0 - depth, depth + rows + offsets - 1)
+        out[0] += np.correlate(other[1 : depth + offsets], one[1 : depth + 1], "valid")
+        table = sliding_window_view(other, offsets)  # table[t, c] = b[j0 - depth + t + c]
+        np.multiply(one[depth + 1 :, None], table[depth + 1 : depth + rows], out=work)
+        out[1:] += work
+        np.multiply(one[1:rows, None], table[1:rows], out=work)
+        out[1:] -= work
+    for r in range(1, rows):  # faster than a cumulative sum across rows
+        out[r] += out[r - 1]
+    return out
+
+
+def _cut(x: Array, start: int, length: int) -> Array:
+    """x[start : start + length] with zeros outside the record."""
+    out = np.zeros(length)
+    low, high = max(start, 0), min(start + length, x.size)
+    if high > low:
+        out[low - start : high - start] = x[low:high]
+    return out
+
+
+def band(signals: Array, depth: int, kernel: SquaredExponential, first: int, rows: int, reach: int) -> tuple[Array, Array]:
+    """M + sigma_n^2 I of the windows ending at first ... first + rows - 1, by lag, and their delta.
+
+    Returns (V, delta): V (rows, reach + 1) with V[r, lag] = entry of windows first + r and first + r + lag;
+    delta (rows + reach,).
+    """
+    V = sliding_products(signals, signals, depth, first, first, rows, reach + 1)
+    norm2 = np.zeros(rows + reach)
+    norm2[:rows] = V[:, 0]
+    norm2[rows:] = V[-1, :1]
+    tail = sliding_products(signals, signals, depth, first + rows - 1, first + rows - 1, reach + 1, 1)
+    norm2[rows - 1 :] = np.maximum(tail[:, 0], 0.0)
+    kernel.split(V, norm2[:rows, None], sliding_window_view(norm2, reach + 1)[:rows])
+    V[:, 0] += kernel.noise_std**2
+    return V, kernel.delta(norm2)
+
+
+def square_from_band(V: Array, start: int, n: int) -> Array:
+    """View of V as the symmetric matrix of points start ... start + n - 1, column-major, its lower triangle valid
+    down to V's largest lag; what lies beyond is meaningless. Read only."""
+    row, item = V.strides
+    return as_strided(V[start:], (n, n), (item, row - item), writeable=False)

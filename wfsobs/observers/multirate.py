@@ -1,0 +1,79 @@
+"""The paper's multi-rate Kalman filter: LGS at every step, NGS at every n-th (section 2.2.1).
+
+    x_pred[k+1] = A x_hat[k]
+    x_hat[k] = x_pred[k] + L_j (z_j[k] - C_j x_pred[k])        (eq. 12)
+
+with two steady-state gains: L_LGS from C_LGS and r_LGS, and L_LGS^NGS from both rows with diag(r_LGS, r_NGS), as if
+both came at every step. The paper prints the predictor gain K; the correction of a state that is already
+predicted takes the filter gain L. An NGS frame counts as a measurement of phi_dist[k-1], like the LGS.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wfsobs.lifted import PeriodicFilter
+from wfsobs.observers.base import TURBULENCE
+from wfsobs.observers.kalman import by_target, filter_step, kalman_model, measurement_noise
+from wfsobs.record import Record
+from wfsobs.riccati import steady_state
+from wfsobs.scenario import Scenario
+from wfsobs.settings import SettingError
+from wfsobs.statespace import DisturbanceModel
+from wfsobs.watch import Watch
+
+Array = NDArray[np.float64]
+
+
+def multirate_noise(scenario: Scenario) -> tuple[float, float]:
+    """Square roots of r_LGS and r_NGS [um]."""
+    m = scenario.multirate
+    return (m.lgs_noise, m.ngs_noise) if m.measurement_noise == "manual" else measurement_noise(scenario)
+
+
+@dataclass(frozen=True)
+class MultiRateFilter:
+    """first: (F, G, H, J) of step 0, which has no NGS frame; cycle: the steps from k = 1 on, the frame last."""
+
+    first: tuple[Array, Array, Array, Array]
+    cycle: PeriodicFilter
+
+    def run(self, z: Array) -> Array:
+        """Filter z (n_steps, 2) = (z_lgs, z_ngs), any number where there is no frame; (n_steps, n_targets)."""
+        _, G, _, J = self.first
+        start = z[0] * [1.0, 0.0]
+        rest = self.cycle.run(z[1:, :, None], (G @ start)[:, None])[:, :, 0]
+        return np.vstack([J @ start, rest])
+
+
+def multirate_filter(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float) -> MultiRateFilter:
+    """The filter for an NGS frame every `ratio` steps; lgs_noise, ngs_noise: square roots of r [um].
+
+    Raises SettingError where the two gains, each stable, make an unstable cycle.
+    """
+    C_lgs, C_both = np.atleast_2d(model.C), np.vstack([model.C, model.C])
+    L_lgs = steady_state(model.A, C_lgs, model.Q, np.array(lgs_noise**2)).L
+    L_both = steady_state(model.A, C_both, model.Q, np.diag([lgs_noise**2, ngs_noise**2])).L
+    alone = filter_step(model, np.hstack([L_lgs, np.zeros_like(L_lgs)]), C_both)
+    cycle = PeriodicFilter([*([alone] * (ratio - 1)), filter_step(model, L_both, C_both)])
+    radius = np.abs(np.linalg.eigvals(cycle.cycle_matrix())).max()
+    if radius >= 1.0:
+        raise SettingError(
+            f"multi-rate filter: the cycle of {ratio} steps is unstable (spectral radius {radius:.3g}) with LGS noise "
+            f"{lgs_noise * 1e3:.4g} nm and NGS noise {ngs_noise * 1e3:.4g} nm; bring the two closer together")
+    return MultiRateFilter(alone, cycle)
+
+
+def multirate(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """The multi-rate filter over a record, for turbulence."""
+    assert record.ratio is not None
+    z = np.stack([record.z, np.nan_to_num(record.z_ngs)], axis=1)
+    columns = []
+    for mode in range(record.n_modes):
+        watch.step(mode / record.n_modes)
+        model = kalman_model(scenario, mode, record.dt)
+        columns.append(multirate_filter(model, record.ratio, *multirate_noise(scenario)).run(z[:, :, mode]))
+    return {TURBULENCE: by_target(columns)[TURBULENCE]}

@@ -1,0 +1,117 @@
+"""The flow in one place: Scenario -> Record -> Estimates -> Scores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wfsobs.loop import simulate
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Estimate, Observer
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.scores import Score, score
+from wfsobs.watch import QUIET, Watch
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An observer that gave no estimate, and the one line that says why."""
+
+    observer: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Result:
+    """All of a run: what was asked, what was measured, what was estimated, how well.
+
+    Estimates, scores and failures are in the order of the registry.
+    """
+
+    scenario: Scenario
+    record: Record
+    estimates: tuple[Estimate, ...]
+    scores: tuple[Score, ...]
+    failures: tuple[Failure, ...] = ()
+
+    def estimate(self, observer: str, target: str) -> Estimate | None:
+        """The estimate of one observer and target, or None."""
+        return next((e for e in self.estimates if (e.observer, e.target) == (observer, target)), None)
+
+
+def run(scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | None = None) -> Result:
+    """Simulate a record and run the observers (all unless named) on it. Raises SettingError, Cancelled."""
+    return observe(simulate(scenario), scenario, watch, observers)
+
+
+def observe(record: Record, scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | None = None) -> Result:
+    """Run the observers on a record. What the record states (step, exposure ratio) overrides the scenario."""
+    scenario = as_stated(record, scenario)
+    estimates: list[Estimate] = []
+    failures: list[Failure] = []
+    for item in each_estimate(record, scenario, watch, observers):
+        (failures if isinstance(item, Failure) else estimates).append(item)  # type: ignore[arg-type]
+    return collect(scenario, record, estimates, failures)
+
+
+def as_stated(record: Record, scenario: Scenario) -> Scenario:
+    """The scenario with the step and exposure ratio of the record."""
+    changes: dict[str, float] = {}
+    if abs(record.dt * scenario.sensors.lgs_rate - 1.0) > 1e-12:
+        changes["sensors.lgs_rate"] = 1.0 / record.dt
+    if record.ratio is not None and record.ratio != scenario.sensors.exposure_ratio:
+        changes["sensors.exposure_ratio"] = record.ratio
+    return scenario.replace(changes) if changes else scenario
+
+
+def collect(scenario: Scenario, record: Record, estimates: Sequence[Estimate], failures: Sequence[Failure]) -> Result:
+    """A Result with its scores, everything in the order of the registry."""
+    order = {name: i for i, name in enumerate(OBSERVERS)}
+    names = [m.name for m in scenario.modes]
+    ordered = sorted(estimates, key=lambda e: (order[e.observer], e.target))
+    scores = [s for e in ordered for s in score(record, e, scenario.run.warm_up, names)]
+    return Result(scenario, record, tuple(ordered), tuple(scores), tuple(sorted(failures, key=lambda f: order[f.observer])))
+
+
+def each_estimate(
+    record: Record, scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | None = None,
+    on_partial: Callable[[str, str, Array], None] | None = None,
+) -> Iterator[Estimate | Failure]:
+    """Run the observers and yield each one's estimates as soon as they are done, the slow ones last.
+
+    on_partial : told (observer, target, values so far) by observers that deliver in blocks.
+    """
+    chosen = [OBSERVERS[name] for name in observers] if observers is not None else list(OBSERVERS.values())
+    weights = {o.id: o.weight for o in chosen}
+    total = sum(weights.values()) or 1.0
+    done = 0.0
+    for observer in sorted(chosen, key=lambda o: o.weight):
+        base, share = done / total, weights[observer.id] / total
+        inner = Watch(
+            progress=lambda f, base=base, share=share: watch.progress(base + share * f),
+            cancelled=watch.cancelled,
+            partial=lambda target, values, o=observer: on_partial(o.id, target, values) if on_partial else None,
+        )
+        yield from _one(observer, record, scenario, inner)
+        done += weights[observer.id]
+        watch.step(done / total)
+
+
+def _one(observer: Observer, record: Record, scenario: Scenario, watch: Watch) -> list[Estimate | Failure]:
+    missing = observer.missing(record)
+    if missing:
+        return [Failure(observer.id, f"{observer.id} left out: the record has no {', '.join(missing)}")]
+    start = perf_counter()
+    try:
+        values = observer.run(record, scenario, watch)
+    except ValueError as error:
+        return [Failure(observer.id, f"{observer.id} left out: {error}")]
+    seconds = (perf_counter() - start) / max(record.n_steps * record.n_modes, 1)
+    return [Estimate(observer.id, target, values[target], seconds) for target in observer.targets]

@@ -1,0 +1,98 @@
+"""`Record`: what the sensors and the mirror tell of one run, and the truth where there is one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class RecordError(ValueError):
+    """A record that cannot be used: one line naming what, where and what is expected."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """What the offline GPR is trained on, a record of its own.
+
+    y_lgs, u : (n, n_modes) [um]; open_loop_y : the same sensors with the mirror at rest, or None.
+    """
+
+    y_lgs: Array
+    u: Array
+    open_loop_y: Array | None = None
+
+
+@dataclass(frozen=True)
+class Record:
+    """Measurements and commands, one row per fast (LGS) step.
+
+    y_lgs       : (n_steps, n_modes) mean LGS measurement [um], y_lgs[k] = phi_res[k-1] + noise
+    u           : (n_steps, n_modes) mirror command [um], computed once y_lgs[k] is known
+    dt          : fast step [s]
+    y_ngs       : (n_steps, n_modes) NGS measurement [um], NaN in steps without a frame, or None
+    ratio       : fast steps per NGS frame, or None where there is no NGS
+    turbulence, vibration : (n_steps, n_modes) truth [um], or None. For scores alone: no observer reads them.
+    open_loop_y : (n_steps, n_modes) what the LGS would have measured with the mirror at rest [um], or None
+    training    : what the offline GPR learns from, or None
+    """
+
+    y_lgs: Array
+    u: Array
+    dt: float
+    y_ngs: Array | None = None
+    ratio: int | None = None
+    turbulence: Array | None = None
+    vibration: Array | None = None
+    open_loop_y: Array | None = None
+    training: Training | None = None
+
+    @property
+    def n_steps(self) -> int:
+        """Number of fast steps."""
+        return self.y_lgs.shape[0]
+
+    @property
+    def n_modes(self) -> int:
+        """Number of Zernike modes."""
+        return self.y_lgs.shape[1]
+
+    @property
+    def z(self) -> Array:
+        """Pseudo-open-loop LGS measurement, z[k] = y_lgs[k] - u[k-2] = phi_dist[k-1] + noise [um]."""
+        return pseudo_open_loop(self.y_lgs, self.u)
+
+    @property
+    def z_ngs(self) -> Array:
+        """Pseudo-open-loop NGS measurement [um], NaN without a frame: the mean of u[k-2] ... u[k-n-1],
+        which is what the mirror did during the frame, is taken off. Raises RecordError without NGS."""
+        if self.y_ngs is None or self.ratio is None:
+            raise RecordError("the record has no NGS measurement")
+        return self.y_ngs - frame_mean(delayed(self.u, 1), self.ratio)
+
+    def truth(self, target: str) -> Array | None:
+        """The true signal of `target` ("turbulence" or "vibration"), or None."""
+        return {"turbulence": self.turbulence, "vibration": self.vibration}[target]
+
+
+def delayed(x: Array, steps: int) -> Array:
+    """x[k - steps], zero before the start; same shape as x."""
+    out = np.zeros_like(x)
+    out[steps:] = x[: max(x.shape[0] - steps, 0)]
+    return out
+
+
+def pseudo_open_loop(y: Array, u: Array) -> Array:
+    """z[k] = y[k] - u[k-2], the measurement with the mirror's part taken off (paper, eq. 4 to 6)."""
+    return y - delayed(u, 2)
+
+
+def frame_mean(x: Array, n: int) -> Array:
+    """Mean of x[k-1] ... x[k-n] at every k, zeros before the start; same shape as x."""
+    total = np.zeros_like(x)
+    for j in range(1, n + 1):
+        total += delayed(x, j)
+    return total / n

@@ -1,0 +1,275 @@
+"""What a tree of settings can do: dotted paths, strict checks, plain dictionaries, differences.
+
+The settings themselves are declared once, in `wfsobs.scenario`; widgets, command-line settings, TOML
+files and shareable links all go through the functions here.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Self
+
+import param
+
+Plain = dict[str, Any]
+"""A tree as plain values: nested dictionaries, lists, numbers, strings and booleans."""
+
+
+class SettingError(ValueError):
+    """A setting that cannot be used: one line naming the setting, its value and what is allowed."""
+
+
+class Real(param.Number):
+    """A finite number; integers become floats, booleans and NaN are refused."""
+
+    def __set__(self, obj: Any, val: Any) -> None:
+        if isinstance(val, int) and not isinstance(val, bool):
+            val = float(val)
+        super().__set__(obj, val)
+
+    def _validate_value(self, val: Any, allow_None: bool) -> None:
+        if isinstance(val, bool) or not isinstance(val, float) or not math.isfinite(val):
+            raise ValueError(f"{self.name} takes a finite number, not {val!r}")
+        super()._validate_value(val, allow_None)
+
+
+class Whole(param.Integer):
+    """A whole number; booleans are refused."""
+
+    def _validate_value(self, val: Any, allow_None: bool) -> None:
+        if isinstance(val, bool):
+            raise ValueError(f"{self.name} takes a whole number, not {val!r}")
+        super()._validate_value(val, allow_None)
+
+
+class Reals(param.List):
+    """A list of finite numbers, each within `item_bounds`; its length within `bounds`."""
+
+    __slots__ = ["item_bounds"]
+    item_bounds: tuple[float, float]
+
+    def __init__(self, default: Sequence[float] = (), *, item_bounds: tuple[float, float], **kwargs: Any):
+        self.item_bounds = item_bounds
+        super().__init__(default=[float(v) for v in default], **kwargs)
+
+    def __set__(self, obj: Any, val: Any) -> None:
+        if isinstance(val, (list, tuple)):
+            val = [float(v) if isinstance(v, int) and not isinstance(v, bool) else v for v in val]
+        super().__set__(obj, val)
+
+    def _validate_value(self, val: Any, allow_None: bool) -> None:
+        super()._validate_value(val, allow_None)
+        low, high = self.item_bounds
+        for v in val:
+            if not isinstance(v, float) or not low <= v <= high:
+                raise ValueError(f"{self.name} takes numbers from {low:g} to {high:g}, not {v!r}")
+
+
+class Group(param.Parameterized):
+    """A named group of settings; groups nest, and a list of groups can grow and shrink.
+
+    Values out of bounds raise `SettingError` at once when they come by path, dictionary or file, and
+    `ValueError` (from param, naming the parameter) on plain attribute assignment. Names that do not
+    exist are refused on every way in.
+    """
+
+    def __init__(self, **values: Any):
+        for name, p in self.param.objects("existing").items():
+            if isinstance(p, param.ClassSelector) and not isinstance(p, param.List) and name not in values:
+                values[name] = p.class_()
+            elif isinstance(p, param.List) and name not in values:
+                values[name] = [v.copy() if isinstance(v, Group) else v for v in p.default or []]
+        super().__init__(**values)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not name.startswith("_") and name != "name" and name not in type(self).param:
+            raise AttributeError(f"{type(self).__name__} has no setting {name!r}")
+        super().__setattr__(name, value)
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and self.to_dict() == other.to_dict()  # type: ignore[attr-defined]
+
+    def __hash__(self) -> int:
+        return hash(repr(self.to_dict()))
+
+    def copy(self) -> Self:
+        """An independent copy of the whole tree."""
+        return type(self).from_dict(self.to_dict())
+
+    # ------------------------------------------------------------------ plain values
+
+    @classmethod
+    def settings(cls) -> dict[str, param.Parameter]:
+        """Name -> param.Parameter of every setting, in order of declaration."""
+        return {k: p for k, p in cls.param.objects("existing").items() if k != "name"}
+
+    def to_dict(self) -> Plain:
+        """The tree as nested plain values."""
+        return {name: _plain(getattr(self, name)) for name in self.settings()}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """A tree with `values` on top of the defaults. Raises SettingError."""
+        tree = cls()
+        tree.update(values)
+        return tree
+
+    def update(self, values: Mapping[str, Any], prefix: str = "") -> None:
+        """Set every value of a (partial) dictionary; whole lists are replaced. Raises SettingError."""
+        for name, value in values.items():
+            self._set_one(str(name), value, prefix)
+
+    def _set_one(self, name: str, value: Any, prefix: str) -> None:
+        path = f"{prefix}{name}"
+        p = self.settings().get(name)
+        if p is None:
+            raise SettingError(f"{path}: no such setting; {name!r} is not one of {', '.join(self.settings())}")
+        current = getattr(self, name)
+        if isinstance(current, Group) and not isinstance(value, Group):
+            if not isinstance(value, Mapping):
+                raise SettingError(f"{path} = {value!r}: this is a group of settings, not a value")
+            current.update(value, f"{path}.")
+            return
+        if isinstance(p, param.List) and _holds_groups(p):
+            value = _groups(p, value, path)
+        try:
+            setattr(self, name, value)
+        except (ValueError, TypeError) as error:
+            raise SettingError(f"{path} = {_short(value)}: {allowed(p)}") from error
+
+    def difference(self, base: Group) -> Plain:
+        """The settings in which this tree differs from `base`, as a partial dictionary."""
+        out: Plain = {}
+        for name in self.settings():
+            mine, other = getattr(self, name), getattr(base, name)
+            if isinstance(mine, Group):
+                inner = mine.difference(other)
+                if inner:
+                    out[name] = inner
+            elif _plain(mine) != _plain(other):
+                out[name] = _plain(mine)
+        return out
+
+    # ------------------------------------------------------------------ dotted paths
+
+    def set(self, path: str, value: Any) -> None:
+        """Set one setting by its dotted path, list items by number; the number one past the end of a
+        list adds an item. Raises SettingError.
+
+        >>> from wfsobs.scenario import Scenario
+        >>> s = Scenario()
+        >>> s.set("vibration.peaks.0.frequency", 45)
+        >>> s.vibration.peaks[0].frequency
+        45.0
+        """
+        trial = self.to_dict()
+        _put(trial, path.split("."), value, path)
+        fresh = type(self).from_dict(trial)
+        for name in self.settings():
+            setattr(self, name, getattr(fresh, name))
+
+    def replace(self, changes: Mapping[str, Any]) -> Self:
+        """A copy with some settings (dotted path -> value) changed. Raises SettingError."""
+        out = self.copy()
+        for path, value in changes.items():
+            out.set(path, value)
+        return out
+
+    def walk(self, prefix: str = "") -> Iterator[tuple[str, Group, param.Parameter]]:
+        """(dotted path, group that owns it, parameter) of every setting that is a value or a list."""
+        for name, p in self.settings().items():
+            value = getattr(self, name)
+            if isinstance(value, Group):
+                yield from value.walk(f"{prefix}{name}.")
+            elif isinstance(p, param.List) and _holds_groups(p):
+                for i, item in enumerate(value):
+                    yield from item.walk(f"{prefix}{name}.{i}.")
+            else:
+                yield f"{prefix}{name}", self, p
+
+
+def allowed(p: param.Parameter) -> str:
+    """What a setting takes, as the end of a one-line message."""
+    unit = f" {u}" if (u := unit_of(p)) else ""
+    if isinstance(p, Reals):
+        low, high = p.item_bounds
+        return f"takes a list of numbers from {low:g} to {high:g}{unit}"
+    if isinstance(p, param.Selector):
+        return f"takes one of {', '.join(map(str, p.objects))}"
+    if isinstance(p, param.Boolean):
+        return "takes true or false"
+    if isinstance(p, param.Number):
+        kind = "a whole number" if isinstance(p, param.Integer) else "a number"
+        low, high = p.bounds or (None, None)
+        above, below = p.inclusive_bounds
+        start = f"{'from' if above else 'above'} {low:g}"
+        return f"takes {kind} {start} {'to' if below else 'and below'} {high:.10g}{unit}"
+    return f"takes a {getattr(p, 'class_', object).__name__.lower()}"
+
+
+def unit_of(p: param.Parameter) -> str:
+    """The unit a setting is in: what stands in [brackets] in its documentation, or nothing."""
+    match = re.search(r"(?<=\s)\[([^\]]+)\]", p.doc or "")
+    return match.group(1) if match else ""
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Group):
+        return value.to_dict()
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    return value
+
+
+def _holds_groups(p: param.List) -> bool:
+    return isinstance(p.item_type, type) and issubclass(p.item_type, Group)
+
+
+def _groups(p: param.List, value: Any, path: str) -> list[Group]:
+    if not isinstance(value, (list, tuple)):
+        raise SettingError(f"{path} = {_short(value)}: takes a list of tables")
+    out: list[Group] = []
+    for i, item in enumerate(value):
+        if isinstance(item, Group):
+            out.append(item)
+        elif isinstance(item, Mapping):
+            made = p.item_type()
+            made.update(item, f"{path}.{i}.")
+            out.append(made)
+        else:
+            raise SettingError(f"{path}.{i} = {_short(item)}: takes a table of settings")
+    low, high = p.bounds or (0, None)
+    if high is not None and len(out) > high:
+        raise SettingError(f"{path}: {len(out)} entries, at most {high} are allowed")
+    return out
+
+
+def _put(node: Any, keys: list[str], value: Any, path: str) -> None:
+    """Put `value` into nested plain values; unknown names are left for `update` to refuse."""
+    key = keys[0]
+    if isinstance(node, list):
+        if not key.isdecimal() or int(key) > len(node):
+            raise SettingError(f"{path}: the list has {len(node)} entries, numbered from 0; {len(node)} adds one")
+        index = int(key)
+        if index == len(node):
+            node.append({} if len(keys) > 1 else None)
+        if len(keys) == 1:
+            node[index] = value
+        else:
+            _put(node[index], keys[1:], value, path)
+    elif isinstance(node, dict):
+        if len(keys) == 1:
+            node[key] = value
+        elif key in node:
+            _put(node[key], keys[1:], value, path)
+        else:
+            raise SettingError(f"{path}: no such setting; {key!r} is not one of {', '.join(node)}")
+    else:
+        raise SettingError(f"{path}: no such setting")
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."

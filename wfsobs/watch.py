@@ -1,0 +1,49 @@
+"""How long work tells its progress and hears that it is no longer wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Cancelled(Exception):
+    """The work was stopped on request."""
+
+
+def _never() -> bool:
+    return False
+
+
+def _silent(_fraction: float) -> None:
+    return None
+
+
+def _keep(_target: str, _values: NDArray[np.float64]) -> None:
+    return None
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Callbacks into whoever started the work; all are called from the working thread.
+
+    progress  : told the fraction done, 0 to 1
+    cancelled : asked at every block of work; true stops it
+    partial   : given (target, values so far with NaN where nothing is known yet) by observers that
+                deliver in blocks
+    """
+
+    progress: Callable[[float], None] = _silent
+    cancelled: Callable[[], bool] = _never
+    partial: Callable[[str, NDArray[np.float64]], None] = _keep
+
+    def step(self, fraction: float) -> None:
+        """Report progress. Raises Cancelled if the work is no longer wanted."""
+        if self.cancelled():
+            raise Cancelled
+        self.progress(fraction)
+
+
+QUIET = Watch()
