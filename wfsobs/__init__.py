@@ -1,7 +1,7 @@
 """Wavefront-based disturbance observers for large telescopes.
 
     >>> import wfsobs
-    >>> scenario = wfsobs.preset("paper").replace({"run.duration": 2.0})
+    >>> scenario = wfsobs.PRESETS["paper"]().replace({"run.duration": 2.0})
     >>> result = wfsobs.run(scenario, observers=["kf-lgs", "zero"])
     >>> [(s.observer, s.target, s.mode) for s in result.scores][:2]
     [('kf-lgs', 'turbulence', 'tip'), ('kf-lgs', 'turbulence', 'tilt')]
@@ -16,11 +16,4 @@ from wfsobs.settings import SettingError
 
 __version__ = "0.1.0"
 
-__all__ = ["PRESETS", "Record", "RecordError", "Result", "Scenario", "SettingError", "observe", "preset", "run", "simulate"]
-
-
-def preset(name: str) -> Scenario:
-    """The preset scenario `name` ("paper", "ut4"). Raises SettingError for an unknown name."""
-    if name not in PRESETS:
-        raise SettingError(f"preset {name!r}: no such preset; there are {', '.join(PRESETS)}")
-    return PRESETS[name]()
+__all__ = ["PRESETS", "Record", "RecordError", "Result", "Scenario", "SettingError", "observe", "run", "simulate"]

@@ -54,6 +54,7 @@ def run(scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | Non
 def observe(record: Record, scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | None = None) -> Result:
     """Run the observers on a record. What the record states (step, exposure ratio) overrides the scenario."""
     scenario = as_stated(record, scenario)
+    scenario.validate()
     estimates: list[Estimate] = []
     failures: list[Failure] = []
     for item in each_estimate(record, scenario, watch, observers):
@@ -74,7 +75,7 @@ def as_stated(record: Record, scenario: Scenario) -> Scenario:
 def collect(scenario: Scenario, record: Record, estimates: Sequence[Estimate], failures: Sequence[Failure]) -> Result:
     """A Result with its scores, everything in the order of the registry."""
     order = {name: i for i, name in enumerate(OBSERVERS)}
-    names = [m.name for m in scenario.modes]
+    names = [m.name for m in scenario.modes][: record.n_modes]
     ordered = sorted(estimates, key=lambda e: (order[e.observer], e.target))
     scores = [s for e in ordered for s in score(record, e, scenario.run.warm_up, names)]
     return Result(scenario, record, tuple(ordered), tuple(scores), tuple(sorted(failures, key=lambda f: order[f.observer])))

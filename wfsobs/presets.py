@@ -94,8 +94,10 @@ def paper() -> Scenario:
 
 
 def ut4() -> Scenario:
-    """The lines measured at VLT UT4 with ERIS as pure lines, and Kalman filters matched to the scenario, their one
-    peak on the strongest line, 48.33 Hz."""
+    """The vibration lines measured at VLT UT4 with ERIS.
+
+    All are pure lines; the Kalman filters are matched to the scenario, their one peak on the strongest line, 48.33 Hz.
+    """
     s = Scenario()
     s.update({
         "vibration": {"cutoff": 100.0, "peaks": [

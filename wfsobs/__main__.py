@@ -1,0 +1,5 @@
+"""`python -m wfsobs`."""
+
+from wfsobs.cli import main
+
+main(prog_name="wfsobs")

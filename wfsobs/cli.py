@@ -1,0 +1,156 @@
+"""The command line: `wfsobs run`, `observe`, `presets`, `serve`."""
+
+from __future__ import annotations
+
+import os
+
+# One BLAS thread: at these sizes two are slower, and modes run side by side. Before numpy is loaded.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from wfsobs import __version__, configfile
+from wfsobs.loop import simulate
+from wfsobs.pipeline import Result
+from wfsobs.pipeline import observe as observe_record
+from wfsobs.presets import PRESETS
+from wfsobs.record import RecordError
+from wfsobs.settings import SettingError
+from wfsobs.tables import TIME, Row, rows, score_table
+from wfsobs.telemetry import load_record, save_arrays, save_record
+from wfsobs.watch import Watch
+
+
+class _Commands(click.Group):
+    """Turns the errors a user can cause into one line and exit status 2."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (SettingError, RecordError) as error:
+            click.echo(f"wfsobs: {error}", err=True)
+        except OSError as error:
+            click.echo(f"wfsobs: {error.filename or 'file'}: {error.strerror or error}", err=True)
+        ctx.exit(2)
+
+
+def scenario_options(command: Callable) -> Callable:
+    """--preset, --config and --set."""
+    for option in (
+        click.option("--set", "assignments", multiple=True, metavar="NAME=VALUE",
+                     help="Change one setting, such as turbulence.wind_speed=20; can be given many times."),
+        click.option("--config", metavar="F.toml", help="Settings from a TOML file, on top of the preset."),
+        click.option("--preset", metavar="NAME", help=f"Start from {', '.join(PRESETS)}; paper unless told."),
+    ):
+        command = option(command)
+    return command
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="wfsobs")
+def main() -> None:
+    """Disturbance observers for adaptive optics: turbulence and vibration from wavefront-sensor data."""
+
+
+@main.command()
+@scenario_options
+@click.option("--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N",
+              help="Repeat with seeds run.seed ... run.seed + N - 1.")
+@click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
+@click.option("--save", metavar="RECORD.npz", help="Also save the record of the (one) run.")
+def run(preset: str | None, config: str | None, assignments: tuple[str, ...], seeds: int, as_json: bool, save: str | None) -> None:
+    """Simulate the loop, run every observer and print the RMS table."""
+    if save and seeds > 1:
+        raise SettingError("--save: saves one record; leave --seeds at 1")
+    scenario = configfile.scenario_from(preset, config, assignments)
+    all_rows: list[Row] = []
+    with progress_bar() as update:
+        for i in range(seeds):
+            one = scenario.replace({"run.seed": scenario.run.seed + i})
+            record = simulate(one)
+            if save:
+                save_record(save, record, configfile.to_toml(one))
+            result = observe_record(record, one, Watch(progress=lambda f, i=i: update((i + f) / seeds)))
+            _warn(result)
+            all_rows += rows(result.scores, one.run.seed)
+    show(all_rows, as_json)
+
+
+@main.command()
+@click.argument("record_file", metavar="RECORD.npz")
+@scenario_options
+@click.option("--out", metavar="ESTIMATES.npz", help="Save every estimate under the key observer/target.")
+@click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
+def observe(
+    record_file: str, preset: str | None, config: str | None, assignments: tuple[str, ...], out: str | None, as_json: bool
+) -> None:
+    """Run the observers on a saved record (preset paper unless told)."""
+    scenario = configfile.scenario_from(preset, config, assignments)
+    record = load_record(record_file, scenario)
+    with progress_bar() as update:
+        result = observe_record(record, scenario, Watch(progress=update))
+    _warn(result)
+    if out:
+        save_arrays(out, {f"{e.observer}/{e.target}": e.values for e in result.estimates})
+    if not result.scores and not as_json:
+        why = "no truth" if record.turbulence is None and record.vibration is None else "nothing after the warm-up"
+        click.echo(f"wfsobs: {record_file}: {len(result.estimates)} estimates, no scores: the record has {why}", err=True)
+        return
+    show(rows(result.scores, None), as_json)
+
+
+@main.command()
+@click.argument("name", required=False)
+def presets(name: str | None) -> None:
+    """List the presets, or print one as TOML."""
+    if name is not None:
+        click.echo(configfile.to_toml(configfile.preset(name)), nl=False)
+        return
+    for key, make in PRESETS.items():
+        click.echo(f"{key:8} {(make.__doc__ or '').splitlines()[0]}")
+
+
+@main.command()
+@click.option("--port", type=click.IntRange(0, 65535), default=5006, show_default=True, help="Port to listen on.")
+@click.option("--address", default="localhost", show_default=True, help="Address to listen on.")
+@click.option("--open", "open_browser", is_flag=True, help="Open a browser.")
+def serve(port: int, address: str, open_browser: bool) -> None:
+    """Serve the dashboard."""
+    try:
+        from wfsobs.app.serve import serve as serve_app
+    except ModuleNotFoundError as error:
+        raise SettingError(f"serve: the dashboard needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
+    serve_app(port=port, address=address, open_browser=open_browser)
+
+
+def show(all_rows: list[Row], as_json: bool) -> None:
+    """Print rows to standard output, as JSON or as a table."""
+    if as_json:
+        click.echo(json.dumps([{k: v for k, v in row.items() if k != TIME} for row in all_rows], allow_nan=False))
+    else:
+        table = score_table(all_rows)
+        console = Console()
+        (console if console.is_terminal else Console(width=120)).print(table)
+
+
+def _warn(result: Result) -> None:
+    for failure in result.failures:
+        click.echo(f"wfsobs: {failure.reason}", err=True)
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[float], None]]:
+    """A progress bar on standard error where that is a terminal; gives the function that moves it."""
+    console = Console(stderr=True)
+    columns = (TextColumn("observers"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        task = progress.add_task("", total=1.0)
+        yield lambda fraction: progress.update(task, completed=fraction)
+

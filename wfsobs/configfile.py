@@ -1,0 +1,93 @@
+"""Scenarios as TOML files, and settings as they are typed on a command line."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from wfsobs.files import write_whole
+from wfsobs.presets import PRESETS
+from wfsobs.scenario import Scenario
+from wfsobs.settings import SettingError
+
+
+def to_toml(scenario: Scenario) -> str:
+    """Every setting as TOML, peaks as [[vibration.peaks]] tables; `from_toml` gives back the very same scenario."""
+    return tomli_w.dumps(scenario.to_dict())
+
+
+def from_toml(text: str, base: Scenario | None = None, where: str = "TOML") -> Scenario:
+    """A scenario with the settings of a (partial) TOML text on top of `base`.
+
+    Without `base`, a top-level `preset = "name"` says what to start from, else the defaults. Lists are replaced as a
+    whole. Raises SettingError, its line starting with `where`.
+    """
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SettingError(f"{where}: not TOML: {error}") from None
+    try:
+        name = values.pop("preset", None)
+        scenario = base.copy() if base is not None else preset(name) if name is not None else Scenario()
+        scenario.update(values)
+    except SettingError as error:
+        raise SettingError(f"{where}: {error}") from None
+    return scenario
+
+
+def load(path: str | Path, base: Scenario | None = None) -> Scenario:
+    """The scenario of a TOML file (see `from_toml`). Raises SettingError, also where it cannot be read."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from None
+    return from_toml(text, base, str(path))
+
+
+def save(scenario: Scenario, path: str | Path) -> None:
+    """Write every setting to a TOML file. Raises OSError."""
+    write_whole(path, lambda file: file.write(to_toml(scenario).encode()))
+
+
+def preset(name: Any) -> Scenario:
+    """The preset `name`. Raises SettingError for an unknown one."""
+    if name not in PRESETS:
+        raise SettingError(f"preset = {name!r}: takes one of {', '.join(PRESETS)}")
+    return PRESETS[name]()
+
+
+def parse_assignment(text: str) -> tuple[str, Any]:
+    """("a.b", value) of "a.b=value"; the value in TOML's syntax, or a bare word.
+
+    >>> parse_assignment("turbulence.wind_speed=20")
+    ('turbulence.wind_speed', 20)
+    >>> parse_assignment("vibration.source=ar2")
+    ('vibration.source', 'ar2')
+    """
+    path, equals, value = text.partition("=")
+    if not equals or not path.strip():
+        raise SettingError(f"--set {text}: takes name=value, such as turbulence.wind_speed=20")
+    try:
+        parsed = tomllib.loads(f"value = {value.strip()}")
+    except tomllib.TOMLDecodeError:
+        return path.strip(), value.strip()
+    return path.strip(), parsed["value"] if set(parsed) == {"value"} else value.strip()
+
+
+def scenario_from(
+    preset_name: str | None, config: str | Path | None, assignments: tuple[str, ...], default: str = "paper"
+) -> Scenario:
+    """What a command line asks for: the preset (or the file's own, or `default`), then the file, then each
+    assignment. Raises SettingError."""
+    base = preset(preset_name) if preset_name is not None else None
+    if config is not None:
+        scenario = load(config, base)
+    else:
+        scenario = base if base is not None else preset(default)
+    for path, value in map(parse_assignment, assignments):
+        scenario.set(path, value)
+    scenario.validate()
+    return scenario
