@@ -25,9 +25,7 @@ class Real(param.Number):
     """A finite number; integers become floats, booleans and NaN are refused."""
 
     def __set__(self, obj: Any, val: Any) -> None:
-        if isinstance(val, int) and not isinstance(val, bool):
-            val = float(val)
-        super().__set__(obj, val)
+        super().__set__(obj, _as_float(val))
 
     def _validate_value(self, val: Any, allow_None: bool) -> None:
         if isinstance(val, bool) or not isinstance(val, float) or not math.isfinite(val):
@@ -56,7 +54,7 @@ class Reals(param.List):
 
     def __set__(self, obj: Any, val: Any) -> None:
         if isinstance(val, (list, tuple)):
-            val = [float(v) if isinstance(v, int) and not isinstance(v, bool) else v for v in val]
+            val = [_as_float(v) for v in val]
         super().__set__(obj, val)
 
     def _validate_value(self, val: Any, allow_None: bool) -> None:
@@ -134,6 +132,8 @@ class Group(param.Parameterized):
             return
         if isinstance(p, param.List) and _holds_groups(p):
             value = _groups(p, value, path)
+        elif isinstance(value, Group):
+            value = value.copy()
         try:
             setattr(self, name, value)
         except (ValueError, TypeError) as error:
@@ -195,7 +195,8 @@ def allowed(p: param.Parameter) -> str:
     unit = f" {u}" if (u := unit_of(p)) else ""
     if isinstance(p, Reals):
         low, high = p.item_bounds
-        return f"takes a list of numbers from {low:g} to {high:g}{unit}"
+        shortest, longest = p.bounds
+        return f"takes a list of {shortest:g} to {longest:g} numbers from {low:g} to {high:g}{unit}"
     if isinstance(p, param.Selector):
         return f"takes one of {', '.join(map(str, p.objects))}"
     if isinstance(p, param.Boolean):
@@ -213,6 +214,16 @@ def unit_of(p: param.Parameter) -> str:
     """The unit a setting is in: what stands in [brackets] in its documentation, or nothing."""
     match = re.search(r"(?<=\s)\[([^\]]+)\]", p.doc or "")
     return match.group(1) if match else ""
+
+
+def _as_float(value: Any) -> Any:
+    """A whole number as the float that it is; anything else, and what no float can hold, as it came."""
+    if isinstance(value, int) and not isinstance(value, bool):
+        try:
+            return float(value)
+        except OverflowError:
+            pass
+    return value
 
 
 def _plain(value: Any) -> Any:
@@ -233,7 +244,7 @@ def _groups(p: param.List, value: Any, path: str) -> list[Group]:
     out: list[Group] = []
     for i, item in enumerate(value):
         if isinstance(item, Group):
-            out.append(item)
+            out.append(item.copy())
         elif isinstance(item, Mapping):
             made = p.item_type()
             made.update(item, f"{path}.{i}.")
