@@ -1,0 +1,77 @@
+# `make help` lists the targets. Everything goes into .venv, but for the tests' browser (scripts/need_browser.sh).
+
+PYTHON ?= python3
+PORT ?= 5006
+VENV := .venv
+BIN := $(VENV)/bin
+
+# One BLAS thread: at the sizes of the observers two are slower.
+export OPENBLAS_NUM_THREADS ?= 1
+# Without this, pyright asks for its newest version at each start.
+export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
+
+# Stamps carry the checksum of what they were made from, so that nothing runs twice and no change is missed.
+# An environment works in one place only, so that the place counts as well.
+PLACE := $(firstword $(shell echo "$(CURDIR)" | cksum))
+PINS := $(PLACE)-$(firstword $(shell cat pyproject.toml requirements*.txt | cksum))
+MADE := $(VENV)/.made-$(PLACE)
+RUN := $(VENV)/.run-$(PINS)
+TEST := $(VENV)/.test-$(PINS)
+BENCH := $(VENV)/.bench-$(PINS)
+
+# $(call install,requirements): these pins and the project itself, editable; stamps of other pins go.
+define install
+@echo "Installing $(1) in $(VENV) ..."
+@find $(VENV) -maxdepth 1 -name '.[rtb]*-*' ! -name '*-$(PINS)' -delete
+@$(PIP) install --quiet -r $(1)
+@$(PIP) install --quiet --no-build-isolation --no-deps --editable .
+@$(PIP) check
+@touch $@ $(RUN)
+endef
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+.PHONY: help run test setup check wheel wheel-check bench clean
+
+help:  ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' Makefile
+
+run: $(RUN)  ## serve the dashboard on localhost:5006 (another port: make run PORT=5007)
+	@$(BIN)/wfsobs serve --port $(PORT)
+
+test: setup  ## run all tests, those in a browser after the others
+	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest tests/browser
+
+setup: $(TEST)  ## install all that the tests need, the browser included
+	@scripts/need_browser.sh
+
+check: $(TEST)  ## ruff and pyright
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+
+wheel: $(TEST)  ## build dist/*.tar.gz, and from it dist/*.whl
+	rm -rf dist
+	$(BIN)/python -m build --no-isolation --outdir dist
+
+wheel-check: wheel  ## install that wheel in an empty environment elsewhere, run it and serve from it
+	scripts/check_wheel.sh "$(PYTHON)" dist/*.whl
+
+bench: $(BENCH)  ## time the observers, and compare them with other libraries
+	$(BIN)/wfsobs bench
+
+clean:  ## remove .venv and all that was built
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis test-output
+	find app assets scripts tests wfsobs -name __pycache__ -prune -exec rm -rf {} +
+
+$(MADE):
+	@scripts/make_venv.sh "$(PYTHON)" $(VENV)
+	@touch $@
+
+$(RUN): | $(MADE)
+	$(call install,requirements.txt)
+
+$(TEST): | $(MADE)
+	$(call install,requirements-test.txt)
+
+$(BENCH): | $(MADE)
+	$(call install,requirements-bench.txt)
