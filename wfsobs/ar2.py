@@ -75,8 +75,11 @@ class Ar2:
 
     def psd(self, frequency: Array) -> Array:
         """One-sided power spectral density [unit^2/Hz] at `frequency` [Hz]."""
-        q = np.exp(-2j * np.pi * np.asarray(frequency) * self.dt)
-        return 2.0 * self.dt * self.drive_variance / np.abs(1.0 - self.a1 * q - self.a2 * q**2) ** 2
+        turn = 2j * np.pi * np.asarray(frequency) * self.dt
+        pole = complex(-self.damping * self.omega, self.omega * np.sqrt(1.0 - self.damping**2)) * self.dt
+        # |1 - a1 q - a2 q^2| with q = exp(-turn), as the product of the distances to both poles
+        distance = np.abs(np.expm1(pole - turn) * np.expm1(pole.conjugate() - turn))
+        return 2.0 * self.dt * self.drive_variance / distance**2
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """`n` steps of the process, stationary from the first, shape (n,)."""

@@ -97,7 +97,10 @@ def _dft_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generat
     phases, *line_streams = rng.spawn(1 + len(scenario.vibration.peaks))
     out = random_phase_signal(_bin_power(scenario, mode, n), n, phases)
     t = np.arange(n) * scenario.dt
-    for peak, stream in zip(_pure_lines(scenario), line_streams, strict=False):
+    lines = _pure_lines(scenario)
+    for peak, stream in zip(scenario.vibration.peaks, line_streams, strict=True):
+        if peak not in lines:
+            continue
         amplitude = np.sqrt(2.0) * peak_rms(peak.rms, mode)
         out += amplitude * np.cos(2.0 * np.pi * (peak.frequency * t + stream.random()))
     return out

@@ -43,10 +43,20 @@ def bin_edges(n: int, dt: float) -> Array:
 
 
 def table_power(frequency: ArrayLike, density: ArrayLike, n: int, dt: float) -> Array:
-    """Variance in each DFT bin of a tabulated density [unit^2/Hz], interpolated linearly between its
-    frequencies [Hz] and zero outside them, shape (n // 2 + 1,)."""
-    f = bin_frequencies(n, dt)
-    return np.interp(f, np.asarray(frequency, float), np.asarray(density, float), left=0.0, right=0.0) / (n * dt)
+    """Variance in each DFT bin of a tabulated density [unit^2/Hz], linear between its frequencies [Hz]
+    and zero outside them, shape (n // 2 + 1,).
+
+    The density is integrated over the bin, so a line narrower than the bins of a short record keeps its power.
+    """
+    f, S = np.asarray(frequency, float), np.asarray(density, float)
+    edges = bin_edges(n, dt)
+    grid = np.union1d(f, edges)
+    heights = np.interp(grid, f, S, left=0.0, right=0.0)
+    # np.interp is zero outside [f[0], f[-1]] but not at these two: the pieces that end there from outside are empty.
+    pieces = 0.5 * np.diff(grid) * (heights[1:] + heights[:-1])
+    pieces[(grid[1:] <= f[0]) | (grid[:-1] >= f[-1])] = 0.0
+    total = np.concatenate([[0.0], np.cumsum(pieces)])
+    return np.diff(total[np.searchsorted(grid, edges)])
 
 
 def random_phase_signal(power: ArrayLike, n: int, rng: np.random.Generator) -> Array:

@@ -63,29 +63,39 @@ class SquaredExponential:
 
 def squared_norms(signals: Array, depth: int) -> Array:
     """|x_j|^2 of the window ending at every step, samples before the start being zero, (n,); signals (n, channels)."""
-    energy = np.concatenate([np.zeros(depth), np.cumsum(np.square(signals).sum(axis=1))])
-    return energy[depth:] - energy[: signals.shape[0]]
+    return sliding_products(signals, signals, depth, 0, 0, signals.shape[0], 1)[:, 0]
+
+
+def restart_interval(depth: int) -> int:
+    """Steps after which sliding inner products start anew from direct ones: as many as a window has, so that
+    rounding never grows beyond that of a direct product and the cost stays independent of depth."""
+    return max(16, depth)
 
 
 def sliding_products(a: Array, b: Array, depth: int, i0: int, j0: int, rows: int, offsets: int) -> Array:
     """Inner products of windows of `a` with windows of `b` along diagonals, shape (rows, offsets).
 
     out[r, c] = <window of a ending at i0 + r, window of b ending at j0 + r + c>; a, b (n, channels), samples
-    outside the records are zero. The first row is direct dot products, the others slide from it.
+    outside the records are zero. Every so many rows are direct dot products, the others slide from them.
     """
     out = np.zeros((rows, offsets))
     work = np.empty((rows - 1, offsets))
+    direct = range(0, rows, restart_interval(depth))
+    restarts = np.zeros((len(direct), offsets))
     for channel in range(a.shape[1]):
         one = _cut(a[:, channel], i0 - depth, depth + rows)  # samples i0 - depth ... i0 + rows - 1
         other = _cut(b[:, channel], j0 - depth, depth + rows + offsets - 1)
-        out[0] += np.correlate(other[1 : depth + offsets], one[1 : depth + 1], "valid")
+        for row, r in zip(restarts, direct, strict=True):
+            row += np.correlate(other[r + 1 : r + depth + offsets], one[r + 1 : r + depth + 1], "valid")
         table = sliding_window_view(other, offsets)  # table[t, c] = b[j0 - depth + t + c]
         np.multiply(one[depth + 1 :, None], table[depth + 1 : depth + rows], out=work)
         out[1:] += work
         np.multiply(one[1:rows, None], table[1:rows], out=work)
         out[1:] -= work
+    out[direct] = restarts
     for r in range(1, rows):  # faster than a cumulative sum across rows
-        out[r] += out[r - 1]
+        if r % direct.step:
+            out[r] += out[r - 1]
     return out
 
 
@@ -107,9 +117,8 @@ def band(signals: Array, depth: int, kernel: SquaredExponential, first: int, row
     V = sliding_products(signals, signals, depth, first, first, rows, reach + 1)
     norm2 = np.zeros(rows + reach)
     norm2[:rows] = V[:, 0]
-    norm2[rows:] = V[-1, :1]
-    tail = sliding_products(signals, signals, depth, first + rows - 1, first + rows - 1, reach + 1, 1)
-    norm2[rows - 1 :] = np.maximum(tail[:, 0], 0.0)
+    norm2[rows:] = sliding_products(signals, signals, depth, first + rows, first + rows, reach, 1)[:, 0]
+    np.maximum(norm2, 0.0, out=norm2)
     kernel.split(V, norm2[:rows, None], sliding_window_view(norm2, reach + 1)[:rows])
     V[:, 0] += kernel.noise_std**2
     return V, kernel.delta(norm2)
