@@ -71,7 +71,7 @@ def vibration_variance(scenario: Scenario, mode: int) -> float:
         return 0.0
     if v.source == "ar2":
         return float(sum(peak_rms(peak.rms, mode) ** 2 for peak in v.peaks))
-    lines = sum(peak_rms(peak.rms, mode) ** 2 for peak in _pure_lines(scenario))
+    lines = sum(peak_rms(peak.rms, mode) ** 2 for peak in v.peaks if _is_pure_line(scenario, peak))
     return float(_bin_power(scenario, mode, scenario.n_steps).sum() + lines)
 
 
@@ -97,18 +97,16 @@ def _dft_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generat
     phases, *line_streams = rng.spawn(1 + len(scenario.vibration.peaks))
     out = random_phase_signal(_bin_power(scenario, mode, n), n, phases)
     t = np.arange(n) * scenario.dt
-    lines = _pure_lines(scenario)
     for peak, stream in zip(scenario.vibration.peaks, line_streams, strict=True):
-        if peak not in lines:
-            continue
-        amplitude = np.sqrt(2.0) * peak_rms(peak.rms, mode)
-        out += amplitude * np.cos(2.0 * np.pi * (peak.frequency * t + stream.random()))
+        if _is_pure_line(scenario, peak):
+            amplitude = np.sqrt(2.0) * peak_rms(peak.rms, mode)
+            out += amplitude * np.cos(2.0 * np.pi * (peak.frequency * t + stream.random()))
     return out
 
 
-def _pure_lines(scenario: Scenario) -> list[Peak]:
+def _is_pure_line(scenario: Scenario, peak: Peak) -> bool:
     v = scenario.vibration
-    return [p for p in v.peaks if p.damping == 0 and p.frequency <= v.cutoff] if v.source == "peaks" else []
+    return v.source == "peaks" and peak.damping == 0 and peak.frequency <= v.cutoff
 
 
 def _bin_power(scenario: Scenario, mode: int, n: int) -> Array:
