@@ -142,6 +142,10 @@ class MultiRate(Group):
                      doc="Square root of r_LGS [um], for measurement noise manual.")
     ngs_noise = Real(0.01, bounds=(1e-6, 100.0), softbounds=(0.001, 0.2), label="Weight of NGS",
                      doc="Square root of r_NGS [um], for measurement noise manual.")
+    model_lgs_error = param.Boolean(
+        True, label="LGS error in the optimal filter",
+        doc="Whether the optimal multi-rate filter knows of the slow LGS error (a state of its own); without it the filter "
+            "trusts the LGS far too much.")
 
 
 class Butterworth(Group):

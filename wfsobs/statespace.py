@@ -11,6 +11,7 @@ smaller model, `DisturbanceModel`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +38,10 @@ class DisturbanceModel:
     C: Array
     Q: Array
     outputs: dict[str, Array]
+
+    def output_rows(self, targets: Sequence[str]) -> Array:
+        """The rows of several targets, (len(targets), n)."""
+        return np.array([self.outputs[target] for target in targets])
 
 
 def disturbance_model(turbulence: list[Ar2], vibration: list[Ar2]) -> DisturbanceModel:

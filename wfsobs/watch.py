@@ -39,10 +39,14 @@ class Watch:
     cancelled: Callable[[], bool] = _never
     partial: Callable[[str, NDArray[np.float64]], None] = _keep
 
-    def step(self, fraction: float) -> None:
-        """Report progress. Raises Cancelled if the work is no longer wanted."""
+    def check(self) -> None:
+        """Raises Cancelled if the work is no longer wanted."""
         if self.cancelled():
             raise Cancelled
+
+    def step(self, fraction: float) -> None:
+        """Report progress. Raises Cancelled if the work is no longer wanted."""
+        self.check()
         self.progress(fraction)
 
 

@@ -7,6 +7,7 @@ from wfsobs.observers.gpr_offline import gpr_offline
 from wfsobs.observers.gpr_online import gpr_online
 from wfsobs.observers.kalman import kf_lgs, kf_ngs
 from wfsobs.observers.multirate import multirate
+from wfsobs.observers.multirate_optimal import multirate_optimal
 from wfsobs.observers.reference import butterworth_cl, butterworth_ol, zero
 
 _NGS = ("y_ngs", "ratio")
@@ -15,6 +16,7 @@ OBSERVERS: dict[str, Observer] = {o.id: o for o in (
     Observer("kf-lgs", "LGS KF", TARGETS, kf_lgs),
     Observer("kf-ngs", "NGS KF", (TURBULENCE,), kf_ngs, needs=_NGS),
     Observer("multirate", "Multi-rate KF", (TURBULENCE,), multirate, needs=_NGS),
+    Observer("multirate-optimal", "Optimal multi-rate KF", TARGETS, multirate_optimal, needs=_NGS),
     Observer("butterworth-ol", "Butterworth, open loop", (VIBRATION,), butterworth_ol, needs=("open_loop_y",), causal=False),
     Observer("butterworth-cl", "Butterworth, closed loop", (VIBRATION,), butterworth_cl),
     Observer("gpr-offline", "Offline GPR", (VIBRATION,), gpr_offline, needs=("training",), weight=20.0),

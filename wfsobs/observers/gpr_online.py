@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.kernels import SquaredExponential, band, square_from_band
 from wfsobs.observers.reference import online_reference
-from wfsobs.observers.sliding import LEAF, finish, run_lengths, slide
+from wfsobs.observers.sliding import finish, run_lengths, slide
 from wfsobs.record import Record
 from wfsobs.scenario import OfflineGpr, OnlineGpr, Scenario
-from wfsobs.watch import Watch
+from wfsobs.watch import QUIET, Watch
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def gpr_online(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Ar
 
     def one(mode: int) -> None:
         signals = window_signals(g, record.y_lgs, record.u, record.z, mode)
-        predict_sliding(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), deliver(mode))
+        predict_sliding(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), deliver(mode), watch.check)
 
     with ThreadPoolExecutor(record.n_modes) as pool:
         list(pool.map(one, range(record.n_modes)))
@@ -63,12 +63,13 @@ def gpr_online(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Ar
 
 def predict_sliding(
     signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential,
-    deliver: Callable[[int, int, Array], None] | None = None,
+    deliver: Callable[[int, int, Array], None] | None = None, check: Callable[[], None] = QUIET.check,
 ) -> tuple[Array, Array]:
     """Predict at every step from the m windows before it.
 
     signals (n, channels), targets (n,): target of the window ending at each step; step k uses targets k - m ... k - 1.
-    deliver : told (start, stop, mean) of each block of steps as it is done.
+    deliver : told (start, stop, mean) of each block of steps as it is done
+    check   : called between pieces of work; what it raises ends the work
     Returns (mean, variance), each (n,), NaN before step depth + m - 1; variance is that of a noisy target.
     """
     n = signals.shape[0]
@@ -87,7 +88,7 @@ def predict_sliding(
             to = min(at + run, n)
             leaves = np.empty((leaf_window + 3, leaf_window + 3, run))
             S, f = _whole_run(V, delta, targets, kernel, at, r * run, m, run)
-            slide(S, f, m, lengths, leaves, 0)
+            slide(S, f, m, lengths, leaves, check=check)
             values, spread = finish(leaves, leaf_window)
             mean[at:to], variance[at:to] = values[: to - at], spread[: to - at]
             if deliver:

@@ -52,18 +52,17 @@ def measurement_noise(scenario: Scenario) -> tuple[float, float]:
     return max(s.lgs_noise / np.sqrt(s.lgs_count), MIN_NOISE), max(s.ngs_noise, MIN_NOISE)
 
 
-def filter_step(model: DisturbanceModel, L: Array, C: Array) -> tuple[Array, Array, Array, Array]:
-    """(F, G, H, J) of one step with filter gain L (n, m) and measurement rows C (m, n), state x_pred[k],
-    outputs the targets of x_hat[k]."""
-    reduced = np.eye(len(model.A)) - L @ C
-    rows = np.array([model.outputs[target] for target in TARGETS])
-    return model.A @ reduced, model.A @ L, rows @ reduced, rows @ L
+def filter_step(A: Array, C: Array, L: Array, outputs: Array) -> tuple[Array, Array, Array, Array]:
+    """(F, G, H, J) of one step with transition A (n, n), measurement rows C (m, n) and filter gain L (n, m): the state
+    is x_pred[k], the result outputs (p, n) times x_hat[k]."""
+    reduced = np.eye(len(A)) - L @ C
+    return A @ reduced, A @ L, outputs @ reduced, outputs @ L
 
 
 def steady_filter(model: DisturbanceModel, noise: float) -> tuple[PeriodicFilter, SteadyState]:
     """The steady-state filter of z (1 input) to every target, and its covariances; noise [um]."""
     steady = steady_state(model.A, model.C, model.Q, np.array(noise**2))
-    return PeriodicFilter([filter_step(model, steady.L, np.atleast_2d(model.C))]), steady
+    return PeriodicFilter([filter_step(model.A, np.atleast_2d(model.C), steady.L, model.output_rows(TARGETS))]), steady
 
 
 def kf_lgs(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:

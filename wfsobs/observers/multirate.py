@@ -10,13 +10,14 @@ predicted takes the filter gain L. An NGS frame counts as a measurement of phi_d
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wfsobs.lifted import PeriodicFilter
-from wfsobs.observers.base import TURBULENCE
+from wfsobs.observers.base import TARGETS, TURBULENCE
 from wfsobs.observers.kalman import by_target, filter_step, kalman_model, measurement_noise
 from wfsobs.record import Record
 from wfsobs.riccati import steady_state
@@ -57,8 +58,9 @@ def multirate_filter(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_
     C_lgs, C_both = np.atleast_2d(model.C), np.vstack([model.C, model.C])
     L_lgs = steady_state(model.A, C_lgs, model.Q, np.array(lgs_noise**2)).L
     L_both = steady_state(model.A, C_both, model.Q, np.diag([lgs_noise**2, ngs_noise**2])).L
-    alone = filter_step(model, np.hstack([L_lgs, np.zeros_like(L_lgs)]), C_both)
-    cycle = PeriodicFilter([*([alone] * (ratio - 1)), filter_step(model, L_both, C_both)])
+    rows = model.output_rows(TARGETS)
+    alone = filter_step(model.A, C_both, np.hstack([L_lgs, np.zeros_like(L_lgs)]), rows)
+    cycle = PeriodicFilter([*([alone] * (ratio - 1)), filter_step(model.A, C_both, L_both, rows)])
     radius = np.abs(np.linalg.eigvals(cycle.cycle_matrix())).max()
     if radius >= 1.0:
         raise SettingError(
@@ -67,13 +69,20 @@ def multirate_filter(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_
     return MultiRateFilter(alone, cycle)
 
 
-def multirate(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
-    """The multi-rate filter over a record, for turbulence."""
-    assert record.ratio is not None
+def run_modes(record: Record, watch: Watch, make: Callable[[int], MultiRateFilter]) -> list[Array]:
+    """Run the filter that `make` gives for each mode; per mode (n_steps, n_targets)."""
     z = np.stack([record.z, np.nan_to_num(record.z_ngs)], axis=1)
     columns = []
     for mode in range(record.n_modes):
         watch.step(mode / record.n_modes)
-        model = kalman_model(scenario, mode, record.dt)
-        columns.append(multirate_filter(model, record.ratio, *multirate_noise(scenario)).run(z[:, :, mode]))
+        columns.append(make(mode).run(z[:, :, mode]))
+    return columns
+
+
+def multirate(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """The multi-rate filter over a record, for turbulence."""
+    assert record.ratio is not None
+    ratio, noise = record.ratio, multirate_noise(scenario)
+    columns = run_modes(
+        record, watch, lambda mode: multirate_filter(kalman_model(scenario, mode, record.dt), ratio, *noise))
     return {TURBULENCE: by_target(columns)[TURBULENCE]}

@@ -13,6 +13,8 @@ cut into shorter runs and eliminated again, down to a window so short that all s
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +24,13 @@ Array = NDArray[np.float64]
 
 LEAF = 8
 """Runs of this many steps are finished together."""
+
+PANEL = 256
+"""Points eliminated at a time: the same work as all at once, with a moment to stop in between."""
+
+
+def _go_on() -> None:
+    return None
 
 
 def run_lengths(window: int) -> list[int]:
@@ -36,12 +45,15 @@ def run_lengths(window: int) -> list[int]:
     return lengths
 
 
-def slide(S: Array, f: Array, window: int, lengths: list[int], leaves: Array, at: int) -> None:
+def slide(
+    S: Array, f: Array, window: int, lengths: list[int], leaves: Array, at: int = 0, check: Callable[[], None] = _go_on
+) -> None:
     """Write the small matrices of all steps of a run into leaves[..., at:at + steps].
 
     S : (window + steps + 2,) square, column-major, lower triangle, over [points | f | delta]; the f row holds what
         eliminations left there, the targets themselves are in f (window + steps,), added when a point is eliminated.
     leaves : (leaf window + 3, leaf window + 3, n)
+    check  : called between pieces of work; what it raises ends the work
     """
     steps = S.shape[0] - 2 - window
     if not lengths:
@@ -49,11 +61,13 @@ def slide(S: Array, f: Array, window: int, lengths: list[int], leaves: Array, at
         return
     b, rest = lengths[0], lengths[1:]
     for start in range(0, steps, b):
-        reduced, targets = _eliminate_common(S, f, window, start, b)
-        slide(reduced, targets, b - 1, rest, leaves, at + start)
+        reduced, targets = _eliminate_common(S, f, window, start, b, check)
+        slide(reduced, targets, b - 1, rest, leaves, at + start, check)
 
 
-def _eliminate_common(S: Array, f: Array, window: int, start: int, b: int) -> tuple[Array, Array]:
+def _eliminate_common(
+    S: Array, f: Array, window: int, start: int, b: int, check: Callable[[], None]
+) -> tuple[Array, Array]:
     """The sliding problem of steps start ... start + b - 1 with the training points they share eliminated."""
     n = window - b + 1
     common = slice(start + b - 1, start + window)
@@ -73,7 +87,9 @@ def _eliminate_common(S: Array, f: Array, window: int, start: int, b: int) -> tu
     T[to[2], to[2]] = S[coming, coming]
     T[to[3], to[2]] = S[border, coming]
     T[to[3], to[3]] = S[border, border]
-    eliminate(T, n)
+    for done in range(0, n, PANEL):
+        check()
+        eliminate(T[done:, done:], min(PANEL, n - done))
     return T[n:, n:], np.concatenate([f[going], f[coming]])
 
 
