@@ -29,8 +29,8 @@ def processes(slowest: float = 1e-6, least_damped: float = 1e-6) -> st.SearchStr
 
 
 def exact(p: Ar2) -> tuple[mp.mpf, mp.mpf, mp.mpf, list[mp.mpf]]:
-    """(a1, a2, drive variance, autocovariance of lags 0 ... 40) to 50 digits: the formulas of the paper's eq. 1b and 1c,
-    then the Yule-Walker equations r0 = a1 r1 + a2 r2 + v, r1 = a1 r0 + a2 r1, r[j] = a1 r[j-1] + a2 r[j-2]."""
+    """(a1, a2, drive variance, autocovariance of lags 0 ... 40) to 50 digits: the paper's eq. 1b and 1c, then the
+    Yule-Walker equations r0 = a1 r1 + a2 r2 + v, r1 = a1 r0 + a2 r1, r[j] = a1 r[j-1] + a2 r[j-2]."""
     with mp.workdps(50):
         omega, xi, dt, rms = (mp.mpf(v) for v in (p.omega, p.damping, p.dt, p.rms))
         a1 = 2 * mp.exp(-xi * omega * dt) * mp.cos(omega * mp.sqrt(1 - xi**2) * dt)
@@ -42,7 +42,7 @@ def exact(p: Ar2) -> tuple[mp.mpf, mp.mpf, mp.mpf, list[mp.mpf]]:
 
 
 def test_corner_of_the_turbulence() -> None:
-    """Paper, eq. 1d with Table 1: 0.6 pi * 2 * 15 / 8 = 2.25 pi rad/s; half the speed or twice the aperture halves it."""
+    """Paper, eq. 1d with Table 1: 0.6 pi * 2 * 15 / 8 = 2.25 pi rad/s; half the speed halves it."""
     assert turbulence_corner(15.0, 8.0, 1) == pytest.approx(2.25 * np.pi, rel=4 * EPS)
     assert turbulence_corner(7.5, 8.0, 1) == pytest.approx(1.125 * np.pi, rel=4 * EPS)
     assert turbulence_corner(15.0, 16.0, 2) == pytest.approx(0.6 * np.pi * 3 * 15 / 16, rel=4 * EPS)
@@ -101,8 +101,8 @@ def test_psd_against_its_definition(p: Ar2, share: float) -> None:
 @EXAMPLES
 @given(processes(slowest=3e-3, least_damped=3e-3))
 def test_psd_integrates_to_the_variance(p: Ar2) -> None:
-    # The midpoint rule with N points over half the period of the spectrum, 2 N over all of it, gives r_0 - 2 r_2N + ...,
-    # and r_2N < exp(-2 N xi omega dt) (1 + 2 N omega dt) r_0, the factor in front for damping near 1.
+    # The midpoint rule with N points over half the period of the spectrum, 2 N over all of it, gives r_0 - 2 r_2N
+    # + ..., and r_2N < exp(-2 N xi omega dt) (1 + 2 N omega dt) r_0, the factor in front for damping near 1.
     points = int(np.ceil(20.0 / (p.damping * p.omega * p.dt))) + 8
     f = (np.arange(points) + 0.5) * (0.5 / p.dt) / points
     left_out = 2 * np.exp(-p.damping * p.omega * p.dt * 2 * points) * (1 + 2 * points * p.omega * p.dt)
@@ -114,7 +114,8 @@ def test_psd_integrates_to_the_variance(p: Ar2) -> None:
 
 
 SAMPLED = [  # omega dt, damping: the paper's two, slow and fast extremes, critical damping, nearly a line
-    (7.0686e-3, 0.9), (0.29843, 0.03), (1e-6, 0.9), (1e-5, 1e-6), (3.0, 0.5), (1.0, 1.0), (0.05, 1.0), (0.3, 1e-6), (2.9, 1e-6),
+    (7.0686e-3, 0.9), (0.29843, 0.03), (1e-6, 0.9), (1e-5, 1e-6), (3.0, 0.5), (1.0, 1.0), (0.05, 1.0), (0.3, 1e-6),
+    (2.9, 1e-6),
 ]
 
 

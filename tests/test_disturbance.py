@@ -76,14 +76,18 @@ def test_nothing_above_the_cutoff(cutoff: float, source: str) -> None:
     above = powers(x)[f > cutoff + 1.0]
     below = powers(x)[(f > 1) & (f < cutoff)]
     if source == "peaks":  # pure lines lie between bins: their leakage is not cut, the noise floor of the rest is
-        x = made({"vibration.cutoff": cutoff, "vibration.peaks": [p.to_dict() for p in scenario().vibration.peaks[:2]]}).vibration
+        damped = [p.to_dict() for p in scenario().vibration.peaks[:2]]
+        x = made({"vibration.cutoff": cutoff, "vibration.peaks": damped}).vibration
         above, below = powers(x)[f > cutoff], powers(x)[(f > 1) & (f < cutoff)]
     assert above.max() < 1e-30 and below.min() > 1e-12
 
 
 def test_pure_lines_keep_their_own_frequency_and_rms() -> None:
     """A line between DFT bins: a sine and a cosine of exactly that frequency explain all of it."""
-    lines = [{"frequency": f, "damping": 0.0, "rms": [0.01 * (i + 1), 0.02]} for i, f in enumerate((10.123, 48.33, 79.9, 96.7))]
+    lines = [
+        {"frequency": f, "damping": 0.0, "rms": [tip, 0.02]}
+        for f, tip in ((10.123, 0.01), (48.33, 0.02), (79.9, 0.03), (96.7, 0.04))
+    ]
     x = made({"vibration.peaks": lines}).vibration
     t = np.arange(N) / 1000
     for mode in range(2):
@@ -113,8 +117,8 @@ def test_a_psd_table_gives_its_variance(step: float, seconds: float) -> None:
     rng = np.random.default_rng(0)
     tip, tilt = 1e-6 * rng.exponential(size=(2, f.size))
     s = scenario({
-        "vibration.source": "psd", "vibration.psd": {"frequency": f.tolist(), "tip": tip.tolist(), "tilt": tilt.tolist()},
-        "run.duration": seconds,
+        "vibration.source": "psd", "run.duration": seconds,
+        "vibration.psd": {"frequency": f.tolist(), "tip": tip.tolist(), "tilt": tilt.tolist()},
     })
     x = make_disturbance(s, s.n_steps, np.random.default_rng(3)).vibration
     for mode, density in enumerate((tip, tilt)):

@@ -118,7 +118,8 @@ def test_every_setting_takes_its_own_bounds(path: str) -> None:
         scenario.set(path, value)
         found = next(getattr(owner, q.name) for at, owner, q in scenario.walk() if at == path)
         assert found == value
-        assert type(found) is (float if isinstance(p, param.Number) and not isinstance(p, param.Integer) else type(value))
+        is_real = isinstance(p, param.Number) and not isinstance(p, param.Integer)
+        assert type(found) is (float if is_real else type(value))
 
 
 @pytest.mark.parametrize("path", ALL)
@@ -148,7 +149,8 @@ def test_all_ways_in_are_equally_strict(path: str, value: Any) -> None:
 
 @pytest.mark.parametrize("path", [
     "x", "telescope.x", "telescope.diameter.x", "vibration.peaks.0.x", "vibration.peaks.2.frequency", "", ".", "name",
-    "vibration.peaks.-1.frequency", "vibration.peaks.first", "telescope.name", "vibration.peaks.0.rms.0.x", "run.to_dict",
+    "vibration.peaks.-1.frequency", "vibration.peaks.first", "telescope.name", "vibration.peaks.0.rms.0.x",
+    "run.to_dict",
 ])
 def test_unknown_names_are_refused(path: str) -> None:
     scenario = Scenario()
@@ -177,7 +179,7 @@ def test_a_list_of_groups_takes_only_tables(value: Any) -> None:
 
 @pytest.mark.parametrize("value", [None, 3, "x", []])
 def test_a_group_is_not_a_value(value: Any) -> None:
-    with pytest.raises(SettingError, match="^telescope = .*group"):
+    with pytest.raises(SettingError, match=r"^telescope = .*group"):
         Scenario().set("telescope", value)
 
 

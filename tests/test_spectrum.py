@@ -135,7 +135,7 @@ def test_table_power_is_the_integral_over_each_bin(points: int, n: int, seed: in
 
 @pytest.mark.parametrize("n", [1, 2, 777, 1000, 3000, 10_000, 60_001])
 def test_a_table_keeps_its_variance_at_any_length_of_record(n: int) -> None:
-    """Lines one step of 0.028 Hz wide (a measured spectrum): a short record's bins are far wider, a long one's narrower."""
+    """Lines one step of 0.028 Hz wide (a measured spectrum): bins of a short record are far wider."""
     f = np.arange(0.0, 100.0, 0.028)
     S = np.zeros_like(f)
     S[[300, 700, 1725]] = 0.01

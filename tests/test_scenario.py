@@ -1,0 +1,79 @@
+"""Settings that must go together, and the presets."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs import PRESETS
+from wfsobs.disturbance import vibration_variance
+from wfsobs.scenario import PAPER_PEAK_HZ, Scenario
+from wfsobs.settings import SettingError
+
+TABLE = {"frequency": [1.0, 2.0, 3.0], "tip": [1.0, 1.0, 1.0], "tilt": [1.0, 1.0, 1.0]}
+PSD: dict[str, Any] = {"vibration.source": "psd"}
+
+
+@pytest.mark.parametrize(("changes", "named", "limit"), [
+    ({"run.duration": 2.0, "run.warm_up": 2.0}, "run.warm_up = 2", "2 s"),
+    ({"vibration.peaks.1": {"frequency": 500.0}}, "vibration.peaks.1.frequency = 500", "500 Hz"),
+    ({"sensors.lgs_rate": 90.0}, "vibration.peaks.0.frequency = 47.4969", "45 Hz"),
+    ({"kalman.frequency": 600.0}, "kalman.frequency = 600", "500 Hz"),
+    ({"butterworth.frequencies": [30.0, 1.0]}, "butterworth.frequencies.1 = 1", "500 Hz"),
+    ({"butterworth.frequencies": [499.0]}, "butterworth.frequencies.0 = 499", "500 Hz"),
+    ({"butterworth.bandwidth_online": 40.0}, "butterworth.frequencies.0 = 17.1", "20 Hz"),
+    (PSD, "vibration.psd.frequency", "two frequencies"),
+    (PSD | {"vibration.psd": TABLE | {"frequency": [1.0, 1.0, 3.0]}}, "vibration.psd.frequency", "increasing"),
+    (PSD | {"vibration.psd": TABLE | {"tilt": [1.0]}}, "vibration.psd.tilt", "1 numbers"),
+])
+def test_settings_that_do_not_go_together(changes: dict[str, Any], named: str, limit: str) -> None:
+    s = Scenario().replace(changes)
+    with pytest.raises(SettingError, match=re.escape(named)) as caught:
+        s.validate()
+    assert limit in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_what_goes_together_passes() -> None:
+    Scenario().validate()
+    Scenario().replace({"vibration.source": "psd", "vibration.psd": TABLE}).validate()
+    Scenario().replace({"vibration.psd": {"frequency": [3.0, 1.0]}}).validate()  # a table that is not used
+
+
+def test_steps_and_time_step() -> None:
+    s = Scenario().replace({"run.duration": 2.5, "sensors.lgs_rate": 800.0})
+    assert s.n_steps == 2000 and s.dt == 1 / 800
+    assert Scenario().replace({"run.duration": 0.1, "sensors.lgs_rate": 10.0}).n_steps == 1
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_valid_and_new_each_time(name: str) -> None:
+    one, other = PRESETS[name](), PRESETS[name]()
+    one.validate()
+    assert one == other and one is not other
+    one.vibration.peaks[0].rms[0] = 9.0
+    assert PRESETS[name]() == other
+    assert PRESETS[name].__doc__
+
+
+def test_the_paper_preset_has_the_numbers_of_the_tables() -> None:
+    """Tables 1 to 4 and section 2.4, transcribed from the paper's text."""
+    s = PRESETS["paper"]()
+    t, v, n, k, b = s.turbulence, s.vibration, s.sensors, s.kalman, s.butterworth
+    assert (t.damping, t.wind_speed, s.telescope.diameter, s.modes[0].radial_order) == (0.9, 15.0, 8.0, 1)
+    assert (k.frequency, k.damping, PAPER_PEAK_HZ) == (47.4969, 0.03, 47.4969)
+    assert (n.lgs_rate, n.exposure_ratio) == (1000.0, 5)  # 200 Hz
+    assert v.cutoff == 80.0
+    assert b.frequencies == [17.1, 24.3, 34.1, 47.7, 54.3, 61.5]
+    assert (b.bandwidth_offline, b.bandwidth_online, b.order) == (3.0, 2.0, 1)
+    offline, online = s.gpr_offline, s.gpr_online
+    assert (offline.signal_std, offline.length_scale, offline.training_size, offline.depth, offline.noise_std) == (
+        10.0, 300.0, 1000, 407, 0.13)
+    assert (online.signal_std, online.length_scale, online.training_size, online.depth, online.noise_std) == (
+        30.0, 300.0, 511, 170, 0.1)
+    assert offline.inputs == online.inputs == "u-y"
+    # stated in the preset's docstring: vibration of 15.5 nm on tip, r_NGS < r_LGS / 2
+    assert np.sqrt(vibration_variance(s, 0)) == pytest.approx(0.0155, abs=0.0001)
+    assert n.ngs_noise**2 < n.lgs_noise**2 / n.lgs_count
