@@ -105,8 +105,9 @@ def _doubled(m: Map) -> Array:
     """The covariance after very many repetitions of a map."""
     for _ in range(60):
         before = m[2]
-        m = _compose(m, m)
-        if not np.isfinite(m[2]).all():
+        with np.errstate(over="ignore", invalid="ignore"):
+            m = _compose(m, m)
+        if not all(np.isfinite(part).all() for part in m):
             break
         if np.abs(m[2] - before).max() <= 1e-15 * np.abs(m[2]).max():
             return m[2]
@@ -147,9 +148,10 @@ def lyapunov(F: Array, W: Array) -> Array:
     """S = F S F' + W by doubling: every pass doubles the number of terms summed. Raises RiccatiError if F is not stable."""
     S = W
     for _ in range(60):
-        step = F @ S @ F.T
-        S = S + step
-        F = F @ F
+        with np.errstate(over="ignore", invalid="ignore"):
+            step = F @ S @ F.T
+            S = S + step
+            F = F @ F
         if not np.isfinite(S).all():
             break
         if np.abs(step).max() <= 1e-17 * np.abs(S).max():

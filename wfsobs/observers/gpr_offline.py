@@ -19,7 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.gpr_online import kernel_of, window_signals
-from wfsobs.observers.kernels import SquaredExponential, band, sliding_products, square_from_band, squared_norms
+from wfsobs.observers.kernels import Points, SquaredExponential, band, sliding_products, square_from_band, squared_norms
 from wfsobs.observers.reference import open_loop_reference
 from wfsobs.record import Record, RecordError, Training, pseudo_open_loop
 from wfsobs.scenario import Scenario
@@ -33,12 +33,12 @@ ROWS = 256
 
 @dataclass(frozen=True)
 class TrainedGpr:
-    """What training leaves: signals (d + m - 1, channels) that the m windows are cut from, their squared norms and
-    weights (m,), and the constant c."""
+    """What training leaves: signals (d + m - 1, channels) that the m windows are cut from, the windows as points,
+    their weights (m,), and the constant c."""
 
     signals: Array
     depth: int
-    norm2: Array
+    points: Points
     weights: Array
     constant: float
     kernel: SquaredExponential
@@ -47,7 +47,7 @@ class TrainedGpr:
         """Mean at every step of signals (n, channels), (n,); NaN before the first full window."""
         n, m, d = signals.shape[0], self.weights.size, self.depth
         out = np.full(n, np.nan)
-        norm2 = squared_norms(signals, d)
+        tests = self.kernel.points(np.maximum(squared_norms(signals, d), 0.0))
         for start in range(d - 1, n, ROWS):
             if watch:
                 watch.step(start / n)
@@ -56,9 +56,9 @@ class TrainedGpr:
             products = sliding_products(signals, self.signals, d, start, d - rows, rows, m + rows - 1)
             row, item = products.strides
             G = as_strided(products[:, rows - 1 :], (rows, m), (row - item, item))
-            here = norm2[start : start + rows]
-            self.kernel.split(G, here[:, None], self.norm2)
-            out[start : start + rows] = G @ self.weights + self.kernel.delta(here) * self.constant
+            here = Points(*(p[start : start + rows, None] for p in tests))
+            self.kernel.split(G, here, self.points)
+            out[start : start + rows] = G @ self.weights + here.delta[:, 0] * self.constant
         return out
 
 
@@ -70,13 +70,12 @@ def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExp
     if signals.shape[0] < depth + m:
         raise RecordError(f"the training record has {signals.shape[0]} steps, depth + training size need {depth + m}")
     first = depth - 1
-    V, delta = band(signals, depth, kernel, first, m, m - 1)
-    norm2 = squared_norms(signals[: first + m], depth)[first:]
-    delta = delta[:m]
+    V, points = band(signals, depth, kernel, first, m, m - 1)
+    points = Points(*(p[:m] for p in points))
     factor = cho_factor(square_from_band(V, 0, m), lower=True, check_finite=False)
-    a, b = cho_solve(factor, np.column_stack([targets[first : first + m], delta]), check_finite=False).T
-    constant = (delta @ a) / (1.0 / kernel.variance + delta @ b)
-    return TrainedGpr(signals[: first + m], depth, norm2, a - b * constant, float(constant), kernel)
+    a, b = cho_solve(factor, np.column_stack([targets[first : first + m], points.delta]), check_finite=False).T
+    constant = (points.delta @ a) / (1.0 / kernel.variance + points.delta @ b)
+    return TrainedGpr(signals[: first + m], depth, points, a - b * constant, float(constant), kernel)
 
 
 def training_targets(training: Training, scenario: Scenario, dt: float) -> Array:

@@ -82,12 +82,12 @@ def predict_sliding(
     for start in range(depth + m - 1, n, chunk):
         stop = min(start + chunk, n)
         runs = -(-(stop - start) // run)
-        V, delta = band(signals, depth, kernel, start - m, m + runs * run, m)
+        V, points = band(signals, depth, kernel, start - m, m + runs * run, m)
         for r in range(runs):
             at = start + r * run
             to = min(at + run, n)
             leaves = np.empty((leaf_window + 3, leaf_window + 3, run))
-            S, f = _whole_run(V, delta, targets, kernel, at, r * run, m, run)
+            S, f = _whole_run(V, points.delta, targets, kernel, at, r * run, m, run)
             slide(S, f, m, lengths, leaves, check=check)
             values, spread = finish(leaves, leaf_window)
             mean[at:to], variance[at:to] = values[: to - at], spread[: to - at]

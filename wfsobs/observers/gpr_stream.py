@@ -10,7 +10,7 @@ date, one slot per training point, a new point taking the slot s of the oldest o
 where v, gamma are the covariances of the new point with the others and itself. Both together are one symmetric
 rank-2 update. The same steps carry a = N f and b = N delta along:
 
-    a_ = a - q a_s / q_s,    a' = a_ - t (f_s - v.a_) / sigma
+    a_ = a - q a_s / q_s,    a' = a_ + t (v.a_ - f_s) / sigma
 
 The newest target is known only with the next sample, so a is kept with 0 in its place, and N e_s = -t / sigma gives what
 the target adds. One step of refinement of r against M itself holds the error at rounding level times the condition
@@ -25,7 +25,7 @@ from scipy.linalg.blas import dsymv, dsyr2
 
 from wfsobs.bandpass import StreamingBank, bandpass_bank
 from wfsobs.observers.gpr_online import kernel_of
-from wfsobs.observers.kernels import SquaredExponential, restart_interval
+from wfsobs.observers.kernels import Points, SquaredExponential, restart_interval
 from wfsobs.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -40,19 +40,19 @@ class SlidingRegression:
     def __init__(self, depth: int, m: int, channels: int, kernel: SquaredExponential):
         self.depth, self.m, self.kernel = depth, m, kernel
         self.step = -1
-        span = m + depth + 1
-        self._history = np.zeros((channels, 4 * span))  # newest sample last, moved back when the end is reached
-        self._end = span
+        self._span = m + depth + 1
+        self._history = np.zeros((4 * self._span, channels))  # newest sample last, moved to the front at the end
+        self._end = self._span
         self._products = np.zeros(m + 1)  # <x_k, x_i> for i = k - m ... k
-        self._norm2 = np.zeros(m)  # by slot, like everything below
-        self._delta = np.zeros(m)
+        renewed = -(-(m + 1) // restart_interval(depth))
+        self._renewal = np.add.outer(np.arange(renewed) * channels, np.arange(depth * channels))  # samples of windows
+        self._points = Points(np.zeros(m), np.ones(m))  # by slot, like everything below
+        self._newest = kernel.points(np.zeros(1))
         self._kappa = np.zeros(m)
-        self._weights = np.zeros((3, m))  # a without the newest target, N e_newest, b
+        self._weights = np.zeros((3, m))  # a without the newest target, b, N e_newest
         self._M = np.zeros((m, m), order="F")  # lower triangles
         self._N = np.zeros((m, m), order="F")
-        self._renewed = -(-(m + 1) // restart_interval(depth))
         self._last_target = 0.0
-        self._norm_t = self._delta_t = 0.0
 
     @property
     def ready(self) -> bool:
@@ -68,96 +68,86 @@ class SlidingRegression:
         self._last_target = last_target
         self._slide(sample)
         self._covariances()
-        a, h, b = self._weights
-        kappa, delta = self._kappa, self._delta
-        by_kappa, by_delta = self._weights @ kappa, self._weights @ delta
         if not self.ready:
             return float("nan")
-        border = (self._delta_t - by_kappa[2]) / (1.0 / self.kernel.variance + by_delta[2])
-        at_kappa = by_kappa[0] + last_target * by_kappa[1]
-        at_delta = by_delta[0] + last_target * by_delta[1]
-        return float(at_kappa + border * at_delta)
+        a, b, h = self._weights @ np.array([self._kappa, self._points.delta]).T
+        border = (self._newest.delta[0] - b[0]) / (1.0 / self.kernel.variance + b[1])
+        return float(a[0] + last_target * h[0] + border * (a[1] + last_target * h[1]))
 
     def _slide(self, sample: Array) -> None:
         """Inner products of the newest window with the m before it and itself, from those one step ago."""
         m, d = self.m, self.depth
-        if self._end == self._history.shape[1]:
-            span = m + d + 1
-            self._history[:, :span] = self._history[:, -span:]
-            self._end = span
+        if self._end == len(self._history):
+            self._history[: self._span] = self._history[-self._span :]
+            self._end = self._span
         H, e = self._history, self._end
-        H[:, e] = sample
-        self._products += H[:, e] @ H[:, e - m : e + 1]
-        self._products -= H[:, e - d] @ H[:, e - d - m : e - d + 1]
+        H[e] = sample
+        self._products += H[e - m : e + 1] @ H[e]
+        self._products -= H[e - d - m : e - d + 1] @ H[e - d]
         self._end += 1
 
     def _covariances(self) -> None:
         """M between the newest window and those in the slots, zero where a slot is empty."""
         m, s = self.m, self.step % self.m
         filled = min(m, max(self.step - self.depth + 1, 0))
-        self._norm_t = max(self._products[m], 0.0)
+        self._newest = self.kernel.points(np.maximum(self._products[m:], 0.0))
         G = self._kappa
         G[s:] = self._products[: m - s]
         G[:s] = self._products[m - s : m]
-        self.kernel.split(G, self._norm2, np.array([self._norm_t]))
+        self.kernel.split(G, self._points, self._newest)
         if filled < m:
             G[(self.step - filled - np.arange(m - filled) - 1) % m] = 0.0
-        self._delta_t = float(np.exp(-0.5 * self._norm_t / self.kernel.length_scale**2))
 
     def update(self) -> None:
         """Put the newest window in the place of the oldest."""
         if self.step < self.depth - 1:
             return
-        m, s, N, M = self.m, self.step % self.m, self._N, self._M
-        a, h, b = self._weights
+        s, N, M, v = self.step % self.m, self._N, self._M, self._kappa
+        a, b, h = self._weights
+        ab = self._weights[:2]
         a += self._last_target * h
-        v = self._kappa
-        v[s] = 0.0
-        gone = np.zeros(m)
+        gone = np.zeros(self.m)
         if M[s, s] > 0.0:
             q = _column(N, s)
-            p = q[s]
-            a -= q * (a[s] / p)
-            b -= q * (b[s] / p)
-            gone = q / np.sqrt(p)
-        a[s] = b[s] = 0.0
-        _set_column(M, s, v * 0.0)
+            ab -= (ab[:, s : s + 1] / q[s]) * q
+            gone = q / np.sqrt(q[s])
+        ab[:, s] = v[s] = 0.0
         r = self._solve_without(v, gone, s)
         r += self._solve_without(v - dsymv(1.0, M, r, lower=1), gone, s)
         gamma = self.kernel.variance * self._own() + self.kernel.noise_std**2
         sigma = gamma - v @ r
         t = r
         t[s] = -1.0
-        a -= t * ((0.0 - v @ a) / sigma)
-        b -= t * ((self._delta_t - v @ b) / sigma)
+        a += ((v @ a) / sigma) * t
+        b += ((v @ b - self._newest.delta[0]) / sigma) * t
         come = t / np.sqrt(sigma)
         dsyr2(0.5, come - gone, come + gone, a=N, lower=1, overwrite_a=1)
         np.divide(t, -sigma, out=h)
         _set_column(N, s, h)
         v[s] = gamma
         _set_column(M, s, v)
-        self._norm2[s], self._delta[s] = self._norm_t, self._delta_t
+        self._points.norm2[s], self._points.delta[s] = self._newest.norm2[0], self._newest.delta[0]
         self._renew_products()
 
     def _own(self) -> float:
         """M of the newest window with itself over s2: exp(-n) expm1(n) = 1 - exp(-n) with n = |x|^2 / l^2."""
-        return float(-np.expm1(-self._norm_t / self.kernel.length_scale**2))
+        return float(-np.expm1(-self._newest.norm2[0] / self.kernel.length_scale**2))
 
     def _solve_without(self, v: Array, gone: Array, s: int) -> Array:
-        """N_ v, the inverse without slot s."""
-        out = dsymv(1.0, self._N, v, lower=1) - gone * (gone @ v)
+        """N_ v, the inverse without slot s; sets v[s] to zero."""
+        v[s] = 0.0
+        out = dsymv(1.0, self._N, v, lower=1)
+        out -= gone * (gone @ v)
         out[s] = 0.0
         return out
 
     def _renew_products(self) -> None:
         """Some inner products from their samples at every step, in turn: rounding of the others has no time to grow."""
-        d, H, e = self.depth, self._history, self._end
-        turns = -(-(self.m + 1) // self._renewed)
-        first = self.step % turns * self._renewed
-        last = min(first + self._renewed, self.m + 1)
-        start = e - self.m - d + first
-        self._products[first:last] = sum(
-            np.correlate(row[start : start + d + last - first - 1], row[e - d : e], "valid") for row in H)
+        turns = -(-(self.m + 1) // len(self._renewal))
+        first = min(self.step % turns * len(self._renewal), self.m + 1 - len(self._renewal))
+        d, e, H = self.depth, self._end, self._history
+        windows = H.ravel().take(self._renewal + (e - self.m - d + first) * H.shape[1])
+        self._products[first : first + len(windows)] = windows @ H[e - d : e].ravel()
 
 
 def _column(S: Array, s: int) -> Array:

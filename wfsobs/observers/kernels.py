@@ -18,6 +18,7 @@ Inner products slide: G(i, j) = G(i-1, j-1) + s[i] s[j] - s[i-d] s[j-d], at a co
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided, sliding_window_view
@@ -39,26 +40,33 @@ class SquaredExponential:
         """s2 = sigma_SE^2 [um^2]."""
         return self.signal_std**2
 
-    def delta(self, norm2: Array) -> Array:
-        """exp(-|x|^2 / 2 l^2) from squared norms [um^2]."""
-        return np.exp(-0.5 * norm2 / self.length_scale**2)
+    def points(self, norm2: Array) -> Points:
+        """The windows with these squared norms [um^2]."""
+        return Points(norm2, np.exp(-0.5 * norm2 / self.length_scale**2))
 
-    def split(self, G: Array, norm_i: Array, norm_j: Array) -> None:
-        """Turn inner products G into M (without the noise), in place; squared norms broadcast to its shape.
+    def split(self, G: Array, i: Points, j: Points) -> None:
+        """Turn inner products G of points i and j, which broadcast to its shape, into M (without the noise), in place.
 
         While |x|^2 < l^2 that is delta_i delta_j expm1(G / l^2). Beyond, where the factors could overflow, it is
         the same number as exp(max(g, 0) - (n_i + n_j) / 2 l^2) times (1 - exp(-|g|)) with the sign of g = G / l^2.
         """
         scale = 1.0 / self.length_scale**2
         G *= scale
-        if max(norm_i.max(), norm_j.max()) * scale < 1.0:
+        if max(i.norm2.max(), j.norm2.max()) * scale < 1.0:
             np.expm1(G, out=G)
-            G *= self.variance * self.delta(norm_i)
-            G *= self.delta(norm_j)
+            G *= self.variance * i.delta
+            G *= j.delta
             return
-        exponent = np.maximum(G, 0.0) - (0.5 * scale) * (norm_i + norm_j)
+        exponent = np.maximum(G, 0.0) - (0.5 * scale) * (i.norm2 + j.norm2)
         np.copysign(np.expm1(-np.abs(G)), G, out=G)
         G *= self.variance * np.exp(exponent)
+
+
+class Points(NamedTuple):
+    """Windows by what the kernel needs beside their inner products: |x|^2 [um^2] and delta, of equal shape."""
+
+    norm2: Array
+    delta: Array
 
 
 def squared_norms(signals: Array, depth: int) -> Array:
@@ -108,20 +116,20 @@ def _cut(x: Array, start: int, length: int) -> Array:
     return out
 
 
-def band(signals: Array, depth: int, kernel: SquaredExponential, first: int, rows: int, reach: int) -> tuple[Array, Array]:
-    """M + sigma_n^2 I of the windows ending at first ... first + rows - 1, by lag, and their delta.
+def band(signals: Array, depth: int, kernel: SquaredExponential, first: int, rows: int, reach: int) -> tuple[Array, Points]:
+    """M + sigma_n^2 I of the windows ending at first ... first + rows - 1, by lag, and those windows.
 
-    Returns (V, delta): V (rows, reach + 1) with V[r, lag] = entry of windows first + r and first + r + lag;
-    delta (rows + reach,).
+    Returns (V, points): V (rows, reach + 1) with V[r, lag] = entry of windows first + r and first + r + lag;
+    points of shape (rows + reach,).
     """
     V = sliding_products(signals, signals, depth, first, first, rows, reach + 1)
-    norm2 = np.zeros(rows + reach)
-    norm2[:rows] = V[:, 0]
-    norm2[rows:] = sliding_products(signals, signals, depth, first + rows, first + rows, reach, 1)[:, 0]
-    np.maximum(norm2, 0.0, out=norm2)
-    kernel.split(V, norm2[:rows, None], sliding_window_view(norm2, reach + 1)[:rows])
+    later = sliding_products(signals, signals, depth, first + rows, first + rows, reach, 1)[:, 0]
+    points = kernel.points(np.maximum(np.concatenate([V[:, 0], later]), 0.0))
+    here = Points(*(p[:rows, None] for p in points))
+    there = Points(*(sliding_window_view(p, reach + 1)[:rows] for p in points))
+    kernel.split(V, here, there)
     V[:, 0] += kernel.noise_std**2
-    return V, kernel.delta(norm2)
+    return V, points
 
 
 def square_from_band(V: Array, start: int, n: int) -> Array:

@@ -14,6 +14,7 @@ cut into shorter runs and eliminated again, down to a window so short that all s
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,18 +96,23 @@ def _eliminate_common(
 
 def _gather_leaves(S: Array, f: Array, window: int, steps: int, out: Array) -> None:
     """out[:, :, i] = the matrix of [training points of step i | its test point | f | delta], symmetric."""
-    size = S.shape[0]
+    rows, columns, points = _leaf_indices(S.shape[0], window, steps)
+    out[...] = S[rows, columns]
+    targets = f[points]
+    out[:window, window + 1] += targets
+    out[window + 1, :window] += targets
+
+
+@lru_cache(maxsize=16)
+def _leaf_indices(size: int, window: int, steps: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Where the leaves of a matrix of `size` are in its lower triangle, and which targets belong to them."""
     step = np.arange(steps)
-    rows = np.concatenate([
+    order = np.vstack([
         step + np.arange(window + 1)[:, None],
         np.full((1, steps), size - 2),
         np.full((1, steps), size - 1),
     ])
-    i, j = np.maximum(rows[:, None], rows[None]), np.minimum(rows[:, None], rows[None])
-    out[...] = S[i, j]
-    targets = f[rows[:window]]
-    out[:window, window + 1] += targets
-    out[window + 1, :window] += targets
+    return np.maximum(order[:, None], order[None]), np.minimum(order[:, None], order[None]), order[:window]
 
 
 def finish(leaves: Array, window: int) -> tuple[Array, Array]:
