@@ -43,7 +43,7 @@ test: setup  ## run all tests, those in a browser after the others
 	$(BIN)/python -m pytest tests/browser
 
 setup: $(TEST)  ## install all that the tests need, the browser included
-	@scripts/need_browser.sh
+	@scripts/need_browser.sh $(VENV)
 
 check: $(TEST)  ## ruff and pyright
 	$(BIN)/ruff check .

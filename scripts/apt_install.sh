@@ -10,5 +10,5 @@ else
     exit 1
 fi
 echo "Installing $* with apt-get ..."
-$sudo apt-get update -qq </dev/null
-$sudo env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" </dev/null
+$sudo apt-get update -qq </dev/null >/dev/null
+$sudo env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" </dev/null >/dev/null

@@ -1,12 +1,25 @@
 #!/bin/sh
-# The browser that the tests drive: $CHROMIUM, else chromium; installed where it is missing and that is allowed.
+# need_browser.sh VENV: the browser of the tests ($CHROMIUM, else chromium) and what playwright's driver in VENV needs
+# of Debian; installed where they are missing and that is allowed, else one line says what to do.
 set -eu
-if [ -n "${CHROMIUM:-}" ]; then
-    command -v "$CHROMIUM" >/dev/null && exit 0
-    echo "CHROMIUM=$CHROMIUM: no such program" >&2
+venv=$1
+
+fail() {
+    echo "$1" >&2
     exit 1
-fi
-command -v chromium >/dev/null && exit 0
-"$(dirname "$0")/apt_install.sh" chromium && exit 0
-echo "The browser tests need chromium: apt-get install chromium, or set CHROMIUM=/path/to/it" >&2
-exit 1
+}
+
+missing() {
+    if [ -n "${CHROMIUM:-}" ]; then
+        command -v "$CHROMIUM" >/dev/null || fail "CHROMIUM=$CHROMIUM: no such program"
+    else
+        command -v chromium >/dev/null || echo chromium
+    fi
+    "$venv"/lib/python3*/site-packages/playwright/driver/node --version >/dev/null 2>&1 || echo libatomic1
+}
+
+packages=$(missing)
+[ -n "$packages" ] || exit 0
+"$(dirname "$0")/apt_install.sh" $packages || true
+packages=$(missing)
+[ -z "$packages" ] || fail "The browser tests need more: apt-get install $(echo $packages) (or CHROMIUM=/path/to/chromium)"
