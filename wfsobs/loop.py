@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
@@ -10,6 +12,7 @@ from wfsobs.disturbance import make_disturbance
 from wfsobs.record import Record, Training, delayed, frame_mean
 from wfsobs.scenario import Scenario
 from wfsobs.sensing import measure
+from wfsobs.watch import QUIET, Watch
 
 Array = NDArray[np.float64]
 
@@ -27,23 +30,26 @@ def integrator(open_loop_y: Array, gain: float, leak: float) -> Array:
     return lfilter([-gain], [1.0, -leak, gain], open_loop_y, axis=0)
 
 
-def simulate(scenario: Scenario, rng: np.random.Generator | None = None) -> Record:
+def simulate(scenario: Scenario, rng: np.random.Generator | None = None, watch: Watch = QUIET) -> Record:
     """Run the loop over the scenario's duration and return its record, training record included.
 
     rng : source of every random number; by default one seeded with `scenario.run.seed`.
-    Raises SettingError where settings do not go together.
+    Raises SettingError where settings do not go together, Cancelled if `watch` says so.
     """
     scenario.validate()
     rng = np.random.default_rng(scenario.run.seed) if rng is None else rng
     record_rng, training_rng = rng.spawn(2)
-    record = _run(scenario, scenario.n_steps, record_rng)
-    return Record(**{**vars(record), "training": _training(scenario, training_rng)})
+    record = _run(scenario, scenario.n_steps, record_rng, watch)
+    return replace(record, training=_training(scenario, training_rng, watch))
 
 
-def _run(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> Record:
+def _run(scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch) -> Record:
     disturbance_rng, sensor_rng = rng.spawn(2)
+    watch.check()
     disturbance = make_disturbance(scenario, n_steps, disturbance_rng)
+    watch.check()
     seen = measure(scenario, disturbance, sensor_rng)
+    watch.check()
     u = np.zeros_like(seen.lgs)
     if scenario.loop.closed:
         u = integrator(seen.lgs, scenario.loop.gain, scenario.loop.leak)
@@ -60,12 +66,12 @@ def _run(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> Record:
     )
 
 
-def _training(scenario: Scenario, rng: np.random.Generator) -> Training:
+def _training(scenario: Scenario, rng: np.random.Generator, watch: Watch) -> Training:
     """A record of the same scenario with random numbers of its own, cut to start after the warm-up:
     the loop has settled, and it is as long as the offline GPR needs."""
     g = scenario.gpr_offline
     settle = round(scenario.run.warm_up * scenario.sensors.lgs_rate)
     needed = g.training_size + g.depth + TRAINING_MARGIN
-    record = _run(scenario, settle + needed, rng)
+    record = _run(scenario, settle + needed, rng, watch)
     assert record.open_loop_y is not None
     return Training(record.y_lgs[settle:], record.u[settle:], record.open_loop_y[settle:])

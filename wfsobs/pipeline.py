@@ -48,7 +48,7 @@ class Result:
 
 def run(scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | None = None) -> Result:
     """Simulate a record and run the observers (all unless named) on it. Raises SettingError, Cancelled."""
-    return observe(simulate(scenario), scenario, watch, observers)
+    return observe(simulate(scenario, watch=watch), scenario, watch, observers)
 
 
 def observe(record: Record, scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | None = None) -> Result:

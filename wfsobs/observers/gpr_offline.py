@@ -23,7 +23,7 @@ from wfsobs.observers.kernels import Points, SquaredExponential, band, sliding_p
 from wfsobs.observers.reference import open_loop_reference
 from wfsobs.record import Record, RecordError, Training, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.watch import Watch
+from wfsobs.watch import QUIET, Watch
 
 Array = NDArray[np.float64]
 
@@ -43,14 +43,13 @@ class TrainedGpr:
     constant: float
     kernel: SquaredExponential
 
-    def predict(self, signals: Array, watch: Watch | None = None) -> Array:
+    def predict(self, signals: Array, watch: Watch = QUIET) -> Array:
         """Mean at every step of signals (n, channels), (n,); NaN before the first full window."""
         n, m, d = signals.shape[0], self.weights.size, self.depth
         out = np.full(n, np.nan)
         tests = self.kernel.points(np.maximum(squared_norms(signals, d), 0.0))
         for start in range(d - 1, n, ROWS):
-            if watch:
-                watch.step(start / n)
+            watch.step(start / n)
             rows = min(ROWS, n - start)
             # products[r, c] of test window start + r and training window c + r - rows + 1
             products = sliding_products(signals, self.signals, d, start, d - rows, rows, m + rows - 1)
@@ -62,7 +61,9 @@ class TrainedGpr:
         return out
 
 
-def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential) -> TrainedGpr:
+def train(
+    signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential, watch: Watch = QUIET
+) -> TrainedGpr:
     """Fit the first m windows of signals (n, channels) to targets (n,), one per step.
 
     Raises RecordError where the record is too short, LinAlgError where sigma_n is too small for the precision.
@@ -72,6 +73,7 @@ def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExp
     first = depth - 1
     V, points = band(signals, depth, kernel, first, m, m - 1)
     points = Points(*(p[:m] for p in points))
+    watch.check()
     factor = cho_factor(square_from_band(V, 0, m), lower=True, check_finite=False)
     a, b = cho_solve(factor, np.column_stack([targets[first : first + m], points.delta]), check_finite=False).T
     constant = (points.delta @ a) / (1.0 / kernel.variance + points.delta @ b)
@@ -93,7 +95,7 @@ def gpr_offline(record: Record, scenario: Scenario, watch: Watch) -> dict[str, A
 
     def one(mode: int) -> Array:
         signals = window_signals(g, training.y_lgs, training.u, training_z, mode)
-        model = train(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g))
+        model = train(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), watch)
         return model.predict(window_signals(g, record.y_lgs, record.u, record.z, mode), watch)
 
     with ThreadPoolExecutor(record.n_modes) as pool:
