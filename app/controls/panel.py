@@ -1,0 +1,144 @@
+"""The drawer: preset, run, progress, and every setting by topic."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import Any
+
+import panel as pn
+import panel_material_ui as pmui
+import param
+
+from wfsobs.app.controls.fields import ROOM, Field, error_html, make_field
+from wfsobs.app.controls.peaks import PATH as PEAKS
+from wfsobs.app.controls.peaks import PeakEditor
+from wfsobs.app.store import CANCELLED, DONE, FAILED, RUNNING, Store
+from wfsobs.presets import PRESETS
+from wfsobs.scenario import Scenario
+from wfsobs.settings import Group
+
+FIRST = ("turbulence.wind_speed", "sensors.exposure_ratio")
+"""Settings that stand above the topics."""
+
+TOPICS = ("vibration", "gpr_offline", "gpr_online")
+"""Topics that come first; the others follow as declared."""
+
+
+class Controls:
+    """Everything in the drawer, in step with the store."""
+
+    def __init__(self, store: Store):
+        self.store = store
+        self.fields: dict[str, Field] = {}
+        self.peaks: PeakEditor | None = None
+        self.preset = pmui.Select(
+            label="Preset", value=store.preset, options={_title(name): name for name in PRESETS}, size="small", **ROOM)
+        self.reset = pmui.Button(
+            label="Reset", icon="restart_alt", variant="text", size="small", margin=(4, 0, 4, 4), align="center")
+        self.run = pmui.Button(label="Run", icon="play_arrow", color="primary", **ROOM)
+        self.cancel = pmui.Button(label="Cancel", icon="stop", variant="outlined", margin=(4, 0, 4, 8))
+        self.progress = pmui.LinearProgress(value=0, variant="determinate", sizing_mode="stretch_width", margin=(2, 0))
+        self.status = pn.pane.HTML("", sizing_mode="stretch_width", margin=(0, 0, 4, 0))
+        self.topics = _names()
+        self.accordion = pmui.Accordion(
+            *((title, pn.Column(sizing_mode="stretch_width", margin=0)) for title in self.topics.values()),
+            title_variant="subtitle2", variant="outlined", disable_gutters=True, dynamic=True,
+            sizing_mode="stretch_width", margin=(8, 0),
+        )
+        self._watch()
+        self.accordion.active = [0]
+        self._refresh_run()
+        self._refresh_preset()
+
+    def view(self) -> pn.Column:
+        """What goes into the drawer."""
+        first = [self._field(path) for path in FIRST]
+        return pn.Column(
+            pn.Row(self.preset, self.reset, sizing_mode="stretch_width", margin=0),
+            pn.Row(self.run, self.cancel, sizing_mode="stretch_width", margin=0),
+            self.progress, self.status, *(f.view for f in first), self.accordion,
+            sizing_mode="stretch_width", margin=(8, 14),
+        )
+
+    def open_topic(self, name: str) -> None:
+        """Fill a topic with its fields, the first time it is opened."""
+        column = self.accordion[list(self.topics).index(name)]
+        if len(column):
+            return
+        views: list[Any] = []
+        if name == "vibration":
+            self.peaks = PeakEditor(self.store)
+            views.append(self.peaks.view)
+        group = getattr(self.store.scenario, name)
+        heading = name
+        for path, _, _ in group.walk(f"{name}."):
+            if path in FIRST or path.startswith(f"{PEAKS}."):
+                continue
+            *_, above, _setting = path.split(".")
+            if above != heading:
+                heading = above
+                views.append(pn.pane.HTML(f"<b>{escape(str(group.settings()[above].label))}</b>", margin=(8, 0, 0, 0)))
+            views.append(self._field(path).view)
+        column[:] = views
+
+    def _field(self, path: str) -> Field:
+        if path not in self.fields:
+            p = next(p for where, _, p in self.store.scenario.walk() if where == path)
+            self.fields[path] = make_field(self.store, path, p)
+        return self.fields[path]
+
+    def _watch(self) -> None:
+        self.preset.param.watch(self._chosen, "value")
+        self.reset.on_click(lambda _event: self.store.choose(self.store.preset))
+        self.run.on_click(lambda _event: self.store.start())
+        self.cancel.on_click(lambda _event: self.store.run.cancel())
+        self.accordion.param.watch(self._opened, "active")
+        self.store.param.watch(self._refresh_preset, ["scenario", "preset"])
+        self.store.param.watch(self._refresh_run, "errors")
+        self.store.run.param.watch(self._refresh_run, ["state", "progress", "message"])
+
+    def _chosen(self, event: param.parameterized.Event) -> None:
+        if event.new != self.store.preset:
+            self.store.choose(event.new)
+
+    def _opened(self, event: param.parameterized.Event) -> None:
+        names = list(self.topics)
+        for index in event.new:
+            self.open_topic(names[index])
+
+    def _refresh_preset(self, *_: object) -> None:
+        changed = self.store.changed()
+        self.preset.value = self.store.preset
+        self.preset.helper_text = f"{len(changed)} changed: {', '.join(changed)}" if changed else ""
+        self.reset.disabled = not changed
+
+    def _refresh_run(self, *_: object) -> None:
+        run = self.store.run
+        running = run.state == RUNNING
+        self.cancel.disabled = not running
+        self.progress.param.update(value=round(100 * run.progress), visible=True)
+        self.status.object = status_html(self.store)
+
+
+def status_html(store: Store) -> str:
+    """One line on the run, and one on what was refused."""
+    run = store.run
+    seconds = f" in {run.shown.seconds:.2f} s" if run.shown and run.state == DONE else ""
+    text = {
+        RUNNING: f"Running, {100 * run.progress:.0f} %", DONE: f"Done{seconds}",
+        CANCELLED: "Cancelled", FAILED: "The run failed",
+    }.get(run.state, "")
+    refused = len(store.errors)
+    note = f"{refused} setting{'s' * (refused > 1)} not accepted: {'; '.join(store.errors.values())}" if refused else ""
+    return f'<div role="status" class="status" style="font-size:13px">{escape(text)}</div>{error_html(note)}'
+
+
+def _names() -> dict[str, str]:
+    """Topic -> title, in the order of the drawer."""
+    settings = {name: str(p.label) for name, p in Scenario.settings().items() if issubclass(p.class_, Group)}
+    return {name: settings[name] for name in (*TOPICS, *(n for n in settings if n not in TOPICS))}
+
+
+def _title(preset: str) -> str:
+    """A preset's name as the page writes it: short ones are abbreviations."""
+    return preset.upper() if len(preset) <= 4 else preset.capitalize()

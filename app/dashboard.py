@@ -1,0 +1,213 @@
+"""The page: drawer, switches, figures and table of one session, wired to one store."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import traceback
+from collections.abc import Callable, Mapping
+from functools import partial
+from html import escape
+from types import MappingProxyType
+from typing import Any
+
+import panel as pn
+import panel_material_ui as pmui
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.controls.panel import Controls
+from wfsobs.app.display import ERROR, SIGNAL, UNITS, Display
+from wfsobs.app.store import FAILED, Post, Store
+from wfsobs.app.style import asset, theme
+from wfsobs.app.views.spectra import MODEL, PEAKS, Spectra
+from wfsobs.app.views.strip import Strip
+from wfsobs.app.views.table import Table
+from wfsobs.app.views.traces import Traces
+from wfsobs.app.work import compute
+from wfsobs.observers.base import TARGETS, VIBRATION
+from wfsobs.scenario import Scenario
+
+log = logging.getLogger(__name__)
+
+GRID = """
+:host { display: grid !important; grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); gap: 10px; }
+@media (max-width: 1000px) { :host { grid-template-columns: minmax(0, 1fr); } }
+"""
+BOX = """
+:host { border: 1px solid color-mix(in srgb, currentColor 18%, transparent); border-radius: 6px; padding: 8px 10px;
+        box-sizing: border-box; min-width: 0; }
+"""
+ZOOMS: Mapping[str, float | None] = MappingProxyType({"Whole record": None, "2 s": 2.0, "0.2 s": 0.2})
+MARKS = (
+    f'<span class="mark" style="border-left:2px solid {PEAKS}">peaks</span>'
+    f'<span class="mark" style="border-left:2px dashed {MODEL}">peak in the Kalman filters</span>'
+)
+FADED = ":host(.stale) { opacity: 0.45; transition: opacity 0.2s 0.3s; }"
+
+
+PHONE_PX = 600
+"""Below this width the drawer lies over the page, and starts closed."""
+
+
+class Viewport(JSComponent):
+    """Tells the width of the window."""
+
+    width_px = param.Integer(0, doc="Width when the page opened [px].")
+
+    _esm = asset("viewport.js")
+
+
+class Dashboard:
+    """One session: its store, its controls and its views."""
+
+    def __init__(self, post: Post, scenario: Scenario | None = None, work: Any = compute):
+        self.store = Store(post, scenario, work)
+        self.display = Display()
+        self.controls = Controls(self.store)
+        self.traces = Traces(self.store.run, self.display)
+        self.spectra = Spectra(self.store.run, self.display)
+        self.strips = {target: Strip(target, self.store.run, self.display) for target in TARGETS}
+        self.table = Table(self.store.run, self.display)
+        self.alert = pmui.Alert(
+            object="", severity="error", visible=False, sizing_mode="stretch_width", margin=0)
+        self.stale = pmui.Alert(
+            object="These results are not those of the settings.", severity="warning", visible=False, sizing_mode="stretch_width", margin=0)
+        self.store.run.param.watch(self._refresh, ["state", "message"])
+        self.store.param.watch(self._refresh, "stale")
+
+    def page(self) -> pmui.Page:
+        """The whole page."""
+        self.body = pn.Column(
+            *(self._section(target) for target in TARGETS), _box("RMS errors", self.table.pane),
+            sizing_mode="stretch_width", margin=0, stylesheets=[":host { gap: 10px; }", FADED])
+        viewport = Viewport(width=0, height=0, margin=0)
+        page = pmui.Page(
+            title="wfsobs", sidebar=[self.controls.view()], sidebar_width=340, theme_config=theme(), favicon=None,
+            main=[pn.Column(
+                self._switches(), self.alert, self.stale, self.body, viewport,
+                sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
+        )
+        viewport.param.watch(lambda event: page.param.update(sidebar_open=event.new >= PHONE_PX), "width_px")
+        page.param.watch(lambda event: self.display.param.update(dark=event.new), "dark_theme")
+        return page
+
+    def start(self) -> None:
+        """The first run."""
+        self.store.start()
+
+    def close(self) -> None:
+        """The session has ended."""
+        self.store.close()
+
+    def _switches(self) -> pn.FlexBox:
+        def group(name: str, options: Any) -> pmui.RadioButtonGroup:
+            widget = pmui.RadioButtonGroup.from_param(
+                self.display.param[name], options=options, size="small", margin=0, variant="outlined")
+            widget.label = ""
+            return widget
+
+        modes = {m.name.capitalize(): m.name for m in self.store.scenario.modes}
+        return pn.FlexBox(
+            group("mode", modes), group("show", {"Signal": SIGNAL, "Error": ERROR}),
+            group("unit", {written: unit for unit, written in UNITS.items()}),
+            self._zoom_buttons(), gap="12px", align_items="center", sizing_mode="stretch_width", margin=0)
+
+    def _zoom_buttons(self) -> pn.Row:
+        buttons = []
+        for label, seconds in ZOOMS.items():
+            button = pmui.Button(
+                label=label, size="small", variant="text", margin=0, description=f"Time window: {label.lower()}")
+            button.on_click(lambda _event, seconds=seconds: self.traces.zoom(seconds))
+            buttons.append(button)
+        return pn.Row(*buttons, margin=0)
+
+    def _section(self, target: str) -> pn.Column:
+        """The strip and the two figures of one target."""
+        cards = self.strips[target].cards
+        cards.param.watch(lambda event: self._hide(target, event.new), "hidden")
+        marks = MARKS if target == VIBRATION else ""
+        figures = pn.Column(
+            pn.Column(_caption("Time trace"), self.traces.pane(target), sizing_mode="stretch_width", margin=0),
+            pn.Column(_caption("Power spectrum", marks), self.spectra.pane(target), sizing_mode="stretch_width", margin=0),
+            sizing_mode="stretch_width", margin=0, stylesheets=[GRID])
+        return _box(target.capitalize(), cards, figures)
+
+    def _hide(self, target: str, names: list[str]) -> None:
+        self.display.hidden = {**self.display.hidden, target: list(names)}
+
+    def _refresh(self, *_: object) -> None:
+        run = self.store.run
+        failed = run.state == FAILED
+        self.alert.param.update(object=run.message, visible=failed)
+        waiting = self.store.stale and run.state != "running"
+        self.stale.visible = waiting
+        self.body.css_classes = ["stale"] if self.store.stale else []
+
+
+def _box(title: str, *content: Any) -> pn.Column:
+    heading = pn.pane.HTML(f'<h2 class="title">{escape(title)}</h2>', margin=0, stylesheets=[asset("style.css")])
+    return pn.Column(heading, *content, sizing_mode="stretch_width", margin=0, stylesheets=[BOX])
+
+
+def _caption(text: str, marks: str = "") -> pn.pane.HTML:
+    return pn.pane.HTML(
+        f'<div class="caption">{escape(text)}{marks}</div>', sizing_mode="stretch_width", margin=(8, 0, 0, 0),
+        stylesheets=[asset("style.css")])
+
+
+def page(build: Callable[[Post], Dashboard] = Dashboard) -> Any:
+    """The page of a new session; a page that says what went wrong where it cannot be built."""
+    try:
+        dashboard = build(post_to_session())
+        page = dashboard.page()
+        dashboard.start()
+        pn.state.on_session_destroyed(lambda _context: dashboard.close())
+        return page
+    except Exception as error:
+        log.exception("the page could not be built")
+        return error_page(error)
+
+
+def post_to_session() -> Post:
+    """How another thread has something done on this session's, from when its page has been drawn.
+
+    What is changed before does not reach a browser that is just being told of the page, so it waits.
+    """
+    doc = pn.state.curdoc
+    if doc is None:
+        return lambda function: function()
+    waiting: list[Callable[[], None]] | None = []
+    lock = threading.Lock()
+
+    def loaded() -> None:
+        nonlocal waiting
+        with lock:
+            functions, waiting = waiting or [], None
+        for function in functions:
+            held(function)
+
+    def held(function: Callable[[], None]) -> None:
+        with pn.io.hold():
+            function()
+
+    def post(function: Callable[[], None]) -> None:
+        with lock:
+            if waiting is not None:
+                waiting.append(function)
+                return
+        if doc.session_context is not None and not doc.session_context.destroyed:
+            doc.add_next_tick_callback(partial(held, function))
+
+    pn.state.onload(loaded)
+    return post
+
+
+def error_page(error: Exception) -> pn.Column:
+    """What went wrong, in place of a page that never comes."""
+    line = "".join(traceback.format_exception_only(error)).strip()
+    return pn.Column(
+        pn.pane.HTML(
+            "<h1>wfsobs could not start</h1><p>The page could not be built. The server's log has the details.</p>"
+            f"<pre>{escape(line)}</pre>"),
+        margin=40)

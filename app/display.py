@@ -1,0 +1,51 @@
+"""How results are shown: which mode, signal or error, and in which unit. Nothing here changes a result."""
+
+from __future__ import annotations
+
+import math
+
+import param
+
+from wfsobs.modes import TIP_TILT
+
+SIGNAL, ERROR = "signal", "error"
+UNITS = {"nm": "nm", "mas": "mas", "um": "µm"}
+"""Unit -> how it is written."""
+
+MAS_PER_RADIAN = math.degrees(1.0) * 3600.0 * 1000.0
+
+
+def per_micrometre(unit: str, diameter: float) -> float:
+    """How many `unit` one micrometre of a tip or tilt coefficient is.
+
+    A Noll-normalised coefficient a tilts the wavefront by 4 a / D on sky; diameter D [m].
+
+    >>> round(per_micrometre("mas", 8.0), 1)
+    103.1
+    """
+    return {"nm": 1e3, "mas": 4e-6 / diameter * MAS_PER_RADIAN, "um": 1.0}[unit]
+
+
+class Display(param.Parameterized):
+    """The switches above the figures."""
+
+    mode = param.Selector(default=TIP_TILT[0].name, objects=[m.name for m in TIP_TILT], label="Mode")
+    show = param.Selector(default=SIGNAL, objects=[SIGNAL, ERROR], label="Show")
+    unit = param.Selector(default="nm", objects=list(UNITS), label="Unit")
+    hidden = param.Dict({}, doc="Target -> names of its hidden lines.")
+    dark = param.Boolean(False, doc="Dark mode.")
+
+    @property
+    def column(self) -> int:
+        """The column of the mode in every array."""
+        return [m.name for m in TIP_TILT].index(self.mode)
+
+    @property
+    def error(self) -> bool:
+        """Whether errors are shown."""
+        return self.show == ERROR
+
+    @property
+    def unit_label(self) -> str:
+        """The unit as it is written."""
+        return UNITS[self.unit]

@@ -1,0 +1,90 @@
+"""Colours, dashes and names: how an observer looks wherever it appears.
+
+The colours are the paper's. In dark mode each has a lighter relative; dashes tell apart what comes close in colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from types import MappingProxyType
+from typing import Any
+
+from wfsobs.app.work import TRUTH
+from wfsobs.observers import OBSERVERS
+
+
+@dataclass(frozen=True)
+class Look:
+    """Name in legends, colour in light and dark mode, dash pattern [px] (empty is solid), line width [px]."""
+
+    label: str
+    light: str
+    dark: str
+    dash: tuple[int, ...] = ()
+    width: float = 1.4
+
+    def colour(self, dark: bool) -> str:
+        """The colour for the mode."""
+        return self.dark if dark else self.light
+
+
+LOOKS: Mapping[str, Look] = MappingProxyType({
+    TRUTH: Look("Truth", "#606060", "#C8C8C8", (6, 3)),
+    "kf-lgs": Look("LGS KF", "#FF6600", "#FF8533"),
+    "kf-ngs": Look("NGS KF", "#003DE6", "#7AA2FF", (8, 2)),
+    "multirate": Look("Multi-rate KF", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
+    "multirate-optimal": Look("Opt. multi-rate", "#7A1FA2", "#C9A0FF", (3, 2)),
+    "butterworth-ol": Look("Butterworth OL", "#B40000", "#FF7A70", (2, 2)),
+    "butterworth-cl": Look("Butterworth CL", "#B40000", "#FF7A70", (8, 3)),
+    "gpr-offline": Look("Offline GPR", "#0A960A", "#4FD64F"),
+    "gpr-online": Look("Online GPR", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
+    "zero": Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4)),
+})
+
+HIDDEN = ("zero",)
+"""Observers in the table only: their line would be the axis, their error the truth."""
+
+PRIMARY = "#0B4F6C"
+
+_COMPONENTS = {
+    "MuiAppBar": {"styleOverrides": {"root": {"backgroundColor": f"{PRIMARY} !important", "color": "#fff !important"}}},
+    "MuiButton": {"styleOverrides": {"root": {"textTransform": "none"}}},
+    "MuiToggleButton": {"styleOverrides": {"root": {"textTransform": "none"}}},
+}
+
+
+def theme() -> dict[str, Any]:
+    """The page's colours in light and dark mode. Units are written as they are, not in capitals."""
+    return {
+        "light": {"palette": {"primary": {"main": PRIMARY}}, "components": _COMPONENTS},
+        "dark": {"palette": {"primary": {"main": "#6FB7D6"}}, "components": _COMPONENTS},
+    }
+
+
+def look(name: str) -> Look:
+    """The look of an observer or of the truth; one that is new here has its registered name, in grey."""
+    if name in LOOKS:
+        return LOOKS[name]
+    return Look(OBSERVERS[name].label if name in OBSERVERS else name, "#555577", "#BBBBDD", (4, 2))
+
+
+def observers_of(target: str, hidden: bool = False) -> list[str]:
+    """Observers that estimate a target, in the order of the registry."""
+    return [o.id for o in OBSERVERS.values() if target in o.targets and (hidden or o.id not in HIDDEN)]
+
+
+def asset(name: str) -> str:
+    """Text of a file of the package's assets."""
+    return files("wfsobs.assets").joinpath(name).read_text(encoding="utf-8")
+
+
+def swatch(name: str, dark: bool) -> str:
+    """A short line as drawn in the figures, as SVG."""
+    it = look(name)
+    dash = f' stroke-dasharray="{" ".join(map(str, it.dash))}"' if it.dash else ""
+    return (
+        '<svg class="swatch" width="26" height="8" aria-hidden="true">'
+        f'<line x1="0" y1="4" x2="26" y2="4" stroke="{it.colour(dark)}" stroke-width="2.5"{dash}/></svg>'
+    )

@@ -1,0 +1,47 @@
+"""What the figures have in common."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import panel as pn
+from bokeh.models import ColumnDataSource, GlyphRenderer
+from bokeh.plotting import figure
+
+from wfsobs.app.style import look
+
+HEIGHT = 230
+
+
+def new_figure(**options: Any) -> figure:
+    """An empty figure as wide as its room, the scroll wheel left to the page until chosen."""
+    fig = figure(
+        height=HEIGHT, sizing_mode="stretch_width", min_width=240, tools="xbox_zoom,xpan,xwheel_zoom,reset,save",
+        active_drag="xbox_zoom", toolbar_location="above", min_border_right=10, min_border_left=70, **options,
+    )
+    fig.toolbar.logo = None
+    fig.toolbar.autohide = True
+    return fig
+
+
+def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> GlyphRenderer:
+    """A line in the look of an observer or of the truth."""
+    it = look(name)
+    renderer = fig.line("x", y, source=source, color=it.light, line_width=it.width, line_dash=list(it.dash), name=name)
+    return renderer
+
+
+def restyle(lines: dict[str, GlyphRenderer], dark: bool, hidden: list[str]) -> None:
+    """Give every line the colour of the mode, and hide those that are to be hidden."""
+    for name, line in lines.items():
+        line.glyph.line_color = look(name).colour(dark)  # type: ignore[union-attr]
+        line.visible = name not in hidden
+
+
+def later(function: Any, milliseconds: int) -> None:
+    """Call a function a little later on the session's thread; at once where there is no session."""
+    doc = pn.state.curdoc
+    if doc is None or doc.session_context is None:
+        function()
+    else:
+        doc.add_timeout_callback(function, milliseconds)

@@ -1,0 +1,112 @@
+"""Power spectra: one figure per target, log-log, the modelled peaks marked."""
+
+from __future__ import annotations
+
+import numpy as np
+import panel as pn
+from bokeh.models import ColumnDataSource, HoverTool, Range1d, VSpan
+
+from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.store import Run
+from wfsobs.app.style import observers_of
+from wfsobs.app.views.plots import add_line, new_figure, restyle
+from wfsobs.app.work import TRUTH, Shown
+from wfsobs.observers.base import TARGETS, VIBRATION
+
+PEAKS, MODEL = "#888888", "#FF6600"
+"""Colours of the marks: the scenario's peaks, and the one that the Kalman filters model."""
+
+DECADES = 8
+"""The most that an axis of densities spans."""
+
+
+class Spectra:
+    """The figures, redrawn when the results or the switches change."""
+
+    def __init__(self, run: Run, display: Display):
+        self.run, self.display = run, display
+        self.x_range = Range1d(0.5, 500.0)
+        self.spectra = {target: _Spectrum(target, self.x_range) for target in TARGETS}
+        run.param.watch(self._redraw, "shown")
+        display.param.watch(self._redraw, ["mode", "show", "unit"])
+        display.param.watch(self._restyle, ["dark", "hidden"])
+
+    def pane(self, target: str) -> pn.pane.Bokeh:
+        """The figure of one target."""
+        return pn.pane.Bokeh(self.spectra[target].figure, sizing_mode="stretch_width", margin=0)
+
+    def _redraw(self, *_: object) -> None:
+        shown = self.run.shown
+        if shown is None:
+            return
+        with pn.io.hold():
+            for spectrum in self.spectra.values():
+                spectrum.draw(shown, self.display)
+            frequencies = next((s.frequency for s in shown.spectra.values()), None)
+            if frequencies is not None:
+                limits = {"start": float(frequencies[1]), "end": float(frequencies[-1])}
+                if self.x_range.reset_start != limits["start"] or self.x_range.reset_end != limits["end"]:
+                    self.x_range.update(**limits, reset_start=limits["start"], reset_end=limits["end"])
+
+    def _restyle(self, *_: object) -> None:
+        with pn.io.hold():
+            for target, spectrum in self.spectra.items():
+                restyle(spectrum.lines, self.display.dark, self.display.hidden.get(target, []))
+
+
+class _Spectrum:
+    """One figure: the spectra of the truth and of the estimates of one target, or of their errors."""
+
+    def __init__(self, target: str, x_range: Range1d):
+        self.target = target
+        self.figure = new_figure(
+            x_range=x_range, y_range=Range1d(1e-6, 1.0), x_axis_type="log", y_axis_type="log",
+        )
+        self.figure.xaxis.axis_label = "frequency [Hz]"
+        if target == VIBRATION:
+            self._add_marks()
+        self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in (TRUTH, *observers_of(target))}
+        self.lines = {name: add_line(self.figure, name, source) for name, source in self.sources.items()}
+
+    def _add_marks(self) -> None:
+        """Vertical lines at the scenario's peaks and at the one that the Kalman filters model."""
+        self.peaks = ColumnDataSource({"x": [], "text": []})
+        self.model = ColumnDataSource({"x": [], "text": []})
+        peaks = self.figure.add_glyph(self.peaks, VSpan(x="x", line_color=PEAKS, line_alpha=0.4, line_width=1.5))
+        model = self.figure.add_glyph(
+            self.model, VSpan(x="x", line_color=MODEL, line_dash=[4, 3], line_width=1.5))
+        self.figure.add_tools(HoverTool(renderers=[peaks, model], tooltips="@text"))
+
+    def draw(self, shown: Shown, display: Display) -> None:
+        """Send every line, its axis and the marks."""
+        scale = per_micrometre(display.unit, shown.scenario.telescope.diameter) ** 2
+        low, high = np.inf, 0.0
+        for name, source in self.sources.items():
+            spectrum = shown.spectra.get((name, self.target))
+            if spectrum is None:
+                source.data = {"x": [], "y": []}
+                continue
+            # Under "error" the truth stays: it is the error of answering zero.
+            density = spectrum.error if display.error and name != TRUTH else spectrum.signal
+            y = scale * density[1:, display.column]
+            source.data = {"x": spectrum.frequency[1:], "y": y}
+            if y.size and y.max() > 0:
+                low, high = min(low, float(np.quantile(y[y > 0], 0.02))), max(high, float(y.max()))
+        if high > 0:
+            self.figure.y_range.update(start=max(low / 3, high * 10.0**-DECADES), end=high * 3)
+        what = "PSD of error" if display.error else "PSD"
+        self.figure.yaxis.axis_label = f"{what}, {display.mode} [{display.unit_label}²/Hz]"
+        if self.target == VIBRATION:
+            self._draw_marks(shown, display)
+
+    def _draw_marks(self, shown: Shown, display: Display) -> None:
+        vibration, kalman = shown.scenario.vibration, shown.scenario.kalman
+        shown_peaks = [p for p in vibration.peaks if p.frequency <= vibration.cutoff] if vibration.source == "peaks" else (
+            vibration.peaks if vibration.source == "ar2" else [])
+        self.peaks.data = {
+            "x": [p.frequency for p in shown_peaks],
+            "text": [f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}" for p in shown_peaks],
+        }
+        self.model.data = {
+            "x": [kalman.frequency], "text": [f"model of the Kalman filters {kalman.frequency:.5g} Hz"],
+        }

@@ -1,0 +1,67 @@
+"""The strip above a target's figures: a card per observer with its RMS error, which is the legend as well."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.store import RUNNING, Run
+from wfsobs.app.style import asset, look, observers_of
+from wfsobs.app.views.table import NOTHING, find, number
+from wfsobs.app.work import TRUTH, Shown
+
+
+class Cards(JSComponent):
+    """The cards in the browser; a click on one hides or shows its line."""
+
+    items = param.List([], doc="{name, label, colour, dash, value, unit, note} of every card.")
+    hidden = param.List([], doc="Names of the cards whose lines are hidden.")
+
+    _esm = asset("strip.js")
+    _stylesheets = [asset("strip.css")]  # noqa: RUF012
+
+
+class Strip:
+    """The cards of one target, in step with the results and the switches."""
+
+    def __init__(self, target: str, run: Run, display: Display):
+        self.target, self.run, self.display = target, run, display
+        self.cards = Cards(items=self.items(), sizing_mode="stretch_width", margin=0)
+        run.param.watch(self._refresh, ["shown", "state"])
+        display.param.watch(self._refresh, ["mode", "unit", "dark"])
+
+    def _refresh(self, *_: object) -> None:
+        self.cards.items = self.items()
+
+    def items(self) -> list[dict[str, Any]]:
+        """What the cards say."""
+        shown = self.run.shown
+        return [self._truth(shown), *(self._observer(name, shown) for name in observers_of(self.target))]
+
+    def _observer(self, name: str, shown: Shown | None) -> dict[str, Any]:
+        score = find(shown, name, self.target, self.display.mode) if shown else None
+        if shown is None or score is None:
+            return self._card(name, None, "computing …" if self.run.state == RUNNING else "no result")
+        relative = f"{score.normalised_rms:.2f} × truth" if score.normalised_rms is not None else ""
+        return self._card(name, self._scaled(score.rms, shown), relative)
+
+    def _truth(self, shown: Shown | None) -> dict[str, Any]:
+        of = (self.target, self.display.mode)
+        scores = [s for s in shown.result.scores if (s.target, s.mode) == of] if shown else []
+        if shown is None or not scores:
+            return self._card(TRUTH, None, "")
+        return self._card(TRUTH, self._scaled(scores[0].truth_rms, shown), "rms")
+
+    def _scaled(self, value: float, shown: Shown) -> float:
+        return value * per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
+
+    def _card(self, name: str, value: float | None, note: str) -> dict[str, Any]:
+        it = look(name)
+        return {
+            "name": name, "label": it.label, "colour": it.colour(self.display.dark), "dash": list(it.dash), "note": note,
+            "value": NOTHING if value is None else number(value),
+            "unit": "" if value is None else self.display.unit_label,
+        }

@@ -1,0 +1,166 @@
+"""The work of one run, done in a thread: what it delivers, and how often.
+
+Nothing here knows of Panel. `compute` runs the core and hands over what is done so far, at most every
+`INTERVAL` seconds: quick observers first, then the slow ones, then parts of the online GPR as they come.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from wfsobs.loop import simulate
+from wfsobs.observers.base import TARGETS, Estimate
+from wfsobs.pipeline import Failure, Result, collect, each_estimate
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.scores import scored_samples, welch_psd
+from wfsobs.watch import Watch
+
+Array = NDArray[np.float64]
+Key = tuple[str, str]
+"""(observer or TRUTH, target)."""
+
+TRUTH = "truth"
+
+INTERVAL = 0.15
+"""Least time between two deliveries [s]."""
+
+GROWTH_INTERVAL = 0.4
+"""The same, where only an estimate under way has grown [s]."""
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Power spectral densities [um^2/Hz], one column per mode, of a signal and of its error; frequency in [Hz]."""
+
+    frequency: Array
+    signal: Array
+    error: Array
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a run has given so far.
+
+    partial : values so far, NaN where there are none yet, of observers still at work
+    spectra : of the truth and of every finished estimate
+    """
+
+    result: Result
+    partial: Mapping[Key, Array] = field(default_factory=dict)
+    spectra: Mapping[Key, Spectrum] = field(default_factory=dict)
+    seconds: float = 0.0
+
+    @property
+    def scenario(self) -> Scenario:
+        """The settings this was computed from."""
+        return self.result.scenario
+
+    def values(self, observer: str, target: str) -> Array | None:
+        """(n_steps, n_modes) [um] of the truth, a finished or a growing estimate, or None."""
+        if observer == TRUTH:
+            return self.result.record.truth(target)
+        estimate = self.result.estimate(observer, target)
+        return estimate.values if estimate else self.partial.get((observer, target))
+
+
+Report = Callable[[float, Shown | None], None]
+"""Told the fraction done, and what is done where that has grown."""
+
+
+def one_blas_thread() -> None:
+    """Let BLAS use one thread: the observers bring their own, and sessions share the processors."""
+    threadpool_limits(limits=1, user_api="blas")
+
+
+def compute(scenario: Scenario, cancelled: Callable[[], bool], report: Report) -> Shown:
+    """Run everything on a scenario. Raises SettingError, Cancelled."""
+    return _Work(scenario, cancelled, report).run()
+
+
+class _Work:
+    def __init__(self, scenario: Scenario, cancelled: Callable[[], bool], report: Report):
+        self.scenario, self.report = scenario, report
+        self.watch = Watch(progress=self._progress, cancelled=cancelled)
+        self.estimates: list[Estimate] = []
+        self.failures: list[Failure] = []
+        self.growing: dict[Key, Array] = {}  # written to by the observers' threads
+        self.spectra: dict[Key, Spectrum] = {}
+        self.started = self.told = self.delivered = perf_counter()
+        self.finished = self.grown = False  # since the last delivery
+        self.lock = threading.Lock()
+        self.record: Record | None = None
+
+    def run(self) -> Shown:
+        self.watch.step(0.0)
+        self.record = record = simulate(self.scenario)
+        self._add_truth(record)
+        for item in each_estimate(record, self.scenario, self.watch, on_partial=self._grow):
+            with self.lock:
+                if isinstance(item, Failure):
+                    self.failures.append(item)
+                else:
+                    self._add(record, item)
+                self.finished = True
+        return self._so_far(record)
+
+    def _so_far(self, record: Record) -> Shown:
+        result = collect(self.scenario, record, self.estimates, self.failures)
+        partial = {key: values.copy() for key, values in self.growing.items()}
+        return Shown(result, partial, dict(self.spectra), perf_counter() - self.started)
+
+    def _progress(self, fraction: float) -> None:
+        """Called from any thread of the observers."""
+        with self.lock:
+            now = perf_counter()
+            if now - self.told < INTERVAL or self.record is None:
+                return
+            self.told = now
+            shown = None
+            if self.finished or (self.grown and now - self.delivered >= GROWTH_INTERVAL):
+                self.delivered, self.finished, self.grown = now, False, False
+                shown = self._so_far(self.record)
+        self.report(fraction, shown)
+
+    def _grow(self, observer: str, target: str, values: Array) -> None:
+        with self.lock:
+            self.growing[observer, target] = values
+            self.grown = True
+
+    def _add(self, record: Record, estimate: Estimate) -> None:
+        key = (estimate.observer, estimate.target)
+        self.estimates.append(estimate)
+        self.growing.pop(key, None)
+        truth = record.truth(estimate.target)
+        if truth is not None:
+            spectrum = self._spectrum(record, truth, estimate.values)
+            if spectrum is not None:
+                self.spectra[key] = spectrum
+
+    def _add_truth(self, record: Record) -> None:
+        for target in TARGETS:
+            truth = record.truth(target)
+            spectrum = self._spectrum(record, truth, truth) if truth is not None else None
+            if spectrum is not None:
+                self.spectra[TRUTH, target] = spectrum
+
+    def _spectrum(self, record: Record, truth: Array, values: Array) -> Spectrum | None:
+        """Over the samples that count for the scores; None where there are too few."""
+        columns = [
+            scored_samples(record, truth[:, mode], values[:, mode], self.scenario.run.warm_up)
+            for mode in range(record.n_modes)
+        ]
+        shortest = min(true.size for true, _ in columns)
+        if shortest < 16:
+            return None
+        true = np.column_stack([t[-shortest:] for t, _ in columns])
+        value = np.column_stack([v[-shortest:] for _, v in columns])
+        frequency, signal = welch_psd(value, record.dt)
+        return Spectrum(frequency, signal, welch_psd(value - true, record.dt)[1])
