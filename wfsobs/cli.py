@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
-# One BLAS thread: at these sizes two are slower, and modes run side by side. Before numpy is loaded.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +10,7 @@ from typing import Any
 import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from threadpoolctl import threadpool_limits
 
 from wfsobs import __version__, configfile
 from wfsobs.loop import simulate
@@ -57,6 +53,8 @@ def scenario_options(command: Callable) -> Callable:
 @click.version_option(__version__, prog_name="wfsobs")
 def main() -> None:
     """Disturbance observers for adaptive optics: turbulence and vibration from wavefront-sensor data."""
+    # One BLAS thread: at these sizes two are slower, and modes run side by side.
+    threadpool_limits(1, user_api="blas")
 
 
 @main.command()
