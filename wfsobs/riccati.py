@@ -107,7 +107,7 @@ def _doubled(m: Map) -> Array:
         before = m[2]
         with np.errstate(over="ignore", invalid="ignore"):
             m = _compose(m, m)
-        if not all(np.isfinite(part).all() for part in m):
+        if not np.isfinite(m[2]).all():
             break
         if np.abs(m[2] - before).max() <= 1e-15 * np.abs(m[2]).max():
             return m[2]

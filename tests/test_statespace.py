@@ -1,0 +1,70 @@
+"""The paper's matrices against its sensor and mirror equations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from wfsobs.ar2 import Ar2
+from wfsobs.statespace import disturbance_model, paper_matrices
+
+TURBULENCE, VIBRATION = Ar2(7.0686, 0.9, 0.5, 1e-3), Ar2(298.4, 0.03, 0.015, 1e-3)
+
+
+def play(B: np.ndarray, n: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """y[k] = C x[k] of x[k+1] = A x[k] + B u[k] + v[k], with phi_dist and u of the same steps."""
+    A, _, C = paper_matrices(TURBULENCE, VIBRATION)
+    rng = np.random.default_rng(0)
+    u, v = rng.standard_normal(n), np.zeros((n, 6))
+    v[:, [0, 2]] = rng.standard_normal((n, 2))
+    x = rng.standard_normal(6) * [1, 1, 1, 1, 0, 0]
+    y, phi = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        y[k], phi[k] = C @ x, x[0] + x[2]
+        x = A @ x + B * u[k] + v[k]
+    return y, phi, u
+
+
+def test_the_measurement_sees_the_command_of_two_steps_before() -> None:
+    """y[k] = phi_dist[k-1] + u[k-2] (paper, eq. 4 to 6)."""
+    _, B, _ = paper_matrices(TURBULENCE, VIBRATION)
+    y, phi, u = play(B)
+    assert np.abs(y[2:] - (phi[1:-1] + u[:-2])).max() < 1e-13
+
+
+def test_with_the_printed_input_matrix_it_does_not() -> None:
+    """B_u = (0, 1) as printed gives y[k] = phi_dist[k-1] + u[k-1], one step too early."""
+    y, phi, u = play(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
+    assert np.abs(y[2:] - (phi[1:-1] + u[1:-1])).max() < 1e-13
+    assert np.abs(y[2:] - (phi[1:-1] + u[:-2])).max() > 1.0
+
+
+def test_matrices_are_those_printed() -> None:
+    """Paper, eq. 8, all but B_u."""
+    A, B, C = paper_matrices(TURBULENCE, VIBRATION)
+    t, v = TURBULENCE, VIBRATION
+    assert np.array_equal(A, [
+        [t.a1, t.a2, 0, 0, 0, 0], [1, 0, 0, 0, 0, 0],
+        [0, 0, v.a1, v.a2, 0, 0], [0, 0, 1, 0, 0, 0],
+        [0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0],
+    ])
+    assert np.array_equal(B, [0, 0, 0, 0, 1, 0]) and np.array_equal(C, [0, 1, 0, 1, 0, 1])
+
+
+@pytest.mark.parametrize(("n_turbulence", "n_vibration"), [(1, 0), (0, 1), (1, 1), (2, 3)])
+def test_a_model_is_the_sum_of_its_processes(n_turbulence: int, n_vibration: int) -> None:
+    turbulence = [Ar2(7.0 * (i + 1), 0.9, 0.5, 1e-3) for i in range(n_turbulence)]
+    vibration = [Ar2(100.0 * (i + 1), 0.03, 0.02, 1e-3) for i in range(n_vibration)]
+    model = disturbance_model(turbulence, vibration)
+    rng = np.random.default_rng(1)
+    x = rng.standard_normal(2 * (n_turbulence + n_vibration))
+    after = model.A @ x
+    now = {"turbulence": x[0 : 2 * n_turbulence : 2].sum(), "vibration": x[2 * n_turbulence :: 2].sum()}
+    for target, row in model.outputs.items():
+        assert row @ x == pytest.approx(now[target], abs=1e-14)
+    # one step late: C x[k+1] is what the outputs said at step k
+    assert model.C @ after == pytest.approx(sum(now.values()), abs=1e-13)
+    for i, p in enumerate([*turbulence, *vibration]):
+        assert after[2 * i] == pytest.approx(p.a1 * x[2 * i] + p.a2 * x[2 * i + 1], rel=1e-13)
+        assert model.Q[2 * i, 2 * i] == p.drive_variance
+    assert np.count_nonzero(model.Q) == n_turbulence + n_vibration
