@@ -19,7 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.gpr_online import kernel_of, window_signals
-from wfsobs.observers.kernels import Points, SquaredExponential, band, sliding_products, square_from_band, squared_norms
+from wfsobs.observers.kernels import Points, SquaredExponential, band, check_condition, sliding_products, square_from_band, squared_norms
 from wfsobs.observers.reference import open_loop_reference
 from wfsobs.record import Record, RecordError, Training, pseudo_open_loop
 from wfsobs.scenario import Scenario
@@ -66,7 +66,7 @@ def train(
 ) -> TrainedGpr:
     """Fit the first m windows of signals (n, channels) to targets (n,), one per step.
 
-    Raises RecordError where the record is too short, LinAlgError where sigma_n is too small for the precision.
+    Raises RecordError where the record is too short, ConditionError where the precision is not enough.
     """
     if signals.shape[0] < depth + m:
         raise RecordError(f"the training record has {signals.shape[0]} steps, depth + training size need {depth + m}")
@@ -74,7 +74,9 @@ def train(
     V, points = band(signals, depth, kernel, first, m, m - 1)
     points = Points(*(p[:m] for p in points))
     watch.check()
-    factor = cho_factor(square_from_band(V, 0, m), lower=True, check_finite=False)
+    S = np.array(square_from_band(V, 0, m), order="F")
+    check_condition(S, kernel)
+    factor = cho_factor(S, lower=True, overwrite_a=True, check_finite=False)
     a, b = cho_solve(factor, np.column_stack([targets[first : first + m], points.delta]), check_finite=False).T
     constant = (points.delta @ a) / (1.0 / kernel.variance + points.delta @ b)
     return TrainedGpr(signals[: first + m], depth, points, a - b * constant, float(constant), kernel)
@@ -90,6 +92,8 @@ def gpr_offline(record: Record, scenario: Scenario, watch: Watch) -> dict[str, A
     """Train on the record's training record and predict over the record, all modes at the same time."""
     g, training = scenario.gpr_offline, record.training
     assert training is not None
+    if record.n_steps < g.depth:
+        raise RecordError(f"the record has {record.n_steps} steps; depth needs {g.depth}")
     targets = training_targets(training, scenario, record.dt)
     training_z = pseudo_open_loop(training.y_lgs, training.u)
 

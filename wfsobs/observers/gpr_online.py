@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wfsobs.observers.base import VIBRATION
-from wfsobs.observers.kernels import SquaredExponential, band, square_from_band
+from wfsobs.observers.kernels import SquaredExponential, band, check_condition, square_from_band
 from wfsobs.observers.reference import online_reference
 from wfsobs.observers.sliding import finish, run_lengths, slide
-from wfsobs.record import Record
+from wfsobs.record import Record, RecordError
 from wfsobs.scenario import OfflineGpr, OnlineGpr, Scenario
 from wfsobs.watch import QUIET, Watch
 
@@ -39,6 +39,8 @@ def window_signals(settings: OfflineGpr | OnlineGpr, y: Array, u: Array, z: Arra
 def gpr_online(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
     """The online GPR over a record, all modes at the same time, delivered block by block."""
     g = scenario.gpr_online
+    if record.n_steps < g.depth + g.training_size:
+        raise RecordError(f"the record has {record.n_steps} steps; depth + training size need {g.depth + g.training_size}")
     f = online_reference(scenario, record.z, record.dt)
     targets = np.vstack([f[1:], np.zeros((1, record.n_modes))])
     values = np.full((record.n_steps, record.n_modes), np.nan)
@@ -88,6 +90,7 @@ def predict_sliding(
             to = min(at + run, n)
             leaves = np.empty((leaf_window + 3, leaf_window + 3, run))
             S, f = _whole_run(V, points.delta, targets, kernel, at, r * run, m, run)
+            check_condition(S[:m, :m], kernel)
             slide(S, f, m, lengths, leaves, check=check)
             values, spread = finish(leaves, leaf_window)
             mean[at:to], variance[at:to] = values[: to - at], spread[: to - at]

@@ -25,7 +25,7 @@ from scipy.linalg.blas import dsymv, dsyr2
 
 from wfsobs.bandpass import StreamingBank, bandpass_bank
 from wfsobs.observers.gpr_online import kernel_of
-from wfsobs.observers.kernels import Points, SquaredExponential, restart_interval
+from wfsobs.observers.kernels import ConditionError, Points, SquaredExponential, restart_interval
 from wfsobs.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -99,7 +99,7 @@ class SlidingRegression:
             G[(self.step - filled - np.arange(m - filled) - 1) % m] = 0.0
 
     def update(self) -> None:
-        """Put the newest window in the place of the oldest."""
+        """Put the newest window in the place of the oldest. Raises ConditionError if the precision is not enough."""
         if self.step < self.depth - 1:
             return
         s, N, M, v = self.step % self.m, self._N, self._M, self._kappa
@@ -114,8 +114,11 @@ class SlidingRegression:
         ab[:, s] = v[s] = 0.0
         r = self._solve_without(v, gone, s)
         r += self._solve_without(v - dsymv(1.0, M, r, lower=1), gone, s)
-        gamma = self.kernel.variance * self._own() + self.kernel.noise_std**2
+        gamma = self.kernel.own(self._newest)[0] + self.kernel.noise_std**2
         sigma = gamma - v @ r
+        if not sigma > 0.0:
+            raise ConditionError("the covariance is no longer positive definite: raise noise_std or length_scale, "
+                                 "or lower signal_std")
         t = r
         t[s] = -1.0
         a += ((v @ a) / sigma) * t
@@ -128,10 +131,6 @@ class SlidingRegression:
         _set_column(M, s, v)
         self._points.norm2[s], self._points.delta[s] = self._newest.norm2[0], self._newest.delta[0]
         self._renew_products()
-
-    def _own(self) -> float:
-        """M of the newest window with itself over s2: exp(-n) expm1(n) = 1 - exp(-n) with n = |x|^2 / l^2."""
-        return float(-np.expm1(-self._newest.norm2[0] / self.kernel.length_scale**2))
 
     def _solve_without(self, v: Array, gone: Array, s: int) -> Array:
         """N_ v, the inverse without slot s; sets v[s] to zero."""

@@ -59,10 +59,16 @@ def filter_step(A: Array, C: Array, L: Array, outputs: Array) -> tuple[Array, Ar
     return A @ reduced, A @ L, outputs @ reduced, outputs @ L
 
 
-def steady_filter(model: DisturbanceModel, noise: float) -> tuple[PeriodicFilter, SteadyState]:
-    """The steady-state filter of z (1 input) to every target, and its covariances; noise [um]."""
+def steady_filter(
+    model: DisturbanceModel, noise: float, outputs: Array | None = None
+) -> tuple[PeriodicFilter, SteadyState]:
+    """The steady-state filter of z (1 input), and its covariances; noise [um].
+
+    outputs : rows wanted of the state x_hat[k], (p, n); every target by default.
+    """
     steady = steady_state(model.A, model.C, model.Q, np.array(noise**2))
-    return PeriodicFilter([filter_step(model.A, np.atleast_2d(model.C), steady.L, model.output_rows(TARGETS))]), steady
+    rows = model.output_rows(TARGETS) if outputs is None else outputs
+    return PeriodicFilter([filter_step(model.A, np.atleast_2d(model.C), steady.L, rows)]), steady
 
 
 def kf_lgs(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
@@ -88,20 +94,20 @@ def kf_ngs(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]
     columns = []
     for mode in range(record.n_modes):
         watch.step(mode / record.n_modes)
-        kalman, _ = steady_filter(kalman_model(scenario, mode, n * record.dt), noise)
-        slow = kalman.run(frames[:, None, mode, None])[:, :, 0]
+        model = kalman_model(scenario, mode, n * record.dt)
+        kalman, _ = steady_filter(model, noise, np.eye(len(model.A)))
+        slow = kalman.run(frames[:, None, mode, None])[:, :, 0]  # of each process, slow steps i and i - 1
         fast = np.full((record.n_steps, len(TARGETS)), np.nan)
         for target, process in enumerate(modelled_processes(scenario, mode, record.dt)):
             spread = between_frames(process, n, scenario.kalman.ngs_between_frames)
-            before = np.concatenate([[0.0], slow[:-1, target]])
-            values = np.outer(slow[:, target], spread[:, 0]) + np.outer(before, spread[:, 1])
+            values = slow[:, 2 * target : 2 * target + 2] @ spread.T
             fast[n:, target] = values.ravel()[: record.n_steps - n]
         columns.append(fast)
     return by_target(columns)
 
 
 def between_frames(process: Ar2, n: int, how: str) -> Array:
-    """Weights (n, 2) of the slow estimates i and i - 1 in the estimates of the fast steps of slow step i.
+    """Weights (n, 2) of the slow estimates i and i - 1, both given frame i, in those of the fast steps of slow step i.
 
     hold: (1, 0). propagate: the conditional mean of phi[n i + j] given the two slow means under the fast
     model, Cov(phi, s) Cov(s)^-1.

@@ -17,12 +17,15 @@ Inner products slide: G(i, j) = G(i-1, j-1) + s[i] s[j] - s[i-d] s[j-d], at a co
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided, sliding_window_view
 from numpy.typing import NDArray
+from scipy.linalg.blas import dsymv
+from scipy.linalg.lapack import dpotrf, dpotrs
 
 Array = NDArray[np.float64]
 
@@ -59,7 +62,12 @@ class SquaredExponential:
             return
         exponent = np.maximum(G, 0.0) - (0.5 * scale) * (i.norm2 + j.norm2)
         np.copysign(np.expm1(-np.abs(G)), G, out=G)
-        G *= self.variance * np.exp(exponent)
+        G *= self.variance * np.exp(np.minimum(exponent, 0.0))  # at most 0 but for rounding: |x_i - x_j|^2 >= 0
+
+
+    def own(self, points: Points) -> Array:
+        """M of each point with itself [um^2], without the noise: s2 (1 - exp(-|x|^2 / l^2))."""
+        return -self.variance * np.expm1(-points.norm2 / self.length_scale**2)
 
 
 class Points(NamedTuple):
@@ -67,6 +75,43 @@ class Points(NamedTuple):
 
     norm2: Array
     delta: Array
+
+
+MAX_CONDITION = 1e13
+"""Condition number of M + sigma_n^2 I beyond which a prediction has no correct digits left to show."""
+
+
+class ConditionError(ValueError):
+    """Kernel numbers that double precision cannot serve; one line saying which and what would help."""
+
+
+def check_condition(S: Array, kernel: SquaredExponential) -> None:
+    """Raise ConditionError if M + sigma_n^2 I is too ill conditioned; S (m, m) column-major, its lower triangle.
+
+    Trace over sigma_n^2 bounds the condition number, which settles all but extreme numbers; for those, power iterations
+    on S and on its inverse find it.
+    """
+    if np.trace(S) <= MAX_CONDITION * kernel.noise_std**2:
+        return
+    condition = np.inf
+    factor, info = dpotrf(S, lower=1)
+    if info == 0:
+        condition = _largest_eigenvalue(lambda x: dsymv(1.0, S, x, lower=1), len(S))
+        condition *= _largest_eigenvalue(lambda x: dpotrs(factor, x, lower=1)[0], len(S))
+    if not condition <= MAX_CONDITION:
+        raise ConditionError(
+            f"the covariance has condition {condition:.1e}, above {MAX_CONDITION:.0e}: raise noise_std "
+            f"({kernel.noise_std:g}) or length_scale ({kernel.length_scale:g}), or lower signal_std ({kernel.signal_std:g})")
+
+
+def _largest_eigenvalue(apply: Callable[[Array], Array], n: int) -> float:
+    """Of a symmetric positive matrix, by power iteration from a start that no symmetry makes orthogonal to it."""
+    x = 1.0 + 0.5 * np.sin(1.0 + np.arange(n) ** 2)
+    largest = 0.0
+    for _ in range(30):
+        x = apply(x / np.linalg.norm(x))
+        largest = float(np.linalg.norm(x))
+    return largest
 
 
 def squared_norms(signals: Array, depth: int) -> Array:

@@ -1,0 +1,97 @@
+"""The Kalman filter tasks. The gains are the same for all and found beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wfsobs.bench import external, textbook
+from wfsobs.bench.external import FILTERPY, STATSMODELS
+from wfsobs.bench.measure import OURS, Row, max_error, row, timed
+from wfsobs.bench.sizes import Sizes
+from wfsobs.loop import simulate
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.kalman import kalman_model, measurement_noise, modelled_processes, steady_filter
+from wfsobs.observers.multirate import multirate_filter, multirate_noise
+from wfsobs.record import pseudo_open_loop
+from wfsobs.riccati import steady_state
+from wfsobs.statespace import paper_matrices
+
+Array = NDArray[np.float64]
+
+EXACT_STEPS = 3000
+"""Steps compared with the textbook's loop in extended precision."""
+
+PHI = np.array([0, 2])
+"""Where phi_turb[k] and phi_vib[k] are in the paper's state."""
+
+
+def kalman_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
+    """The steady-state Kalman filter on LGS, one mode over a long record."""
+    scenario = sizes.scenario(sizes.filter_duration)
+    record = simulate(scenario)
+    y, u, n = record.y_lgs[:, 0], record.u[:, 0], record.n_steps
+    task, size = "kalman-record", f"{n} steps, 6 states"
+    noise, model = measurement_noise(scenario)[0], kalman_model(scenario, 0, record.dt)
+    ours, steady = steady_filter(model, noise)
+    A, B, C = paper_matrices(*modelled_processes(scenario, 0, record.dt))
+    arguments = A, B, C, _with_mirror(steady.L[:, 0]), y, u
+    exact = _extended(textbook.kalman_loop, *arguments)[:, PHI]
+
+    seconds, values = timed(lambda: ours.run(pseudo_open_loop(y, u)[:, None, None])[:, :, 0], sizes.repeats)
+    yield row(task, size, OURS, seconds, n, error=_error(values, exact))
+    seconds, states = timed(lambda: textbook.kalman_loop(*arguments), sizes.repeats)
+    yield row(task, size, "numpy-loop", seconds, n, error=_error(states[:, PHI], exact))
+    if FILTERPY in libraries:
+        seconds, states = timed(lambda: external.filterpy_kalman(*arguments), sizes.repeats)
+        yield row(task, size, FILTERPY, seconds, n, error=_error(states[:, PHI], exact))
+    if STATSMODELS in libraries:
+        seconds, states = timed(lambda: external.statsmodels_kalman(
+            model.A, model.C, model.Q, noise**2, steady.P, pseudo_open_loop(y, u)), sizes.repeats)
+        yield row(task, size, STATSMODELS, seconds, n, error=_error(states[:, PHI], exact))
+
+
+def multirate_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
+    """The paper's multi-rate filter, one mode over a long record. statsmodels has no filter with given gains."""
+    scenario = sizes.scenario(sizes.filter_duration)
+    record = simulate(scenario)
+    assert record.ratio is not None
+    y, u, z_ngs, n = record.y_lgs[:, 0], record.u[:, 0], record.z_ngs[:, 0], record.n_steps
+    task, size = "multirate-record", f"{n} steps, 6 states"
+    lgs, ngs = multirate_noise(scenario)
+    model = kalman_model(scenario, 0, record.dt)
+    ours = multirate_filter(model, record.ratio, lgs, ngs)
+    A, B, C = paper_matrices(*modelled_processes(scenario, 0, record.dt))
+    C_ngs = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 0.0])  # of z_ngs, from which the mirror's part has been taken
+    L = steady_state(model.A, model.C, model.Q, np.array(lgs**2)).L[:, 0]
+    L_both = steady_state(model.A, np.vstack([model.C, model.C]), model.Q, np.diag([lgs**2, ngs**2])).L
+    arguments = A, B, C, C_ngs, _with_mirror(L), _with_mirror(L_both), y, z_ngs, u
+    exact = _extended(textbook.multirate_loop, *arguments)[:, PHI]
+
+    def run_ours() -> Array:
+        return ours.run(np.column_stack([pseudo_open_loop(y, u), np.nan_to_num(z_ngs)]))
+
+    seconds, values = timed(run_ours, sizes.repeats)
+    yield row(task, size, OURS, seconds, n, error=_error(values, exact))
+    seconds, states = timed(lambda: textbook.multirate_loop(*arguments), sizes.repeats)
+    yield row(task, size, "numpy-loop", seconds, n, error=_error(states[:, PHI], exact))
+    if FILTERPY in libraries:
+        seconds, states = timed(lambda: external.filterpy_multirate(*arguments), sizes.repeats)
+        yield row(task, size, FILTERPY, seconds, n, error=_error(states[:, PHI], exact))
+
+
+def _with_mirror(L: Array) -> Array:
+    """A gain of the disturbance's states for the paper's state, of which the mirror's part is known."""
+    return np.concatenate([L, np.zeros((2, *L.shape[1:]))])
+
+
+def _extended(loop: Callable[..., Array], *arguments: Array) -> Array:
+    """The first steps of a loop in extended precision."""
+    return loop(*(a.astype(np.longdouble)[:EXACT_STEPS] for a in arguments))
+
+
+def _error(values: Array, exact: Array) -> float:
+    """Largest over the targets, values (n_steps, n_targets)."""
+    return max(max_error(values[: len(exact), i], exact[:, i]) for i in range(len(TARGETS)))

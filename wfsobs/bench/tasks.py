@@ -1,0 +1,65 @@
+"""All tasks, one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import NamedTuple
+
+from wfsobs.bench import external
+from wfsobs.bench.filters import kalman_record, multirate_record
+from wfsobs.bench.gpr import offline, online_record, online_stream
+from wfsobs.bench.measure import OURS, Row, peak_memory_mb, row, timed, with_ratios
+from wfsobs.bench.sizes import Sizes
+from wfsobs.observers import OBSERVERS
+from wfsobs.pipeline import run
+
+
+class Task(NamedTuple):
+    """A task, and its share of the time; it yields rows without their ratios."""
+
+    run: Callable[[Sizes, Collection[str]], Iterator[Row]]
+    weight: float
+
+
+def longest_run(sizes: Sizes, _libraries: Collection[str]) -> Iterator[Row]:
+    """A long run; first of all, so that the memory is its own."""
+    if sizes.longest_duration is not None:
+        scenario = sizes.scenario(sizes.longest_duration)
+        seconds, _ = timed(lambda: run(scenario), 1)
+        yield row("whole-run", _length(sizes.longest_duration), OURS, seconds, scenario.n_steps, peak_memory_mb=peak_memory_mb())
+
+
+def whole_run(sizes: Sizes, _libraries: Collection[str]) -> Iterator[Row]:
+    """Simulation, every observer on two modes, scores."""
+    scenario, size = sizes.scenario(sizes.duration), _length(sizes.duration)
+    seconds, _ = timed(lambda: run(scenario), sizes.repeats)
+    yield row("whole-run", size, OURS, seconds, scenario.n_steps)
+    quick = [name for name in OBSERVERS if name != "gpr-online"]
+    seconds, _ = timed(lambda: run(scenario, observers=quick), sizes.repeats)
+    yield row("whole-run", size, "without-online-gpr", seconds, scenario.n_steps)
+
+
+def _length(duration: float) -> str:
+    return f"{duration:g} s, 2 modes"
+
+
+TASKS = (
+    Task(longest_run, 1.0), Task(online_record, 5.0), Task(online_stream, 4.0), Task(offline, 3.0), Task(kalman_record, 2.0),
+    Task(multirate_record, 2.0), Task(whole_run, 3.0),
+)
+"""In the order of the table, but for the longest run."""
+
+
+def measure_all(
+    sizes: Sizes, progress: Callable[[float], None] | None = None, libraries: Sequence[str] | None = None
+) -> list[Row]:
+    """Every row. progress: told the fraction done; libraries: to compare with, by default those that are installed."""
+    libraries = external.installed() if libraries is None else libraries
+    total, done = sum(task.weight for task in TASKS), 0.0
+    found: list[list[Row]] = []
+    for task in TASKS:
+        found.append(with_ratios(list(task.run(sizes, libraries))))
+        done += task.weight
+        if progress:
+            progress(done / total)
+    return [r for rows in [*found[1:], found[0]] for r in rows]
