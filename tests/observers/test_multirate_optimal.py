@@ -1,0 +1,188 @@
+"""The optimal multi-rate filter: white innovations, the covariance it predicts, and its limits."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import lfilter
+from scipy.stats import chi2
+
+from wfsobs.ar2 import Ar2
+from wfsobs.loop import simulate
+from wfsobs.observers.kalman import kalman_model, modelled_processes
+from wfsobs.observers.multirate_optimal import multirate_optimal, optimal_cycle, optimal_filter, optimal_model
+from wfsobs.presets import paper
+from wfsobs.riccati import periodic_steady_state, steady_state
+from wfsobs.scenario import Scenario
+from wfsobs.statespace import disturbance_model
+from wfsobs.watch import QUIET
+
+DT = 1e-3
+TURBULENCE = Ar2(7.0686, 0.9, 0.5, DT)
+VIBRATION = Ar2(2 * np.pi * 47.4969, 0.03, 0.015, DT)
+MODEL = disturbance_model([TURBULENCE], [VIBRATION])
+OUTPUTS = MODEL.output_rows(["turbulence", "vibration"])
+
+
+def padded(rows, cycle):
+    return np.hstack([rows, np.zeros((len(rows), len(cycle[0][0]) - rows.shape[1]))])
+
+
+def simulated(cycle, n_cycles, rng):
+    """The cycle's own model, run for many cycles from the stationary start of the paper's processes.
+
+    Returns states (n, n_states) and measurements (n, 2) for steps k = 1, 2, ...
+    """
+    ratio, size = len(cycle), len(cycle[0][0])
+    n = ratio * n_cycles
+    drive = np.sqrt(np.diag(cycle[0][2]))
+    noise = np.sqrt(np.diag(cycle[0][3]))
+    x = np.zeros((n, size))
+    for first in range(0, size - 1, 2):  # each AR(2) pair on its own
+        A = cycle[0][0][first : first + 2, first : first + 2]
+        phi = lfilter([1.0], [1.0, -A[0, 0], -A[0, 1]], drive[first] * rng.standard_normal(n + 20_000))[20_000 - 1 :]
+        x[:, first], x[:, first + 1] = phi[1 : n + 1], phi[:n]
+    seen = cycle[0][0][size - 1, : size - 1]  # what one step adds to the frame
+    before = np.concatenate([[0.0], x[:-1, : size - 1] @ seen])  # the frame starts at k = 0, of which nothing is left
+    total = np.cumsum(before)
+    read = np.arange(1, n + 1) % ratio == 0
+    at_last_read = np.concatenate([[0.0], total[read]])[np.cumsum(read) - read]
+    x[:, size - 1] = total - at_last_read
+    C = np.array([step[1] for step in cycle])[np.arange(n) % ratio]
+    return x, np.einsum("kij,kj->ki", C, x) + noise * rng.standard_normal((n, 2))
+
+
+def run_cycle(cycle, z, outputs):
+    """(estimates, innovations over their predicted std) of the filter of a cycle on measurements from k = 1 on."""
+    filters, states = optimal_filter(cycle, outputs)
+    n = len(z)
+    estimates = filters.cycle.run(z[:, :, None])[:, :, 0]
+    # Innovations need the predicted state: the same filter with the identity as output, one step back.
+    everything = np.eye(len(cycle[0][0]))
+    whole = optimal_filter(cycle, everything)[0].cycle.run(z[:, :, None])[:, :, 0]
+    phase = np.arange(n) % len(cycle)
+    A = np.array([step[0] for step in cycle])
+    predicted = np.vstack([np.zeros(whole.shape[1]), np.einsum("kij,kj->ki", A[phase], whole)[:-1]])
+    C = np.array([step[1] for step in cycle])[phase]
+    S = np.array([step[1] @ s.P @ step[1].T + step[3] for step, s in zip(cycle, states, strict=True)])[phase]
+    return estimates, z - np.einsum("kij,kj->ki", C, predicted), S, states
+
+
+@pytest.mark.parametrize("with_error", [False, True])
+def test_innovations_are_white_and_errors_as_predicted(with_error):
+    """Ljung-Box over 20 lags at 1 % on 1e6 steps; covariances against Monte Carlo within 3 standard errors."""
+    error = Ar2(7.0686, 0.9, 0.05, DT) if with_error else None
+    cycle = optimal_cycle(MODEL, 5, 0.014, 0.01, error)
+    x, z = simulated(cycle, 200_000, np.random.default_rng(11))
+    outputs = padded(OUTPUTS, cycle)
+    estimates, innovations, S, states = run_cycle(cycle, z, outputs)
+    settled = slice(20_000, None)
+    white = (innovations[:, 0] / np.sqrt(S[:, 0, 0]))[settled]
+    n, lags = white.size, 20
+    r = np.array([white[j:] @ white[: n - j] for j in range(1, lags + 1)]) / (white @ white)
+    ljung_box = n * (n + 2) * np.sum(r**2 / (n - np.arange(1, lags + 1)))
+    # Two-sided at 1 %: neither correlated nor suspiciously flat.
+    assert chi2.ppf(0.005, lags) < ljung_box < chi2.ppf(0.995, lags)
+    errors = (estimates - x @ outputs.T)[settled]
+    for phase, state in enumerate(states):
+        expected = np.diag(outputs @ state.filtered @ outputs.T)
+        squares = errors[(np.arange(settled.start, len(x)) % 5) == phase] ** 2
+        # Errors are correlated over tens of steps: the standard error from means of long batches.
+        batches = np.array([b.mean(axis=0) for b in np.array_split(squares, 100)])
+        standard_error = batches.std(axis=0, ddof=1) / 10
+        assert (np.abs(squares.mean(axis=0) - expected) < 3 * standard_error).all()
+        assert (standard_error < 0.02 * expected).all()
+
+
+def test_with_ratio_one_it_is_the_filter_of_two_sensors():
+    cycle = optimal_cycle(MODEL, 1, 0.02, 0.01)
+    (state,) = periodic_steady_state(cycle)
+    C = np.vstack([MODEL.C, MODEL.C])
+    both = steady_state(MODEL.A, C, MODEL.Q, np.diag([0.02**2, 0.01**2]))
+    # The frame state equals phi_dist[k-1], so the covariance of the rest is the two-sensor one; rounding only.
+    np.testing.assert_allclose(OUTPUTS @ state.filtered[:4, :4] @ OUTPUTS.T, OUTPUTS @ both.filtered @ OUTPUTS.T, rtol=1e-9)
+    z = np.random.default_rng(3).standard_normal((500, 2))
+    got = optimal_filter(cycle, padded(OUTPUTS, cycle))[0].run(z)
+    x, expected = np.zeros(4), []
+    for k, measured in enumerate(z):
+        gain = both.L if k else steady_state(MODEL.A, MODEL.C, MODEL.Q, np.array(0.02**2)).L
+        rows = C if k else C[:1]
+        x = x + gain @ (measured[: len(rows)] - rows @ x)
+        expected.append(OUTPUTS @ x)
+        x = MODEL.A @ x
+    # Step 0 has no frame and another gain in the filter under test; from a few hundred steps on nothing is left of it.
+    np.testing.assert_allclose(got[300:], np.array(expected)[300:], atol=1e-9)
+
+
+@settings(deadline=None, derandomize=True, max_examples=40)
+@given(
+    ratio=st.integers(1, 20), lgs=st.floats(-4, 0), ngs=st.floats(-4, 0), wind=st.floats(1, 60), rms=st.floats(-3, 0),
+    error=st.one_of(st.none(), st.floats(-3, -0.5)), frequency=st.floats(5, 200), damping=st.floats(-3, -0.5),
+)
+def test_never_worse_than_the_better_single_sensor_filter(ratio, lgs, ngs, wind, rms, error, frequency, damping):
+    """In the covariance it predicts for its own model, mean over the cycle, for both targets."""
+    model = disturbance_model(
+        [Ar2(0.6 * np.pi * 2 * wind / 8, 0.9, 0.5, DT)], [Ar2(2 * np.pi * frequency, 10**damping, 10**rms, DT)])
+    slow = None if error is None else Ar2(0.6 * np.pi * 2 * wind / 8, 0.9, 10**error, DT)
+    cycle = optimal_cycle(model, ratio, 10**lgs, 10**ngs, slow)
+    rows = padded(OUTPUTS, cycle)
+
+    def mean_error(rows_kept):
+        steps = [(A, C * rows_kept[:, None], Q, R) for A, C, Q, R in cycle]
+        return np.mean([np.diag(rows @ s.filtered @ rows.T) for s in periodic_steady_state(steps)], axis=0)
+
+    both, lgs_only, ngs_only = (mean_error(np.array(keep)) for keep in ([1.0, 1.0], [1.0, 0.0], [0.0, 1.0]))
+    # 1e-7: the Riccati residual times the condition of a slow process' state.
+    assert (both <= np.minimum(lgs_only, ngs_only) * (1 + 1e-7)).all()
+
+
+def test_over_a_record_it_matches_its_textbook_recursion():
+    scenario = paper().replace({"run.duration": 1.5})
+    record = simulate(scenario)
+    got = multirate_optimal(record, scenario, QUIET)
+    for mode in range(2):
+        cycle, rows = optimal_model(scenario, mode, record.dt, 5)
+        states = periodic_steady_state(cycle)
+        x, expected = np.zeros(len(cycle[0][0])), []
+        for k in range(record.n_steps):
+            A, C, _, R = cycle[(k - 1) % 5]
+            P, measured = states[(k - 1) % 5].P, np.array([record.z[k, mode], record.z_ngs[k, mode]])
+            if np.isnan(measured[1]):
+                C, R, measured = C[:1], R[:1, :1], measured[:1]
+            x = x + P @ C.T @ np.linalg.solve(C @ P @ C.T + R, measured - C @ x)
+            expected.append(rows @ x)
+            x = A @ x
+        for i, target in enumerate(("turbulence", "vibration")):
+            # Same arithmetic in another order; signals of order 1.
+            np.testing.assert_allclose(got[target][:, mode], np.array(expected)[:, i], atol=1e-11)
+
+
+def test_the_error_state_is_what_makes_it_useful_with_a_slow_lgs_error():
+    """Without the state it trusts the LGS: the realised error is several times the predicted one, and worse than with it."""
+    base = Scenario().replace({"vibration.source": "ar2", "run.duration": 60.0, "sensors.lgs_low_frequency_rms": 0.05})
+    realised, predicted = {}, {}
+    for known in (True, False):
+        scenario = base.replace({"multirate.model_lgs_error": known})
+        record = simulate(scenario)
+        error = (multirate_optimal(record, scenario, QUIET)["turbulence"] - record.turbulence)[1000:]
+        realised[known] = np.sqrt(np.mean(error**2))
+        cycle, rows = optimal_model(scenario, 0, record.dt, 5)
+        predicted[known] = np.sqrt(np.mean([(rows @ s.filtered @ rows.T)[0, 0] for s in periodic_steady_state(cycle)]))
+    # A minute of a process with a correlation time of 0.1 s: the rms is good to about 5 %.
+    assert realised[True] == pytest.approx(predicted[True], rel=0.1)
+    assert realised[False] > 2 * predicted[False]
+    assert realised[False] > 1.3 * realised[True]
+
+
+def test_the_model_is_the_scenarios():
+    scenario = paper()
+    cycle, _ = optimal_model(scenario, 0, 1e-3, 5)
+    turbulence, vibration = modelled_processes(scenario, 0, 1e-3)
+    assert len(cycle) == 5
+    A, C, Q, R = cycle[4]
+    np.testing.assert_array_equal(A[:4, :4], kalman_model(scenario, 0, 1e-3).A)
+    assert (C[1] == np.eye(7)[6]).all()
+    assert [float(step[1][1, 6]) for step in cycle] == [0, 0, 0, 0, 1]
+    assert [Q[0, 0], Q[2, 2]] == [turbulence.drive_variance, vibration.drive_variance]
+    # mean of two LGS of 20 nm, NGS of 10 nm
+    np.testing.assert_allclose(np.sqrt(np.diag(R)), [0.02 / np.sqrt(2), 0.01], rtol=1e-12)
