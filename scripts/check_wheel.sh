@@ -38,7 +38,7 @@ venv/bin/python - "$checkout" <<'PY'
 import importlib, pathlib, pkgutil, sys
 import wfsobs, wfsobs.app, wfsobs.assets
 checkout = pathlib.Path(sys.argv[1])
-names = [m.name for m in pkgutil.walk_packages(wfsobs.__path__, "wfsobs.") if not m.name.endswith("__main__")]
+names = [m.name for m in pkgutil.walk_packages(wfsobs.__path__, "wfsobs.") if not m.name.endswith(("__main__", "app.main"))]
 for name in names:
     importlib.import_module(name)
 inside = [name for name, m in sys.modules.items() if checkout in pathlib.Path(getattr(m, "__file__", None) or "/").parents]
