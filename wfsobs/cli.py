@@ -1,4 +1,4 @@
-"""The command line: `wfsobs run`, `observe`, `presets`, `serve`."""
+"""The command line: `wfsobs run`, `observe`, `presets`, `bench`, `serve`."""
 
 from __future__ import annotations
 
@@ -63,7 +63,9 @@ def main() -> None:
               help="Repeat with seeds run.seed ... run.seed + N - 1.")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 @click.option("--save", metavar="RECORD.npz", help="Also save the record of the (one) run.")
-def run(preset: str | None, config: str | None, assignments: tuple[str, ...], seeds: int, as_json: bool, save: str | None) -> None:
+def run(
+    preset: str | None, config: str | None, assignments: tuple[str, ...], seeds: int, as_json: bool, save: str | None
+) -> None:
     """Simulate the loop, run every observer and print the RMS table."""
     if save and seeds > 1:
         raise SettingError("--save: saves one record; leave --seeds at 1")
@@ -116,6 +118,26 @@ def presets(name: str | None) -> None:
 
 
 @main.command()
+@click.option("--full", is_flag=True, help="Also m up to 2048, d up to 1000 and a run of 60 s: some minutes.")
+@click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
+def bench(full: bool, as_json: bool) -> None:
+    """Time the observers beside textbook versions, and other libraries if installed (wfsobs[bench])."""
+    from wfsobs import bench as benches
+
+    with progress_bar("benchmarks") as update:
+        measured = benches.measure_all(benches.FULL if full else benches.QUICK, update)
+    missing = [name for name in benches.LIBRARIES if name not in benches.installed()]
+    if missing:
+        click.echo(f"wfsobs: bench: without {', '.join(missing)}; the extra wfsobs[bench] installs them", err=True)
+    if as_json:
+        click.echo(json.dumps(measured, allow_nan=False))
+        return
+    console = Console()
+    table = benches.bench_table(measured, benches.machine(benches.LIBRARIES), markdown=not console.is_terminal)
+    (console if console.is_terminal else Console(width=200)).print(table)
+
+
+@main.command()
 @click.option("--port", type=click.IntRange(0, 65535), default=5006, show_default=True, help="Port to listen on.")
 @click.option("--address", default="localhost", show_default=True, help="Address to listen on.")
 @click.option("--open", "open_browser", is_flag=True, help="Open a browser.")
@@ -144,10 +166,10 @@ def _warn(result: Result) -> None:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[float], None]]:
+def progress_bar(what: str = "observers") -> Iterator[Callable[[float], None]]:
     """A progress bar on standard error where that is a terminal; gives the function that moves it."""
     console = Console(stderr=True)
-    columns = (TextColumn("observers"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
+    columns = (TextColumn(what), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
         task = progress.add_task("", total=1.0)
         yield lambda fraction: progress.update(task, completed=fraction)

@@ -40,7 +40,7 @@ def sklearn_online(X: Array, f: Array, rows: Array, m: int, kernel: SquaredExpon
 
 
 def filterpy_kalman(A: Array, B: Array, C: Array, L: Array, y: Array, u: Array) -> Array:
-    """Compare `textbook.kalman_loop`; by filterpy's steady-state functions, which are lighter than its filter object."""
+    """Compare `textbook.kalman_loop`; filterpy's steady-state functions are lighter than its filter object."""
     predict, update = _filterpy_steps()
     H, x, out = C[None], np.zeros((len(B), 1)), np.empty((len(y), len(B)))
     column, gain = B[:, None], L[:, None]

@@ -168,7 +168,7 @@ def offline(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
     targets = training_targets(training, scenario, record.dt)[:, 0]
     X, f, T = textbook.windows(learn, d)[:m], targets[d - 1 : d - 1 + m], textbook.windows(signals, d)
     exact, constant = textbook.exact_weights(X, f, kernel)
-    some = slice(None, None, max(1, len(T) // (8 * sizes.exact_steps)))
+    some = slice(None, None, -(-len(T) // (50 * sizes.library_steps)))
     exact_mean = textbook.exact_predict(T[some], X, exact, constant, kernel)
 
     seconds, model = timed(lambda: train(learn, targets, d, m, kernel), sizes.repeats)
@@ -186,6 +186,6 @@ def offline(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
     seconds, values = timed(lambda: textbook.predict(T, X, weights, kernel), sizes.repeats)
     yield row(task, size, "gemm-stored-weights", seconds, len(T), error=max_error(values[some], exact_mean))
     if regressor is not None:
-        part = T[some][: 50 * sizes.library_steps]
+        part = T[some]
         seconds, values = timed(lambda: regressor.predict(part), sizes.repeats)
-        yield row(task, size, SKLEARN, seconds, len(part), error=max_error(values, exact_mean[: len(part)]))
+        yield row(task, size, SKLEARN, seconds, len(part), error=max_error(values, exact_mean))

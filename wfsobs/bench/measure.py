@@ -52,8 +52,9 @@ def timed(work: Callable[[], T], repeats: int) -> tuple[float, T]:
 
 
 def row(
-    task: str, size: str, variant: str, seconds: float, steps: int | None = None, *, per_step_us: float | None = None,
-    p999_us: float | None = None, ready_us: float | None = None, error: float | None = None, peak_memory_mb: float | None = None,
+    task: str, size: str, variant: str, seconds: float, steps: int | None = None, *,
+    per_step_us: float | None = None, p999_us: float | None = None, ready_us: float | None = None,
+    error: float | None = None, peak_memory_mb: float | None = None,
 ) -> Row:
     """A measurement, its ratio still open."""
     if per_step_us is None and steps is not None:
@@ -97,9 +98,7 @@ def machine(libraries: Iterable[str] = ()) -> str:
             found.append(f"{name} {version(name)}")
         except PackageNotFoundError:
             continue
-    threads = os.environ.get("OPENBLAS_NUM_THREADS", "default number of")
-    found += [f"BLAS threads: {threads}", f"{_processor()}, {os.cpu_count()} cores"]
-    return ", ".join(found)
+    return ", ".join([*found, "one BLAS thread", f"{_processor()}, {os.cpu_count()} cores"])
 
 
 def _processor() -> str:
@@ -117,8 +116,8 @@ def bench_table(rows: Sequence[Row], caption: str, markdown: bool = False) -> Ta
     memory = any(r["peak_memory_mb"] is not None for r in rows)
     for name in ("Task", "Size", "Variant"):
         table.add_column(name, no_wrap=True)
-    numbers = ("steps", "median [ms]", "us / step", "99.9 % [us]", "ready [us]", "ratio to ours", "error / std")
-    for name in (*numbers, *(("peak [MB]",) if memory else ())):
+    numbers = ("steps", "median, ms", "us / step", "99.9 %, us", "ready, us", "ratio to ours", "error / std")
+    for name in (*numbers, *(("peak, MB",) if memory else ())):
         table.add_column(name, justify="right", no_wrap=True)
     last = None
     for r in rows:
@@ -126,8 +125,9 @@ def bench_table(rows: Sequence[Row], caption: str, markdown: bool = False) -> Ta
             table.add_section()
         last = r["task"]
         table.add_row(
-            r["task"], r["size"], r["variant"], "-" if r["steps"] is None else str(r["steps"]), _number(r["median_s"] * 1e3),
-            _number(r["per_step_us"]), _number(r["p999_us"]), _number(r["ready_us"]), _number(r["ratio_to_ours"]),
+            r["task"], r["size"], r["variant"],
+            "-" if r["steps"] is None else str(r["steps"]), _number(r["median_s"] * 1e3), _number(r["per_step_us"]),
+            _number(r["p999_us"]), _number(r["ready_us"]), _number(r["ratio_to_ours"]),
             "-" if r["max_error_over_std"] is None else f"{r['max_error_over_std']:.0e}",
             *((_number(r["peak_memory_mb"]),) if memory else ()),
         )

@@ -136,8 +136,9 @@ def exact_predict(X: Array, trained_on: Array, w: Array, c: float, kernel: Squar
 
 def exact_online(X: Array, f: Array, rows: Array, m: int, kernel: SquaredExponential) -> Array:
     """What `predict_online` approximates."""
+    trained = [exact_weights(X[r - m : r], f[r - m : r], kernel) for r in rows]
     return np.array([
-        exact_predict(X[r : r + 1], X[r - m : r], *exact_weights(X[r - m : r], f[r - m : r], kernel), kernel)[0] for r in rows
+        exact_predict(X[r : r + 1], X[r - m : r], w, c, kernel)[0] for r, (w, c) in zip(rows, trained, strict=True)
     ])
 
 
