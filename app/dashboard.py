@@ -30,6 +30,7 @@ from wfsobs.scenario import Scenario
 
 log = logging.getLogger(__name__)
 
+WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
 GRID = """
 :host { display: grid !important; grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); gap: 10px; }
 @media (max-width: 1000px) { :host { grid-template-columns: minmax(0, 1fr); } }
@@ -70,9 +71,10 @@ class Dashboard:
         self.strips = {target: Strip(target, self.store.run, self.display) for target in TARGETS}
         self.table = Table(self.store.run, self.display)
         self.alert = pmui.Alert(
-            object="", severity="error", visible=False, sizing_mode="stretch_width", margin=0)
+            object="", severity="error", visible=False, **WIDE)
         self.stale = pmui.Alert(
-            object="These results are not those of the settings.", severity="warning", visible=False, sizing_mode="stretch_width", margin=0)
+            object="These results are not those of the settings.", severity="warning", visible=False,
+            **WIDE)
         self.store.run.param.watch(self._refresh, ["state", "message"])
         self.store.param.watch(self._refresh, "stale")
 
@@ -80,15 +82,15 @@ class Dashboard:
         """The whole page."""
         self.body = pn.Column(
             *(self._section(target) for target in TARGETS), _box("RMS errors", self.table.pane),
-            sizing_mode="stretch_width", margin=0, stylesheets=[":host { gap: 10px; }", FADED])
-        viewport = Viewport(width=0, height=0, margin=0)
+            **WIDE, stylesheets=[":host { gap: 10px; }", FADED])
+        self.viewport = Viewport(width=0, height=0, margin=0)
         page = pmui.Page(
             title="wfsobs", sidebar=[self.controls.view()], sidebar_width=340, theme_config=theme(), favicon=None,
             main=[pn.Column(
-                self._switches(), self.alert, self.stale, self.body, viewport,
+                self._switches(), self.alert, self.stale, self.body, self.viewport,
                 sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
         )
-        viewport.param.watch(lambda event: page.param.update(sidebar_open=event.new >= PHONE_PX), "width_px")
+        self.viewport.param.watch(lambda event: page.param.update(sidebar_open=event.new >= PHONE_PX), "width_px")
         page.param.watch(lambda event: self.display.param.update(dark=event.new), "dark_theme")
         return page
 
@@ -111,7 +113,7 @@ class Dashboard:
         return pn.FlexBox(
             group("mode", modes), group("show", {"Signal": SIGNAL, "Error": ERROR}),
             group("unit", {written: unit for unit, written in UNITS.items()}),
-            self._zoom_buttons(), gap="12px", align_items="center", sizing_mode="stretch_width", margin=0)
+            self._zoom_buttons(), gap="12px", align_items="center", **WIDE)
 
     def _zoom_buttons(self) -> pn.Row:
         buttons = []
@@ -128,9 +130,9 @@ class Dashboard:
         cards.param.watch(lambda event: self._hide(target, event.new), "hidden")
         marks = MARKS if target == VIBRATION else ""
         figures = pn.Column(
-            pn.Column(_caption("Time trace"), self.traces.pane(target), sizing_mode="stretch_width", margin=0),
-            pn.Column(_caption("Power spectrum", marks), self.spectra.pane(target), sizing_mode="stretch_width", margin=0),
-            sizing_mode="stretch_width", margin=0, stylesheets=[GRID])
+            pn.Column(_caption("Time trace"), self.traces.pane(target), **WIDE),
+            pn.Column(_caption("Power spectrum", marks), self.spectra.pane(target), **WIDE),
+            **WIDE, stylesheets=[GRID])
         return _box(target.capitalize(), cards, figures)
 
     def _hide(self, target: str, names: list[str]) -> None:
@@ -147,7 +149,7 @@ class Dashboard:
 
 def _box(title: str, *content: Any) -> pn.Column:
     heading = pn.pane.HTML(f'<h2 class="title">{escape(title)}</h2>', margin=0, stylesheets=[asset("style.css")])
-    return pn.Column(heading, *content, sizing_mode="stretch_width", margin=0, stylesheets=[BOX])
+    return pn.Column(heading, *content, **WIDE, stylesheets=[BOX])
 
 
 def _caption(text: str, marks: str = "") -> pn.pane.HTML:

@@ -95,6 +95,7 @@ class _Work:
         self.spectra: dict[Key, Spectrum] = {}
         self.started = self.told = self.delivered = perf_counter()
         self.finished = self.grown = False  # since the last delivery
+        self.fraction = 0.0
         self.lock = threading.Lock()
         self.record: Record | None = None
 
@@ -123,6 +124,7 @@ class _Work:
             if now - self.told < INTERVAL or self.record is None:
                 return
             self.told = now
+            self.fraction = fraction = max(self.fraction, fraction)  # modes at work in parallel overtake each other
             shown = None
             if self.finished or (self.grown and now - self.delivered >= GROWTH_INTERVAL):
                 self.delivered, self.finished, self.grown = now, False, False

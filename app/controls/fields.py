@@ -100,7 +100,8 @@ class ChoiceField(Field):
         select.param.watch(self._change, "value")
         return [select]
 
-    def show(self, value: Any) -> None:  # noqa: D102
+    def show(self, value: Any) -> None:
+        """Put a value into the widget."""
         self.widgets[0].value = value
 
 
@@ -112,7 +113,8 @@ class SwitchField(Field):
         switch.param.watch(self._change, "value")
         return [switch]
 
-    def show(self, value: Any) -> None:  # noqa: D102
+    def show(self, value: Any) -> None:
+        """Put a value into the widget."""
         self.widgets[0].value = value
 
 
@@ -132,6 +134,7 @@ class TextField(Field):
             self.store.change(self.path, self.read(event.new))
 
     def show(self, value: Any) -> None:
+        """Put a value into the text."""
         written = self.written(value)
         self.widgets[-1].param.update(value=written, value_input=written)
 
@@ -148,9 +151,11 @@ class NumbersField(TextField):
     """A list of numbers, typed with commas between them."""
 
     def written(self, value: Any) -> str:
+        """The numbers as text."""
         return ", ".join(number_text(v) for v in value)
 
     def read(self, text: str) -> Any:
+        """The text as numbers."""
         return [parsed(part) for part in re.split(r"[,;\s]+", text.strip()) if part]
 
 
@@ -179,6 +184,7 @@ class SliderField(TextField):
             self.store.change(self.path, event.new)
 
     def show(self, value: Any) -> None:
+        """Put a value into the text and the slider, whose range grows to hold it."""
         super().show(value)
         slider = self.widgets[0]
         low, high = self.parameter.softbounds  # type: ignore[attr-defined]

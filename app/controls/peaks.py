@@ -26,7 +26,7 @@ class PeakTable(JSComponent):
     errors = param.Dict({}, doc="'row.key' -> {text, reason} of refused cells.")
 
     _esm = asset("peaks.js")
-    _stylesheets = [asset("peaks.css")]
+    _stylesheets = [asset("peaks.css")]  # noqa: RUF012
 
     def __init__(self, **params: Any):
         self.on_edit: Any = None

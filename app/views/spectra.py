@@ -97,15 +97,15 @@ class _Spectrum:
         what = "PSD of error" if display.error else "PSD"
         self.figure.yaxis.axis_label = f"{what}, {display.mode} [{display.unit_label}²/Hz]"
         if self.target == VIBRATION:
-            self._draw_marks(shown, display)
+            self._draw_marks(shown)
 
-    def _draw_marks(self, shown: Shown, display: Display) -> None:
+    def _draw_marks(self, shown: Shown) -> None:
         vibration, kalman = shown.scenario.vibration, shown.scenario.kalman
-        shown_peaks = [p for p in vibration.peaks if p.frequency <= vibration.cutoff] if vibration.source == "peaks" else (
-            vibration.peaks if vibration.source == "ar2" else [])
+        peaks = {"peaks": [p for p in vibration.peaks if p.frequency <= vibration.cutoff], "ar2": vibration.peaks}
+        drawn = peaks.get(vibration.source, [])
         self.peaks.data = {
-            "x": [p.frequency for p in shown_peaks],
-            "text": [f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}" for p in shown_peaks],
+            "x": [p.frequency for p in drawn],
+            "text": [f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}" for p in drawn],
         }
         self.model.data = {
             "x": [kalman.frequency], "text": [f"model of the Kalman filters {kalman.frequency:.5g} Hz"],

@@ -39,12 +39,14 @@ class Strip:
     def items(self) -> list[dict[str, Any]]:
         """What the cards say."""
         shown = self.run.shown
-        return [self._truth(shown), *(self._observer(name, shown) for name in observers_of(self.target))]
+        observers = [self._observer(name, shown) for name in observers_of(self.target)]
+        return [self._truth(shown), *observers]
 
     def _observer(self, name: str, shown: Shown | None) -> dict[str, Any]:
         score = find(shown, name, self.target, self.display.mode) if shown else None
         if shown is None or score is None:
-            return self._card(name, None, "computing …" if self.run.state == RUNNING else "no result")
+            waiting = self.run.state == RUNNING
+            return self._card(name, None, "computing …" if waiting else "no result")
         relative = f"{score.normalised_rms:.2f} × truth" if score.normalised_rms is not None else ""
         return self._card(name, self._scaled(score.rms, shown), relative)
 
@@ -61,7 +63,7 @@ class Strip:
     def _card(self, name: str, value: float | None, note: str) -> dict[str, Any]:
         it = look(name)
         return {
-            "name": name, "label": it.label, "colour": it.colour(self.display.dark), "dash": list(it.dash), "note": note,
-            "value": NOTHING if value is None else number(value),
+            "name": name, "label": it.label, "colour": it.colour(self.display.dark), "dash": list(it.dash),
+            "note": note, "value": NOTHING if value is None else number(value),
             "unit": "" if value is None else self.display.unit_label,
         }

@@ -50,8 +50,9 @@ class Table:
     def html(self) -> str:
         """The table."""
         unit = self.display.unit_label
-        head = "".join(f"<th scope=col>{h}</th>" for h in (
-            "Observer", f"RMS error [{unit}]", f"RMS truth [{unit}]", "error / truth", "Lag [ms]", "Time per step [µs]"))
+        columns = (
+            "Observer", f"RMS error [{unit}]", f"RMS truth [{unit}]", "error / truth", "Lag [ms]", "Time per step [µs]")
+        head = "".join(f"<th scope=col>{name}</th>" for name in columns)
         body = "".join(self._target(target) for target in TARGETS)
         table = f'<table class="rms"><thead><tr>{head}</tr></thead>{body}</table>'
         return f'<div class="scroll" tabindex=0 role=region aria-label="RMS errors">{table}</div>{self._notes()}'

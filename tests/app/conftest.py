@@ -1,0 +1,82 @@
+"""A session without a server: what another thread posts waits in a queue until the test lets it land."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Callable, Iterator
+from time import monotonic
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.store import RUNNING, Store
+from wfsobs.app.work import compute
+from wfsobs.presets import PRESETS
+from wfsobs.scenario import Scenario
+
+SHORT = {
+    "run.duration": 2.0, "run.warm_up": 0.5, "gpr_offline.training_size": 40, "gpr_offline.depth": 20,
+    "gpr_online.training_size": 40, "gpr_online.depth": 20,
+}
+
+
+class Loop:
+    """Stands for the event loop of a session."""
+
+    def __init__(self) -> None:
+        self.queue: queue.Queue[Callable[[], None]] = queue.Queue()
+        self.closing: list[Any] = []
+
+    def land(self, timeout: float = 20.0) -> None:
+        """Do the next thing that was posted."""
+        self.queue.get(timeout=timeout)()
+
+    def until(self, condition: Callable[[], bool], timeout: float = 20.0) -> None:
+        """Do what is posted until a condition holds."""
+        end = monotonic() + timeout
+        while not condition():
+            self.land(max(end - monotonic(), 0.01))
+
+    def finish(self, store: Store) -> None:
+        """Do what is posted until the run is over."""
+        self.until(lambda: store.run.state != RUNNING)
+
+
+@pytest.fixture
+def loop() -> Iterator[Loop]:
+    loop = Loop()
+    yield loop
+    for thing in loop.closing:
+        thing.close()
+
+
+@pytest.fixture
+def short() -> Scenario:
+    return PRESETS["paper"]().replace(SHORT)
+
+
+@pytest.fixture
+def make_store(loop: Loop, short: Scenario) -> Callable[..., Store]:
+    def make(work: Any = compute) -> Store:
+        store = Store(loop.queue.put, short, work)
+        loop.closing.append(store)
+        return store
+    return make
+
+
+@pytest.fixture
+def dashboard(loop: Loop, short: Scenario) -> Dashboard:
+    """A dashboard whose first run is done."""
+    dashboard = Dashboard(loop.queue.put, short)
+    loop.closing.append(dashboard)
+    dashboard.page()
+    dashboard.start()
+    loop.finish(dashboard.store)
+    return dashboard
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(1)

@@ -1,0 +1,246 @@
+"""Every widget: generated from the settings, in step with the store, its refusals beside it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import param
+import pytest
+
+from wfsobs.app.controls.fields import SliderField, label_of, parsed, written_unit
+from wfsobs.app.controls.panel import FIRST, Controls, status_html
+from wfsobs.app.controls.peaks import PATH
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.presets import PRESETS
+
+
+@pytest.fixture
+def controls(dashboard: Dashboard) -> Controls:
+    """The drawer with every topic open."""
+    dashboard.controls.accordion.active = list(range(len(dashboard.controls.topics)))
+    return dashboard.controls
+
+
+def release(slider: Any, value: float) -> None:
+    """What the browser sends when a slider is let go."""
+    with param.edit_constant(slider):
+        slider.param.update(value=value, value_throttled=value)
+
+
+def error_of(controls: Controls, path: str) -> str:
+    pane = controls.fields[path]._error
+    return pane.object if pane.visible else ""
+
+
+def test_every_setting_has_one_field(controls: Controls) -> None:
+    settings = [path for path, _, _ in controls.store.scenario.walk() if not path.startswith(PATH)]
+    assert sorted(controls.fields) == sorted(settings)
+    assert controls.peaks is not None
+    assert len(controls.peaks.table.rows) == len(controls.store.scenario.vibration.peaks)
+
+
+def test_labels_come_from_the_settings(controls: Controls) -> None:
+    field = controls.fields["turbulence.wind_speed"]
+    assert label_of(field.parameter) == "Wind speed V₀ [m/s]" == field.widgets[0].label
+    assert field.widgets[0].description == field.parameter.doc
+    assert label_of(controls.fields["sensors.lgs_noise"].parameter) == "LGS noise [µm]"
+    assert written_unit("um^2/Hz") == "µm²/Hz"
+
+
+def test_what_matters_most_stands_first(controls: Controls) -> None:
+    assert FIRST == ("turbulence.wind_speed", "sensors.exposure_ratio")
+    assert list(controls.topics)[:3] == ["vibration", "gpr_offline", "gpr_online"]
+
+
+def test_topics_are_filled_when_opened(dashboard: Dashboard) -> None:
+    controls = dashboard.controls
+    assert "loop.gain" not in controls.fields
+    controls.accordion.active = [*controls.accordion.active, list(controls.topics).index("loop")]
+    assert "loop.gain" in controls.fields
+
+
+def test_a_slider_that_is_let_go_runs(controls: Controls, loop: Any) -> None:
+    before = controls.store.run.shown
+    field = controls.fields["turbulence.wind_speed"]
+    release(field.widgets[0], 22.0)
+    assert controls.store.scenario.turbulence.wind_speed == 22.0
+    assert field.widgets[1].value == "22", "the typed number follows"
+    loop.finish(controls.store)
+    assert controls.store.run.shown is not before
+    assert controls.store.run.shown.scenario.turbulence.wind_speed == 22.0
+
+
+def test_a_slider_under_way_does_not_run(controls: Controls) -> None:
+    controls.fields["turbulence.wind_speed"].widgets[0].value = 22.0
+    assert controls.store.scenario.turbulence.wind_speed == 15.0
+
+
+def test_a_slider_let_go_where_it_once_was_runs(controls: Controls, loop: Any) -> None:
+    slider = controls.fields["turbulence.wind_speed"].widgets[0]
+    release(slider, 22.0)
+    controls.store.change("turbulence.wind_speed", 15)
+    release(slider, 22.0)
+    assert controls.store.scenario.turbulence.wind_speed == 22.0
+    loop.finish(controls.store)
+
+
+def test_a_whole_number_stays_whole(controls: Controls, loop: Any) -> None:
+    release(controls.fields["sensors.exposure_ratio"].widgets[0], 8)
+    assert controls.store.scenario.sensors.exposure_ratio == 8
+    loop.finish(controls.store)
+
+
+@pytest.mark.parametrize(("path", "text", "value"), [
+    ("turbulence.wind_speed", "12.5", 12.5), ("run.seed", " 7 ", 7), ("gpr_online.noise_std", "1e-2", 0.01),
+    ("butterworth.frequencies", "20, 30; 40", [20.0, 30.0, 40.0]), ("telescope.diameter", "39", 39.0),
+])
+def test_a_typed_value_runs(controls: Controls, loop: Any, path: str, text: str, value: Any) -> None:
+    controls.fields[path].widgets[-1].value = text
+    assert controls.store.value(path) == value and error_of(controls, path) == ""
+    loop.finish(controls.store)
+    assert controls.store.run.shown.scenario == controls.store.scenario
+
+
+@pytest.mark.parametrize(("path", "text", "says"), [
+    ("turbulence.wind_speed", "200", "0.1 to 100 m/s"), ("turbulence.wind_speed", "fast", "a number"),
+    ("turbulence.wind_speed", "", "a number"), ("run.seed", "1.5", "a whole number"),
+    ("gpr_online.length_scale", "nan", "0.1"), ("butterworth.frequencies", "20, x", "a list of"),
+    ("kalman.frequency", "900", "half the LGS rate"), ("run.warm_up", "3", "run.duration"),
+])
+def test_a_bad_value_shows_beside_its_setting(controls: Controls, path: str, text: str, says: str) -> None:
+    shown, scenario = controls.store.run.shown, controls.store.scenario
+    field = controls.fields[path]
+    field.widgets[-1].value = text
+    assert says in error_of(controls, path)
+    assert field.widgets[-1].error_state and field.widgets[-1].value == text, "what was typed stays, to be corrected"
+    assert controls.store.run.shown is shown and controls.store.scenario is scenario
+    assert says in status_html(controls.store)
+
+
+def test_correcting_a_bad_value_clears_the_message(controls: Controls, loop: Any) -> None:
+    path = "turbulence.wind_speed"
+    text = controls.fields[path].widgets[-1]
+    text.value = "200"
+    text.value = "20"
+    assert error_of(controls, path) == "" and not text.error_state
+    text.value = "200"
+    text.value = "20"
+    assert error_of(controls, path) == "" and not text.error_state, "back to the value that stands"
+    loop.finish(controls.store)
+
+
+def test_a_slider_grows_to_hold_a_typed_value(controls: Controls, loop: Any) -> None:
+    field = controls.fields["turbulence.wind_speed"]
+    field.widgets[-1].value = "80"
+    assert field.widgets[0].end == 80.0 and field.widgets[0].value == 80.0
+    controls.store.change("turbulence.wind_speed", 10)
+    assert field.widgets[0].end == 40.0
+    loop.finish(controls.store)
+
+
+def test_choices_and_switches_run(controls: Controls, loop: Any) -> None:
+    controls.fields["kalman.process_noise"].widgets[0].value = "matched"
+    controls.fields["loop.closed"].widgets[0].value = False
+    assert controls.store.scenario.kalman.process_noise == "matched"
+    assert controls.store.scenario.loop.closed is False
+    loop.finish(controls.store)
+    assert controls.store.run.shown.scenario.loop.closed is False
+
+
+def test_every_widget_follows_the_store(controls: Controls, loop: Any) -> None:
+    controls.store.load(PRESETS["ut4"]().replace({"run.duration": 2.0, "run.warm_up": 0.5, "loop.closed": False}))
+    controls.store.run.cancel()
+    for path, field in controls.fields.items():
+        value = controls.store.value(path)
+        for widget in field.widgets:
+            expected = field.written(value) if widget is field.widgets[-1] and hasattr(field, "written") else value
+            assert widget.value == expected, path
+    for field in controls.fields.values():
+        if isinstance(field, SliderField):
+            assert field.widgets[0].value_throttled == field.widgets[0].value
+
+
+def test_choosing_a_preset(controls: Controls) -> None:
+    controls.preset.value = "ut4"
+    assert controls.store.scenario == PRESETS["ut4"]() and controls.store.run.state == "running"
+    assert controls.reset.disabled and controls.preset.helper_text == ""
+    controls.store.change("loop.gain", 0.1)
+    assert "loop.gain" in controls.preset.helper_text and not controls.reset.disabled
+    controls.reset.clicks += 1
+    assert controls.store.scenario == PRESETS["ut4"]()
+    controls.store.run.cancel()
+
+
+def test_run_and_cancel(controls: Controls, loop: Any) -> None:
+    assert controls.cancel.disabled and "Done" in controls.status.object
+    controls.run.clicks += 1
+    assert not controls.cancel.disabled and "Running" in controls.status.object
+    controls.cancel.clicks += 1
+    assert controls.cancel.disabled and "Cancelled" in controls.status.object
+    controls.run.clicks += 1
+    loop.finish(controls.store)
+    assert controls.progress.value == 100
+
+
+class TestPeaks:
+    def test_add(self, controls: Controls, loop: Any) -> None:
+        assert controls.peaks is not None
+        n = len(controls.peaks.table.rows)
+        controls.peaks.table._handle_msg({"action": "add"})
+        assert len(controls.store.scenario.vibration.peaks) == n + 1 == len(controls.peaks.table.rows)
+        assert controls.store.run.state == "running"
+        loop.finish(controls.store)
+
+    def test_remove(self, controls: Controls, loop: Any) -> None:
+        assert controls.peaks is not None
+        second = controls.store.scenario.vibration.peaks[1]
+        controls.peaks.table._handle_msg({"action": "remove", "row": 0})
+        assert controls.store.scenario.vibration.peaks[0] == second
+        loop.finish(controls.store)
+
+    def test_remove_all(self, controls: Controls, loop: Any) -> None:
+        assert controls.peaks is not None
+        while controls.peaks.table.rows:
+            controls.peaks.table._handle_msg({"action": "remove", "row": 0})
+        loop.finish(controls.store)
+        assert controls.store.run.state == "done"
+
+    @pytest.mark.parametrize(("key", "text", "expected"), [
+        ("frequency", "33.3", 33.3), ("damping", "0", 0.0), ("rms.0", "0.02", 0.02), ("rms.1", "2e-3", 0.002),
+    ])
+    def test_edit_in_place(self, controls: Controls, loop: Any, key: str, text: str, expected: float) -> None:
+        assert controls.peaks is not None
+        before = controls.store.run.shown.result.scores
+        controls.peaks.table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
+        assert controls.store.value(f"{PATH}.2.{key}") == expected
+        assert controls.peaks.table.errors == {}
+        loop.finish(controls.store)
+        assert controls.store.run.shown.result.scores != before
+
+    @pytest.mark.parametrize(("key", "text", "says"), [
+        ("frequency", "-3", "from 0.01"), ("frequency", "600", "half the LGS rate"), ("damping", "two", "a number"),
+        ("rms.1", "-1", "from 0 to 100"),
+    ])
+    def test_bad_cell(self, controls: Controls, key: str, text: str, says: str) -> None:
+        assert controls.peaks is not None
+        shown, rows = controls.store.run.shown, controls.peaks.table.rows
+        controls.peaks.table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
+        error = controls.peaks.table.errors[f"2.{key}"]
+        assert error["text"] == text and says in error["reason"]
+        assert controls.store.run.shown is shown and controls.peaks.table.rows == rows
+        good = {"frequency": rows[2][0], "damping": rows[2][1], "rms.1": rows[2][3]}[key]
+        controls.peaks.table._handle_msg({"action": "edit", "row": 2, "key": key, "text": good})
+        assert controls.peaks.table.errors == {} and controls.store.run.shown is shown
+
+    def test_removing_a_bad_row_removes_its_error(self, controls: Controls, loop: Any) -> None:
+        assert controls.peaks is not None
+        controls.peaks.table._handle_msg({"action": "edit", "row": 0, "key": "damping", "text": "7"})
+        controls.peaks.table._handle_msg({"action": "remove", "row": 0})
+        assert controls.peaks.table.errors == {}
+        loop.finish(controls.store)
+
+
+def test_parsed() -> None:
+    assert parsed("3") == 3 and isinstance(parsed("3"), int)
+    assert parsed("−1.5e-3") == -0.0015
+    assert parsed("three") == "three"

@@ -1,0 +1,104 @@
+"""The page as a whole."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import pytest
+
+from wfsobs.app import dashboard as module
+from wfsobs.app.dashboard import Dashboard, page
+from wfsobs.app.work import Shown, compute
+from wfsobs.scenario import Scenario
+
+
+def test_error_page(caplog: pytest.LogCaptureFixture) -> None:
+    def build(post: Any) -> Dashboard:
+        raise RuntimeError("<no> room")
+
+    html = page(build)[0].object
+    assert "could not be built" in html and "RuntimeError: &lt;no&gt; room" in html
+    assert "no> room" in caplog.text
+
+
+def test_a_page_that_cannot_be_assembled(monkeypatch: pytest.MonkeyPatch, loop: Any, short: Scenario) -> None:
+    def broken(self: Dashboard) -> Any:
+        raise ValueError("no page")
+
+    monkeypatch.setattr(module.Dashboard, "page", broken)
+    made: list[Dashboard] = []
+
+    def build(post: Any) -> Dashboard:
+        made.append(Dashboard(loop.queue.put, short))
+        return made[0]
+
+    assert "ValueError: no page" in page(build)[0].object
+    assert made[0].store.run.state == "idle"
+    made[0].close()
+
+
+def test_a_failing_run_shows_inline(loop: Any, short: Scenario) -> None:
+    def work(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
+        if scenario.loop.gain == 0.1:
+            raise RuntimeError("no such luck")
+        return compute(scenario, cancelled, report)
+
+    dashboard = Dashboard(loop.queue.put, short, work)
+    loop.closing.append(dashboard)
+    dashboard.page()
+    dashboard.start()
+    loop.finish(dashboard.store)
+    table = dashboard.table.pane.object
+    dashboard.store.change("loop.gain", 0.1)
+    loop.finish(dashboard.store)
+    assert dashboard.alert.visible and "no such luck" in dashboard.alert.object
+    assert dashboard.stale.visible and dashboard.body.css_classes == ["stale"]
+    assert dashboard.table.pane.object == table, "the last result stands"
+    dashboard.store.change("loop.gain", 0.2)
+    loop.finish(dashboard.store)
+    assert not dashboard.alert.visible and not dashboard.stale.visible and dashboard.body.css_classes == []
+
+
+def test_results_are_marked_stale_until_new_ones_land(loop: Any, short: Scenario) -> None:
+    gate = threading.Event()
+
+    def work(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
+        if scenario.loop.gain == 0.1:
+            assert gate.wait(20)
+        return compute(scenario, cancelled, report)
+
+    dashboard = Dashboard(loop.queue.put, short, work)
+    loop.closing.append(dashboard)
+    dashboard.page()
+    dashboard.start()
+    loop.finish(dashboard.store)
+    dashboard.store.change("loop.gain", 0.1)
+    assert dashboard.body.css_classes == ["stale"] and not dashboard.stale.visible, "no line while it runs"
+    gate.set()
+    loop.finish(dashboard.store)
+    assert dashboard.body.css_classes == []
+
+
+def test_the_page(dashboard: Dashboard) -> None:
+    page = dashboard.page()
+    assert page.title == "wfsobs" and page.sidebar and page.main
+    page.dark_theme = True
+    assert dashboard.display.dark
+
+
+def test_a_narrow_window_closes_the_drawer(dashboard: Dashboard) -> None:
+    page = dashboard.page()
+    viewport = dashboard.viewport
+    viewport.width_px = 1400
+    assert page.sidebar_open
+    viewport.width_px = 390
+    assert not page.sidebar_open
+
+
+def test_importing_the_package_imports_no_panel() -> None:
+    import subprocess
+    import sys
+
+    code = "import sys, wfsobs.app, wfsobs; assert not {'panel', 'bokeh', 'holoviews'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

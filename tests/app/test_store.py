@@ -1,0 +1,291 @@
+"""The settings of a session and the one run that follows them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from wfsobs import pipeline
+from wfsobs.app.store import CANCELLED, DONE, FAILED, RUNNING, Store
+from wfsobs.app.work import Report, Shown
+from wfsobs.presets import PRESETS
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.settings import SettingError
+from wfsobs.watch import Cancelled
+
+
+def answer(scenario: Scenario) -> Shown:
+    """An empty result of a scenario."""
+    record = Record(y_lgs=np.zeros((8, 2)), u=np.zeros((8, 2)), dt=1e-3)
+    return Shown(pipeline.Result(scenario, record, (), ()))
+
+
+def instant(scenario: Scenario, cancelled: Callable[[], bool], report: Report) -> Shown:
+    return answer(scenario)
+
+
+class Gated:
+    """Work that waits to be let go, one gate per run, by wind speed; it does not listen to `cancelled`."""
+
+    def __init__(self) -> None:
+        self.gates: dict[float, threading.Event] = {}
+        self.told_to_stop: dict[float, bool] = {}
+        self.reporting: dict[float, Report] = {}
+        self.entered: dict[float, threading.Event] = {}
+        self.left: dict[float, threading.Event] = {}
+
+    def expect(self, *speeds: float) -> None:
+        for speed in speeds:
+            self.gates[speed], self.entered[speed], self.left[speed] = (threading.Event() for _ in range(3))
+
+    def __call__(self, scenario: Scenario, cancelled: Callable[[], bool], report: Report) -> Shown:
+        speed = scenario.turbulence.wind_speed
+        self.reporting[speed] = report
+        self.entered[speed].set()
+        assert self.gates[speed].wait(20)
+        self.told_to_stop[speed] = cancelled()
+        try:
+            return answer(scenario)
+        finally:
+            self.left[speed].set()
+
+
+def test_a_run_gives_what_the_core_gives(make_store: Any, loop: Any, short: Scenario) -> None:
+    store = make_store()
+    store.start()
+    assert store.run.state == RUNNING
+    loop.finish(store)
+    assert store.run.state == DONE and store.run.progress == 1.0
+    expected = pipeline.run(short)
+    got = {(s.observer, s.target, s.mode): s.rms for s in store.run.shown.result.scores}
+    assert got == {(s.observer, s.target, s.mode): s.rms for s in expected.scores}
+
+
+def test_a_change_runs_again(make_store: Any, loop: Any, short: Scenario) -> None:
+    store = make_store()
+    store.start()
+    loop.finish(store)
+    first = store.run.shown
+    assert store.change("turbulence.wind_speed", 25)
+    assert store.stale and store.run.state == RUNNING
+    loop.finish(store)
+    assert not store.stale
+    assert store.run.shown.scenario.turbulence.wind_speed == 25.0
+    assert store.run.shown.result.scores != first.result.scores
+    assert short.turbulence.wind_speed == 15.0, "a scenario that was handed over is a snapshot"
+
+
+def test_the_same_value_again_does_not_run(make_store: Any) -> None:
+    store = make_store(instant)
+    assert store.change("turbulence.wind_speed", store.scenario.turbulence.wind_speed)
+    assert store.run.state == "idle"
+
+
+def test_a_bad_value_leaves_the_last_result_standing(make_store: Any, loop: Any) -> None:
+    store = make_store(instant)
+    store.start()
+    loop.finish(store)
+    scenario, shown = store.scenario, store.run.shown
+    assert not store.change("turbulence.wind_speed", 200)
+    assert store.errors == {"turbulence.wind_speed": "turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s"}
+    assert store.scenario is scenario and store.run.shown is shown
+    assert store.run.state == DONE and not store.stale
+
+
+def test_a_bad_text_is_refused_by_the_setting_itself(make_store: Any) -> None:
+    store = make_store(instant)
+    assert not store.change("run.seed", "many")
+    assert "run.seed" in store.errors["run.seed"] and "many" in store.errors["run.seed"]
+
+
+def test_a_good_value_clears_the_error(make_store: Any, loop: Any) -> None:
+    store = make_store(instant)
+    store.change("turbulence.wind_speed", 200)
+    assert store.change("turbulence.wind_speed", 20)
+    assert store.errors == {} and store.run.state == RUNNING
+    loop.finish(store)
+
+
+def test_going_back_to_the_value_that_stands_clears_the_error(make_store: Any) -> None:
+    store = make_store(instant)
+    store.change("turbulence.wind_speed", 200)
+    assert store.change("turbulence.wind_speed", store.scenario.turbulence.wind_speed)
+    assert store.errors == {} and store.run.state == "idle"
+
+
+def test_settings_that_do_not_go_together_are_refused(make_store: Any) -> None:
+    store = make_store(instant)
+    assert not store.change("run.warm_up", 5)
+    assert "run.duration" in store.errors["run.warm_up"]
+
+
+def test_settings_that_only_go_together_can_be_given_one_by_one(make_store: Any) -> None:
+    store = make_store(instant)
+    assert not store.change("run.duration", 0.4), "shorter than the warm-up"
+    assert store.change("run.warm_up", 0.1)
+    assert (store.scenario.run.duration, store.scenario.run.warm_up) == (0.4, 0.1)
+    assert store.errors == {}
+
+
+def test_an_error_of_one_setting_does_not_hold_up_another(make_store: Any) -> None:
+    store = make_store(instant)
+    store.change("turbulence.wind_speed", 200)
+    assert store.change("loop.gain", 0.2)
+    assert store.scenario.loop.gain == 0.2
+    assert list(store.errors) == ["turbulence.wind_speed"]
+
+
+def test_replacing_the_peaks_forgets_what_was_refused_of_one(make_store: Any) -> None:
+    store = make_store(instant)
+    assert not store.change("vibration.peaks.0.frequency", -1)
+    assert store.change("vibration.peaks", [])
+    assert store.errors == {} and store.scenario.vibration.peaks == []
+
+
+def test_a_superseded_run_never_lands(make_store: Any, loop: Any) -> None:
+    work = Gated()
+    work.expect(15.0, 20.0)
+    store = make_store(work)
+    store.start()
+    assert work.entered[15.0].wait(20)
+    store.change("turbulence.wind_speed", 20)
+    assert work.entered[20.0].wait(20)
+    work.gates[20.0].set()
+    loop.finish(store)
+    assert store.run.shown.scenario.turbulence.wind_speed == 20.0
+
+    work.reporting[15.0](0.5, answer(PRESETS["paper"]()))
+    work.gates[15.0].set()
+    assert work.left[15.0].wait(20)
+    store.run._pool.shutdown(wait=True)
+    assert loop.queue.empty(), "nothing of it is even posted"
+    assert store.run.shown.scenario.turbulence.wind_speed == 20.0 and store.run.progress == 1.0
+    assert work.told_to_stop == {20.0: False, 15.0: True}
+
+
+def test_what_was_posted_before_a_run_was_superseded_does_not_land_after(make_store: Any, loop: Any) -> None:
+    work = Gated()
+    work.expect(15.0, 20.0)
+    store = make_store(work)
+    store.start()
+    assert work.entered[15.0].wait(20)
+    work.reporting[15.0](0.5, answer(store.scenario))
+    store.change("turbulence.wind_speed", 20)
+    loop.land()
+    assert store.run.shown is None and store.run.progress == 0.0
+    for gate in work.gates.values():
+        gate.set()
+    loop.finish(store)
+    assert store.run.shown.scenario.turbulence.wind_speed == 20.0
+
+
+def test_many_changes_in_a_row_show_only_the_last(make_store: Any, loop: Any) -> None:
+    store = make_store()
+    speeds: list[float] = []
+    store.run.param.watch(lambda event: speeds.append(event.new.scenario.turbulence.wind_speed), "shown")
+    for speed in (10, 12, 14, 16, 18):
+        store.change("turbulence.wind_speed", speed)
+    loop.finish(store)
+    assert set(speeds) == {18.0} and not store.stale
+
+
+def test_cancel_stops_and_keeps_what_was_shown(make_store: Any, loop: Any) -> None:
+    work = Gated()
+    work.expect(15.0)
+    store = make_store(work)
+    store.start()
+    assert work.entered[15.0].wait(20)
+    part = answer(store.scenario)
+    work.reporting[15.0](0.3, part)
+    loop.until(lambda: store.run.shown is part)
+    store.run.cancel()
+    assert store.run.state == CANCELLED and store.run.progress == 0.3
+    work.gates[15.0].set()
+    assert work.left[15.0].wait(20)
+    store.run._pool.shutdown(wait=True)
+    assert work.told_to_stop == {15.0: True}
+    assert loop.queue.empty() and store.run.state == CANCELLED and store.run.shown is part
+
+
+def test_cancelling_before_anything_has_landed_leaves_the_results_stale(make_store: Any, loop: Any) -> None:
+    work = Gated()
+    work.expect(15.0, 20.0)
+    store = make_store(work)
+    work.gates[15.0].set()
+    store.start()
+    loop.finish(store)
+    store.change("turbulence.wind_speed", 20)
+    store.run.cancel()
+    assert store.stale and store.run.shown.scenario.turbulence.wind_speed == 15.0
+    work.gates[20.0].set()
+
+
+def test_cancelled_work_that_reports_it_itself(make_store: Any, loop: Any) -> None:
+    def stops(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
+        raise Cancelled
+
+    store = make_store(stops)
+    store.start()
+    loop.finish(store)
+    assert store.run.state == CANCELLED
+
+
+def test_a_failing_run_says_why_and_leaves_the_last_result_standing(make_store: Any, loop: Any, caplog: Any) -> None:
+    def fails(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
+        if scenario.loop.gain == 0.1:
+            raise RuntimeError("no such luck")
+        if scenario.loop.gain == 0.2:
+            raise SettingError("loop.gain = 0.2: not today")
+        return answer(scenario)
+
+    store = make_store(fails)
+    store.start()
+    loop.finish(store)
+    shown = store.run.shown
+    store.change("loop.gain", 0.1)
+    loop.finish(store)
+    assert (store.run.state, store.run.message) == (FAILED, "RuntimeError: no such luck")
+    assert "no such luck" in caplog.text, "the traceback is in the log"
+    store.change("loop.gain", 0.2)
+    loop.finish(store)
+    assert store.run.message == "loop.gain = 0.2: not today"
+    assert store.run.shown is shown and store.stale
+    store.change("loop.gain", 0.3)
+    loop.finish(store)
+    assert store.run.state == DONE and store.run.message == "" and not store.stale
+
+
+def test_a_preset_replaces_every_setting(make_store: Any, loop: Any) -> None:
+    store = make_store(instant)
+    store.change("turbulence.wind_speed", 200)
+    store.choose("ut4")
+    assert store.scenario == PRESETS["ut4"]() and store.preset == "ut4"
+    assert store.errors == {} and store.changed() == []
+    store.change("loop.gain", 0.1)
+    assert store.changed() == ["loop.gain"]
+    loop.finish(store)
+
+
+def test_sessions_do_not_see_each_other(make_store: Any, loop: Any) -> None:
+    one, other = make_store(instant), make_store(instant)
+    one.change("turbulence.wind_speed", 30)
+    one.change("vibration.peaks", [])
+    one.change("loop.gain", 9)
+    assert other.scenario.turbulence.wind_speed == 15.0 and other.scenario.vibration.peaks
+    assert other.errors == {} and other.run.state == "idle"
+
+
+def test_a_closed_session_hears_nothing(make_store: Any, loop: Any) -> None:
+    work = Gated()
+    work.expect(15.0)
+    store: Store = make_store(work)
+    store.start()
+    assert work.entered[15.0].wait(20)
+    store.close()
+    work.gates[15.0].set()
+    assert work.left[15.0].wait(20)
+    assert loop.queue.empty()

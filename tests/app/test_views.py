@@ -1,0 +1,217 @@
+"""The figures, the cards and the table against the results they show."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.display import per_micrometre
+from wfsobs.app.style import LOOKS, look
+from wfsobs.app.views.envelope import envelope, envelope_times
+from wfsobs.app.views.table import number
+from wfsobs.app.views.traces import BINS
+from wfsobs.app.work import TRUTH
+from wfsobs.observers import OBSERVERS
+
+
+def trace(dashboard: Dashboard, target: str) -> dict[str, Any]:
+    return dict(dashboard.traces.traces[target].source.data)
+
+
+class TestEnvelope:
+    def test_short_signals_stay_as_they_are(self) -> None:
+        x = np.arange(20.0)
+        assert np.array_equal(envelope(x, 10), x)
+        assert np.array_equal(envelope_times(5, 25, 10, 0.1), np.arange(5, 25) * 0.1)
+
+    @pytest.mark.parametrize("n", [21, 999, 1000, 1003, 60_007])
+    def test_every_extreme_is_kept(self, n: int, rng: np.random.Generator) -> None:
+        x = rng.normal(size=n)
+        x[-1] = 99.0  # in the last, ragged bin
+        small = envelope(x, 10)
+        assert small.size == 20 == envelope_times(0, n, 10, 1.0).size
+        edges = np.linspace(0, n, 11).astype(int)
+        for i, (a, b) in enumerate(pairwise(edges)):
+            assert sorted(small[2 * i : 2 * i + 2]) == [x[a:b].min(), x[a:b].max()]
+            assert np.all(envelope_times(0, n, 10, 1.0)[2 * i : 2 * i + 2] >= a)
+            assert np.all(envelope_times(0, n, 10, 1.0)[2 * i : 2 * i + 2] < b)
+
+    def test_nan_is_left_out(self) -> None:
+        x = np.full(100, np.nan)
+        x[55:] = 1.0
+        small = envelope(x, 10)
+        assert np.isnan(small[:10]).all() and (small[10:] == 1.0).all()
+
+
+class TestTraces:
+    def test_signal(self, dashboard: Dashboard) -> None:
+        shown = dashboard.store.run.shown
+        data = trace(dashboard, "turbulence")
+        assert set(data) == {"x", TRUTH, "kf-lgs", "kf-ngs", "multirate", "multirate-optimal"}
+        expected = 1e3 * envelope(shown.values("kf-lgs", "turbulence")[:, 0], BINS)
+        assert np.allclose(data["kf-lgs"], expected, rtol=1e-6)
+        assert data["x"][0] >= 0 and data["x"][-1] <= 2.0 and data["x"].size == data[TRUTH].size
+
+    def test_error(self, dashboard: Dashboard) -> None:
+        dashboard.display.show = "error"
+        shown = dashboard.store.run.shown
+        error = shown.values("kf-lgs", "vibration") - shown.values(TRUTH, "vibration")
+        data = trace(dashboard, "vibration")
+        assert np.allclose(data["kf-lgs"], 1e3 * envelope(error[:, 0], BINS), rtol=1e-5)
+        assert np.isnan(data[TRUTH]).all()
+        assert "error of tip [nm]" in dashboard.traces.traces["vibration"].figure.yaxis.axis_label
+
+    def test_mode_and_unit(self, dashboard: Dashboard) -> None:
+        dashboard.display.param.update(mode="tilt", unit="mas")
+        truth = dashboard.store.run.shown.values(TRUTH, "vibration")[:, 1]
+        assert np.allclose(trace(dashboard, "vibration")[TRUTH], 103.132403 * envelope(truth, BINS), rtol=1e-6)
+        assert dashboard.traces.traces["vibration"].figure.yaxis.axis_label == "tilt [mas]"
+
+    def test_figures_share_their_time_axis(self, dashboard: Dashboard) -> None:
+        ranges = {id(t.figure.x_range) for t in dashboard.traces.traces.values()}
+        assert len(ranges) == 1
+        assert (dashboard.traces.x_range.start, dashboard.traces.x_range.end) == (0.0, 2.0)
+
+    def test_a_zoom_sends_the_samples_of_its_window(self, dashboard: Dashboard) -> None:
+        dashboard.traces.x_range.update(start=1.0, end=1.1)
+        data = trace(dashboard, "vibration")
+        step = np.diff(data["x"])
+        assert np.allclose(step, 1e-3), "every sample of it"
+        assert data["x"][0] == pytest.approx(0.975, abs=2e-3) and data["x"][-1] == pytest.approx(1.125, abs=3e-3)
+        first = round(data["x"][0] / 1e-3)
+        truth = dashboard.store.run.shown.values(TRUTH, "vibration")[first : first + data["x"].size, 0]
+        assert np.allclose(data[TRUTH], 1e3 * truth, rtol=1e-6)
+
+    def test_the_window_stays_through_a_change(self, dashboard: Dashboard, loop: Any) -> None:
+        dashboard.traces.zoom(0.2)
+        window = (dashboard.traces.x_range.start, dashboard.traces.x_range.end)
+        assert window == pytest.approx((0.9, 1.1))
+        dashboard.store.change("turbulence.wind_speed", 30)
+        loop.finish(dashboard.store)
+        assert (dashboard.traces.x_range.start, dashboard.traces.x_range.end) == window
+        dashboard.store.change("run.duration", 3)
+        loop.finish(dashboard.store)
+        assert (dashboard.traces.x_range.start, dashboard.traces.x_range.end) == (0.0, 3.0)
+        dashboard.traces.zoom(None)
+        assert dashboard.traces.x_range.reset_end == 3.0
+
+    def test_hidden_lines(self, dashboard: Dashboard) -> None:
+        dashboard.strips["vibration"].cards.hidden = ["kf-lgs"]
+        assert not dashboard.traces.traces["vibration"].lines["kf-lgs"].visible
+        assert not dashboard.spectra.spectra["vibration"].lines["kf-lgs"].visible
+        assert dashboard.traces.traces["turbulence"].lines["kf-lgs"].visible
+        dashboard.strips["vibration"].cards.hidden = []
+        assert dashboard.traces.traces["vibration"].lines["kf-lgs"].visible
+
+    def test_the_axis_leaves_out_the_warm_up(self, dashboard: Dashboard) -> None:
+        figure = dashboard.traces.traces["turbulence"].figure
+        data = trace(dashboard, "turbulence")
+        counted = np.concatenate([np.asarray(v)[data["x"] >= 0.5] for k, v in data.items() if k != "x"])
+        assert figure.y_range.start < np.nanmin(counted) < np.nanmax(counted) < figure.y_range.end
+
+
+class TestSpectra:
+    def test_signal_and_error(self, dashboard: Dashboard) -> None:
+        shown, view = dashboard.store.run.shown, dashboard.spectra.spectra["vibration"]
+        spectrum = shown.spectra["gpr-offline", "vibration"]
+        assert np.allclose(view.sources["gpr-offline"].data["y"], 1e6 * spectrum.signal[1:, 0])
+        truth = np.asarray(view.sources[TRUTH].data["y"])
+        dashboard.display.show = "error"
+        assert np.allclose(view.sources["gpr-offline"].data["y"], 1e6 * spectrum.error[1:, 0])
+        assert np.array_equal(view.sources[TRUTH].data["y"], truth), "the error of answering zero"
+
+    def test_unit(self, dashboard: Dashboard) -> None:
+        dashboard.display.unit = "um"
+        view = dashboard.spectra.spectra["vibration"]
+        assert np.allclose(
+            view.sources[TRUTH].data["y"], dashboard.store.run.shown.spectra[TRUTH, "vibration"].signal[1:, 0])
+        assert "µm²/Hz" in view.figure.yaxis.axis_label
+
+    def test_peaks_are_marked(self, dashboard: Dashboard, loop: Any) -> None:
+        view = dashboard.spectra.spectra["vibration"]
+        peaks = [p.frequency for p in dashboard.store.scenario.vibration.peaks]
+        assert view.peaks.data["x"] == peaks
+        assert view.model.data["x"] == [dashboard.store.scenario.kalman.frequency]
+        dashboard.store.change("vibration.cutoff", 20)
+        loop.finish(dashboard.store)
+        assert view.peaks.data["x"] == [f for f in peaks if f <= 20]
+        dashboard.store.change("vibration.source", "none")
+        loop.finish(dashboard.store)
+        assert view.peaks.data["x"] == []
+
+    def test_axes(self, dashboard: Dashboard) -> None:
+        assert dashboard.spectra.x_range.start == pytest.approx(0.667, abs=0.01)
+        assert dashboard.spectra.x_range.end == 500.0
+        for view in dashboard.spectra.spectra.values():
+            assert 0 < view.figure.y_range.start < view.figure.y_range.end
+
+
+class TestNumbers:
+    def test_the_table_shows_the_scores(self, dashboard: Dashboard) -> None:
+        html = dashboard.table.pane.object
+        for score in dashboard.store.run.shown.result.scores:
+            if score.mode == "tip":
+                assert number(1e3 * score.rms) in html
+        assert html.count("<tr data-observer") == sum(len(o.targets) for o in OBSERVERS.values())
+        assert "RMS error [nm]" in html and "Turbulence, tip" in html
+
+    def test_the_table_follows_mode_and_unit(self, dashboard: Dashboard) -> None:
+        dashboard.display.param.update(mode="tilt", unit="mas")
+        score = next(s for s in dashboard.store.run.shown.result.scores if s.mode == "tilt")
+        assert number(score.rms * per_micrometre("mas", 8.0)) in dashboard.table.pane.object
+        assert "RMS error [mas]" in dashboard.table.pane.object
+
+    def test_a_failure_is_named(self, dashboard: Dashboard, loop: Any) -> None:
+        dashboard.store.change("multirate.measurement_noise", "manual")
+        dashboard.store.change("multirate.ngs_noise", 0.5)
+        loop.finish(dashboard.store)
+        failures = dashboard.store.run.shown.result.failures
+        for failure in failures:
+            assert failure.observer in dashboard.table.pane.object
+
+    def test_cards(self, dashboard: Dashboard) -> None:
+        cards = {c["name"]: c for c in dashboard.strips["vibration"].cards.items}
+        score = next(s for s in dashboard.store.run.shown.result.scores
+                     if (s.observer, s.target, s.mode) == ("gpr-online", "vibration", "tip"))
+        assert cards["gpr-online"]["value"] == number(1e3 * score.rms) and cards["gpr-online"]["unit"] == "nm"
+        assert cards["gpr-online"]["colour"] == "#004B00"
+        assert cards[TRUTH]["value"] == number(1e3 * score.truth_rms)
+        assert "zero" not in cards
+
+    def test_before_the_first_result(self, make_store: Any, loop: Any, short: Any) -> None:
+        dashboard = Dashboard(loop.queue.put, short)
+        loop.closing.append(dashboard)
+        assert all(c["value"] == "–" for c in dashboard.strips["vibration"].cards.items)
+        assert dashboard.table.pane.object.count("–") > 20
+
+    @pytest.mark.parametrize(("value", "text"), [
+        (None, "–"), (0.0, "0"), (15.723, "15.7"), (406.4, "406"), (1234.5, "1234"), (0.0616, "0.0616"),
+        (-0.05, "−0.0500"), (2e-5, "2.00e-05"), (100.0, "100"),
+    ])
+    def test_number(self, value: float | None, text: str) -> None:
+        assert number(value) == text
+
+
+class TestLooks:
+    def test_every_observer_has_one(self) -> None:
+        assert set(OBSERVERS) <= set(LOOKS)
+        assert look("a-new-one").label == "a-new-one"
+
+    def test_lines_of_one_colour_differ_by_dash(self) -> None:
+        seen = [(it.light, it.dash) for it in LOOKS.values()]
+        assert len(seen) == len(set(seen))
+
+    def test_dark_mode(self, dashboard: Dashboard) -> None:
+        dashboard.display.dark = True
+        line = dashboard.traces.traces["vibration"].lines["gpr-online"]
+        assert line.glyph.line_color == LOOKS["gpr-online"].dark
+        assert LOOKS["gpr-online"].dark in dashboard.table.pane.object
+
+
+def test_tilt_on_sky() -> None:
+    assert per_micrometre("mas", 8.0) / 1e3 == pytest.approx(0.1031, abs=5e-5)
+    assert per_micrometre("nm", 8.0) == 1e3 and per_micrometre("um", 8.0) == 1.0

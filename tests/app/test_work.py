@@ -1,0 +1,83 @@
+"""What a run delivers on its way."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app import work
+from wfsobs.app.work import TRUTH, Shown, compute
+from wfsobs.scenario import Scenario
+from wfsobs.scores import scored_samples, welch_psd
+from wfsobs.watch import Cancelled
+
+
+def keys(shown: Shown) -> set[tuple[str, str]]:
+    return {(e.observer, e.target) for e in shown.result.estimates}
+
+
+@pytest.fixture
+def reports(monkeypatch: pytest.MonkeyPatch, short: Scenario) -> list[tuple[float, Shown | None]]:
+    """Everything that a run reports when nothing is held back, the final result last."""
+    monkeypatch.setattr(work, "INTERVAL", 0.0)
+    monkeypatch.setattr(work, "GROWTH_INTERVAL", 0.0)
+    out: list[tuple[float, Shown | None]] = []
+    final = compute(short, lambda: False, lambda fraction, shown: out.append((fraction, shown)))
+    return [*out, (1.0, final)]
+
+
+def test_observers_are_delivered_one_after_the_other(reports: Any) -> None:
+    grown = [keys(shown) for _, shown in reports if shown is not None]
+    assert all(before <= after for before, after in pairwise(grown))
+    assert len({len(k) for k in grown}) > 3
+    quick = next(i for i, k in enumerate(grown) if ("kf-lgs", "turbulence") in k)
+    assert ("gpr-online", "vibration") not in grown[quick]
+
+
+def test_the_online_gpr_grows(reports: Any) -> None:
+    key = ("gpr-online", "vibration")
+    known = [np.isfinite(s.partial[key]).sum() for _, s in reports if s is not None and key in s.partial]
+    assert len(known) >= 2 and known == sorted(known) and known[0] < known[-1]
+    final = reports[-1][1]
+    assert key not in final.partial and key in keys(final)
+    assert final.values(*key) is final.result.estimate(*key).values
+
+
+def test_progress_rises_to_one(reports: Any) -> None:
+    fractions = [fraction for fraction, _ in reports]
+    assert fractions[0] < 0.1 and fractions[-1] == 1.0
+    assert fractions == sorted(fractions)
+
+
+def test_deliveries_are_held_back(short: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work, "INTERVAL", 1000.0)
+    told: list[float] = []
+    compute(short, lambda: False, lambda fraction, shown: told.append(fraction))
+    assert told == []
+
+
+def test_spectra_are_of_what_is_scored(reports: Any) -> None:
+    final: Shown = reports[-1][1]
+    record, key = final.result.record, ("gpr-online", "vibration")
+    truth, values = final.values(TRUTH, "vibration"), final.values(*key)
+    assert truth is not None and values is not None
+    true, value = scored_samples(record, truth[:, 0], values[:, 0], final.scenario.run.warm_up)
+    frequency, density = welch_psd(value, record.dt)
+    assert np.array_equal(final.spectra[key].frequency, frequency)
+    assert np.allclose(final.spectra[key].signal[:, 0], density, rtol=1e-10)
+    assert np.allclose(final.spectra[key].error[:, 0], welch_psd(value - true, record.dt)[1], rtol=1e-10)
+    assert np.all(final.spectra[TRUTH, "vibration"].error == 0)
+
+
+def test_a_run_that_is_not_wanted_stops(short: Scenario) -> None:
+    with pytest.raises(Cancelled):
+        compute(short, lambda: True, lambda fraction, shown: None)
+
+
+def test_a_record_too_short_for_an_observer_says_so(short: Scenario) -> None:
+    scenario = short.replace({"run.duration": 0.2, "run.warm_up": 0.19, "gpr_online.training_size": 400})
+    shown = compute(scenario, lambda: False, lambda fraction, part: None)
+    assert ("gpr-online", "vibration") not in shown.spectra
