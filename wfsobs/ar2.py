@@ -8,10 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter, lfiltic
 
-Array = NDArray[np.float64]
+from wfsobs.arrays import Array
 
 
 def turbulence_corner(wind_speed: float, diameter: float, radial_order: int) -> float:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.signal import butter, sosfilt
 
-Array = NDArray[np.float64]
+from wfsobs.arrays import Array
 
 
 def bandpass_bank(frequencies: Sequence[float], bandwidth: float, order: int, dt: float) -> list[Array]:

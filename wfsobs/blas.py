@@ -11,13 +11,12 @@ triangles of symmetric matrices are read or written.
 from __future__ import annotations
 
 import ctypes
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cython_blas, cython_lapack
 
-Array = NDArray[np.float64]
+from wfsobs.arrays import Array
 
 _api = ctypes.pythonapi
 _name, _pointer = _api.PyCapsule_GetName, _api.PyCapsule_GetPointer
@@ -25,7 +24,7 @@ _name.restype, _name.argtypes = ctypes.c_char_p, [ctypes.py_object]
 _pointer.restype, _pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
 
 
-def _routine(module: object, name: str, n_arguments: int):  # noqa: ANN202
+def _routine(module: object, name: str, n_arguments: int):
     """A Fortran routine by name: every argument an address."""
     capsule = module.__pyx_capi__[name]  # type: ignore[attr-defined]
     return ctypes.CFUNCTYPE(None, *([ctypes.c_void_p] * n_arguments))(_pointer(capsule, _name(capsule)))
@@ -38,19 +37,19 @@ _syrk = _routine(cython_blas, "dsyrk", 10)
 _keep: list[ctypes._SimpleCData] = []  # what the addresses below point at
 
 
-@lru_cache(maxsize=None)
+@cache
 def _int(value: int) -> int:
     _keep.append(ctypes.c_int(value))
     return ctypes.addressof(_keep[-1])
 
 
-@lru_cache(maxsize=None)
+@cache
 def _real(value: float) -> int:
     _keep.append(ctypes.c_double(value))
     return ctypes.addressof(_keep[-1])
 
 
-@lru_cache(maxsize=None)
+@cache
 def _char(value: bytes) -> int:
     _keep.append(ctypes.c_char(value))
     return ctypes.addressof(_keep[-1])

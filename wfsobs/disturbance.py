@@ -10,13 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wfsobs.ar2 import Ar2, turbulence_corner
+from wfsobs.arrays import Array
 from wfsobs.scenario import Peak, Scenario
 from wfsobs.spectrum import bin_edges, bin_frequencies, random_phase_signal, resonance_power, table_power
 
-Array = NDArray[np.float64]
 Source = Callable[[Scenario, int, int, np.random.Generator], Array]
 """(scenario, mode index, number of steps, generator) -> one signal [um], shape (n_steps,)."""
 

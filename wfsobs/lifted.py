@@ -13,9 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from wfsobs.arrays import Array
 
 BLOCK = 48
 """Steps per block, about; the work per step grows with it, the number of blocks falls."""

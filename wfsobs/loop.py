@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from wfsobs.arrays import Array
 from wfsobs.disturbance import make_disturbance
 from wfsobs.record import Record, Training, delayed, frame_mean
 from wfsobs.scenario import Scenario
 from wfsobs.sensing import measure
 from wfsobs.watch import QUIET, Watch
-
-Array = NDArray[np.float64]
 
 TRAINING_MARGIN = 500
 """Steps that a training record has beyond its last window, so that the end of the zero-phase filter

@@ -6,9 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 
-import numpy as np
-from numpy.typing import NDArray
-
+from wfsobs.arrays import Array
 from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Observer
@@ -16,8 +14,6 @@ from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scores import Score, score
 from wfsobs.watch import QUIET, Watch
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from wfsobs.arrays import Array
+
 Step = tuple[Array, Array, Array, Array]
 """(A, C, Q, R) of one step: measure with C and R, then predict with A and Q."""
 
@@ -141,7 +141,10 @@ def _lyapunov_around(cycle: Sequence[Step], states: Sequence[SteadyState]) -> Ar
 
 
 def _closed_loop(cycle: Sequence[Step], states: Sequence[SteadyState]) -> Array:
-    return reduce(lambda F, one: (one[0][0] - one[1].K @ one[0][1]) @ F, zip(cycle, states, strict=True), np.eye(len(cycle[0][0])))
+    F = np.eye(len(cycle[0][0]))
+    for (A, C, _, _), state in zip(cycle, states, strict=True):
+        F = (A - state.K @ C) @ F
+    return F
 
 
 def lyapunov(F: Array, W: Array) -> Array:

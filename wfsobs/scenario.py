@@ -7,10 +7,12 @@ Large Telescopes". Wavefronts are Noll-normalised Zernike coefficients in microm
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import param
 
 from wfsobs.modes import TIP_TILT, Mode
-from wfsobs.settings import Group, Real, Reals, SettingError, Whole
+from wfsobs.settings import Group, Real, Reals, SettingError, Whole, section
 
 MICROMETRES = (0.0, 1000.0)
 
@@ -72,7 +74,7 @@ class Vibration(Group):
                   doc="Nothing above this frequency in an inverse DFT [Hz] (paper, section 2.4).")
     peaks = param.List([Peak()], item_type=Peak, bounds=(0, 100), label="Peaks",
                        doc="The lines of the spectrum.")
-    psd = param.ClassSelector(class_=PsdTable, label="PSD table", doc="The spectrum as a table, for source psd.")
+    psd = section(PsdTable, "PSD table", "The spectrum as a table, for source psd.")
 
 
 class Sensors(Group):
@@ -214,17 +216,17 @@ class Scenario(Group):
     wfsobs.settings.SettingError: turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s
     """
 
-    telescope = param.ClassSelector(class_=Telescope, label="Telescope")
-    turbulence = param.ClassSelector(class_=Turbulence, label="Turbulence")
-    vibration = param.ClassSelector(class_=Vibration, label="Vibration")
-    sensors = param.ClassSelector(class_=Sensors, label="Sensors")
-    loop = param.ClassSelector(class_=Loop, label="Loop")
-    kalman = param.ClassSelector(class_=Kalman, label="Kalman filters")
-    multirate = param.ClassSelector(class_=MultiRate, label="Multi-rate filter")
-    butterworth = param.ClassSelector(class_=Butterworth, label="Butterworth reference")
-    gpr_offline = param.ClassSelector(class_=OfflineGpr, label="Offline GPR")
-    gpr_online = param.ClassSelector(class_=OnlineGpr, label="Online GPR")
-    run = param.ClassSelector(class_=Run, label="Run")
+    telescope = section(Telescope, "Telescope")
+    turbulence = section(Turbulence, "Turbulence")
+    vibration = section(Vibration, "Vibration")
+    sensors = section(Sensors, "Sensors")
+    loop = section(Loop, "Loop")
+    kalman = section(Kalman, "Kalman filters")
+    multirate = section(MultiRate, "Multi-rate filter")
+    butterworth = section(Butterworth, "Butterworth reference")
+    gpr_offline = section(OfflineGpr, "Offline GPR")
+    gpr_online = section(OnlineGpr, "Online GPR")
+    run = section(Run, "Run")
 
     @property
     def modes(self) -> tuple[Mode, ...]:
@@ -263,8 +265,9 @@ class Scenario(Group):
     def _validate_psd(self) -> None:
         psd = self.vibration.psd
         f = psd.frequency
-        if len(f) < 2 or any(b <= a for a, b in zip(f, f[1:], strict=False)):
+        if len(f) < 2 or any(b <= a for a, b in pairwise(f)):
             raise SettingError("vibration.psd.frequency: needs at least two frequencies, increasing, for vibration.source = psd")
         for name in ("tip", "tilt"):
             if len(getattr(psd, name)) != len(f):
-                raise SettingError(f"vibration.psd.{name}: has {len(getattr(psd, name))} numbers, vibration.psd.frequency {len(f)}")
+                raise SettingError(f"vibration.psd.{name}: has {len(getattr(psd, name))} numbers, "
+                                   f"vibration.psd.frequency {len(f)}")

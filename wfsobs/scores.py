@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import welch
 
+from wfsobs.arrays import Array
 from wfsobs.observers.base import Estimate
 from wfsobs.record import Record
-
-Array = NDArray[np.float64]
 
 MAX_LAG = 0.025
 """Lags beyond this [s] are not looked for."""

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wfsobs.ar2 import Ar2, turbulence_corner
+from wfsobs.arrays import Array
 from wfsobs.disturbance import Disturbance
 from wfsobs.record import delayed, frame_mean
 from wfsobs.scenario import Scenario
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

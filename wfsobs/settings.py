@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Self
+from typing import Any, Self, TypeVar, cast
 
 import param
 
@@ -63,6 +63,9 @@ class Reals(param.List):
         for v in val:
             if not isinstance(v, float) or not low <= v <= high:
                 raise ValueError(f"{self.name} takes numbers from {low:g} to {high:g}, not {v!r}")
+
+
+G = TypeVar("G", bound="Group")
 
 
 class Group(param.Parameterized):
@@ -190,6 +193,11 @@ class Group(param.Parameterized):
                 yield f"{prefix}{name}", self, p
 
 
+def section(kind: type[G], label: str, doc: str = "") -> G:
+    """A setting that is a group of its own; each tree gets a fresh one."""
+    return cast(G, param.ClassSelector(class_=kind, label=label, doc=doc))
+
+
 def allowed(p: param.Parameter) -> str:
     """What a setting takes, as the end of a one-line message."""
     unit = f" {u}" if (u := unit_of(p)) else ""
@@ -251,7 +259,7 @@ def _groups(p: param.List, value: Any, path: str) -> list[Group]:
             out.append(made)
         else:
             raise SettingError(f"{path}.{i} = {_short(item)}: takes a table of settings")
-    low, high = p.bounds or (0, None)
+    _, high = p.bounds or (0, None)
     if high is not None and len(out) > high:
         raise SettingError(f"{path}: {len(out)} entries, at most {high} are allowed")
     return out

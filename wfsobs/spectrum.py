@@ -7,9 +7,9 @@ variance.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from wfsobs.arrays import Array
 
 
 def bin_frequencies(n: int, dt: float) -> Array:

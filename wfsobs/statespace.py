@@ -15,12 +15,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from wfsobs.ar2 import Ar2
-
-Array = NDArray[np.float64]
+from wfsobs.arrays import Array
 
 MIN_MODEL_DAMPING = 1e-4
 """Damping floor of a modelled process: a line of damping 0 would put an estimator pole on the unit circle."""

@@ -58,7 +58,7 @@ def _number(same: Sequence[Row], key: str, scale: float, digits: int) -> str:
     return f"{median(values):.{digits}f}" if values else "-"
 
 
-def _order(rows: Sequence[Row]):  # noqa: ANN202
+def _order(rows: Sequence[Row]):
     """Turbulence before vibration, modes as they come, best observer first."""
     modes = list(dict.fromkeys(r["mode"] for r in rows))
 

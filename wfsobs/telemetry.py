@@ -8,17 +8,16 @@ and training_open_loop_y (n, n_modes). A saved record also holds its scenario as
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from wfsobs.arrays import Array
 from wfsobs.files import write_whole
 from wfsobs.record import Record, RecordError, Training
 from wfsobs.scenario import Scenario
-
-Array = NDArray[np.float64]
 
 SAME_SHAPE = ("u", "y_ngs", "turbulence", "vibration", "open_loop_y")
 
@@ -36,7 +35,7 @@ def save_record(path: str | Path, record: Record, scenario_toml: str | None = No
     save_arrays(path, arrays)
 
 
-def save_arrays(path: str | Path, arrays: Mapping[str, NDArray]) -> None:
+def save_arrays(path: str | Path, arrays: Mapping[str, Array]) -> None:
     """Write named arrays as a compressed `.npz`. Raises OSError."""
     write_whole(path, lambda file: np.savez_compressed(file, allow_pickle=False, **dict(arrays)))
 
@@ -68,20 +67,24 @@ def load_record(path: str | Path, scenario: Scenario | None = None) -> Record:
     return Record(y_lgs=y_lgs, dt=_number(arrays, "dt", where), ratio=ratio, training=training, **same)
 
 
-def _read(path: str | Path) -> dict[str, NDArray]:
+def _read(path: str | Path) -> dict[str, Array]:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if not isinstance(file, np.lib.npyio.NpzFile):
-                raise RecordError(f"{path}: is a single array; a record is an .npz with y_lgs, u and dt")
-            return {name: file[name] for name in file.files}
+        with open(path, "rb") as file:
+            if not zipfile.is_zipfile(file):
+                raise RecordError(f"{path}: not an .npz file; a record is an .npz with y_lgs, u and dt")
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in arrays.files}
     except OSError as error:
         raise RecordError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except (ValueError, EOFError, zipfile.BadZipFile, KeyError):
-        raise RecordError(f"{path}: not an .npz file of plain arrays") from None
+    except RecordError:
+        raise
+    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError):
+        raise RecordError(f"{path}: damaged, or holds more than plain arrays") from None
 
 
 def _signal(
-    arrays: Mapping[str, NDArray], name: str, where: str, shape: tuple[int | None, ...] = (None, None), nan: bool = False
+    arrays: Mapping[str, Array], name: str, where: str, shape: tuple[int | None, ...] = (None, None), nan: bool = False
 ) -> Array:
     raw = arrays[name]
     if raw.dtype.kind not in "fiu":
@@ -97,14 +100,14 @@ def _signal(
     return out
 
 
-def _number(arrays: Mapping[str, NDArray], name: str, where: str) -> float:
+def _number(arrays: Mapping[str, Array], name: str, where: str) -> float:
     raw = arrays[name]
     if raw.ndim != 0 or raw.dtype.kind not in "fiu" or not np.isfinite(raw) or raw <= 0:
         raise RecordError(f"{where}: {name} takes one number above 0, not {np.array2string(raw, threshold=4)}")
     return float(raw)
 
 
-def _ratio(arrays: Mapping[str, NDArray], where: str) -> int:
+def _ratio(arrays: Mapping[str, Array], where: str) -> int:
     if "ratio" not in arrays:
         raise RecordError(f"{where}: y_ngs needs ratio, the number of fast steps per NGS frame")
     value = _number(arrays, "ratio", where)
@@ -117,7 +120,8 @@ def _frames(y_ngs: Array, ratio: int, where: str) -> Array:
     """Check that frames are where the ratio says, at k = n, 2n, ...; a frame at k = 0 saw nothing and is dropped."""
     steps = np.arange(y_ngs.shape[0])
     due = (steps % ratio == 0) & (steps >= ratio)
-    wrong = (np.isnan(y_ngs).any(axis=1) == due) & (steps > 0)
+    empty = np.isnan(y_ngs)
+    wrong = np.where(due, empty.any(axis=1), ~empty.all(axis=1)) & (steps > 0)
     if wrong.any():
         k = int(np.argmax(wrong))
         raise RecordError(f"{where}: y_ngs {'lacks the' if due[k] else 'has a'} frame at step {k}; with ratio = {ratio} "

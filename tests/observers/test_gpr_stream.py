@@ -110,8 +110,10 @@ def test_extremes_of_the_settings(length_scale, signal_std, noise_std, m, depth)
     ):
         try:
             got = run()[steps]
-        except ConditionError as error:
-            assert condition > 1e12, error  # the limit is 1e13; a decade for the accuracy of estimating it
+        except ConditionError:
+            got = None
+        if got is None:
+            assert condition > 1e12  # the limit is 1e13; a decade for the accuracy of estimating it
         else:
             assert np.abs(got - expected).max() <= factor * bound
 

@@ -9,14 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from wfsobs.arrays import Array
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.watch import Watch
-
-Array = NDArray[np.float64]
 
 TURBULENCE, VIBRATION = "turbulence", "vibration"
 TARGETS = (TURBULENCE, VIBRATION)

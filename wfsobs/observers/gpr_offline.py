@@ -14,18 +14,24 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from wfsobs.arrays import Array
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.gpr_online import kernel_of, window_signals
-from wfsobs.observers.kernels import Points, SquaredExponential, band, check_condition, sliding_products, square_from_band, squared_norms
+from wfsobs.observers.kernels import (
+    Points,
+    SquaredExponential,
+    band,
+    check_condition,
+    sliding_products,
+    square_from_band,
+    squared_norms,
+)
 from wfsobs.observers.reference import open_loop_reference
 from wfsobs.record import Record, RecordError, Training, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.watch import QUIET, Watch
-
-Array = NDArray[np.float64]
 
 ROWS = 256
 """Steps predicted at a time."""

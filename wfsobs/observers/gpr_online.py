@@ -10,8 +10,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from numpy.typing import NDArray
 
+from wfsobs.arrays import Array
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.kernels import SquaredExponential, band, check_condition, square_from_band
 from wfsobs.observers.reference import online_reference
@@ -19,8 +19,6 @@ from wfsobs.observers.sliding import finish, run_lengths, slide
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import OfflineGpr, OnlineGpr, Scenario
 from wfsobs.watch import QUIET, Watch
-
-Array = NDArray[np.float64]
 
 BAND_ENTRIES = 4_000_000
 """Covariances kept at a time (32 MB)."""

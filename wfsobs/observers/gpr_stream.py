@@ -20,15 +20,13 @@ number, for any length of stream: a replaced point takes its error with it, so n
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.blas import dsymv, dsyr2
 
+from wfsobs.arrays import Array
 from wfsobs.bandpass import StreamingBank, bandpass_bank
 from wfsobs.observers.gpr_online import kernel_of
 from wfsobs.observers.kernels import ConditionError, Points, SquaredExponential, restart_interval
 from wfsobs.scenario import Scenario
-
-Array = NDArray[np.float64]
 
 
 class SlidingRegression:

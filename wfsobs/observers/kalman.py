@@ -9,9 +9,9 @@ y up to k - 1. Here phi_hat[k] uses y[k] too, like the GPR. The mirror's part is
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wfsobs.ar2 import Ar2, turbulence_corner
+from wfsobs.arrays import Array
 from wfsobs.disturbance import vibration_variance
 from wfsobs.lifted import PeriodicFilter
 from wfsobs.observers.base import TARGETS
@@ -20,8 +20,6 @@ from wfsobs.riccati import SteadyState, steady_state
 from wfsobs.scenario import Scenario
 from wfsobs.statespace import MIN_MODEL_DAMPING, DisturbanceModel, disturbance_model
 from wfsobs.watch import Watch
-
-Array = NDArray[np.float64]
 
 MIN_NOISE = 1e-6
 """Floor of a modelled measurement noise [um]: a filter for perfect measurements has no Riccati solution."""

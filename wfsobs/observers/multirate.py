@@ -14,8 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from wfsobs.arrays import Array
 from wfsobs.lifted import PeriodicFilter
 from wfsobs.observers.base import TARGETS, TURBULENCE
 from wfsobs.observers.kalman import by_target, filter_step, kalman_model, measurement_noise
@@ -25,8 +25,6 @@ from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 from wfsobs.statespace import DisturbanceModel
 from wfsobs.watch import Watch
-
-Array = NDArray[np.float64]
 
 
 def multirate_noise(scenario: Scenario) -> tuple[float, float]:

@@ -13,10 +13,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from wfsobs.ar2 import Ar2
+from wfsobs.arrays import Array
 from wfsobs.lifted import PeriodicFilter
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman import by_target, filter_step, kalman_model
@@ -27,8 +27,6 @@ from wfsobs.scenario import Scenario
 from wfsobs.sensing import low_frequency_process
 from wfsobs.statespace import DisturbanceModel
 from wfsobs.watch import Watch
-
-Array = NDArray[np.float64]
 
 
 def optimal_cycle(
@@ -67,7 +65,7 @@ def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[MultiRateFilter, 
     """
     states = periodic_steady_state(cycle)
     steps = [filter_step(A, C, s.L, outputs) for (A, C, _, _), s in zip(cycle, states, strict=True)]
-    A, C, Q, R = cycle[-1]
+    A, C, _, R = cycle[-1]
     alone = C * [[1.0], [0.0]]
     L = np.linalg.solve(alone @ states[-1].P @ alone.T + R, alone @ states[-1].P).T
     return MultiRateFilter(filter_step(A, alone, L, outputs), PeriodicFilter(steps)), states

@@ -8,15 +8,13 @@ causal, so its estimate of step k is what the filter gives at step k.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from wfsobs.arrays import Array
 from wfsobs.bandpass import bandpass_bank, filter_causal, filter_zero_phase
 from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.watch import Watch
-
-Array = NDArray[np.float64]
 
 
 def open_loop_reference(scenario: Scenario, open_loop_y: Array, dt: float) -> Array:

@@ -19,9 +19,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from wfsobs.arrays import Array
 from wfsobs.blas import eliminate
-
-Array = NDArray[np.float64]
 
 LEAF = 8
 """Runs of this many steps are finished together."""

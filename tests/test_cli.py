@@ -1,0 +1,136 @@
+"""The command line as a person types it."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import wfsobs
+from wfsobs import configfile
+from wfsobs.cli import main
+from wfsobs.observers import OBSERVERS
+from wfsobs.presets import paper
+
+QUICK = ["--set", "run.duration=2", "--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=50"]
+KEYS = {"observer", "target", "mode", "rms_um", "truth_rms_um", "normalised_rms", "lag_s", "seed"}
+SHORT = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50}
+
+
+def call(*arguments):
+    return CliRunner().invoke(main, arguments, catch_exceptions=False)
+
+
+def test_json_is_nothing_but_the_rows_of_the_library():
+    result = call("run", "--preset", "ut4", *QUICK, "--seeds", "2", "--set", "run.seed=4", "--json")
+    assert result.exit_code == 0
+    rows = json.loads(result.stdout, parse_constant=pytest.fail)
+    assert {frozenset(row) for row in rows} == {frozenset(KEYS)}
+    assert sorted({row["seed"] for row in rows}) == [4, 5]
+    expected = wfsobs.run(configfile.preset("ut4").replace(SHORT | {"run.seed": 5}))
+    got = [(r["observer"], r["target"], r["mode"], r["rms_um"], r["truth_rms_um"]) for r in rows if r["seed"] == 5]
+    assert got == [(s.observer, s.target, s.mode, s.rms, s.truth_rms) for s in expected.scores]
+
+
+def test_table_names_every_observer():
+    result = call("run", *QUICK)
+    assert result.exit_code == 0
+    for observer in OBSERVERS.values():
+        assert observer.label in result.stdout
+    assert "nan" not in result.stdout
+
+
+def test_a_saved_record_gives_the_same_numbers(tmp_path):
+    record, estimates = tmp_path / "r.npz", tmp_path / "e.npz"
+    first = call("run", *QUICK, "--json", "--save", str(record))
+    second = call("observe", str(record), *QUICK, "--json", "--out", str(estimates))
+    assert second.exit_code == 0
+    without_seed = [[{k: v for k, v in row.items() if k != "seed"} for row in json.loads(r.stdout)] for r in (first, second)]
+    assert without_seed[0] == without_seed[1]
+    with np.load(estimates, allow_pickle=False) as file:
+        keys = {f"{o.id}/{t}" for o in OBSERVERS.values() for t in o.targets}
+        assert set(file.files) == keys
+        assert {file[k].shape for k in keys} == {(2000, 2)}
+
+
+def test_observers_that_lack_something_are_left_out_with_a_line(tmp_path):
+    simulated = wfsobs.simulate(paper().replace(SHORT))
+    np.savez(tmp_path / "bare.npz", y_lgs=simulated.y_lgs, u=simulated.u, dt=simulated.dt)
+    result = call("observe", str(tmp_path / "bare.npz"), *QUICK, "--out", str(tmp_path / "e.npz"))
+    assert result.exit_code == 0
+    assert "kf-ngs left out: the record has no y_ngs, ratio" in result.stderr
+    assert "butterworth-ol left out: the record has no open_loop_y" in result.stderr
+    assert "gpr-offline left out: the record has no training" in result.stderr
+    assert "no scores: the record has no truth" in result.stderr
+    assert json.loads(call("observe", str(tmp_path / "bare.npz"), *QUICK, "--json").stdout) == []
+    with np.load(tmp_path / "e.npz") as file:
+        assert "gpr-online/vibration" in file.files
+        assert "kf-ngs/turbulence" not in file.files
+
+
+def test_the_record_overrides_the_scenario(tmp_path):
+    """A record at 500 Hz with a frame every 4 steps is scored as such, whatever the preset says."""
+    scenario = paper().replace(SHORT | {"sensors.lgs_rate": 500.0, "sensors.exposure_ratio": 4})
+    configfile.save(scenario, tmp_path / "s.toml")
+    path = str(tmp_path / "r.npz")
+    first = call("run", "--config", str(tmp_path / "s.toml"), "--json", "--save", path)
+    second = call("observe", path, *QUICK, "--json")
+    assert [r["rms_um"] for r in json.loads(second.stdout)] == [r["rms_um"] for r in json.loads(first.stdout)]
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["run", "--set", "turbulence.wind_speed=200"], "turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s"),
+    (["run", "--set", "turbulence.wind=2"], "turbulence.wind: no such setting"),
+    (["run", "--set", "wind"], "--set wind: takes name=value"),
+    (["run", "--preset", "nope"], "preset = 'nope': takes one of paper, ut4"),
+    (["run", "--config", "none.toml"], "none.toml: cannot be read"),
+    (["run", "--set", "run.warm_up=10"], "run.warm_up = 10: must be below run.duration"),
+    (["run", "--seeds", "2", "--save", "x.npz"], "--save: saves one record"),
+    (["run", *QUICK, "--save", "no/such/folder/x.npz"], "no/such/folder"),
+    (["observe", "none.npz"], "none.npz: cannot be read"),
+    (["presets", "nope"], "preset = 'nope'"),
+])
+def test_errors_are_one_line_and_status_2(arguments, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = call(*arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert result.stdout == ""
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unstable_multirate_cycle_leaves_only_that_observer_out():
+    weights = ("measurement_noise=manual", "lgs_noise=0.04", "ngs_noise=0.001")
+    result = call("run", *QUICK, *(x for w in weights for x in ("--set", f"multirate.{w}")), "--json")
+    assert result.exit_code == 0
+    assert "multirate left out: multi-rate filter: the cycle of 5 steps is unstable" in result.stderr
+    assert "LGS noise 40 nm and NGS noise 1 nm" in result.stderr
+    assert "multirate" not in {row["observer"] for row in json.loads(result.stdout)}
+
+
+def test_presets_lists_and_prints():
+    listing = call("presets").stdout
+    assert listing.startswith("paper ")
+    assert "\nut4 " in listing
+    assert configfile.from_toml(call("presets", "ut4").stdout) == configfile.preset("ut4")
+
+
+def test_as_a_program():
+    done = subprocess.run([sys.executable, "-m", "wfsobs", "run", "--set", "run.seed=-1"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "wfsobs: run.seed = -1: takes a whole number from 0 to 4294967295\n"
+
+
+def test_the_core_needs_numpy_scipy_and_param_alone():
+    code = (
+        "import sys\n"
+        "for name in ('panel', 'bokeh', 'holoviews', 'click', 'rich', 'tomli_w', 'matplotlib', 'pandas', 'threadpoolctl'):\n"
+        "    sys.modules[name] = None\n"
+        "import wfsobs\n"
+        "s = wfsobs.PRESETS['paper']().replace({'run.duration': 2.0, 'gpr_online.training_size': 20})\n"
+        "assert len(wfsobs.run(s).scores) > 10\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
