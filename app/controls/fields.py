@@ -59,8 +59,7 @@ class Field:
     def __init__(self, store: Store, path: str, p: param.Parameter):
         self.store, self.path, self.parameter = store, path, p
         self.widgets = self._widgets()
-        self._error = pn.pane.HTML("", visible=False, sizing_mode="stretch_width", margin=(0, 0, 6, 0))
-        self.view = pn.Column(self._row(), self._error, sizing_mode="stretch_width", margin=0)
+        self.view = pn.Column(self._row(), sizing_mode="stretch_width", margin=0)
         self._value: Any = None
         self.refresh()
         store.param.watch(self.refresh, ["scenario", "errors"])
@@ -70,7 +69,9 @@ class Field:
         reason = self.store.errors.get(self.path, "")
         if not reason:
             self.show(self.store.value(self.path))
-        self._error.param.update(object=error_html(reason), visible=bool(reason))
+        if reason or len(self.view) > 1:
+            note = [pn.pane.HTML(error_html(reason), margin=(0, 0, 6, 0))] if reason else []
+            self.view[1:] = note
         for widget in self.widgets:
             if "error_state" in widget.param:
                 widget.error_state = bool(reason)

@@ -4,21 +4,45 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import param
 import pytest
 
 from wfsobs.app.controls.fields import SliderField, label_of, parsed, written_unit
 from wfsobs.app.controls.panel import FIRST, Controls, status_html
 from wfsobs.app.controls.peaks import PATH
-from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.work import Shown
+from wfsobs.pipeline import Result
 from wfsobs.presets import PRESETS
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+
+
+def nothing(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
+    """An empty result, at once."""
+    record = Record(y_lgs=np.zeros((8, 2)), u=np.zeros((8, 2)), dt=1e-3)
+    return Shown(Result(scenario, record, (), ()))
 
 
 @pytest.fixture
-def controls(dashboard: Dashboard) -> Controls:
-    """The drawer with every topic open."""
-    dashboard.controls.accordion.active = list(range(len(dashboard.controls.topics)))
-    return dashboard.controls
+def controls(make_store: Any, loop: Any) -> Controls:
+    """The drawer over a store whose first run is done."""
+    store = make_store(nothing)
+    controls = Controls(store)
+    controls.view()
+    store.start()
+    loop.finish(store)
+    return controls
+
+
+def open_all(controls: Controls) -> None:
+    controls.accordion.active = list(range(len(controls.topics)))
+
+
+def field_of(controls: Controls, path: str) -> Any:
+    """The field of a setting, its topic opened."""
+    controls.open_topic(path.partition(".")[0])
+    return controls.fields[path]
 
 
 def release(slider: Any, value: float) -> None:
@@ -28,11 +52,11 @@ def release(slider: Any, value: float) -> None:
 
 
 def error_of(controls: Controls, path: str) -> str:
-    pane = controls.fields[path]._error
-    return pane.object if pane.visible else ""
+    return "".join(pane.object for pane in controls.fields[path].view[1:])
 
 
 def test_every_setting_has_one_field(controls: Controls) -> None:
+    open_all(controls)
     settings = [path for path, _, _ in controls.store.scenario.walk() if not path.startswith(PATH)]
     assert sorted(controls.fields) == sorted(settings)
     assert controls.peaks is not None
@@ -40,10 +64,10 @@ def test_every_setting_has_one_field(controls: Controls) -> None:
 
 
 def test_labels_come_from_the_settings(controls: Controls) -> None:
-    field = controls.fields["turbulence.wind_speed"]
+    field = field_of(controls, "turbulence.wind_speed")
     assert label_of(field.parameter) == "Wind speed V₀ [m/s]" == field.widgets[0].label
     assert field.widgets[0].description == field.parameter.doc
-    assert label_of(controls.fields["sensors.lgs_noise"].parameter) == "LGS noise [µm]"
+    assert label_of(field_of(controls, "sensors.lgs_noise").parameter) == "LGS noise [µm]"
     assert written_unit("um^2/Hz") == "µm²/Hz"
 
 
@@ -52,8 +76,7 @@ def test_what_matters_most_stands_first(controls: Controls) -> None:
     assert list(controls.topics)[:3] == ["vibration", "gpr_offline", "gpr_online"]
 
 
-def test_topics_are_filled_when_opened(dashboard: Dashboard) -> None:
-    controls = dashboard.controls
+def test_topics_are_filled_when_opened(controls: Controls) -> None:
     assert "loop.gain" not in controls.fields
     controls.accordion.active = [*controls.accordion.active, list(controls.topics).index("loop")]
     assert "loop.gain" in controls.fields
@@ -61,7 +84,7 @@ def test_topics_are_filled_when_opened(dashboard: Dashboard) -> None:
 
 def test_a_slider_that_is_let_go_runs(controls: Controls, loop: Any) -> None:
     before = controls.store.run.shown
-    field = controls.fields["turbulence.wind_speed"]
+    field = field_of(controls, "turbulence.wind_speed")
     release(field.widgets[0], 22.0)
     assert controls.store.scenario.turbulence.wind_speed == 22.0
     assert field.widgets[1].value == "22", "the typed number follows"
@@ -71,12 +94,12 @@ def test_a_slider_that_is_let_go_runs(controls: Controls, loop: Any) -> None:
 
 
 def test_a_slider_under_way_does_not_run(controls: Controls) -> None:
-    controls.fields["turbulence.wind_speed"].widgets[0].value = 22.0
+    field_of(controls, "turbulence.wind_speed").widgets[0].value = 22.0
     assert controls.store.scenario.turbulence.wind_speed == 15.0
 
 
 def test_a_slider_let_go_where_it_once_was_runs(controls: Controls, loop: Any) -> None:
-    slider = controls.fields["turbulence.wind_speed"].widgets[0]
+    slider = field_of(controls, "turbulence.wind_speed").widgets[0]
     release(slider, 22.0)
     controls.store.change("turbulence.wind_speed", 15)
     release(slider, 22.0)
@@ -85,7 +108,7 @@ def test_a_slider_let_go_where_it_once_was_runs(controls: Controls, loop: Any) -
 
 
 def test_a_whole_number_stays_whole(controls: Controls, loop: Any) -> None:
-    release(controls.fields["sensors.exposure_ratio"].widgets[0], 8)
+    release(field_of(controls, "sensors.exposure_ratio").widgets[0], 8)
     assert controls.store.scenario.sensors.exposure_ratio == 8
     loop.finish(controls.store)
 
@@ -95,7 +118,7 @@ def test_a_whole_number_stays_whole(controls: Controls, loop: Any) -> None:
     ("butterworth.frequencies", "20, 30; 40", [20.0, 30.0, 40.0]), ("telescope.diameter", "39", 39.0),
 ])
 def test_a_typed_value_runs(controls: Controls, loop: Any, path: str, text: str, value: Any) -> None:
-    controls.fields[path].widgets[-1].value = text
+    field_of(controls, path).widgets[-1].value = text
     assert controls.store.value(path) == value and error_of(controls, path) == ""
     loop.finish(controls.store)
     assert controls.store.run.shown.scenario == controls.store.scenario
@@ -109,7 +132,7 @@ def test_a_typed_value_runs(controls: Controls, loop: Any, path: str, text: str,
 ])
 def test_a_bad_value_shows_beside_its_setting(controls: Controls, path: str, text: str, says: str) -> None:
     shown, scenario = controls.store.run.shown, controls.store.scenario
-    field = controls.fields[path]
+    field = field_of(controls, path)
     field.widgets[-1].value = text
     assert says in error_of(controls, path)
     assert field.widgets[-1].error_state and field.widgets[-1].value == text, "what was typed stays, to be corrected"
@@ -119,7 +142,7 @@ def test_a_bad_value_shows_beside_its_setting(controls: Controls, path: str, tex
 
 def test_correcting_a_bad_value_clears_the_message(controls: Controls, loop: Any) -> None:
     path = "turbulence.wind_speed"
-    text = controls.fields[path].widgets[-1]
+    text = field_of(controls, path).widgets[-1]
     text.value = "200"
     text.value = "20"
     assert error_of(controls, path) == "" and not text.error_state
@@ -130,7 +153,7 @@ def test_correcting_a_bad_value_clears_the_message(controls: Controls, loop: Any
 
 
 def test_a_slider_grows_to_hold_a_typed_value(controls: Controls, loop: Any) -> None:
-    field = controls.fields["turbulence.wind_speed"]
+    field = field_of(controls, "turbulence.wind_speed")
     field.widgets[-1].value = "80"
     assert field.widgets[0].end == 80.0 and field.widgets[0].value == 80.0
     controls.store.change("turbulence.wind_speed", 10)
@@ -139,8 +162,8 @@ def test_a_slider_grows_to_hold_a_typed_value(controls: Controls, loop: Any) -> 
 
 
 def test_choices_and_switches_run(controls: Controls, loop: Any) -> None:
-    controls.fields["kalman.process_noise"].widgets[0].value = "matched"
-    controls.fields["loop.closed"].widgets[0].value = False
+    field_of(controls, "kalman.process_noise").widgets[0].value = "matched"
+    field_of(controls, "loop.closed").widgets[0].value = False
     assert controls.store.scenario.kalman.process_noise == "matched"
     assert controls.store.scenario.loop.closed is False
     loop.finish(controls.store)
@@ -148,6 +171,7 @@ def test_choices_and_switches_run(controls: Controls, loop: Any) -> None:
 
 
 def test_every_widget_follows_the_store(controls: Controls, loop: Any) -> None:
+    open_all(controls)
     controls.store.load(PRESETS["ut4"]().replace({"run.duration": 2.0, "run.warm_up": 0.5, "loop.closed": False}))
     controls.store.run.cancel()
     for path, field in controls.fields.items():
@@ -210,12 +234,13 @@ class TestPeaks:
     ])
     def test_edit_in_place(self, controls: Controls, loop: Any, key: str, text: str, expected: float) -> None:
         assert controls.peaks is not None
-        before = controls.store.run.shown.result.scores
+        before = controls.store.run.shown
         controls.peaks.table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
         assert controls.store.value(f"{PATH}.2.{key}") == expected
         assert controls.peaks.table.errors == {}
         loop.finish(controls.store)
-        assert controls.store.run.shown.result.scores != before
+        assert controls.store.run.shown is not before
+        assert controls.store.run.shown.scenario == controls.store.scenario
 
     @pytest.mark.parametrize(("key", "text", "says"), [
         ("frequency", "-3", "from 0.01"), ("frequency", "600", "half the LGS rate"), ("damping", "two", "a number"),
