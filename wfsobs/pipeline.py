@@ -89,16 +89,30 @@ def each_estimate(
     weights = {o.id: o.weight for o in chosen}
     total = sum(weights.values()) or 1.0
     done = 0.0
+    progress = _only_forward(watch.progress)
     for observer in sorted(chosen, key=lambda o: o.weight):
         base, share = done / total, weights[observer.id] / total
         inner = Watch(
-            progress=lambda f, base=base, share=share: watch.progress(base + share * f),
+            progress=lambda f, base=base, share=share: progress(base + share * f),
             cancelled=watch.cancelled,
             partial=lambda target, values, o=observer: on_partial(o.id, target, values) if on_partial else None,
         )
         yield from _one(observer, record, scenario, inner)
         done += weights[observer.id]
-        watch.step(done / total)
+        watch.check()
+        progress(done / total)
+
+
+def _only_forward(tell: Callable[[float], None]) -> Callable[[float], None]:
+    """Progress that never falls back, where two modes of an observer each tell their own."""
+    highest = 0.0
+
+    def told(fraction: float) -> None:
+        nonlocal highest
+        highest = max(highest, fraction)
+        tell(highest)
+
+    return told
 
 
 def _one(observer: Observer, record: Record, scenario: Scenario, watch: Watch) -> list[Estimate | Failure]:

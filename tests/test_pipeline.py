@@ -1,0 +1,160 @@
+"""From settings to scores: order, failures, progress, cancelling, what a record states."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs import PRESETS, Record, Scenario, SettingError, observe, run, simulate
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Estimate
+from wfsobs.pipeline import Failure, as_stated, each_estimate
+from wfsobs.watch import Cancelled, Watch
+
+
+def scenario(changes: dict[str, Any] | None = None) -> Scenario:
+    base = PRESETS["paper"]()
+    base.update({
+        "run": {"duration": 0.8, "warm_up": 0.3}, "gpr_offline": {"training_size": 60, "depth": 25},
+        "gpr_online": {"training_size": 60, "depth": 25},
+    })
+    return base.replace(changes or {})
+
+
+def test_results_come_in_the_order_of_the_registry() -> None:
+    backwards = list(OBSERVERS)[::-1]
+    result = run(scenario(), observers=backwards)
+    assert not result.failures
+    order = list(OBSERVERS)
+    pairs = [(e.observer, e.target) for e in result.estimates]
+    assert pairs == [(name, target) for name in order for target in sorted(OBSERVERS[name].targets)]
+    rows = [(*pair, mode) for pair in pairs for mode in ("tip", "tilt")]
+    assert [(s.observer, s.target, s.mode) for s in result.scores] == rows
+    found = result.estimate("kf-lgs", "vibration")
+    assert found is not None and found.values.shape == result.record.y_lgs.shape and found.seconds_per_step > 0
+    assert result.estimate("kf-ngs", "vibration") is None
+
+
+def test_scores_are_those_of_the_estimates() -> None:
+    result = run(scenario(), observers=["kf-lgs", "butterworth-ol"])
+    for s in result.scores:
+        e, truth = result.estimate(s.observer, s.target), result.record.truth(s.target)
+        assert e is not None and truth is not None
+        mode = ("tip", "tilt").index(s.mode)
+        error = (e.values - truth)[300:, mode]
+        assert s.rms == pytest.approx(np.sqrt(np.nanmean(error**2)), rel=1e-12)
+
+
+def test_same_seed_same_result_and_a_subset_is_part_of_it() -> None:
+    one, same = run(scenario()), run(scenario())
+    some = run(scenario(), observers=["gpr-online", "multirate"])
+    for e in one.estimates:
+        twin = same.estimate(e.observer, e.target)
+        assert twin is not None and np.array_equal(e.values, twin.values, equal_nan=True)
+        if (part := some.estimate(e.observer, e.target)) is not None:
+            assert np.array_equal(e.values, part.values, equal_nan=True)
+    assert {e.observer for e in some.estimates} == {"gpr-online", "multirate"}
+    other = run(scenario({"run.seed": 9}), observers=["kf-lgs"]).estimate("kf-lgs", "vibration")
+    mine = one.estimate("kf-lgs", "vibration")
+    assert other is not None and mine is not None and not np.array_equal(other.values, mine.values)
+
+
+@pytest.mark.parametrize(("missing", "left_out"), [
+    ({"y_ngs": None, "ratio": None}, ["kf-ngs", "multirate", "multirate-optimal"]),
+    ({"open_loop_y": None}, ["butterworth-ol"]),
+    ({"training": None}, ["gpr-offline"]),
+])
+def test_what_a_record_lacks_is_one_line_per_observer(missing: dict[str, None], left_out: list[str]) -> None:
+    record = replace(simulate(scenario()), **missing)
+    result = observe(record, scenario())
+    assert [f.observer for f in result.failures] == left_out
+    for failure in result.failures:
+        assert failure.reason.startswith(f"{failure.observer} left out:") and "\n" not in failure.reason
+        assert all(name in failure.reason for name in missing if name in OBSERVERS[failure.observer].needs)
+    assert {e.observer for e in result.estimates} == set(OBSERVERS) - set(left_out)
+
+
+def test_a_record_without_truth_has_estimates_and_no_scores() -> None:
+    record = replace(simulate(scenario()), turbulence=None, vibration=None)
+    result = observe(record, scenario(), observers=["kf-lgs", "zero"])
+    assert len(result.estimates) == 4 and result.scores == ()
+
+
+def test_a_single_mode_record() -> None:
+    whole = simulate(scenario())
+    assert whole.y_ngs is not None and whole.turbulence is not None and whole.training is not None
+    t = whole.training
+    assert t.open_loop_y is not None and whole.open_loop_y is not None and whole.vibration is not None
+    record = Record(
+        whole.y_lgs[:, :1], whole.u[:, :1], whole.dt, whole.y_ngs[:, :1], whole.ratio, whole.turbulence[:, :1],
+        whole.vibration[:, :1], whole.open_loop_y[:, :1], type(t)(t.y_lgs[:, :1], t.u[:, :1], t.open_loop_y[:, :1]),
+    )
+    one, both = observe(record, scenario()), observe(whole, scenario())
+    assert not one.failures and {s.mode for s in one.scores} == {"tip"}
+    for e in one.estimates:
+        twin = both.estimate(e.observer, e.target)
+        assert twin is not None
+        assert np.allclose(e.values[:, 0], twin.values[:, 0], rtol=1e-9, atol=1e-12, equal_nan=True)
+
+
+def test_quick_ones_first_and_progress_only_forward() -> None:
+    s = scenario()
+    told: list[float] = []
+    partial: list[tuple[str, str]] = []
+    watch = Watch(progress=told.append)
+    items = list(each_estimate(simulate(s), s, watch, None, lambda o, t, _values: partial.append((o, t))))
+    names = [item.observer for item in items]
+    weights = [OBSERVERS[name].weight for name in names]
+    assert weights == sorted(weights) and names[-1] == "gpr-online"
+    assert told == sorted(told) and 0.0 <= told[0] and told[-1] == pytest.approx(1.0)
+    assert set(partial) == {("gpr-online", "vibration")}
+    assert all(isinstance(item, Estimate) for item in items)
+
+
+@pytest.mark.parametrize("after", [0, 1, 3, 7, 20])
+def test_cancelling_stops_the_work(after: int) -> None:
+    s = scenario({"run.duration": 2.0})
+    asked: list[bool] = []
+
+    def cancelled() -> bool:
+        asked.append(True)
+        return len(asked) > after
+
+    with pytest.raises(Cancelled):
+        run(s, Watch(cancelled=cancelled))
+    # both modes of a GPR may ask once more before they see that the other has stopped
+    assert len(asked) <= after + 3
+
+
+def test_the_record_overrides_the_scenario_where_it_states_something() -> None:
+    made = simulate(scenario({"sensors.lgs_rate": 500.0, "sensors.exposure_ratio": 3}))
+    stated = as_stated(made, scenario())
+    assert (stated.sensors.lgs_rate, stated.sensors.exposure_ratio) == (500.0, 3)
+    assert stated.difference(scenario()) == {"sensors": {"lgs_rate": 500.0, "exposure_ratio": 3}}
+    result = observe(made, scenario(), observers=["kf-ngs", "kf-lgs"])
+    assert result.scenario == stated
+    right = observe(made, stated, observers=["kf-ngs", "kf-lgs"])
+    for one, other in zip(result.estimates, right.estimates, strict=True):
+        assert np.array_equal(one.values, other.values, equal_nan=True)
+    own = scenario()
+    assert as_stated(simulate(own), own) is own
+    without_ngs = replace(made, y_ngs=None, ratio=None)
+    assert as_stated(without_ngs, scenario()).sensors.exposure_ratio == scenario().sensors.exposure_ratio
+
+
+def test_a_record_too_slow_for_the_settings_is_refused() -> None:
+    made = simulate(scenario())
+    slow = replace(made, dt=1 / 90)
+    with pytest.raises(SettingError, match="45 Hz"):
+        observe(slow, scenario())
+
+
+def test_an_observer_that_cannot_work_is_left_out_with_its_reason() -> None:
+    s = scenario({"gpr_online.training_size": 2000, "multirate.measurement_noise": "manual",
+                  "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001})
+    result = run(s)
+    assert [f.observer for f in result.failures] == ["multirate", "gpr-online"]
+    assert all(isinstance(f, Failure) and "\n" not in f.reason and len(f.reason) < 250 for f in result.failures)

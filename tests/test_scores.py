@@ -1,0 +1,190 @@
+"""Errors, lags and spectra of signals whose errors, lags and spectra are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from wfsobs.ar2 import Ar2
+from wfsobs.observers.base import Estimate
+from wfsobs.record import Record
+from wfsobs.scores import cumulative_rms, lag, rms, score, scored_samples, welch_psd
+
+NAMES = ["tip", "tilt"]
+
+
+def record(turbulence: np.ndarray | None = None, vibration: np.ndarray | None = None, n: int = 1000) -> Record:
+    return Record(np.zeros((n, 2)), np.zeros((n, 2)), 1e-3, turbulence=turbulence, vibration=vibration)
+
+
+def test_rms_keeps_the_mean() -> None:
+    assert rms(np.array([3.0, 4.0, 3.0, 4.0])) == pytest.approx(np.sqrt(12.5))
+    assert rms(np.full(10, -2.0)) == 2.0
+    assert rms(np.zeros(0)) == 0.0
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(st.integers(0, 2**31), st.floats(-6, 3), st.floats(0.0, 0.5), st.integers(0, 300))
+def test_scores_of_a_known_error(seed: int, log_scale: float, warm_up: float, unknown: int) -> None:
+    """Truth plus noise; the warm-up and the steps without an estimate are left out, and nothing else."""
+    rng = np.random.default_rng(seed)
+    truth = 10**log_scale * rng.standard_normal((1000, 2))
+    values = truth + 10**log_scale * 0.3 * rng.standard_normal((1000, 2))
+    start = round(warm_up * 1000)
+    values[:unknown] = np.nan
+    values[700:705, 1] = np.nan
+    wild = truth.copy()
+    wild[:start] = 1e9  # whatever the warm-up holds
+    found = score(record(vibration=wild), Estimate("x", "vibration", values, 2e-6), warm_up, NAMES)
+    assert [s.mode for s in found] == NAMES
+    for mode, s in enumerate(found):
+        known = [k for k in range(1000) if k >= start and not np.isnan(values[k, mode])]
+        error = np.sqrt(sum((values[k, mode] - truth[k, mode]) ** 2 for k in known) / len(known))
+        size = np.sqrt(sum(truth[k, mode] ** 2 for k in known) / len(known))
+        assert s.rms == pytest.approx(error, rel=1e-12) and s.truth_rms == pytest.approx(size, rel=1e-12)
+        assert s.normalised_rms == pytest.approx(error / size, rel=1e-12)
+        assert (s.observer, s.target, s.seconds_per_step) == ("x", "vibration", 2e-6)
+        assert s.lag == pytest.approx(0.0, abs=1e-4)  # white noise at 0.3: the peak of the correlation is at zero
+
+
+def test_no_truth_no_score_and_zero_truth_no_ratio() -> None:
+    estimate = Estimate("x", "vibration", np.ones((1000, 2)), 0.0)
+    assert score(record(turbulence=np.ones((1000, 2))), estimate, 0.0, NAMES) == []
+    found = score(record(vibration=np.zeros((1000, 2))), estimate, 0.0, NAMES)
+    assert [(s.rms, s.truth_rms, s.normalised_rms, s.lag) for s in found] == [(1.0, 0.0, None, None)] * 2
+
+
+def test_nothing_left_to_score_gives_no_row() -> None:
+    values = np.full((1000, 2), np.nan)
+    values[:100, 0] = 1.0
+    values[:, 1] = 0.0
+    found = score(record(vibration=np.ones((1000, 2))), Estimate("x", "vibration", values, 0.0), 0.5, NAMES)
+    assert [s.mode for s in found] == ["tilt"]
+    assert score(record(vibration=np.ones((1000, 2))), Estimate("x", "vibration", values, 0.0), 5.0, NAMES) == []
+
+
+def test_an_answer_of_zero_scores_one() -> None:
+    truth = np.random.default_rng(0).standard_normal((1000, 2))
+    found = score(record(vibration=truth), Estimate("zero", "vibration", np.zeros((1000, 2)), 0.0), 0.1, NAMES)
+    assert [s.normalised_rms for s in found] == [1.0, 1.0] and [s.lag for s in found] == [None, None]
+
+
+def test_scored_samples_are_pairs() -> None:
+    truth, value = np.arange(10.0), np.array([0, 1, np.nan, 3, 4, np.nan, 6, 7, 8, 9.0])
+    one, other = scored_samples(record(n=10), truth, value, 0.002)
+    assert one.tolist() == other.tolist() == [3, 4, 6, 7, 8, 9]
+
+
+# ---------------------------------------------------------------------- lag
+
+
+def shifted(delay: float, n: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A band-limited periodic signal and itself `delay` samples later, exactly (a phase ramp on its DFT)."""
+    rng = np.random.default_rng(seed)
+    f = np.fft.rfftfreq(n)
+    spectrum = np.exp(-((f / 0.05) ** 2)) * (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size))
+    spectrum[0] = 0.0
+    return np.fft.irfft(spectrum, n), np.fft.irfft(spectrum * np.exp(-2j * np.pi * f * delay), n)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.floats(-20.0, 20.0), st.floats(-5, -2), st.integers(0, 50))
+def test_lag_of_a_signal_delayed_by_part_of_a_sample(delay: float, log_dt: float, seed: int) -> None:
+    """Positive is late. The signal is exactly the same elsewhere, so the correlation is 1 there; the parabola is off by
+    its fourth derivative, some 1 / 6^2 of a sample for a correlation 6 samples wide."""
+    dt = 10**log_dt
+    truth, value = shifted(delay, seed=seed)
+    found = lag(truth, value, dt)
+    reach = round(0.025 / dt)
+    if abs(delay) < reach - 1:
+        assert found is not None and abs(found / dt - delay) < 0.01
+    else:  # not looked for beyond 25 ms
+        assert found is not None and abs(found) <= (reach + 0.5) * dt
+
+
+@pytest.mark.parametrize("delay", [-0.4, -0.25, 0.0, 0.1, 0.25, 0.49])
+def test_lag_of_a_sine_is_the_parabola_through_a_cosine(delay: float) -> None:
+    """Through three points of cos(w (j - delay)) the parabola has its top at tan(w delay) / (2 tan(w / 2))."""
+    w = 2 * np.pi * 47.0 * 1e-3
+    t = np.arange(40_000)
+    found = lag(np.cos(w * t), np.cos(w * (t - delay)), 1e-3)
+    # a long record: pieces that are not whole periods count for 1 / (w n) = 1e-4
+    assert found == pytest.approx(np.tan(w * delay) / (2 * np.tan(w / 2)) * 1e-3, abs=1e-3 * 1e-3)
+
+
+def test_lag_does_not_see_scale_offset_or_noise() -> None:
+    truth, value = shifted(3.0)
+    noisy = 7.0 + 0.01 * value + 0.003 * truth.std() * np.random.default_rng(1).standard_normal(truth.size)
+    # noise of 0.3 in 4000 samples moves a peak 6 samples wide by 0.3 * 6 / sqrt(4000 / 6) or less: 0.07
+    assert lag(truth - 5.0, noisy, 1e-3) == pytest.approx(3e-3, abs=1.5e-4)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_lag_of_slow_turbulence_in_a_short_record(seed: int) -> None:
+    """9 s of turbulence, 3 samples late, alone and with the noise of a sensor. A plain cross-correlation, which loses
+    terms at the ends, says 1.4 +- 1 here."""
+    rng = np.random.default_rng(seed)
+    x = Ar2(7.0686, 0.9, 0.5, 1e-3).sample(9003, rng)
+    truth, value = x[3:], x[:-3]
+    assert lag(truth, value, 1e-3) == pytest.approx(3e-3, abs=1e-6)
+    noisy = 0.8 * value + 0.014 * rng.standard_normal(value.size)
+    # spread found over 60 seeds: 0.04 samples; 4.5 of it
+    assert lag(truth, noisy, 1e-3) == pytest.approx(3e-3, abs=1.8e-4)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_lag_of_next_to_nothing(n: int) -> None:
+    rising = np.arange(float(n))
+    found = lag(rising, rising, 1e-3)
+    assert found is None if n == 1 else found == pytest.approx(0.0, abs=1e-3)
+    assert lag(np.ones(n), rising, 1e-3) is None and lag(rising, np.ones(n), 1e-3) is None
+
+
+# ---------------------------------------------------------------------- spectra
+
+
+@pytest.mark.parametrize("n", [2000, 10_000, 60_001])
+def test_welch_integrates_to_the_variance(n: int) -> None:
+    """White noise, and AR(2) vibration slow against nothing: the mean of the windows' variances is the variance."""
+    rng = np.random.default_rng(1)
+    x = np.column_stack([rng.standard_normal(n), Ar2(298.4, 0.03, 0.02, 1e-3).sample(n, rng)])
+    f, density = welch_psd(x, 1e-3)
+    assert f[1] - f[0] == pytest.approx(0.5) and f[-1] == pytest.approx(500.0)
+    assert density.shape == (f.size, 2)
+    # Hann windows weigh the ends of the record less: the variance of 2 s pieces, spread sqrt(2 / dof), 4.5 of it
+    for column, dof in ((0, n / 2), (1, 2 * np.pi * 47.5 * 0.03 * n * 1e-3)):
+        power = density[:, column].sum() * 0.5
+        assert abs(power / np.var(x[:, column]) - 1) < 4.5 * np.sqrt(2 / dof) * (0.3 if n > 3000 else 1.0)
+
+
+def test_welch_follows_the_closed_form() -> None:
+    p = Ar2(298.4, 0.1, 0.02, 1e-3)
+    f, density = welch_psd(p.sample(200_000, np.random.default_rng(2))[:, None], 1e-3)
+    ratio = density[2:-2, 0] / p.psd(f[2:-2])
+    # 199 half-overlapping windows are worth 105 independent ones: a spread of 1 / sqrt(105) per bin
+    assert abs(ratio.mean() - 1) < 4.5 / np.sqrt(105 * ratio.size / 1.5)
+    assert 0.7 / np.sqrt(105) < ratio.std() < 1.4 / np.sqrt(105)
+
+
+def test_a_tone_has_its_power_at_its_frequency() -> None:
+    t = np.arange(8000) * 1e-3
+    f, density = welch_psd((0.1 * np.sqrt(2) * np.sin(2 * np.pi * 40.0 * t))[:, None], 1e-3)
+    assert f[np.argmax(density[:, 0])] == 40.0
+    assert density[:, 0].sum() * 0.5 == pytest.approx(0.01, rel=1e-6)
+
+
+@pytest.mark.parametrize("n", [2, 10, 999])
+def test_a_record_shorter_than_a_window_is_one_window(n: int) -> None:
+    f, density = welch_psd(np.random.default_rng(0).standard_normal((n, 2)), 1e-3)
+    assert f.size == n // 2 + 1 == len(density) and np.isfinite(density).all()
+
+
+def test_cumulative_rms_counts_from_high_to_low() -> None:
+    f = np.arange(5) * 0.5
+    density = np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 8.0], [4.0, 0.0], [5.0, 0.0]])
+    got = cumulative_rms(f, density)
+    wanted = [[np.sqrt(0.5 * density[k:, c].sum()) for c in range(2)] for k in range(5)]
+    assert np.allclose(got, wanted, rtol=1e-14)
+    assert (np.diff(got, axis=0) <= 0).all()
