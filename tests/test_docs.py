@@ -1,0 +1,174 @@
+"""The pages tell the truth: links, code paths, commands, and the settings page."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import importlib.util
+import io
+import re
+import shlex
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from click.testing import CliRunner
+
+from wfsobs import configfile
+from wfsobs.cli import main
+from wfsobs.observers import OBSERVERS
+from wfsobs.scenario import Scenario
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+SHORT = ("--set", "run.duration=2", "--set", "run.warm_up=0.5")
+MADE_LATER = {ROOT / "docs" / "screenshot.png"}
+
+
+def script(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / "scripts" / f"{name}.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+
+
+def prose(page: Path) -> str:
+    return re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+
+
+def anchors(page: Path) -> set[str]:
+    heads = re.findall(r"^#+ (.*)$", prose(page), flags=re.M)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in heads}
+
+
+def test_settings_page_is_what_the_script_gives() -> None:
+    assert script("settings_table").page() == (ROOT / "docs" / "settings.md").read_text(encoding="utf-8"), \
+        "run: python docs/scripts/settings_table.py"
+
+
+def test_settings_page_names_every_setting() -> None:
+    page = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
+    missing = [path for path, *_ in Scenario().walk() if f"`{re.sub(r'[.]0[.]', '.N.', path)}`" not in page]
+    assert not missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_relative_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)]+)\)", prose(page)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        file = (page.parent / name).resolve() if name else page
+        assert file.exists() or file in MADE_LATER, target
+        assert not anchor or anchor in anchors(file), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_code_paths_exist(page: Path) -> None:
+    for path, name in re.findall(r"`((?:wfsobs|tests|docs)/[\w/.]*)(?::([\w.]+))?`", prose(page)):
+        file = ROOT / path
+        assert file.exists(), path
+        if name:
+            assert name in names_of(file), f"{path}:{name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_named_tests_exist(page: Path) -> None:
+    """A test in brackets after a module, `tests/x.py` (`test_y`), is in that module."""
+    for path, name in re.findall(r"`(tests/[\w/]+\.py)` \(`(test_\w+)`\)", prose(page)):
+        assert name in names_of(ROOT / path), f"{path}: {name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_named_settings_exist(page: Path) -> None:
+    paths = {path for path, *_ in Scenario().walk()}
+    groups = {path.split(".")[0] for path in paths}
+    for path in re.findall(r"`([a-z_]+(?:\.[a-z_0-9N]+)+)`", prose(page)):
+        if path.split(".")[0] in groups and not path.endswith(".py"):
+            assert path.replace(".N.", ".0.") in paths | {"vibration.peaks"}, path
+
+
+def names_of(file: Path) -> set[str]:
+    """Top-level names of a module, and Class.member."""
+    out: set[str] = set()
+    for node in ast.parse(file.read_text(encoding="utf-8")).body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            out.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            out |= {f"{node.name}.{inner.name}" for inner in node.body if isinstance(inner, ast.FunctionDef)}
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+        out |= {t.id for t in targets if isinstance(t, ast.Name)}
+    return out
+
+
+def test_readme_lists_the_observers() -> None:
+    rows = re.findall(r"^\| `([\w-]+)` \| ([^|]+?) \| ([^|]+?) \|", prose(README), flags=re.M)
+    here = {(id_, name, targets) for id_, name, targets in rows if id_ in OBSERVERS}
+    assert here == {(o.id, o.label, ", ".join(o.targets)) for o in OBSERVERS.values()}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every line of a ```sh block that starts with wfsobs, in order, in one folder, on short records."""
+    monkeypatch.chdir(tmp_path)
+    for line in "".join(blocks(page, "sh")).splitlines():
+        words = shlex.split(line)
+        if words[0] != "wfsobs":
+            continue
+        words, out = (words[:-2], words[-1]) if ">" in words else (words, None)
+        if "--seeds" in words:
+            words[words.index("--seeds") + 1] = "2"
+        result = CliRunner().invoke(main, [*words[1:], *(SHORT if words[1] in ("run", "observe") else ())])
+        assert result.exit_code == 0, (line, result.output)
+        if out:
+            Path(out).write_text(result.stdout, encoding="utf-8")
+
+
+def test_readme_output_is_real() -> None:
+    """The errors and truths in the table under `wfsobs run` are those of that command."""
+    def table(text: str) -> list[list[str]]:
+        return [[cell.strip() for cell in line.strip("│").split("│")][:5] for line in text.splitlines() if line.startswith("│")]
+
+    printed = table(blocks(README, "text")[0])
+    assert len(printed) > 10
+    assert sorted(table(CliRunner().invoke(main, ["run"]).stdout)) == sorted(printed)
+
+
+def test_readme_python_and_toml() -> None:
+    said = io.StringIO()
+    for code in blocks(README, "python"):
+        with contextlib.redirect_stdout(said):
+            exec(compile(code, "README.md", "exec"), {})
+    assert "gpr-online vibration tip" in said.getvalue()
+    for text in blocks(README, "toml"):
+        assert configfile.from_toml(text).sensors.lgs_count == 4
+
+
+def test_readme_texts_are_what_the_program_says() -> None:
+    listed, refused = blocks(README, "text")[1:]
+    assert CliRunner().invoke(main, ["presets"]).stdout == listed
+    result = CliRunner().invoke(main, ["run", "--set", "turbulence.wind_speed=200"])
+    assert result.exit_code == 2 and result.stderr == refused
+
+
+def test_cone_effect_is_the_number_of_the_presets() -> None:
+    cone = script("cone_effect")
+    assert cone.cone_error(8.0)[0] == pytest.approx(49.4, abs=0.05)
+    assert cone.cone_error(10.0)[0] == pytest.approx(62.0, abs=0.05)
+    assert cone.integral_nm2(lambda k: cone.tip(k, cone.DIAMETER) ** 2) ** 0.5 == pytest.approx(529.3, abs=0.05)
+
+
+def test_model_page_prints_what_the_script_prints(capsys: pytest.CaptureFixture[str]) -> None:
+    source = ROOT / "docs" / "scripts" / "cone_effect.py"
+    exec(compile(source.read_text(encoding="utf-8"), str(source), "exec"), {"__name__": "__main__"})
+    page = (ROOT / "docs" / "model.md").read_text(encoding="utf-8")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines
+    for line in lines:
+        assert line in page
