@@ -133,8 +133,9 @@ def bench(full: bool, as_json: bool) -> None:
         click.echo(json.dumps(measured, allow_nan=False))
         return
     console = Console()
-    table = benches.bench_table(measured, benches.machine(benches.LIBRARIES), markdown=not console.is_terminal)
+    table = benches.bench_table(measured, markdown=not console.is_terminal)
     (console if console.is_terminal else Console(width=200)).print(table)
+    click.echo(benches.machine(benches.LIBRARIES))
 
 
 @main.command()

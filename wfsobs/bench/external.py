@@ -8,11 +8,9 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from wfsobs.arrays import Array
 from wfsobs.observers.kernels import SquaredExponential
-
-Array = NDArray[np.float64]
 
 SKLEARN, FILTERPY, STATSMODELS = "scikit-learn", "filterpy", "statsmodels"
 LIBRARIES = {SKLEARN: "sklearn", FILTERPY: "filterpy", STATSMODELS: "statsmodels"}
@@ -30,7 +28,8 @@ def sklearn_regressor(kernel: SquaredExponential) -> Any:
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel  # pyright: ignore[reportMissingImports]
 
     covariance = ConstantKernel(kernel.variance, "fixed") * RBF(kernel.length_scale, "fixed")
-    return GaussianProcessRegressor(covariance, alpha=kernel.noise_std**2, optimizer=None)
+    keep: Any = None  # no optimizer, which its annotation does not know of
+    return GaussianProcessRegressor(covariance, alpha=kernel.noise_std**2, optimizer=keep)
 
 
 def sklearn_online(X: Array, f: Array, rows: Array, m: int, kernel: SquaredExponential) -> Array:

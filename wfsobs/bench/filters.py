@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from wfsobs.arrays import Array
 from wfsobs.bench import external, textbook
 from wfsobs.bench.external import FILTERPY, STATSMODELS
 from wfsobs.bench.measure import OURS, Row, max_error, row, timed
@@ -18,8 +18,6 @@ from wfsobs.observers.multirate import multirate_filter, multirate_noise
 from wfsobs.record import pseudo_open_loop
 from wfsobs.riccati import steady_state
 from wfsobs.statespace import paper_matrices
-
-Array = NDArray[np.float64]
 
 EXACT_STEPS = 3000
 """Steps compared with the textbook's loop in extended precision."""

@@ -8,8 +8,8 @@ from statistics import median
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 
+from wfsobs.arrays import Array
 from wfsobs.bench import external, textbook
 from wfsobs.bench.external import SKLEARN
 from wfsobs.bench.measure import OURS, Row, max_error, row, timed
@@ -24,8 +24,6 @@ from wfsobs.observers.reference import online_reference
 from wfsobs.record import Record, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.watch import QUIET
-
-Array = NDArray[np.float64]
 
 ENOUGH_FOR_P999 = 1000
 """Steps below which a 99.9th percentile says nothing."""

@@ -13,11 +13,10 @@ from time import perf_counter
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from rich import box
 from rich.table import Table
 
-Array = NDArray[np.float64]
 Row = dict[str, Any]
 """One measurement:
 
@@ -110,9 +109,9 @@ def _processor() -> str:
     return names[0] if names else platform.machine()
 
 
-def bench_table(rows: Sequence[Row], caption: str, markdown: bool = False) -> Table:
+def bench_table(rows: Sequence[Row], markdown: bool = False) -> Table:
     """The rows for people; `markdown` draws the table as Markdown does."""
-    table = Table(caption=caption, box=box.MARKDOWN if markdown else box.HEAVY_HEAD)
+    table = Table(box=box.MARKDOWN if markdown else box.HEAVY_HEAD)
     memory = any(r["peak_memory_mb"] is not None for r in rows)
     for name in ("Task", "Size", "Variant"):
         table.add_column(name, no_wrap=True)

@@ -14,12 +14,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from wfsobs.arrays import Array
 from wfsobs.observers.kernels import SquaredExponential
-
-Array = NDArray[np.float64]
 
 BLOCK = 256
 """Windows predicted at a time, so that the covariances stay in the cache."""
