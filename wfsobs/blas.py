@@ -11,6 +11,7 @@ triangles of symmetric matrices are read or written.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -55,12 +56,23 @@ def _char(value: bytes) -> int:
     return ctypes.addressof(_keep[-1])
 
 
-def eliminate(S: Array, n: int) -> None:
+PANEL = 256
+"""Columns eliminated at a time: the same work as all at once, with a moment to stop in between."""
+
+
+def eliminate(S: Array, n: int, check: Callable[[], None]) -> None:
     """Eliminate the first `n` rows and columns of the symmetric S (N, N), in place.
 
-    The lower triangle of S[n:, n:] becomes the Schur complement S22 - S21 S11^-1 S12; the first n columns are used
-    up. Raises numpy.linalg.LinAlgError where S11 is not positive definite.
+    With S11 = L L', the lower triangle of S[n:, n:] becomes the Schur complement S22 - S21 S11^-1 S12, and the first n
+    columns become L over S21 L'^-1. check: called between pieces of work; what it raises ends the work.
+    Raises numpy.linalg.LinAlgError where S11 is not positive definite.
     """
+    for done in range(0, n, PANEL):
+        check()
+        _eliminate_panel(S[done:, done:], min(PANEL, n - done))
+
+
+def _eliminate_panel(S: Array, n: int) -> None:
     size = S.shape[0]
     lead, here, item = _int(S.strides[1] // S.itemsize), S.ctypes.data, S.itemsize
     below, corner = here + n * item, here + n * (S.strides[1] + item)

@@ -15,6 +15,7 @@ from wfsobs.ar2 import Ar2, turbulence_corner
 from wfsobs.arrays import Array
 from wfsobs.scenario import Peak, Scenario
 from wfsobs.spectrum import bin_edges, bin_frequencies, random_phase_signal, resonance_power, table_power
+from wfsobs.watch import QUIET, Watch
 
 Source = Callable[[Scenario, int, int, np.random.Generator], Array]
 """(scenario, mode index, number of steps, generator) -> one signal [um], shape (n_steps,)."""
@@ -36,19 +37,24 @@ class Disturbance:
         return self.turbulence + self.vibration
 
 
-def make_disturbance(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> Disturbance:
+def make_disturbance(
+    scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch = QUIET
+) -> Disturbance:
     """Both disturbances over `n_steps`. Every source and mode has a random stream of its own, so
     changing one setting leaves the others' numbers as they were."""
     turbulence_rng, vibration_rng = rng.spawn(2)
     return Disturbance(
-        _columns(TURBULENCE[scenario.turbulence.source], scenario, n_steps, turbulence_rng),
-        _columns(VIBRATION[scenario.vibration.source], scenario, n_steps, vibration_rng),
+        _columns(TURBULENCE[scenario.turbulence.source], scenario, n_steps, turbulence_rng, watch),
+        _columns(VIBRATION[scenario.vibration.source], scenario, n_steps, vibration_rng, watch),
     )
 
 
-def _columns(source: Source, scenario: Scenario, n_steps: int, rng: np.random.Generator) -> Array:
-    streams = rng.spawn(len(scenario.modes))
-    return np.column_stack([source(scenario, mode, n_steps, stream) for mode, stream in enumerate(streams)])
+def _columns(source: Source, scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch) -> Array:
+    columns = []
+    for mode, stream in enumerate(rng.spawn(len(scenario.modes))):
+        watch.check()
+        columns.append(source(scenario, mode, n_steps, stream))
+    return np.column_stack(columns)
 
 
 def turbulence_process(scenario: Scenario, mode: int, dt: float) -> Ar2:

@@ -43,10 +43,8 @@ def simulate(scenario: Scenario, rng: np.random.Generator | None = None, watch: 
 
 def _run(scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch) -> Record:
     disturbance_rng, sensor_rng = rng.spawn(2)
-    watch.check()
-    disturbance = make_disturbance(scenario, n_steps, disturbance_rng)
-    watch.check()
-    seen = measure(scenario, disturbance, sensor_rng)
+    disturbance = make_disturbance(scenario, n_steps, disturbance_rng, watch)
+    seen = measure(scenario, disturbance, sensor_rng, watch)
     watch.check()
     u = np.zeros_like(seen.lgs)
     if scenario.loop.closed:

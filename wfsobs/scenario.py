@@ -14,8 +14,6 @@ import param
 from wfsobs.modes import TIP_TILT, Mode
 from wfsobs.settings import Group, Real, Reals, SettingError, Whole, section
 
-MICROMETRES = (0.0, 1000.0)
-
 PAPER_PEAK_HZ = 47.4969
 """The dominant natural frequency of VLT UT4 (paper, Table 2)."""
 

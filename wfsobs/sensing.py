@@ -11,6 +11,7 @@ from wfsobs.arrays import Array
 from wfsobs.disturbance import Disturbance
 from wfsobs.record import delayed, frame_mean
 from wfsobs.scenario import Scenario
+from wfsobs.watch import QUIET, Watch
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,9 @@ class OpenLoop:
     ngs: Array
 
 
-def measure(scenario: Scenario, disturbance: Disturbance, rng: np.random.Generator) -> OpenLoop:
+def measure(
+    scenario: Scenario, disturbance: Disturbance, rng: np.random.Generator, watch: Watch = QUIET
+) -> OpenLoop:
     """LGS at every step, NGS at every n-th, both of the wavefront up to the step before.
 
     LGS: the mean over the guide stars of phi_dist[k-1] + low-frequency error + noise (paper, eq. 4),
@@ -32,7 +35,7 @@ def measure(scenario: Scenario, disturbance: Disturbance, rng: np.random.Generat
     lgs_rng, ngs_rng = rng.spawn(2)
     n_steps, n_modes = disturbance.total.shape
     seen = disturbance.vibration if scenario.sensors.tip_tilt_indetermination else disturbance.total
-    errors = [_lgs_error(scenario, n_steps, n_modes, stream) for stream in lgs_rng.spawn(scenario.sensors.lgs_count)]
+    errors = [_lgs_error(scenario, n_steps, n_modes, stream, watch) for stream in lgs_rng.spawn(scenario.sensors.lgs_count)]
     lgs = delayed(seen, 1) + np.mean(errors, axis=0)
 
     n = scenario.sensors.exposure_ratio
@@ -43,12 +46,13 @@ def measure(scenario: Scenario, disturbance: Disturbance, rng: np.random.Generat
     return OpenLoop(lgs, ngs)
 
 
-def _lgs_error(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.Generator) -> Array:
+def _lgs_error(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.Generator, watch: Watch) -> Array:
     """Error of one guide star [um], (n_steps, n_modes): white noise plus a slow AR(2) with the corner
     of the turbulence, since the part of the beam it misses moves with the same wind."""
     noise_rng, slow_rng = rng.spawn(2)
     out = scenario.sensors.lgs_noise * noise_rng.standard_normal((n_steps, n_modes))
     for mode, stream in enumerate(slow_rng.spawn(n_modes)):
+        watch.check()
         process = low_frequency_process(scenario, mode)
         out[:, mode] += process.sample(n_steps, stream)
     return out

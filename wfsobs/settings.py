@@ -77,11 +77,13 @@ class Group(param.Parameterized):
     """
 
     def __init__(self, **values: Any):
-        for name, p in self.param.objects("existing").items():
-            if isinstance(p, param.ClassSelector) and not isinstance(p, param.List) and name not in values:
-                values[name] = p.class_()
-            elif isinstance(p, param.List) and name not in values:
+        for name, p in self.settings().items():
+            if name in values:
+                continue
+            if isinstance(p, param.List):
                 values[name] = [v.copy() if isinstance(v, Group) else v for v in p.default or []]
+            elif isinstance(p, param.ClassSelector):
+                values[name] = cast(type[Group], p.class_)()
         super().__init__(**values)
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -203,7 +205,7 @@ def allowed(p: param.Parameter) -> str:
     unit = f" {u}" if (u := unit_of(p)) else ""
     if isinstance(p, Reals):
         low, high = p.item_bounds
-        shortest, longest = p.bounds
+        shortest, longest = p.bounds or (0, 0)
         return f"takes a list of {shortest:g} to {longest:g} numbers from {low:g} to {high:g}{unit}"
     if isinstance(p, param.Selector):
         return f"takes one of {', '.join(map(str, p.objects))}"
@@ -254,7 +256,7 @@ def _groups(p: param.List, value: Any, path: str) -> list[Group]:
         if isinstance(item, Group):
             out.append(item.copy())
         elif isinstance(item, Mapping):
-            made = p.item_type()
+            made = cast(type[Group], p.item_type)()
             made.update(item, f"{path}.{i}.")
             out.append(made)
         else:

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import solve_triangular
 
 from wfsobs.arrays import Array
+from wfsobs.blas import eliminate
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.gpr_online import kernel_of, window_signals
 from wfsobs.observers.kernels import (
@@ -53,7 +54,7 @@ class TrainedGpr:
         """Mean at every step of signals (n, channels), (n,); NaN before the first full window."""
         n, m, d = signals.shape[0], self.weights.size, self.depth
         out = np.full(n, np.nan)
-        tests = self.kernel.points(np.maximum(squared_norms(signals, d), 0.0))
+        tests = self.kernel.points(squared_norms(signals, d))
         for start in range(d - 1, n, ROWS):
             watch.step(start / n)
             rows = min(ROWS, n - start)
@@ -80,10 +81,12 @@ def train(
     V, points = band(signals, depth, kernel, first, m, m - 1)
     points = Points(*(p[:m] for p in points))
     watch.check()
-    S = np.array(square_from_band(V, 0, m), order="F")
-    check_condition(S, kernel)
-    factor = cho_factor(S, lower=True, overwrite_a=True, check_finite=False)
-    a, b = cho_solve(factor, np.column_stack([targets[first : first + m], points.delta]), check_finite=False).T
+    S = np.empty((m + 2, m + 2), order="F")  # the covariance with the targets and delta as two more rows
+    S[:m, :m] = square_from_band(V, 0, m)
+    S[m:, :m] = targets[first : first + m], points.delta
+    check_condition(S[:m, :m], kernel)
+    eliminate(S, m, watch.check)
+    a, b = solve_triangular(S[:m, :m], S[m:, :m].T, trans="T", lower=True, check_finite=False).T
     constant = (points.delta @ a) / (1.0 / kernel.variance + points.delta @ b)
     return TrainedGpr(signals[: first + m], depth, points, a - b * constant, float(constant), kernel)
 

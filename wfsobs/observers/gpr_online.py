@@ -20,8 +20,8 @@ from wfsobs.record import Record, RecordError
 from wfsobs.scenario import OfflineGpr, OnlineGpr, Scenario
 from wfsobs.watch import QUIET, Watch
 
-BAND_ENTRIES = 4_000_000
-"""Covariances kept at a time (32 MB)."""
+BAND_ENTRIES, BAND_ROWS = 4_000_000, 8192
+"""Covariances (32 MB) and windows at a time: enough to share the overlap of the runs, and soon done."""
 
 
 def kernel_of(settings: OfflineGpr | OnlineGpr) -> SquaredExponential:
@@ -78,12 +78,13 @@ def predict_sliding(
     run = lengths[0] if lengths else 256
     leaf_window = lengths[-1] - 1 if lengths else m
     # As many runs at a time as the band has room for: their windows overlap.
-    chunk = run * max(1, (BAND_ENTRIES // (m + 1) - m) // run)
+    chunk = run * max(1, (min(BAND_ENTRIES // (m + 1), BAND_ROWS) - m) // run)
     for start in range(depth + m - 1, n, chunk):
         stop = min(start + chunk, n)
         runs = -(-(stop - start) // run)
         V, points = band(signals, depth, kernel, start - m, m + runs * run, m)
         for r in range(runs):
+            check()
             at = start + r * run
             to = min(at + run, n)
             leaves = np.empty((leaf_window + 3, leaf_window + 3, run))

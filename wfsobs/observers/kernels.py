@@ -114,8 +114,17 @@ def _largest_eigenvalue(apply: Callable[[Array], Array], n: int) -> float:
 
 
 def squared_norms(signals: Array, depth: int) -> Array:
-    """|x_j|^2 of the window ending at every step, samples before the start being zero, (n,); signals (n, channels)."""
-    return sliding_products(signals, signals, depth, 0, 0, signals.shape[0], 1)[:, 0]
+    """|x_j|^2 of the window ending at every step, samples before the start being zero, (n,); signals (n, channels).
+
+    A window is the end of one block of `depth` samples and the start of the next, so that sums from the blocks' borders
+    outwards are all it takes and nothing is ever subtracted.
+    """
+    n = signals.shape[0]
+    blocks = np.zeros((-(-n // depth) + 1, depth))
+    blocks.reshape(-1)[depth : depth + n] = np.square(signals).sum(axis=1)
+    out = np.cumsum(blocks, axis=1)
+    out[1:, :-1] += np.cumsum(blocks[:-1, :0:-1], axis=1)[:, ::-1]
+    return out.ravel()[depth : depth + n]
 
 
 def restart_interval(depth: int) -> int:
@@ -167,8 +176,8 @@ def band(signals: Array, depth: int, kernel: SquaredExponential, first: int, row
     points of shape (rows + reach,).
     """
     V = sliding_products(signals, signals, depth, first, first, rows, reach + 1)
-    later = sliding_products(signals, signals, depth, first + rows, first + rows, reach, 1)[:, 0]
-    points = kernel.points(np.maximum(np.concatenate([V[:, 0], later]), 0.0))
+    samples = np.column_stack([_cut(channel, first - depth + 1, depth - 1 + rows + reach) for channel in signals.T])
+    points = kernel.points(squared_norms(samples, depth)[depth - 1 :])
     here = Points(*(p[:rows, None] for p in points))
     there = Points(*(sliding_window_view(p, reach + 1)[:rows] for p in points))
     kernel.split(V, here, there)

@@ -49,12 +49,12 @@ def optimal_cycle(
     steps: list[Step] = []
     for j in range(1, ratio + 1):
         frame = j == ratio
-        A = block_diag(A0, 0.0 if frame else 1.0)
+        A = block_diag(A0, np.array([[0.0 if frame else 1.0]]))
         A[n, :n] = now
         C = np.zeros((2, n + 1))
         C[0, :n] = C0
         C[1, n] = float(frame)
-        steps.append((A, C, block_diag(Q0, 0.0), R))
+        steps.append((A, C, block_diag(Q0, np.zeros((1, 1))), R))
     return steps
 
 

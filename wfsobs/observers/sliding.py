@@ -25,10 +25,6 @@ from wfsobs.blas import eliminate
 LEAF = 8
 """Runs of this many steps are finished together."""
 
-PANEL = 256
-"""Points eliminated at a time: the same work as all at once, with a moment to stop in between."""
-
-
 def _go_on() -> None:
     return None
 
@@ -87,9 +83,7 @@ def _eliminate_common(
     T[to[2], to[2]] = S[coming, coming]
     T[to[3], to[2]] = S[border, coming]
     T[to[3], to[3]] = S[border, border]
-    for done in range(0, n, PANEL):
-        check()
-        eliminate(T[done:, done:], min(PANEL, n - done))
+    eliminate(T, n, check)
     return T[n:, n:], np.concatenate([f[going], f[coming]])
 
 
