@@ -63,6 +63,7 @@ class Dashboard:
     """One session: its store, its controls and its views."""
 
     def __init__(self, post: Post, scenario: Scenario | None = None, work: Any = compute):
+        self._post = post
         self.store = Store(post, scenario, work)
         self.display = Display()
         self.controls = Controls(self.store)
@@ -90,7 +91,7 @@ class Dashboard:
                 self._switches(), self.alert, self.stale, self.body, self.viewport,
                 sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
         )
-        self.viewport.param.watch(lambda event: page.param.update(sidebar_open=event.new >= PHONE_PX), "width_px")
+        self.viewport.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")
         page.param.watch(lambda event: self.display.param.update(dark=event.new), "dark_theme")
         return page
 
@@ -145,6 +146,10 @@ class Dashboard:
         waiting = self.store.stale and run.state != "running"
         self.stale.visible = waiting
         self.body.css_classes = ["stale"] if self.store.stale else []
+
+
+def _open_drawer(page: pmui.Page, width: int) -> None:
+    page.sidebar_open = width >= PHONE_PX
 
 
 def _box(title: str, *content: Any) -> pn.Column:

@@ -156,15 +156,17 @@ class Store(param.Parameterized):
         self.errors = {p: e for p, e in self.errors.items() if p in waiting} | {path: reason}
         return False
 
-    def load(self, scenario: Scenario) -> None:
-        """Replace every setting and run. Raises SettingError where they do not go together."""
+    def load(self, scenario: Scenario, preset: str | None = None) -> None:
+        """Replace every setting and run. Raises SettingError where they do not go together.
+
+        preset : the one that they are to be compared with from now on; as it was if not given
+        """
         scenario.validate()
-        self._accept(scenario, {})
+        self._accept(scenario, {}, preset or self.preset)
 
     def choose(self, name: str) -> None:
         """Start again from a preset."""
-        self.load(PRESETS[name]())
-        self.preset = name
+        self.load(PRESETS[name](), name)
 
     def changed(self) -> list[str]:
         """Dotted paths of the settings that differ from the preset's."""
@@ -174,14 +176,15 @@ class Store(param.Parameterized):
         """The session has ended."""
         self.run.close()
 
-    def _accept(self, scenario: Scenario, refused: dict[str, Any]) -> None:
+    def _accept(self, scenario: Scenario, refused: dict[str, Any], preset: str | None = None) -> None:
         """The one way in for new settings."""
         self._refused = refused
         errors = {path: reason for path, reason in self.errors.items() if path in refused}
-        if scenario == self.scenario:
-            self.errors = errors
+        same = scenario == self.scenario
+        self.param.update(
+            scenario=self.scenario if same else scenario, errors=errors, preset=preset or self.preset)
+        if same:
             return
-        self.param.update(scenario=scenario, errors=errors)
         self._compare()
         self.start()
 

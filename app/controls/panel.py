@@ -125,11 +125,10 @@ def status_html(store: Store) -> str:
     run = store.run
     seconds = f" in {run.shown.seconds:.2f} s" if run.shown and run.state == DONE else ""
     text = {
-        RUNNING: f"Running, {100 * run.progress:.0f} %", DONE: f"Done{seconds}",
+        RUNNING: f"Running, {int(100 * run.progress)} %", DONE: f"Done{seconds}",
         CANCELLED: "Cancelled", FAILED: "The run failed",
     }.get(run.state, "")
-    refused = len(store.errors)
-    note = f"{refused} setting{'s' * (refused > 1)} not accepted: {'; '.join(store.errors.values())}" if refused else ""
+    note = f"Not accepted: {', '.join(store.errors)}" if store.errors else ""
     return f'<div role="status" class="status" style="font-size:13px">{escape(text)}</div>{error_html(note)}'
 
 

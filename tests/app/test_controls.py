@@ -137,7 +137,7 @@ def test_a_bad_value_shows_beside_its_setting(controls: Controls, path: str, tex
     assert says in error_of(controls, path)
     assert field.widgets[-1].error_state and field.widgets[-1].value == text, "what was typed stays, to be corrected"
     assert controls.store.run.shown is shown and controls.store.scenario is scenario
-    assert says in status_html(controls.store)
+    assert f"Not accepted: {path}" in status_html(controls.store)
 
 
 def test_correcting_a_bad_value_clears_the_message(controls: Controls, loop: Any) -> None:

@@ -87,12 +87,14 @@ def test_the_page(dashboard: Dashboard) -> None:
     assert dashboard.display.dark
 
 
-def test_a_narrow_window_closes_the_drawer(dashboard: Dashboard) -> None:
+def test_a_narrow_window_closes_the_drawer(dashboard: Dashboard, loop: Any) -> None:
     page = dashboard.page()
     viewport = dashboard.viewport
     viewport.width_px = 1400
+    loop.land()
     assert page.sidebar_open
     viewport.width_px = 390
+    loop.land()
     assert not page.sidebar_open
 
 

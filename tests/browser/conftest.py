@@ -1,0 +1,132 @@
+"""The dashboard in a browser: a server in a process of its own, and a page that tolerates no error.
+
+A console error, a request that leaves the machine or a traceback in the server's log fails the test.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+ROOT = Path(__file__).parents[2]
+FLAGS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+]
+CLOSED_MID_UPDATE = ("WebSocketClosedError", "StreamClosedError")
+"""What a page that closes during an update leaves in the log; nothing else is let through."""
+
+
+class Server:
+    """A server on a free port of this machine, its output in a file."""
+
+    def __init__(self, command: list[str], log: Path, path: str):
+        self.log = log
+        with socket.socket() as s:
+            s.bind(("127.0.0.1", 0))
+            port = s.getsockname()[1]
+        self.url = f"http://localhost:{port}{path}"
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+        with log.open("w") as out:
+            self.process = subprocess.Popen(
+                [sys.executable, *(part.format(port=port) for part in command)], cwd=ROOT, env=environment,
+                stdout=out, stderr=subprocess.STDOUT)
+        self._wait(f"http://localhost:{port}/liveness")
+
+    def _wait(self, url: str) -> None:
+        end = time.monotonic() + 60
+        while time.monotonic() < end and self.process.poll() is None:
+            try:
+                urllib.request.urlopen(url, timeout=5)
+                return
+            except OSError:
+                time.sleep(0.2)
+        self.close()
+        pytest.fail(f"the server did not come up:\n{self.log.read_text()}")
+
+    def errors(self, start: int) -> list[str]:
+        """Tracebacks in the log since position `start`, but for those of a page closed mid-update."""
+        blocks = self.log.read_text()[start:].split("Traceback (most recent call last)")[1:]
+        return [block for block in blocks if not any(name in block for name in CLOSED_MID_UPDATE)]
+
+    def close(self) -> None:
+        self.process.terminate()
+        self.process.wait(20)
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    log = tmp_path_factory.mktemp("server") / "log"
+    server = Server(["-m", "panel", "serve", "app", "--port", "{port}", "--liveness"], log, "/app")
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def make_server() -> type[Server]:
+    return Server
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    named = os.environ.get("CHROMIUM") or shutil.which("chromium")
+    if named is None or shutil.which(named) is None:
+        pytest.fail("no browser: apt-get install chromium, or set CHROMIUM to one")
+    with sync_playwright() as p:
+        browser = p.chromium.launch(executable_path=named, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+class Watched:
+    """Collects what must not happen on a page."""
+
+    def __init__(self, page: Page):
+        self.faults: list[str] = []
+        page.on("console", lambda m: self.faults.append(f"console: {m.text}") if m.type == "error" else None)
+        page.on("pageerror", lambda e: self.faults.append(f"page: {e}"))
+        page.on("request", self._request)
+
+    def _request(self, request: Any) -> None:
+        if not request.url.startswith(("http://localhost:", "ws://localhost:", "data:", "blob:")):
+            self.faults.append(f"request: {request.url}")
+
+
+@pytest.fixture
+def open_page(server: Server, browser: Browser) -> Iterator[Any]:
+    """A function that opens the dashboard in a window of some size and waits for the first result."""
+    start = len(server.log.read_text())
+    opened: list[tuple[Page, Watched]] = []
+
+    def open_it(width: int = 1400, height: int = 1000, url: str = "", wait: bool = True) -> Page:
+        page = browser.new_page(viewport={"width": width, "height": height})
+        page.set_default_timeout(60_000)
+        opened.append((page, Watched(page)))
+        page.goto(url or server.url)
+        if wait:
+            finished(page)
+        return page
+
+    yield open_it
+    faults = [fault for _, watched in opened for fault in watched.faults]
+    for page, _ in opened:
+        page.close()
+    assert faults == []
+    assert server.errors(start) == []
+
+
+def finished(page: Page) -> None:
+    """Wait until the run is over."""
+    page.locator("[role=status]", has_text="Done in").first.wait_for(state="attached")
+    page.wait_for_timeout(300)

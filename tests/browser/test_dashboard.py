@@ -1,0 +1,201 @@
+"""What a user sees and does."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+POINTS = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
+    .filter(m => m.type === "GlyphRenderer" && m.glyph.type === "Line").map(m => m.data_source.get_length())"""
+
+
+def finished(page: Page) -> None:
+    page.locator("[role=status]", has_text="Done in").first.wait_for(state="attached")
+
+
+def row(page: Page, observer: str, target: str) -> list[str]:
+    return page.locator(f'tr[data-observer="{observer}"][data-target="{target}"] td').all_inner_texts()
+
+
+def rms(page: Page, observer: str = "kf-lgs", target: str = "turbulence") -> str:
+    return row(page, observer, target)[0]
+
+
+def wind(page: Page) -> Any:
+    return page.get_by_role("slider", name=re.compile("Wind speed"))
+
+
+def shot(page: Page, directory: Path, name: str) -> None:
+    path = directory / f"{name}.png"
+    page.screenshot(path=path)
+    assert path.stat().st_size > 20_000, "a page with something on it"
+
+
+def test_first_paint(open_page: Any, tmp_path: Path) -> None:
+    page = open_page()
+    for observer, target in (("kf-lgs", "turbulence"), ("multirate", "turbulence"), ("gpr-offline", "vibration"),
+                             ("gpr-online", "vibration")):
+        value, truth, relative, lag, seconds = row(page, observer, target)
+        assert float(value) > 0 and float(truth) > 0
+        assert float(relative) == pytest.approx(float(value) / float(truth), rel=0.02)
+        assert lag and float(seconds) > 0
+    points = page.evaluate(POINTS)
+    assert len(points) == 2 * (5 + 7) and min(points) > 300, "every line of the four figures has points"
+    shot(page, tmp_path, "light")
+
+
+def test_the_wind_speed_slider_runs_again(open_page: Any) -> None:
+    page = open_page()
+    before = rms(page)
+    wind(page).focus()
+    for _ in range(8):
+        page.keyboard.press("ArrowRight")
+    expect(page.get_by_role("textbox", name="m/s")).to_have_value("19")
+    expect(page.locator('tr[data-observer="kf-lgs"][data-target="turbulence"] td').first).not_to_have_text(before)
+    finished(page)
+    assert float(rms(page)) != float(before)
+
+
+def test_peaks_are_added_removed_and_edited(open_page: Any) -> None:
+    page = open_page()
+    cells = page.locator('input[data-cell$=".frequency"]')
+    n = cells.count()
+    truth = row(page, "kf-lgs", "vibration")[1]
+    page.get_by_role("button", name="+ Add peak").click()
+    expect(cells).to_have_count(n + 1)
+    cell = page.locator(f'input[data-cell="{n}.rms.0"]')
+    expect(cell).to_have_value("0.01")
+    cell.fill("0.05")
+    cell.press("Enter")
+    truth_cell = page.locator('tr[data-observer="kf-lgs"][data-target="vibration"] td').nth(1)
+    expect(truth_cell).to_have_text(re.compile(r"^[45]\d\.\d$"))
+    page.get_by_role("button", name=f"Remove peak {n + 1}").click()
+    expect(cells).to_have_count(n)
+    expect(truth_cell).to_have_text(truth)
+    finished(page)
+
+
+def test_a_bad_value_shows_inline_and_leaves_the_result(open_page: Any) -> None:
+    page = open_page()
+    before = rms(page)
+    box = page.get_by_role("textbox", name="m/s")
+    box.fill("200")
+    box.press("Enter")
+    message = "takes a number from 0.1 to 100 m/s"
+    expect(page.get_by_role("alert").filter(has_text=message).first).to_be_visible()
+    expect(box).to_have_value("200")
+    assert box.get_attribute("aria-invalid") == "true"
+    assert rms(page) == before
+    box.fill("15")
+    box.press("Enter")
+    expect(page.get_by_role("alert").filter(has_text=message)).to_have_count(0)
+
+    cell = page.locator('input[data-cell="0.frequency"]')
+    cell.fill("fast")
+    cell.press("Enter")
+    expect(page.get_by_role("alert").filter(has_text="vibration.peaks.0.frequency").first).to_be_visible()
+    expect(cell).to_have_attribute("aria-invalid", "true")
+    assert rms(page) == before
+
+
+def test_choosing_a_preset(open_page: Any) -> None:
+    page = open_page()
+    page.get_by_role("combobox", name="Preset").click()
+    page.get_by_role("menuitem", name="UT4").click()
+    expect(page.locator('input[data-cell="0.damping"]')).to_have_value("0")
+    expect(page.get_by_role("combobox", name="Preset")).to_have_text("UT4")
+    expect(page.locator('tr[data-observer="kf-lgs"][data-target="vibration"] td').first).not_to_have_text("–")
+    finished(page)
+
+
+def test_signal_and_error(open_page: Any) -> None:
+    page = open_page()
+    label = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
+        .filter(m => m.type === "LinearAxis").map(m => m.axis_label).join()"""
+    assert "error" not in page.evaluate(label)
+    page.get_by_role("button", name="Error", exact=True).click()
+    page.wait_for_function(f"({label})().includes('error of tip [nm]')")
+    page.get_by_role("button", name="mas", exact=True).click()
+    page.get_by_role("button", name="Tilt", exact=True).click()
+    page.wait_for_function(f"({label})().includes('error of tilt [mas]')")
+    expect(page.get_by_text("RMS error [mas]")).to_be_visible()
+
+
+def test_a_zoom_fetches_more_samples(open_page: Any) -> None:
+    page = open_page()
+    step = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
+        .filter(m => m.type === "ColumnDataSource" && m.data["kf-ngs"]).map(m => m.data.x[1] - m.data.x[0])[0]"""
+    assert page.evaluate(step) > 5e-3
+    page.get_by_role("button", name="Time window: 0.2 s").click()
+    page.wait_for_function(f"Math.abs(({step})() - 1e-3) < 1e-9")
+
+
+def test_cards_hide_lines(open_page: Any) -> None:
+    page = open_page()
+    card = page.get_by_role("button", name=re.compile("NGS KF"))
+    expect(card).to_have_attribute("aria-pressed", "true")
+    card.click()
+    expect(card).to_have_attribute("aria-pressed", "false")
+    visible = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
+        .filter(m => m.type === "GlyphRenderer" && m.name === "kf-ngs").map(m => m.visible)"""
+    page.wait_for_function(f"({visible})().every(v => !v)")
+
+
+def test_cancel(open_page: Any) -> None:
+    page = open_page()
+    page.get_by_role("button", name="Run", exact=True).first.click()
+    cancel = page.get_by_role("button", name="Cancel", exact=True)
+    expect(cancel).to_be_enabled()
+    cancel.click()
+    page.locator("[role=status]", has_text="Cancelled").first.wait_for(state="attached")
+    expect(cancel).to_be_disabled()
+    page.get_by_role("button", name="Run", exact=True).first.click()
+    finished(page)
+
+
+def test_phone(open_page: Any, tmp_path: Path) -> None:
+    page = open_page(390, 844)
+    expect(page.get_by_role("button", name="Open drawer")).to_be_visible()
+    page.wait_for_timeout(600)
+    wide = page.evaluate("""() => {
+      const out = [], limit = window.innerWidth
+      const scan = (root) => root.querySelectorAll("*").forEach((el) => {
+        const scrolled = el.closest(".scroll") !== null
+        if (!scrolled && el.getBoundingClientRect().right > limit + 1 && el.getBoundingClientRect().width > 0) {
+          out.push(`${el.tagName}.${el.className}`)
+        }
+        if (el.shadowRoot) scan(el.shadowRoot)
+      })
+      scan(document.querySelector("main") ?? document)
+      return [document.documentElement.scrollWidth, out]
+    }""")
+    assert wide[0] <= 390
+    shot(page, tmp_path, "phone")
+    page.get_by_role("button", name="Open drawer").click()
+    expect(wind(page)).to_be_visible()
+
+
+def test_dark(open_page: Any, tmp_path: Path) -> None:
+    page = open_page()
+    page.get_by_role("button", name=re.compile("theme", re.I)).click()
+    colour = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
+        .filter(m => m.type === "GlyphRenderer" && m.name === "gpr-online").map(m => m.glyph.line_color.value)"""
+    page.wait_for_function(f"({colour})().every(c => c === '#A6E3A6')")
+    background = page.evaluate("() => getComputedStyle(document.body).backgroundColor")
+    assert background != "rgb(255, 255, 255)"
+    page.wait_for_timeout(800)
+    shot(page, tmp_path, "dark")
+
+
+def test_two_sessions_do_not_see_each_other(open_page: Any) -> None:
+    one, other = open_page(), open_page()
+    box = one.get_by_role("textbox", name="m/s")
+    box.fill("30")
+    box.press("Enter")
+    expect(one.get_by_role("alert")).to_have_count(0)
+    finished(one)
+    expect(other.get_by_role("textbox", name="m/s")).to_have_value("15")

@@ -1,0 +1,17 @@
+"""The command's own server."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+
+def test_serve(open_page: Any, make_server: Any, tmp_path: Path) -> None:
+    code = "from wfsobs.app.serve import serve; serve(port={port}, address='localhost', open_browser=False)"
+    server = make_server(["-c", code], tmp_path / "log", "/")
+    try:
+        page = open_page(url=server.url)
+        assert page.title() == "wfsobs"
+        assert server.errors(0) == []
+    finally:
+        server.close()
