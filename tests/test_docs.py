@@ -172,3 +172,41 @@ def test_model_page_prints_what_the_script_prints(capsys: pytest.CaptureFixture[
     assert lines
     for line in lines:
         assert line in page
+
+
+def test_reproduction_page_holds(capsys: pytest.CaptureFixture[str]) -> None:
+    """Seeds 1 and 2 lie in the ranges that the page gives for twenty, and the full filter beats both GPR."""
+    reproduction = script("reproduction")
+    reproduction.SEEDS = (1, 2)
+    errors = reproduction.errors({})
+    page = (ROOT / "docs" / "reproduction.md").read_text(encoding="utf-8")
+    tables = re.split(r"^#+ .*$|^The paper shows tip only", page, flags=re.M)
+    places = {
+        ("vibration", "tip"): r"Tip \| paper", ("vibration", "tilt"): r"Tilt \| here",
+        ("turbulence", "tip"): r"\| Tip \| Tip, matched", ("turbulence", "tilt"): r"\| Tip \| Tip, matched",
+    }
+    checked = 0
+    for (target, mode), head in places.items():
+        (text,) = [t for t in tables if re.search(head, t)]
+        for line in text.splitlines():
+            name = line.split("|")[1].strip().removesuffix(" (fitted)") if line.startswith("|") else ""
+            ids = [id_ for id_, label in reproduction.NAMES.items() if label == name]
+            if not ids:
+                continue
+            ranges = re.findall(r"\(([\d.]+) - ([\d.]+)\)", line)
+            low, high = ranges[-1 if (target, mode) == ("turbulence", "tilt") else 0]
+            for value in errors[ids[0], target, mode]:
+                assert float(low) - 0.01 <= value <= float(high) + 0.01, (name, target, mode, value)
+            checked += 1
+    assert checked == 6 + 6 + 4 + 4
+    reproduction.all_peaks()
+    full = float(capsys.readouterr().out.splitlines()[2].split("|")[2].split()[0])
+    assert full < min(*errors["gpr-offline", "vibration", "tip"], *errors["gpr-online", "vibration", "tip"])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_scripts_named_on_a_page_have_the_tables_named(page: Path) -> None:
+    """A table of docs/reproduction.md is followed by the name that the script knows it by."""
+    known = script("reproduction").TABLES
+    named = re.findall(r"^`(\w+)`[;.,]", page.read_text(encoding="utf-8"), flags=re.M)
+    assert set(named) == (set(known) if page.name == "reproduction.md" else set())
