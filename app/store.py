@@ -113,7 +113,7 @@ class Run(param.Parameterized):
 class Store(param.Parameterized):
     """The settings of a session, what was refused of them, and their run."""
 
-    scenario = param.ClassSelector(class_=Scenario, doc="The settings as accepted.")
+    scenario: Scenario = param.ClassSelector(class_=Scenario, doc="The settings as accepted.")  # type: ignore
     errors = param.Dict({}, doc="Dotted path of a refused setting -> why, in one line.")
     preset = param.Selector(default=next(iter(PRESETS)), objects=list(PRESETS), doc="Where the settings started.")
     stale = param.Boolean(False, doc="Whether the results shown are not those of the settings.")

@@ -40,8 +40,9 @@ class Controls:
         self.progress = pmui.LinearProgress(value=0, variant="determinate", sizing_mode="stretch_width", margin=(2, 0))
         self.status = pn.pane.HTML("", sizing_mode="stretch_width", margin=(0, 0, 4, 0))
         self.topics = _names()
+        self.rooms = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
         self.accordion = pmui.Accordion(
-            *((title, pn.Column(sizing_mode="stretch_width", margin=0)) for title in self.topics.values()),
+            *((title, self.rooms[name]) for name, title in self.topics.items()),
             title_variant="subtitle2", variant="outlined", disable_gutters=True, dynamic=True,
             sizing_mode="stretch_width", margin=(8, 0),
         )
@@ -62,7 +63,7 @@ class Controls:
 
     def open_topic(self, name: str) -> None:
         """Fill a topic with its fields, the first time it is opened."""
-        column = self.accordion[list(self.topics).index(name)]
+        column = self.rooms[name]
         if len(column):
             return
         views: list[Any] = []

@@ -82,8 +82,7 @@ class PeakEditor:
         errors: dict[str, dict[str, str]] = {}
         for path, reason in self.store.errors.items():
             if path.startswith(f"{PATH}."):
-                row, _, name = path.removeprefix(f"{PATH}.").partition(".")
-                errors[f"{row}.{name}"] = {"text": self._texts.get(path, ""), "reason": reason}
+                errors[path.removeprefix(f"{PATH}.")] = {"text": self._texts.get(path, ""), "reason": reason}
         self.table.param.update(rows=rows, errors=errors)
 
     def _plain(self) -> list[dict[str, Any]]:

@@ -12,7 +12,7 @@ def envelope_times(start: int, stop: int, bins: int, dt: float) -> Array:
     """Times [s] that belong to `envelope` of samples start ... stop - 1."""
     n = stop - start
     if n <= 2 * bins:
-        return np.arange(start, stop) * dt
+        return dt * np.arange(start, stop, dtype=np.float64)
     edges = _edges(n, bins)
     width = np.diff(edges)
     left = start + edges[:-1] + 0.25 * (width - 1)

@@ -25,7 +25,7 @@ class Spectra:
 
     def __init__(self, run: Run, display: Display):
         self.run, self.display = run, display
-        self.x_range = Range1d(0.5, 500.0)
+        self.x_range = Range1d(start=0.5, end=500.0)
         self.spectra = {target: _Spectrum(target, self.x_range) for target in TARGETS}
         run.param.watch(self._redraw, "shown")
         display.param.watch(self._redraw, ["mode", "show", "unit"])
@@ -60,7 +60,7 @@ class _Spectrum:
     def __init__(self, target: str, x_range: Range1d):
         self.target = target
         self.figure = new_figure(
-            x_range=x_range, y_range=Range1d(1e-6, 1.0), x_axis_type="log", y_axis_type="log",
+            x_range=x_range, y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log",
         )
         self.figure.xaxis.axis_label = "frequency [Hz]"
         if target == VIBRATION:

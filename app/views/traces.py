@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import panel as pn
 from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, Range1d, Span
@@ -32,7 +34,7 @@ class Traces:
 
     def __init__(self, run: Run, display: Display):
         self.run, self.display = run, display
-        self.x_range = Range1d(0.0, 10.0)
+        self.x_range = Range1d(start=0.0, end=10.0)
         self.length = 0.0
         self._waiting = False
         crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
@@ -98,7 +100,7 @@ class _Trace:
         self.target = target
         self.names = [TRUTH, *observers_of(target)]
         self.source = ColumnDataSource({"x": [], **{name: [] for name in self.names}})
-        self.figure = new_figure(x_range=x_range, y_range=Range1d(-1.0, 1.0))
+        self.figure = new_figure(x_range=x_range, y_range=Range1d(start=-1.0, end=1.0))
         self.figure.xaxis.axis_label = "time [s]"
         self.figure.add_tools(crosshair)
         self.warm_up = BoxAnnotation(
@@ -109,7 +111,7 @@ class _Trace:
     def draw(self, shown: Shown, display: Display, first: int, last: int) -> None:
         """Send the samples first ... last - 1 of every line."""
         scale = per_micrometre(display.unit, shown.scenario.telescope.diameter)
-        data = {"x": envelope_times(first, last, BINS, shown.result.record.dt)}
+        data: dict[str, Any] = {"x": envelope_times(first, last, BINS, shown.result.record.dt)}
         for name in self.names:
             values = _line(shown, name, self.target, display, first, last)
             data[name] = (scale * envelope(values, BINS)).astype(np.float32)
@@ -120,7 +122,7 @@ class _Trace:
         what = f"error of {display.mode}" if display.error else display.mode
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
 
-    def _fit(self, data: dict[str, Array], warm_up: float) -> None:
+    def _fit(self, data: dict[str, Any], warm_up: float) -> None:
         """Have the axis hold every visible line; what a filter does while it settles does not count."""
         counted = data["x"] >= warm_up
         if not counted.any():
