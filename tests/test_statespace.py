@@ -40,7 +40,7 @@ def test_with_the_printed_input_matrix_it_does_not() -> None:
 
 
 def test_matrices_are_those_printed() -> None:
-    """Paper, eq. 8, all but B_u."""
+    """Paper, eq. 7, all but B_u."""
     A, B, C = paper_matrices(TURBULENCE, VIBRATION)
     t, v = TURBULENCE, VIBRATION
     assert np.array_equal(A, [

@@ -48,7 +48,7 @@ class Ar2:
 
     @property
     def transition(self) -> Array:
-        """A of the state (phi[k], phi[k-1]), shape (2, 2) (paper, eq. 8c)."""
+        """A of the state (phi[k], phi[k-1]), shape (2, 2) (paper, eq. 7c)."""
         return np.array([[self.a1, self.a2], [1.0, 0.0]])
 
     @property

@@ -33,7 +33,7 @@ class Disturbance:
 
     @property
     def total(self) -> Array:
-        """phi_dist = phi_turb + phi_vib [um] (paper, eq. 5b)."""
+        """phi_dist = phi_turb + phi_vib [um] (paper, eq. 4b)."""
         return self.turbulence + self.vibration
 
 

@@ -85,7 +85,7 @@ def delayed(x: Array, steps: int) -> Array:
 
 
 def pseudo_open_loop(y: Array, u: Array) -> Array:
-    """z[k] = y[k] - u[k-2], the measurement with the mirror's part taken off (paper, eq. 4 to 6)."""
+    """z[k] = y[k] - u[k-2], the measurement with the mirror's part taken off (paper, eq. 3 to 5)."""
     return y - delayed(u, 2)
 
 

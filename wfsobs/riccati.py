@@ -1,6 +1,6 @@
 """Steady-state Kalman gains: discrete algebraic Riccati equations by structured doubling.
 
-    P = A P A' - A P C' (C P C' + R)^-1 C P A' + Q        (paper, eq. 9b)
+    P = A P A' - A P C' (C P C' + R)^-1 C P A' + Q        (paper, eq. 8b)
 
 and the periodic one, where (A, C, Q, R) repeat every few steps. One step maps a covariance to the next as
 

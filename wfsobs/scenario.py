@@ -66,7 +66,7 @@ class Vibration(Group):
     """Structural vibration of the telescope."""
 
     source = param.Selector(default="peaks", objects=["peaks", "psd", "ar2", "none"], label="Source",
-                            doc="How vibration is made: inverse DFT of the peak list (paper, Algorithm 5), inverse "
+                            doc="How vibration is made: inverse DFT of the peak list (paper, Algorithm 4), inverse "
                                 "DFT of the PSD table, each peak as an AR(2) process (paper, eq. 2), or none.")
     cutoff = Real(80.0, bounds=(0.1, 5000.0), softbounds=(10.0, 200.0), label="Cut-off f_c",
                   doc="Nothing above this frequency in an inverse DFT [Hz] (paper, section 2.4).")
@@ -88,7 +88,7 @@ class Sensors(Group):
     ngs_noise = Real(0.01, bounds=(0.0, 10.0), softbounds=(0.0, 0.2), step=0.001, label="NGS noise",
                      doc="White measurement noise of an NGS frame and mode, rms [um]; not given in the paper.")
     lgs_low_frequency_rms = Real(
-        0.05, bounds=(0.0, 10.0), softbounds=(0.0, 0.2), step=0.005, label="LGS low-frequency error",
+        0.049, bounds=(0.0, 10.0), softbounds=(0.0, 0.2), step=0.005, label="LGS low-frequency error",
         doc="Slow tip-tilt error of each LGS, rms [um], independent between LGS: the stand-in for cone effect and "
             "uplink turbulence. 0.049 um is the cone effect of one layer at 8 km and a guide star at 90 km.")
     tip_tilt_indetermination = param.Boolean(
@@ -165,14 +165,14 @@ class _Gpr(Group):
 
     inputs = param.Selector(
         default="u-y", objects=["u-y", "z"], label="Inputs",
-        doc="What a window holds: commands and LGS measurements (paper, eq. 12) or pseudo-open-loop measurements z.")
+        doc="What a window holds: commands and LGS measurements (paper, eq. 14) or pseudo-open-loop measurements z.")
     training_size = Whole(1000, bounds=(2, 2048), label="Training size m", doc="Number of training windows (paper, Table 4).")
     depth = Whole(407, bounds=(1, 2000), label="Depth d", doc="Samples in a window (paper, Table 4).")
     signal_std = Real(10.0, bounds=(1e-3, 1e4), softbounds=(0.1, 100.0), label="Output scale σ_SE",
-                      doc="sigma_SE of the squared-exponential kernel [um] (paper, eq. 11 and Table 4).")
+                      doc="sigma_SE of the squared-exponential kernel [um] (paper, eq. 13 and Table 4).")
     length_scale = Real(
         300.0, bounds=(0.1, 1e5), softbounds=(1.0, 1000.0), label="Length scale l",
-        doc="l of the squared-exponential kernel [um] (paper, eq. 11 and Table 4). Far above the windows' norm the "
+        doc="l of the squared-exponential kernel [um] (paper, eq. 13 and Table 4). Far above the windows' norm the "
             "kernel is linear: ridge regression with weight (sigma_n l / sigma_SE)^2.")
     noise_std = Real(0.13, bounds=(1e-4, 10.0), softbounds=(0.01, 1.0), label="Noise σ_awgn",
                      doc="sigma_awgn on the diagonal of the covariance [um] (paper, Table 4).")
@@ -188,7 +188,7 @@ class OnlineGpr(_Gpr):
     training_size = Whole(511, bounds=(2, 2048), label="Training size m", doc="Number of training windows (paper, Table 4).")
     depth = Whole(170, bounds=(1, 2000), label="Depth d", doc="Samples in a window (paper, Table 4).")
     signal_std = Real(30.0, bounds=(1e-3, 1e4), softbounds=(0.1, 100.0), label="Output scale σ_SE",
-                      doc="sigma_SE of the squared-exponential kernel [um] (paper, eq. 11 and Table 4).")
+                      doc="sigma_SE of the squared-exponential kernel [um] (paper, eq. 13 and Table 4).")
     noise_std = Real(0.1, bounds=(1e-4, 10.0), softbounds=(0.01, 1.0), label="Noise σ_awgn",
                      doc="sigma_awgn on the diagonal of the covariance [um] (paper, Table 4).")
 

@@ -28,7 +28,7 @@ def measure(
 ) -> OpenLoop:
     """LGS at every step, NGS at every n-th, both of the wavefront up to the step before.
 
-    LGS: the mean over the guide stars of phi_dist[k-1] + low-frequency error + noise (paper, eq. 4),
+    LGS: the mean over the guide stars of phi_dist[k-1] + low-frequency error + noise (paper, eq. 3),
     each guide star with noise and error of its own. NGS at k = n, 2n, ...: the mean of phi_dist[k-1]
     ... phi_dist[k-n], plus noise. With tip-tilt indetermination the LGS see no turbulence.
     """

@@ -1,4 +1,4 @@
-"""Spectra and signals: damped lines, tables, and the inverse DFT with random phases (paper, Algorithm 5).
+"""Spectra and signals: damped lines, tables, and the inverse DFT with random phases (paper, Algorithm 4).
 
 All spectra are one-sided power spectral densities: their integral over positive frequencies is the
 variance.
@@ -63,7 +63,7 @@ def random_phase_signal(power: ArrayLike, n: int, rng: np.random.Generator) -> A
     """A real signal of `n` samples whose DFT bins carry `power` [unit^2] with random phases, shape (n,).
 
     The amplitude of a bin of power S df is sqrt(2 S df), its phase uniform on [0, 2 pi) (paper,
-    Algorithm 5, which prints S itself as amplitude and drops the imaginary unit). The bins at zero
+    Algorithm 4, which prints S itself as amplitude and drops the imaginary unit). The bins at zero
     and at Nyquist stay empty: a phase means nothing there.
     """
     power = np.asarray(power, dtype=float)

@@ -1,8 +1,8 @@
-"""The paper's state-space model (eq. 7 and 8), for one Zernike mode.
+"""The paper's state-space model (eq. 6 and 7), for one Zernike mode.
 
 State x[k] = (phi_turb[k], phi_turb[k-1], phi_vib[k], phi_vib[k-1], u[k-1], u[k-2]), so that
 y[k] = C x[k] + w[k] = phi_dist[k-1] + u[k-2] + w[k]. With the B_u = (0, 1) that the paper prints, y[k]
-would see u[k-1]; B_u = (1, 0) is what its sensor and mirror equations (4 to 6) say.
+would see u[k-1]; B_u = (1, 0) is what its sensor and mirror equations (3 to 5) say.
 
 The mirror's part of the state is known exactly: the Riccati solution is zero there, and the filter
 on y[k] and u[k] is the filter of the disturbance alone on z[k] = y[k] - u[k-2]. Observers use that
@@ -43,7 +43,7 @@ class DisturbanceModel:
 
 
 def disturbance_model(turbulence: list[Ar2], vibration: list[Ar2]) -> DisturbanceModel:
-    """The model of all the given processes, each with its own drive (paper, eq. 1, 2 and 8)."""
+    """The model of all the given processes, each with its own drive (paper, eq. 1, 2 and 7)."""
     processes = [*turbulence, *vibration]
     n = 2 * len(processes)
     C, Q = np.zeros(n), np.zeros((n, n))
@@ -56,7 +56,7 @@ def disturbance_model(turbulence: list[Ar2], vibration: list[Ar2]) -> Disturbanc
 
 
 def paper_matrices(turbulence: Ar2, vibration: Ar2) -> tuple[Array, Array, Array]:
-    """A (6, 6), B (6,), C (6,) of the paper's eq. 8, with the B_u that its equations 4 to 6 imply."""
+    """A (6, 6), B (6,), C (6,) of the paper's eq. 7, with the B_u that its equations 3 to 5 imply."""
     A = block_diag(turbulence.transition, vibration.transition, [[0.0, 0.0], [1.0, 0.0]])
     B = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
     C = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 1.0])

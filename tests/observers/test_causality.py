@@ -64,7 +64,7 @@ def test_only_the_reference_looks_ahead() -> None:
 def test_nothing_after_a_step_changes_its_estimate(name: str, k: int, record: Record) -> None:
     """48 is a border of the filters' blocks, 5 and 300 are NGS frames."""
     s = scenario()
-    # u[k] enters the GPR's window of step k (paper, eq. 12): of commands, those from k + 1 on are later
+    # u[k] enters the GPR's window of step k (paper, eq. 14): of commands, those from k + 1 on are later
     later = changed_after(record, k)
     if name in GPR:
         u = later.u.copy()

@@ -44,7 +44,7 @@ def textbook_gain(A: np.ndarray, C: np.ndarray, Q: np.ndarray, r: float, steps: 
 
 
 def textbook_lgs(record: Record, s: Scenario, mode: int, r: float) -> np.ndarray:
-    """Paper, eq. 8 to 10 on y_lgs and u, in the form that uses y[k] for the estimate of step k; (n_steps, 2)."""
+    """Paper, eq. 7 to 9 on y_lgs and u, in the form that uses y[k] for the estimate of step k; (n_steps, 2)."""
     turbulence, vibration = modelled_processes(s, mode, record.dt)
     A, B, C = paper_matrices(turbulence, vibration)
     Q = np.diag([turbulence.drive_variance, 0, vibration.drive_variance, 0, 0, 0])

@@ -60,7 +60,7 @@ def test_products_do_not_drift() -> None:
 
 
 def exact_split(kernel: SquaredExponential, x: np.ndarray, y: np.ndarray) -> mp.mpf:
-    """k(x, y) - s2 delta_x delta_y in 50 digits, k as printed (paper, eq. 11)."""
+    """k(x, y) - s2 delta_x delta_y in 50 digits, k as printed (paper, eq. 13)."""
     with mp.workdps(50):
         X, Y = [mp.mpf(float(v)) for v in x], [mp.mpf(float(v)) for v in y]
         l2 = 2 * mp.mpf(kernel.length_scale) ** 2

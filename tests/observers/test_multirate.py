@@ -39,7 +39,7 @@ def six_state_gain(A: np.ndarray, C: np.ndarray, Q: np.ndarray, R: np.ndarray) -
 
 
 def textbook(record: Record, s: Scenario, mode: int, lgs: float, ngs: float) -> np.ndarray:
-    """Paper, eq. 11 to 13, with the filter gain in place of the printed predictor gain. What the mirror did during an
+    """Paper, eq. 10 to 12, with the filter gain in place of the printed predictor gain. What the mirror did during an
     NGS frame, mean of u[k-2] ... u[k-n-1], stands in for the u[k-2] that C puts there. Turbulence, (n_steps,)."""
     turbulence, vibration = modelled_processes(s, mode, record.dt)
     A, B, C = paper_matrices(turbulence, vibration)

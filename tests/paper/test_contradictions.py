@@ -141,7 +141,7 @@ def test_ngs_weighs_more_than_lgs() -> None:
 
 
 def printed_idft(S: np.ndarray, rng: np.random.Generator, imaginary_unit: bool) -> np.ndarray:
-    """Algorithm 5: X = S exp(phase), mirrored, inverse DFT, times len(X) / 2."""
+    """Algorithm 4: X = S exp(phase), mirrored, inverse DFT, times len(X) / 2."""
     phase = np.concatenate([[0.0], 2 * np.pi * rng.random(S.size - 2), [0.0]])
     X = S * np.exp(1j * phase if imaginary_unit else phase)
     X = np.concatenate([X, X[:0:-1].conj()])
@@ -169,15 +169,15 @@ def test_inverse_dft_needs_the_imaginary_unit_and_the_root() -> None:
 
 @pytest.mark.parametrize(("d", "m"), [(170, 511), (2, 3)])
 def test_window_indices_of_the_online_gpr(d: int, m: int) -> None:
-    """Algorithm 4 prints x[k-i+d+1 : k-i], of length -d; x[k-i-d+1 : k-i] has d samples and ends i steps back."""
+    """Algorithm 3 prints x[k-i+d+1 : k-i], of length -d; x[k-i-d+1 : k-i] has d samples and ends i steps back."""
     k, i = d + m, m
     assert (k - i) - (k - i + d + 1) + 1 == -d
     assert (k - i) - (k - i - d + 1) + 1 == d
-    assert k - i - d + 1 == 1  # with the first step counted as 1, the loop of Algorithm 4 starts where the record does
+    assert k - i - d + 1 == 1  # with the first step counted as 1, the loop of Algorithm 3 starts where the record does
 
 
 def test_targets_of_the_offline_gpr_are_as_many_as_windows() -> None:
-    """Algorithm 2 makes windows for k = d ... m + d - 1, that is m; Algorithm 3 multiplies targets d ... m + d, one more."""
+    """Algorithm 1 makes windows for k = d ... m + d - 1, that is m; Algorithm 2 multiplies targets d ... m + d, one more."""
     m, d = 1000, 407
     assert len(range(d, m + d)) == m and len(range(d, m + d + 1)) == m + 1
 

@@ -103,7 +103,7 @@ def kalman_loop(A: Array, B: Array, C: Array, L: Array, y: Array, u: Array) -> A
 def multirate_loop(
     A: Array, B: Array, C: Array, C_ngs: Array, L: Array, L_both: Array, y: Array, z_ngs: Array, u: Array
 ) -> Array:
-    """The paper's multi-rate filter (eq. 12), step by step; filtered states (n_steps, n).
+    """The paper's multi-rate filter (eq. 11), step by step; filtered states (n_steps, n).
 
     L (n,) where there is an LGS measurement alone, L_both (n, 2) where z_ngs (n_steps,) is not NaN.
     """

@@ -1,4 +1,4 @@
-"""Offline Gaussian process regression: trained once, on a record of its own (paper, Algorithms 2 and 3).
+"""Offline Gaussian process regression: trained once, on a record of its own (paper, Algorithms 1 and 2).
 
 The target of a window is the zero-phase Butterworth reference of the training record's open-loop twin at the
 window's last step; without a twin, that of its z. With w = a - b c and c = (delta.a) / (1 / s2 + delta.b) (`kernels` has

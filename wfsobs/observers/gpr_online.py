@@ -1,4 +1,4 @@
-"""Online Gaussian process regression: trained anew at every step on the last m windows (paper, Algorithm 4).
+"""Online Gaussian process regression: trained anew at every step on the last m windows (paper, Algorithm 3).
 
 At step k the newest training pair is (x[k-1], target[k-1]). The target of window j is the vibration at step j: the
 causal Butterworth bank on z, of which value j + 1 belongs to step j and is known at step j + 1.
@@ -30,7 +30,7 @@ def kernel_of(settings: OfflineGpr | OnlineGpr) -> SquaredExponential:
 
 
 def window_signals(settings: OfflineGpr | OnlineGpr, y: Array, u: Array, z: Array, mode: int) -> Array:
-    """The channels of a window, (n_steps, channels): u and y_lgs (paper, eq. 12), or z."""
+    """The channels of a window, (n_steps, channels): u and y_lgs (paper, eq. 14), or z."""
     return z[:, [mode]] if settings.inputs == "z" else np.column_stack([u[:, mode], y[:, mode]])
 
 

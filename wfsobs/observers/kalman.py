@@ -2,7 +2,7 @@
 
     x_pred[k+1] = A x_hat[k],    x_hat[k] = x_pred[k] + L (z[k] - C x_pred[k])
 
-with the filter gain L = P C' (C P C' + R)^-1; the paper's eq. 10 is the predictor form with K = A L, which uses
+with the filter gain L = P C' (C P C' + R)^-1; the paper's eq. 9 is the predictor form with K = A L, which uses
 y up to k - 1. Here phi_hat[k] uses y[k] too, like the GPR. The mirror's part is known and taken off before.
 """
 

@@ -1,7 +1,7 @@
 """Squared-exponential covariances of sliding windows, split so that nothing is ill conditioned.
 
 A point x_j is a window: the last `depth` samples up to step j of every channel. With G_ij = <x_i, x_j>,
-delta_i = exp(-|x_i|^2 / 2 l^2) and s2 = sigma_SE^2, the kernel of the paper's eq. 11 is
+delta_i = exp(-|x_i|^2 / 2 l^2) and s2 = sigma_SE^2, the kernel of the paper's eq. 13 is
 
     k(x_i, x_j) = s2 exp(-|x_i - x_j|^2 / 2 l^2) = M_ij + s2 delta_i delta_j,
     M_ij = s2 delta_i delta_j expm1(G_ij / l^2).

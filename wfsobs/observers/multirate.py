@@ -1,7 +1,7 @@
 """The paper's multi-rate Kalman filter: LGS at every step, NGS at every n-th (section 2.2.1).
 
     x_pred[k+1] = A x_hat[k]
-    x_hat[k] = x_pred[k] + L_j (z_j[k] - C_j x_pred[k])        (eq. 12)
+    x_hat[k] = x_pred[k] + L_j (z_j[k] - C_j x_pred[k])        (eq. 11)
 
 with two steady-state gains: L_LGS from C_LGS and r_LGS, and L_LGS^NGS from both rows with diag(r_LGS, r_NGS), as if
 both came at every step. The paper prints the predictor gain K; the correction of a state that is already
