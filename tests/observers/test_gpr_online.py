@@ -317,7 +317,8 @@ def test_cancelling_stops_it_and_partial_results_come_before() -> None:
     partial: list[np.ndarray] = []
     gpr_online(record, s, Watch(partial=lambda target, values: partial.append(values.copy())))
     counts = [int(np.isfinite(values).sum()) for values in partial]
-    assert len(counts) > 10 and counts == sorted(counts) and counts[-1] == 2 * (3000 - 84)
+    # the two modes tell on their own threads, in any order between them
+    assert len(counts) > 10 and min(counts) < 500 and max(counts) == 2 * (3000 - 84)
     asked = iter([False] * 5 + [True] * 10_000)
     with pytest.raises(Cancelled):
         gpr_online(record, s, Watch(cancelled=lambda: next(asked)))
