@@ -51,7 +51,7 @@ def test_every_gain_that_can_be_set_is_stable(gain: float, leak: float) -> None:
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize("ratio", [1, 5, 8])
 def test_a_record_without_noise_obeys_the_equations(closed: bool, ratio: int) -> None:
-    """Paper, eq. 4 to 6: y_lgs[k] = phi_dist[k-1] + u[k-2]; an NGS frame is the mean of exactly n residual steps."""
+    """Paper, eq. 3 to 5: y_lgs[k] = phi_dist[k-1] + u[k-2]; an NGS frame is the mean of exactly n residual steps."""
     s = scenario(NOISELESS | {"loop.closed": closed, "sensors.exposure_ratio": ratio, "loop.leak": 0.99})
     r = simulate(s)
     assert r.turbulence is not None and r.vibration is not None and r.y_ngs is not None

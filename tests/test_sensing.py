@@ -29,7 +29,7 @@ QUIET = Disturbance(np.zeros((N, 2)), np.zeros((N, 2)))
 
 
 def test_lgs_sees_the_step_before() -> None:
-    """Paper, eq. 4: y[k] = phi_dist[k-1], to the last bit; nothing is there before the start."""
+    """Paper, eq. 3: y[k] = phi_dist[k-1], to the last bit; nothing is there before the start."""
     d = disturbance()
     lgs = measure(sensors(), d, np.random.default_rng(0)).lgs
     assert np.array_equal(lgs[1:], (d.turbulence + d.vibration)[:-1])

@@ -26,7 +26,7 @@ def play(B: np.ndarray, n: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def test_the_measurement_sees_the_command_of_two_steps_before() -> None:
-    """y[k] = phi_dist[k-1] + u[k-2] (paper, eq. 4 to 6)."""
+    """y[k] = phi_dist[k-1] + u[k-2] (paper, eq. 3 to 5)."""
     _, B, _ = paper_matrices(TURBULENCE, VIBRATION)
     y, phi, u = play(B)
     assert np.abs(y[2:] - (phi[1:-1] + u[:-2])).max() < 1e-13

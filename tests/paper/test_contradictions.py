@@ -66,7 +66,7 @@ def test_exposures_are_those_of_the_text() -> None:
 
 
 def test_printed_input_matrix_makes_the_filter_worse(case: tuple[Scenario, Record]) -> None:
-    """B_u = (0, 1) puts u[k-1] where sensor and mirror have u[k-2] (eq. 4 to 6): the filter takes the wrong command off."""
+    """B_u = (0, 1) puts u[k-1] where sensor and mirror have u[k-2] (eq. 3 to 5): the filter takes the wrong command off."""
     s, record = case
     turbulence, vibration = modelled_processes(s, 0, record.dt)
     A, B, C = paper_matrices(turbulence, vibration)
@@ -87,7 +87,7 @@ def test_printed_input_matrix_makes_the_filter_worse(case: tuple[Scenario, Recor
 
 
 def test_the_predictor_form_is_one_step_behind(case: tuple[Scenario, Record]) -> None:
-    """Eq. 10 estimates step k from y up to k - 1, the GPR from y[k]: built is the form with y[k]. One prediction, A x_hat[k]
+    """Eq. 9 estimates step k from y up to k - 1, the GPR from y[k]: built is the form with y[k]. One prediction, A x_hat[k]
     + B u[k], takes it to the printed one."""
     s, record = case
     turbulence, vibration = modelled_processes(s, 0, record.dt)
@@ -105,7 +105,7 @@ def test_the_predictor_form_is_one_step_behind(case: tuple[Scenario, Record]) ->
 
 
 def test_a_predicted_state_is_corrected_with_the_filter_gain(case: tuple[Scenario, Record]) -> None:
-    """Eq. 12 corrects x_pred[k+1] with the K of eq. 9c, A L, which predicts once more. Same gains, L in place of K, are
+    """Eq. 11 corrects x_pred[k+1] with the K of eq. 8c, A L, which predicts once more. Same gains, L in place of K, are
     what is built; with K the error of turbulence grows."""
     s, record = case
     model = kalman_model(s, 0, record.dt)
@@ -190,7 +190,7 @@ def test_the_band_at_47_7_hz_holds_the_peak_at_47_4969() -> None:
 
 
 def test_the_mirror_is_taken_off_with_its_delay() -> None:
-    """Section 2.3 writes phi_dist = y_CL - u; eq. 4 to 6 make that y[k] - u[k-2]. With the printed one, noise of two more
+    """Section 2.3 writes phi_dist = y_CL - u; eq. 3 to 5 make that y[k] - u[k-2]. With the printed one, noise of two more
     steps of commands passes the bands: a larger error of the causal reference."""
     s = paper().replace({"run.duration": 12.0})
     record = simulate(s)
