@@ -39,8 +39,10 @@ run: $(RUN)  ## serve the dashboard on localhost:5006 (another port: make run PO
 	@$(BIN)/wfsobs serve --port $(PORT)
 
 test: setup  ## run all tests, those in a browser after the others
-	$(BIN)/python -m pytest
-	$(BIN)/python -m pytest tests/browser
+	@status=0; \
+	$(BIN)/python -m pytest || status=1; \
+	$(BIN)/python -m pytest tests/browser || status=1; \
+	exit $$status
 
 setup: $(TEST)  ## install all that the tests need, the browser included
 	@scripts/need_browser.sh $(VENV)
