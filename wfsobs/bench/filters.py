@@ -17,6 +17,7 @@ from wfsobs.observers.kalman import kalman_model, measurement_noise, modelled_pr
 from wfsobs.observers.multirate import multirate_filter, multirate_noise
 from wfsobs.record import pseudo_open_loop
 from wfsobs.riccati import steady_state
+from wfsobs.scenario import Scenario
 from wfsobs.statespace import paper_matrices
 
 EXACT_STEPS = 3000
@@ -32,9 +33,10 @@ def kalman_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
     record = simulate(scenario)
     y, u, n = record.y_lgs[:, 0], record.u[:, 0], record.n_steps
     task, size = "kalman-record", f"{n} steps, 6 states"
-    noise, model = measurement_noise(scenario)[0], kalman_model(scenario, 0, record.dt)
-    ours, steady = steady_filter(model, noise)
-    A, B, C = paper_matrices(*modelled_processes(scenario, 0, record.dt))
+    noise = measurement_noise(scenario)[0]
+    ours, _ = steady_filter(kalman_model(scenario, 0, record.dt), noise)
+    A, B, C, Q = paper_model(scenario, record.dt)
+    steady = steady_state(A[:4, :4], C[:4], Q, np.array(noise**2))
     arguments = A, B, C, _with_mirror(steady.L[:, 0]), y, u
     exact = _extended(textbook.kalman_loop, *arguments)[:, PHI]
 
@@ -47,7 +49,7 @@ def kalman_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
         yield row(task, size, FILTERPY, seconds, n, error=_error(states[:, PHI], exact))
     if STATSMODELS in libraries:
         seconds, states = timed(lambda: external.statsmodels_kalman(
-            model.A, model.C, model.Q, noise**2, steady.P, pseudo_open_loop(y, u)), sizes.repeats)
+            A[:4, :4], C[:4], Q, noise**2, steady.P, pseudo_open_loop(y, u)), sizes.repeats)
         yield row(task, size, STATSMODELS, seconds, n, error=_error(states[:, PHI], exact))
 
 
@@ -59,12 +61,11 @@ def multirate_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
     y, u, z_ngs, n = record.y_lgs[:, 0], record.u[:, 0], record.z_ngs[:, 0], record.n_steps
     task, size = "multirate-record", f"{n} steps, 6 states"
     lgs, ngs = multirate_noise(scenario)
-    model = kalman_model(scenario, 0, record.dt)
-    ours = multirate_filter(model, record.ratio, lgs, ngs)
-    A, B, C = paper_matrices(*modelled_processes(scenario, 0, record.dt))
+    ours = multirate_filter(kalman_model(scenario, 0, record.dt), record.ratio, lgs, ngs)
+    A, B, C, Q = paper_model(scenario, record.dt)
     C_ngs = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 0.0])  # of z_ngs, from which the mirror's part has been taken
-    L = steady_state(model.A, model.C, model.Q, np.array(lgs**2)).L[:, 0]
-    L_both = steady_state(model.A, np.vstack([model.C, model.C]), model.Q, np.diag([lgs**2, ngs**2])).L
+    L = steady_state(A[:4, :4], C[:4], Q, np.array(lgs**2)).L[:, 0]
+    L_both = steady_state(A[:4, :4], np.vstack([C[:4], C[:4]]), Q, np.diag([lgs**2, ngs**2])).L
     arguments = A, B, C, C_ngs, _with_mirror(L), _with_mirror(L_both), y, z_ngs, u
     exact = _extended(textbook.multirate_loop, *arguments)[:, PHI]
 
@@ -80,8 +81,15 @@ def multirate_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
         yield row(task, size, FILTERPY, seconds, n, error=_error(states[:, PHI], exact))
 
 
+def paper_model(scenario: Scenario, dt: float) -> tuple[Array, Array, Array, Array]:
+    """A (6, 6), B (6,), C (6,) of the paper's state, and Q (4, 4) [um^2] of its disturbances."""
+    turbulence, vibration = modelled_processes(scenario, 0, dt)
+    drives = np.array([turbulence.drive_variance, 0.0, vibration.drive_variance, 0.0])
+    return *paper_matrices(turbulence, vibration), np.diag(drives)
+
+
 def _with_mirror(L: Array) -> Array:
-    """A gain of the disturbance's states for the paper's state, of which the mirror's part is known."""
+    """A gain (4, ...) of the disturbances for the paper's state, of which the mirror's part is known, (6, ...)."""
     return np.concatenate([L, np.zeros((2, *L.shape[1:]))])
 
 
