@@ -44,19 +44,19 @@ MARKS = (
     f'<span class="mark" style="border-left:2px solid {PEAKS}">peaks</span>'
     f'<span class="mark" style="border-left:2px dashed {MODEL}">peak in the Kalman filters</span>'
 )
-FADED = ":host(.stale) { opacity: 0.45; transition: opacity 0.2s 0.3s; }"
 
 
 PHONE_PX = 600
 """Below this width the drawer lies over the page, and starts closed."""
 
 
-class Viewport(JSComponent):
-    """Tells the width of the window."""
+class Frame(JSComponent):
+    """Tells the width of the window, and fades the results above it while they are stale."""
 
     width_px = param.Integer(0, doc="Width when the page opened [px].")
+    stale = param.Boolean(False, doc="Whether to fade the results.")
 
-    _esm = asset("viewport.js")
+    _esm = asset("frame.js")
 
 
 class Dashboard:
@@ -71,6 +71,7 @@ class Dashboard:
         self.spectra = Spectra(self.store.run, self.display)
         self.strips = {target: Strip(target, self.store.run, self.display) for target in TARGETS}
         self.table = Table(self.store.run, self.display)
+        self.frame = Frame(width=0, height=0, margin=0)
         self.alert = pmui.Alert(
             object="", severity="error", visible=False, **WIDE)
         self.stale = pmui.Alert(
@@ -81,17 +82,16 @@ class Dashboard:
 
     def page(self) -> pmui.Page:
         """The whole page."""
-        self.body = pn.Column(
+        body = pn.Column(
             *(self._section(target) for target in TARGETS), _box("RMS errors", self.table.pane),
-            **WIDE, stylesheets=[":host { gap: 10px; }", FADED])
-        self.viewport = Viewport(width=0, height=0, margin=0)
+            **WIDE, stylesheets=[":host { gap: 10px; }"])
         page = pmui.Page(
             title="wfsobs", sidebar=[self.controls.view()], sidebar_width=340, theme_config=theme(), favicon=None,
             main=[pn.Column(
-                self._switches(), self.alert, self.stale, self.body, self.viewport,
+                self._switches(), self.alert, self.stale, body, self.frame,
                 sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
         )
-        self.viewport.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")
+        self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")
         page.param.watch(lambda event: self.display.param.update(dark=event.new), "dark_theme")
         return page
 
@@ -145,7 +145,7 @@ class Dashboard:
         self.alert.param.update(object=run.message, visible=failed)
         waiting = self.store.stale and run.state != "running"
         self.stale.visible = waiting
-        self.body.css_classes = ["stale"] if self.store.stale else []
+        self.frame.stale = self.store.stale
 
 
 def _open_drawer(page: pmui.Page, width: int) -> None:

@@ -8,11 +8,13 @@ from typing import Any
 import panel as pn
 import panel_material_ui as pmui
 import param
+from panel.custom import JSComponent
 
-from wfsobs.app.controls.fields import ROOM, Field, error_html, make_field
+from wfsobs.app.controls.fields import ROOM, Field, make_field
 from wfsobs.app.controls.peaks import PATH as PEAKS
 from wfsobs.app.controls.peaks import PeakEditor
 from wfsobs.app.store import CANCELLED, DONE, FAILED, RUNNING, Store
+from wfsobs.app.style import asset
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
 from wfsobs.settings import Group
@@ -22,6 +24,17 @@ FIRST = ("turbulence.wind_speed", "sensors.exposure_ratio")
 
 TOPICS = ("vibration", "gpr_offline", "gpr_online")
 """Topics that come first; the others follow as declared."""
+
+
+class Status(JSComponent):
+    """The state of the run in the browser."""
+
+    progress = param.Number(0.0, doc="Fraction done.")
+    text = param.String("", doc="The state, in words.")
+    note = param.String("", doc="What was refused.")
+
+    _esm = asset("status.js")
+    _stylesheets = [asset("status.css")]  # noqa: RUF012
 
 
 class Controls:
@@ -37,8 +50,7 @@ class Controls:
             label="Reset", icon="restart_alt", variant="text", size="small", margin=(4, 0, 4, 4), align="center")
         self.run = pmui.Button(label="Run", icon="play_arrow", color="primary", **ROOM)
         self.cancel = pmui.Button(label="Cancel", icon="stop", variant="outlined", margin=(4, 0, 4, 8))
-        self.progress = pmui.LinearProgress(value=0, variant="determinate", sizing_mode="stretch_width", margin=(2, 0))
-        self.status = pn.pane.HTML("", sizing_mode="stretch_width", margin=(0, 0, 4, 0))
+        self.status = Status(sizing_mode="stretch_width", margin=(4, 0))
         self.topics = _names()
         self.rooms = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
         self.accordion = pmui.Accordion(
@@ -57,7 +69,7 @@ class Controls:
         return pn.Column(
             pn.Row(self.preset, self.reset, sizing_mode="stretch_width", margin=0),
             pn.Row(self.run, self.cancel, sizing_mode="stretch_width", margin=0),
-            self.progress, self.status, *(f.view for f in first), self.accordion,
+            self.status, *(f.view for f in first), self.accordion,
             sizing_mode="stretch_width", margin=(8, 14),
         )
 
@@ -117,12 +129,12 @@ class Controls:
         run = self.store.run
         running = run.state == RUNNING
         self.cancel.disabled = not running
-        self.progress.param.update(value=round(100 * run.progress), visible=True)
-        self.status.object = status_html(self.store)
+        text, note = status_of(self.store)
+        self.status.param.update(progress=run.progress, text=text, note=note)
 
 
-def status_html(store: Store) -> str:
-    """One line on the run, and one on what was refused."""
+def status_of(store: Store) -> tuple[str, str]:
+    """A line on the run, and one on what was refused."""
     run = store.run
     seconds = f" in {run.shown.seconds:.2f} s" if run.shown and run.state == DONE else ""
     text = {
@@ -130,7 +142,7 @@ def status_html(store: Store) -> str:
         CANCELLED: "Cancelled", FAILED: "The run failed",
     }.get(run.state, "")
     note = f"Not accepted: {', '.join(store.errors)}" if store.errors else ""
-    return f'<div role="status" class="status" style="font-size:13px">{escape(text)}</div>{error_html(note)}'
+    return text, note
 
 
 def _names() -> dict[str, str]:

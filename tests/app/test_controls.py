@@ -9,7 +9,7 @@ import param
 import pytest
 
 from wfsobs.app.controls.fields import SliderField, label_of, parsed, written_unit
-from wfsobs.app.controls.panel import FIRST, Controls, status_html
+from wfsobs.app.controls.panel import FIRST, Controls, status_of
 from wfsobs.app.controls.peaks import PATH
 from wfsobs.app.work import Shown
 from wfsobs.pipeline import Result
@@ -137,7 +137,7 @@ def test_a_bad_value_shows_beside_its_setting(controls: Controls, path: str, tex
     assert says in error_of(controls, path)
     assert field.widgets[-1].error_state and field.widgets[-1].value == text, "what was typed stays, to be corrected"
     assert controls.store.run.shown is shown and controls.store.scenario is scenario
-    assert f"Not accepted: {path}" in status_html(controls.store)
+    assert status_of(controls.store)[1] == f"Not accepted: {path}" == controls.status.note
 
 
 def test_correcting_a_bad_value_clears_the_message(controls: Controls, loop: Any) -> None:
@@ -196,14 +196,14 @@ def test_choosing_a_preset(controls: Controls) -> None:
 
 
 def test_run_and_cancel(controls: Controls, loop: Any) -> None:
-    assert controls.cancel.disabled and "Done" in controls.status.object
+    assert controls.cancel.disabled and "Done" in controls.status.text
     controls.run.clicks += 1
-    assert not controls.cancel.disabled and "Running" in controls.status.object
+    assert not controls.cancel.disabled and "Running" in controls.status.text
     controls.cancel.clicks += 1
-    assert controls.cancel.disabled and "Cancelled" in controls.status.object
+    assert controls.cancel.disabled and "Cancelled" in controls.status.text
     controls.run.clicks += 1
     loop.finish(controls.store)
-    assert controls.progress.value == 100
+    assert controls.status.progress == 1.0
 
 
 class TestPeaks:

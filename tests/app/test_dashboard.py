@@ -13,6 +13,10 @@ from wfsobs.app.work import Shown, compute
 from wfsobs.scenario import Scenario
 
 
+def faded(dashboard: Dashboard) -> bool:
+    return dashboard.frame.stale
+
+
 def test_error_page(caplog: pytest.LogCaptureFixture) -> None:
     def build(post: Any) -> Dashboard:
         raise RuntimeError("<no> room")
@@ -53,11 +57,11 @@ def test_a_failing_run_shows_inline(loop: Any, short: Scenario) -> None:
     dashboard.store.change("loop.gain", 0.1)
     loop.finish(dashboard.store)
     assert dashboard.alert.visible and "no such luck" in dashboard.alert.object
-    assert dashboard.stale.visible and dashboard.body.css_classes == ["stale"]
+    assert dashboard.stale.visible and faded(dashboard)
     assert dashboard.table.pane.object == table, "the last result stands"
     dashboard.store.change("loop.gain", 0.2)
     loop.finish(dashboard.store)
-    assert not dashboard.alert.visible and not dashboard.stale.visible and dashboard.body.css_classes == []
+    assert not dashboard.alert.visible and not dashboard.stale.visible and not faded(dashboard)
 
 
 def test_results_are_marked_stale_until_new_ones_land(loop: Any, short: Scenario) -> None:
@@ -74,10 +78,10 @@ def test_results_are_marked_stale_until_new_ones_land(loop: Any, short: Scenario
     dashboard.start()
     loop.finish(dashboard.store)
     dashboard.store.change("loop.gain", 0.1)
-    assert dashboard.body.css_classes == ["stale"] and not dashboard.stale.visible, "no line while it runs"
+    assert faded(dashboard) and not dashboard.stale.visible, "no line while it runs"
     gate.set()
     loop.finish(dashboard.store)
-    assert dashboard.body.css_classes == []
+    assert not faded(dashboard)
 
 
 def test_the_page(dashboard: Dashboard) -> None:
@@ -89,13 +93,11 @@ def test_the_page(dashboard: Dashboard) -> None:
 
 def test_a_narrow_window_closes_the_drawer(dashboard: Dashboard, loop: Any) -> None:
     page = dashboard.page()
-    viewport = dashboard.viewport
-    viewport.width_px = 1400
-    loop.land()
-    assert page.sidebar_open
-    viewport.width_px = 390
-    loop.land()
-    assert not page.sidebar_open
+    frame = dashboard.frame
+    frame.width_px = 390
+    loop.until(lambda: not page.sidebar_open)
+    frame.width_px = 1400
+    loop.until(lambda: page.sidebar_open)
 
 
 def test_importing_the_package_imports_no_panel() -> None:
