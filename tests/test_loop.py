@@ -140,7 +140,7 @@ def test_training_is_a_record_of_its_own_with_a_twin(closed: bool) -> None:
     r = simulate(s)
     t = r.training
     assert t is not None and t.open_loop_y is not None
-    assert t.y_lgs.shape == t.u.shape == t.open_loop_y.shape == (50 + 20 + TRAINING_MARGIN, 2)
+    assert t.y_lgs.shape == t.u.shape == t.open_loop_y.shape == (50 + 20 + round(TRAINING_MARGIN / r.dt), 2)
     # the twin is the same measurement without the mirror, the first two steps' commands lying before the cut
     assert np.abs(t.y_lgs[2:] - t.u[:-2] - t.open_loop_y[2:]).max() < 1e-14
     # no copy and no shift of the record itself: the second differences, mostly noise, are not correlated at any lag

@@ -180,12 +180,16 @@ def test_whatever_can_be_set_gives_a_filter_or_says_why(
 def test_no_disturbance_needs_no_gain() -> None:
     model = disturbance_model([Ar2(7.0, 0.9, 0.0, 1e-3)], [Ar2(300.0, 0.03, 0.0, 1e-3)])
     found = steady_state(model.A, model.C, model.Q, np.array(1e-4))
-    assert not found.P.any() and not found.L.any() and not found.filtered.any()
+    # A state of variance one that nothing is seen of: no gain, its own covariance, and outputs of zero.
+    assert not found.L.any()
+    assert np.allclose(found.P, np.eye(4), atol=1e-12) and np.allclose(found.filtered, found.P, atol=1e-12)
+    assert not any(row.any() for row in model.outputs.values())
 
 
 def test_more_noise_never_helps() -> None:
     model = disturbance_model([Ar2(7.0, 0.9, 0.5, 1e-3)], [Ar2(300.0, 0.03, 0.015, 1e-3)])
-    traces = [np.trace(steady_state(model.A, model.C, model.Q, np.array(r)).P) for r in np.geomspace(1e-10, 1e4, 15)]
+    T = model.pairs
+    traces = [np.trace(T @ steady_state(model.A, model.C, model.Q, np.array(r)).P @ T.T) for r in np.geomspace(1e-10, 1e4, 15)]
     assert np.all(np.diff(traces) > 0)
     stationary = 2 * (0.5**2 + 0.015**2)
     assert traces[-1] < stationary and traces[-1] == pytest.approx(stationary, rel=0.01)

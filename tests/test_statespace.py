@@ -57,14 +57,18 @@ def test_a_model_is_the_sum_of_its_processes(n_turbulence: int, n_vibration: int
     vibration = [Ar2(100.0 * (i + 1), 0.03, 0.02, 1e-3) for i in range(n_vibration)]
     model = disturbance_model(turbulence, vibration)
     rng = np.random.default_rng(1)
-    x = rng.standard_normal(2 * (n_turbulence + n_vibration))
-    after = model.A @ x
+    state = rng.standard_normal(2 * (n_turbulence + n_vibration))
+    x, after = model.pairs @ state, model.pairs @ model.A @ state
     now = {"turbulence": x[0 : 2 * n_turbulence : 2].sum(), "vibration": x[2 * n_turbulence :: 2].sum()}
     for target, row in model.outputs.items():
-        assert row @ x == pytest.approx(now[target], abs=1e-14)
+        assert row @ state == pytest.approx(now[target], abs=1e-14)
     # one step late: C x[k+1] is what the outputs said at step k
-    assert model.C @ after == pytest.approx(sum(now.values()), abs=1e-13)
+    assert model.C @ model.A @ state == pytest.approx(sum(now.values()), abs=1e-13)
     for i, p in enumerate([*turbulence, *vibration]):
-        assert after[2 * i] == pytest.approx(p.a1 * x[2 * i] + p.a2 * x[2 * i + 1], rel=1e-13)
-        assert model.Q[2 * i, 2 * i] == p.drive_variance
-    assert np.count_nonzero(model.Q) == n_turbulence + n_vibration
+        assert after[2 * i] == pytest.approx(p.a1 * x[2 * i] + p.a2 * x[2 * i + 1], abs=1e-13)
+        assert after[2 * i + 1] == pytest.approx(x[2 * i], abs=1e-13)
+    drive = np.diag([v for p in (*turbulence, *vibration) for v in (p.drive_variance, 0.0)])
+    # 1e-12: phi[k+1] and phi[k] are nearly the same, so the zero of the second is a difference
+    assert np.allclose(model.pairs @ model.Q @ model.pairs.T, drive, rtol=1e-9, atol=1e-12 * drive.max())
+    # variance one, uncorrelated: the stationary covariance is the identity
+    assert np.allclose(model.A @ model.A.T + model.Q, np.eye(len(state)), atol=1e-13)

@@ -53,9 +53,14 @@ class Ar2:
 
     @property
     def drive_variance(self) -> float:
-        """Variance of v that gives phi the variance rms^2.
+        """Variance of v that gives phi the variance rms^2."""
+        return self.rms**2 * self.unit_drive_variance
 
-        (1 + a2) ((1 - a2)^2 - a1^2) / (1 - a2) rms^2, with the small factors (1 - a1 - a2) and
+    @property
+    def unit_drive_variance(self) -> float:
+        """Variance of v that gives phi the variance 1.
+
+        (1 + a2) ((1 - a2)^2 - a1^2) / (1 - a2), with the small factors (1 - a1 - a2) and
         (1 + a2) written so that nothing cancels when the process is slow or hardly damped.
         """
         damped, angle = self.damping * self.omega * self.dt, self.omega * np.sqrt(1.0 - self.damping**2) * self.dt
@@ -63,7 +68,7 @@ class Ar2:
         # 1 -+ a1 - a2 = |1 -+ exp(-damped + i angle)|^2
         at_zero = np.expm1(-damped) ** 2 + 4.0 * np.exp(-damped) * np.sin(angle / 2.0) ** 2
         at_nyquist = np.expm1(-damped) ** 2 + 4.0 * np.exp(-damped) * np.cos(angle / 2.0) ** 2
-        return float(self.rms**2 * one_plus_a2 * at_zero * at_nyquist / (1.0 - self.a2))
+        return float(one_plus_a2 * at_zero * at_nyquist / (1.0 - self.a2))
 
     def autocovariance(self, n: int) -> Array:
         """E phi[k] phi[k-j] for j = 0 ... n - 1, shape (n,)."""

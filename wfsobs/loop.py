@@ -14,9 +14,9 @@ from wfsobs.scenario import Scenario
 from wfsobs.sensing import measure
 from wfsobs.watch import QUIET, Watch
 
-TRAINING_MARGIN = 500
-"""Steps that a training record has beyond its last window, so that the end of the zero-phase filter
-stays out of the targets."""
+TRAINING_MARGIN = 0.5
+"""What a training record has beyond its last window [s], so that the end of the zero-phase filter stays out of
+the targets."""
 
 
 def integrator(open_loop_y: Array, gain: float, leak: float) -> Array:
@@ -67,7 +67,7 @@ def _training(scenario: Scenario, rng: np.random.Generator, watch: Watch) -> Tra
     the loop has settled, and it is as long as the offline GPR needs."""
     g = scenario.gpr_offline
     settle = round(scenario.run.warm_up * scenario.sensors.lgs_rate)
-    needed = g.training_size + g.depth + TRAINING_MARGIN
+    needed = g.training_size + g.depth + round(TRAINING_MARGIN * scenario.sensors.lgs_rate)
     record = _run(scenario, settle + needed, rng, watch)
     assert record.open_loop_y is not None
     return Training(record.y_lgs[settle:], record.u[settle:], record.open_loop_y[settle:])

@@ -13,6 +13,7 @@ from wfsobs.observers.base import Estimate, Observer
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scores import Score, score
+from wfsobs.settings import SettingError
 from wfsobs.watch import QUIET, Watch
 
 
@@ -85,7 +86,10 @@ def each_estimate(
 
     on_partial : told (observer, target, values so far) by observers that deliver in blocks.
     """
-    chosen = [OBSERVERS[name] for name in observers] if observers is not None else list(OBSERVERS.values())
+    unknown = set(observers or ()) - set(OBSERVERS)
+    if unknown:
+        raise SettingError(f"observer {sorted(unknown)[0]!r}: no such observer; there are {', '.join(OBSERVERS)}")
+    chosen = list(OBSERVERS.values()) if observers is None else [OBSERVERS[name] for name in dict.fromkeys(observers)]
     weights = {o.id: o.weight for o in chosen}
     total = sum(weights.values()) or 1.0
     done = 0.0

@@ -9,7 +9,8 @@ and the periodic one, where (A, C, Q, R) repeat every few steps. One step maps a
 and two such maps in a row are one of the same kind. Composing a cycle, then the cycle with itself over and over, doubles
 the steps in every pass: about twelve passes do, even for hardly damped lines, and H is then the solution.
 What rounding leaves is taken out by Kleinman steps: the covariance that the gains at hand really give is a
-Lyapunov equation, a sum of positive terms that loses nothing, and its gains are better, quadratically.
+Lyapunov equation, a sum of positive terms that loses nothing, and its gains are better, quadratically. Where the noise
+is so small that rounding spoils the doubling, they start from the covariance without any measurement.
 """
 
 from __future__ import annotations
@@ -59,22 +60,30 @@ def periodic_steady_state(cycle: Sequence[Step]) -> list[SteadyState]:
 
     Raises RiccatiError like `steady_state`.
     """
-    P = _doubled(reduce(_compose, (_map(*step) for step in cycle)))
-    best: list[SteadyState] = []
-    for _ in range(8):
-        states = _around(cycle, P)
-        if best and not states[0].residual < 0.5 * best[0].residual:
-            break
-        best = states
-        if states[0].residual < 1e-14:
-            break
-        P = _lyapunov_around(cycle, states)
-    if not best[0].residual <= RESIDUAL:
-        raise RiccatiError(f"no accurate steady-state filter: the Riccati equation is met to {best[0].residual:.1e} only; "
+    found = _refined(cycle, _doubled(cycle))
+    if found[0].residual > RESIDUAL:
+        found = _refined(cycle, _without_measurements(cycle))
+    residual = found[0].residual
+    if not residual <= RESIDUAL:
+        raise RiccatiError(f"no accurate steady-state filter: the Riccati equation is met to {residual:.1e} only; "
                            "measurement noise and process noise are too far apart")
-    radius = np.abs(np.linalg.eigvals(_closed_loop(cycle, best))).max()
+    radius = np.abs(np.linalg.eigvals(_closed_loop(cycle, found))).max()
     if radius >= 1.0:
         raise RiccatiError(f"the steady-state filter is not stable: spectral radius {radius:.6f}")
+    return found
+
+
+def _refined(cycle: Sequence[Step], P: Array) -> list[SteadyState]:
+    """The best that Kleinman steps from P find: until rounding is all that is left, or three of them bring nothing."""
+    best = _around(cycle, P)
+    states, idle = best, 0
+    while idle < 3 and best[0].residual > 1e-14:
+        try:
+            states = _around(cycle, _lyapunov_around(cycle, states))
+        except RiccatiError:  # gains from a poor start need not be stable
+            break
+        idle = 0 if states[0].residual < 0.5 * best[0].residual else idle + 1
+        best = min(best, states, key=lambda s: s[0].residual)
     return best
 
 
@@ -101,17 +110,26 @@ def _compose(first: Map, then: Map) -> Map:
     return A1 @ W[:, :n], 0.5 * (G + G.T), 0.5 * (H + H.T)
 
 
-def _doubled(m: Map) -> Array:
-    """The covariance after very many repetitions of a map."""
+def _doubled(cycle: Sequence[Step]) -> Array:
+    """The covariance after very many cycles, by doubling: until it stands still, or only rounding moves it."""
+    m = reduce(_compose, (_map(*step) for step in cycle))
+    last = np.inf
     for _ in range(60):
-        before = m[2]
-        with np.errstate(over="ignore", invalid="ignore"):
-            m = _compose(m, m)
+        before = m
+        m = _compose(m, m)
         if not np.isfinite(m[2]).all():
+            return before[2]
+        moved = np.abs(m[2] - before[2]).max() / max(np.abs(m[2]).max(), np.finfo(float).tiny)
+        if moved <= 1e-15 or (moved < 1e-9 and moved >= last):
             break
-        if np.abs(m[2] - before).max() <= 1e-15 * np.abs(m[2]).max():
-            return m[2]
-    raise RiccatiError("the Riccati equation did not converge")
+        last = moved
+    return m[2]
+
+
+def _without_measurements(cycle: Sequence[Step]) -> Array:
+    """The covariance of the model itself, from which Kleinman steps lead to the solution as surely, if more slowly."""
+    blind = _around([(A, np.zeros_like(C), Q, R) for A, C, Q, R in cycle], np.zeros_like(cycle[0][2]))
+    return _lyapunov_around(cycle, blind)
 
 
 def _around(cycle: Sequence[Step], P: Array) -> list[SteadyState]:

@@ -285,8 +285,10 @@ def _put(node: Any, keys: list[str], value: Any, path: str) -> None:
             node[key] = value
         elif key in node:
             _put(node[key], keys[1:], value, path)
-        else:
+        elif node:
             raise SettingError(f"{path}: no such setting; {key!r} is not one of {', '.join(node)}")
+        else:
+            raise SettingError(f"{path}: the entry is new; give it a whole {key} first")
     else:
         raise SettingError(f"{path}: no such setting")
 

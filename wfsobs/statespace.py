@@ -6,13 +6,14 @@ would see u[k-1]; B_u = (1, 0) is what its sensor and mirror equations (3 to 5) 
 
 The mirror's part of the state is known exactly: the Riccati solution is zero there, and the filter
 on y[k] and u[k] is the filter of the disturbance alone on z[k] = y[k] - u[k-2]. Observers use that
-smaller model, `DisturbanceModel`.
+smaller model, `DisturbanceModel`, in coordinates that keep its digits.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -28,31 +29,66 @@ MIN_MODEL_DAMPING = 1e-4
 class DisturbanceModel:
     """Sum of AR(2) processes measured one step late, z[k] = C x[k] + w[k].
 
-    A (n, n), C (n,) with x = (phi_1[k], phi_1[k-1], phi_2[k], ...); Q (n, n) in [um^2].
-    outputs : target -> row (n,) that gives its phi[k].
+    A (n, n), C (n,), Q (n, n); x holds two numbers per process (`process_model`).
+    outputs : target -> row (n,) that gives its phi[k] [um].
+    pairs   : (n, n) that gives the paper's state (phi_1[k], phi_1[k-1], phi_2[k], ...) [um].
     """
 
     A: Array
     C: Array
     Q: Array
     outputs: dict[str, Array]
+    pairs: Array
 
     def output_rows(self, targets: Sequence[str]) -> Array:
         """The rows of several targets, (len(targets), n)."""
         return np.array([self.outputs[target] for target in targets])
 
 
+class ProcessModel(NamedTuple):
+    """One AR(2) process as a state-space model: A, Q (2, 2); rows (2,) that give phi[k] and phi[k-1]."""
+
+    A: Array
+    Q: Array
+    now: Array
+    before: Array
+
+
+def process_model(p: Ar2) -> ProcessModel:
+    """An AR(2) process in coordinates of variance one, uncorrelated with each other.
+
+    The paper's pair (phi[k], phi[k-1]) is all but linearly dependent for a slow process, which costs the Riccati equation
+    its digits. With rho the correlation of the two, s = sqrt(1 - rho^2) and
+
+        phi[k] = rms xi_0,    phi[k-1] = rms (rho xi_0 + s xi_1)
+
+    the same process is xi[k+1] = [[rho, a2 s], [s, -rho a2]] xi[k] + (1, -rho / s) v[k], v for phi of rms one. For s, nothing is
+    subtracted from one: s (1 - a2) = |1 - exp(-2 xi w T + 2 i angle)| has the two squares below.
+    """
+    damped, angle = p.damping * p.omega * p.dt, p.omega * np.sqrt(1.0 - p.damping**2) * p.dt
+    rho = p.a1 / (1.0 - p.a2)
+    s = np.hypot(np.expm1(-2.0 * damped), 2.0 * np.exp(-damped) * np.sin(angle)) / (1.0 - p.a2)
+    drive = np.array([1.0, -rho / s])
+    return ProcessModel(
+        A=np.array([[rho, p.a2 * s], [s, -rho * p.a2]]),
+        Q=p.unit_drive_variance * np.outer(drive, drive),
+        now=p.rms * np.array([1.0, 0.0]),
+        before=p.rms * np.array([rho, s]),
+    )
+
+
 def disturbance_model(turbulence: list[Ar2], vibration: list[Ar2]) -> DisturbanceModel:
     """The model of all the given processes, each with its own drive (paper, eq. 1, 2 and 7)."""
-    processes = [*turbulence, *vibration]
-    n = 2 * len(processes)
-    C, Q = np.zeros(n), np.zeros((n, n))
-    C[1::2] = 1.0
-    Q[range(0, n, 2), range(0, n, 2)] = [p.drive_variance for p in processes]
-    rows = {"turbulence": np.zeros(n), "vibration": np.zeros(n)}
-    rows["turbulence"][0 : 2 * len(turbulence) : 2] = 1.0
-    rows["vibration"][2 * len(turbulence) :: 2] = 1.0
-    return DisturbanceModel(block_diag(*(p.transition for p in processes)), C, Q, rows)
+    models = [process_model(p) for p in (*turbulence, *vibration)]
+    now = np.concatenate([m.now for m in models])
+    first = np.arange(now.size) < 2 * len(turbulence)
+    return DisturbanceModel(
+        A=block_diag(*(m.A for m in models)),
+        C=np.concatenate([m.before for m in models]),
+        Q=block_diag(*(m.Q for m in models)),
+        outputs={"turbulence": np.where(first, now, 0.0), "vibration": np.where(first, 0.0, now)},
+        pairs=block_diag(*(np.array([m.now, m.before]) for m in models)),
+    )
 
 
 def paper_matrices(turbulence: Ar2, vibration: Ar2) -> tuple[Array, Array, Array]:

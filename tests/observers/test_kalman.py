@@ -196,12 +196,13 @@ def test_error_of_the_matched_filter_is_what_the_riccati_equation_says() -> None
         values = kf_lgs(record, s, QUIET)
         one = []
         for mode in range(2):
-            _, steady = steady_filter(kalman_model(s, mode, record.dt), measurement_noise(s)[0])
-            for i, target in enumerate(("turbulence", "vibration")):
+            model = kalman_model(s, mode, record.dt)
+            _, steady = steady_filter(model, measurement_noise(s)[0])
+            for target in ("turbulence", "vibration"):
                 truth = record.truth(target)
                 assert truth is not None
                 error = (values[target] - truth)[1000:, mode]
-                one.append(np.mean(error**2) / steady.filtered[2 * i, 2 * i])
+                one.append(np.mean(error**2) / (model.outputs[target] @ steady.filtered @ model.outputs[target]))
         ratios.append(one)
     mean, standard_error = np.mean(ratios, axis=0), np.std(ratios, axis=0, ddof=1) / np.sqrt(len(ratios))
     assert (standard_error < 0.005).all(), standard_error  # else the next line would say nothing

@@ -14,7 +14,7 @@ from wfsobs.observers.multirate_optimal import multirate_optimal, optimal_cycle,
 from wfsobs.presets import paper
 from wfsobs.riccati import periodic_steady_state, steady_state
 from wfsobs.scenario import Scenario
-from wfsobs.statespace import disturbance_model
+from wfsobs.statespace import disturbance_model, process_model
 from wfsobs.watch import QUIET
 
 DT = 1e-3
@@ -28,23 +28,23 @@ def padded(rows, cycle):
     return np.hstack([rows, np.zeros((len(rows), len(cycle[0][0]) - rows.shape[1]))])
 
 
-def simulated(cycle, n_cycles, rng):
-    """The cycle's own model, run for many cycles from the stationary start of the paper's processes.
+def simulated(cycle, processes, n_cycles, rng):
+    """The cycle's own model, run for many cycles; processes: turbulence, vibration and, if modelled, the LGS error.
 
     Returns states (n, n_states) and measurements (n, 2) for steps k = 1, 2, ...
     """
     ratio, size = len(cycle), len(cycle[0][0])
     n = ratio * n_cycles
-    drive = np.sqrt(np.diag(cycle[0][2]))
     noise = np.sqrt(np.diag(cycle[0][3]))
     x = np.zeros((n, size))
-    for first in range(0, size - 1, 2):  # each AR(2) pair on its own
-        A = cycle[0][0][first : first + 2, first : first + 2]
-        phi = lfilter([1.0], [1.0, -A[0, 0], -A[0, 1]], drive[first] * rng.standard_normal(n + 20_000))[20_000 - 1 :]
-        x[:, first], x[:, first + 1] = phi[1 : n + 1], phi[:n]
-    seen = cycle[0][0][size - 1, : size - 1]  # what one step adds to the frame
-    before = np.concatenate([[0.0], x[:-1, : size - 1] @ seen])  # the frame starts at k = 0, of which nothing is left
-    total = np.cumsum(before)
+    disturbance = np.zeros(n + 1)
+    for i, p in enumerate(processes):
+        drive = np.sqrt(p.drive_variance) * rng.standard_normal(n + 20_000)
+        phi = lfilter([1.0], [1.0, -p.a1, -p.a2], drive)[-n - 1 :]
+        rows = process_model(p)  # how the state gives phi[k] and phi[k-1]
+        x[:, 2 * i : 2 * i + 2] = np.linalg.solve([rows.now, rows.before], [phi[1:], phi[:-1]]).T
+        disturbance += phi if i < 2 else 0.0
+    total = np.cumsum(np.concatenate([[0.0], disturbance[1:-1]])) / ratio  # the frame starts at k = 0, unseen here
     read = np.arange(1, n + 1) % ratio == 0
     at_last_read = np.concatenate([[0.0], total[read]])[np.cumsum(read) - read]
     x[:, size - 1] = total - at_last_read
@@ -73,7 +73,8 @@ def test_innovations_are_white_and_errors_as_predicted(with_error):
     """Ljung-Box over 20 lags at 1 % on 1e6 steps; covariances against Monte Carlo within 3 standard errors."""
     error = Ar2(7.0686, 0.9, 0.05, DT) if with_error else None
     cycle = optimal_cycle(MODEL, 5, 0.014, 0.01, error)
-    x, z = simulated(cycle, 200_000, np.random.default_rng(11))
+    processes = [TURBULENCE, VIBRATION, *([error] if error else [])]
+    x, z = simulated(cycle, processes, 200_000, np.random.default_rng(11))
     outputs = padded(OUTPUTS, cycle)
     estimates, innovations, S, states = run_cycle(cycle, z, outputs)
     settled = slice(20_000, None)
@@ -183,6 +184,7 @@ def test_the_model_is_the_scenarios():
     np.testing.assert_array_equal(A[:4, :4], kalman_model(scenario, 0, 1e-3).A)
     assert (C[1] == np.eye(7)[6]).all()
     assert [float(step[1][1, 6]) for step in cycle] == [0, 0, 0, 0, 1]
-    assert [Q[0, 0], Q[2, 2]] == [turbulence.drive_variance, vibration.drive_variance]
+    np.testing.assert_array_equal(Q[:2, :2], process_model(turbulence).Q)
+    np.testing.assert_array_equal(Q[2:4, 2:4], process_model(vibration).Q)
     # mean of two LGS of 20 nm, NGS of 10 nm
     np.testing.assert_allclose(np.sqrt(np.diag(R)), [0.02 / np.sqrt(2), 0.01], rtol=1e-12)

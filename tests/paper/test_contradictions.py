@@ -71,7 +71,7 @@ def test_printed_input_matrix_makes_the_filter_worse(case: tuple[Scenario, Recor
     turbulence, vibration = modelled_processes(s, 0, record.dt)
     A, B, C = paper_matrices(turbulence, vibration)
     model = kalman_model(s, 0, record.dt)
-    L = np.append(steady_filter(model, 0.02 / np.sqrt(2))[1].L[:, 0], [0.0, 0.0])
+    L = np.append(model.pairs @ steady_filter(model, 0.02 / np.sqrt(2))[1].L[:, 0], [0.0, 0.0])
     errors = []
     for B_u in (B, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])):
         x, out = np.zeros(6), np.zeros(record.n_steps)
@@ -92,13 +92,14 @@ def test_the_predictor_form_is_one_step_behind(case: tuple[Scenario, Record]) ->
     s, record = case
     turbulence, vibration = modelled_processes(s, 0, record.dt)
     A, B, C = paper_matrices(turbulence, vibration)
-    steady = steady_filter(kalman_model(s, 0, record.dt), 0.02 / np.sqrt(2))[1]
-    K = A @ np.append(steady.L[:, 0], [0.0, 0.0])
+    model = kalman_model(s, 0, record.dt)
+    steady = steady_filter(model, 0.02 / np.sqrt(2))[1]
+    K = A @ np.append(model.pairs @ steady.L[:, 0], [0.0, 0.0])
     x, printed = np.zeros(6), np.zeros((record.n_steps + 1, 2))
     for k in range(record.n_steps):
         x = A @ x + B * record.u[k, 0] + K * (record.y_lgs[k, 0] - C @ x)
         printed[k + 1] = x[0], x[2]
-    filtered = steady_filter(kalman_model(s, 0, record.dt), 0.02 / np.sqrt(2), np.eye(4))[0]
+    filtered = steady_filter(model, 0.02 / np.sqrt(2), model.pairs)[0]
     states = filtered.run(record.z[:, None, 0, None])[:, :, 0]
     assert np.abs(states @ A[:4, :4].T[:, [0, 2]] - printed[1:]).max() < 1e-10
     assert np.trace(steady.filtered) < np.trace(steady.P)
@@ -123,7 +124,7 @@ def test_a_predicted_state_is_corrected_with_the_filter_gain(case: tuple[Scenari
                 x = x + gain_one[:, 0] * (z[k] - model.C @ x)
             else:
                 x = x + gain_both @ (np.array([z[k], z_ngs[k]]) - C @ x)
-            out[k] = x[0]
+            out[k] = model.outputs["turbulence"] @ x
             x = model.A @ x
         return out
 

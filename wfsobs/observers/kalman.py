@@ -93,7 +93,7 @@ def kf_ngs(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]
     for mode in range(record.n_modes):
         watch.step(mode / record.n_modes)
         model = kalman_model(scenario, mode, n * record.dt)
-        kalman, _ = steady_filter(model, noise, np.eye(len(model.A)))
+        kalman, _ = steady_filter(model, noise, model.pairs)
         slow = kalman.run(frames[:, None, mode, None])[:, :, 0]  # of each process, slow steps i and i - 1
         fast = np.full((record.n_steps, len(TARGETS)), np.nan)
         for target, process in enumerate(modelled_processes(scenario, mode, record.dt)):

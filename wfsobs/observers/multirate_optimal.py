@@ -25,7 +25,7 @@ from wfsobs.record import Record
 from wfsobs.riccati import SteadyState, Step, periodic_steady_state
 from wfsobs.scenario import Scenario
 from wfsobs.sensing import low_frequency_process
-from wfsobs.statespace import DisturbanceModel
+from wfsobs.statespace import DisturbanceModel, process_model
 from wfsobs.watch import Watch
 
 
@@ -38,13 +38,12 @@ def optimal_cycle(
     frame the second is zero.
     """
     A0, C0, Q0 = model.A, model.C, model.Q
+    now = sum(model.outputs.values()) / ratio
     if lgs_error is not None:
-        A0 = block_diag(A0, lgs_error.transition)
-        C0 = np.append(C0, [1.0, 0.0])
-        Q0 = block_diag(Q0, np.diag([lgs_error.drive_variance, 0.0]))
+        error = process_model(lgs_error)
+        A0, Q0 = block_diag(A0, error.A), block_diag(Q0, error.Q)
+        C0, now = np.append(C0, error.now), np.append(now, [0.0, 0.0])
     n = len(A0)
-    now = np.zeros(n)
-    now[0 : len(model.A) : 2] = 1.0 / ratio
     R = np.diag([lgs_noise**2, ngs_noise**2])
     steps: list[Step] = []
     for j in range(1, ratio + 1):
