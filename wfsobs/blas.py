@@ -83,3 +83,11 @@ def _eliminate_panel(S: Array, n: int) -> None:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
     _trsm(_char(b"R"), _char(b"L"), _char(b"T"), _char(b"N"), rest, _int(n), _real(1.0), here, lead, below, lead)
     _syrk(_char(b"L"), _char(b"N"), rest, _int(n), _real(-1.0), below, lead, _real(1.0), corner, lead)
+
+
+def solved_rows(S: Array, n: int) -> Array:
+    """S21 S11^-1, (N - n, n), from what `eliminate` left of S; in place, over what was S21."""
+    size, lead, here = S.shape[0], _int(S.strides[1] // S.itemsize), S.ctypes.data
+    _trsm(_char(b"R"), _char(b"L"), _char(b"N"), _char(b"N"), _int(size - n), _int(n), _real(1.0), here, lead,
+          here + n * S.itemsize, lead)
+    return S[n:, :n]

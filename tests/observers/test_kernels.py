@@ -74,7 +74,7 @@ def exact_split(kernel: SquaredExponential, x: np.ndarray, y: np.ndarray) -> mp.
 def test_split_kernel_in_long_arithmetic(log_l: float, log_s: float, log_amplitude: float, d: int, seed: int) -> None:
     kernel = SquaredExponential(10**log_s, 10**log_l, 0.1)
     x = 10**log_amplitude * np.random.default_rng(seed).standard_normal((12, 2))
-    V, points = band(x, d, kernel, d, 3, 2)
+    V, points = band(x, d, kernel, d, 5, 2)
     for r in range(3):
         for lag in range(3):
             one, other = window(x, d + r, d), window(x, d + r + lag, d)
@@ -86,7 +86,7 @@ def test_split_kernel_in_long_arithmetic(log_l: float, log_s: float, log_amplitu
             assert abs(entry - wanted) <= slack + 8 * EPS * abs(wanted)
     for r in range(5):
         norm2 = np.sum(window(x, d + r, d) ** 2)
-        assert points.norm2[r] == pytest.approx(norm2, rel=1e-13)
+        assert points.norm2[r] == pytest.approx(norm2 / kernel.length_scale**2, rel=1e-13)
         assert points.delta[r] == pytest.approx(np.exp(-norm2 / 2 / kernel.length_scale**2), rel=1e-12, abs=1e-300)
 
 

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
-from scipy.linalg import solve_triangular
 
 from wfsobs.arrays import Array
-from wfsobs.blas import eliminate
+from wfsobs.blas import eliminate, solved_rows
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.gpr_online import kernel_of, window_signals
 from wfsobs.observers.kernels import (
@@ -40,7 +39,7 @@ ROWS = 256
 
 @dataclass(frozen=True)
 class TrainedGpr:
-    """What training leaves: signals (d + m - 1, channels) that the m windows are cut from, the windows as points,
+    """What training leaves: signals (d + m - 1, channels) [l] that the m windows are cut from, the windows as points,
     their weights (m,), and the constant c."""
 
     signals: Array
@@ -54,6 +53,7 @@ class TrainedGpr:
         """Mean at every step of signals (n, channels), (n,); NaN before the first full window."""
         n, m, d = signals.shape[0], self.weights.size, self.depth
         out = np.full(n, np.nan)
+        signals = signals / self.kernel.length_scale
         tests = self.kernel.points(squared_norms(signals, d))
         for start in range(d - 1, n, ROWS):
             watch.step(start / n)
@@ -62,9 +62,9 @@ class TrainedGpr:
             products = sliding_products(signals, self.signals, d, start, d - rows, rows, m + rows - 1)
             row, item = products.strides
             G = as_strided(products[:, rows - 1 :], (rows, m), (row - item, item))
-            here = Points(*(p[start : start + rows, None] for p in tests))
-            self.kernel.split(G, here, self.points)
-            out[start : start + rows] = G @ self.weights + here.delta[:, 0] * self.constant
+            here = tests.seen(lambda p, start=start, rows=rows: p[start : start + rows])
+            known = self.kernel.split_times(G, here, self.points, self.weights)
+            out[start : start + rows] = known + here.delta * self.constant
         return out
 
 
@@ -79,16 +79,15 @@ def train(
         raise RecordError(f"the training record has {signals.shape[0]} steps, depth + training size need {depth + m}")
     first = depth - 1
     V, points = band(signals, depth, kernel, first, m, m - 1)
-    points = Points(*(p[:m] for p in points))
     watch.check()
     S = np.empty((m + 2, m + 2), order="F")  # the covariance with the targets and delta as two more rows
     S[:m, :m] = square_from_band(V, 0, m)
     S[m:, :m] = targets[first : first + m], points.delta
     check_condition(S[:m, :m], kernel)
     eliminate(S, m, watch.check)
-    a, b = solve_triangular(S[:m, :m], S[m:, :m].T, trans="T", lower=True, check_finite=False).T
+    a, b = solved_rows(S, m)
     constant = (points.delta @ a) / (1.0 / kernel.variance + points.delta @ b)
-    return TrainedGpr(signals[: first + m], depth, points, a - b * constant, float(constant), kernel)
+    return TrainedGpr(signals[: first + m] / kernel.length_scale, depth, points, a - b * constant, float(constant), kernel)
 
 
 def training_targets(training: Training, scenario: Scenario, dt: float) -> Array:

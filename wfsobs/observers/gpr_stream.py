@@ -25,7 +25,7 @@ from scipy.linalg.blas import dsymv, dsyr2
 from wfsobs.arrays import Array
 from wfsobs.bandpass import StreamingBank, bandpass_bank
 from wfsobs.observers.gpr_online import kernel_of
-from wfsobs.observers.kernels import ConditionError, Points, SquaredExponential, restart_interval
+from wfsobs.observers.kernels import ConditionError, SquaredExponential, restart_interval
 from wfsobs.scenario import Scenario
 
 
@@ -44,7 +44,7 @@ class SlidingRegression:
         self._products = np.zeros(m + 1)  # <x_k, x_i> for i = k - m ... k
         renewed = -(-(m + 1) // restart_interval(depth))
         self._renewal = np.add.outer(np.arange(renewed) * channels, np.arange(depth * channels))  # samples of windows
-        self._points = Points(np.zeros(m), np.ones(m))  # by slot, like everything below
+        self._points = kernel.points(np.zeros(m))  # by slot, like everything below
         self._newest = kernel.points(np.zeros(1))
         self._kappa = np.zeros(m)
         self._weights = np.zeros((3, m))  # a without the newest target, b, N e_newest
@@ -79,7 +79,7 @@ class SlidingRegression:
             self._history[: self._span] = self._history[-self._span :]
             self._end = self._span
         H, e = self._history, self._end
-        H[e] = sample
+        H[e] = sample / self.kernel.length_scale
         self._products += H[e - m : e + 1] @ H[e]
         self._products -= H[e - d - m : e - d + 1] @ H[e - d]
         self._end += 1
@@ -128,6 +128,7 @@ class SlidingRegression:
         v[s] = gamma
         _set_column(M, s, v)
         self._points.norm2[s], self._points.delta[s] = self._newest.norm2[0], self._newest.delta[0]
+        self._points = self._points._replace(largest=max(self._points.largest, self._newest.largest))
         self._renew_products()
 
     def _solve_without(self, v: Array, gone: Array, s: int) -> Array:

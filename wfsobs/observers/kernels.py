@@ -43,37 +43,47 @@ class SquaredExponential:
         return self.signal_std**2
 
     def points(self, norm2: Array) -> Points:
-        """The windows with these squared norms [um^2]."""
-        return Points(norm2, np.exp(-0.5 * norm2 / self.length_scale**2))
+        """The windows with these squared norms [l^2]."""
+        return Points(norm2, np.exp(-0.5 * norm2), float(norm2.max(initial=0.0)))
 
     def split(self, G: Array, i: Points, j: Points) -> None:
-        """Turn inner products G of points i and j, which broadcast to its shape, into M (without the noise), in place.
+        """Turn inner products G [l^2] of points i and j, which broadcast to its shape, into M (without the noise), in place.
 
-        While |x|^2 < l^2 that is delta_i delta_j expm1(G / l^2). Beyond, where the factors could overflow, it is
-        the same number as exp(max(g, 0) - (n_i + n_j) / 2 l^2) times (1 - exp(-|g|)) with the sign of g = G / l^2.
+        While |x|^2 < l^2 that is delta_i delta_j expm1(g). Beyond, where the factors could overflow, it is the same
+        number as exp(max(g, 0) - (n_i + n_j) / 2) times (1 - exp(-|g|)) with the sign of g.
         """
-        scale = 1.0 / self.length_scale**2
-        G *= scale
-        if max(i.norm2.max(), j.norm2.max()) * scale < 1.0:
+        if max(i.largest, j.largest) < 1.0:
             np.expm1(G, out=G)
             G *= self.variance * i.delta
             G *= j.delta
             return
-        exponent = np.maximum(G, 0.0) - (0.5 * scale) * (i.norm2 + j.norm2)
+        exponent = np.maximum(G, 0.0) - 0.5 * (i.norm2 + j.norm2)
         np.copysign(np.expm1(-np.abs(G)), G, out=G)
         G *= self.variance * np.exp(np.minimum(exponent, 0.0))  # at most 0 but for rounding: |x_i - x_j|^2 >= 0
 
+    def split_times(self, G: Array, i: Points, j: Points, w: Array) -> Array:
+        """M w from inner products G (rows, columns) [l^2] of points i (rows,) and j (columns,); uses up G."""
+        if max(i.largest, j.largest) < 1.0:  # the factors of `split`, taken out of the matrix
+            return i.delta * (np.expm1(G, out=G) @ (self.variance * j.delta * w))
+        self.split(G, i.seen(lambda p: p[:, None]), j)
+        return G @ w
 
     def own(self, points: Points) -> Array:
         """M of each point with itself [um^2], without the noise: s2 (1 - exp(-|x|^2 / l^2))."""
-        return -self.variance * np.expm1(-points.norm2 / self.length_scale**2)
+        return -self.variance * np.expm1(-points.norm2)
 
 
 class Points(NamedTuple):
-    """Windows by what the kernel needs beside their inner products: |x|^2 [um^2] and delta, of equal shape."""
+    """Windows by what the kernel needs beside their inner products: |x|^2 [l^2] and delta, of equal shape, and the
+    largest |x|^2 among them or more."""
 
     norm2: Array
     delta: Array
+    largest: float
+
+    def seen(self, part: Callable[[Array], Array]) -> Points:
+        """Some of the points, or all of them in another shape."""
+        return Points(part(self.norm2), part(self.delta), self.largest)
 
 
 MAX_CONDITION = 1e13
@@ -133,31 +143,51 @@ def restart_interval(depth: int) -> int:
     return max(16, depth)
 
 
-def sliding_products(a: Array, b: Array, depth: int, i0: int, j0: int, rows: int, offsets: int) -> Array:
+def sliding_products(
+    a: Array, b: Array, depth: int, i0: int, j0: int, rows: int, offsets: int, triangle: bool = False
+) -> Array:
     """Inner products of windows of `a` with windows of `b` along diagonals, shape (rows, offsets).
 
     out[r, c] = <window of a ending at i0 + r, window of b ending at j0 + r + c>; a, b (n, channels), samples
     outside the records are zero. Every so many rows are direct dot products, the others slide from them.
+    triangle: leave out what has r + c >= rows, but for the last few rows.
     """
     out = np.zeros((rows, offsets))
-    work = np.empty((rows - 1, offsets))
-    direct = range(0, rows, restart_interval(depth))
-    restarts = np.zeros((len(direct), offsets))
-    for channel in range(a.shape[1]):
-        one = _cut(a[:, channel], i0 - depth, depth + rows)  # samples i0 - depth ... i0 + rows - 1
-        other = _cut(b[:, channel], j0 - depth, depth + rows + offsets - 1)
-        for row, r in zip(restarts, direct, strict=True):
-            row += np.correlate(other[r + 1 : r + depth + offsets], one[r + 1 : r + depth + 1], "valid")
-        table = sliding_window_view(other, offsets)  # table[t, c] = b[j0 - depth + t + c]
-        np.multiply(one[depth + 1 :, None], table[depth + 1 : depth + rows], out=work)
-        out[1:] += work
-        np.multiply(one[1:rows, None], table[1:rows], out=work)
-        out[1:] -= work
-    out[direct] = restarts
-    for r in range(1, rows):  # faster than a cumulative sum across rows
-        if r % direct.step:
-            out[r] += out[r - 1]
+    work = np.empty((min(TILE, rows), offsets))
+    interval = restart_interval(depth)
+    channels = []
+    for x, y in zip(a.T, b.T, strict=True):
+        one = _cut(x, i0 - depth, depth + rows)  # samples i0 - depth ... i0 + rows - 1
+        other = _cut(y, j0 - depth, depth + rows + offsets - 1)
+        channels.append((one, other, sliding_window_view(other, offsets)))  # table[t, c] = b[j0 - depth + t + c]
+    for top in range(0, rows, TILE):
+        wide = min(offsets, rows - top) if triangle else offsets
+        tile = out[top : top + TILE, :wide]
+        _differences(tile, work[: len(tile), :wide], channels, depth, top)
+        for r in range(top, top + len(tile)):
+            if r % interval:
+                out[r, :wide] += out[r - 1, :wide]
+            else:
+                out[r, :wide] = sum(np.correlate(other[r + 1 : r + depth + wide], one[r + 1 : r + depth + 1], "valid")
+                                    for one, other, _ in channels)
     return out
+
+
+TILE = 64
+"""Rows of inner products worked on at a time, few enough to stay in the cache."""
+
+
+def _differences(out: Array, work: Array, channels: list[tuple[Array, Array, Array]], depth: int, top: int) -> None:
+    """What each inner product of rows top, top + 1, ... has more than the one a row above: sum of what comes in less what
+    goes out of the window."""
+    rows, wide = out.shape
+    for n, (one, _, table) in enumerate(channels):
+        come, go = slice(depth + top, depth + top + rows), slice(top, top + rows)
+        np.multiply(one[come, None], table[come, :wide], out=work if n else out)
+        if n:
+            out += work
+        np.multiply(one[go, None], table[go, :wide], out=work)
+        out -= work
 
 
 def _cut(x: Array, start: int, length: int) -> Array:
@@ -172,17 +202,20 @@ def _cut(x: Array, start: int, length: int) -> Array:
 def band(signals: Array, depth: int, kernel: SquaredExponential, first: int, rows: int, reach: int) -> tuple[Array, Points]:
     """M + sigma_n^2 I of the windows ending at first ... first + rows - 1, by lag, and those windows.
 
-    Returns (V, points): V (rows, reach + 1) with V[r, lag] = entry of windows first + r and first + r + lag;
-    points of shape (rows + reach,).
+    Returns (V, points): V (rows, reach + 1) with V[r, lag] = entry of windows first + r and first + r + lag, as far as
+    that one is among the rows; points (rows,).
     """
-    V = sliding_products(signals, signals, depth, first, first, rows, reach + 1)
+    signals = signals / kernel.length_scale
+    V = sliding_products(signals, signals, depth, first, first, rows, reach + 1, triangle=True)
     samples = np.column_stack([_cut(channel, first - depth + 1, depth - 1 + rows + reach) for channel in signals.T])
     points = kernel.points(squared_norms(samples, depth)[depth - 1 :])
-    here = Points(*(p[:rows, None] for p in points))
-    there = Points(*(sliding_window_view(p, reach + 1)[:rows] for p in points))
-    kernel.split(V, here, there)
+    later = points.seen(lambda p: sliding_window_view(p, reach + 1)[:rows])
+    for top in range(0, rows, TILE):
+        part, wide = slice(top, min(top + TILE, rows)), min(reach + 1, rows - top)
+        here = points.seen(lambda p, part=part: p[part, None])
+        kernel.split(V[part, :wide], here, later.seen(lambda p, part=part, wide=wide: p[part, :wide]))
     V[:, 0] += kernel.noise_std**2
-    return V, points
+    return V, points.seen(lambda p: p[:rows])
 
 
 def square_from_band(V: Array, start: int, n: int) -> Array:
