@@ -87,9 +87,10 @@ def _online_record(
     ours = []
     for variant, n_modes in ((OURS, 1), ("ours-two-modes", 2)) if both else ((OURS, 1),):
         part = cut(record, record.n_steps, n_modes)
-        ours.append((variant, *timed(lambda part=part: gpr_online(part, scenario, QUIET)[VIBRATION][:, 0], sizes.repeats)))
+        seconds, result = timed(lambda part=part: gpr_online(part, scenario, QUIET)[VIBRATION], sizes.repeats)
+        ours.append((variant, seconds, result[:, 0]))
     problem = online_problem(record, scenario, 0, count)  # only now: much memory held slows down the allocation of more
-    std = float(np.nanstd(ours[0][-1]))
+    std = float(np.nanstd(ours[0][2]))
     for variant, seconds, values in ours:
         error = problem.error(values[problem.rows + g.depth - 1], std, sizes.exact_steps)
         yield row(task, size, variant, seconds, steps, error=error)
