@@ -34,7 +34,7 @@ def score_table(rows: Sequence[Row]) -> Table:
     table = Table(title="RMS error after warm-up" + (", median over seeds" if several else ""))
     for name in ("Target", "Mode", "Observer"):
         table.add_column(name, no_wrap=True)
-    for name in ("error [nm]", *(("spread [nm]",) if several else ()), "truth [nm]", "error / truth", "lag [ms]", "us / step"):
+    for name in ("error, nm", *(("spread, nm",) if several else ()), "truth, nm", "error / truth", "lag, ms", "us / step"):
         table.add_column(name, justify="right")
     last = None
     for target, mode, observer in sorted({(r["target"], r["mode"], r["observer"]) for r in rows}, key=_order(rows)):

@@ -137,6 +137,10 @@ def squared_norms(signals: Array, depth: int) -> Array:
     return out.ravel()[depth : depth + n]
 
 
+TILE = 64
+"""Rows worked on at a time, few enough to stay in the cache."""
+
+
 def restart_interval(depth: int) -> int:
     """Steps after which sliding inner products start anew from direct ones: as many as a window has, so that
     rounding never grows beyond that of a direct product and the cost stays independent of depth."""
@@ -153,41 +157,24 @@ def sliding_products(
     triangle: leave out what has r + c >= rows, but for the last few rows.
     """
     out = np.zeros((rows, offsets))
-    work = np.empty((min(TILE, rows), offsets))
     interval = restart_interval(depth)
-    channels = []
-    for x, y in zip(a.T, b.T, strict=True):
-        one = _cut(x, i0 - depth, depth + rows)  # samples i0 - depth ... i0 + rows - 1
-        other = _cut(y, j0 - depth, depth + rows + offsets - 1)
-        channels.append((one, other, sliding_window_view(other, offsets)))  # table[t, c] = b[j0 - depth + t + c]
+    span = rows + offsets - 1
+    ones = [_cut(x, i0 - depth, depth + rows) for x in a.T]  # samples i0 - depth ... i0 + rows - 1 of each channel
+    others = [_cut(x, j0 - depth, depth + span) for x in b.T]
+    # What row r has more than the one above: what comes into the window less what goes out, a product of 2 x channels numbers.
+    factors = np.stack([one[depth:] for one in ones] + [-one[:rows] for one in ones], axis=1)[:, None]
+    samples = np.stack([other[depth:] for other in others] + [other[:span] for other in others])
+    pieces = sliding_window_view(samples, offsets, axis=1).transpose(1, 0, 2)  # [r, :, c] = samples[:, r + c]
     for top in range(0, rows, TILE):
-        wide = min(offsets, rows - top) if triangle else offsets
-        tile = out[top : top + TILE, :wide]
-        _differences(tile, work[: len(tile), :wide], channels, depth, top)
-        for r in range(top, top + len(tile)):
+        bottom, wide = min(top + TILE, rows), min(offsets, rows - top) if triangle else offsets
+        np.matmul(factors[top:bottom], pieces[top:bottom, :, :wide], out=out[top:bottom, None, :wide])
+        for r in range(top, bottom):
             if r % interval:
                 out[r, :wide] += out[r - 1, :wide]
             else:
                 out[r, :wide] = sum(np.correlate(other[r + 1 : r + depth + wide], one[r + 1 : r + depth + 1], "valid")
-                                    for one, other, _ in channels)
+                                    for one, other in zip(ones, others, strict=True))
     return out
-
-
-TILE = 64
-"""Rows of inner products worked on at a time, few enough to stay in the cache."""
-
-
-def _differences(out: Array, work: Array, channels: list[tuple[Array, Array, Array]], depth: int, top: int) -> None:
-    """What each inner product of rows top, top + 1, ... has more than the one a row above: sum of what comes in less what
-    goes out of the window."""
-    rows, wide = out.shape
-    for n, (one, _, table) in enumerate(channels):
-        come, go = slice(depth + top, depth + top + rows), slice(top, top + rows)
-        np.multiply(one[come, None], table[come, :wide], out=work if n else out)
-        if n:
-            out += work
-        np.multiply(one[go, None], table[go, :wide], out=work)
-        out -= work
 
 
 def _cut(x: Array, start: int, length: int) -> Array:
