@@ -158,7 +158,7 @@ def show(all_rows: list[Row], as_json: bool) -> None:
     else:
         table = score_table(all_rows)
         console = Console()
-        (console if console.is_terminal else Console(width=120)).print(table)
+        (console if console.is_terminal else Console(width=124)).print(table)
 
 
 def _warn(result: Result) -> None:

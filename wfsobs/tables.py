@@ -35,7 +35,7 @@ def score_table(rows: Sequence[Row]) -> Table:
     for name in ("Target", "Mode", "Observer"):
         table.add_column(name, no_wrap=True)
     for name in ("error, nm", *(("spread, nm",) if several else ()), "truth, nm", "error / truth", "lag, ms", "us / step"):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
     last = None
     for target, mode, observer in sorted({(r["target"], r["mode"], r["observer"]) for r in rows}, key=_order(rows)):
         same = [r for r in rows if (r["target"], r["mode"], r["observer"]) == (target, mode, observer)]
