@@ -14,8 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from wfsobs.parameters import Reals, allowed, unit_of
 from wfsobs.scenario import Peak, Scenario
-from wfsobs.settings import Group, Reals, SettingError, allowed, unit_of
+from wfsobs.settings import Group, SettingError
 
 EXAMPLES = settings(max_examples=30, deadline=None, derandomize=True)
 HUGE = 10**400

@@ -12,7 +12,8 @@ from itertools import pairwise
 import param
 
 from wfsobs.modes import TIP_TILT, Mode
-from wfsobs.settings import Group, Real, Reals, SettingError, Whole, section
+from wfsobs.parameters import Real, Reals, Whole
+from wfsobs.settings import Group, SettingError, section
 
 PAPER_PEAK_HZ = 47.4969
 """The dominant natural frequency of VLT UT4 (paper, Table 2)."""

@@ -16,7 +16,7 @@ import panel_material_ui as pmui
 import param
 
 from wfsobs.app.store import Store
-from wfsobs.settings import Reals, unit_of
+from wfsobs.parameters import Reals, unit_of
 
 ROOM = {"sizing_mode": "stretch_width", "margin": (4, 0)}
 NUMBER_WIDTH = 92

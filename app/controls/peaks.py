@@ -12,8 +12,8 @@ from wfsobs.app.controls.fields import number_text, parsed, written_unit
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset
 from wfsobs.modes import TIP_TILT
+from wfsobs.parameters import unit_of
 from wfsobs.scenario import Peak
-from wfsobs.settings import unit_of
 
 PATH = "vibration.peaks"
 

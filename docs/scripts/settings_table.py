@@ -7,9 +7,10 @@ from pathlib import Path
 
 import param
 
+from wfsobs.parameters import Reals, unit_of
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
-from wfsobs.settings import Group, Reals, unit_of
+from wfsobs.settings import Group
 
 PAGE = Path(__file__).parents[1] / "settings.md"
 
