@@ -54,7 +54,7 @@ def save(scenario: Scenario, path: str | Path) -> None:
 
 def preset(name: Any) -> Scenario:
     """The preset `name`. Raises SettingError for an unknown one."""
-    if name not in PRESETS:
+    if not isinstance(name, str) or name not in PRESETS:
         raise SettingError(f"preset = {name!r}: takes one of {', '.join(PRESETS)}")
     return PRESETS[name]()
 

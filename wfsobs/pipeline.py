@@ -56,7 +56,7 @@ def observe(record: Record, scenario: Scenario, watch: Watch = QUIET, observers:
     failures: list[Failure] = []
     for item in each_estimate(record, scenario, watch, observers):
         (failures if isinstance(item, Failure) else estimates).append(item)  # type: ignore[arg-type]
-    return collect(scenario, record, estimates, failures)
+    return collect(scenario, record, estimates, failures, watch)
 
 
 def as_stated(record: Record, scenario: Scenario) -> Scenario:
@@ -69,12 +69,17 @@ def as_stated(record: Record, scenario: Scenario) -> Scenario:
     return scenario.replace(changes) if changes else scenario
 
 
-def collect(scenario: Scenario, record: Record, estimates: Sequence[Estimate], failures: Sequence[Failure]) -> Result:
-    """A Result with its scores, everything in the order of the registry."""
+def collect(
+    scenario: Scenario, record: Record, estimates: Sequence[Estimate], failures: Sequence[Failure], watch: Watch = QUIET
+) -> Result:
+    """A Result with its scores, everything in the order of the registry. Raises Cancelled."""
     order = {name: i for i, name in enumerate(OBSERVERS)}
     names = [m.name for m in scenario.modes][: record.n_modes]
     ordered = sorted(estimates, key=lambda e: (order[e.observer], e.target))
-    scores = [s for e in ordered for s in score(record, e, scenario.run.warm_up, names)]
+    scores: list[Score] = []
+    for estimate in ordered:
+        watch.check()
+        scores += score(record, estimate, scenario.run.warm_up, names)
     return Result(scenario, record, tuple(ordered), tuple(scores), tuple(sorted(failures, key=lambda f: order[f.observer])))
 
 

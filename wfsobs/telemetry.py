@@ -24,6 +24,11 @@ SAME_SHAPE = ("u", "y_ngs", "turbulence", "vibration", "open_loop_y")
 
 def save_record(path: str | Path, record: Record, scenario_toml: str | None = None) -> None:
     """Write a record, its training record with it. Raises OSError."""
+    save_arrays(path, record_arrays(record, scenario_toml))
+
+
+def record_arrays(record: Record, scenario_toml: str | None = None) -> dict[str, Array]:
+    """What the file of a record holds, by name."""
     arrays = {name: np.asarray(value) for name, value in vars(record).items() if name != "training" and value is not None}
     if record.training is not None:
         t = record.training
@@ -32,7 +37,7 @@ def save_record(path: str | Path, record: Record, scenario_toml: str | None = No
             arrays["training_open_loop_y"] = t.open_loop_y
     if scenario_toml is not None:
         arrays["scenario"] = np.array(scenario_toml)
-    save_arrays(path, arrays)
+    return arrays
 
 
 def save_arrays(path: str | Path, arrays: Mapping[str, Array]) -> None:
