@@ -101,7 +101,7 @@ class _Work:
 
     def run(self) -> Shown:
         self.watch.step(0.0)
-        self.record = record = simulate(self.scenario)
+        self.record = record = simulate(self.scenario, watch=self.watch)
         self._add_truth(record)
         for item in each_estimate(record, self.scenario, self.watch, on_partial=self._grow):
             with self.lock:
