@@ -143,7 +143,9 @@ def _around(cycle: Sequence[Step], P: Array) -> list[SteadyState]:
         filtered = reduced @ P @ reduced.T + L @ R @ L.T
         found.append((P, L, A @ L, filtered))
         P = A @ filtered @ A.T + Q
-    residual = float(np.abs(P - start).max() / max(np.abs(start).max(), np.finfo(float).tiny))
+    with np.errstate(over="ignore", invalid="ignore"):  # a start that doubling has spoiled is far off, and is then dropped
+        residual = float(np.abs(P - start).max() / max(np.abs(start).max(), np.finfo(float).tiny))
+    residual = residual if np.isfinite(residual) else np.inf
     return [SteadyState(*one, residual) for one in found]
 
 
