@@ -14,6 +14,7 @@ from typing import Any
 import param
 
 from wfsobs.app.work import Report, Shown, compute
+from wfsobs.cost import run_seconds
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
@@ -22,10 +23,19 @@ from wfsobs.watch import Cancelled
 log = logging.getLogger(__name__)
 
 Compute = Callable[[Scenario, Callable[[], bool], Report], Shown]
+Step = tuple[Scenario, str]
+"""Settings, and the preset that they are compared with."""
+
 Post = Callable[[Callable[[], None]], None]
 """Has a function called soon on the thread that owns the session; may itself be called from any thread."""
 
 IDLE, RUNNING, DONE, CANCELLED, FAILED = "idle", "running", "done", "cancelled", "failed"
+
+AT_ONCE = 5.0
+"""A run that takes longer waits to be asked for [s]."""
+
+STEPS_BACK = 100
+"""Changes that can be undone."""
 
 
 class Run(param.Parameterized):
@@ -61,6 +71,14 @@ class Run(param.Parameterized):
         if self.state == RUNNING:
             self._supersede()
             self.param.update(state=CANCELLED)
+
+    def aside(self, function: Callable[[], None]) -> None:
+        """Have something done in a thread, beside the run."""
+        self._pool.submit(function)
+
+    def post(self, function: Callable[[], None]) -> None:
+        """Have something done on the session's thread; may be called from any."""
+        self._post(function)
 
     def close(self) -> None:
         """Stop and let the threads go: the session has ended."""
@@ -117,16 +135,43 @@ class Store(param.Parameterized):
     errors = param.Dict({}, doc="Dotted path of a refused setting -> why, in one line.")
     preset = param.Selector(default=next(iter(PRESETS)), objects=list(PRESETS), doc="Where the settings started.")
     stale = param.Boolean(False, doc="Whether the results shown are not those of the settings.")
+    waiting = param.Number(0.0, doc="How long the run would take that waits to be asked for [s]; 0 where none does.")
+    can_undo = param.Boolean(False, doc="Whether there is a change to undo.")
+    can_redo = param.Boolean(False, doc="Whether there is an undone change to make again.")
 
     def __init__(self, post: Post, scenario: Scenario | None = None, work: Compute = compute):
         super().__init__(scenario=scenario or PRESETS[next(iter(PRESETS))]())
         self._refused: dict[str, Any] = {}
+        self._past: list[Step] = []
+        self._future: list[Step] = []
         self.run = Run(post, work)
         self.run.param.watch(self._compare, "shown")
 
     def start(self) -> None:
         """Run the settings as they stand."""
+        self.waiting = 0.0
         self.run.start(self.scenario)
+
+    def follow(self) -> None:
+        """Run the settings as they stand, unless that takes long: then stop, and wait to be asked."""
+        seconds = run_seconds(self.scenario)
+        if seconds <= AT_ONCE:
+            self.start()
+        else:
+            self.run.cancel()
+            self.waiting = seconds
+
+    def undo(self) -> None:
+        """Take back the last change that was accepted."""
+        if self._past:
+            self._future.append((self.scenario, self.preset))
+            self._accept(self._past.pop(), {}, step=False)
+
+    def redo(self) -> None:
+        """Make the last change again that was taken back."""
+        if self._future:
+            self._past.append((self.scenario, self.preset))
+            self._accept(self._future.pop(), {}, step=False)
 
     def value(self, path: str) -> Any:
         """The accepted value of a setting, by dotted path."""
@@ -150,7 +195,7 @@ class Store(param.Parameterized):
             except SettingError as error:
                 reason = str(error)
             else:
-                self._accept(fresh, {p: v for p, v in waiting.items() if p not in changes})
+                self._accept((fresh, self.preset), {p: v for p, v in waiting.items() if p not in changes})
                 return True
         self._refused = {**waiting, path: value}
         self.errors = {p: e for p, e in self.errors.items() if p in waiting} | {path: reason}
@@ -162,7 +207,7 @@ class Store(param.Parameterized):
         preset : the one that they are to be compared with from now on; as it was if not given
         """
         scenario.validate()
-        self._accept(scenario, {}, preset or self.preset)
+        self._accept((scenario, preset or self.preset), {})
 
     def choose(self, name: str) -> None:
         """Start again from a preset."""
@@ -176,17 +221,22 @@ class Store(param.Parameterized):
         """The session has ended."""
         self.run.close()
 
-    def _accept(self, scenario: Scenario, refused: dict[str, Any], preset: str | None = None) -> None:
-        """The one way in for new settings."""
+    def _accept(self, to: Step, refused: dict[str, Any], step: bool = True) -> None:
+        """The one way in for new settings. step : whether it is a change of its own, to be undone later."""
+        scenario, preset = to
+        same = scenario == self.scenario
+        if step and not (same and preset == self.preset):
+            self._past = [*self._past, (self.scenario, self.preset)][-STEPS_BACK:]
+            self._future = []
         self._refused = refused
         errors = {path: reason for path, reason in self.errors.items() if path in refused}
-        same = scenario == self.scenario
         self.param.update(
-            scenario=self.scenario if same else scenario, errors=errors, preset=preset or self.preset)
+            scenario=self.scenario if same else scenario, errors=errors, preset=preset,
+            can_undo=bool(self._past), can_redo=bool(self._future))
         if same:
             return
         self._compare()
-        self.start()
+        self.follow()
 
     def _compare(self, *_: object) -> None:
         shown = self.run.shown

@@ -47,7 +47,10 @@ class Controls:
         self.preset = pmui.Select(
             label="Preset", value=store.preset, options={_title(name): name for name in PRESETS}, size="small", **ROOM)
         self.reset = pmui.Button(
-            label="Reset", icon="restart_alt", variant="text", size="small", margin=(4, 0, 4, 4), align="center")
+            label="Reset", icon="restart_alt", variant="text", size="small", margin=(4, 0))
+        self.undo, self.redo = (
+            pmui.Button(label=name, icon=name.lower(), variant="text", size="small", margin=(4, 4, 4, 0), disabled=True)
+            for name in ("Undo", "Redo"))
         self.run = pmui.Button(label="Run", icon="play_arrow", color="primary", **ROOM)
         self.cancel = pmui.Button(label="Cancel", icon="stop", variant="outlined", margin=(4, 0, 4, 8))
         self.status = Status(sizing_mode="stretch_width", margin=(4, 0))
@@ -67,7 +70,7 @@ class Controls:
         """What goes into the drawer."""
         first = [self._field(path) for path in FIRST]
         return pn.Column(
-            pn.Row(self.preset, self.reset, sizing_mode="stretch_width", margin=0),
+            self.preset, pn.Row(self.undo, self.redo, self.reset, sizing_mode="stretch_width", margin=0),
             pn.Row(self.run, self.cancel, sizing_mode="stretch_width", margin=0),
             self.status, *(f.view for f in first), self.accordion,
             sizing_mode="stretch_width", margin=(8, 14),
@@ -103,11 +106,13 @@ class Controls:
     def _watch(self) -> None:
         self.preset.param.watch(self._chosen, "value")
         self.reset.on_click(lambda _event: self.store.choose(self.store.preset))
+        self.undo.on_click(lambda _event: self.store.undo())
+        self.redo.on_click(lambda _event: self.store.redo())
         self.run.on_click(lambda _event: self.store.start())
         self.cancel.on_click(lambda _event: self.store.run.cancel())
         self.accordion.param.watch(self._opened, "active")
-        self.store.param.watch(self._refresh_preset, ["scenario", "preset"])
-        self.store.param.watch(self._refresh_run, "errors")
+        self.store.param.watch(self._refresh_preset, ["scenario", "preset", "can_undo", "can_redo"])
+        self.store.param.watch(self._refresh_run, ["errors", "waiting"])
         self.store.run.param.watch(self._refresh_run, ["state", "progress", "message"])
 
     def _chosen(self, event: param.parameterized.Event) -> None:
@@ -124,6 +129,7 @@ class Controls:
         self.preset.value = self.store.preset
         self.preset.helper_text = f"{len(changed)} changed: {', '.join(changed)}" if changed else ""
         self.reset.disabled = not changed
+        self.undo.disabled, self.redo.disabled = not self.store.can_undo, not self.store.can_redo
 
     def _refresh_run(self, *_: object) -> None:
         run = self.store.run
@@ -141,8 +147,20 @@ def status_of(store: Store) -> tuple[str, str]:
         RUNNING: f"Running, {int(100 * run.progress)} %", DONE: f"Done{seconds}",
         CANCELLED: "Cancelled", FAILED: "The run failed",
     }.get(run.state, "")
+    if store.waiting:
+        text = waiting_text(store.waiting)
     note = f"Not accepted: {', '.join(store.errors)}" if store.errors else ""
     return text, note
+
+
+def waiting_text(seconds: float) -> str:
+    """How long a run takes that waits to be asked for.
+
+    >>> waiting_text(12.3), waiting_text(1000.0)
+    ('About 12 s: press Run', 'About 17 min: press Run')
+    """
+    length = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+    return f"About {length}: press Run"
 
 
 def _names() -> dict[str, str]:

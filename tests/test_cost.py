@@ -1,0 +1,37 @@
+"""How long a run is said to take, against what was measured."""
+
+from __future__ import annotations
+
+import pytest
+
+from wfsobs.cost import gpr_offline_seconds, gpr_online_seconds, part_seconds, run_seconds
+from wfsobs.presets import paper, ut4
+
+
+@pytest.mark.parametrize(("m", "depth", "measured"), [
+    (20, 170, 0.32), (100, 170, 0.123), (256, 170, 0.115), (511, 170, 0.26), (511, 1000, 0.21), (1000, 170, 0.72),
+    (2048, 170, 2.34),
+])
+def test_online_gpr_near_what_was_measured(m: int, depth: int, measured: float) -> None:
+    assert 0.7 < gpr_online_seconds(10_000, m, depth) / measured < 1.5
+
+
+@pytest.mark.parametrize(("m", "depth", "measured"), [(100, 407, 0.017), (1000, 407, 0.055), (2048, 407, 0.138)])
+def test_offline_gpr_near_what_was_measured(m: int, depth: int, measured: float) -> None:
+    assert 0.7 < gpr_offline_seconds(10_000, m, depth) / measured < 1.8
+
+
+@pytest.mark.parametrize(("changes", "measured"), [({}, 0.410), ({"run.duration": 60}, 2.647)])
+def test_whole_runs_of_the_benchmarks_page(changes: dict[str, float], measured: float) -> None:
+    assert 0.7 < run_seconds(paper().replace(changes)) / measured < 1.3
+
+
+def test_the_presets_are_a_moment() -> None:
+    assert run_seconds(paper()) < 1 and run_seconds(ut4()) < 1
+
+
+def test_parts_add_up_and_grow_with_the_record() -> None:
+    short, long = (paper().replace({"run.duration": seconds}) for seconds in (20, 40))
+    assert sum(part_seconds(short).values()) == run_seconds(short) < run_seconds(long)
+    assert part_seconds(paper().replace({"run.duration": 1.1, "run.warm_up": 0.1, "gpr_online.training_size": 2048}))[
+        "gpr-online"] == 0.0, "too short to start"

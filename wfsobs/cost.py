@@ -1,0 +1,48 @@
+"""How long a run will take, told from its settings.
+
+Measured as processor time on the machine of docs/benchmarks.md (2 virtual cores of an AMD EPYC, one BLAS thread),
+10 s to 300 s of record, m from 20 to 2048, d from 20 to 2000; there a run of the paper's takes 0.41 s, 0.38 s by this. The
+depth and the exposure ratio cost next to nothing. Modes run side by side on two cores. A busy machine takes two to
+three times as long: what counts here is whether it will be a moment or a wait.
+"""
+
+from __future__ import annotations
+
+from wfsobs.loop import TRAINING_MARGIN
+from wfsobs.scenario import Scenario
+
+CORES = 2
+
+
+def run_seconds(scenario: Scenario) -> float:
+    """About how long simulation, every observer and the scores take [s].
+
+    >>> from wfsobs.presets import paper
+    >>> round(run_seconds(paper()), 1), round(run_seconds(paper().replace({"run.duration": 300})))
+    (0.4, 11)
+    """
+    return sum(part_seconds(scenario).values())
+
+
+def part_seconds(scenario: Scenario) -> dict[str, float]:
+    """What `run_seconds` adds up [s]: the two GPR, and all else as "rest"."""
+    n, turns = scenario.n_steps, -(-len(scenario.modes) // CORES)
+    online, offline = scenario.gpr_online, scenario.gpr_offline
+    training = offline.depth + offline.training_size + round(TRAINING_MARGIN * scenario.sensors.lgs_rate)
+    return {
+        "gpr-online": turns * gpr_online_seconds(n, online.training_size, online.depth),
+        "gpr-offline": turns * gpr_offline_seconds(n, offline.training_size, offline.depth),
+        "rest": 5e-6 * (n + training),
+    }
+
+
+def gpr_online_seconds(n_steps: int, training_size: int, depth: int) -> float:
+    """One mode [s]: 10 us + 400 us / m + 0.065 ns m^2 for every step with a full training set."""
+    m = training_size
+    return max(n_steps - depth - m + 1, 0) * (10e-6 + 400e-6 / m + 65e-12 * m**2)
+
+
+def gpr_offline_seconds(n_steps: int, training_size: int, depth: int) -> float:
+    """One mode [s]: training 4 ns m^2 + 10 ps m^3, prediction 1.2 us + 4.2 ns m per step."""
+    m = training_size
+    return 4e-9 * m**2 + 10e-12 * m**3 + max(n_steps - depth + 1, 0) * (1.2e-6 + 4.2e-9 * m)
