@@ -9,7 +9,6 @@ a, b, delta), a prediction is
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +27,7 @@ from wfsobs.observers.kernels import (
     square_from_band,
     squared_norms,
 )
+from wfsobs.observers.modes import over_modes
 from wfsobs.observers.reference import open_loop_reference
 from wfsobs.record import Record, RecordError, Training, pseudo_open_loop
 from wfsobs.scenario import Scenario
@@ -105,10 +105,9 @@ def gpr_offline(record: Record, scenario: Scenario, watch: Watch) -> dict[str, A
     targets = training_targets(training, scenario, record.dt)
     training_z = pseudo_open_loop(training.y_lgs, training.u)
 
-    def one(mode: int) -> Array:
+    def one(mode: int, watch: Watch) -> Array:
         signals = window_signals(g, training.y_lgs, training.u, training_z, mode)
         model = train(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), watch)
         return model.predict(window_signals(g, record.y_lgs, record.u, record.z, mode), watch)
 
-    with ThreadPoolExecutor(record.n_modes) as pool:
-        return {VIBRATION: np.column_stack(list(pool.map(one, range(record.n_modes))))}
+    return {VIBRATION: over_modes(record.n_modes, one, watch)}

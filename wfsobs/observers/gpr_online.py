@@ -7,13 +7,13 @@ causal Butterworth bank on z, of which value j + 1 belongs to step j and is know
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from wfsobs.arrays import Array
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.kernels import SquaredExponential, band, check_condition, square_from_band
+from wfsobs.observers.modes import over_modes
 from wfsobs.observers.reference import online_reference
 from wfsobs.observers.sliding import finish, run_lengths, slide
 from wfsobs.record import Record, RecordError
@@ -44,21 +44,17 @@ def gpr_online(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Ar
     values = np.full((record.n_steps, record.n_modes), np.nan)
     done = np.zeros(record.n_modes)
 
-    def deliver(mode: int) -> Callable[[int, int, Array], None]:
-        def block(start: int, stop: int, mean: Array) -> None:
+    def one(mode: int, watch: Watch) -> Array:
+        def deliver(start: int, stop: int, mean: Array) -> None:
             values[start:stop, mode] = mean
             done[mode] = stop / record.n_steps
             watch.step(float(done.mean()))
             watch.partial(VIBRATION, values)
-        return block
 
-    def one(mode: int) -> None:
         signals = window_signals(g, record.y_lgs, record.u, record.z, mode)
-        predict_sliding(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), deliver(mode), watch.check)
+        return predict_sliding(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), deliver, watch.check)[0]
 
-    with ThreadPoolExecutor(record.n_modes) as pool:
-        list(pool.map(one, range(record.n_modes)))
-    return {VIBRATION: values}
+    return {VIBRATION: over_modes(record.n_modes, one, watch)}
 
 
 def predict_sliding(
