@@ -16,10 +16,12 @@ import panel_material_ui as pmui
 import param
 from panel.custom import JSComponent
 
-from wfsobs.app.controls.panel import Controls
-from wfsobs.app.display import ERROR, SIGNAL, UNITS, Display
-from wfsobs.app.store import FAILED, Post, Store
+from wfsobs.app.actions import Actions
+from wfsobs.app.controls.panel import Controls, waiting_text
+from wfsobs.app.display import CUMULATIVE, ERROR, PSD, SIGNAL, UNITS, Display
+from wfsobs.app.store import FAILED, IDLE, Post, Store
 from wfsobs.app.style import asset, theme
+from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.spectra import MODEL, PEAKS, Spectra
 from wfsobs.app.views.strip import Strip
 from wfsobs.app.views.table import Table
@@ -44,7 +46,7 @@ MARKS = (
     f'<span class="mark" style="border-left:2px solid {PEAKS}">peaks</span>'
     f'<span class="mark" style="border-left:2px dashed {MODEL}">peak in the Kalman filters</span>'
 )
-
+STALE = "These results are not those of the settings."
 
 PHONE_PX = 600
 """Below this width the drawer lies over the page, and starts closed."""
@@ -67,28 +69,30 @@ class Dashboard:
         self.store = Store(post, scenario, work)
         self.display = Display()
         self.controls = Controls(self.store)
+        self.actions = Actions(self.store)
         self.traces = Traces(self.store.run, self.display)
         self.spectra = Spectra(self.store.run, self.display)
         self.strips = {target: Strip(target, self.store.run, self.display) for target in TARGETS}
         self.table = Table(self.store.run, self.display)
+        self.pinning = Pinning(self.store.run, self.display)
         self.frame = Frame(width=0, height=0, margin=0)
         self.alert = pmui.Alert(
             object="", severity="error", visible=False, **WIDE)
         self.stale = pmui.Alert(
-            object="These results are not those of the settings.", severity="warning", visible=False,
+            object=STALE, severity="warning", visible=False,
             **WIDE)
         self.store.run.param.watch(self._refresh, ["state", "message"])
-        self.store.param.watch(self._refresh, "stale")
+        self.store.param.watch(self._refresh, ["stale", "waiting"])
 
     def page(self) -> pmui.Page:
         """The whole page."""
         body = pn.Column(
-            *(self._section(target) for target in TARGETS), _box("RMS errors", self.table.pane),
+            *(self._section(target) for target in TARGETS), _box("RMS errors", self._best_first(), self.table.pane),
             **WIDE, stylesheets=[":host { gap: 10px; }"])
         page = pmui.Page(
             title="wfsobs", sidebar=[self.controls.view()], sidebar_width=340, theme_config=theme(), favicon=None,
             main=[pn.Column(
-                self._switches(), self.alert, self.stale, body, self.frame,
+                self._switches(), self.actions.toolbar, self.alert, self.stale, body, self.frame,
                 sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
         )
         self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")
@@ -96,8 +100,9 @@ class Dashboard:
         return page
 
     def start(self) -> None:
-        """The first run."""
-        self.store.start()
+        """The first run, unless settings from a link have brought one or would take long."""
+        if self.store.run.state == IDLE:
+            self.store.follow()
 
     def close(self) -> None:
         """The session has ended."""
@@ -114,7 +119,11 @@ class Dashboard:
         return pn.FlexBox(
             group("mode", modes), group("show", {"Signal": SIGNAL, "Error": ERROR}),
             group("unit", {written: unit for unit, written in UNITS.items()}),
-            self._zoom_buttons(), gap="12px", align_items="center", **WIDE)
+            group("spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
+            self._zoom_buttons(), *self.pinning.view(), gap="12px", align_items="center", **WIDE)
+
+    def _best_first(self) -> pmui.Checkbox:
+        return pmui.Checkbox.from_param(self.display.param.best_first, size="small", margin=(0, 0, 4, 0))
 
     def _zoom_buttons(self) -> pn.Row:
         buttons = []
@@ -127,12 +136,14 @@ class Dashboard:
 
     def _section(self, target: str) -> pn.Column:
         """The strip and the two figures of one target."""
+        self.traces.traces[target].figure.name = f"{target.capitalize()} time trace"
+        self.spectra.spectra[target].figure.name = f"{target.capitalize()} spectrum"
         cards = self.strips[target].cards
         cards.param.watch(lambda event: self._hide(target, event.new), "hidden")
         marks = MARKS if target == VIBRATION else ""
         figures = pn.Column(
             pn.Column(_caption("Time trace"), self.traces.pane(target), **WIDE),
-            pn.Column(_caption("Power spectrum", marks), self.spectra.pane(target), **WIDE),
+            pn.Column(_caption("Spectrum", marks), self.spectra.pane(target), **WIDE),
             **WIDE, stylesheets=[GRID])
         return _box(target.capitalize(), cards, figures)
 
@@ -143,8 +154,10 @@ class Dashboard:
         run = self.store.run
         failed = run.state == FAILED
         self.alert.param.update(object=run.message, visible=failed)
-        waiting = self.store.stale and run.state != "running"
-        self.stale.visible = waiting
+        texts = [STALE] if self.store.stale else []
+        if self.store.waiting:
+            texts.append(f"{waiting_text(self.store.waiting)}.")
+        self.stale.param.update(object=" ".join(texts), visible=bool(texts) and run.state != "running")
         self.frame.stale = self.store.stale
 
 
@@ -167,6 +180,8 @@ def page(build: Callable[[Post], Dashboard] = Dashboard) -> Any:
     """The page of a new session; a page that says what went wrong where it cannot be built."""
     try:
         dashboard = build(post_to_session())
+        if pn.state.location is not None and pn.state.location.search:
+            dashboard.actions.open_link(pn.state.location.search)
         page = dashboard.page()
         dashboard.start()
         pn.state.on_session_destroyed(lambda _context: dashboard.close())

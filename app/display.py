@@ -6,9 +6,11 @@ import math
 
 import param
 
+from wfsobs.app.pin import Pin
 from wfsobs.modes import TIP_TILT
 
 SIGNAL, ERROR = "signal", "error"
+PSD, CUMULATIVE = "psd", "cumulative"
 UNITS = {"nm": "nm", "mas": "mas", "um": "µm"}
 """Unit -> how it is written."""
 
@@ -34,6 +36,9 @@ class Display(param.Parameterized):
     unit = param.Selector(default="nm", objects=list(UNITS), label="Unit")
     hidden = param.Dict({}, doc="Target -> names of its hidden lines.")
     dark = param.Boolean(False, doc="Dark mode.")
+    spectrum = param.Selector(default=PSD, objects=[PSD, CUMULATIVE], label="Spectrum")
+    best_first = param.Boolean(True, label="Best first", doc="Sort the observers of the table by their error.")
+    pinned = param.ClassSelector(class_=Pin, default=None, allow_None=True, doc="The run to compare with.")
 
     @property
     def column(self) -> int:
@@ -44,6 +49,11 @@ class Display(param.Parameterized):
     def error(self) -> bool:
         """Whether errors are shown."""
         return self.show == ERROR
+
+    @property
+    def cumulative(self) -> bool:
+        """Whether spectra are summed from high to low frequency."""
+        return self.spectrum == CUMULATIVE
 
     @property
     def unit_label(self) -> str:

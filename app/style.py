@@ -51,7 +51,7 @@ PRIMARY = "#0B4F6C"
 _COMPONENTS = {
     "MuiAppBar": {"styleOverrides": {"root": {"backgroundColor": f"{PRIMARY} !important", "color": "#fff !important"}}},
     "MuiButton": {"styleOverrides": {"root": {"textTransform": "none"}}},
-    "MuiToggleButton": {"styleOverrides": {"root": {"textTransform": "none"}}},
+    "MuiToggleButton": {"styleOverrides": {"root": {"textTransform": "none", "whiteSpace": "nowrap"}}},
 }
 
 

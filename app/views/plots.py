@@ -7,6 +7,7 @@ from typing import Any
 import panel as pn
 from bokeh.models import ColumnDataSource, GlyphRenderer
 from bokeh.plotting import figure
+from numpy.typing import ArrayLike
 
 from wfsobs.app.style import look
 
@@ -36,6 +37,28 @@ def restyle(lines: dict[str, GlyphRenderer], dark: bool, hidden: list[str]) -> N
     for name, line in lines.items():
         line.glyph.line_color = look(name).colour(dark)  # type: ignore[union-attr]
         line.visible = name not in hidden
+
+
+class Faint:
+    """The lines of the pinned run in a figure, faint under those of the present one; nothing until there is one."""
+
+    def __init__(self, fig: figure):
+        self.figure = fig
+        self.source: ColumnDataSource | None = None
+
+    def draw(self, lines: dict[str, tuple[ArrayLike, ArrayLike]], dark: bool) -> None:
+        """Show these lines (name -> x, y) in place of those before."""
+        if self.source is None:
+            if not lines:
+                return
+            self.source = ColumnDataSource({"xs": [], "ys": [], "colour": []})
+            self.figure.multi_line(
+                "xs", "ys", line_color="colour", line_alpha=0.4, line_width=1.0, source=self.source, name="pinned",
+                level="underlay")
+        self.source.data = {
+            "xs": [x for x, _ in lines.values()], "ys": [y for _, y in lines.values()],
+            "colour": [look(name).colour(dark) for name in lines],
+        }
 
 
 def later(function: Any, milliseconds: int) -> None:

@@ -9,15 +9,16 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d, VSpan
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.store import Run
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.plots import add_line, new_figure, restyle
-from wfsobs.app.work import TRUTH, Shown
+from wfsobs.app.views.plots import Faint, add_line, new_figure, restyle
+from wfsobs.app.work import TRUTH, Array, Shown, Spectrum
 from wfsobs.observers.base import TARGETS, VIBRATION
+from wfsobs.scores import cumulative_rms
 
 PEAKS, MODEL = "#888888", "#FF6600"
 """Colours of the marks: the scenario's peaks, and the one that the Kalman filters model."""
 
 DECADES = 8
-"""The most that an axis of densities spans."""
+"""The most that an axis of densities spans; one of amplitudes spans half of it."""
 
 
 class Spectra:
@@ -28,7 +29,7 @@ class Spectra:
         self.x_range = Range1d(start=0.5, end=500.0)
         self.spectra = {target: _Spectrum(target, self.x_range) for target in TARGETS}
         run.param.watch(self._redraw, "shown")
-        display.param.watch(self._redraw, ["mode", "show", "unit"])
+        display.param.watch(self._redraw, ["mode", "show", "unit", "spectrum", "pinned"])
         display.param.watch(self._restyle, ["dark", "hidden"])
 
     def pane(self, target: str) -> pn.pane.Bokeh:
@@ -52,6 +53,7 @@ class Spectra:
         with pn.io.hold():
             for target, spectrum in self.spectra.items():
                 restyle(spectrum.lines, self.display.dark, self.display.hidden.get(target, []))
+                spectrum.draw_pinned(self.display)
 
 
 class _Spectrum:
@@ -67,6 +69,7 @@ class _Spectrum:
             self._add_marks()
         self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in (TRUTH, *observers_of(target))}
         self.lines = {name: add_line(self.figure, name, source) for name, source in self.sources.items()}
+        self.faint = Faint(self.figure)
 
     def _add_marks(self) -> None:
         """Vertical lines at the scenario's peaks and at the one that the Kalman filters model."""
@@ -79,25 +82,43 @@ class _Spectrum:
 
     def draw(self, shown: Shown, display: Display) -> None:
         """Send every line, its axis and the marks."""
-        scale = per_micrometre(display.unit, shown.scenario.telescope.diameter) ** 2
-        low, high = np.inf, 0.0
+        diameter = shown.scenario.telescope.diameter
+        drawn: list[Array] = []
         for name, source in self.sources.items():
             spectrum = shown.spectra.get((name, self.target))
             if spectrum is None:
                 source.data = {"x": [], "y": []}
                 continue
-            # Under "error" the truth stays: it is the error of answering zero.
-            density = spectrum.error if display.error and name != TRUTH else spectrum.signal
-            y = scale * density[1:, display.column]
+            y = _curve(spectrum, name, display, diameter)
             source.data = {"x": spectrum.frequency[1:], "y": y}
-            if y.size and y.max() > 0:
-                low, high = min(low, float(np.quantile(y[y > 0], 0.02))), max(high, float(y.max()))
-        if high > 0:
-            self.figure.y_range.update(start=max(low / 3, high * 10.0**-DECADES), end=high * 3)
-        what = "PSD of error" if display.error else "PSD"
-        self.figure.yaxis.axis_label = f"{what}, {display.mode} [{display.unit_label}²/Hz]"
+            drawn.append(y)
+        self._fit(drawn + self.draw_pinned(display), display.cumulative)
+        of = " of error" if display.error else ""
+        what, unit = (
+            (f"cumulative rms{of}", display.unit_label) if display.cumulative else (f"PSD{of}", f"{display.unit_label}²/Hz"))
+        self.figure.yaxis.axis_label = f"{what}, {display.mode} [{unit}]"
         if self.target == VIBRATION:
             self._draw_marks(shown)
+
+    def draw_pinned(self, display: Display) -> list[Array]:
+        """Send the pinned run's visible lines; what was sent."""
+        kept, lines = display.pinned, {}
+        if kept is not None:
+            diameter = kept.scenario.telescope.diameter
+            for name, line in self.lines.items():
+                spectrum = kept.spectra.get((name, self.target))
+                if line.visible and spectrum is not None:
+                    lines[name] = (spectrum.frequency[1:], _curve(spectrum, name, display, diameter))
+        self.faint.draw(lines, display.dark)
+        return [y for _, y in lines.values()]
+
+    def _fit(self, lines: list[Array], cumulative: bool) -> None:
+        """Have the axis hold every line, but for what lies too far below the highest."""
+        positive = [y[y > 0] for y in lines if (y > 0).any()]
+        if positive:
+            low, high = min(float(np.quantile(y, 0.02)) for y in positive), max(float(y.max()) for y in positive)
+            room, decades = (1.5, DECADES / 2) if cumulative else (3.0, DECADES)
+            self.figure.y_range.update(start=max(low / room, high * 10.0**-decades), end=high * room)
 
     def _draw_marks(self, shown: Shown) -> None:
         vibration, kalman = shown.scenario.vibration, shown.scenario.kalman
@@ -110,3 +131,10 @@ class _Spectrum:
         self.model.data = {
             "x": [kalman.frequency], "text": [f"model of the Kalman filters {kalman.frequency:.5g} Hz"],
         }
+
+
+def _curve(spectrum: Spectrum, name: str, display: Display, diameter: float) -> Array:
+    """What is drawn of a spectrum above zero frequency. Under "error" the truth stays: it is the error of answering zero."""
+    scale = per_micrometre(display.unit, diameter)
+    density = (spectrum.error if display.error and name != TRUTH else spectrum.signal)[1:, display.column]
+    return scale * cumulative_rms(spectrum.frequency[1:], density) if display.cumulative else scale**2 * density

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from html import escape
 
 import panel as pn
@@ -15,6 +16,8 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.scores import Score
 
 NOTHING = "–"
+BEST = '<span class="tag best">best</span> '
+ABOVE = '<span class="tag above">above truth</span> '
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -42,43 +45,87 @@ class Table:
         self.run, self.display = run, display
         self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
         run.param.watch(self._refresh, "shown")
-        display.param.watch(self._refresh, ["mode", "unit", "dark"])
+        display.param.watch(self._refresh, ["mode", "unit", "dark", "best_first", "pinned"])
 
     def _refresh(self, *_: object) -> None:
         self.pane.object = self.html()
 
     def html(self) -> str:
         """The table."""
-        unit = self.display.unit_label
-        columns = (
-            "Observer", f"RMS error [{unit}]", f"RMS truth [{unit}]", "error / truth", "Lag [ms]", "Time per step [µs]")
-        head = "".join(f"<th scope=col>{name}</th>" for name in columns)
-        body = "".join(self._target(target) for target in TARGETS)
+        columns = self._columns()
+        head = "".join(f'<th scope=col title="{why}">{name}</th>' for name, why in columns.items())
+        body = "".join(self._target(target, len(columns)) for target in TARGETS)
         table = f'<table class="rms"><thead><tr>{head}</tr></thead>{body}</table>'
         return f'<div class="scroll" tabindex=0 role=region aria-label="RMS errors">{table}</div>{self._notes()}'
 
-    def _target(self, target: str) -> str:
-        rows = "".join(self._row(name, target) for name in observers_of(target, hidden=True))
-        title = f"{target.capitalize()}, {self.display.mode}"
-        return f'<tbody><tr><th colspan=6 class="target" scope=rowgroup>{title}</th></tr>{rows}</tbody>'
+    def _columns(self) -> dict[str, str]:
+        """Heading -> explanation."""
+        unit = self.display.unit_label
+        pinned = {
+            f"Pinned [{unit}]": "RMS error in the pinned run", "Change [%]": "from the pinned run to this one",
+        } if self.display.pinned else {}
+        return {
+            "Observer": "", f"RMS error [{unit}]": "of the estimate, after the warm-up", **pinned,
+            f"RMS truth [{unit}]": "the error of answering zero", "error / truth": "above 1 is worse than answering zero",
+            "Lag [ms]": "how late the estimate is", "Time per step [µs]": "computing time per step and mode",
+            "Real-time factor": "time per step over the step of the loop; below 1 keeps up with it",
+        }
 
-    def _row(self, name: str, target: str) -> str:
+    def _target(self, target: str, columns: int) -> str:
+        """The rows of a target, best first if asked for, those without a score last."""
         shown = self.run.shown
-        score = find(shown, name, target, self.display.mode) if shown else None
+        scores = {
+            name: find(shown, name, target, self.display.mode) if shown else None
+            for name in observers_of(target, hidden=True)}
+        best = min((s.rms for n, s in scores.items() if s and OBSERVERS[n].causal), default=None)
+        order = list(scores.items())
+        if self.display.best_first:
+            order.sort(key=lambda item: item[1].rms if item[1] else math.inf)
+        rows = "".join(self._row(name, target, score, best) for name, score in order)
+        title = f"{target.capitalize()}, {self.display.mode}"
+        return f'<tbody><tr><th colspan={columns} class="target" scope=rowgroup>{title}</th></tr>{rows}</tbody>'
+
+    def _row(self, name: str, target: str, score: Score | None, best: float | None) -> str:
         label = escape(OBSERVERS[name].label) + ("" if OBSERVERS[name].causal else " <sup>looks ahead</sup>")
-        cells = [NOTHING] * 5
+        shown, pinned = self.run.shown, self._pinned(name, target, score)
+        cells = [NOTHING, *pinned, *[NOTHING] * 5]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
+            is_best = score.rms == best and OBSERVERS[name].causal
             cells = [
-                number(score.rms * scale), number(score.truth_rms * scale), number(score.normalised_rms),
+                (BEST if is_best else "") + number(score.rms * scale), *pinned,
+                number(score.truth_rms * scale),
+                (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
                 NOTHING if score.lag is None else f"{1e3 * score.lag:.2f}".replace("-", "−"),
-                number(1e6 * score.seconds_per_step),
+                number(1e6 * score.seconds_per_step), number(score.seconds_per_step / shown.result.record.dt, 2),
             ]
         values = "".join(f"<td>{c}</td>" for c in cells)
         head = f"<th scope=row>{swatch(name, self.display.dark)}{label}</th>"
         return f'<tr data-observer="{name}" data-target="{target}">{head}{values}</tr>'
 
+    def _pinned(self, name: str, target: str, score: Score | None) -> list[str]:
+        """The pinned run's error and the change since; nothing while nothing is pinned."""
+        kept = self.display.pinned
+        if kept is None:
+            return []
+        before = kept.score(name, target, self.display.mode)
+        if before is None:
+            return [NOTHING] * 2
+        scale = per_micrometre(self.display.unit, kept.scenario.telescope.diameter)
+        return [number(before.rms * scale), change(before.rms, score.rms if score else None)]
+
     def _notes(self) -> str:
         shown = self.run.shown
         failures = shown.result.failures if shown else ()
         return "".join(f'<p class="failure">{escape(f.reason)}</p>' for f in failures)
+
+
+def change(before: float, now: float | None) -> str:
+    """A change in per cent, signed.
+
+    >>> change(20.0, 15.0)
+    '−25.0'
+    """
+    if now is None or before == 0:
+        return NOTHING
+    return f"{100.0 * (now / before - 1.0):+.1f}".replace("-", "−")

@@ -13,7 +13,7 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.store import Run
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
-from wfsobs.app.views.plots import add_line, later, new_figure, restyle
+from wfsobs.app.views.plots import Faint, add_line, later, new_figure, restyle
 from wfsobs.app.work import TRUTH, Shown
 from wfsobs.observers.base import TARGETS
 
@@ -40,7 +40,7 @@ class Traces:
         crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
         self.traces = {target: _Trace(target, self.x_range, crosshair) for target in TARGETS}
         run.param.watch(self._redraw, "shown")
-        display.param.watch(self._redraw, ["mode", "show", "unit"])
+        display.param.watch(self._redraw, ["mode", "show", "unit", "pinned"])
         display.param.watch(self._restyle, ["dark", "hidden"])
         for end in ("start", "end"):
             self.x_range.on_change(end, self._moved)
@@ -107,6 +107,7 @@ class _Trace:
             left=0, right=0, fill_color="#808080", fill_alpha=0.10, line_width=0, level="underlay")
         self.figure.add_layout(self.warm_up)
         self.lines = {name: add_line(self.figure, name, self.source, name) for name in self.names}
+        self.faint = Faint(self.figure)
 
     def draw(self, shown: Shown, display: Display, first: int, last: int) -> None:
         """Send the samples first ... last - 1 of every line."""
@@ -118,22 +119,45 @@ class _Trace:
         self.source.data = data
         warm_up = shown.scenario.run.warm_up
         self.warm_up.right = warm_up
-        self._fit(data, warm_up)
+        self._fit(data, warm_up, self._draw_pinned(display, data["x"]))
         what = f"error of {display.mode}" if display.error else display.mode
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
 
-    def _fit(self, data: dict[str, Any], warm_up: float) -> None:
+    def _draw_pinned(self, display: Display, times: Array) -> dict[str, tuple[Array, Array]]:
+        """Send the pinned run's visible lines between the first and the last of the times; what was sent."""
+        kept, lines = display.pinned, {}
+        if kept is not None:
+            first, last = np.searchsorted(kept.times, [times[0], times[-1]])
+            cut = slice(first, last + 1)
+            x = _thinned(kept.times[cut])
+            scale = per_micrometre(display.unit, kept.scenario.telescope.diameter)
+            for name, line in self.lines.items():
+                values = (kept.errors if display.error else kept.signals).get((name, self.target))
+                if line.visible and values is not None:
+                    lines[name] = (x, scale * envelope(values[cut, display.column], BINS))
+        self.faint.draw(lines, display.dark)
+        return lines
+
+    def _fit(self, data: dict[str, Any], warm_up: float, pinned: dict[str, tuple[Array, Array]]) -> None:
         """Have the axis hold every visible line; what a filter does while it settles does not count."""
         counted = data["x"] >= warm_up
         if not counted.any():
             counted[:] = True
         lines = [data[name][counted] for name, line in self.lines.items() if line.visible]
+        lines += [y[x >= warm_up] for x, y in pinned.values()]
         values = np.concatenate(lines) if lines else np.empty(0)
         values = values[np.isfinite(values)]
         if values.size:
             low, high = float(values.min()), float(values.max())
             pad = 0.05 * (high - low) or 1.0
             self.figure.y_range.update(start=low - pad, end=high + pad)
+
+
+def _thinned(times: Array) -> Array:
+    """The times of an envelope of samples that are a run of times themselves."""
+    if times.size <= 2 * BINS:
+        return times
+    return np.interp(envelope_times(0, times.size, BINS, 1.0), np.arange(times.size), times)
 
 
 def _line(shown: Shown, name: str, target: str, display: Display, first: int, last: int) -> Array:

@@ -1,0 +1,137 @@
+"""Pinning a run and comparing with it; what the table and the spectra do besides."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.pin import differences, name_of, pin
+from wfsobs.app.views.table import change, number
+from wfsobs.app.work import TRUTH
+from wfsobs.observers.base import TARGETS
+from wfsobs.presets import PRESETS
+from wfsobs.scenario import Scenario
+from wfsobs.scores import rms
+
+
+def press(dashboard: Dashboard) -> None:
+    dashboard.pinning.button.param.trigger("clicks")
+
+
+@pytest.fixture
+def pinned(dashboard: Dashboard, loop: Any) -> Dashboard:
+    """A dashboard that shows a windier run than the pinned one."""
+    press(dashboard)
+    dashboard.store.change("turbulence.wind_speed", 30)
+    loop.finish(dashboard.store)
+    return dashboard
+
+
+def order(dashboard: Dashboard, target: str) -> list[str]:
+    return re.findall(rf'data-observer="([\w-]+)" data-target="{target}"', dashboard.table.pane.object)
+
+
+class TestPin:
+    def test_the_table_shows_the_change(self, pinned: Dashboard) -> None:
+        kept, shown = pinned.display.pinned, pinned.store.run.shown
+        before = kept.score("kf-lgs", "turbulence", "tip").rms
+        now = next(s for s in shown.result.scores if (s.observer, s.target, s.mode) == ("kf-lgs", "turbulence", "tip")).rms
+        assert now != before
+        html = pinned.table.pane.object
+        assert f"<td>{number(1e3 * before)}</td><td>{change(before, now)}</td>" in html
+        assert "Pinned [nm]" in html and "Change [%]" in html
+
+    def test_the_name_says_what_differs(self, pinned: Dashboard, loop: Any) -> None:
+        assert "Wind speed V₀ 15 → 30 m/s" in pinned.pinning.note.object and pinned.pinning.note.visible
+        pinned.store.change("turbulence.wind_speed", 15)
+        loop.finish(pinned.store)
+        assert "the same settings" in pinned.pinning.note.object
+
+    def test_faint_lines(self, pinned: Dashboard) -> None:
+        trace, kept = pinned.traces.traces["turbulence"], pinned.display.pinned
+        data = trace.faint.source.data
+        assert len(data["xs"]) == len(data["colour"]) == 5
+        assert np.nanmax(data["ys"][0]) == pytest.approx(1e3 * np.nanmax(kept.signals[TRUTH, "turbulence"][:, 0]))
+        spectrum = pinned.spectra.spectra["vibration"].faint.source.data
+        assert np.allclose(spectrum["ys"][0], 1e6 * kept.spectra[TRUTH, "vibration"].signal[1:, 0])
+        pinned.display.show = "error"
+        assert len(trace.faint.source.data["xs"]) == 4, "the truth has no error"
+        pinned.display.hidden = {"turbulence": ["kf-lgs"]}
+        assert len(trace.faint.source.data["xs"]) == 3
+
+    def test_a_zoom_cuts_the_pinned_lines(self, pinned: Dashboard) -> None:
+        pinned.traces.x_range.update(start=1.0, end=1.1)
+        x = np.asarray(pinned.traces.traces["vibration"].faint.source.data["xs"][0])
+        assert x[0] == pytest.approx(0.975, abs=2e-3) and x[-1] == pytest.approx(1.125, abs=3e-3)
+
+    def test_unpin(self, pinned: Dashboard) -> None:
+        assert pinned.pinning.button.label == "Unpin"
+        press(pinned)
+        assert pinned.display.pinned is None and pinned.pinning.button.label == "Pin"
+        assert "Pinned" not in pinned.table.pane.object and not pinned.pinning.note.visible
+        assert pinned.traces.traces["turbulence"].faint.source.data["xs"] == []
+
+    def test_nothing_is_drawn_before(self, dashboard: Dashboard) -> None:
+        assert all(dashboard.traces.traces[target].faint.source is None for target in TARGETS)
+
+    def test_all_samples_of_a_short_record_are_kept(self, dashboard: Dashboard) -> None:
+        shown = dashboard.store.run.shown
+        kept = pin(shown)
+        values = shown.values("kf-lgs", "vibration")
+        assert np.allclose(kept.signals["kf-lgs", "vibration"], values, atol=1e-6)
+        assert np.allclose(kept.errors["kf-lgs", "vibration"], values - shown.values(TRUTH, "vibration"), atol=1e-6)
+
+
+class TestWords:
+    def test_differences(self) -> None:
+        one = Scenario()
+        other = one.replace({"turbulence.damping": 0.8, "loop.closed": False, "kalman.process_noise": "manual",
+                             "turbulence.rms": 0.4, "butterworth.frequencies": [20.0]})
+        assert differences(one, other) == [
+            "Turbulence: Damping ξ 0.9 → 0.8", "Strength, rms 0.5 → 0.4 µm", "Closed loop on → off",
+            "Process noise Q matched → manual", "Centre frequencies changed"]
+        assert name_of(one, other).endswith("and 2 more")
+        assert name_of(one, one.copy()) == "the same settings"
+        assert "Peaks changed" in differences(PRESETS["paper"](), PRESETS["ut4"]())
+
+    def test_change(self) -> None:
+        assert change(20.0, 25.0) == "+25.0" and change(20.0, None) == change(0.0, 1.0) == "–"
+
+
+class TestTable:
+    def test_best_first(self, dashboard: Dashboard) -> None:
+        rms_of = {s.observer: s.rms for s in dashboard.store.run.shown.result.scores
+                  if (s.target, s.mode) == ("vibration", "tip")}
+        assert order(dashboard, "vibration") == sorted(rms_of, key=lambda name: rms_of[name])
+        dashboard.display.best_first = False
+        assert order(dashboard, "vibration") == list(rms_of)
+
+    def test_marks(self, dashboard: Dashboard) -> None:
+        html = dashboard.table.pane.object
+        assert html.count(">best<") == 2, "one causal observer per target"
+        worse = [s for s in dashboard.store.run.shown.result.scores
+                 if s.mode == "tip" and s.normalised_rms is not None and s.normalised_rms > 1]
+        assert html.count(">above truth<") == len(worse) > 0
+
+    def test_real_time_factor(self, dashboard: Dashboard) -> None:
+        score = next(s for s in dashboard.store.run.shown.result.scores if s.observer == "gpr-online" and s.mode == "tip")
+        assert f"<td>{number(1e3 * score.seconds_per_step, 2)}</td></tr>" in dashboard.table.pane.object
+
+
+def test_cumulative_rms(dashboard: Dashboard) -> None:
+    """At the lowest frequency it is the rms of what is shown, the mean aside."""
+    dashboard.display.spectrum = "cumulative"
+    shown, view = dashboard.store.run.shown, dashboard.spectra.spectra["vibration"]
+    y = np.asarray(view.sources["kf-lgs"].data["y"])
+    assert np.all(np.diff(y) <= 0)
+    signal = shown.values("kf-lgs", "vibration")[500:, 0]
+    assert y[0] == pytest.approx(1e3 * rms(signal), rel=0.15)
+    assert view.figure.yaxis.axis_label == "cumulative rms, tip [nm]"
+    dashboard.display.show = "error"
+    error = signal - shown.values(TRUTH, "vibration")[500:, 0]
+    assert np.asarray(view.sources["kf-lgs"].data["y"])[0] == pytest.approx(1e3 * rms(error), rel=0.15)
+    assert view.figure.yaxis.axis_label == "cumulative rms of error, tip [nm]"
