@@ -235,8 +235,8 @@ class Store(param.Parameterized):
             can_undo=bool(self._past), can_redo=bool(self._future))
         if same:
             return
+        self.follow()  # first, so that a warning of stale results does not come and go
         self._compare()
-        self.follow()
 
     def _compare(self, *_: object) -> None:
         shown = self.run.shown

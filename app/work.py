@@ -1,7 +1,7 @@
 """The work of one run, done in a thread: what it delivers, and how often.
 
-Nothing here knows of Panel. `compute` runs the core and hands over what is done so far, at most every
-`INTERVAL` seconds: quick observers first, then the slow ones, then parts of the online GPR as they come.
+Nothing here knows of Panel. `compute` runs the core and hands over what is done so far: the quick observers where the
+others keep one waiting, all but the slowest as soon as they are done, then parts of that one as they come.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from wfsobs.loop import simulate
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.pipeline import Failure, Result, collect, each_estimate
 from wfsobs.record import Record
@@ -30,10 +31,12 @@ Key = tuple[str, str]
 TRUTH = "truth"
 
 INTERVAL = 0.15
-"""Least time between two deliveries [s]."""
+"""Least time between two reports of progress [s]."""
 
-GROWTH_INTERVAL = 0.4
-"""The same, where only an estimate under way has grown [s]."""
+DELIVERY_INTERVAL = 0.4
+"""Least time between two deliveries [s], each of which has the page drawn anew."""
+
+SLOWEST = max(OBSERVERS.values(), key=lambda o: o.weight).id
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,7 @@ class _Work:
         self.growing: dict[Key, Array] = {}  # written to by the observers' threads
         self.spectra: dict[Key, Spectrum] = {}
         self.started = self.told = self.delivered = perf_counter()
-        self.finished = self.grown = False  # since the last delivery
+        self.news = False  # since the last delivery
         self.fraction = 0.0
         self.lock = threading.Lock()
         self.record: Record | None = None
@@ -109,7 +112,15 @@ class _Work:
                     self.failures.append(item)
                 else:
                     self._add(record, item)
-                self.finished = True
+                self.news = True
+                done = {of.observer for of in (*self.estimates, *self.failures)}
+                shown = self._deliver(record) if done == set(OBSERVERS) - {SLOWEST} else None
+            if shown is not None:
+                self.report(self.fraction, shown)
+        return self._so_far(record)
+
+    def _deliver(self, record: Record) -> Shown:
+        self.delivered, self.news = perf_counter(), False
         return self._so_far(record)
 
     def _so_far(self, record: Record) -> Shown:
@@ -126,15 +137,14 @@ class _Work:
             self.told = now
             self.fraction = fraction = max(self.fraction, fraction)  # modes at work in parallel overtake each other
             shown = None
-            if self.finished or (self.grown and now - self.delivered >= GROWTH_INTERVAL):
-                self.delivered, self.finished, self.grown = now, False, False
-                shown = self._so_far(self.record)
+            if self.news and now - self.delivered >= DELIVERY_INTERVAL:
+                shown = self._deliver(self.record)
         self.report(fraction, shown)
 
     def _grow(self, observer: str, target: str, values: Array) -> None:
         with self.lock:
             self.growing[observer, target] = values
-            self.grown = True
+            self.news = True
 
     def _add(self, record: Record, estimate: Estimate) -> None:
         key = (estimate.observer, estimate.target)
@@ -164,5 +174,6 @@ class _Work:
             return None
         true = np.column_stack([t[-shortest:] for t, _ in columns])
         value = np.column_stack([v[-shortest:] for _, v in columns])
-        frequency, signal = welch_psd(value, record.dt)
-        return Spectrum(frequency, signal, welch_psd(value - true, record.dt)[1])
+        frequency, density = welch_psd(np.hstack([value, value - true]), record.dt)
+        signal, error = np.hsplit(density, 2)
+        return Spectrum(frequency, signal, error)

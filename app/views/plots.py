@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import panel as pn
 from bokeh.models import ColumnDataSource, GlyphRenderer
 from bokeh.plotting import figure
@@ -30,6 +31,19 @@ def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> 
     it = look(name)
     renderer = fig.line("x", y, source=source, color=it.light, line_width=it.width, line_dash=list(it.dash), name=name)
     return renderer
+
+
+def send(source: ColumnDataSource, data: dict[str, Any]) -> None:
+    """Give a source its data, unless it has them already: each one sent has its figure drawn anew."""
+    old = source.data
+    if data.keys() != old.keys() or not all(_same(old[name], data[name]) for name in data):  # type: ignore[arg-type]
+        source.data = data
+
+
+def _same(a: Any, b: Any) -> bool:
+    if len(a) != len(b):
+        return False
+    return np.array_equal(a, b, equal_nan=True) if isinstance(b, np.ndarray) else list(a) == list(b)
 
 
 def restyle(lines: dict[str, GlyphRenderer], dark: bool, hidden: list[str]) -> None:

@@ -9,7 +9,7 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d, VSpan
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.store import Run
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.plots import Faint, add_line, new_figure, restyle
+from wfsobs.app.views.plots import Faint, add_line, new_figure, restyle, send
 from wfsobs.app.work import TRUTH, Array, Shown, Spectrum
 from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.scores import cumulative_rms
@@ -87,10 +87,10 @@ class _Spectrum:
         for name, source in self.sources.items():
             spectrum = shown.spectra.get((name, self.target))
             if spectrum is None:
-                source.data = {"x": [], "y": []}
+                send(source, {"x": [], "y": []})
                 continue
             y = _curve(spectrum, name, display, diameter)
-            source.data = {"x": spectrum.frequency[1:], "y": y}
+            send(source, {"x": spectrum.frequency[1:], "y": y})
             drawn.append(y)
         self._fit(drawn + self.draw_pinned(display), display.cumulative)
         of = " of error" if display.error else ""
@@ -124,13 +124,13 @@ class _Spectrum:
         vibration, kalman = shown.scenario.vibration, shown.scenario.kalman
         peaks = {"peaks": [p for p in vibration.peaks if p.frequency <= vibration.cutoff], "ar2": vibration.peaks}
         drawn = peaks.get(vibration.source, [])
-        self.peaks.data = {
+        send(self.peaks, {
             "x": [p.frequency for p in drawn],
             "text": [f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}" for p in drawn],
-        }
-        self.model.data = {
+        })
+        send(self.model, {
             "x": [kalman.frequency], "text": [f"model of the Kalman filters {kalman.frequency:.5g} Hz"],
-        }
+        })
 
 
 def _curve(spectrum: Spectrum, name: str, display: Display, diameter: float) -> Array:

@@ -13,7 +13,7 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.store import Run
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
-from wfsobs.app.views.plots import Faint, add_line, later, new_figure, restyle
+from wfsobs.app.views.plots import Faint, add_line, later, new_figure, restyle, send
 from wfsobs.app.work import TRUTH, Shown
 from wfsobs.observers.base import TARGETS
 
@@ -116,7 +116,7 @@ class _Trace:
         for name in self.names:
             values = _line(shown, name, self.target, display, first, last)
             data[name] = (scale * envelope(values, BINS)).astype(np.float32)
-        self.source.data = data
+        send(self.source, data)
         warm_up = shown.scenario.run.warm_up
         self.warm_up.right = warm_up
         self._fit(data, warm_up, self._draw_pinned(display, data["x"]))

@@ -10,6 +10,7 @@ import pytest
 
 from wfsobs.app import work
 from wfsobs.app.work import TRUTH, Shown, compute
+from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.scores import scored_samples, welch_psd
 from wfsobs.watch import Cancelled
@@ -23,7 +24,7 @@ def keys(shown: Shown) -> set[tuple[str, str]]:
 def reports(monkeypatch: pytest.MonkeyPatch, short: Scenario) -> list[tuple[float, Shown | None]]:
     """Everything that a run reports when nothing is held back, the final result last."""
     monkeypatch.setattr(work, "INTERVAL", 0.0)
-    monkeypatch.setattr(work, "GROWTH_INTERVAL", 0.0)
+    monkeypatch.setattr(work, "DELIVERY_INTERVAL", 0.0)
     out: list[tuple[float, Shown | None]] = []
     final = compute(short, lambda: False, lambda fraction, shown: out.append((fraction, shown)))
     return [*out, (1.0, final)]
@@ -54,9 +55,11 @@ def test_progress_rises_to_one(reports: Any) -> None:
 
 def test_deliveries_are_held_back(short: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(work, "INTERVAL", 1000.0)
-    told: list[float] = []
-    compute(short, lambda: False, lambda fraction, shown: told.append(fraction))
-    assert told == []
+    told: list[Shown | None] = []
+    compute(short, lambda: False, lambda fraction, shown: told.append(shown))
+    (shown,) = told
+    assert shown is not None
+    assert {name for name, _ in keys(shown)} == set(OBSERVERS) - {"gpr-online"}, "all but the slowest, at once"
 
 
 def test_spectra_are_of_what_is_scored(reports: Any) -> None:
