@@ -38,7 +38,7 @@ LOOKS: Mapping[str, Look] = MappingProxyType({
     "multirate-optimal": Look("Opt. multi-rate", "#7A1FA2", "#C9A0FF", (3, 2)),
     "butterworth-ol": Look("Butterworth OL", "#B40000", "#FF7A70", (2, 2)),
     "butterworth-cl": Look("Butterworth CL", "#B40000", "#FF7A70", (8, 3)),
-    "gpr-offline": Look("Offline GPR", "#0A960A", "#4FD64F"),
+    "gpr-offline": Look("Offline GPR", "#0A960A", "#4FD64F", (12, 2, 2, 2, 2, 2)),
     "gpr-online": Look("Online GPR", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
     "zero": Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4)),
 })
