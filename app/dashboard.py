@@ -18,6 +18,7 @@ from panel.custom import JSComponent
 
 from wfsobs.app.controls.panel import Controls
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, SIGNAL, UNITS, Display
+from wfsobs.app.pages.pages import Pages
 from wfsobs.app.store import FAILED, Post, Store
 from wfsobs.app.style import asset, theme
 from wfsobs.app.views.pinning import Pinning
@@ -87,10 +88,12 @@ class Dashboard:
         body = pn.Column(
             *(self._section(target) for target in TARGETS), _box("RMS errors", self._best_first(), self.table.pane),
             **WIDE, stylesheets=[":host { gap: 10px; }"])
+        explore = pn.Column(self._switches(), body, **WIDE, stylesheets=[":host { gap: 10px; }"])
+        self.pages = Pages(explore, self.store, self.display)
         page = pmui.Page(
             title="wfsobs", sidebar=[self.controls.view()], sidebar_width=340, theme_config=theme(), favicon=None,
             main=[pn.Column(
-                self._switches(), self.alert, self.stale, body, self.frame,
+                self._top(), self.alert, self.stale, self.pages.view, self.frame,
                 sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
         )
         self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")
@@ -105,18 +108,24 @@ class Dashboard:
         """The session has ended."""
         self.store.close()
 
-    def _switches(self) -> pn.FlexBox:
-        def group(name: str, options: Any) -> pmui.RadioButtonGroup:
-            widget = pmui.RadioButtonGroup.from_param(
-                self.display.param[name], options=options, size="small", margin=0, variant="outlined")
-            widget.label = ""
-            return widget
+    def _group(self, name: str, options: Any) -> pmui.RadioButtonGroup:
+        widget = pmui.RadioButtonGroup.from_param(
+            self.display.param[name], options=options, size="small", margin=0, variant="outlined")
+        widget.label = ""
+        return widget
 
+    def _top(self) -> pn.FlexBox:
+        """The pages, and what holds on all of them."""
         modes = {m.name.capitalize(): m.name for m in self.store.scenario.modes}
         return pn.FlexBox(
-            group("mode", modes), group("show", {"Signal": SIGNAL, "Error": ERROR}),
-            group("unit", {written: unit for unit, written in UNITS.items()}),
-            group("spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
+            self.pages.switch, self._group("mode", modes),
+            self._group("unit", {written: unit for unit, written in UNITS.items()}),
+            gap="12px", align_items="center", **WIDE)
+
+    def _switches(self) -> pn.FlexBox:
+        return pn.FlexBox(
+            self._group("show", {"Signal": SIGNAL, "Error": ERROR}),
+            self._group("spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
             self._zoom_buttons(), *self.pinning.view(), gap="12px", align_items="center", **WIDE)
 
     def _best_first(self) -> pmui.Checkbox:

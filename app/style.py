@@ -80,10 +80,10 @@ def asset(name: str) -> str:
     return files("wfsobs.assets").joinpath(name).read_text(encoding="utf-8")
 
 
-def swatch(name: str, dark: bool) -> str:
-    """A short line as drawn in the figures, as SVG."""
+def swatch(name: str, dark: bool, dashed: bool = True) -> str:
+    """A short line as drawn in the figures, as SVG; solid if not to be dashed."""
     it = look(name)
-    dash = f' stroke-dasharray="{" ".join(map(str, it.dash))}"' if it.dash else ""
+    dash = f' stroke-dasharray="{" ".join(map(str, it.dash))}"' if it.dash and dashed else ""
     return (
         '<svg class="swatch" width="26" height="8" aria-hidden="true">'
         f'<line x1="0" y1="4" x2="26" y2="4" stroke="{it.colour(dark)}" stroke-width="2.5"{dash}/></svg>'

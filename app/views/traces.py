@@ -134,7 +134,7 @@ class _Trace:
             for name, line in self.lines.items():
                 values = (kept.errors if display.error else kept.signals).get((name, self.target))
                 if line.visible and values is not None:
-                    lines[name] = (x, scale * envelope(values[cut, display.column], BINS))
+                    lines[name] = (x, scale * envelope(values[cut, display.column].astype(np.float64), BINS))
         self.faint.draw(lines, display.dark)
         return lines
 

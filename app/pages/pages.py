@@ -1,0 +1,60 @@
+"""The pages of the main area, and the switch between them: a page is made when it is first opened."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, Protocol
+
+import panel as pn
+import panel_material_ui as pmui
+import param
+
+from wfsobs.app.display import Display
+from wfsobs.app.pages.figures import Figures
+from wfsobs.app.pages.model import Model
+from wfsobs.app.store import Store
+
+EXPLORE, FIGURES, MODEL = "explore", "figures", "model"
+TITLES: Mapping[str, str] = MappingProxyType({"Explore": EXPLORE, "Paper figures": FIGURES, "Model": MODEL})
+
+
+class Page(Protocol):
+    """What a page beside the first must be able to do."""
+
+    def view(self) -> Any:
+        """What is shown."""
+
+    def show(self, visible: bool) -> None:
+        """Bring it up to date, and keep it so while it is visible."""
+
+
+class Pages(param.Parameterized):
+    """The first page, and others that are made when they are wanted."""
+
+    current = param.Selector(default=EXPLORE, objects=list(TITLES.values()), label="Page")
+
+    def __init__(self, explore: Any, store: Store, display: Display):
+        super().__init__()
+        self._makers: dict[str, Callable[[], Page]] = {
+            FIGURES: lambda: Figures(store.run, display), MODEL: lambda: Model(store, display)}
+        self.made: dict[str, Page] = {}
+        self.rooms = {EXPLORE: explore, **{
+            name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers}}
+        self.switch = pmui.RadioButtonGroup.from_param(
+            self.param.current, options=dict(TITLES), size="small", margin=0, color="primary")
+        self.switch.label = ""
+        self.view = pn.Column(*self.rooms.values(), sizing_mode="stretch_width", margin=0)
+        self.param.watch(self._turn, "current")
+
+    def _turn(self, _event: object) -> None:
+        name = self.current
+        with pn.io.hold():
+            if name in self._makers and name not in self.made:
+                page = self.made[name] = self._makers[name]()
+                page.show(True)
+                self.rooms[name][:] = [page.view()]
+            for other, room in self.rooms.items():
+                if other in self.made:
+                    self.made[other].show(other == name)
+                room.visible = other == name

@@ -1,0 +1,154 @@
+"""The pages beside the first: made when opened, true to the results, at rest while hidden."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.pages import mathml, model
+from wfsobs.app.pages.figures import PSD_TOP_HZ, Figures
+from wfsobs.app.pages.pages import EXPLORE, FIGURES, MODEL
+from wfsobs.app.style import LOOKS
+from wfsobs.app.work import TRUTH
+from wfsobs.describe import describe
+from wfsobs.scenario import Scenario
+
+
+def opened(dashboard: Dashboard, name: str) -> Any:
+    dashboard.pages.current = name
+    return dashboard.pages.made[name]
+
+
+class Checker(HTMLParser):
+    """Fails where tags do not nest."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.words = ""
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_startendtag(self, tag: str, attrs: Any) -> None:
+        pass
+
+    def handle_data(self, data: str) -> None:
+        self.words += data
+
+
+def words(html: str) -> str:
+    checker = Checker()
+    checker.feed(html)
+    assert checker.open == []
+    return checker.words
+
+
+class TestPages:
+    def test_nothing_is_made_before_it_is_opened(self, dashboard: Dashboard) -> None:
+        assert dashboard.pages.made == {}
+        assert [room.visible for room in dashboard.pages.rooms.values()] == [True, False, False]
+
+    def test_turning(self, dashboard: Dashboard) -> None:
+        first = opened(dashboard, FIGURES)
+        assert [room.visible for room in dashboard.pages.rooms.values()] == [False, True, False]
+        assert not dashboard.pages.rooms[MODEL].objects
+        dashboard.pages.current = EXPLORE
+        assert [room.visible for room in dashboard.pages.rooms.values()] == [True, False, False]
+        assert opened(dashboard, FIGURES) is first
+
+    def test_a_hidden_page_rests(self, dashboard: Dashboard, loop: Any) -> None:
+        figures, equations = opened(dashboard, FIGURES), opened(dashboard, MODEL)
+        assert not figures.visible and equations.visible
+        data, html = figures.sheets[2].plots[0].sources[TRUTH].data, equations.pane.object
+        dashboard.pages.current = EXPLORE
+        dashboard.store.change("turbulence.wind_speed", 30)
+        loop.finish(dashboard.store)
+        assert figures.sheets[2].plots[0].sources[TRUTH].data is data and equations.pane.object == html
+        assert opened(dashboard, MODEL).pane.object != html
+        assert not np.array_equal(opened(dashboard, FIGURES).sheets[2].plots[0].sources[TRUTH].data["y"], data["y"])
+
+
+class TestFigures:
+    @pytest.fixture
+    def figures(self, dashboard: Dashboard) -> Figures:
+        return opened(dashboard, FIGURES)
+
+    def test_every_line_has_data(self, figures: Figures) -> None:
+        plots = [plot for sheet in figures.sheets for plot in sheet.plots]
+        assert len(plots) == 2 + 2 + 2 + 3
+        for plot in plots:
+            for source in plot.sources.values():
+                y = np.asarray(source.data["y"])
+                assert y.size > 50 and np.isfinite(y).mean() > 0.9 and len(source.data["x"]) == y.size
+
+    def test_values(self, figures: Figures, dashboard: Dashboard) -> None:
+        shown = dashboard.store.run.shown
+        turbulence = figures.sheets[2]
+        tilt = np.asarray(turbulence.plots[1].sources["multirate"].data["y"])
+        assert np.nanmax(tilt) == pytest.approx(1e3 * shown.values("multirate", "turbulence")[500:, 1].max(), rel=1e-6)
+        zoomed = figures.sheets[0].plots[1].sources["butterworth-ol"].data
+        first = round(zoomed["x"][0] / 1e-3)
+        values = shown.values("butterworth-ol", "vibration")[first : first + len(zoomed["x"]), 0]
+        assert np.allclose(zoomed["y"], 1e3 * values, rtol=1e-5)
+        psd = figures.sheets[3].plots[2].sources["gpr-online"].data
+        assert psd["x"][-1] <= PSD_TOP_HZ
+        n = len(psd["x"])
+        assert np.allclose(psd["y"], 1e6 * shown.spectra["gpr-online", "vibration"].signal[1 : n + 1, 0])
+
+    def test_colours_and_captions(self, figures: Figures, dashboard: Dashboard) -> None:
+        for sheet in figures.sheets:
+            for plot in sheet.plots:
+                assert {n: line.glyph.line_color for n, line in plot.lines.items()} == {n: LOOKS[n].light for n in plot.lines}
+        captions = [words(sheet.caption.object) for sheet in figures.sheets]
+        assert [c.split(" of the paper")[0] for c in captions] == ["Figure 4a", "Figure 4b", "Figure 5", "Figure 6"]
+        assert "RMS error of tilt [nm]: LGS KF" in captions[2] and "16.6e-3" in captions[3]
+        dashboard.display.param.update(unit="mas", dark=True)
+        assert figures.sheets[0].plots[0].figure.yaxis.axis_label == "tip [mas]"
+        assert figures.sheets[0].plots[0].lines[TRUTH].glyph.line_color == LOOKS[TRUTH].dark
+
+    def test_without_a_vibration(self, figures: Figures, dashboard: Dashboard, loop: Any) -> None:
+        dashboard.store.change("vibration.source", "none")
+        loop.finish(dashboard.store)
+        assert dashboard.store.run.state == "done"
+
+
+class TestModel:
+    def test_the_numbers_are_there(self, dashboard: Dashboard) -> None:
+        page = opened(dashboard, MODEL)
+        told = describe(dashboard.store.scenario)
+        text = words(page.pane.object)
+        for number in (told.turbulence.a1, -told.turbulence.a2):
+            assert mathml.short(number, 7) in text
+        assert mathml.short(told.filters["kf-lgs"].gains["LGS"][0]) in text
+        for facts in told.filters.values():
+            assert f"Radius {mathml.short(facts.radius or 0.0, 6)}" in text
+        assert mathml.short(told.gprs["gpr-offline"].ridge) in text and "mode tip" in text
+
+    def test_it_follows_settings_and_mode(self, dashboard: Dashboard) -> None:
+        page = opened(dashboard, MODEL)
+        dashboard.store.change("turbulence.wind_speed", 30)
+        assert mathml.short(describe(dashboard.store.scenario).turbulence.a1, 7) in words(page.pane.object)
+        dashboard.display.mode = "tilt"
+        assert "mode tilt" in words(page.pane.object)
+
+    def test_an_unstable_cycle_says_why(self) -> None:
+        told = describe(Scenario().replace({
+            "kalman.process_noise": "manual", "kalman.vibration_rms": 0.06, "multirate.measurement_noise": "manual",
+            "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001}))
+        assert "is unstable" in words(model.html(told, dark=False))
+
+    def test_nothing_is_fetched(self) -> None:
+        html = model.html(describe(Scenario()), dark=True)
+        assert "http" not in html and "src=" not in html
+
+    @pytest.mark.parametrize(("x", "text"), [(0.5, "0.5"), (-1.0, "−1"), (0.0, "0"), (100.0, "100"), (2e-7, "2.0000e-07")])
+    def test_short(self, x: float, text: str) -> None:
+        assert mathml.short(x) == text

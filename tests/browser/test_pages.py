@@ -1,0 +1,110 @@
+"""The pages beside the first, the pinned run and the cumulative spectra, in a browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Page, expect
+
+MODELS = "[...Bokeh.index.roots[0].model.document._all_models.values()]"
+VISIBLE_LINES = f"""() => {MODELS}.filter(m => m.type === "GlyphRenderer" && m.glyph.type === "Line")
+    .map(m => m.data_source.get_length())"""
+PINNED = f"""() => {MODELS}.filter(m => m.type === "GlyphRenderer" && m.name === "pinned")
+    .map(m => m.data_source.data.xs.length)"""
+LABELS = f"""() => {MODELS}.filter(m => m.type === "LinearAxis" || m.type === "LogAxis").map(m => m.axis_label).join()"""
+LINES_OF_FIRST_PAGE = 2 * (5 + 7)
+LINES_OF_FIGURES = 2 * 2 + 2 * 2 + 2 * 4 + 3 * 4
+
+
+def turn(page: Page, name: str) -> None:
+    page.get_by_role("button", name=name, exact=True).click()
+
+
+def cells(page: Page, observer: str, target: str) -> list[str]:
+    return page.locator(f'tr[data-observer="{observer}"][data-target="{target}"] td').all_inner_texts()
+
+
+def no_wider_than(page: Page, width: int) -> None:
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= width
+
+
+def test_the_figures_of_the_paper(open_page: Any, tmp_path: Path) -> None:
+    page = open_page()
+    assert len(page.evaluate(VISIBLE_LINES)) == LINES_OF_FIRST_PAGE, "not made before it is opened"
+    turn(page, "Paper figures")
+    for number in ("4a", "4b", "5", "6"):
+        expect(page.get_by_text(f"Figure {number} of the paper")).to_be_visible()
+    points = page.evaluate(VISIBLE_LINES)
+    assert len(points) == LINES_OF_FIRST_PAGE + LINES_OF_FIGURES and min(points) > 100
+    expect(page.get_by_role("heading", name="RMS errors")).to_be_hidden()
+    page.screenshot(path=tmp_path / "figures.png")
+    turn(page, "Explore")
+    expect(page.get_by_role("heading", name="RMS errors")).to_be_visible()
+    expect(page.get_by_text("Figure 5 of the paper")).to_be_hidden()
+
+
+def test_the_model(open_page: Any) -> None:
+    page = open_page()
+    turn(page, "Model")
+    expect(page.get_by_role("heading", name="State space: equations 6 and 7")).to_be_visible()
+    expect(page.get_by_text("Poles of one cycle, 5 ms").first).to_be_visible()
+    coefficient = page.get_by_role("cell", name="1.987308")
+    expect(coefficient).to_be_visible()
+    box = page.get_by_role("textbox", name="m/s")
+    box.fill("30")
+    box.press("Enter")
+    expect(coefficient).to_have_count(0)
+
+
+def test_by_keyboard_on_a_phone(open_page: Any) -> None:
+    page = open_page(390, 844)
+    page.wait_for_timeout(600)
+    button = page.get_by_role("button", name="Model", exact=True)
+    button.focus()
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", name="State space: equations 6 and 7")).to_be_visible()
+    no_wider_than(page, 390)
+    page.get_by_role("button", name="Paper figures", exact=True).focus()
+    page.keyboard.press("Space")
+    expect(page.get_by_text("Figure 4a of the paper")).to_be_visible()
+    no_wider_than(page, 390)
+
+
+def test_pin_and_compare(open_page: Any) -> None:
+    page = open_page()
+    before = cells(page, "kf-lgs", "turbulence")[0].split()[-1]
+    page.get_by_role("button", name="Pin this run to compare others with it").click()
+    expect(page.get_by_text("Pinned, faint in the figures: the same settings")).to_be_visible()
+    page.wait_for_function(f"({PINNED})().join() === '5,7,5,7' || ({PINNED})().join() === '5,5,7,7'")
+    box = page.get_by_role("textbox", name="m/s")
+    box.fill("30")
+    box.press("Enter")
+    expect(page.get_by_text("Wind speed V₀ 15 → 30 m/s")).to_be_visible()
+    expect(page.get_by_role("columnheader", name="Change [%]")).to_be_visible()
+    row = page.locator('tr[data-observer="kf-lgs"][data-target="turbulence"] td')
+    expect(row.nth(2)).not_to_have_text("+0.0")
+    value, pinned, change = (text.split()[-1] for text in row.all_inner_texts()[:3])
+    assert pinned == before
+    assert abs(float(change) - 100 * (float(value) / float(pinned) - 1)) < 1
+    page.get_by_role("button", name="Unpin the run compared with").click()
+    expect(page.get_by_role("columnheader", name="Change [%]")).to_have_count(0)
+    page.wait_for_function(f"({PINNED})().every(n => n === 0)")
+
+
+def test_cumulative_rms(open_page: Any) -> None:
+    page = open_page()
+    assert "cumulative" not in page.evaluate(LABELS)
+    turn(page, "Cumulative rms")
+    page.wait_for_function(f"({LABELS})().includes('cumulative rms, tip [nm]')")
+    turn(page, "Error")
+    page.wait_for_function(f"({LABELS})().includes('cumulative rms of error, tip [nm]')")
+
+
+def test_best_first(open_page: Any) -> None:
+    page = open_page()
+    rows = page.locator('tr[data-target="turbulence"]')
+    assert rows.first.get_attribute("data-observer") == "multirate-optimal"
+    expect(rows.first).to_contain_text("best")
+    page.get_by_role("checkbox", name="Best first").click()
+    expect(rows.first).to_have_attribute("data-observer", "kf-lgs")
