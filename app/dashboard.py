@@ -16,10 +16,11 @@ import panel_material_ui as pmui
 import param
 from panel.custom import JSComponent
 
-from wfsobs.app.controls.panel import Controls
+from wfsobs.app.actions import Actions
+from wfsobs.app.controls.panel import Controls, waiting_text
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, SIGNAL, UNITS, Display
 from wfsobs.app.pages.pages import Pages
-from wfsobs.app.store import FAILED, Post, Store
+from wfsobs.app.store import FAILED, IDLE, Post, Store
 from wfsobs.app.style import asset, theme
 from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.spectra import MODEL, PEAKS, Spectra
@@ -46,7 +47,7 @@ MARKS = (
     f'<span class="mark" style="border-left:2px solid {PEAKS}">peaks</span>'
     f'<span class="mark" style="border-left:2px dashed {MODEL}">peak in the Kalman filters</span>'
 )
-
+STALE = "These results are not those of the settings."
 
 PHONE_PX = 600
 """Below this width the drawer lies over the page, and starts closed."""
@@ -69,6 +70,7 @@ class Dashboard:
         self.store = Store(post, scenario, work)
         self.display = Display()
         self.controls = Controls(self.store)
+        self.actions = Actions(self.store)
         self.traces = Traces(self.store.run, self.display)
         self.spectra = Spectra(self.store.run, self.display)
         self.strips = {target: Strip(target, self.store.run, self.display) for target in TARGETS}
@@ -78,10 +80,10 @@ class Dashboard:
         self.alert = pmui.Alert(
             object="", severity="error", visible=False, **WIDE)
         self.stale = pmui.Alert(
-            object="These results are not those of the settings.", severity="warning", visible=False,
+            object=STALE, severity="warning", visible=False,
             **WIDE)
         self.store.run.param.watch(self._refresh, ["state", "message"])
-        self.store.param.watch(self._refresh, "stale")
+        self.store.param.watch(self._refresh, ["stale", "waiting"])
 
     def page(self) -> pmui.Page:
         """The whole page."""
@@ -93,7 +95,7 @@ class Dashboard:
         page = pmui.Page(
             title="wfsobs", sidebar=[self.controls.view()], sidebar_width=340, theme_config=theme(), favicon=None,
             main=[pn.Column(
-                self._top(), self.alert, self.stale, self.pages.view, self.frame,
+                self._top(), self.actions.toolbar, self.alert, self.stale, self.pages.view, self.frame,
                 sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
         )
         self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")
@@ -101,8 +103,9 @@ class Dashboard:
         return page
 
     def start(self) -> None:
-        """The first run."""
-        self.store.start()
+        """The first run, unless settings from a link have brought one or would take long."""
+        if self.store.run.state == IDLE:
+            self.store.follow()
 
     def close(self) -> None:
         """The session has ended."""
@@ -142,6 +145,8 @@ class Dashboard:
 
     def _section(self, target: str) -> pn.Column:
         """The strip and the two figures of one target."""
+        self.traces.traces[target].figure.name = f"{target.capitalize()} time trace"
+        self.spectra.spectra[target].figure.name = f"{target.capitalize()} spectrum"
         cards = self.strips[target].cards
         cards.param.watch(lambda event: self._hide(target, event.new), "hidden")
         marks = MARKS if target == VIBRATION else ""
@@ -158,8 +163,10 @@ class Dashboard:
         run = self.store.run
         failed = run.state == FAILED
         self.alert.param.update(object=run.message, visible=failed)
-        waiting = self.store.stale and run.state != "running"
-        self.stale.visible = waiting
+        texts = [STALE] if self.store.stale else []
+        if self.store.waiting:
+            texts.append(f"{waiting_text(self.store.waiting)}.")
+        self.stale.param.update(object=" ".join(texts), visible=bool(texts) and run.state != "running")
         self.frame.stale = self.store.stale
 
 
@@ -182,6 +189,8 @@ def page(build: Callable[[Post], Dashboard] = Dashboard) -> Any:
     """The page of a new session; a page that says what went wrong where it cannot be built."""
     try:
         dashboard = build(post_to_session())
+        if pn.state.location is not None and pn.state.location.search:
+            dashboard.actions.open_link(pn.state.location.search)
         page = dashboard.page()
         dashboard.start()
         pn.state.on_session_destroyed(lambda _context: dashboard.close())

@@ -1,0 +1,225 @@
+"""Settings as links, command lines and Python: only what differs from the preset, each field in its own words.
+
+A link's query is `preset=ut4&turbulence.wind_speed=20&vibration.peaks=45,0.03,0.01,0.01;...`: lists with commas, a
+peak as frequency, damping and its rms per mode, peaks with semicolons. Whatever of a query cannot be used is
+named, and the rest is used. Nothing of it is ever opened or evaluated.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import parse_qsl, quote
+
+import param
+
+from wfsobs.configfile import from_toml, to_toml
+from wfsobs.presets import PRESETS
+from wfsobs.scenario import Scenario
+from wfsobs.settings import SettingError
+
+LONGEST = 8000
+"""Characters of a query, or of a command line; what is longer travels as a file."""
+
+SHORTEST_NAME = next(iter(PRESETS))
+"""The preset of a query that names none."""
+
+ROUNDS = 3
+MOST = 200
+"""Fields of a query that are read."""
+
+PEAKS = "vibration.peaks"
+PASSED_OVER = ("theme",)
+"""Keys of a query that are not ours."""
+
+FILE = "wfsobs.toml"
+
+
+@dataclass(frozen=True)
+class Link:
+    """What a query asks for; rejected : a line for every field that could not be used."""
+
+    scenario: Scenario
+    preset: str
+    rejected: tuple[str, ...] = field(default=())
+
+
+def changes(scenario: Scenario, preset: str) -> dict[str, Any]:
+    """Dotted path -> plain value of the settings that differ from the preset's."""
+    return dict(_leaves(scenario.difference(PRESETS[preset]())))
+
+
+# ---------------------------------------------------------------------- links
+
+def to_query(scenario: Scenario, preset: str) -> str | None:
+    """The query of a link to these settings, without "?"; None where it would be too long."""
+    changed = changes(scenario, preset)
+    parts = [f"preset={preset}"] if preset != SHORTEST_NAME or changed else []
+    parts += [f"{path}={quote(written(path, value), safe=',;:+-.')}" for path, value in changed.items()]
+    query = "&".join(parts)
+    return query if len(query) <= LONGEST else None
+
+
+def from_query(query: str) -> Link:
+    """The settings that a query asks for, and a line for every field of it that was refused."""
+    if len(query) > LONGEST:
+        return Link(PRESETS[SHORTEST_NAME](), SHORTEST_NAME, (
+            f"The link has {len(query)} characters, at most {LONGEST} are read: nothing of it was used.",))
+    pairs = parse_qsl(query.removeprefix("?").replace("+", "%2B"), keep_blank_values=True)
+    fields = {key: text for key, text in pairs[:MOST] if key not in PASSED_OVER}
+    name = fields.pop("preset", SHORTEST_NAME)
+    rejected = []
+    if name not in PRESETS:
+        rejected.append(_line("preset", name, f"takes one of {', '.join(PRESETS)}"))
+        name = SHORTEST_NAME
+    scenario, refused = _apply(PRESETS[name](), fields)
+    return Link(scenario, name, (*rejected, *refused))
+
+
+def written(path: str, value: Any) -> str:
+    """A setting's plain value as a link has it."""
+    if path == PEAKS:
+        return ";".join(",".join(map(_word, (p["frequency"], p["damping"], *p["rms"]))) for p in value)
+    if isinstance(value, list):
+        return ",".join(map(_word, value))
+    return _word(value)
+
+
+def read(path: str, text: str, known: Mapping[str, param.Parameter]) -> Any:
+    """The value that a link has written; what makes no sense stays text, for the setting itself to refuse."""
+    if path == PEAKS:
+        return [_peak(part) for part in text.split(";")] if text else []
+    p = known.get(path)
+    if isinstance(p, param.List):
+        return [_number(part) for part in text.split(",")] if text else []
+    if isinstance(p, param.Boolean):
+        return {"true": True, "false": False}.get(text, text)
+    return _number(text) if isinstance(p, param.Number) else text
+
+
+def _peak(text: str) -> Any:
+    numbers = [_number(part) for part in text.split(",")]
+    if len(numbers) < 3:
+        return text
+    return {"frequency": numbers[0], "damping": numbers[1], "rms": numbers[2:]}
+
+
+def _apply(base: Scenario, fields: Mapping[str, str]) -> tuple[Scenario, list[str]]:
+    """Every field that can be applied, whatever their order, and a line for every other."""
+    known = {path: p for path, _, p in base.walk()}
+    values = {path: read(path, text, known) for path, text in fields.items()}
+    refused = {path: reason for path, value in values.items() if (reason := _reason(base, {path: value}))}
+    good = {path: value for path, value in values.items() if path not in refused}
+    if _reason(base, good, together=True):
+        scenario = base
+        for _ in range(ROUNDS):  # what one field needs, a later one may bring
+            for path, value in list(good.items()):
+                if not _reason(scenario, {path: value}, together=True):
+                    scenario = scenario.replace({path: good.pop(path)})
+        refused |= {path: _reason(scenario, {path: value}, together=True) for path, value in good.items()}
+    else:
+        scenario = base.replace(good)
+    return scenario, [_line(path, fields[path], refused[path]) for path in fields if path in refused]
+
+
+def _reason(base: Scenario, values: Mapping[str, Any], together: bool = False) -> str:
+    """Why settings cannot have these values, or nothing; together : whether they have to go with all others."""
+    try:
+        fresh = base.replace(values)
+        if together:
+            fresh.validate()
+    except SettingError as error:
+        return str(error)
+    return ""
+
+
+def _line(path: str, text: str, reason: str) -> str:
+    """The line of a field that was refused; a reason that does not name it gets it in front."""
+    line = reason if reason.startswith(path) else f"{path} = {text}: {reason}"
+    return line if len(line) <= 200 else f"{line[:197]}..."
+
+
+def _number(text: str) -> int | float | str:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+# ---------------------------------------------------------------------- other languages
+
+def to_command(scenario: Scenario, preset: str) -> str:
+    """The command that prints the RMS table of these settings."""
+    words = ["wfsobs", "run", "--preset", preset]
+    for path, value in changes(scenario, preset).items():
+        words += ["--set", f"{path}={_inline(value)}"]
+    command = shlex.join(words)
+    return command if len(command) <= LONGEST else f"wfsobs run --config {FILE}"
+
+
+def to_python(scenario: Scenario, preset: str) -> str:
+    """A script that runs these settings and prints the errors."""
+    changed = changes(scenario, preset)
+    lines = [f"    {json.dumps(path)}: {value!r},\n" for path, value in changed.items()]
+    made = f'wfsobs.PRESETS["{preset}"]()' + (f".replace({{\n{''.join(lines)}}})" if lines else "")
+    imports = "import wfsobs\n"
+    if len(made) > LONGEST:
+        imports, made = "import wfsobs\nfrom wfsobs import configfile\n", f'configfile.load("{FILE}")'
+    return (
+        f"{imports}\nscenario = {made}\nresult = wfsobs.run(scenario)\n"
+        "for s in result.scores:\n"
+        '    print(f"{s.target:10} {s.mode:4} {s.observer:17} {1e3 * s.rms:8.2f} nm")\n'
+    )
+
+
+def to_file(scenario: Scenario, preset: str) -> str:
+    """Every setting as TOML, with the preset that they are compared with."""
+    return f'preset = "{preset}"\n{to_toml(scenario)}'
+
+
+def from_file(text: str) -> Link:
+    """The settings of a TOML file; preset "" where it names none. Raises SettingError with one line."""
+    try:
+        scenario = from_toml(text, where="file")
+        preset = tomllib.loads(text).get("preset", "")
+        scenario.validate()
+    except SettingError as error:
+        raise SettingError(str(error).partition("\n")[0]) from None
+    except (ValueError, RecursionError):
+        raise SettingError("file: not TOML that can be read") from None
+    return Link(scenario, preset)
+
+
+def _inline(value: Any) -> str:
+    """A plain value in TOML's syntax, on one line; words as they are."""
+    if isinstance(value, str):
+        return value
+    return _toml(value)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_toml(v)}" for key, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return json.dumps(value)

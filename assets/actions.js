@@ -1,0 +1,184 @@
+// The row of actions: menus to share and to save, opening a scenario, and what there is to say about it. It also keeps the
+// address in step with the settings, and hears the keys for undo and redo.
+
+const KINDS = ["svg", "png"]
+
+function tag(name, parent, properties = {}, attributes = {}) {
+  const it = Object.assign(document.createElement(name), properties)
+  for (const [key, value] of Object.entries(attributes)) it.setAttribute(key, value)
+  parent.append(it)
+  return it
+}
+
+function save(name, blob) {
+  const url = URL.createObjectURL(blob)
+  const link = document.createElement("a")
+  Object.assign(link, {href: url, download: name})
+  link.click()
+  setTimeout(() => URL.revokeObjectURL(url), 10_000)
+}
+
+// ------------------------------------------------------------------ menus
+
+function menu(bar, label, items) {
+  const button = tag("button", bar, {type: "button", textContent: `${label} ▾`},
+                     {"aria-haspopup": "menu", "aria-expanded": "false", "aria-label": label})
+  const list = tag("div", bar, {className: "menu", popover: "auto"}, {role: "menu", "aria-label": label})
+  button.popoverTargetElement = list
+  list.addEventListener("beforetoggle", (event) => {
+    button.setAttribute("aria-expanded", event.newState === "open")
+    if (event.newState === "open") {
+      list.replaceChildren()
+      for (const [text, act] of items()) {
+        const item = tag("button", list, {type: "button", textContent: text, tabIndex: -1}, {role: "menuitem"})
+        item.onclick = () => { list.hidePopover(); button.focus(); act() }
+      }
+      list.style.background = ground(bar)
+    }
+  })
+  list.addEventListener("toggle", (event) => {
+    if (event.newState !== "open") return
+    const box = button.getBoundingClientRect()
+    list.style.top = `${Math.min(box.bottom + 4, Math.max(window.innerHeight - list.offsetHeight - 8, 8))}px`
+    list.style.left = `${Math.max(8, Math.min(box.left, window.innerWidth - list.offsetWidth - 8))}px`
+    list.firstElementChild?.focus()
+  })
+  list.addEventListener("keydown", (event) => move(event, [...list.children], list.getRootNode().activeElement))
+}
+
+function move(event, items, focused) {
+  const at = items.indexOf(focused)
+  const to = {ArrowDown: at + 1, ArrowUp: at - 1 + items.length, Home: 0, End: items.length - 1}[event.key]
+  if (to === undefined) return
+  event.preventDefault()
+  items[to % items.length]?.focus()
+}
+
+// The colour behind an element: menus lie on top of everything, where nothing is inherited.
+function ground(element) {
+  for (let it = element; it; it = it.parentElement ?? it.getRootNode().host) {
+    const colour = getComputedStyle(it).backgroundColor
+    if (colour.startsWith("rgb(")) return colour  // the others let something through
+  }
+  return "Canvas"
+}
+
+// ------------------------------------------------------------------ figures
+
+function figures() {
+  const views = [...Bokeh.index.query((view) => view.model.type === "Figure")]
+  return views.map((view) => {
+    const axes = [view.model.left[0]?.axis_label, view.model.below[0]?.axis_label]
+    return [view.model.name ?? axes.filter(Boolean).join(" over "), view]
+  })
+}
+
+async function saveFigure(name, view, kind, model) {
+  const blob = await view.export(kind).to_blob()
+  save(`${name.toLowerCase().replaceAll(/[^a-z0-9]+/g, "-")}.${kind}`, blob)
+  model.said = `Saved ${name} as ${kind.toUpperCase()}.`
+}
+
+// ------------------------------------------------------------------ the row
+
+function isText(target) {
+  const kind = target?.type ?? ""
+  return target?.isContentEditable || target?.tagName === "TEXTAREA" ||
+    (target?.tagName === "INPUT" && !["range", "checkbox", "radio", "button", "file"].includes(kind))
+}
+
+function keys(model) {
+  const pressed = (event) => {
+    if (!(event.ctrlKey || event.metaKey) || event.altKey || isText(event.composedPath()[0])) return
+    const key = event.key.toLowerCase()
+    const action = key === "z" ? (event.shiftKey ? "redo" : "undo") : key === "y" ? "redo" : ""
+    if (action) {
+      event.preventDefault()
+      model.send_msg({action})
+    }
+  }
+  document.addEventListener("keydown", pressed)
+  model.on("remove", () => document.removeEventListener("keydown", pressed))
+}
+
+function textBox(el, model) {
+  const box = tag("div", el, {className: "text", hidden: true})
+  const label = tag("label", box, {textContent: "Copy this by hand"})
+  const area = tag("textarea", label, {readOnly: true})
+  tag("button", box, {type: "button", textContent: "Close"}).onclick = () => { box.hidden = true }
+  return async (text, what) => {
+    try {
+      await navigator.clipboard.writeText(text)
+      box.hidden = true
+      model.said = `Copied the ${what}.`
+    } catch {
+      area.value = text
+      box.hidden = false
+      area.select()
+      model.said = "The browser does not let this page copy."
+    }
+  }
+}
+
+function opener(bar, model) {
+  const input = tag("input", bar, {type: "file", accept: ".toml", hidden: true}, {"aria-label": "Scenario file"})
+  input.onchange = async () => {
+    const file = input.files[0]
+    if (file) {
+      const text = file.size <= model.largest ? await file.text() : null
+      model.send_msg({action: "open", name: file.name, text})
+    }
+    input.value = ""
+  }
+  tag("button", bar, {type: "button", textContent: "Open scenario"}).onclick = () => input.click()
+}
+
+function noteBox(el, model) {
+  const box = tag("div", el, {className: "notes", hidden: true})
+  const lines = tag("div", box, {}, {role: "alert"})
+  tag("button", box, {type: "button", textContent: "Dismiss"}).onclick = () => { model.notes = [] }
+  const draw = () => {
+    lines.replaceChildren()
+    model.notes.forEach((note) => tag("p", lines, {textContent: note}))
+    box.hidden = model.notes.length === 0
+  }
+  model.on("notes", draw)
+  draw()
+}
+
+export function render({model, el}) {
+  const bar = tag("div", el, {className: "bar"})
+  const here = () => location.origin + location.pathname + (model.query ? `?${model.query}` : "")
+  const copyLink = () => model.linked ? copy(here(), "link") : model.send_msg({action: "unlinked"})
+  const ask = (action) => () => {
+    model.said = "Preparing the file …"
+    model.send_msg({action})
+  }
+  menu(bar, "Share", () => [
+    ["Copy link", copyLink],
+    ["Copy as command line", () => copy(model.command, "command line")],
+    ["Copy as Python", () => copy(model.python, "Python")],
+  ])
+  menu(bar, "Save", () => [
+    ["Scenario as TOML", ask("toml")],
+    ...(model.ready ? [["Data as CSV", ask("csv")], ["Data as NPZ", ask("npz")]] : []),
+    ...figures().flatMap(([name, view]) =>
+      KINDS.map((kind) => [`${name} as ${kind.toUpperCase()}`, () => saveFigure(name, view, kind, model)])),
+  ])
+  opener(bar, model)
+  const said = tag("span", bar, {className: "said"}, {role: "status"})
+  const copy = textBox(el, model)
+  noteBox(el, model)
+  keys(model)
+
+  const speak = () => { said.textContent = model.said }
+  const address = () => history.replaceState(history.state, "", here() + location.hash)
+  model.on("said", speak)
+  model.on("query", address)
+  model.on("msg:custom", (event) => {
+    const {name, kind, content} = event.data ?? event
+    save(name, new Blob([Uint8Array.from(atob(content), (c) => c.charCodeAt(0))], {type: kind}))
+    model.said = `Saved ${name}.`
+  })
+  speak()
+}

@@ -1,0 +1,175 @@
+"""The row of actions and the files it gives."""
+
+from __future__ import annotations
+
+import base64
+import io
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wfsobs.app import downloads
+from wfsobs.app.actions import LARGEST, Actions
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.downloads import TooLarge, data_csv, data_npz
+from wfsobs.app.share import to_query
+from wfsobs.app.work import Shown, compute
+from wfsobs.cli import main
+from wfsobs.configfile import from_toml
+from wfsobs.presets import PRESETS
+from wfsobs.scenario import Scenario
+from wfsobs.telemetry import load_record
+
+WIND = "turbulence.wind_speed"
+
+
+@pytest.fixture
+def actions(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> Actions:
+    """The row of a dashboard whose first run is done; what it sends is kept in `sent`."""
+    sent: list[dict[str, str]] = []
+    monkeypatch.setattr(dashboard.actions.toolbar, "_send_msg", sent.append)
+    dashboard.actions.sent = sent  # type: ignore[attr-defined]
+    return dashboard.actions
+
+
+@pytest.fixture(scope="module")
+def shown() -> Shown:
+    scenario = PRESETS["paper"]().replace({
+        "run.duration": 1.0, "run.warm_up": 0.2, "gpr_offline.training_size": 40, "gpr_offline.depth": 20,
+        "gpr_online.training_size": 40, "gpr_online.depth": 20})
+    return compute(scenario, lambda: False, lambda fraction, shown: None)
+
+
+def test_texts_follow_the_settings(actions: Actions) -> None:
+    toolbar, store = actions.toolbar, actions.store
+    store.change(WIND, 20)
+    assert toolbar.query == to_query(store.scenario, "paper") and f"{WIND}=20" in toolbar.query
+    assert f"--set {WIND}=20.0" in toolbar.command and f'"{WIND}": 20.0' in toolbar.python
+    store.choose("ut4")
+    assert toolbar.query == "preset=ut4" and toolbar.command == "wfsobs run --preset ut4"
+
+
+def test_undo_and_redo_by_message(actions: Actions) -> None:
+    actions.store.change(WIND, 20)
+    actions.handle({"action": "undo"})
+    assert actions.store.value(WIND) == 15.0
+    actions.handle({"action": "redo"})
+    assert actions.store.value(WIND) == 20.0
+    actions.handle({"action": "close"})
+    actions.handle({})
+
+
+def test_a_link_is_one_step_and_names_what_it_could_not_use(actions: Actions) -> None:
+    before = actions.store.scenario
+    actions.open_link(f"?preset=ut4&{WIND}=25&loop.gain=9&run.seed=3")
+    store = actions.store
+    assert (store.preset, store.value(WIND), store.scenario.run.seed) == ("ut4", 25.0, 3)
+    assert actions.toolbar.notes == ["Not used from the link: loop.gain = 9: takes a number from 0 and below 1"]
+    store.undo()
+    assert store.scenario == before and store.preset == "paper"
+
+
+def test_a_file_is_one_step(actions: Actions) -> None:
+    before = actions.store.scenario
+    actions.handle({"action": "open", "name": "mine.toml", "text": 'preset = "ut4"\nloop.gain = 0.2'})
+    store = actions.store
+    assert store.scenario == PRESETS["ut4"]().replace({"loop.gain": 0.2}) and store.preset == "ut4"
+    assert actions.toolbar.said == "Opened mine.toml."
+    store.undo()
+    assert store.scenario == before
+
+
+@pytest.mark.parametrize("text", ["loop.gain = 9", "nonsense", "run.warm_up = 20", "#" * (LARGEST + 1), None, 3])
+def test_a_bad_file_changes_nothing_and_has_one_line(actions: Actions, text: Any) -> None:
+    before = actions.store.scenario
+    actions.handle({"action": "open", "name": "mine.toml", "text": text})
+    assert actions.store.scenario is before
+    (note,) = actions.toolbar.notes
+    assert note.startswith("mine.toml: ") and "\n" not in note
+    actions.handle({"action": "open", "name": "mine.toml", "text": "loop.gain = 0.2"})
+    assert actions.toolbar.notes == []
+
+
+def test_the_scenario_file(actions: Actions) -> None:
+    actions.store.change(WIND, 20)
+    actions.handle({"action": "toml"})
+    (file,) = actions.sent  # type: ignore[attr-defined]
+    text = base64.b64decode(file["content"]).decode()
+    assert file["name"] == "wfsobs.toml" and tomllib.loads(text)["preset"] == "paper"
+    assert from_toml(text) == actions.store.scenario
+
+
+@pytest.mark.parametrize(("action", "make"), [("csv", data_csv), ("npz", data_npz)])
+def test_data_is_made_aside_and_sent(actions: Actions, loop: Any, action: str, make: Any) -> None:
+    actions.handle({"action": action})
+    loop.until(lambda: actions.sent)  # type: ignore[attr-defined]
+    (file,) = actions.sent  # type: ignore[attr-defined]
+    content = base64.b64decode(file["content"])
+    assert file["name"] == f"wfsobs.{action}" and len(content) == len(make(actions.store.run.shown))
+
+
+def test_too_much_data_is_refused_with_a_line(actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(downloads, "MOST", 1000)
+    with pytest.raises(TooLarge):
+        data_csv(actions.store.run.shown)  # type: ignore[arg-type]
+    actions.handle({"action": "npz"})
+    loop.until(lambda: actions.toolbar.notes)
+    assert "wfsobs run --save" in actions.toolbar.notes[0]
+
+
+def test_settings_too_long_for_a_link(actions: Actions) -> None:
+    many = [1.0 + i / 100 for i in range(3000)]
+    actions.store.change("vibration.psd.frequency", many)
+    assert not actions.toolbar.linked and actions.toolbar.query == ""
+    actions.handle({"action": "unlinked"})
+    assert "save the scenario" in actions.toolbar.notes[0]
+
+
+def test_csv(shown: Shown) -> None:
+    text = data_csv(shown).decode()
+    head = [line for line in text.splitlines() if line.startswith("#")]
+    assert from_toml("\n".join(line[1:].strip() for line in head)) == shown.scenario
+    names, *lines = text.splitlines()[len(head):]
+    columns = np.loadtxt(io.StringIO("\n".join(lines)), delimiter=",", unpack=True)
+    table = dict(zip(names.split(","), columns, strict=True))
+    record, estimate = shown.result.record, shown.result.estimate("gpr-online", "vibration")
+    assert estimate is not None and columns.shape == (1 + 2 * (5 + 12), record.n_steps)
+    np.testing.assert_allclose(table["time_s"], np.arange(record.n_steps) * 1e-3, rtol=1e-8)
+    for name, values in (("truth/turbulence", record.turbulence), ("y_lgs", record.y_lgs), ("y_ngs", record.y_ngs),
+                         ("u", record.u), ("gpr-online/vibration", estimate.values)):
+        assert values is not None
+        for i, mode in enumerate(("tip", "tilt")):
+            np.testing.assert_allclose(table[f"{name}/{mode}_um"], values[:, i], rtol=1e-8)
+
+
+def test_npz_is_a_record_and_its_estimates(shown: Shown, tmp_path: Path) -> None:
+    path = tmp_path / "wfsobs.npz"
+    path.write_bytes(data_npz(shown))
+    record = load_record(path)
+    np.testing.assert_array_equal(record.y_lgs, shown.result.record.y_lgs)
+    with np.load(path, allow_pickle=False) as file:
+        assert from_toml(str(file["scenario"])) == shown.scenario
+        for estimate in shown.result.estimates:
+            np.testing.assert_array_equal(file[f"{estimate.observer}/{estimate.target}"], estimate.values)
+    config = tmp_path / "scenario.toml"
+    with np.load(path, allow_pickle=False) as file:
+        config.write_text(str(file["scenario"]), encoding="utf-8")
+    result = CliRunner().invoke(main, ["observe", str(path), "--config", str(config), "--out", str(tmp_path / "e.npz")])
+    assert result.exit_code == 0, result.output
+    with np.load(path, allow_pickle=False) as file, np.load(tmp_path / "e.npz", allow_pickle=False) as again:
+        for name in again.files:
+            np.testing.assert_allclose(again[name], file[name], rtol=1e-9, atol=1e-12)
+
+
+def test_the_page_tells_of_a_long_run(loop: Any, short: Scenario) -> None:
+    dashboard = Dashboard(loop.queue.put, short)
+    loop.closing.append(dashboard)
+    dashboard.actions.open_link("?run.duration=300")
+    dashboard.page()
+    dashboard.start()
+    assert dashboard.store.run.state == "idle" and dashboard.stale.visible
+    assert dashboard.stale.object.startswith("About 1") and "press Run" in dashboard.stale.object

@@ -1,0 +1,166 @@
+"""Settings as links, command lines, Python and files: there and back."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from typing import Any
+
+import numpy as np
+import param
+import pytest
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import wfsobs
+from wfsobs.app.share import LONGEST, changes, from_file, from_query, to_command, to_file, to_python, to_query
+from wfsobs.cli import main
+from wfsobs.presets import PRESETS
+from wfsobs.scenario import Peak, Scenario
+from wfsobs.settings import SettingError
+
+QUICK = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50}
+LEAVES = [(path, p) for path, _, p in Scenario().walk() if not path.startswith("vibration.peaks")]
+
+
+def allowed(p: Any) -> st.SearchStrategy[Any]:
+    """Values that a setting takes."""
+    if isinstance(p, param.Boolean):
+        return st.booleans()
+    if isinstance(p, param.Selector):
+        return st.sampled_from(list(p.objects))
+    if isinstance(p, param.List):
+        low, high = p.item_bounds  # type: ignore[attr-defined]
+        return st.lists(st.floats(low, high), min_size=p.bounds[0], max_size=5)
+    low, high = p.bounds
+    if isinstance(p, param.Integer):
+        return st.integers(low, high)
+    above, below = p.inclusive_bounds
+    return st.floats(low, high, exclude_min=not above, exclude_max=not below)
+
+
+def peaks() -> st.SearchStrategy[list[dict[str, Any]]]:
+    fields = {name: allowed(p) for name, p in Peak.settings().items()}
+    return st.lists(st.fixed_dictionaries(fields), max_size=4)
+
+
+def usable(scenario: Scenario) -> bool:
+    try:
+        scenario.validate()
+    except SettingError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(("path", "p"), LEAVES, ids=[path for path, _ in LEAVES])
+@settings(max_examples=5, deadline=None, derandomize=True)
+@given(data=st.data(), preset=st.sampled_from(list(PRESETS)))
+def test_every_setting_survives_a_link_and_a_file(path: str, p: Any, data: st.DataObject, preset: str) -> None:
+    scenario = PRESETS[preset]().replace({path: data.draw(allowed(p))})
+    if not usable(scenario):
+        return
+    query = to_query(scenario, preset)
+    assert query is not None
+    link = from_query(f"?{query}")
+    assert (link.scenario, link.preset, link.rejected) == (scenario, preset if query else "paper", ())
+    assert from_file(to_file(scenario, preset)) == link
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(listed=peaks())
+def test_peaks_survive_a_link(listed: list[dict[str, Any]]) -> None:
+    scenario = Scenario().replace({"vibration.peaks": listed, "sensors.lgs_rate": 20_000.0})
+    query = to_query(scenario, "ut4")
+    assert query is not None and from_query(query).scenario == scenario
+
+
+def test_a_link_holds_what_differs_and_can_be_read() -> None:
+    scenario = PRESETS["ut4"]().replace({
+        "turbulence.wind_speed": 20, "loop.closed": False, "butterworth.frequencies": [17, 20.5],
+        "vibration.peaks": [{"frequency": 45, "damping": 0.03, "rms": [0.01, 0.02]}] * 2})
+    assert to_query(scenario, "ut4") == (
+        "preset=ut4&turbulence.wind_speed=20&vibration.peaks=45,0.03,0.01,0.02;45,0.03,0.01,0.02&loop.closed=false"
+        "&butterworth.frequencies=17,20.5")
+    assert to_query(PRESETS["paper"](), "paper") == ""
+    assert to_query(PRESETS["ut4"](), "ut4") == "preset=ut4"
+
+
+def test_a_bad_field_is_named_and_the_rest_applies() -> None:
+    link = from_query("?preset=ut4&turbulence.wind_speed=200&loop.gain=0.2&nonsense=1&run.seed=7")
+    assert changes(link.scenario, "ut4") == {"loop.gain": 0.2, "run.seed": 7}
+    first, second = link.rejected
+    assert first == "turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s"
+    assert second.startswith("nonsense: no such setting")
+
+
+@pytest.mark.parametrize("query", [
+    "preset=other", "preset=", "run.seed=", "run.seed=__import__('os')", "run.duration=/etc/passwd", "telescope=1",
+    "loop.closed=yes", "vibration.peaks=1,2", "vibration.peaks=a,b,c", "vibration.peaks=1,0,nan", "run.duration=nan",
+    "run.seed=1.5", "turbulence.wind_speed=1e999", f"run.seed={'9' * 5000}", "loop.=1", ".=1", "=1", "vibration.peaks.x=1",
+    "vibration.peaks.999.frequency=3", "turbulence.wind_speed=%FF%00", "_refused=1", "name=x", "turbulence.name=x",
+    "kalman.frequency=600", "run.warm_up=20", f"x={'a' * LONGEST}",
+])
+def test_what_cannot_be_used_changes_nothing_and_has_one_line(query: str) -> None:
+    link = from_query(query)
+    assert link.scenario == PRESETS["paper"]() and link.preset == "paper"
+    assert len(link.rejected) == 1
+    assert "\n" not in link.rejected[0] and len(link.rejected[0]) <= 200
+
+
+def test_fields_that_only_go_together_in_any_order_beside_one_that_never_does() -> None:
+    for query in ("run.warm_up=20&run.duration=30&loop.gain=0.1", "loop.gain=0.1&run.duration=30&run.warm_up=20"):
+        link = from_query(f"{query}&kalman.frequency=600")
+        assert changes(link.scenario, "paper") == {"run.warm_up": 20.0, "run.duration": 30.0, "loop.gain": 0.1}
+        assert len(link.rejected) == 1 and "kalman.frequency = 600" in link.rejected[0]
+
+
+def test_settings_too_long_for_a_link_travel_as_a_file() -> None:
+    frequencies = [float(f) for f in np.linspace(1, 80, 2000)]
+    scenario = PRESETS["paper"]().replace({
+        "vibration.psd": {"frequency": frequencies, "tip": frequencies, "tilt": frequencies}})
+    assert to_query(scenario, "paper") is None
+    assert to_command(scenario, "paper") == "wfsobs run --config wfsobs.toml"
+    assert 'configfile.load("wfsobs.toml")' in to_python(scenario, "paper")
+    assert from_file(to_file(scenario, "paper")).scenario == scenario
+
+
+CHANGED = {
+    **QUICK, "turbulence.wind_speed": 22.5, "loop.gain": 0.25, "kalman.measurement_noise": "manual",
+    "multirate.model_lgs_error": False, "butterworth.frequencies": [24.3, 47.7], "vibration.source": "ar2",
+    "vibration.peaks": [{"frequency": 47, "damping": 0.01, "rms": [0.02, 1e-5]}],
+}
+
+
+@pytest.mark.parametrize("preset", list(PRESETS))
+def test_the_command_line_prints_the_very_numbers(preset: str) -> None:
+    scenario = PRESETS[preset]().replace(CHANGED)
+    program, *arguments = shlex.split(to_command(scenario, preset))
+    assert program == "wfsobs"
+    result = CliRunner().invoke(main, [*arguments, "--json"], catch_exceptions=False)
+    got = {(r["observer"], r["target"], r["mode"]): r["rms_um"] for r in json.loads(result.stdout)}
+    assert got == {(s.observer, s.target, s.mode): s.rms for s in wfsobs.run(scenario).scores}
+
+
+def test_the_python_makes_the_very_scenario(capsys: pytest.CaptureFixture[str]) -> None:
+    scenario = PRESETS["ut4"]().replace(CHANGED)
+    made: dict[str, Any] = {}
+    exec(to_python(scenario, "ut4"), made)
+    assert made["scenario"] == scenario
+    assert len(capsys.readouterr().out.splitlines()) == len(made["result"].scores)
+
+
+@pytest.mark.parametrize(("text", "reason"), [
+    ("a =", "not TOML"), ("loop.gain = 9", "loop.gain = 9"), ("nonsense = 1", "no such setting"),
+    ("run.warm_up = 20", "run.warm_up = 20"), (f"run.seed = {'9' * 5000}", "not TOML"), (f"a = {'[' * 5000}", "not TOML"),
+    ("preset = [1]", "preset = [1]"), ('preset = "../x"', "preset = '../x'"), ("\0", "not TOML"),
+])
+def test_a_bad_file_says_why_in_one_line(text: str, reason: str) -> None:
+    with pytest.raises(SettingError) as caught:
+        from_file(text)
+    assert reason in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_file_without_a_preset_leaves_that_open() -> None:
+    link = from_file("loop.gain = 0.2")
+    assert link.preset == "" and link.scenario == Scenario().replace({"loop.gain": 0.2})
