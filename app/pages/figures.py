@@ -118,7 +118,8 @@ class _Sheet:
     def draw(self, shown: Shown, display: Display) -> None:
         """Every plot and the texts."""
         legend = "".join(
-            f'<span class="mark">{swatch(n, display.dark, dashed=n == TRUTH)}{escape(_label(n))}</span>' for n in self.names)
+            f'<span class="mark">{swatch(n, display.dark, dashed=_dashed(n, self.figure))}{escape(_label(n))}</span>'
+            for n in self.names)
         self.head.object = f'<h2 class="title">{escape(self.figure.title)}</h2><div class="caption legend">{legend}</div>'
         self.caption.object = f'<p class="text">{escape(self.figure.caption)} {escape(self._errors(shown, display))}</p>'
         for drawn in self.plots:
@@ -152,7 +153,7 @@ class _Drawn:
         self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
         self.lines: dict[str, GlyphRenderer] = {
             name: self.figure.line(
-                "x", "y", source=source, line_width=1.6, line_dash=[4, 3] if name == TRUTH else [], name=name)
+                "x", "y", source=source, line_width=1.6, line_dash=list(look(name).dash) if _dashed(name, of) else [], name=name)
             for name, source in self.sources.items()}
         self.window = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.15, line_width=0, level="underlay")
         if plot.what == WHOLE and any(p.what == ZOOMED for p in of.plots):
@@ -202,3 +203,8 @@ class _Drawn:
 
 def _label(name: str) -> str:
     return "Reference" if name == TRUTH else look(name).label
+
+
+def _dashed(name: str, of: PaperFigure) -> bool:
+    """Whether a line has its dashes; one alone with the reference needs none."""
+    return name == TRUTH or len(of.observers) > 1

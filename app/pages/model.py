@@ -151,7 +151,7 @@ def _gprs(told: Description, dark: bool) -> str:
     """Equations 13 and 14, and what the GPR amounts to."""
     phi, kernel = m.at(m.hat("φ", "vib"), "k"), m.name("k")
     estimate = m.math(
-        phi, m.op("="), kernel, m.op("("), m.at(m.name("x"), "k"), m.op(")"), "<msup><mo></mo><mo>⊤</mo></msup>",
+        phi, m.op("="), "<msup><mrow>", kernel, m.op("("), m.at(m.name("x"), "k"), m.op(")"), "</mrow><mi>⊤</mi></msup>",
         "<msup><mrow>", m.op("("), m.name("K"), m.op("+"), m.name("σ", "n", "2"), m.name("I"), m.op(")"),
         "</mrow><mn>−1</mn></msup>", m.name("f"), m.gap(), m.name("λ"), m.op("="), "<msup><mrow>", m.op("("),
         m.name("σ", "n"), m.name("l"), m.op("/"), m.name("σ", "SE"), m.op(")"), "</mrow><mn>2</mn></msup>")
