@@ -43,7 +43,14 @@ function menu(bar, label, items) {
     list.style.left = `${Math.max(8, Math.min(box.left, window.innerWidth - list.offsetWidth - 8))}px`
     list.firstElementChild?.focus()
   })
-  list.addEventListener("keydown", (event) => move(event, [...list.children], list.getRootNode().activeElement))
+  list.addEventListener("keydown", (event) => {
+    if (event.key === "Escape") {
+      event.preventDefault()
+      list.hidePopover()
+      button.focus()
+    }
+    move(event, [...list.children], list.getRootNode().activeElement)
+  })
 }
 
 function move(event, items, focused) {

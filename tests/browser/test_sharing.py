@@ -1,0 +1,155 @@
+"""Undo, links, files: what a user takes along and brings back."""
+
+from __future__ import annotations
+
+import tomllib
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Download, Page, expect
+
+SHORT = "run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40"
+
+
+@pytest.fixture
+def open_short(open_page: Any, server: Any) -> Callable[..., Page]:
+    """The dashboard on a short record, by a link."""
+    def open_it(more: str = "", **options: Any) -> Page:
+        return open_page(url=f"{server.url}?{SHORT}{more}", **options)
+    return open_it
+
+
+def speed(page: Page) -> Any:
+    return page.get_by_role("textbox", name="m/s")
+
+
+def set_speed(page: Page, text: str) -> None:
+    speed(page).fill(text)
+    speed(page).press("Enter")
+
+
+def choose(page: Page, menu: str, item: str) -> None:
+    page.get_by_role("button", name=menu, exact=True).click()
+    page.get_by_role("menuitem", name=item, exact=True).click()
+
+
+def saved(page: Page, item: str, to: Path) -> Path:
+    with page.expect_download() as waiting:
+        choose(page, "Save", item)
+    download: Download = waiting.value
+    path = to / download.suggested_filename
+    download.save_as(path)
+    expect(page.get_by_text("Saved ")).to_be_visible()
+    return path
+
+
+def copied(page: Page, item: str) -> str:
+    """What a copy puts into the text box that stands in for a clipboard that is refused."""
+    page.evaluate("() => { navigator.clipboard.writeText = () => Promise.reject() }")
+    choose(page, "Share", item)
+    return page.get_by_role("textbox", name="Copy this by hand").input_value()
+
+
+def test_undo_by_key_and_by_button(open_short: Any) -> None:
+    page = open_short()
+    set_speed(page, "20")
+    page.wait_for_function("location.search.includes('turbulence.wind_speed=20')")
+    speed(page).press("Control+z")
+    expect(page.get_by_text("turbulence.wind_speed").first).to_be_visible()
+    page.get_by_role("heading", name="Turbulence").first.click()
+    page.keyboard.press("Control+z")
+    expect(speed(page)).to_have_value("15")
+    page.wait_for_function("!location.search.includes('turbulence.wind_speed')")
+    page.keyboard.press("Control+Shift+z")
+    expect(speed(page)).to_have_value("20")
+    page.get_by_role("button", name="Undo", exact=True).click()
+    expect(speed(page)).to_have_value("15")
+    page.get_by_role("button", name="Redo", exact=True).click()
+    expect(speed(page)).to_have_value("20")
+    expect(page.get_by_role("button", name="Redo", exact=True)).to_be_disabled()
+
+
+def test_a_link_with_one_bad_field(open_short: Any, open_page: Any) -> None:
+    page = open_short("&turbulence.wind_speed=200&vibration.peaks=45,0.03,0.01,0.01;20,0,0.005,0")
+    expect(page.get_by_text("Not used from the link: turbulence.wind_speed = 200")).to_be_visible()
+    expect(page.locator('input[data-cell$=".frequency"]')).to_have_count(2)
+    expect(speed(page)).to_have_value("15")
+    set_speed(page, "25")
+    page.get_by_role("button", name="Dismiss").click()
+    page.wait_for_function("location.search.includes('turbulence.wind_speed=25')")
+    link = copied(page, "Copy link")
+    assert link == page.url
+    expect(page.locator("[role=status]", has_text="Done in").first).to_be_attached()
+
+    other = open_page(url=link)
+    expect(speed(other)).to_have_value("25")
+    expect(other.locator('input[data-cell="1.frequency"]')).to_have_value("20")
+    expect(other.get_by_text("Not used")).to_have_count(0)
+    cell = 'tr[data-observer="kf-lgs"][data-target="turbulence"] td'
+    expect(page.locator(cell).first).to_have_text(other.locator(cell).first.inner_text())
+
+
+def test_other_languages(open_short: Any) -> None:
+    page = open_short()
+    assert copied(page, "Copy as command line").startswith("wfsobs run --preset paper --set ")
+    assert 'wfsobs.PRESETS["paper"]().replace({' in copied(page, "Copy as Python")
+
+
+def test_data_and_figures(open_short: Any, tmp_path: Path) -> None:
+    page = open_short()
+    lines = saved(page, "Data as CSV", tmp_path).read_text(encoding="utf-8").splitlines()
+    names, *rows = [line for line in lines if not line.startswith("#")]
+    assert len(rows) == 2000 and {len(row.split(",")) for row in rows} == {len(names.split(","))}
+    tomllib.loads("\n".join(line[1:] for line in lines if line.startswith("#")))
+    with np.load(saved(page, "Data as NPZ", tmp_path), allow_pickle=False) as file:
+        assert file["y_lgs"].shape == file["gpr-online/vibration"].shape == (2000, 2)
+    for name in ("Turbulence time trace", "Vibration spectrum"):
+        root = ET.parse(saved(page, f"{name} as SVG", tmp_path)).getroot()
+        assert root.tag == "{http://www.w3.org/2000/svg}svg" and len(list(root.iter())) > 50
+        assert saved(page, f"{name} as PNG", tmp_path).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_scenario_out_and_in_again(open_short: Any, tmp_path: Path) -> None:
+    page = open_short("&turbulence.wind_speed=22")
+    path = saved(page, "Scenario as TOML", tmp_path)
+    assert tomllib.loads(path.read_text(encoding="utf-8"))["turbulence"]["wind_speed"] == 22.0
+    page.get_by_role("button", name="Reset", exact=True).click()
+    expect(speed(page)).to_have_value("15")
+    file = page.get_by_label("Scenario file")
+    bad = tmp_path / "bad.toml"
+    bad.write_text("run.seed = -1", encoding="utf-8")
+    file.set_input_files(bad)
+    expect(page.get_by_text("bad.toml: run.seed = -1")).to_be_visible()
+    expect(speed(page)).to_have_value("15")
+    file.set_input_files(path)
+    expect(speed(page)).to_have_value("22")
+    expect(page.get_by_text("Opened wfsobs.toml.")).to_be_visible()
+    expect(page.get_by_text("bad.toml")).to_have_count(0)
+    expect(page.locator("[role=status]", has_text="Done in").first).to_be_attached()
+
+
+def test_a_long_run_waits(open_short: Any) -> None:
+    page = open_short("&run.duration=400", wait=False)
+    expect(page.get_by_text("s: press Run.").first).to_be_visible()
+    expect(page.get_by_role("status").filter(has_text="press Run").first).to_be_visible()
+    set_speed(page, "20")
+    expect(page.get_by_text("s: press Run.").first).to_be_visible()
+
+
+def test_menus_by_keyboard(open_short: Any) -> None:
+    page = open_short()
+    button = page.get_by_role("button", name="Share", exact=True)
+    button.focus()
+    page.keyboard.press("Enter")
+    expect(button).to_have_attribute("aria-expanded", "true")
+    expect(page.get_by_role("menuitem", name="Copy link")).to_be_focused()
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("ArrowDown")
+    expect(page.get_by_role("menuitem", name="Copy as Python")).to_be_focused()
+    page.keyboard.press("Escape")
+    expect(button).to_have_attribute("aria-expanded", "false")
+    expect(button).to_be_focused()
