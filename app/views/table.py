@@ -65,7 +65,7 @@ class Table:
             f"Pinned [{unit}]": "RMS error in the pinned run", "Change [%]": "from the pinned run to this one",
         } if self.display.pinned else {}
         return {
-            "Observer": "", f"RMS error [{unit}]": "of the estimate, after the warm-up", **pinned,
+            "Observer": "and its line in the figures", f"RMS error [{unit}]": "of the estimate, after the warm-up", **pinned,
             f"RMS truth [{unit}]": "the error of answering zero", "error / truth": "above 1 is worse than answering zero",
             "Lag [ms]": "how late the estimate is", "Time per step [µs]": "computing time per step and mode",
             "Real-time factor": "time per step over the step of the loop; below 1 keeps up with it",

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bokeh.models import CrosshairTool
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import per_micrometre
@@ -75,6 +76,11 @@ class TestTraces:
         ranges = {id(t.figure.x_range) for t in dashboard.traces.traces.values()}
         assert len(ranges) == 1
         assert (dashboard.traces.x_range.start, dashboard.traces.x_range.end) == (0.0, 2.0)
+
+    def test_figures_share_their_crosshair(self, dashboard: Dashboard) -> None:
+        spans = [{id(tool.overlay) for tool in t.figure.tools if isinstance(tool, CrosshairTool)}
+                 for t in dashboard.traces.traces.values()]
+        assert len(spans) == 2 and spans[0] == spans[1] and len(spans[0]) == 1
 
     def test_a_zoom_sends_the_samples_of_its_window(self, dashboard: Dashboard) -> None:
         dashboard.traces.x_range.update(start=1.0, end=1.1)
