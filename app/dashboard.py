@@ -94,7 +94,7 @@ class Dashboard:
         self.pages = Pages(explore, self.store, self.display)
         page = pmui.Page(
             title="wfsobs", sidebar=[self.controls.view()], sidebar_width=340, theme_config=theme(), favicon=None,
-            main=[pn.Column(
+            main=[_title(), pn.Column(
                 self._top(), self.actions.toolbar, self.alert, self.stale, self.pages.view, self.frame,
                 sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
         )
@@ -168,6 +168,12 @@ class Dashboard:
             texts.append(f"{waiting_text(self.store.waiting)}.")
         self.stale.param.update(object=" ".join(texts), visible=bool(texts) and run.state != "running")
         self.frame.stale = self.store.stale
+
+
+def _title() -> pn.pane.HTML:
+    """The heading of the page, for those who hear it."""
+    return pn.pane.HTML("<h1>wfsobs: disturbance observers for adaptive optics</h1>", margin=0, styles={
+        "position": "absolute", "width": "1px", "height": "1px", "overflow": "hidden", "clip-path": "inset(50%)"})
 
 
 def _open_drawer(page: pmui.Page, width: int) -> None:

@@ -58,7 +58,7 @@ class Controls:
         self.rooms = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
         self.accordion = pmui.Accordion(
             *((title, self.rooms[name]) for name, title in self.topics.items()),
-            title_variant="subtitle2", variant="outlined", disable_gutters=True, dynamic=True,
+            title_variant="body2", variant="outlined", disable_gutters=True, dynamic=True,
             sizing_mode="stretch_width", margin=(8, 0),
         )
         self._watch()

@@ -1,0 +1,179 @@
+"""For everyone, at every size, under strain: accessibility, keyboard, narrow windows, long runs, a page that fails."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import Counter
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+ALLOWED: Mapping[str, tuple[str, int, str]] = MappingProxyType({
+    "aria-prohibited-attr": (
+        r'^<span aria-label="[^"]*" sx=|aria-label="Resize sidebar"', 24,
+        "panel-material-ui: a tooltip's span and the drawer's edge have labels but no role"),
+    "aria-progressbar-name": ("MuiLinearProgress-root", 1, "panel-material-ui: the busy line has no name and stays"),
+    "empty-heading": ("<h5[^>]*>&nbsp;</h5>", 2, "panel-material-ui: a heading keeps room below the bar"),
+    "heading-order": ("<h5[^>]*>&nbsp;</h5>", 2, "the same heading"),
+    "region": ("data-pmui-layer", 1, "panel-material-ui: the layer of its menus lies outside of the landmarks"),
+    "aria-dialog-name": ("MuiPaper-root", 1, "panel-material-ui: the drawer of a phone is a dialog without a name"),
+})
+"""Rule -> pattern of what breaks it, how often at most, whose fault."""
+
+VIOLATIONS = """async () => (await axe.run(document, {resultTypes: ["violations"]})).violations
+    .flatMap(v => v.nodes.map(n => [v.id, n.html, (n.any[0] ?? n.all[0] ?? n.none[0])?.message ?? ""]))"""
+
+FOCUSED = """() => {
+  let e = document.activeElement
+  while (e?.shadowRoot?.activeElement) e = e.shadowRoot.activeElement
+  const root = e.getRootNode()
+  const by = (e.getAttribute("aria-labelledby") ?? "").split(" ").map((id) => id && root.getElementById(id)?.textContent)
+  const own = [e.getAttribute("aria-label"), e.textContent, ...[...(e.labels ?? [])].map((l) => l.textContent), e.title]
+  const style = getComputedStyle(e)
+  const ring = style.outlineStyle !== "none" || e.matches(".Mui-focusVisible")
+    || e.closest(".Mui-focused, .Mui-focusVisible") !== null
+  return {name: [...by, ...own].find((text) => text?.trim()) ?? "", tag: e.tagName, ring}
+}"""
+
+OVERFLOW = "() => [document.documentElement.scrollWidth, window.innerWidth]"
+
+ONLINE = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
+    .filter(m => m.type === "ColumnDataSource" && m.data["gpr-online"])
+    .map(m => [...m.data["gpr-online"]].filter(Number.isFinite).length / m.data["gpr-online"].length)[0]"""
+
+BROKEN = """
+from wfsobs.app.dashboard import page
+
+def build(post):
+    raise RuntimeError("no such mirror")
+
+page(build).servable()
+"""
+
+
+def theme(page: Page) -> None:
+    """Switch the theme and wait for the new colours."""
+    before = page.evaluate("() => getComputedStyle(document.body).backgroundColor")
+    page.get_by_role("button", name=re.compile("theme", re.I)).click()
+    page.wait_for_function("before => getComputedStyle(document.body).backgroundColor !== before", arg=before)
+    page.wait_for_function("() => document.getAnimations().every(a => a.playState !== 'running')")
+
+
+def status(page: Page, text: str) -> Any:
+    return page.locator("[role=status]", has_text=text).first
+
+
+def violations(page: Page) -> tuple[list[str], Counter[str]]:
+    """What axe finds wrong, and how often what is allowed."""
+    allowed: Counter[str] = Counter()
+    faults = []
+    for rule, html, message in page.evaluate(VIOLATIONS):
+        if rule in ALLOWED and re.search(ALLOWED[rule][0], html):
+            allowed[rule] += 1
+        else:
+            faults.append(f"{rule}: {message}: {html[:300]}")
+    return faults, allowed
+
+
+def focused(page: Page, key: str = "Tab") -> dict[str, Any]:
+    page.keyboard.press(key)
+    return page.evaluate(FOCUSED)
+
+
+@pytest.mark.parametrize(("width", "dark"), [(1400, False), (1400, True), (390, False)], ids=["light", "dark", "phone"])
+def test_accessibility(open_page: Any, width: int, dark: bool) -> None:
+    page = open_page(width, 900)
+    if dark:
+        theme(page)
+    page.evaluate(files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8"))
+    end = time.monotonic() + 20
+    faults, allowed = violations(page)
+    while faults and time.monotonic() < end:  # colours may still be on their way to the other theme
+        faults, allowed = violations(page)
+    assert not faults, "\n".join(faults)
+    assert {rule: n for rule, n in allowed.items() if n > ALLOWED[rule][1]} == {}
+
+
+def test_every_stop_of_the_tab_key_has_a_name_and_shows(open_page: Any) -> None:
+    page = open_page()
+    stops = [focused(page) for _ in range(90)]
+    names = [stop["name"] for stop in stops]
+    assert [stop for stop in stops if stop["tag"] != "BODY" and not stop["name"]] == []
+    assert [stop for stop in stops if stop["tag"] != "BODY" and not stop["ring"]] == []
+    order = [next(i for i, name in enumerate(names) if part in name) for part in ("drawer", "Run", "Wind speed", "Peak 1: f")]
+    assert order == sorted(order), "the drawer from top to bottom"
+
+
+def test_the_keyboard_does_it_all(open_page: Any) -> None:
+    page = open_page()
+    assert "drawer" in focused(page)["name"], "the drawer's button comes first"
+    page.keyboard.press("Enter")
+    opener = page.get_by_role("button", name="Open drawer")
+    expect(opener).to_be_visible()
+    opener.focus()
+    page.keyboard.press("Space")
+    expect(page.get_by_role("button", name="Close drawer")).to_be_visible()
+
+    page.get_by_role("slider", name=re.compile("Wind speed")).focus()
+    page.keyboard.press("ArrowRight")
+    expect(page.get_by_role("textbox", name="m/s")).not_to_have_value("15")
+
+    cell = page.locator('input[data-cell="0.frequency"]')
+    cell.focus()
+    page.keyboard.press("ControlOrMeta+a")
+    page.keyboard.type("7.5")
+    assert focused(page)["name"] == "Peak 1: ξ", "Tab takes the value over and goes on"
+    expect(page.get_by_text(re.compile("2 changed: .*vibration.peaks"))).to_be_visible()
+    expect(cell).to_have_value("7.5")
+
+    card = page.get_by_role("button", name=re.compile("Optimal|Opt. multi-rate")).first
+    for key, pressed in (("Enter", "false"), ("Space", "true")):
+        card.focus()
+        page.keyboard.press(key)
+        expect(card).to_have_attribute("aria-pressed", pressed)
+        assert "multi-rate" in page.evaluate(FOCUSED)["name"], "the focus stays"
+
+
+@pytest.mark.parametrize("width", [390, 820])
+def test_no_window_scrolls_sideways(open_page: Any, width: int) -> None:
+    page = open_page(width, 1100)
+    content, window = page.evaluate(OVERFLOW)
+    assert content <= window == width
+
+
+def test_a_long_run_grows_and_stops_at_once(open_page: Any) -> None:
+    page = open_page()
+    page.get_by_role("button", name="Run", exact=True).last.click()  # the topic
+    duration = page.get_by_role("textbox", name="s", exact=True).first
+    duration.fill("40")
+    duration.press("Enter")
+    expect(page.get_by_text(re.compile("changed: .*run.duration"))).to_be_visible()
+    page.get_by_role("button", name="Run", exact=True).first.click()
+    page.wait_for_function(f"() => {{ const part = ({ONLINE})(); return part > 0.02 && part < 0.9 }}")
+    part = page.evaluate(ONLINE)
+    page.wait_for_function(f"part => ({ONLINE})() > part", arg=part)
+    clicked = time.monotonic()
+    page.get_by_role("button", name="Cancel", exact=True).click()
+    status(page, "Cancelled").wait_for(state="attached")
+    assert time.monotonic() - clicked < 3.0
+    assert page.evaluate(ONLINE) < 0.95, "what had come stays, the rest does not come"
+    expect(page.get_by_role("button", name="Cancel", exact=True)).to_be_disabled()
+
+
+def test_a_page_that_cannot_be_built_says_so(open_page: Any, make_server: Any, tmp_path: Path) -> None:
+    script = tmp_path / "broken.py"
+    script.write_text(BROKEN)
+    server = make_server(["-m", "panel", "serve", str(script), "--port", "{port}", "--liveness"], tmp_path / "log", "/broken")
+    try:
+        page = open_page(url=server.url, wait=False)
+        expect(page.get_by_role("heading", name="wfsobs could not start")).to_be_visible()
+        expect(page.get_by_text("RuntimeError: no such mirror")).to_be_visible()
+        assert len(server.errors(0)) == 1, "the log has the traceback"
+    finally:
+        server.close()
