@@ -12,6 +12,7 @@ import shlex
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any
 from urllib.parse import parse_qsl, quote
 
@@ -111,27 +112,40 @@ def _peak(text: str) -> Any:
 def _apply(base: Scenario, fields: Mapping[str, str]) -> tuple[Scenario, list[str]]:
     """Every field that can be applied, whatever their order, and a line for every other."""
     known = {path: p for path, _, p in base.walk()}
-    values = {path: read(path, text, known) for path, text in fields.items()}
-    refused = {path: reason for path, value in values.items() if (reason := _reason(base, {path: value}))}
-    good = {path: value for path, value in values.items() if path not in refused}
-    if _reason(base, good, together=True):
-        scenario = base
+    values, refused = {}, {}
+    scenario = base.copy()
+    for path, text in fields.items():
+        values[path] = read(path, text, known)
+        try:
+            _set(scenario, path, values[path])
+        except SettingError as error:
+            refused[path] = str(error)
+    if _clash(scenario):
+        scenario = base.copy()
+        waiting = {path: value for path, value in values.items() if path not in refused}
         for _ in range(ROUNDS):  # what one field needs, a later one may bring
-            for path, value in list(good.items()):
-                if not _reason(scenario, {path: value}, together=True):
-                    scenario = scenario.replace({path: good.pop(path)})
-        refused |= {path: _reason(scenario, {path: value}, together=True) for path, value in good.items()}
-    else:
-        scenario = base.replace(good)
+            for path, value in list(waiting.items()):
+                before = reduce(getattr, path.split("."), scenario)
+                _set(scenario, path, value)
+                refused[path] = _clash(scenario)
+                if refused[path]:
+                    _set(scenario, path, before)
+                else:
+                    del waiting[path], refused[path]
     return scenario, [_line(path, fields[path], refused[path]) for path in fields if path in refused]
 
 
-def _reason(base: Scenario, values: Mapping[str, Any], together: bool = False) -> str:
-    """Why settings cannot have these values, or nothing; together : whether they have to go with all others."""
+def _set(scenario: Scenario, path: str, value: Any) -> None:
+    """Set one setting in place; items of lists have no path here. Raises SettingError."""
+    for key in reversed(path.split(".")):
+        value = {key: value}
+    scenario.update(value)
+
+
+def _clash(scenario: Scenario) -> str:
+    """Why settings do not go together, or nothing."""
     try:
-        fresh = base.replace(values)
-        if together:
-            fresh.validate()
+        scenario.validate()
     except SettingError as error:
         return str(error)
     return ""

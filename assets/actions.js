@@ -73,7 +73,8 @@ function ground(element) {
 // ------------------------------------------------------------------ figures
 
 function figures() {
-  const views = [...Bokeh.index.query((view) => view.model.type === "Figure")]
+  const seen = (view) => view.model.type === "Figure" && view.el.getBoundingClientRect().width > 0
+  const views = [...Bokeh.index.query(seen)]
   return views.map((view) => {
     const axes = [view.model.left[0]?.axis_label, view.model.below[0]?.axis_label]
     return [view.model.name ?? axes.filter(Boolean).join(" over "), view]
