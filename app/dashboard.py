@@ -20,7 +20,8 @@ from wfsobs.app.actions import Actions
 from wfsobs.app.controls.panel import Controls, waiting_text
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, SIGNAL, UNITS, Display
 from wfsobs.app.pages.pages import Pages
-from wfsobs.app.store import FAILED, IDLE, Post, Store
+from wfsobs.app.run import FAILED, IDLE, Post
+from wfsobs.app.store import Store
 from wfsobs.app.style import asset, theme
 from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.spectra import MODEL, PEAKS, Spectra

@@ -5,127 +5,25 @@ A `Scenario` in the store is replaced, never changed in place, so whoever holds 
 
 from __future__ import annotations
 
-import logging
-import threading
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import param
 
-from wfsobs.app.work import Report, Shown, compute
+from wfsobs.app.run import Compute, Post, Run
+from wfsobs.app.work import compute
 from wfsobs.cost import run_seconds
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
-from wfsobs.watch import Cancelled
 
-log = logging.getLogger(__name__)
-
-Compute = Callable[[Scenario, Callable[[], bool], Report], Shown]
 Step = tuple[Scenario, str]
 """Settings, and the preset that they are compared with."""
-
-Post = Callable[[Callable[[], None]], None]
-"""Has a function called soon on the thread that owns the session; may itself be called from any thread."""
-
-IDLE, RUNNING, DONE, CANCELLED, FAILED = "idle", "running", "done", "cancelled", "failed"
 
 AT_ONCE = 5.0
 """A run that takes longer waits to be asked for [s]."""
 
 STEPS_BACK = 100
 """Changes that can be undone."""
-
-
-class Run(param.Parameterized):
-    """The state machine of the one computation of a session.
-
-    Starting a run supersedes the one before: it is told to stop, and nothing of it lands any more, however
-    late it comes. What the worker reports is gathered and lands in one `param.update` on the session's thread.
-    """
-
-    state = param.Selector(default=IDLE, objects=[IDLE, RUNNING, DONE, CANCELLED, FAILED])
-    progress = param.Number(0.0, bounds=(0.0, 1.0), doc="Fraction done.")
-    message = param.String("", doc="Why the run failed, in one line.")
-    shown = param.ClassSelector(class_=Shown, default=None, allow_None=True, doc="The latest results.")
-
-    def __init__(self, post: Post, work: Compute = compute):
-        super().__init__()
-        self._post, self._compute = post, work
-        self._pool = ThreadPoolExecutor(2, thread_name_prefix="wfsobs-run")
-        self._lock = threading.Lock()
-        self._generation = 0
-        self._cancel = threading.Event()
-        self._news: dict[str, Any] = {}
-        self._posted = False
-
-    def start(self, scenario: Scenario) -> None:
-        """Run a scenario, in place of whatever is running."""
-        generation, cancel = self._supersede()
-        self.param.update(state=RUNNING, progress=0.0, message="")
-        self._pool.submit(self._work, scenario, generation, cancel)
-
-    def cancel(self) -> None:
-        """Stop; what has been delivered stays."""
-        if self.state == RUNNING:
-            self._supersede()
-            self.param.update(state=CANCELLED)
-
-    def aside(self, function: Callable[[], None]) -> None:
-        """Have something done in a thread, beside the run."""
-        self._pool.submit(function)
-
-    def post(self, function: Callable[[], None]) -> None:
-        """Have something done on the session's thread; may be called from any."""
-        self._post(function)
-
-    def close(self) -> None:
-        """Stop and let the threads go: the session has ended."""
-        self._supersede()
-        self._pool.shutdown(wait=False, cancel_futures=True)
-
-    def _supersede(self) -> tuple[int, threading.Event]:
-        with self._lock:
-            self._cancel.set()
-            self._cancel = threading.Event()
-            self._generation += 1
-            self._news = {}
-            return self._generation, self._cancel
-
-    def _work(self, scenario: Scenario, generation: int, cancel: threading.Event) -> None:
-        """In a thread of the pool."""
-        def report(fraction: float, shown: Shown | None) -> None:
-            news: dict[str, Any] = {"progress": min(max(fraction, 0.0), 1.0)}
-            self._tell(generation, news if shown is None else news | {"shown": shown})
-
-        try:
-            shown = self._compute(scenario, cancel.is_set, report)
-        except Cancelled:
-            self._tell(generation, {"state": CANCELLED})
-        except SettingError as error:
-            self._tell(generation, {"state": FAILED, "message": str(error)})
-        except Exception as error:  # a bug, but the session goes on
-            log.exception("the run failed")
-            self._tell(generation, {"state": FAILED, "message": f"{type(error).__name__}: {error}"})
-        else:
-            self._tell(generation, {"state": DONE, "progress": 1.0, "shown": shown})
-
-    def _tell(self, generation: int, news: dict[str, Any]) -> None:
-        with self._lock:
-            if generation != self._generation:
-                return
-            self._news |= news
-            if self._posted:
-                return
-            self._posted = True
-        self._post(self._land)
-
-    def _land(self) -> None:
-        with self._lock:
-            news, self._news, self._posted = self._news, {}, False
-        if news:
-            self.param.update(**news)
 
 
 class Store(param.Parameterized):

@@ -13,7 +13,8 @@ from panel.custom import JSComponent
 from wfsobs.app.controls.fields import ROOM, Field, make_field
 from wfsobs.app.controls.peaks import PATH as PEAKS
 from wfsobs.app.controls.peaks import PeakEditor
-from wfsobs.app.store import CANCELLED, DONE, FAILED, RUNNING, Store
+from wfsobs.app.run import CANCELLED, DONE, FAILED, RUNNING
+from wfsobs.app.store import Store
 from wfsobs.app.style import asset
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario

@@ -11,7 +11,7 @@ from bokeh.models import BoxAnnotation, ColumnDataSource, DataRange1d, GlyphRend
 from bokeh.plotting import figure
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.store import Run
+from wfsobs.app.run import Run
 from wfsobs.app.style import asset, look, swatch
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.plots import new_figure

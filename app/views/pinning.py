@@ -9,7 +9,7 @@ import panel_material_ui as pmui
 
 from wfsobs.app.display import Display
 from wfsobs.app.pin import name_of, pin
-from wfsobs.app.store import Run
+from wfsobs.app.run import Run
 from wfsobs.app.style import asset
 
 PIN, UNPIN = "Pin this run to compare others with it", "Unpin the run compared with"

@@ -7,7 +7,7 @@ import panel as pn
 from bokeh.models import ColumnDataSource, HoverTool, Range1d, VSpan
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.store import Run
+from wfsobs.app.run import Run
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.plots import Faint, add_line, new_figure, restyle, send
 from wfsobs.app.work import TRUTH, Array, Shown, Spectrum

@@ -8,7 +8,7 @@ import param
 from panel.custom import JSComponent
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.store import RUNNING, Run
+from wfsobs.app.run import RUNNING, Run
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.table import NOTHING, find, number
 from wfsobs.app.work import TRUTH, Shown

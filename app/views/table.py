@@ -8,7 +8,7 @@ from html import escape
 import panel as pn
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.store import Run
+from wfsobs.app.run import Run
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import Shown
 from wfsobs.observers import OBSERVERS

@@ -10,7 +10,7 @@ from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, Range1d
 from numpy.typing import NDArray
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.store import Run
+from wfsobs.app.run import Run
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.plots import Faint, add_line, later, new_figure, restyle, send

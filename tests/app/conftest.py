@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.store import RUNNING, Store
+from wfsobs.app.run import RUNNING
+from wfsobs.app.store import Store
 from wfsobs.app.work import compute
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario

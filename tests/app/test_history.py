@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from wfsobs.app.controls.panel import Controls
-from wfsobs.app.store import DONE, STEPS_BACK, Store
+from wfsobs.app.run import DONE
+from wfsobs.app.store import STEPS_BACK, Store
 from wfsobs.app.work import Report, Shown
 from wfsobs.cost import run_seconds
 from wfsobs.pipeline import Result

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from wfsobs import pipeline
-from wfsobs.app.store import CANCELLED, DONE, FAILED, RUNNING, Store
+from wfsobs.app.run import CANCELLED, DONE, FAILED, RUNNING
+from wfsobs.app.store import Store
 from wfsobs.app.work import Report, Shown
 from wfsobs.presets import PRESETS
 from wfsobs.record import Record
