@@ -24,8 +24,9 @@ FLAGS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync",
 ]
-CLOSED_MID_UPDATE = ("WebSocketClosedError", "StreamClosedError")
-"""What a page that closes during an update leaves in the log; nothing else is let through."""
+CLOSED_MID_UPDATE = ("WebSocketClosedError", "StreamClosedError", "self.connection.session.notify_connection_lost()")
+"""What a page that closes during an update, or (the last, Bokeh's own) before its session is there, leaves in the log;
+nothing else is let through."""
 
 
 class Server:
