@@ -18,6 +18,7 @@ from urllib.parse import parse_qsl, quote
 
 import param
 
+from wfsobs.app.controls.fields import parsed
 from wfsobs.configfile import from_toml, to_toml
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
@@ -96,14 +97,14 @@ def read(path: str, text: str, known: Mapping[str, param.Parameter]) -> Any:
         return [_peak(part) for part in text.split(";")] if text else []
     p = known.get(path)
     if isinstance(p, param.List):
-        return [_number(part) for part in text.split(",")] if text else []
+        return [parsed(part) for part in text.split(",")] if text else []
     if isinstance(p, param.Boolean):
         return {"true": True, "false": False}.get(text, text)
-    return _number(text) if isinstance(p, param.Number) else text
+    return parsed(text) if isinstance(p, param.Number) else text
 
 
 def _peak(text: str) -> Any:
-    numbers = [_number(part) for part in text.split(",")]
+    numbers = [parsed(part) for part in text.split(",")]
     if len(numbers) < 3:
         return text
     return {"frequency": numbers[0], "damping": numbers[1], "rms": numbers[2:]}
@@ -155,15 +156,6 @@ def _line(path: str, text: str, reason: str) -> str:
     """The line of a field that was refused; a reason that does not name it gets it in front."""
     line = reason if reason.startswith(path) else f"{path} = {text}: {reason}"
     return line if len(line) <= 200 else f"{line[:197]}..."
-
-
-def _number(text: str) -> int | float | str:
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
 
 
 def _word(value: Any) -> str:
