@@ -60,7 +60,6 @@ class Field:
         self.store, self.path, self.parameter = store, path, p
         self.widgets = self._widgets()
         self.view = pn.Column(self._row(), sizing_mode="stretch_width", margin=0)
-        self._value: Any = None
         self.refresh()
         store.param.watch(self.refresh, ["scenario", "errors"])
 
@@ -163,6 +162,9 @@ class NumbersField(TextField):
 class SliderField(TextField):
     """A number with a usual range: a slider over that range, and the number itself to type."""
 
+    _value: Any = None
+    """What the slider stands at, as far as it has said or was told."""
+
     def _widgets(self) -> list[Any]:
         p: Any = self.parameter
         whole = isinstance(p, param.Integer)
@@ -181,12 +183,19 @@ class SliderField(TextField):
         return pn.Row(*self.widgets, sizing_mode="stretch_width", margin=0)
 
     def _released(self, event: param.parameterized.Event) -> None:
+        self._value = event.new
         if event.new is not None and event.new != self.store.value(self.path):
             self.store.change(self.path, event.new)
 
     def show(self, value: Any) -> None:
-        """Put a value into the text and the slider, whose range grows to hold it."""
+        """Put a value into the text and the slider, whose range grows to hold it.
+
+        A value that came from the slider does not go back to it: by then it may have been moved on.
+        """
         super().show(value)
+        if value == self._value:
+            return
+        self._value = value
         slider = self.widgets[0]
         low, high = self.parameter.softbounds  # type: ignore[attr-defined]
         with param.edit_constant(slider):  # value_throttled too: releasing at its old value must count as news

@@ -51,6 +51,20 @@ def release(slider: Any, value: float) -> None:
         slider.param.update(value=value, value_throttled=value)
 
 
+def test_a_slider_moved_on_is_not_called_back(controls: Controls) -> None:
+    """The browser's messages come in batches: where the slider stands now, and where it was let go before."""
+    field = field_of(controls, "turbulence.wind_speed")
+    slider = field.widgets[0]
+    with param.edit_constant(slider):
+        slider.param.update(value=16.0, value_throttled=15.5)
+    assert controls.store.scenario.turbulence.wind_speed == 15.5 and slider.value == 16.0
+    assert field.widgets[-1].value == "15.5"
+    controls.store.undo()
+    assert slider.value == slider.value_throttled == 15.0
+    release(slider, 15.5)
+    assert controls.store.scenario.turbulence.wind_speed == 15.5
+
+
 def error_of(controls: Controls, path: str) -> str:
     return "".join(pane.object for pane in controls.fields[path].view[1:])
 
