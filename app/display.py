@@ -14,6 +14,8 @@ PSD, CUMULATIVE = "psd", "cumulative"
 UNITS = {"nm": "nm", "mas": "mas", "um": "µm"}
 """Unit -> how it is written."""
 
+NOTHING = "–"
+
 MAS_PER_RADIAN = math.degrees(1.0) * 3600.0 * 1000.0
 
 
@@ -26,6 +28,18 @@ def per_micrometre(unit: str, diameter: float) -> float:
     103.1
     """
     return {"nm": 1e3, "mas": 4e-6 / diameter * MAS_PER_RADIAN, "um": 1.0}[unit]
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number with some significant digits and no exponent where it is of common size."""
+    if value is None:
+        return NOTHING
+    if value == 0:
+        return "0"
+    if not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}"
+    text = f"{value:#.{digits}g}"
+    return (f"{value:.0f}" if "e" in text else text.rstrip(".")).replace("-", "−")
 
 
 class Display(param.Parameterized):

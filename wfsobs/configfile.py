@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
+from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +55,12 @@ def save(scenario: Scenario, path: str | Path) -> None:
     write_whole(path, lambda file: file.write(to_toml(scenario).encode()))
 
 
+@cache
+def pristine(name: str) -> Scenario:
+    """A preset to compare with, made once; not to be changed."""
+    return PRESETS[name]()
+
+
 def preset(name: Any) -> Scenario:
     """The preset `name`. Raises SettingError for an unknown one."""
     if not isinstance(name, str) or name not in PRESETS:
@@ -75,6 +84,36 @@ def parse_assignment(text: str) -> tuple[str, Any]:
     except tomllib.TOMLDecodeError:
         return path.strip(), value.strip()
     return path.strip(), parsed["value"] if set(parsed) == {"value"} else value.strip()
+
+
+def changes(scenario: Scenario, base: Scenario) -> dict[str, Any]:
+    """Dotted path -> plain value of the settings that differ from those of `base`; lists as a whole."""
+    return dict(_leaves(scenario.difference(base)))
+
+
+def written(value: Any) -> str:
+    """A plain value as `parse_assignment` reads it: TOML on one line, words bare.
+
+    >>> written([{"frequency": 18.1, "rms": [0.02, 0.01]}]), written("ar2")
+    ('[{frequency = 18.1, rms = [0.02, 0.01]}]', 'ar2')
+    """
+    return value if isinstance(value, str) else _inline(value)
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_inline(v)}" for key, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_inline, value)) + "]"
+    return json.dumps(value)
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def scenario_from(

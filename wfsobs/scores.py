@@ -99,6 +99,25 @@ def welch_psd(x: Array, dt: float, resolution: float = 0.5) -> tuple[Array, Arra
     return frequency, density
 
 
+def spectra(record: Record, target: str, values: Array, warm_up: float) -> tuple[Array, Array, Array] | None:
+    """(frequency [Hz], density of the values, density of their error against the truth [um^2/Hz], a column per mode).
+
+    Over the samples that count for the scores; None where there are too few, or no truth.
+    """
+    truth = record.truth(target)
+    if truth is None:
+        return None
+    columns = [scored_samples(record, truth[:, mode], values[:, mode], warm_up) for mode in range(record.n_modes)]
+    shortest = min(true.size for true, _ in columns)
+    if shortest < 16:
+        return None
+    true = np.column_stack([t[-shortest:] for t, _ in columns])
+    value = np.column_stack([v[-shortest:] for _, v in columns])
+    frequency, density = welch_psd(np.hstack([value, value - true]), record.dt)
+    signal, error = np.hsplit(density, 2)
+    return frequency, signal, error
+
+
 def cumulative_rms(frequency: Array, density: Array) -> Array:
     """Root of the variance above each frequency, from high to low (the AO habit); same shape as `density`."""
     df = frequency[1] - frequency[0]

@@ -10,12 +10,12 @@ import panel as pn
 from bokeh.models import BoxAnnotation, ColumnDataSource, DataRange1d, GlyphRenderer, Range1d
 from bokeh.plotting import figure
 
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import Display, number, per_micrometre
 from wfsobs.app.run import Run
 from wfsobs.app.style import asset, look, swatch
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.plots import new_figure
-from wfsobs.app.views.table import find, number
+from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, Shown
 from wfsobs.modes import TIP_TILT
 from wfsobs.observers.base import TURBULENCE, VIBRATION

@@ -11,7 +11,7 @@ from html import escape
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wfsobs.app.views.table import number
+from wfsobs.app.display import number
 
 DIGITS = 5
 

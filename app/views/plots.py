@@ -5,14 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import panel as pn
 from bokeh.models import ColumnDataSource, GlyphRenderer
 from bokeh.plotting import figure
 from numpy.typing import ArrayLike
 
 from wfsobs.app.style import look
+from wfsobs.scenario import Peak, Scenario
 
 HEIGHT = 230
+
+PEAKS, MODEL = "#888888", "#FF6600"
+"""Colours of the marks: the scenario's peaks, and the one that the Kalman filters model."""
 
 
 def new_figure(**options: Any) -> figure:
@@ -31,6 +34,13 @@ def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> 
     it = look(name)
     renderer = fig.line("x", y, source=source, color=it.light, line_width=it.width, line_dash=list(it.dash), name=name)
     return renderer
+
+
+def marked_peaks(scenario: Scenario) -> list[Peak]:
+    """The peaks of the scenario that are in its vibration."""
+    vibration = scenario.vibration
+    below = [p for p in vibration.peaks if p.frequency <= vibration.cutoff]
+    return {"peaks": below, "ar2": list(vibration.peaks)}.get(vibration.source, [])
 
 
 def send(source: ColumnDataSource, data: dict[str, Any]) -> None:
@@ -73,12 +83,3 @@ class Faint:
             "xs": [x for x, _ in lines.values()], "ys": [y for _, y in lines.values()],
             "colour": [look(name).colour(dark) for name in lines],
         }
-
-
-def later(function: Any, milliseconds: int) -> None:
-    """Call a function a little later on the session's thread; at once where there is no session."""
-    doc = pn.state.curdoc
-    if doc is None or doc.session_context is None:
-        function()
-    else:
-        doc.add_timeout_callback(function, milliseconds)

@@ -9,13 +9,10 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d, VSpan
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.run import Run
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.plots import Faint, add_line, new_figure, restyle, send
+from wfsobs.app.views.plots import MODEL, PEAKS, Faint, add_line, marked_peaks, new_figure, restyle, send
 from wfsobs.app.work import TRUTH, Array, Shown, Spectrum
 from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.scores import cumulative_rms
-
-PEAKS, MODEL = "#888888", "#FF6600"
-"""Colours of the marks: the scenario's peaks, and the one that the Kalman filters model."""
 
 DECADES = 8
 """The most that an axis of densities spans; one of amplitudes spans half of it."""
@@ -121,9 +118,7 @@ class _Spectrum:
             self.figure.y_range.update(start=max(low / room, high * 10.0**-decades), end=high * room)
 
     def _draw_marks(self, shown: Shown) -> None:
-        vibration, kalman = shown.scenario.vibration, shown.scenario.kalman
-        peaks = {"peaks": [p for p in vibration.peaks if p.frequency <= vibration.cutoff], "ar2": vibration.peaks}
-        drawn = peaks.get(vibration.source, [])
+        drawn, kalman = marked_peaks(shown.scenario), shown.scenario.kalman
         send(self.peaks, {
             "x": [p.frequency for p in drawn],
             "text": [f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}" for p in drawn],

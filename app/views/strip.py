@@ -7,10 +7,10 @@ from typing import Any
 import param
 from panel.custom import JSComponent
 
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import NOTHING, Display, number, per_micrometre
 from wfsobs.app.run import RUNNING, Run
 from wfsobs.app.style import asset, look, observers_of
-from wfsobs.app.views.table import NOTHING, find, number
+from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, Shown
 
 

@@ -7,7 +7,7 @@ from html import escape
 
 import panel as pn
 
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import NOTHING, Display, number, per_micrometre
 from wfsobs.app.run import Run
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import Shown
@@ -15,21 +15,8 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.scores import Score
 
-NOTHING = "–"
 BEST = '<span class="tag best">best</span> '
 ABOVE = '<span class="tag above">above truth</span> '
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """A number with some significant digits and no exponent where it is of common size."""
-    if value is None:
-        return NOTHING
-    if value == 0:
-        return "0"
-    if not 1e-4 <= abs(value) < 1e6:
-        return f"{value:.{digits - 1}e}"
-    text = f"{value:#.{digits}g}"
-    return (f"{value:.0f}" if "e" in text else text.rstrip(".")).replace("-", "−")
 
 
 def find(shown: Shown, observer: str, target: str, mode: str) -> Score | None:

@@ -13,7 +13,7 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.run import Run
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
-from wfsobs.app.views.plots import Faint, add_line, later, new_figure, restyle, send
+from wfsobs.app.views.plots import Faint, add_line, new_figure, restyle, send
 from wfsobs.app.work import TRUTH, Shown
 from wfsobs.observers.base import TARGETS
 
@@ -170,3 +170,12 @@ def _line(shown: Shown, name: str, target: str, display: Display, first: int, la
     if not display.error:
         return cut
     return nothing if truth is None or name == TRUTH else cut - truth[first:last, display.column]
+
+
+def later(function: Any, milliseconds: int) -> None:
+    """Call a function a little later on the session's thread; at once where there is no session."""
+    doc = pn.state.curdoc
+    if doc is None or doc.session_context is None:
+        function()
+    else:
+        doc.add_timeout_callback(function, milliseconds)

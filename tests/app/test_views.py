@@ -10,10 +10,9 @@ import pytest
 from bokeh.models import CrosshairTool
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.display import per_micrometre
+from wfsobs.app.display import number, per_micrometre
 from wfsobs.app.style import LOOKS, look
 from wfsobs.app.views.envelope import envelope, envelope_times
-from wfsobs.app.views.table import number
 from wfsobs.app.views.traces import BINS
 from wfsobs.app.work import TRUTH
 from wfsobs.observers import OBSERVERS
