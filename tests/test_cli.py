@@ -114,7 +114,7 @@ def test_an_unstable_multirate_cycle_leaves_only_that_observer_out():
 def test_presets_lists_and_prints():
     listing = call("presets").stdout
     assert listing.startswith("paper ")
-    assert "\nut4 " in listing
+    assert "\nut4 " in listing and "\nut4-floor " in listing
     assert configfile.from_toml(call("presets", "ut4").stdout) == configfile.preset("ut4")
 
 

@@ -150,7 +150,7 @@ def test_ar2_vibration_is_the_sum_of_its_peaks() -> None:
         assert per_seed.std() / np.sqrt(len(seeds)) < 0.1 * wanted
 
 
-@pytest.mark.parametrize("source", ["peaks", "psd", "ar2", "none"])
+@pytest.mark.parametrize("source", ["peaks", "psd", "measured", "ar2", "none"])
 def test_every_source_has_its_shape(source: str) -> None:
     table = {"frequency": [10.0, 20.0], "tip": [1.0, 1.0], "tilt": [1.0, 1.0]}
     for n in (1, 2, 3, 10):

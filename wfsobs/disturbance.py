@@ -13,6 +13,7 @@ import numpy as np
 
 from wfsobs.ar2 import Ar2, turbulence_corner
 from wfsobs.arrays import Array
+from wfsobs.measured import measured_spectrum
 from wfsobs.scenario import Peak, Scenario
 from wfsobs.spectrum import bin_edges, bin_frequencies, random_phase_signal, resonance_power, table_power
 from wfsobs.watch import QUIET, Watch
@@ -115,13 +116,18 @@ def _is_pure_line(scenario: Scenario, peak: Peak) -> bool:
 
 
 def _bin_power(scenario: Scenario, mode: int, n: int) -> Array:
-    """Variance [um^2] in each DFT bin: that of the damped peaks or of the PSD table, up to the cut-off."""
+    """Variance [um^2] in each DFT bin: that of the damped peaks, of the PSD table or of the
+    measured spectrum, up to the cut-off."""
     v, dt = scenario.vibration, scenario.dt
     power = np.zeros(n // 2 + 1)
     if v.source == "psd":
         density = getattr(v.psd, scenario.modes[mode].name, None)
         if density is not None:
             power = table_power(v.psd.frequency, density, n, dt)
+    elif v.source == "measured":
+        spectrum = measured_spectrum(v.spectrum)
+        if mode < spectrum.density.shape[1]:
+            power = table_power(spectrum.frequency, spectrum.part(v.part)[:, mode], n, dt)
     else:
         edges = bin_edges(n, dt)
         for peak in v.peaks:
@@ -133,5 +139,5 @@ def _bin_power(scenario: Scenario, mode: int, n: int) -> Array:
 
 TURBULENCE: dict[str, Source] = {"ar2": _ar2_turbulence, "none": _no_disturbance}
 VIBRATION: dict[str, Source] = {
-    "peaks": _dft_vibration, "psd": _dft_vibration, "ar2": _ar2_vibration, "none": _no_disturbance,
+    "peaks": _dft_vibration, "psd": _dft_vibration, "measured": _dft_vibration, "ar2": _ar2_vibration, "none": _no_disturbance,
 }

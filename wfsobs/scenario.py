@@ -66,9 +66,14 @@ class PsdTable(Group):
 class Vibration(Group):
     """Structural vibration of the telescope."""
 
-    source = param.Selector(default="peaks", objects=["peaks", "psd", "ar2", "none"], label="Source",
-                            doc="How vibration is made: inverse DFT of the peak list (paper, Algorithm 4), inverse "
-                                "DFT of the PSD table, each peak as an AR(2) process (paper, eq. 2), or none.")
+    source = param.Selector(default="peaks", objects=["peaks", "psd", "measured", "ar2", "none"], label="Source",
+                            doc="How vibration is made: inverse DFT of the peak list (paper, Algorithm 4), of the PSD table or "
+                                "of a measured spectrum, each peak as an AR(2) process (paper, eq. 2), or none.")
+    spectrum = param.Selector(default="eris-ut4", objects=["eris-ut4"], label="Measured spectrum",
+                              doc="For source measured: eris-ut4, measured at VLT UT4 with ERIS (astro-tiptop/TIPTOP, MIT).")
+    part = param.Selector(default="lines", objects=["lines", "all"], label="Part of the spectrum",
+                          doc="For source measured: the lines that stand above its synthetic floor 4e4 / f^2 nm^2/Hz, from "
+                              "7.5 Hz up, or all of it.")
     cutoff = Real(80.0, bounds=(0.1, 5000.0), softbounds=(10.0, 200.0), label="Cut-off f_c",
                   doc="Nothing above this frequency in an inverse DFT [Hz] (paper, section 2.4).")
     peaks = param.List([Peak()], item_type=Peak, bounds=(0, 100), label="Peaks",

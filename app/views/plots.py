@@ -10,12 +10,16 @@ from bokeh.plotting import figure
 from numpy.typing import ArrayLike
 
 from wfsobs.app.style import look
+from wfsobs.measured import measured_spectrum
 from wfsobs.scenario import Peak, Scenario
 
 HEIGHT = 230
 
 PEAKS, MODEL = "#888888", "#FF6600"
 """Colours of the marks: the scenario's peaks, and the one that the Kalman filters model."""
+
+MARKED_LINE = 0.004
+"""Lines of a measured spectrum get a mark above this rms in either axis [um]."""
 
 
 def new_figure(**options: Any) -> figure:
@@ -37,10 +41,15 @@ def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> 
 
 
 def marked_peaks(scenario: Scenario) -> list[Peak]:
-    """The peaks of the scenario that are in its vibration."""
+    """The peaks of the scenario that are in its vibration; of a measured spectrum, its stronger lines."""
     vibration = scenario.vibration
-    below = [p for p in vibration.peaks if p.frequency <= vibration.cutoff]
-    return {"peaks": below, "ar2": list(vibration.peaks)}.get(vibration.source, [])
+    if vibration.source == "ar2":
+        return list(vibration.peaks)
+    peaks = list(vibration.peaks) if vibration.source == "peaks" else []
+    if vibration.source == "measured":
+        lines = measured_spectrum(vibration.spectrum).lines(MARKED_LINE)
+        peaks = [Peak(frequency=line.frequency, damping=0.0, rms=list(line.rms)) for line in lines]
+    return [p for p in peaks if p.frequency <= vibration.cutoff]
 
 
 def send(source: ColumnDataSource, data: dict[str, Any]) -> None:
