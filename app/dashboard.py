@@ -15,6 +15,7 @@ import panel as pn
 import panel_material_ui as pmui
 import param
 from panel.custom import JSComponent
+from panel.util.parameters import edit_readonly
 
 from wfsobs.app.actions import Actions
 from wfsobs.app.controls.panel import Controls, waiting_text
@@ -100,6 +101,8 @@ class Dashboard:
                 sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
         )
         self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")
+        with edit_readonly(page):
+            page.busy = False  # unties it: each of its changes, of any session's work, walks all models of the page
         page.param.watch(lambda event: self.display.param.update(dark=event.new), "dark_theme")
         return page
 

@@ -19,7 +19,7 @@ from urllib.parse import parse_qsl, quote
 import param
 
 from wfsobs.app.controls.fields import parsed
-from wfsobs.configfile import from_toml, to_toml
+from wfsobs.configfile import from_toml, pristine, to_toml
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
@@ -52,7 +52,7 @@ class Link:
 
 def changes(scenario: Scenario, preset: str) -> dict[str, Any]:
     """Dotted path -> plain value of the settings that differ from the preset's."""
-    return dict(_leaves(scenario.difference(PRESETS[preset]())))
+    return dict(_leaves(scenario.difference(pristine(preset))))
 
 
 # ---------------------------------------------------------------------- links

@@ -11,6 +11,7 @@ import param
 
 from wfsobs.app.run import Compute, Post, Run
 from wfsobs.app.work import compute
+from wfsobs.configfile import pristine
 from wfsobs.cost import run_seconds
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
@@ -113,7 +114,7 @@ class Store(param.Parameterized):
 
     def changed(self) -> list[str]:
         """Dotted paths of the settings that differ from the preset's."""
-        return _paths(self.scenario.difference(PRESETS[self.preset]()))
+        return _paths(self.scenario.difference(pristine(self.preset)))
 
     def close(self) -> None:
         """The session has ended."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from time import perf_counter
+from time import perf_counter, sleep
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,9 @@ INTERVAL = 0.15
 
 DELIVERY_INTERVAL = 0.4
 """Least time between two deliveries [s], each of which has the page drawn anew."""
+
+DRAWING = 0.15
+"""What the page takes to draw a delivery [s]."""
 
 SLOWEST = max(OBSERVERS.values(), key=lambda o: o.weight).id
 
@@ -117,7 +120,15 @@ class _Work:
                 shown = self._deliver(record) if done == set(OBSERVERS) - {SLOWEST} else None
             if shown is not None:
                 self.report(self.fraction, shown)
+                self._let_draw()
         return self._so_far(record)
+
+    def _let_draw(self) -> None:
+        """Leave the processors to the page and the browser while all but the slowest observer is drawn."""
+        until = perf_counter() + DRAWING
+        while perf_counter() < until:
+            self.watch.check()
+            sleep(0.01)
 
     def _deliver(self, record: Record) -> Shown:
         self.delivered, self.news = perf_counter(), False

@@ -334,3 +334,9 @@ def test_numbers_of_numpy() -> None:
         scenario.set("butterworth.frequencies", np.array([10.0, 20.0]))
     with pytest.raises(SettingError):
         scenario.set("telescope.diameter", np.array(3.5))
+
+
+def test_a_new_item_has_all_its_settings_for_the_changes_that_follow() -> None:
+    n = len(Scenario().vibration.peaks)
+    fresh = Scenario().replace({f"vibration.peaks.{n}.frequency": 45, f"vibration.peaks.{n}.rms.1": 0.05})
+    assert fresh.vibration.peaks[n].to_dict() == {**Peak().to_dict(), "frequency": 45.0, "rms": [Peak().rms[0], 0.05]}

@@ -125,18 +125,17 @@ class Group(param.Parameterized):
         >>> s.vibration.peaks[0].frequency
         45.0
         """
-        trial = self.to_dict()
-        _put(trial, path.split("."), value, path)
-        fresh = type(self).from_dict(trial)
+        fresh = self.replace({path: value})
         for name in self.settings():
             setattr(self, name, getattr(fresh, name))
 
     def replace(self, changes: Mapping[str, Any]) -> Self:
         """A copy with some settings (dotted path -> value) changed. Raises SettingError."""
-        out = self.copy()
+        trial = self.to_dict()
         for path, value in changes.items():
-            out.set(path, value)
-        return out
+            if _put(trial, path.split("."), value, path):
+                trial = type(self).from_dict(trial).to_dict()  # a new item has its other settings, too
+        return type(self).from_dict(trial)
 
     def walk(self, prefix: str = "") -> Iterator[tuple[str, Group, param.Parameter]]:
         """(dotted path, group that owns it, parameter) of every setting that is a value or a list."""
@@ -187,30 +186,33 @@ def _groups(p: param.List, value: Any, path: str) -> list[Group]:
     return out
 
 
-def _put(node: Any, keys: list[str], value: Any, path: str) -> None:
-    """Put `value` into nested plain values; unknown names are left for `update` to refuse."""
+def _put(node: Any, keys: list[str], value: Any, path: str) -> bool:
+    """Put `value` into nested plain values; unknown names are left for `update` to refuse. Returns whether a list grew."""
     key = keys[0]
+    grown = False
     if isinstance(node, list):
         if not key.isdecimal() or int(key) > len(node):
             raise SettingError(f"{path}: the list has {len(node)} entries, numbered from 0; {len(node)} adds one")
         index = int(key)
         if index == len(node):
             node.append({} if len(keys) > 1 else None)
+            grown = True
         if len(keys) == 1:
             node[index] = value
         else:
-            _put(node[index], keys[1:], value, path)
+            grown |= _put(node[index], keys[1:], value, path)
     elif isinstance(node, dict):
         if len(keys) == 1:
             node[key] = value
         elif key in node:
-            _put(node[key], keys[1:], value, path)
+            grown = _put(node[key], keys[1:], value, path)
         elif node:
             raise SettingError(f"{path}: no such setting; {key!r} is not one of {', '.join(node)}")
         else:
             raise SettingError(f"{path}: the entry is new; give it a whole {key} first")
     else:
         raise SettingError(f"{path}: no such setting")
+    return grown
 
 
 def _short(value: Any) -> str:

@@ -21,6 +21,9 @@ from wfsobs.parameters import Reals, unit_of
 ROOM = {"sizing_mode": "stretch_width", "margin": (4, 0)}
 NUMBER_WIDTH = 92
 
+SOON = 5
+"""How long a message of a slider waits for the next to go with it [ms]: by default 50, a tenth of what a redraw takes."""
+
 
 def written_unit(unit: str) -> str:
     """A unit as the page writes it.
@@ -174,6 +177,7 @@ class SliderField(TextField):
         slider = kind(
             start=low, end=high, value=low, step=p.step or (1 if whole else _step(low, high)), show_value=False,
             size="small", **names, **ROOM)
+        slider._debounce = SOON  # type: ignore[misc]
         slider.param.watch(self._released, "value_throttled")
         unit = written_unit(unit_of(p))
         text = self._text(label=unit or "value", width=NUMBER_WIDTH, margin=(4, 0, 4, 8), align="end")
