@@ -76,7 +76,7 @@ class Actions:
 
     def open_link(self, query: str) -> None:
         """Take the settings that the page's address asks for, and name what cannot be taken."""
-        link = from_query(query)
+        link = from_query(query, self.store.validate)
         self.store.load(link.scenario, link.preset)
         self.toolbar.notes = [f"Not used from the link: {line}" for line in link.rejected]
 
@@ -87,10 +87,10 @@ class Actions:
             return
         try:
             link = from_file(text)
+            self.store.load(link.scenario, link.preset or None)
         except SettingError as error:
             self._note(f"{name[:80]}: {str(error).removeprefix('file: ')[:300]}")
             return
-        self.store.load(link.scenario, link.preset or None)
         self.toolbar.param.update(notes=[], said=f"Opened {name[:80]}.")
 
     def save_scenario(self) -> None:

@@ -67,9 +67,9 @@ class Frame(JSComponent):
 class Dashboard:
     """One session: its store, its controls and its views."""
 
-    def __init__(self, post: Post, scenario: Scenario | None = None, work: Any = compute):
+    def __init__(self, post: Post, scenario: Scenario | None = None, work: Any = compute, **store: Any):
         self._post = post
-        self.store = Store(post, scenario, work)
+        self.store = Store(post, scenario, work, **store)
         self.display = Display()
         self.controls = Controls(self.store)
         self.actions = Actions(self.store)

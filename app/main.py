@@ -1,7 +1,5 @@
 """What `panel serve app` runs, once per session."""
 
-from wfsobs.app.dashboard import page
-from wfsobs.app.work import one_blas_thread
+from wfsobs.app.serve import new_page, shared
 
-one_blas_thread()
-page().servable(title="wfsobs")
+new_page(shared()).servable(title="wfsobs")

@@ -3,33 +3,34 @@
 from __future__ import annotations
 
 import logging
-import os
-import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, Protocol
 
 import param
 
-from wfsobs.app.work import Report, Shown, compute
+from wfsobs.app.queue import step_back
+from wfsobs.app.work import Shown, compute
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 from wfsobs.watch import Cancelled
 
 log = logging.getLogger(__name__)
 
-Compute = Callable[[Scenario, Callable[[], bool], Report], Shown]
+
+class Tell(Protocol):
+    """How whoever does the work tells of it."""
+
+    def __call__(self, fraction: float, shown: Shown | None, place: int = 0) -> None:
+        """The fraction done, what is done where that has grown, and the place in the line while the work waits."""
+
+
+Compute = Callable[[Scenario, Callable[[], bool], Tell], Shown]
 Post = Callable[[Callable[[], None]], None]
 """Has a function called soon on the thread that owns the session; may itself be called from any thread."""
 
 IDLE, RUNNING, DONE, CANCELLED, FAILED = "idle", "running", "done", "cancelled", "failed"
-
-
-def _step_back() -> None:
-    """Let the page's own thread, and a browser on the same machine, go first. On Linux priority is the thread's own."""
-    if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
 
 
 class Run(param.Parameterized):
@@ -41,13 +42,14 @@ class Run(param.Parameterized):
 
     state = param.Selector(default=IDLE, objects=[IDLE, RUNNING, DONE, CANCELLED, FAILED])
     progress = param.Number(0.0, bounds=(0.0, 1.0), doc="Fraction done.")
+    place = param.Integer(0, doc="Place in the line of runs, from 1; 0 when it is being done.")
     message = param.String("", doc="Why the run failed, in one line.")
     shown = param.ClassSelector(class_=Shown, default=None, allow_None=True, doc="The latest results.")
 
     def __init__(self, post: Post, work: Compute = compute):
         super().__init__()
         self._post, self._compute = post, work
-        self._pool = ThreadPoolExecutor(2, thread_name_prefix="wfsobs-run", initializer=_step_back)
+        self._pool = ThreadPoolExecutor(2, thread_name_prefix="wfsobs-run", initializer=step_back)
         self._lock = threading.Lock()
         self._generation = 0
         self._cancel = threading.Event()
@@ -57,7 +59,7 @@ class Run(param.Parameterized):
     def start(self, scenario: Scenario) -> None:
         """Run a scenario, in place of whatever is running."""
         generation, cancel = self._supersede()
-        self.param.update(state=RUNNING, progress=0.0, message="")
+        self.param.update(state=RUNNING, progress=0.0, place=0, message="")
         self._pool.submit(self._work, scenario, generation, cancel)
 
     def cancel(self) -> None:
@@ -89,8 +91,8 @@ class Run(param.Parameterized):
 
     def _work(self, scenario: Scenario, generation: int, cancel: threading.Event) -> None:
         """In a thread of the pool."""
-        def report(fraction: float, shown: Shown | None) -> None:
-            news: dict[str, Any] = {"progress": min(max(fraction, 0.0), 1.0)}
+        def report(fraction: float, shown: Shown | None, place: int = 0) -> None:
+            news: dict[str, Any] = {"progress": min(max(fraction, 0.0), 1.0), "place": place}
             self._tell(generation, news if shown is None else news | {"shown": shown})
 
         try:

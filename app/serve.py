@@ -2,24 +2,203 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import signal
+import sys
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from html import escape
+from ipaddress import ip_address
+from typing import Any
 
 import panel as pn
+from bokeh.server.server import Server
+from bokeh.server.views.autoload_js_handler import AutoloadJsHandler
+from bokeh.server.views.metadata_handler import MetadataHandler
+from bokeh.util.token import generate_secret_key
+from panel.io.server import DocHandler, get_server
+from tornado.web import RequestHandler
 
-from wfsobs.app.dashboard import page
+from wfsobs.app.dashboard import Dashboard, page
+from wfsobs.app.limits import NONE, PUBLIC, Limits
+from wfsobs.app.logs import event, to_stream
+from wfsobs.app.service import Full, Service
+from wfsobs.app.share import LONGEST
 from wfsobs.app.work import one_blas_thread
 
+CACHE_MB = 256
+MESSAGE_BYTES = 6_000_000
+"""The largest message that is read from a browser; a scenario file comes as one."""
 
-def serve(
-    port: int = 5006, address: str = "localhost", open_browser: bool = False, origins: Sequence[str] = (),
-) -> None:
-    """Serve the dashboard at http://address:port/ until interrupted.
+TURN = 0.001
+"""How long the interpreter stays with one thread while another waits [s]: the page's own has short things to do."""
 
-    origins : further host:port names that browsers may reach it by, for use behind a proxy
+UNUSED = (AutoloadJsHandler, MetadataHandler)
+"""Ways into a session that this page does not need."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to serve.
+
+    origins    : HOST or HOST:PORT that browsers reach the server by, where it is not the address: behind a proxy
+    prefix     : path of the page, where a proxy serves other things beside it
+    runs       : at once; 0 for as many as there are processors
+    cache_mb   : results kept [MB]
+    log_level  : debug, info, warning or error
+    log_requests : also a line per request, which holds the address it came from
     """
+
+    port: int = 5006
+    address: str = "localhost"
+    open_browser: bool = False
+    origins: Sequence[str] = ()
+    prefix: str = ""
+    limits: Limits = NONE
+    runs: int = 0
+    cache_mb: int = CACHE_MB
+    log_level: str = "info"
+    log_requests: bool = False
+
+
+def options(*, public: bool | None = None, runs: int | None = None, **given: Any) -> Options:
+    """Options as the command line gives them; those of the limits start with max_ and are None where not given.
+
+    public : whether there are limits; None for where more than this machine reaches the page
+
+    >>> options(origins=("ao.example.org",), max_duration=30.0, max_depth=None).limits.duration
+    30.0
+    """
+    own = {key.removeprefix("max_").replace("memory", "megabytes"): given.pop(key) for key in list(given) if key[:4] == "max_"}
+    if public is None:
+        public = bool(given.get("origins")) or not is_local(given.get("address", "localhost"))
+    limits = replace(PUBLIC if public else NONE, **{key: value for key, value in own.items() if value is not None})
+    return Options(limits=limits, runs=runs or 0, **given)
+
+
+def serve(options: Options) -> None:
+    """Serve the dashboard at http://address:port/prefix until told to stop by SIGINT or SIGTERM. Raises OSError."""
+    to_stream(options.log_level, options.log_requests)
+    prepare()
+    service = make_service(options.limits, options.runs, options.cache_mb)
+    server = make_server(options, service)
+    loop = server.io_loop
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: loop.add_callback_from_signal(loop.stop))
+    event("serving", url=f"http://{options.address}:{server.port}{server.prefix}/", runs=service.queue.workers,
+          cache_mb=options.cache_mb, limits="on" if options.limits != NONE else "off")
+    server.start()
+    loop.start()
+    server.stop(wait=False)
+    ended = service.close()
+    event("stopped", sessions=service.visits)
+    if not ended:  # a computation that does not listen must not keep the process
+        logging.shutdown()
+        sys.stdout.flush()
+        os._exit(0)
+
+
+def make_service(limits: Limits, runs: int = 0, cache_mb: int = CACHE_MB) -> Service:
+    """What the sessions of a server share."""
+    return Service(limits, runs or os.cpu_count() or 1, cache_mb * 1_000_000)
+
+
+def prepare() -> None:
+    """Set up this process: its runs are threads beside the page's own."""
     one_blas_thread()
-    allowed = sorted({f"{address}:{port}", f"localhost:{port}", f"127.0.0.1:{port}", *origins})
-    pn.serve(
-        {"/": page}, port=port, address=address, websocket_origin=allowed, show=open_browser,
-        title="wfsobs", liveness=True,
+    sys.setswitchinterval(TURN)
+
+
+@cache
+def shared() -> Service:
+    """The one service of a process that is served by something else: `panel serve app`."""
+    prepare()
+    return make_service(NONE)
+
+
+def new_page(service: Service) -> Any:
+    """The page of a new session."""
+    try:
+        visit = service.enter()
+    except Full as error:
+        return pn.pane.HTML(full_html(str(error)), margin=40)
+    pn.state.on_session_destroyed(lambda _context: visit.leave())
+    return page(lambda post: Dashboard(post, work=visit.compute, check=service.limits.check, held=service.held))
+
+
+def make_server(options: Options, service: Service) -> Server:
+    """A server that listens but has not started."""
+    server = get_server(
+        {"/": lambda: new_page(service)}, port=options.port, address=options.address, show=options.open_browser,
+        prefix=options.prefix, title="wfsobs", websocket_origin=origins(options),
+        websocket_max_message_size=MESSAGE_BYTES, use_xheaders=bool(options.origins),
+        # A session is reached by a name that this server has signed, and keeps nothing of who the visitor is.
+        sign_sessions=True, secret_key=generate_secret_key(), include_headers=[], include_cookies=[],
+        extra_patterns=[("/liveness", Liveness, {"service": service})],
     )
+    router = server._tornado.wildcard_router
+    router.rules = [rule for rule in router.rules if not issubclass(rule.target, UNUSED)]
+    for rule in router.rules:
+        if rule.target is DocHandler:
+            rule.target = type("Door", (Door,), {"service": service})
+    return server
+
+
+def origins(options: Options) -> list[str]:
+    """HOST:PORT that a page may come from to open a websocket."""
+    here = {options.address, "localhost", "127.0.0.1"} if is_local(options.address) else {options.address}
+    own = [f"{name}:{options.port}" for name in here]
+    return sorted({*own, *options.origins})
+
+
+def is_local(address: str) -> bool:
+    """Whether only this machine reaches an address.
+
+    >>> is_local("localhost"), is_local("127.0.0.1"), is_local("::1"), is_local("0.0.0.0"), is_local("ao.example.org")
+    (True, True, True, False, False)
+    """
+    try:
+        return ip_address(address.strip("[]")).is_loopback
+    except ValueError:
+        return address.lower() == "localhost"
+
+
+class Door(DocHandler):
+    """The page: turns visitors away who are too many, and takes no session's name and no endless query from an address."""
+
+    service: Service
+
+    async def prepare(self) -> None:
+        """Called before anything is done for a request."""
+        await super().prepare()
+        if self.service.full:
+            self.set_status(503)
+            self.set_header("Retry-After", "60")
+            self.finish(full_html("There are as many visitors as this server takes. Please try again later."))
+            return
+        arguments = self.request.arguments
+        for name in ("bokeh-token", "bokeh-session-id"):
+            arguments.pop(name, None)
+        self.request.headers.pop("Bokeh-Session-Id", None)
+        if len(self.request.query) > LONGEST:  # the page says that it was not used; here it would be sent to and fro
+            arguments.clear()
+
+
+class Liveness(RequestHandler):
+    """Whether the server answers, and how busy it is."""
+
+    def initialize(self, service: Service) -> None:
+        """Called by Tornado with what was given beside the pattern."""
+        self.service = service
+
+    def get(self) -> None:
+        """Answer in JSON."""
+        self.write({"ok": True, "sessions": self.service.visits, "waiting": self.service.queue.length})
+
+
+def full_html(line: str) -> str:
+    """What is shown to one visitor too many."""
+    return f"<!doctype html><title>wfsobs</title><h1>wfsobs is full</h1><p>{escape(line)}</p>"
+

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import shlex
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import reduce
 from typing import Any
@@ -23,6 +23,8 @@ from wfsobs.configfile import from_toml, pristine, to_toml
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
+
+Check = Callable[[Scenario], None]
 
 LONGEST = 8000
 """Characters of a query, or of a command line; what is longer travels as a file."""
@@ -66,8 +68,11 @@ def to_query(scenario: Scenario, preset: str) -> str | None:
     return query if len(query) <= LONGEST else None
 
 
-def from_query(query: str) -> Link:
-    """The settings that a query asks for, and a line for every field of it that was refused."""
+def from_query(query: str, check: Check = Scenario.validate) -> Link:
+    """The settings that a query asks for, and a line for every field of it that was refused.
+
+    check : raises SettingError where settings do not go together
+    """
     if len(query) > LONGEST:
         return Link(PRESETS[SHORTEST_NAME](), SHORTEST_NAME, (
             f"The link has {len(query)} characters, at most {LONGEST} are read: nothing of it was used.",))
@@ -78,7 +83,7 @@ def from_query(query: str) -> Link:
     if name not in PRESETS:
         rejected.append(_line("preset", name, f"takes one of {', '.join(PRESETS)}"))
         name = SHORTEST_NAME
-    scenario, refused = _apply(PRESETS[name](), fields)
+    scenario, refused = _apply(PRESETS[name](), fields, check)
     return Link(scenario, name, (*rejected, *refused))
 
 
@@ -110,7 +115,7 @@ def _peak(text: str) -> Any:
     return {"frequency": numbers[0], "damping": numbers[1], "rms": numbers[2:]}
 
 
-def _apply(base: Scenario, fields: Mapping[str, str]) -> tuple[Scenario, list[str]]:
+def _apply(base: Scenario, fields: Mapping[str, str], check: Check) -> tuple[Scenario, list[str]]:
     """Every field that can be applied, whatever their order, and a line for every other."""
     known = {path: p for path, _, p in base.walk()}
     values, refused = {}, {}
@@ -121,14 +126,14 @@ def _apply(base: Scenario, fields: Mapping[str, str]) -> tuple[Scenario, list[st
             _set(scenario, path, values[path])
         except SettingError as error:
             refused[path] = str(error)
-    if _clash(scenario):
+    if _clash(scenario, check):
         scenario = base.copy()
         waiting = {path: value for path, value in values.items() if path not in refused}
         for _ in range(ROUNDS):  # what one field needs, a later one may bring
             for path, value in list(waiting.items()):
                 before = reduce(getattr, path.split("."), scenario)
                 _set(scenario, path, value)
-                refused[path] = _clash(scenario)
+                refused[path] = _clash(scenario, check)
                 if refused[path]:
                     _set(scenario, path, before)
                 else:
@@ -143,10 +148,10 @@ def _set(scenario: Scenario, path: str, value: Any) -> None:
     scenario.update(value)
 
 
-def _clash(scenario: Scenario) -> str:
+def _clash(scenario: Scenario, check: Check) -> str:
     """Why settings do not go together, or nothing."""
     try:
-        scenario.validate()
+        check(scenario)
     except SettingError as error:
         return str(error)
     return ""

@@ -5,10 +5,12 @@ A `Scenario` in the store is replaced, never changed in place, so whoever holds 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import param
 
+from wfsobs.app.limits import NONE
 from wfsobs.app.run import Compute, Post, Run
 from wfsobs.app.work import compute
 from wfsobs.configfile import pristine
@@ -38,8 +40,13 @@ class Store(param.Parameterized):
     can_undo = param.Boolean(False, doc="Whether there is a change to undo.")
     can_redo = param.Boolean(False, doc="Whether there is an undone change to make again.")
 
-    def __init__(self, post: Post, scenario: Scenario | None = None, work: Compute = compute):
+    def __init__(
+        self, post: Post, scenario: Scenario | None = None, work: Compute = compute,
+        check: Callable[[Scenario], None] = NONE.check, held: Callable[[Scenario], bool] = lambda _: False,
+    ):
+        """Check raises SettingError where a scenario is not allowed; held says whether its results are there already."""
         super().__init__(scenario=scenario or PRESETS[next(iter(PRESETS))]())
+        self._check, self._held = check, held
         self._refused: dict[str, Any] = {}
         self._past: list[Step] = []
         self._future: list[Step] = []
@@ -54,7 +61,7 @@ class Store(param.Parameterized):
     def follow(self) -> None:
         """Run the settings as they stand, unless that takes long: then stop, and wait to be asked."""
         seconds = run_seconds(self.scenario)
-        if seconds <= AT_ONCE:
+        if seconds <= AT_ONCE or self._held(self.scenario):
             self.start()
         else:
             self.run.cancel()
@@ -90,7 +97,7 @@ class Store(param.Parameterized):
         for changes in ({**waiting, path: value}, {path: value}) if waiting else ({path: value},):
             try:
                 fresh = self.scenario.replace(changes)
-                fresh.validate()
+                self.validate(fresh)
             except SettingError as error:
                 reason = str(error)
             else:
@@ -100,12 +107,17 @@ class Store(param.Parameterized):
         self.errors = {p: e for p, e in self.errors.items() if p in waiting} | {path: reason}
         return False
 
+    def validate(self, scenario: Scenario) -> None:
+        """Raises SettingError where settings do not go together, or are more than is allowed here."""
+        scenario.validate()
+        self._check(scenario)
+
     def load(self, scenario: Scenario, preset: str | None = None) -> None:
         """Replace every setting and run. Raises SettingError where they do not go together.
 
         preset : the one that they are to be compared with from now on; as it was if not given
         """
-        scenario.validate()
+        self.validate(scenario)
         self._accept((scenario, preset or self.preset), {})
 
     def choose(self, name: str) -> None:

@@ -1,4 +1,4 @@
-"""How long a run will take, told from its settings.
+"""How long a run will take and how much memory, told from its settings.
 
 Measured as processor time on the machine of docs/benchmarks.md (2 virtual cores of an AMD EPYC, one BLAS thread),
 10 s to 300 s of record, m from 20 to 2048, d from 20 to 2000; there a run of the paper's takes 0.41 s, 0.38 s by this. The
@@ -46,3 +46,18 @@ def gpr_offline_seconds(n_steps: int, training_size: int, depth: int) -> float:
     """One mode [s]: training 4 ns m^2 + 10 ps m^3, prediction 1.2 us + 4.2 ns m per step."""
     m = training_size
     return 4e-9 * m**2 + 10e-12 * m**3 + max(n_steps - depth + 1, 0) * (1.2e-6 + 4.2e-9 * m)
+
+
+def run_bytes(scenario: Scenario) -> float:
+    """About how much memory a run takes at its height [bytes], both modes at once.
+
+    Measured from 10 s to 300 s of record and m from 20 to 2048, where it is within a third: what is kept of every
+    step, and the windows of the larger GPR.
+
+    >>> from wfsobs.presets import paper
+    >>> round(run_bytes(paper()) / 1e6), round(run_bytes(paper().replace({"run.duration": 300})) / 1e6)
+    (108, 282)
+    """
+    n_modes = len(scenario.modes)
+    windows = max(100e3 * scenario.gpr_online.training_size, 35e3 * scenario.gpr_offline.training_size)
+    return n_modes * (300.0 * scenario.n_steps + windows)

@@ -114,7 +114,7 @@ class Controls:
         self.accordion.param.watch(self._opened, "active")
         self.store.param.watch(self._refresh_preset, ["scenario", "preset", "can_undo", "can_redo"])
         self.store.param.watch(self._refresh_run, ["errors", "waiting"])
-        self.store.run.param.watch(self._refresh_run, ["state", "progress", "message"])
+        self.store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"])
 
     def _chosen(self, event: param.parameterized.Event) -> None:
         if event.new != self.store.preset:
@@ -145,8 +145,10 @@ def status_of(store: Store) -> tuple[str, str]:
     run = store.run
     seconds = f" in {run.shown.seconds:.2f} s" if run.shown and run.state == DONE else ""
     text = {
-        RUNNING: f"Running, {int(100 * run.progress)} %", DONE: f"Done{seconds}",
-        CANCELLED: "Cancelled", FAILED: "The run failed",
+        RUNNING: f"Waiting: position {run.place}" if run.place else f"Running, {int(100 * run.progress)} %",
+        DONE: f"Done{seconds}",
+        CANCELLED: "Cancelled",
+        FAILED: "The run failed",
     }.get(run.state, "")
     if store.waiting:
         text = waiting_text(store.waiting)

@@ -7,8 +7,7 @@ from typing import Any
 
 
 def test_serve(open_page: Any, make_server: Any, tmp_path: Path) -> None:
-    code = "from wfsobs.app.serve import serve; serve(port={port}, address='localhost', open_browser=False)"
-    server = make_server(["-c", code], tmp_path / "log", "/")
+    server = make_server(["-m", "wfsobs", "serve", "--port", "{port}"], tmp_path / "log", "/")
     try:
         page = open_page(url=server.url)
         assert page.title() == "wfsobs"

@@ -1,0 +1,109 @@
+"""Results kept for all sessions: the latest wanted ones, up to a number of bytes, their arrays read-only."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import threading
+from collections import OrderedDict
+from collections.abc import Hashable, Iterator, Mapping
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wfsobs.scenario import Scenario
+
+T = TypeVar("T")
+
+
+def key_of(scenario: Scenario, record: str = "") -> str:
+    """What names the results of a scenario: the same settings, the same key, and in practice no others.
+
+    record : names the record that the observers ran on, where it was not simulated from the scenario
+
+    >>> key_of(Scenario()) == key_of(Scenario().replace({"turbulence.wind_speed": 15})) != key_of(Scenario(), "mine")
+    True
+    """
+    text = json.dumps([record, scenario.to_dict()], sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def arrays_in(value: Any) -> Iterator[NDArray[Any]]:
+    """Every array in nested dataclasses, mappings, lists and tuples."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, (list, tuple, Mapping)):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from arrays_in(item)
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            yield from arrays_in(getattr(value, field.name))
+
+
+def frozen(value: T) -> T:
+    """The same value, its arrays read-only from now on."""
+    for array in arrays_in(value):
+        array.flags.writeable = False
+    return value
+
+
+def size_of(value: Any) -> int:
+    """Memory that the arrays in a value hold [bytes], shared ones counted once."""
+    owners: dict[int, int] = {}
+    for array in arrays_in(value):
+        owner: Any = array
+        while isinstance(owner.base, np.ndarray):
+            owner = owner.base
+        owners[id(owner)] = owner.nbytes
+    return sum(owners.values())
+
+
+class Cache(Generic[T]):
+    """Least recently used goes first; for any thread.
+
+    most_bytes : of arrays in all; what is larger by itself is not kept
+    """
+
+    def __init__(self, most_bytes: int):
+        self.most_bytes = most_bytes
+        self._kept: OrderedDict[Hashable, tuple[T, int]] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def get(self, key: Hashable) -> T | None:
+        """What is kept under a key, or None."""
+        with self._lock:
+            if key not in self._kept:
+                return None
+            self._kept.move_to_end(key)
+            return self._kept[key][0]
+
+    def put(self, key: Hashable, value: T) -> T:
+        """Keep a value, in place of the least wanted ones; gives it back, its arrays read-only."""
+        size = size_of(frozen(value))
+        with self._lock:
+            _, before = self._kept.pop(key, (None, 0))
+            self._bytes -= before
+            if size <= self.most_bytes:
+                self._kept[key] = value, size
+                self._bytes += size
+            while self._bytes > self.most_bytes:
+                _, (_, gone) = self._kept.popitem(last=False)
+                self._bytes -= gone
+        return value
+
+    def __contains__(self, key: Hashable) -> bool:
+        with self._lock:
+            return key in self._kept
+
+    def __len__(self) -> int:
+        with self._lock:
+            return len(self._kept)
+
+    @property
+    def bytes(self) -> int:
+        """Of arrays that are kept."""
+        with self._lock:
+            return self._bytes

@@ -1,0 +1,73 @@
+"""What a visitor may ask of a server: the bounds on a run, on messages and on visitors, all in one place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from wfsobs.cost import run_bytes, run_seconds
+from wfsobs.scenario import Scenario
+from wfsobs.settings import SettingError
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Bounds that hold on top of those of the settings; infinite unless given.
+
+    duration      : length of a record [s]
+    steps         : of a record
+    training_size : m of either GPR
+    depth         : d of either GPR
+    items         : entries in a list of settings: peaks, bands, rows of a PSD table
+    seconds       : processor time of a run, as estimated from its settings [s]
+    megabytes     : memory of a run, likewise [MB]
+    sessions      : open pages
+    """
+
+    duration: float = math.inf
+    steps: float = math.inf
+    training_size: float = math.inf
+    depth: float = math.inf
+    items: float = math.inf
+    seconds: float = math.inf
+    megabytes: float = math.inf
+    sessions: float = math.inf
+
+    def check(self, scenario: Scenario) -> None:
+        """Raises SettingError, one line, where a run of this scenario is more than the server allows."""
+        _most("run.duration", scenario.run.duration, self.duration, " s")
+        if scenario.n_steps > self.steps:
+            raise SettingError(f"run.duration = {scenario.run.duration:g}: {scenario.n_steps} steps at sensors.lgs_rate = "
+                               f"{scenario.sensors.lgs_rate:g} Hz; at most {self.steps:g} on this server")
+        for name in ("gpr_offline", "gpr_online"):
+            group = getattr(scenario, name)
+            _most(f"{name}.training_size", group.training_size, self.training_size)
+            _most(f"{name}.depth", group.depth, self.depth)
+        for path, items in (
+            ("vibration.peaks", scenario.vibration.peaks), ("vibration.psd.frequency", scenario.vibration.psd.frequency),
+            ("vibration.psd.tip", scenario.vibration.psd.tip), ("vibration.psd.tilt", scenario.vibration.psd.tilt),
+            ("butterworth.frequencies", scenario.butterworth.frequencies),
+        ):
+            if len(items) > self.items:
+                raise SettingError(f"{path}: {len(items)} entries, at most {self.items:g} on this server")
+        _whole(run_seconds(scenario), self.seconds, "s of processor time")
+        _whole(run_bytes(scenario) / 1e6, self.megabytes, "MB of memory")
+
+
+NONE = Limits()
+"""For those who serve themselves."""
+
+PUBLIC = Limits(
+    duration=120.0, steps=120_000, training_size=1024, depth=1000, items=100, seconds=30.0, megabytes=600.0, sessions=100)
+"""For a server that strangers reach."""
+
+
+def _most(path: str, value: float, most: float, unit: str = "") -> None:
+    if value > most:
+        raise SettingError(f"{path} = {value:g}: at most {most:g}{unit} on this server")
+
+
+def _whole(value: float, most: float, what: str) -> None:
+    if value > most:
+        raise SettingError(f"The run would take about {value:.0f} {what}, at most {most:g} on this server: lower "
+                           "run.duration, sensors.lgs_rate, gpr_online.training_size or gpr_offline.training_size")
