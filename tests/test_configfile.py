@@ -5,8 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs import configfile
+from wfsobs.groups.vibration import Peak
 from wfsobs.presets import PRESETS, paper
-from wfsobs.scenario import Peak, Scenario
+from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 
 

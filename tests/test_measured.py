@@ -7,9 +7,10 @@ import pytest
 
 from wfsobs.app.views.plots import marked_peaks
 from wfsobs.disturbance import make_disturbance, vibration_variance
+from wfsobs.groups.vibration import Vibration
 from wfsobs.measured import ALL, LINES, PARTS, SPECTRA, measured_spectrum
 from wfsobs.presets import PRESETS
-from wfsobs.scenario import Scenario, Vibration
+from wfsobs.scenario import Scenario
 
 ERIS = measured_spectrum("eris-ut4")
 DF = 0.028

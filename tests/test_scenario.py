@@ -10,7 +10,8 @@ import pytest
 
 from wfsobs import PRESETS
 from wfsobs.disturbance import vibration_variance
-from wfsobs.scenario import PAPER_PEAK_HZ, Scenario
+from wfsobs.groups.vibration import PAPER_PEAK_HZ
+from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 
 TABLE = {"frequency": [1.0, 2.0, 3.0], "tip": [1.0, 1.0, 1.0], "tilt": [1.0, 1.0, 1.0]}

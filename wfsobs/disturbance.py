@@ -13,8 +13,9 @@ import numpy as np
 
 from wfsobs.ar2 import Ar2, turbulence_corner
 from wfsobs.arrays import Array
+from wfsobs.groups.vibration import Peak
 from wfsobs.measured import measured_spectrum
-from wfsobs.scenario import Peak, Scenario
+from wfsobs.scenario import Scenario
 from wfsobs.spectrum import bin_edges, bin_frequencies, random_phase_signal, resonance_power, table_power
 from wfsobs.watch import QUIET, Watch
 
@@ -77,8 +78,16 @@ def vibration_variance(scenario: Scenario, mode: int) -> float:
         return 0.0
     if v.source == "ar2":
         return float(sum(peak_rms(peak.rms, mode) ** 2 for peak in v.peaks))
-    lines = sum(peak_rms(peak.rms, mode) ** 2 for peak in v.peaks if _is_pure_line(scenario, peak))
-    return float(_bin_power(scenario, mode, scenario.n_steps).sum() + lines)
+    return float(vibration_power(scenario, mode, scenario.n_steps).sum())
+
+
+def vibration_power(scenario: Scenario, mode: int, n: int) -> Array:
+    """Variance [um^2] of the vibration in each DFT bin of `n` steps, pure lines in the bin that they lie in, (n // 2 + 1,)."""
+    power = _bin_power(scenario, mode, n)
+    for peak in scenario.vibration.peaks:
+        if _is_pure_line(scenario, peak):
+            power[min(round(peak.frequency * n * scenario.dt), n // 2)] += peak_rms(peak.rms, mode) ** 2
+    return power
 
 
 def _no_disturbance(_scenario: Scenario, _mode: int, n: int, _rng: np.random.Generator) -> Array:

@@ -11,9 +11,9 @@ from panel.custom import JSComponent
 from wfsobs.app.controls.fields import number_text, parsed, written_unit
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset
+from wfsobs.groups.vibration import Peak
 from wfsobs.modes import TIP_TILT
 from wfsobs.parameters import unit_of
-from wfsobs.scenario import Peak
 
 PATH = "vibration.peaks"
 

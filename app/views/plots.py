@@ -10,8 +10,9 @@ from bokeh.plotting import figure
 from numpy.typing import ArrayLike
 
 from wfsobs.app.style import look
+from wfsobs.groups.vibration import Peak
 from wfsobs.measured import measured_spectrum
-from wfsobs.scenario import Peak, Scenario
+from wfsobs.scenario import Scenario
 
 HEIGHT = 230
 

@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 import wfsobs
 from wfsobs.app.share import LONGEST, changes, from_file, from_query, to_command, to_file, to_python, to_query
 from wfsobs.cli import main
+from wfsobs.groups.vibration import Peak
 from wfsobs.presets import PRESETS
-from wfsobs.scenario import Peak, Scenario
+from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 
 QUICK = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50}

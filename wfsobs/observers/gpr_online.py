@@ -11,13 +11,14 @@ from collections.abc import Callable
 import numpy as np
 
 from wfsobs.arrays import Array
+from wfsobs.groups.observers import OfflineGpr, OnlineGpr
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.kernels import SquaredExponential, band, check_condition, square_from_band
 from wfsobs.observers.modes import over_modes
 from wfsobs.observers.reference import online_reference
 from wfsobs.observers.sliding import finish, run_lengths, slide
 from wfsobs.record import Record, RecordError
-from wfsobs.scenario import OfflineGpr, OnlineGpr, Scenario
+from wfsobs.scenario import Scenario
 from wfsobs.watch import QUIET, Watch
 
 BAND_ENTRIES, BAND_ROWS = 4_000_000, 8192

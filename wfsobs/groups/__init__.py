@@ -1,0 +1,1 @@
+"""The settings of a scenario, one module per topic."""
