@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import param
 
@@ -40,6 +41,15 @@ def number(value: float | None, digits: int = 3) -> str:
         return f"{value:.{digits - 1}e}"
     text = f"{value:#.{digits}g}"
     return (f"{value:.0f}" if "e" in text else text.rstrip(".")).replace("-", "−")
+
+
+def written_unit(unit: str) -> str:
+    """A unit as the page writes it.
+
+    >>> written_unit("um^2/Hz")
+    'µm²/Hz'
+    """
+    return re.sub(r"\bum\b", "µm", unit).replace("^2", "²")
 
 
 class Display(param.Parameterized):

@@ -1,10 +1,11 @@
-"""The command line: `wfsobs run`, `observe`, `presets`, `bench`, `serve`."""
+"""The command line: `wfsobs run`, `observe`, `export`, `presets`, `bench`, `serve`."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from typing import Any
 
 import click
@@ -13,14 +14,17 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from threadpoolctl import threadpool_limits
 
 from wfsobs import __version__, configfile
+from wfsobs.files import check_writable, write_whole
 from wfsobs.loop import simulate
 from wfsobs.pipeline import Result
 from wfsobs.pipeline import observe as observe_record
+from wfsobs.pipeline import run as run_scenario
 from wfsobs.presets import PRESETS
 from wfsobs.record import RecordError
 from wfsobs.settings import SettingError
 from wfsobs.tables import TIME, Row, rows, score_table
 from wfsobs.telemetry import load_record, save_arrays, save_record
+from wfsobs.variations import MOST, parse_variation, scenarios
 from wfsobs.watch import Watch
 
 
@@ -104,6 +108,34 @@ def observe(
         click.echo(f"wfsobs: {record_file}: {len(result.estimates)} estimates, no scores: the record has {why}", err=True)
         return
     show(rows(result.scores, None), as_json)
+
+
+@main.command()
+@click.argument("out", metavar="OUT.html")
+@scenario_options
+@click.option("--vary", multiple=True, metavar="NAME=VALUE,VALUE,...",
+              help=f"Run for each of these values as well; several make every combination, at most {MOST}.")
+def export(out: str, preset: str | None, config: str | None, assignments: tuple[str, ...], vary: tuple[str, ...]) -> None:
+    """Write a report: one HTML file with figures and numbers that opens without a network."""
+    base = configfile.scenario_from(preset, config, assignments)
+    variations = [parse_variation(text) for text in vary]
+    states = scenarios(base, variations)
+    check_writable(out)
+    try:
+        from wfsobs.app.report.page import page
+    except ModuleNotFoundError as error:
+        raise SettingError(f"export: a report needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
+    from wfsobs.app.report.data import Report, state_of
+
+    kept = []
+    with progress_bar("runs") as update:
+        for i, scenario in enumerate(states):
+            result = run_scenario(scenario, Watch(progress=lambda f, i=i: update((i + f) / len(states))))
+            _warn(result)
+            kept.append(state_of(result, len(states)))
+    report = Report(configfile.preset_name(preset, config), base, tuple(variations), tuple(kept))
+    content = page(report, datetime.now().astimezone()).encode()
+    write_whole(out, lambda file: file.write(content))
 
 
 @main.command()

@@ -43,11 +43,14 @@ def from_toml(text: str, base: Scenario | None = None, where: str = "TOML") -> S
 
 def load(path: str | Path, base: Scenario | None = None) -> Scenario:
     """The scenario of a TOML file (see `from_toml`). Raises SettingError, also where it cannot be read."""
+    return from_toml(_text(path), base, str(path))
+
+
+def _text(path: str | Path) -> str:
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        return Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise SettingError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from None
-    return from_toml(text, base, str(path))
 
 
 def save(scenario: Scenario, path: str | Path) -> None:
@@ -66,6 +69,13 @@ def preset(name: Any) -> Scenario:
     if not isinstance(name, str) or name not in PRESETS:
         raise SettingError(f"preset = {name!r}: takes one of {', '.join(PRESETS)}")
     return PRESETS[name]()
+
+
+def preset_name(chosen: str | None, config: str | Path | None, default: str = "paper") -> str:
+    """The preset that the arguments of `scenario_from` start from. Raises SettingError where the file cannot be read."""
+    if chosen is not None or config is None:
+        return chosen or default
+    return tomllib.loads(_text(config)).get("preset", default)
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:

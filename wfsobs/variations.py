@@ -9,6 +9,7 @@ from itertools import product
 from math import prod
 from typing import Any
 
+from wfsobs.configfile import written
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 
@@ -22,6 +23,10 @@ class Variation:
 
     path: str
     values: tuple[Any, ...]
+
+    def __str__(self) -> str:
+        """As `parse_variation` reads it."""
+        return f"{self.path}={','.join(map(written, self.values))}"
 
 
 def parse_variation(text: str) -> Variation:

@@ -1,0 +1,60 @@
+"""The figures of a report as Bokeh models without data: the page's script fills them, state by state."""
+
+from __future__ import annotations
+
+from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, DataRenderer, HoverTool, Range1d, Span, VSpan
+from bokeh.plotting import figure
+
+from wfsobs.app.style import observers_of
+from wfsobs.app.views.plots import MODEL, PEAKS, add_line, new_figure
+from wfsobs.app.work import TRUTH
+from wfsobs.observers.base import TARGETS, VIBRATION
+
+TRACE, SPECTRUM = "trace", "spectrum"
+
+
+def all_figures() -> dict[str, figure]:
+    """"trace-turbulence" and the like -> figure; the traces share their time axis, the spectra their frequencies."""
+    times, frequencies = Range1d(start=0.0, end=10.0), Range1d(start=0.5, end=500.0)
+    crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
+    made = {f"{TRACE}-{target}": _trace(target, times, crosshair) for target in TARGETS}
+    made |= {f"{SPECTRUM}-{target}": _spectrum(target, frequencies) for target in TARGETS}
+    for name, fig in made.items():
+        fig.name = name
+    return made
+
+
+def _trace(target: str, times: Range1d, crosshair: CrosshairTool) -> figure:
+    """Time traces of the truth and the estimates; warm-up and the stretch of every sample shaded."""
+    fig = new_figure(x_range=times, y_range=Range1d(start=-1.0, end=1.0))
+    fig.xaxis.axis_label = "time [s]"
+    fig.add_tools(crosshair)
+    for name, colour in (("warm-up", "#808080"), ("window", "#2B8AB3")):
+        fig.add_layout(BoxAnnotation(
+            left=0, right=0, fill_color=colour, fill_alpha=0.10, line_width=0, level="underlay", name=name))
+    source = ColumnDataSource({"x": [], **{name: [] for name in _names(target)}})
+    for name in _names(target):
+        add_line(fig, name, source, name)
+    return fig
+
+
+def _spectrum(target: str, frequencies: Range1d) -> figure:
+    """Spectra, log-log, the peaks of the vibration and of the Kalman filters' model marked."""
+    fig = new_figure(
+        x_range=frequencies, y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log")
+    fig.xaxis.axis_label = "frequency [Hz]"
+    if target == VIBRATION:
+        marks: list[DataRenderer] = [
+            fig.add_glyph(ColumnDataSource({"x": [], "text": []}), VSpan(x="x", **look), name=name)
+            for name, look in (
+                ("peaks", {"line_color": PEAKS, "line_alpha": 0.4, "line_width": 1.5}),
+                ("model", {"line_color": MODEL, "line_dash": [4, 3], "line_width": 1.5}))]
+        fig.add_tools(HoverTool(renderers=marks, tooltips="@text"))
+    source = ColumnDataSource({"x": [], **{name: [] for name in _names(target)}})
+    for name in _names(target):
+        add_line(fig, name, source, name)
+    return fig
+
+
+def _names(target: str) -> list[str]:
+    return [TRUTH, *observers_of(target)]

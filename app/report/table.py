@@ -1,0 +1,79 @@
+"""The RMS table of one state as plain HTML, in nm; the page's script turns a copy of it to other units."""
+
+from __future__ import annotations
+
+import math
+from html import escape
+from itertools import groupby
+
+from wfsobs.app.display import NOTHING, number, per_micrometre
+from wfsobs.app.report.data import State
+from wfsobs.observers import OBSERVERS
+from wfsobs.tables import TIME, Row
+
+COLUMNS = {
+    "Observer": "and its line in the figures",
+    'RMS error [<span class="unit">nm</span>]': "of the estimate, after the warm-up",
+    'RMS truth [<span class="unit">nm</span>]': "the error of answering zero",
+    "error / truth": "above 1 is worse than answering zero",
+    "Lag [ms]": "how late the estimate is",
+    "Time per step [µs]": "computing time per step and mode",
+    "Real-time factor": "time per step over the step of the loop; below 1 keeps up with it",
+}
+"""Heading -> explanation."""
+
+BEST, ABOVE = '<span class="tag best">best</span> ', '<span class="tag above">above truth</span> '
+
+
+def state_table(state: State) -> str:
+    """Every score of a state, one body per target and mode, best first, and what is missing."""
+    head = "".join(f'<th scope=col title="{why}">{name}</th>' for name, why in COLUMNS.items())
+    groups = [list(rows) for _, rows in groupby(sorted(state.rows, key=_order(state.rows)), _group)]
+    bodies = "".join(_body(state, rows) for rows in groups)
+    why = "".join(f'<p class="failure">{escape(reason)}</p>' for reason in state.reasons)
+    return (
+        '<div class="scroll" tabindex=0 role=region aria-label="RMS errors">'
+        f'<table class="rms"><thead><tr>{head}</tr></thead>{bodies}</table></div>{why}')
+
+
+def _group(row: Row) -> tuple[str, str]:
+    return row["target"], row["mode"]
+
+
+def _order(rows: list[Row]):
+    """Targets and modes as they come, best first."""
+    groups = list(dict.fromkeys(map(_group, rows)))
+    return lambda row: (groups.index(_group(row)), row["rms_um"])
+
+
+def _body(state: State, rows: list[Row]) -> str:
+    target, mode = _group(rows[0])
+    best = min((row["rms_um"] for row in rows if OBSERVERS[row["observer"]].causal), default=math.inf)
+    title = f'<tr><th colspan={len(COLUMNS)} class="target" scope=rowgroup>{target.capitalize()}, {escape(mode)}</th></tr>'
+    return (
+        f'<tbody data-target="{target}" data-mode="{escape(mode)}">{title}'
+        f'{"".join(_row(state, row, row["rms_um"] == best) for row in rows)}</tbody>')
+
+
+def _row(state: State, row: Row, best: bool) -> str:
+    observer = OBSERVERS[row["observer"]]
+    label = escape(observer.label) + ("" if observer.causal else " <sup>looks ahead</sup>")
+    lag = NOTHING if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−")
+    cells = [
+        f"<td>{BEST if best and observer.causal else ''}{length(row['rms_um'])}</td>",
+        f"<td>{length(row['truth_rms_um'])}</td>",
+        f"<td>{ABOVE if (row['normalised_rms'] or 0.0) > 1.0 else ''}{number(row['normalised_rms'])}</td>",
+        f"<td>{lag}</td>",
+        f"<td>{number(row[TIME])}</td>", f"<td>{number(1e-6 * row[TIME] / state.grid.dt, 2)}</td>",
+    ]
+    return f'<tr data-observer="{observer.id}"><th scope=row>{swatch(observer.id)}{label}</th>{"".join(cells)}</tr>'
+
+
+def length(um: float) -> str:
+    """A length of the wavefront, in nm until the page says otherwise."""
+    return f'<span data-um="{um!r}">{number(um * per_micrometre("nm", 1.0))}</span>'
+
+
+def swatch(name: str) -> str:
+    """A short line as drawn in the figures; its symbol is in the page once."""
+    return f'<svg class="swatch" width="26" height="8" aria-hidden="true"><use href="#line-{name}"/></svg>'

@@ -1,0 +1,303 @@
+// The script of a report: reads the data embedded in the page and keeps figures, cards and table in step with the controls.
+// What draws the cards, `render`, stands above it in the same script.
+
+const read = (id) => JSON.parse(document.getElementById(id).textContent)
+const data = read("data")
+const states = read("rows")
+const shown = {state: data.start, mode: data.modes[0], unit: "nm", show: "signal", spectrum: "psd", zoom: "whole"}
+const hidden = Object.fromEntries(Object.keys(data.names).map((target) => [target, []]))
+const night = matchMedia("screen and (prefers-color-scheme: dark)")
+let dark = night.matches
+
+const DECADES = 8  // that an axis of densities spans at most; one of amplitudes half of it
+const NONE = 65535
+
+// ------------------------------------------------------------------ numbers and lines
+
+// Three significant digits and no exponent where it is of common size, as in the tables.
+export function number(value, digits = 3) {
+  if (value === null || value === undefined) return "–"
+  if (value === 0) return "0"
+  const size = Math.abs(value)
+  const exponent = (text) => text.replace(/e([+-])(\d)$/, "e$10$2")
+  const text = size < 1e-4 || size >= 1e6 ? exponent(value.toExponential(digits - 1))
+    : value.toPrecision(digits).includes("e") ? value.toFixed(0) : value.toPrecision(digits)
+  return size < 1e-4 || size >= 1e6 ? text : text.replace("-", "−")
+}
+
+function bytes(index) {
+  return Uint8Array.from(atob(data.arrays[index]), (c) => c.charCodeAt(0)).buffer
+}
+
+const decoded = new Map()
+function once(key, make) {
+  if (!decoded.has(key)) decoded.set(key, make())
+  return decoded.get(key)
+}
+
+function axis(state, name) {
+  const index = state.axes[name]
+  return index === undefined ? new Float32Array(0) : once(index, () => new Float32Array(bytes(index)))
+}
+
+// The points of a line [um], or of a density [um^2/Hz]; nothing where there is no such line.
+function points(state, kind, target, name) {
+  const line = state.lines[`${kind}/${target}/${name}/${shown.mode}`]
+  if (!line) return null
+  const [index, low, step] = line
+  const logarithmic = kind.startsWith("psd") || kind.startsWith("cumulative")
+  return once(`${index} ${low} ${step}`, () => Float64Array.from(new Uint16Array(bytes(index)), (level) => {
+    const value = level === NONE ? NaN : low + step * level
+    return logarithmic ? 10 ** value : value
+  }))
+}
+
+// ------------------------------------------------------------------ figures
+
+const embedded = read("figures")
+
+async function embed() {
+  const id = "report"
+  await Bokeh.embed.embed_items({[id]: embedded.document},
+                                [{docid: id, roots: embedded.roots, root_ids: Object.keys(embedded.roots)}])
+  const document_ = Bokeh.documents[0]
+  return Object.fromEntries(document_.roots().map((figure) => [figure.name, figure]))
+}
+
+function lines(figure) {
+  return figure.renderers.filter((r) => r.name in data.looks)
+}
+
+function fill(figure, x, columns) {
+  lines(figure)[0].data_source.data = {x, ...columns}
+}
+
+function drawTrace(figure, target, state) {
+  const scale = state.scale[shown.unit]
+  const x = axis(state, "time")
+  const columns = {}
+  const seen = []
+  for (const name of data.names[target]) {
+    const y = points(state, shown.show, target, name)
+    columns[name] = y ? y.map((v) => v * scale) : new Float64Array(x.length).fill(NaN)
+    if (!hidden[target].includes(name)) seen.push(columns[name])
+  }
+  fill(figure, x, columns)
+  fitTrace(figure, x, seen, state.warm_up)
+  figure.left[0].axis_label = `${shown.show === "error" ? "error of " : ""}${shown.mode} [${data.units[shown.unit]}]`
+  const boxes = Object.fromEntries(figure.center.filter((r) => r.type === "BoxAnnotation").map((r) => [r.name, r]))
+  boxes["warm-up"].right = state.warm_up
+  const [start, end] = data.window ?? [0, 0]
+  boxes.window.setv({left: start, right: end})
+}
+
+// The axis holds every visible line; what a filter does while it settles does not count.
+function fitTrace(figure, x, seen, from) {
+  let low = Infinity, high = -Infinity
+  for (const y of seen) {
+    for (let i = 0; i < y.length; i++) {
+      if (x[i] >= from && y[i] < low) low = y[i]
+      if (x[i] >= from && y[i] > high) high = y[i]
+    }
+  }
+  if (low <= high) {
+    const room = 0.05 * (high - low) || 1
+    figure.y_range.setv({start: low - room, end: high + room, reset_start: low - room, reset_end: high + room})
+  }
+}
+
+function drawSpectrum(figure, target, state) {
+  const cumulative = shown.spectrum === "cumulative"
+  const scale = state.scale[shown.unit] ** (cumulative ? 1 : 2)
+  const x = axis(state, cumulative ? "frequency-cumulative" : "frequency")
+  const columns = {}
+  const seen = []
+  for (const name of data.names[target]) {
+    const error = shown.show === "error" && name !== "truth"
+    const y = points(state, shown.spectrum + (error ? "-error" : ""), target, name)
+    columns[name] = y ? y.map((v) => v * scale) : new Float64Array(x.length).fill(NaN)
+    if (!hidden[target].includes(name)) seen.push(columns[name].filter((v) => v > 0).sort())
+  }
+  fill(figure, x, columns)
+  const full = seen.filter((y) => y.length > 0)
+  if (full.length > 0) {
+    const low = Math.min(...full.map((y) => y[Math.floor(0.02 * y.length)]))
+    const high = Math.max(...full.map((y) => y[y.length - 1]))
+    const room = cumulative ? 1.5 : 3
+    const start = Math.max(low / room, high / 10 ** (cumulative ? DECADES / 2 : DECADES))
+    figure.y_range.setv({start, end: high * room, reset_start: start, reset_end: high * room})
+  }
+  const what = `${cumulative ? "cumulative rms" : "PSD"}${shown.show === "error" ? " of error" : ""}`
+  figure.left[0].axis_label = `${what}, ${shown.mode} [${data.units[shown.unit]}${cumulative ? "" : "²/Hz"}]`
+  for (const mark of figure.renderers.filter((r) => ["peaks", "model"].includes(r.name))) {
+    const marks = state[mark.name]
+    mark.data_source.data = {x: marks.map(([at]) => at), text: marks.map(([, text]) => text)}
+  }
+}
+
+function paint(figure) {
+  const text = dark ? "#e8e8e8" : "#1c1c1c"
+  const line = dark ? "#777777" : "#999999"
+  figure.setv({background_fill_alpha: 0, border_fill_alpha: 0, outline_line_color: line, outline_line_alpha: 0.5})
+  for (const it of [...figure.left, ...figure.below]) {
+    it.setv({
+      axis_label_text_color: text, major_label_text_color: text, axis_line_color: line, major_tick_line_color: line,
+      minor_tick_line_color: line, axis_label_text_font_style: "normal"})
+  }
+  for (const it of figure.center.filter((r) => r.type === "Grid")) it.setv({grid_line_color: line, grid_line_alpha: 0.25})
+  for (const it of lines(figure)) it.glyph.line_color = {value: data.looks[it.name][dark ? "dark" : "light"]}
+}
+
+function hide(figure, target) {
+  for (const it of lines(figure)) it.visible = !hidden[target].includes(it.name)
+}
+
+// ------------------------------------------------------------------ time window
+
+function zoom(figure, state) {
+  const range = figure.x_range
+  const whole = {start: 0, end: state.length}
+  const [start, end] = data.window ?? [state.length / 2 - 0.25, state.length / 2 + 0.25]
+  const middle = 0.5 * (start + end)
+  const now = {whole, 2: {start: middle - 1, end: middle + 1}, window: {start, end}}[shown.zoom]
+  range.setv({
+    start: Math.max(now.start, 0), end: Math.min(now.end, state.length), reset_start: whole.start, reset_end: whole.end})
+}
+
+// ------------------------------------------------------------------ cards and table
+
+function cards(target) {
+  const watchers = {items: [], hidden: []}
+  const model = {
+    items: [],
+    get hidden() { return hidden[target] },
+    set hidden(names) { hidden[target] = names; toggled(target); watchers.hidden.forEach((f) => f()) },
+    on(name, f) { watchers[name].push(f) },
+  }
+  render({model, el: document.getElementById(`cards-${target}`)})
+  return () => {
+    model.items = data.names[target].map((name) => card(target, name))
+    watchers.items.forEach((f) => f())
+  }
+}
+
+function card(target, name) {
+  const look = data.looks[name]
+  const rows = states[shown.state].rows.filter((r) => r.target === target && r.mode === shown.mode)
+  const row = name === "truth" ? rows[0] : rows.find((r) => r.observer === name)
+  const value = row && (name === "truth" ? row.truth_rms_um : row.rms_um)
+  const relative = row && row.normalised_rms !== null ? `${row.normalised_rms.toFixed(2)} × truth` : ""
+  return {
+    name, label: look.label, colour: look[dark ? "dark" : "light"], dash: look.dash,
+    value: row ? number(value * data.states[shown.state].scale[shown.unit]) : "–",
+    unit: row ? data.units[shown.unit] : "", note: row ? (name === "truth" ? "rms" : relative) : name === "truth" ? "" : "no result",
+  }
+}
+
+function drawTable() {
+  const copy = document.querySelector(`[data-state="${shown.state}"]`).cloneNode(true)
+  copy.removeAttribute("data-state")
+  for (const body of copy.querySelectorAll("tbody")) body.hidden = body.dataset.mode !== shown.mode
+  inUnit(copy, data.states[shown.state].scale[shown.unit])
+  document.getElementById("table").replaceChildren(copy)
+}
+
+function inUnit(table, scale) {
+  for (const it of table.querySelectorAll(".unit")) it.textContent = data.units[shown.unit]
+  for (const it of table.querySelectorAll("[data-um]")) it.textContent = number(Number(it.dataset.um) * scale)
+}
+
+// ------------------------------------------------------------------ all together
+
+let figures = {}
+const strips = {}
+
+function toggled(target) {
+  hide(figures[`trace-${target}`], target)
+  hide(figures[`spectrum-${target}`], target)
+  drawFigures(target)
+}
+
+function drawFigures(target) {
+  const state = data.states[shown.state]
+  drawTrace(figures[`trace-${target}`], target, state)
+  drawSpectrum(figures[`spectrum-${target}`], target, state)
+}
+
+function draw() {
+  for (const target of Object.keys(data.names)) {
+    drawFigures(target)
+    strips[target]()
+  }
+  drawTable()
+}
+
+function drawAxes() {
+  const [target] = Object.keys(data.names)
+  const state = data.states[shown.state]
+  zoom(figures[`trace-${target}`], state)
+  const f = axis(state, "frequency")
+  if (f.length > 0) {
+    const limits = {start: f[0], end: f[f.length - 1]}
+    figures[`spectrum-${target}`].x_range.setv({...limits, reset_start: limits.start, reset_end: limits.end})
+  }
+}
+
+function repaint() {
+  Object.values(figures).forEach(paint)
+  Object.values(strips).forEach((f) => f())
+}
+
+function sliders() {
+  const all = data.variations.map((_, i) => document.getElementById(`vary-${i}`))
+  const place = () => all.reduce((at, slider, i) => at * data.variations[i].length + Number(slider.value), 0)
+  const say = () => all.forEach((slider, i) => {
+    const text = data.variations[i][Number(slider.value)]
+    slider.setAttribute("aria-valuetext", text)
+    slider.nextElementSibling.textContent = text
+  })
+  let left = data.start
+  for (let i = all.length - 1; i >= 0; i--) {
+    all[i].value = left % data.variations[i].length
+    left = Math.floor(left / data.variations[i].length)
+  }
+  for (const slider of all) {
+    slider.oninput = () => {
+      const before = data.states[shown.state]
+      shown.state = place()
+      const after = data.states[shown.state]
+      say()
+      draw()
+      if (before.length !== after.length || before.dt !== after.dt) drawAxes()
+    }
+  }
+  say()
+}
+
+function switches() {
+  for (const input of document.querySelectorAll(".switch input")) {
+    input.onchange = () => {
+      shown[input.name] = input.value
+      if (input.name === "zoom") drawAxes()
+      else draw()
+    }
+  }
+}
+
+try {
+  for (const it of document.querySelectorAll("[data-state]")) it.parentElement.open = false  // the one shown stands above
+  figures = await embed()
+  for (const target of Object.keys(data.names)) strips[target] = cards(target)
+  sliders()
+  switches()
+  Object.values(figures).forEach(paint)
+  drawAxes()
+  draw()
+  const turn = (to) => { dark = to; repaint() }
+  night.onchange = () => turn(night.matches)
+  window.addEventListener("beforeprint", () => turn(false))
+  window.addEventListener("afterprint", () => turn(night.matches))
+} catch (error) {
+  document.documentElement.classList.remove("js")
+  console.error(error)
+}
