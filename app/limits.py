@@ -19,7 +19,7 @@ class Limits:
     training_size : m of either GPR
     depth         : d of either GPR
     items         : entries in a list of settings: peaks, bands, rows of a PSD table
-    seconds       : processor time of a run, as estimated from its settings [s]
+    seconds       : how long a run takes, as estimated from its settings [s]
     megabytes     : memory of a run, likewise [MB]
     sessions      : open pages
     """
@@ -50,7 +50,7 @@ class Limits:
         ):
             if len(items) > self.items:
                 raise SettingError(f"{path}: {len(items)} entries, at most {self.items:g} on this server")
-        _whole(run_seconds(scenario), self.seconds, "s of processor time")
+        _whole(run_seconds(scenario), self.seconds, "s")
         _whole(run_bytes(scenario) / 1e6, self.megabytes, "MB of memory")
 
 
@@ -58,7 +58,7 @@ NONE = Limits()
 """For those who serve themselves."""
 
 PUBLIC = Limits(
-    duration=120.0, steps=120_000, training_size=1024, depth=1000, items=100, seconds=30.0, megabytes=600.0, sessions=100)
+    duration=120.0, steps=120_000, training_size=1024, depth=1000, items=100, seconds=20.0, megabytes=600.0, sessions=100)
 """For a server that strangers reach."""
 
 

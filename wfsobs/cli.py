@@ -184,7 +184,7 @@ def bench(full: bool, as_json: bool) -> None:
 @click.option("--max-training-size", type=click.IntRange(2), metavar="M", help="Largest training set of a GPR.")
 @click.option("--max-depth", type=click.IntRange(1), metavar="D", help="Deepest windows of a GPR.")
 @click.option("--max-seconds", type=click.FloatRange(0, min_open=True), metavar="S",
-              help="Processor time of a run, as estimated.")
+              help="Longest run, as estimated.")
 @click.option("--max-memory", type=click.FloatRange(0, min_open=True), metavar="MB", help="Memory of a run, as estimated.")
 @click.option("--max-sessions", type=click.IntRange(1), metavar="N", help="Open pages.")
 @click.option("--runs", type=click.IntRange(1), metavar="N", help="Runs at once, as many as there are processors unless told.")

@@ -1,0 +1,163 @@
+"""What a visitor may ask for: refused in one line, beside the setting, before anything runs."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import fields
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.limits import NONE, PUBLIC, Limits
+from wfsobs.app.serve import Options, full_html, options, origins
+from wfsobs.app.service import Full, Service
+from wfsobs.app.share import from_query, to_file
+from wfsobs.app.store import Store
+from wfsobs.app.work import Shown
+from wfsobs.cost import run_bytes, run_seconds
+from wfsobs.presets import PRESETS, paper
+from wfsobs.scenario import Scenario
+from wfsobs.settings import SettingError
+
+
+def refused(limits: Limits, changes: dict[str, Any]) -> str:
+    """Why a change of the paper's settings is refused, or nothing."""
+    try:
+        limits.check(paper().replace(changes))
+    except SettingError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize(("changes", "line"), [
+    ({"run.duration": 121}, "run.duration = 121: at most 120 s on this server"),
+    ({"run.duration": 61, "sensors.lgs_rate": 2000},
+     "run.duration = 61: 122000 steps at sensors.lgs_rate = 2000 Hz; at most 120000 on this server"),
+    ({"gpr_offline.training_size": 1025}, "gpr_offline.training_size = 1025: at most 1024 on this server"),
+    ({"gpr_online.training_size": 2048}, "gpr_online.training_size = 2048: at most 1024 on this server"),
+    ({"gpr_online.depth": 1001}, "gpr_online.depth = 1001: at most 1000 on this server"),
+    ({"vibration.psd.tip": [0.0] * 101}, "vibration.psd.tip: 101 entries, at most 100 on this server"),
+])
+def test_one_line_says_what_and_how_much(changes: dict[str, Any], line: str) -> None:
+    assert refused(PUBLIC, changes) == line
+    assert refused(NONE, changes) == ""
+
+
+@pytest.mark.parametrize("preset", list(PRESETS))
+def test_the_presets_are_allowed(preset: str) -> None:
+    PUBLIC.check(PRESETS[preset]())
+
+
+@given(
+    st.floats(2.0, 3600.0), st.sampled_from([10.0, 500.0, 1000.0, 20_000.0, 100_000.0]), st.integers(2, 2048),
+    st.integers(1, 2000), st.integers(2, 2048),
+)
+def test_what_is_allowed_is_within_every_bound(duration: float, rate: float, m: int, depth: int, offline: int) -> None:
+    changes = {
+        "run.duration": duration, "sensors.lgs_rate": rate, "gpr_online.training_size": m, "gpr_online.depth": depth,
+        "gpr_offline.training_size": offline}
+    scenario = paper().replace(changes)
+    within = (
+        duration <= PUBLIC.duration and round(duration * rate) <= PUBLIC.steps
+        and max(m, offline) <= PUBLIC.training_size and depth <= PUBLIC.depth
+        and run_seconds(scenario) <= PUBLIC.seconds and run_bytes(scenario) <= 1e6 * PUBLIC.megabytes)
+    line = refused(PUBLIC, changes)
+    assert (line == "") == within and "\n" not in line
+
+
+def test_the_whole_run_is_bounded_where_each_setting_is_not() -> None:
+    assert refused(Limits(seconds=3), {"run.duration": 100}).startswith("The run would take about 4 s, at most 3 on this server")
+    assert refused(Limits(megabytes=50), {}).startswith("The run would take about 108 MB of memory, at most 50")
+
+
+# ---------------------------------------------------------------------- every way in
+
+@pytest.fixture
+def store(loop: Any, short: Scenario) -> Store:
+    store = Store(loop.queue.put, short, check=Limits(duration=30).check)
+    loop.closing.append(store)
+    return store
+
+
+def test_a_field_says_it_and_the_settings_stand(store: Store) -> None:
+    assert not store.change("run.duration", 31)
+    assert store.errors == {"run.duration": "run.duration = 31: at most 30 s on this server"}
+    assert store.scenario.run.duration == 2.0 and store.run.state == "idle"
+    with pytest.raises(SettingError, match="at most 30 s"):
+        store.load(paper().replace({"run.duration": 40}))
+
+
+def test_a_link_and_a_file_say_it(loop: Any, short: Scenario) -> None:
+    dashboard = Dashboard(loop.queue.put, short, check=Limits(duration=30).check)
+    loop.closing.append(dashboard)
+    actions = dashboard.actions
+    actions.open_link("?run.duration=31&turbulence.wind_speed=20")
+    assert actions.toolbar.notes == ["Not used from the link: run.duration = 31: at most 30 s on this server"]
+    assert dashboard.store.scenario.turbulence.wind_speed == 20.0, "the rest of the link is used"
+    before = dashboard.store.scenario
+    actions.open_file("mine.toml", to_file(paper().replace({"run.duration": 31}), "paper"))
+    assert actions.toolbar.notes == ["mine.toml: run.duration = 31: at most 30 s on this server"]
+    assert dashboard.store.scenario is before
+
+
+def test_links_are_limited_only_where_asked() -> None:
+    assert from_query("?run.duration=500").rejected == ()
+
+
+def test_a_service_refuses_what_has_passed_by_the_page(short: Scenario) -> None:
+    def never(*_: Any) -> Shown:
+        raise AssertionError
+
+    service = Service(Limits(duration=1.0), 1, 0, never)
+    try:
+        with pytest.raises(SettingError, match="at most 1 s"):
+            service.enter().compute(short, lambda: False, lambda *_: None)
+    finally:
+        assert service.close(20)
+
+
+# ---------------------------------------------------------------------- the server
+
+def test_no_more_sessions_than_may_be(caplog: Any) -> None:
+    caplog.set_level(logging.INFO, "wfsobs.serve")
+    service = Service(Limits(sessions=2), 1, 0)
+    try:
+        first, _ = service.enter(), service.enter()
+        assert service.full
+        with pytest.raises(Full, match="2 visitors"):
+            service.enter()
+        first.leave()
+        first.leave()
+        assert service.visits == 1, "one who leaves twice has left once"
+        service.enter()
+    finally:
+        assert service.close(20)
+    events = [record.getMessage().split()[0] for record in caplog.records]
+    assert events == ["session-start", "session-start", "refused", "session-end", "session-start"]
+    assert "&lt;b&gt;" in full_html("<b>")
+
+
+@pytest.mark.parametrize(("given", "limited"), [
+    ({}, False), ({"address": "127.0.0.1"}, False), ({"address": "::1"}, False), ({"address": "0.0.0.0"}, True),
+    ({"address": "ao.example.org"}, True), ({"origins": ("ao.example.org",)}, True),
+    ({"address": "0.0.0.0", "public": False}, False), ({"public": True}, True),
+])
+def test_limits_are_on_unless_only_this_machine_reaches_the_page(given: dict[str, Any], limited: bool) -> None:
+    assert options(**given).limits == (PUBLIC if limited else NONE)
+
+
+def test_every_limit_has_a_flag() -> None:
+    flags = {"max_duration": 1, "max_training_size": 2, "max_depth": 3, "max_seconds": 4, "max_memory": 5, "max_sessions": 6}
+    limits = options(**flags).limits
+    assert (limits.duration, limits.training_size, limits.depth, limits.seconds, limits.megabytes, limits.sessions) == (
+        1, 2, 3, 4, 5, 6)
+    assert {f.name for f in fields(Limits)} - {"steps", "items"} == {
+        "duration", "training_size", "depth", "seconds", "megabytes", "sessions"}
+
+
+def test_pages_come_from_where_the_server_is_reached() -> None:
+    assert origins(Options(port=5007)) == ["127.0.0.1:5007", "localhost:5007"]
+    assert origins(Options(address="10.0.0.5", origins=["ao.example.org"])) == ["10.0.0.5:5006", "ao.example.org"]
