@@ -11,6 +11,9 @@ covariance at all lags of the record, the first step like the last, and none of 
 
 Across the wind: the trapezoidal rule in u(k_y) = asinh(k_y / q) / h + k_y / delta, q^2 = k_x^2 + k_0^2. The first term
 follows the von Karman spectrum, analytic in u; the second keeps the spacing below delta, which resolves the aperture.
+
+Small waves that a Zernike mode averages away are what a Shack-Hartmann sensor's aliasing is made of. Where a sensor reaches
+for them they are there, with random numbers of their own.
 """
 
 from __future__ import annotations
@@ -111,12 +114,15 @@ def layer_signals(
 ) -> list[Array]:
     """What each beam sees of one layer, [(n_outputs, n_steps) um]."""
     grid = Grid.of(layer, outer_scale, diameter, n_steps, dt)
-    amplitudes = [np.empty((sensor.n_outputs, grid.f.size), complex) for sensor, _ in beams]
-    for part, wave in waves(grid, layer, outer_scale, diameter, rng):
+    amplitudes = [np.zeros((sensor.n_outputs, grid.f.size), complex) for sensor, _ in beams]
+    reaches = [sensor.reach / footprint.scale for sensor, footprint in beams]
+    for part, wave in waves(grid, layer, outer_scale, diameter, rng, max(reaches)):
         watch.check()
         exposure = np.sinc(grid.f[part] * dt)
-        for (sensor, footprint), amplitude in zip(beams, amplitudes, strict=True):
-            amplitude[:, part] = sensor.measure(wave, footprint) * exposure
+        least = wave.ky[wave.ky.size // 2]
+        for (sensor, footprint), reach, amplitude in zip(beams, reaches, amplitudes, strict=True):
+            if least <= max(reach, CORE / (0.5 * diameter)):
+                amplitude[:, part] += sensor.measure(wave, footprint) * exposure
     return [grid.signal(amplitude, n_steps) for amplitude in amplitudes]
 
 
@@ -195,36 +201,52 @@ def _sum_of_waves(f: Array, a: Array, n_steps: int, dt: float) -> Array:
 
 
 def waves(
-    grid: Grid, layer: Layer, outer_scale: float, diameter: float, rng: np.random.Generator
+    grid: Grid, layer: Layer, outer_scale: float, diameter: float, rng: np.random.Generator, reach: float = 0.0
 ) -> Iterator[tuple[slice, Wave]]:
-    """(columns of the grid, their waves), block by block."""
-    core, far = rng.spawn(2)
+    """(columns of the grid, their waves), block by block: those of the core, then what is beside, ahead and far of it.
+
+    reach : spatial frequency [rad/m] up to which waves are resolved finely at least
+    """
+    streams = dict(zip(("core", "far", "beside", "ahead"), rng.spawn(4), strict=True))
     kx = 2.0 * np.pi * grid.f / layer.speed
     k0 = 2.0 * np.pi / outer_scale
-    for part in blocks(kx, grid.n_low, FAR / (0.5 * diameter)):
-        first, last = kx[part][0], kx[part][-1]
-        is_far = first >= FAR / (0.5 * diameter)
-        q = np.hypot(k0, 0.0 if part.start == 0 else first)
-        ky, weight = across(q, *((4.0 * last, np.inf, 0.25) if is_far else core_rule(layer.height, diameter)))
-        shape = (ky.size, kx[part].size)
-        noise = (far if is_far else core).standard_normal((2, *shape))
+    core, front = CORE / (0.5 * diameter), FAR / (0.5 * diameter)
+
+    def made(part: slice, zone: str, ky: Array, weight: Array) -> tuple[slice, Wave]:
+        noise = streams[zone].standard_normal((2, ky.size, kx[part].size))
         density = spectrum(kx[part] ** 2 + ky[:, None] ** 2, layer.strength, outer_scale)
         cell = weight[:, None] * (grid.weight[part] * (2.0 * np.pi / layer.speed))
         # phi = Re sum over half the plane: E |A|^2 = 4 density cell, and standard_normal has twice the unit variance
-        yield part, Wave(kx[part], ky, layer.angle, np.sqrt(2.0 * density * cell) * (noise[0] + 1j * noise[1]))
+        return part, Wave(kx[part], ky, layer.angle, np.sqrt(2.0 * density * cell) * (noise[0] + 1j * noise[1]))
+
+    for part in blocks(kx, grid.n_low, (front, max(front, reach))):
+        first, last = kx[part][0], kx[part][-1]
+        q = np.hypot(k0, 0.0 if part.start == 0 else first)
+        delta, h = fine_rule(layer.height, diameter)
+        if first >= max(front, reach):
+            yield made(part, "far", *across(q, 4.0 * last, np.inf, 0.25))
+        elif first >= front:
+            yield made(part, "ahead", *across(q, max(core, reach), delta, h))
+        else:
+            inner = across(q, core, delta, h)
+            yield made(part, "core", *inner)
+            if reach > core:
+                n = inner[0].size // 2
+                wider = across(q, reach, delta, h)
+                yield made(part, "beside", *(np.concatenate([x[: x.size // 2 - n], x[x.size // 2 + n :]]) for x in wider))
 
 
-def core_rule(height: float, diameter: float) -> tuple[float, float, float]:
-    """(end, delta, h) of the rule across the wind where waves matter."""
-    return CORE / (0.5 * diameter), np.pi / (diameter + FIELD * height), 0.5
+def fine_rule(height: float, diameter: float) -> tuple[float, float]:
+    """(delta, h) of the rule across the wind where waves matter."""
+    return np.pi / (diameter + FIELD * height), 0.5
 
 
-def blocks(kx: Array, n_low: int, far: float) -> Iterator[slice]:
-    """The single nodes, then columns whose k_x at most doubles and does not cross `far`."""
+def blocks(kx: Array, n_low: int, borders: tuple[float, ...]) -> Iterator[slice]:
+    """The single nodes, then columns whose k_x at most doubles and does not cross a border."""
     yield slice(0, n_low)
     start = n_low
     while start < kx.size:
-        end = min(2.0 * kx[start], far) if kx[start] < far else 2.0 * kx[start]
+        end = min([2.0 * kx[start], *(border for border in borders if border > kx[start])])
         stop = min(max(int(np.searchsorted(kx[n_low:], end)) + n_low, start + 1), start + COLUMNS, kx.size)
         yield slice(start, stop)
         start = stop
