@@ -63,8 +63,10 @@ def test_observers_that_lack_something_are_left_out_with_a_line(tmp_path):
     assert "kf-ngs left out: the record has no y_ngs, ratio" in result.stderr
     assert "butterworth-ol left out: the record has no open_loop_y" in result.stderr
     assert "gpr-offline left out: the record has no training" in result.stderr
-    assert "no scores: the record has no truth" in result.stderr
-    assert json.loads(call("observe", str(tmp_path / "bare.npz"), *QUICK, "--json").stdout) == []
+    scored = json.loads(call("observe", str(tmp_path / "bare.npz"), *QUICK, "--json").stdout)
+    assert {(r["observer"], r["target"]) for r in scored} == {
+        ("kf-lgs", "next z"), ("zero", "next z"), ("loop", "residual y")}
+    assert "Recorded loop" in result.stdout and "error / z" in result.stdout
     with np.load(tmp_path / "e.npz") as file:
         assert "gpr-online/vibration" in file.files
         assert "kf-ngs/turbulence" not in file.files

@@ -10,8 +10,9 @@ import pytest
 
 from wfsobs import PRESETS, Record, Scenario, SettingError, observe, run, simulate
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import Estimate
+from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.pipeline import Failure, as_stated, each_estimate
+from wfsobs.scores import LOOP, PREDICTION, RESIDUAL, rms
 from wfsobs.watch import Cancelled, Watch
 
 
@@ -77,10 +78,22 @@ def test_what_a_record_lacks_is_one_line_per_observer(missing: dict[str, None], 
     assert {e.observer for e in result.estimates} == set(OBSERVERS) - set(left_out)
 
 
-def test_a_record_without_truth_has_estimates_and_no_scores() -> None:
+def test_a_record_without_truth_is_scored_by_prediction_and_residual() -> None:
+    """Only an observer of both targets says what the next measurement will be."""
     record = replace(simulate(scenario()), turbulence=None, vibration=None)
-    result = observe(record, scenario(), observers=["kf-lgs", "zero"])
-    assert len(result.estimates) == 4 and result.scores == ()
+    result = observe(record, scenario(), observers=["kf-lgs", "kf-ngs", "multirate-optimal", "zero"])
+    assert len(result.estimates) == 7
+    assert {(s.observer, s.target) for s in result.scores} == {
+        ("kf-lgs", PREDICTION), ("multirate-optimal", PREDICTION), ("zero", PREDICTION), (LOOP, RESIDUAL)}
+    z, start = record.z, round(scenario().run.warm_up / record.dt)
+    for mode, name in enumerate(("tip", "tilt")):
+        found = {s.observer: s for s in result.scores if s.mode == name}
+        values = [result.estimate("kf-lgs", target).values[:, mode] for target in TARGETS]
+        error = [z[k + 1, mode] - values[0][k] - values[1][k] for k in range(start, record.n_steps - 1)]
+        assert found["kf-lgs"].rms == pytest.approx(np.sqrt(np.mean(np.square(error))), rel=1e-12)
+        assert found["zero"].rms == found["zero"].truth_rms == pytest.approx(rms(z[start + 1 :, mode]), rel=1e-12)
+        assert found[LOOP].rms == pytest.approx(rms(record.y_lgs[start + 1 :, mode]), rel=1e-12)
+        assert found["kf-lgs"].normalised_rms == pytest.approx(found["kf-lgs"].rms / found["zero"].rms, rel=1e-12)
 
 
 def test_a_single_mode_record() -> None:

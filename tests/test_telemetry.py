@@ -71,9 +71,11 @@ WRONG = [
     (lambda a: a | {"dt": np.array(np.nan)}, "dt takes one number above 0, not nan"),
     (lambda a: a | {"dt": np.ones(2)}, "dt takes one number above 0"),
     (lambda a: a | {"ratio": np.array(2.5)}, "ratio takes a whole number, not 2.5"),
-    (lambda a: a | {"ratio": np.array(4)}, r"y_ngs lacks the frame at step 4; with ratio = 4 frames are at"),
+    (lambda a: a | {"ratio": np.array(4)}, r"y_ngs has a frame at step 5; with ratio = 4 frames are at"),
     (lambda a: changed(a, "y_ngs", 7, 0.0), "y_ngs has a frame at step 7; with ratio = 5"),
-    (lambda a: changed(a, "y_lgs", 3, np.nan), "y_lgs is nan at step 3, mode 0; it takes finite numbers"),
+    (lambda a: changed(a, "y_lgs", 3, -np.inf), "y_lgs is -inf at step 3, mode 0; it takes finite numbers"),
+    (lambda a: changed(a, "y_lgs", slice(None), np.nan), "y_lgs holds no measurement of one of its modes"),
+    (lambda a: a | {"training_y": changed(a, "u", 2, np.nan)["u"], "training_u": a["u"]}, "training_y is nan at step 2, mode 0"),
     (lambda a: changed(a, "u", 4, np.inf), "u is inf at step 4, mode 0"),
     (lambda a: a | {"training_y": a["u"]}, "training_y and training_u must come together"),
     (lambda a: a | {"training_y": a["u"], "training_u": a["u"][:-1]}, r"training_u has shape \(39, 2\); expected \(40, 2\)"),
@@ -99,7 +101,9 @@ def test_files_that_are_no_records(tmp_path):
     whole = tmp_path / "whole.npz"
     save_arrays(whole, {"y_lgs": np.random.default_rng(0).standard_normal((50, 2))})
     (tmp_path / "cut.npz").write_bytes(whole.read_bytes()[:150])
-    for name in ("text.npz", "single.npy", "cut.npz"):
+    with pytest.raises(RecordError, match=r"single.npy: its name ends in none of \.npz, \.csv"):
+        load_record(tmp_path / "single.npy")
+    for name in ("text.npz", "cut.npz"):
         with pytest.raises(RecordError, match=r"not an \.npz file"):
             load_record(tmp_path / name)
     content = bytearray(whole.read_bytes())

@@ -15,15 +15,18 @@ from threadpoolctl import threadpool_limits
 
 from wfsobs import __version__, configfile
 from wfsobs.files import check_writable, write_whole
+from wfsobs.formats.psd import load_psd
+from wfsobs.intake import Stated
 from wfsobs.loop import simulate
 from wfsobs.pipeline import Result
 from wfsobs.pipeline import observe as observe_record
 from wfsobs.pipeline import run as run_scenario
 from wfsobs.presets import PRESETS
-from wfsobs.record import RecordError
+from wfsobs.record import DELAY, RecordError
 from wfsobs.settings import SettingError
 from wfsobs.tables import TIME, Row, rows, score_table
 from wfsobs.telemetry import load_record, save_arrays, save_record
+from wfsobs.units import UNITS
 from wfsobs.variations import MOST, parse_variation, scenarios
 from wfsobs.watch import Watch
 
@@ -66,14 +69,20 @@ def main() -> None:
 @click.option("--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N",
               help="Repeat with seeds run.seed ... run.seed + N - 1.")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
-@click.option("--save", metavar="RECORD.npz", help="Also save the record of the (one) run.")
+@click.option("--save", metavar="RECORD", help="Also save the record of the (one) run: .npz, .csv, .fits or .aot.fits.")
+@click.option("--vibration-psd", metavar="FILE", help="Vibration with the spectrum of a CSV or FITS file (docs/data.md).")
+@click.option("--psd-unit", type=click.Choice(UNITS), help="Its unit, squared per Hz, where it states none.")
 def run(
-    preset: str | None, config: str | None, assignments: tuple[str, ...], seeds: int, as_json: bool, save: str | None
+    preset: str | None, config: str | None, assignments: tuple[str, ...], seeds: int, as_json: bool, save: str | None,
+    vibration_psd: str | None, psd_unit: str | None,
 ) -> None:
     """Simulate the loop, run every observer and print the RMS table."""
     if save and seeds > 1:
         raise SettingError("--save: saves one record; leave --seeds at 1")
     scenario = configfile.scenario_from(preset, config, assignments)
+    if vibration_psd is not None:
+        table = load_psd(vibration_psd, psd_unit, scenario.telescope.diameter)
+        scenario = scenario.replace({"vibration.source": "psd", "vibration.psd": table})
     all_rows: list[Row] = []
     with progress_bar() as update:
         for i in range(seeds):
@@ -88,24 +97,34 @@ def run(
 
 
 @main.command()
-@click.argument("record_file", metavar="RECORD.npz")
+@click.argument("record_file", metavar="RECORD")
 @scenario_options
+@click.option("--unit", type=click.Choice(UNITS), help="Unit of the record where it states none; um unless told.")
+@click.option("--command-sign", type=click.Choice(["+1", "-1"]),
+              help="+1 where a command adds to what the sensor sees (the default), -1 where it is taken off.")
+@click.option("--command-delay", type=click.IntRange(1, 100), metavar="N",
+              help=f"Steps from a command to the first measurement that sees it; {DELAY} unless told.")
+@click.option("--rate", type=click.FloatRange(0, min_open=True), metavar="HZ", help="Rate of the rows where they have no time.")
 @click.option("--out", metavar="ESTIMATES.npz", help="Save every estimate under the key observer/target.")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def observe(
-    record_file: str, preset: str | None, config: str | None, assignments: tuple[str, ...], out: str | None, as_json: bool
+    record_file: str, preset: str | None, config: str | None, assignments: tuple[str, ...], unit: str | None,
+    command_sign: str | None, command_delay: int | None, rate: float | None, out: str | None, as_json: bool,
 ) -> None:
-    """Run the observers on a saved record (preset paper unless told)."""
+    """Run the observers on a record: .npz, .csv, .fits or AOT (preset paper unless told)."""
     scenario = configfile.scenario_from(preset, config, assignments)
-    record = load_record(record_file, scenario)
+    stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
+    record = load_record(record_file, scenario, stated)
+    if record.missing:
+        click.echo(f"wfsobs: {record_file}: {record.missing} of {record.n_steps} frames are missing; they are bridged by "
+                   "prediction and count in no score of one", err=True)
     with progress_bar() as update:
         result = observe_record(record, scenario, Watch(progress=update))
     _warn(result)
     if out:
         save_arrays(out, {f"{e.observer}/{e.target}": e.values for e in result.estimates})
     if not result.scores and not as_json:
-        why = "no truth" if record.turbulence is None and record.vibration is None else "nothing after the warm-up"
-        click.echo(f"wfsobs: {record_file}: {len(result.estimates)} estimates, no scores: the record has {why}", err=True)
+        click.echo(f"wfsobs: {record_file}: {len(result.estimates)} estimates, no scores: nothing after the warm-up", err=True)
         return
     show(rows(result.scores, None), as_json)
 

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from time import perf_counter
 
 from wfsobs.arrays import Array
+from wfsobs.gaps import bridged
 from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Observer
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.scores import Score, score
+from wfsobs.scores import Score, score, unsupervised_scores
 from wfsobs.settings import SettingError
 from wfsobs.watch import QUIET, Watch
 
@@ -80,6 +81,8 @@ def collect(
     for estimate in ordered:
         watch.check()
         scores += score(record, estimate, scenario.run.warm_up, names)
+    if record.turbulence is None and record.vibration is None:
+        scores = unsupervised_scores(record, ordered, scenario.run.warm_up, names)
     return Result(scenario, record, tuple(ordered), tuple(scores), tuple(sorted(failures, key=lambda f: order[f.observer])))
 
 
@@ -91,6 +94,7 @@ def each_estimate(
 
     on_partial : told (observer, target, values so far) by observers that deliver in blocks.
     """
+    record = bridged(record, scenario)
     unknown = set(observers or ()) - set(OBSERVERS)
     if unknown:
         raise SettingError(f"observer {sorted(unknown)[0]!r}: no such observer; there are {', '.join(OBSERVERS)}")

@@ -8,6 +8,9 @@ import numpy as np
 
 from wfsobs.arrays import Array
 
+DELAY = 2
+"""The paper's delay: a command is computed once y_lgs[k] is known, acts during step k + 1, and is seen at k + 2."""
+
 
 class RecordError(ValueError):
     """A record that cannot be used: one line naming what, where and what is expected."""
@@ -37,6 +40,10 @@ class Record:
     turbulence, vibration : (n_steps, n_modes) truth [um], or None. For scores alone: no observer reads them.
     open_loop_y : (n_steps, n_modes) what the LGS would have measured with the mirror at rest [um], or None
     training    : what the offline GPR learns from, or None
+    delay       : steps from a command to the first measurement that sees it, y_lgs[k] = phi_dist[k-1] + u[k-delay] + noise
+    origin      : what a file said of unit, sign and timing before it was brought into this form, one line
+
+    NaN in y_lgs, u and the rest is a sample that is missing; what observers are given in its place is `wfsobs.gaps.bridged`.
     """
 
     y_lgs: Array
@@ -48,6 +55,8 @@ class Record:
     vibration: Array | None = None
     open_loop_y: Array | None = None
     training: Training | None = None
+    delay: int = DELAY
+    origin: str = ""
 
     @property
     def n_steps(self) -> int:
@@ -60,17 +69,22 @@ class Record:
         return self.y_lgs.shape[1]
 
     @property
+    def missing(self) -> int:
+        """Steps in which a mode has no LGS measurement."""
+        return int(np.isnan(self.y_lgs).any(axis=1).sum())
+
+    @property
     def z(self) -> Array:
-        """Pseudo-open-loop LGS measurement, z[k] = y_lgs[k] - u[k-2] = phi_dist[k-1] + noise [um]."""
-        return pseudo_open_loop(self.y_lgs, self.u)
+        """Pseudo-open-loop LGS measurement, z[k] = y_lgs[k] - u[k-delay] = phi_dist[k-1] + noise [um]; NaN where either is."""
+        return pseudo_open_loop(self.y_lgs, self.u, self.delay)
 
     @property
     def z_ngs(self) -> Array:
-        """Pseudo-open-loop NGS measurement [um], NaN without a frame: the mean of u[k-2] ... u[k-n-1],
+        """Pseudo-open-loop NGS measurement [um], NaN without a frame: the mean of u[k-2] ... u[k-n-1] (delay 2),
         which is what the mirror did during the frame, is taken off. Raises RecordError without NGS."""
         if self.y_ngs is None or self.ratio is None:
             raise RecordError("the record has no NGS measurement")
-        return self.y_ngs - frame_mean(delayed(self.u, 1), self.ratio)
+        return self.y_ngs - frame_mean(delayed(self.u, self.delay - 1), self.ratio)
 
     def truth(self, target: str) -> Array | None:
         """The true signal of `target` ("turbulence" or "vibration"), or None."""
@@ -84,9 +98,9 @@ def delayed(x: Array, steps: int) -> Array:
     return out
 
 
-def pseudo_open_loop(y: Array, u: Array) -> Array:
-    """z[k] = y[k] - u[k-2], the measurement with the mirror's part taken off (paper, eq. 3 to 5)."""
-    return y - delayed(u, 2)
+def pseudo_open_loop(y: Array, u: Array, delay: int = DELAY) -> Array:
+    """z[k] = y[k] - u[k-delay], the measurement with the mirror's part taken off (paper, eq. 3 to 5)."""
+    return y - delayed(u, delay)
 
 
 def frame_mean(x: Array, n: int) -> Array:

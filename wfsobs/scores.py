@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import welch
 
 from wfsobs.arrays import Array
-from wfsobs.observers.base import Estimate
+from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.record import Record
+
+PREDICTION, RESIDUAL = "next z", "residual y"
+"""What takes the place of a target where there is no truth: the next measurement, and what the loop left of it."""
+
+LOOP = "loop"
+"""In the place of an observer: the loop that made the record."""
 
 MAX_LAG = 0.025
 """Lags beyond this [s] are not looked for."""
@@ -51,10 +58,40 @@ def score(record: Record, estimate: Estimate, warm_up: float, mode_names: list[s
     return out
 
 
+def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:
+    """What can be said without truth, in the place of `score`; truth_rms is the rms of z throughout.
+
+    - PREDICTION: rms of z[k+1] - phi_hat[k], one step ahead, since z[k+1] = phi_dist[k] + noise and phi_hat[k] knows y up to
+      k. The noise of the measurement stays in. Only an observer that estimates both turbulence and vibration says what
+      z will be; the others cannot be scored so. Samples that were missing do not count.
+    - RESIDUAL: rms of y_lgs, what the recorded loop left.
+    """
+    start = round(warm_up / record.dt)
+    z, out = record.z, []
+    whole: dict[str, list[Estimate]] = {}
+    for estimate in estimates:
+        whole.setdefault(estimate.observer, []).append(estimate)
+    for mode, name in enumerate(mode_names):
+        measured = z[start + 1 :, mode]
+        scale = rms(measured[~np.isnan(measured)])
+        if not scale > 0:
+            continue
+        for observer, parts in whole.items():
+            error = measured - sum(e.values[start:-1, mode] for e in parts)
+            known = error[~np.isnan(error)]
+            if {e.target for e in parts} == set(TARGETS) and known.size:
+                seconds = max(e.seconds_per_step for e in parts)
+                out.append(Score(observer, PREDICTION, name, rms(known), scale, rms(known) / scale, None, seconds))
+        left = record.y_lgs[start + 1 :, mode]
+        left = rms(left[~np.isnan(left)])
+        out.append(Score(LOOP, RESIDUAL, name, left, scale, left / scale, None, 0.0))
+    return out
+
+
 def scored_samples(record: Record, truth: Array, value: Array, warm_up: float) -> tuple[Array, Array]:
     """(truth, estimate) without the warm-up [s] and without the steps where the estimate is NaN."""
     start = round(warm_up / record.dt)
-    known = ~np.isnan(value[start:])
+    known = ~np.isnan(value[start:]) & ~np.isnan(truth[start:])
     return truth[start:][known], value[start:][known]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from wfsobs.observers import OBSERVERS
-from wfsobs.scores import Score
+from wfsobs.scores import LOOP, RESIDUAL, Score
 
 Row = dict[str, Any]
 
@@ -29,12 +29,15 @@ def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
 
 
 def score_table(rows: Sequence[Row]) -> Table:
-    """The RMS table; over several seeds the medians, with the spread (smallest to largest) of the error."""
+    """The RMS table, of errors or, without truth, of predictions; over several seeds the medians, with the spread (smallest
+    to largest) of the error."""
     several = len({r["seed"] for r in rows}) > 1
-    table = Table(title="RMS error after warm-up" + (", median over seeds" if several else ""))
+    unknown = any(r["target"] == RESIDUAL for r in rows)
+    title, base = ("One-step prediction error of z, and residual,", "z") if unknown else ("RMS error", "truth")
+    table = Table(title=f"{title} after warm-up" + (", median over seeds" if several else ""))
     for name in ("Target", "Mode", "Observer"):
         table.add_column(name, no_wrap=True)
-    for name in ("error, nm", *(("spread, nm",) if several else ()), "truth, nm", "error / truth", "lag, ms", "us / step"):
+    for name in ("error, nm", *(("spread, nm",) if several else ()), f"{base}, nm", f"error / {base}", "lag, ms", "us / step"):
         table.add_column(name, justify="right", no_wrap=True)
     last = None
     for target, mode, observer in sorted({(r["target"], r["mode"], r["observer"]) for r in rows}, key=_order(rows)):
@@ -43,14 +46,19 @@ def score_table(rows: Sequence[Row]) -> Table:
         if last not in (None, (target, mode)):
             table.add_section()
         last = (target, mode)
-        look_ahead = "" if OBSERVERS[observer].causal else " (looks ahead)"
         table.add_row(
-            target, mode, OBSERVERS[observer].label + look_ahead, f"{median(errors):.2f}",
+            target, mode, _label(observer), f"{median(errors):.2f}",
             *((f"{min(errors):.2f} - {max(errors):.2f}",) if several else ()),
             f"{median(r['truth_rms_um'] for r in same) * 1e3:.2f}", _number(same, "normalised_rms", 1.0, 3),
             _number(same, "lag_s", 1e3, 2), _number(same, TIME, 1.0, 2),
         )
     return table
+
+
+def _label(observer: str) -> str:
+    if observer == LOOP:
+        return "Recorded loop"
+    return OBSERVERS[observer].label + ("" if OBSERVERS[observer].causal else " (looks ahead)")
 
 
 def _number(same: Sequence[Row], key: str, scale: float, digits: int) -> str:

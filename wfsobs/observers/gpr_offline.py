@@ -29,7 +29,7 @@ from wfsobs.observers.kernels import (
 )
 from wfsobs.observers.modes import over_modes
 from wfsobs.observers.reference import open_loop_reference
-from wfsobs.record import Record, RecordError, Training, pseudo_open_loop
+from wfsobs.record import DELAY, Record, RecordError, Training, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.watch import QUIET, Watch
 
@@ -90,10 +90,11 @@ def train(
     return TrainedGpr(signals[: first + m] / kernel.length_scale, depth, points, a - b * constant, float(constant), kernel)
 
 
-def training_targets(training: Training, scenario: Scenario, dt: float) -> Array:
+def training_targets(training: Training, scenario: Scenario, dt: float, delay: int = DELAY) -> Array:
     """The vibration reference of the training record, (n, n_modes) [um]; NaN at the last step."""
     twin = training.open_loop_y
-    return open_loop_reference(scenario, pseudo_open_loop(training.y_lgs, training.u) if twin is None else twin, dt)
+    return open_loop_reference(
+        scenario, pseudo_open_loop(training.y_lgs, training.u, delay) if twin is None else twin, dt)
 
 
 def gpr_offline(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
@@ -102,8 +103,8 @@ def gpr_offline(record: Record, scenario: Scenario, watch: Watch) -> dict[str, A
     assert training is not None
     if record.n_steps < g.depth:
         raise RecordError(f"the record has {record.n_steps} steps; depth needs {g.depth}")
-    targets = training_targets(training, scenario, record.dt)
-    training_z = pseudo_open_loop(training.y_lgs, training.u)
+    targets = training_targets(training, scenario, record.dt, record.delay)
+    training_z = pseudo_open_loop(training.y_lgs, training.u, record.delay)
 
     def one(mode: int, watch: Watch) -> Array:
         signals = window_signals(g, training.y_lgs, training.u, training_z, mode)

@@ -1,0 +1,37 @@
+"""Units of a wavefront at the boundary; inside, coefficients are Noll-normalised micrometres rms.
+
+A tip or tilt of a [m] rms over an aperture D tilts the wavefront by 4 a / D [rad].
+
+>>> round(0.1 / micrometres_per("mas", 8.0), 4)  # 100 nm on 8 m, in mas
+10.3132
+"""
+
+from __future__ import annotations
+
+import math
+
+LENGTHS = {"um": 1.0, "nm": 1e-3, "m": 1e6}
+"""Micrometres in one."""
+
+ANGLES = {"rad": 1.0, "arcsec": math.radians(1.0 / 3600.0), "mas": math.radians(1.0 / 3.6e6)}
+"""Radians in one."""
+
+UNITS = ("um", "nm", "mas", "arcsec", "rad")
+"""What a user can say that a file is in."""
+
+_OTHERWISE = {"µm": "um", "micron": "um", "microns": "um", "\u03bcm": "um", "meter": "m", "arcseconds": "arcsec", "radian": "rad"}
+
+
+def micrometres_per(unit: str, diameter: float) -> float:
+    """Micrometres rms of tip or tilt in one of `unit`, on an aperture of `diameter` [m]."""
+    return LENGTHS[unit] if unit in LENGTHS else ANGLES[unit] * 1e6 * diameter / 4.0
+
+
+def unit_named(text: str) -> str | None:
+    """The unit that a file's text stands for, or None where it is none of these.
+
+    >>> unit_named("micron"), unit_named("mas"), unit_named("V")
+    ('um', 'mas', None)
+    """
+    name = _OTHERWISE.get(text.strip(), text.strip())
+    return name if name in LENGTHS or name in ANGLES else None
