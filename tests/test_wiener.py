@@ -1,0 +1,142 @@
+"""The Wiener bound against closed forms, Riccati covariances and long FIR filters."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import solve_toeplitz
+
+from wfsobs.ar2 import Ar2, turbulence_corner
+from wfsobs.arrays import Array
+from wfsobs.bound import TrueSpectra, bound, line_width, n_frequencies, true_spectra, turned
+from wfsobs.disturbance import vibration_variance
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.kalman import kalman_model, measurement_noise
+from wfsobs.presets import PRESETS
+from wfsobs.riccati import steady_state
+from wfsobs.scenario import Scenario
+from wfsobs.wiener import advanced, causal_error, circle_mean, factorise
+
+# The loop of one 530 nm turbulence, one 50 nm line at 47.5 Hz, 20 nm of noise.
+MATCHED = Scenario().replace({
+    "turbulence.rms": 0.53, "vibration.source": "ar2", "kalman.frequency": 47.5,
+    "vibration.peaks": [{"frequency": 47.5, "damping": 0.03, "rms": [0.05, 0.05]}],
+    "sensors.lgs_count": 1, "sensors.lgs_noise": 0.02, "sensors.lgs_low_frequency_rms": 0.0,
+})
+
+
+def riccati_errors(scenario: Scenario) -> tuple[dict[str, float], dict[str, float]]:
+    """Target -> rms error of phi[k] and of phi[k + 1] given z[k], from the Riccati covariance of the true model."""
+    model = kalman_model(scenario, 0, scenario.dt)
+    steady = steady_state(model.A, model.C, model.Q, np.array(measurement_noise(scenario)[0] ** 2))
+    rows = model.outputs | {"total": sum(model.outputs.values())}
+    filtered = {name: float(np.sqrt(row @ steady.filtered @ row)) for name, row in rows.items()}
+    return filtered, {name: float(np.sqrt(row @ steady.P @ row)) for name, row in rows.items()}
+
+
+def test_an_ar1_signal_in_white_noise_has_the_textbook_error() -> None:
+    # s[k] = a s[k-1] + v: predicted variance P solves P = a^2 P R / (P + R) + q.
+    a, q, R, n = 0.9, 0.5, 2.0, 4096
+    w = 2 * np.pi * np.arange(n // 2 + 1) / n
+    spectrum = q / np.abs(1 - a * np.exp(-1j * w)) ** 2
+    b = q + (a**2 - 1) * R
+    P = 0.5 * (b + np.sqrt(b**2 + 4 * q * R))
+    whitener = factorise(spectrum + R)
+    assert whitener.innovation_variance == pytest.approx(P + R, rel=1e-12)  # 0.9^4096 is nothing: rounding alone
+    assert causal_error(spectrum, advanced(spectrum, 1), whitener) == pytest.approx(P, rel=1e-12)
+    assert causal_error(spectrum, advanced(spectrum, 0), whitener) == pytest.approx(P * R / (P + R), rel=1e-12)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_factor_is_causal_and_gives_the_spectrum(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 512
+    zeros = 0.8 * rng.random(3) * np.exp(2j * np.pi * rng.random(3))
+    taps = np.real(np.poly(np.concatenate([zeros, zeros.conj()])))
+    spectrum = np.abs(np.fft.rfft(taps, n)) ** 2 * (1.0 + rng.random())
+    whitener = factorise(spectrum)
+    assert np.abs(whitener.H) ** 2 * whitener.innovation_variance == pytest.approx(spectrum, rel=1e-10)
+    # Zeros within 0.8 of the circle's radius: the minimum-phase factor is the polynomial itself, 0.8^(n/2) off by wrapping.
+    assert np.fft.irfft(whitener.H, n)[: taps.size] == pytest.approx(taps, abs=1e-10)
+
+
+def test_a_spectrum_without_noise_is_refused() -> None:
+    with pytest.raises(ValueError, match="above 0"):
+        factorise(np.array([1.0, 0.0, 1.0]))
+
+
+def test_the_bound_of_the_two_frame_loop() -> None:
+    # 21.63 nm by theory for the residual, phi[k + 1] given z[k]; two decimals are given.
+    assert bound(MATCHED, 0, ahead=1)["total"] == pytest.approx(21.63e-3, abs=0.005e-3)
+
+
+@settings(max_examples=25)
+@given(
+    wind=st.floats(2.0, 60.0), rms=st.floats(0.05, 2.0), frequency=st.floats(5.0, 80.0), damping=st.floats(0.005, 0.5),
+    vibration=st.floats(0.002, 0.2), noise=st.floats(0.002, 0.2), duration=st.floats(1.0, 3.0),
+)
+def test_where_the_truth_is_ar2_it_is_the_riccati_covariance(
+    wind: float, rms: float, frequency: float, damping: float, vibration: float, noise: float, duration: float
+) -> None:
+    scenario = MATCHED.replace({
+        "turbulence.wind_speed": wind, "turbulence.rms": rms, "vibration.peaks.0.frequency": frequency,
+        "kalman.frequency": frequency, "vibration.peaks.0.rms": [vibration], "sensors.lgs_noise": noise, "run.duration": duration,
+    })
+    floor = line_width(scenario) / (2 * frequency)  # a bound takes no line for narrower
+    scenario = scenario.replace({"vibration.peaks.0.damping": max(damping, floor), "kalman.damping": max(damping, floor)})
+    filtered, predicted = riccati_errors(scenario)
+    # At half the DFT a line of the least width still has exp(-2.5) of its correlation, which comes round.
+    assert bound(scenario, 0) == pytest.approx(filtered, rel=1e-4)
+    assert bound(scenario, 0, ahead=1) == pytest.approx(predicted, rel=1e-4)
+
+
+def autocovariance(spectrum: Array) -> Array:
+    return np.fft.irfft(spectrum, 2 * (spectrum.size - 1))
+
+
+def fir_error(spectra: TrueSpectra, taps: int, ahead: int) -> float:
+    """rms error of the best FIR filter of z[k] ... z[k - taps + 1] for phi[k + ahead], from the normal equations."""
+    signal, shared = spectra.total
+    r, c, s = autocovariance(spectra.measured), autocovariance(shared), autocovariance(signal)
+    wanted = c[1 + ahead : 1 + ahead + taps]
+    return float(np.sqrt(s[0] - wanted @ solve_toeplitz(r[:taps], wanted)))
+
+
+def test_thirty_taps_of_the_two_frame_loop() -> None:
+    assert fir_error(true_spectra(MATCHED, 0), 30, 1) == pytest.approx(21.92e-3, abs=0.005e-3)
+
+
+@pytest.mark.parametrize(("name", "mode"), [("paper", 0), ("paper", 1), ("ut4", 0)])
+def test_where_it_is_not_ar2_long_fir_filters_come_near_from_above(name: str, mode: int) -> None:
+    scenario = PRESETS[name]().replace({"turbulence.source": "ar2", "run.duration": 2.0})
+    spectra, least = true_spectra(scenario, mode), bound(scenario, mode, ahead=1)["total"]
+    errors = [fir_error(spectra, taps, 1) for taps in (30, 300, 3000)]
+    assert errors[0] > errors[1] > errors[2] > least * (1 - 1e-6)
+    assert errors[2] == pytest.approx(least, rel=0.02)  # 3 s of taps, lines 1/32 Hz wide: their memory is 10 s
+
+
+@pytest.mark.parametrize("name", ["paper", "ut4"])
+def test_the_spectra_have_the_variances_of_the_scenario(name: str) -> None:
+    scenario = PRESETS[name]().replace({"turbulence.source": "ar2"})
+    for mode in range(2):
+        spectra = true_spectra(scenario, mode)
+        assert spectra.measured.size == n_frequencies(scenario) // 2 + 1
+        # The record's own bins and the finer ones here cut a spectrum at the cut-off a little differently.
+        assert circle_mean(spectra.signal["vibration"]) == pytest.approx(vibration_variance(scenario, mode), rel=1e-3)
+        assert circle_mean(spectra.signal["turbulence"]) == pytest.approx(scenario.turbulence.rms**2, rel=1e-6)
+    assert line_width(scenario) == pytest.approx(1 / 160)
+
+
+def test_what_the_lgs_cannot_see_cannot_be_estimated() -> None:
+    blind = PRESETS["paper"]().replace({"turbulence.source": "ar2", "sensors.tip_tilt_indetermination": True})
+    assert bound(blind, 0)["turbulence"] == pytest.approx(blind.turbulence.rms, rel=1e-6)
+    assert set(bound(blind, 0)) == {*TARGETS, "total"}
+
+
+def test_slow_turbulence_is_resolved_at_any_wind() -> None:
+    process = Ar2(turbulence_corner(0.5, 8.0, 1), 0.9, 0.5, 1e-3)
+    spectrum = process.psd(np.fft.rfftfreq(2**17, 1e-3)) / 2e-3
+    assert circle_mean(spectrum) == pytest.approx(0.25, rel=1e-6)
+    assert turned(spectrum, 0) == pytest.approx(spectrum)

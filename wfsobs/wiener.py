@@ -1,0 +1,73 @@
+"""The least error of any causal linear observer: Wiener filter by spectral factorisation.
+
+A target s[k] is estimated from all measurements z[k], z[k-1], ... of a stationary process. With the spectrum of z factorised
+as S_z = sigma^2 |H|^2, H and 1/H causal, the innovations e = z / H are white, and the best estimate keeps of the
+cross spectrum S_sz = E s z* what is causal after whitening,
+
+    G = S_sz / H*,    error = E s^2 - sum_{n >= 0} g[n]^2 / sigma^2
+                            = mean(S_s - |S_sz|^2 / S_z) + sum_{n < 0} g[n]^2 / sigma^2.
+
+The second form, the error of the two-sided filter plus what causality costs, is a sum of positive terms, so that a small
+error keeps its digits. H is the exponential of the causal half of the cepstrum, the inverse DFT of log S_z (Kolmogorov; Oppenheim
+and Schafer, Discrete-Time Signal Processing, section 13.6). No filter of Gaussian signals does better, linear or not.
+
+Spectra are two-sided and per sample, on the frequencies 0 ... 1/2 of a DFT of even length n, shape (n // 2 + 1,): their
+mean over the whole circle is the variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wfsobs.arrays import Array
+
+Complex = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class Whitener:
+    """H (n // 2 + 1,) complex of the measurement's spectrum S_z (n // 2 + 1,), and the variance of the innovations."""
+
+    spectrum: Array
+    H: Complex
+    innovation_variance: float
+
+    @property
+    def n(self) -> int:
+        """Length of the DFT."""
+        return 2 * (self.spectrum.size - 1)
+
+
+def factorise(spectrum: Array) -> Whitener:
+    """The minimum-phase factor of a spectrum. Raises ValueError unless it is positive throughout."""
+    if not (np.isfinite(spectrum).all() and (spectrum > 0).all()):
+        raise ValueError("the measurement's spectrum must be above 0 at every frequency: it needs some noise")
+    n = 2 * (spectrum.size - 1)
+    cepstrum = np.fft.irfft(np.log(spectrum), n)
+    causal = np.zeros(n)
+    causal[1 : n // 2] = cepstrum[1 : n // 2]
+    causal[n // 2] = 0.5 * cepstrum[n // 2]
+    return Whitener(spectrum, np.exp(np.fft.rfft(causal)), float(np.exp(cepstrum[0])))
+
+
+def causal_error(target: Array, cross: Complex, whitener: Whitener) -> float:
+    """Variance of the least error of s[k] from z[k], z[k-1], ...
+
+    target : S_s; cross : S_sz, the transform over n of E s[k] z[k-n]; both (n // 2 + 1,)
+    """
+    g = np.fft.irfft(cross / whitener.H.conj(), whitener.n)
+    anticausal = float(np.sum(g[whitener.n // 2 :] ** 2)) / whitener.innovation_variance
+    return circle_mean(np.maximum(target - np.abs(cross) ** 2 / whitener.spectrum, 0.0)) + anticausal
+
+
+def circle_mean(spectrum: Array) -> float:
+    """Mean over the whole circle of a spectrum given on its upper half: the variance."""
+    return float((2.0 * spectrum.sum() - spectrum[0] - spectrum[-1]) / (2 * (spectrum.size - 1)))
+
+
+def advanced(spectrum: Array, steps: int) -> Complex:
+    """S_sz of z[k] = s[k - steps] + anything independent: the spectrum, turned `steps` ahead."""
+    return spectrum * np.exp(2j * np.pi * steps * np.arange(spectrum.size) / (2 * (spectrum.size - 1)))
