@@ -70,6 +70,7 @@ def test_a_spectrum_without_noise_is_refused() -> None:
 def test_the_bound_of_the_two_frame_loop() -> None:
     # 21.63 nm by theory for the residual, phi[k + 1] given z[k]; two decimals are given.
     assert bound(MATCHED, 0, ahead=1)["total"] == pytest.approx(21.63e-3, abs=0.005e-3)
+    assert bound(MATCHED, 0, ahead=1) == pytest.approx(riccati_errors(MATCHED)[1], rel=1e-9)
 
 
 @settings(max_examples=25)
@@ -88,8 +89,8 @@ def test_where_the_truth_is_ar2_it_is_the_riccati_covariance(
     scenario = scenario.replace({"vibration.peaks.0.damping": max(damping, floor), "kalman.damping": max(damping, floor)})
     filtered, predicted = riccati_errors(scenario)
     # At half the DFT a line of the least width still has exp(-2.5) of its correlation, which comes round.
-    assert bound(scenario, 0) == pytest.approx(filtered, rel=1e-4)
-    assert bound(scenario, 0, ahead=1) == pytest.approx(predicted, rel=1e-4)
+    assert bound(scenario, 0) == pytest.approx(filtered, rel=1e-3)
+    assert bound(scenario, 0, ahead=1) == pytest.approx(predicted, rel=1e-3)
 
 
 def autocovariance(spectrum: Array) -> Array:
