@@ -1,8 +1,9 @@
-"""The row of actions: share the settings, save data and figures, open a scenario; undo and redo by keys."""
+"""The row of actions: share the settings, save data and figures, make a report, open a scenario; undo and redo by keys."""
 
 from __future__ import annotations
 
 import base64
+import logging
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -11,14 +12,19 @@ import param
 from panel.custom import JSComponent
 
 from wfsobs.app.downloads import TooLarge, data_csv, data_npz
+from wfsobs.app.report.maker import FAILED, Maker, ReportError
 from wfsobs.app.share import FILE, from_file, from_query, to_command, to_file, to_python, to_query
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset
 from wfsobs.app.work import Shown
 from wfsobs.settings import SettingError
 
+log = logging.getLogger(__name__)
+
 LARGEST = 2_000_000
 """Of a scenario file that is opened [bytes]."""
+
+REPORT = "wfsobs-report.html"
 
 
 class Toolbar(JSComponent):
@@ -29,6 +35,7 @@ class Toolbar(JSComponent):
     command = param.String("", doc="The settings as a command line.")
     python = param.String("", doc="The settings as Python.")
     ready = param.Boolean(False, doc="Whether there are results to save.")
+    reporting = param.Boolean(False, doc="Whether a report is being made.")
     said = param.String("", doc="What was done, in one line.")
     notes = param.List([], doc="What was refused, a line each.")
     largest = param.Integer(LARGEST, doc="The largest scenario file that is read [bytes].")
@@ -56,6 +63,7 @@ class Actions:
         self.store = store
         self.toolbar = Toolbar(sizing_mode="stretch_width", margin=0)
         self.toolbar.on_action = self.handle
+        self.maker = Maker()
         store.param.watch(self._refresh, ["scenario", "preset"])
         store.run.param.watch(self._refresh_ready, "shown")
         self._refresh()
@@ -67,6 +75,7 @@ class Actions:
             "redo": self.store.redo,
             "open": lambda: self.open_file(str(msg.get("name", "")), msg.get("text")),
             "unlinked": lambda: self._note("These settings are too long for a link: save the scenario and send the file."),
+            "report": self.make_report,
             "toml": self.save_scenario,
             "csv": lambda: self.save_data("wfsobs.csv", "text/csv", data_csv),
             "npz": lambda: self.save_data("wfsobs.npz", "application/octet-stream", data_npz),
@@ -114,6 +123,35 @@ class Actions:
                 run.post(partial(self.toolbar.save, name, kind, content))
 
         run.aside(work)
+
+    def make_report(self) -> None:
+        """Make the report of the results shown, beside everything else, and send it; one at a time."""
+        shown, run, preset = self.store.run.shown, self.store.run, self.store.preset
+        if shown is None or self.toolbar.reporting:
+            return
+        self.toolbar.param.update(reporting=True, said="", notes=[])
+
+        def work() -> None:
+            try:
+                content = self.maker.make(shown.result, preset)
+            except ReportError as error:
+                run.post(partial(self._reported, f"Report: {error}"))
+            except Exception:
+                log.exception("the report could not be made")
+                run.post(partial(self._reported, f"Report: {FAILED}"))
+            else:
+                run.post(partial(self._reported, "", content))
+
+        run.aside(work)
+
+    def _reported(self, line: str, content: bytes = b"") -> None:
+        self.toolbar.param.update(reporting=False, notes=[line] if line else [])
+        if content:
+            self.toolbar.save(REPORT, "text/html", content)
+
+    def close(self) -> None:
+        """The session has ended."""
+        self.maker.close()
 
     def _note(self, line: str) -> None:
         self.toolbar.param.update(notes=[line], said="")

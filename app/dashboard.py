@@ -113,6 +113,7 @@ class Dashboard:
 
     def close(self) -> None:
         """The session has ended."""
+        self.actions.close()
         self.store.close()
 
     def _group(self, name: str, options: Any) -> pmui.RadioButtonGroup:

@@ -141,6 +141,20 @@ function opener(bar, model) {
   tag("button", bar, {type: "button", textContent: "Open scenario"}).onclick = () => input.click()
 }
 
+function reporter(bar, model) {
+  const button = tag("button", bar, {type: "button"})
+  const draw = () => {
+    button.textContent = model.reporting ? "Making the report …" : "Report"
+    button.setAttribute("aria-disabled", !model.ready || model.reporting)
+  }
+  button.onclick = () => {
+    if (model.ready && !model.reporting) model.send_msg({action: "report"})
+  }
+  model.on("reporting", draw)
+  model.on("ready", draw)
+  draw()
+}
+
 function noteBox(el, model) {
   const box = tag("div", el, {className: "notes", hidden: true})
   const lines = tag("div", box, {}, {role: "alert"})
@@ -173,6 +187,7 @@ export function render({model, el}) {
     ...figures().flatMap(([name, view]) =>
       KINDS.map((kind) => [`${name} as ${kind.toUpperCase()}`, () => saveFigure(name, view, kind, model)])),
   ])
+  reporter(bar, model)
   opener(bar, model)
   const said = tag("span", bar, {className: "said"}, {role: "status"})
   const copy = textBox(el, model)

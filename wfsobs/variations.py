@@ -11,7 +11,7 @@ from typing import Any
 
 from wfsobs.configfile import written
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
+from wfsobs.settings import Plain, SettingError
 
 MOST = 60
 """Combinations that are run at once."""
@@ -60,12 +60,15 @@ def scenarios(base: Scenario, variations: Sequence[Variation]) -> list[Scenario]
     """
     _check_number(variations)
     out: list[Scenario] = []
+    seen: list[Plain] = []
     for values in product(*(v.values for v in variations)):
         changes = {v.path: value for v, value in zip(variations, values, strict=True)}
         one = base.replace(changes)
         one.validate()
-        if one in out:
+        plain = one.to_dict()
+        if plain in seen:
             raise SettingError(f"--vary: {_listed(changes.items())} gives the same settings as another combination")
+        seen.append(plain)
         out.append(one)
     return out
 

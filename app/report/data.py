@@ -18,6 +18,7 @@ from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.work import TRUTH
 from wfsobs.configfile import from_toml, to_toml
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.pipeline import Result
 from wfsobs.scenario import Scenario
@@ -156,8 +157,14 @@ def state_of(result: Result, states: int = 1) -> State:
                 lines |= _frequencies(found[0])
                 for suffix, density in zip(("", "-error") if "error" in signals else ("",), found[1:], strict=False):
                     lines[f"psd{suffix}/{where}"], lines[f"cumulative{suffix}/{where}"] = _spectra(found[0], density[:, i])
-    return State(
-        scenario, rows(result.scores, scenario.run.seed), tuple(f.reason for f in result.failures), grid, lines)
+    return State(scenario, rows(result.scores, scenario.run.seed), tuple(_reasons(result)), grid, lines)
+
+
+def _reasons(result: Result) -> list[str]:
+    """Why an observer gave nothing."""
+    done = {item.observer for item in (*result.estimates, *result.failures)}
+    waiting = [f"{name} left out: not finished when the report was made" for name in OBSERVERS if name not in done]
+    return [f.reason for f in result.failures] + waiting
 
 
 def _frequencies(frequency: Array) -> dict[str, Floats]:

@@ -16,6 +16,7 @@ from wfsobs.app import downloads
 from wfsobs.app.actions import LARGEST, Actions
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.downloads import TooLarge, data_csv, data_npz
+from wfsobs.app.report.maker import FAILED, ReportError
 from wfsobs.app.share import to_query
 from wfsobs.app.work import Shown, compute
 from wfsobs.cli import main
@@ -110,6 +111,35 @@ def test_data_is_made_aside_and_sent(actions: Actions, loop: Any, action: str, m
     (file,) = actions.sent  # type: ignore[attr-defined]
     content = base64.b64decode(file["content"])
     assert file["name"] == f"wfsobs.{action}" and len(content) == len(make(actions.store.run.shown))
+
+
+def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
+    actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[tuple[Any, str]] = []
+    monkeypatch.setattr(actions.maker, "make", lambda result, preset: asked.append((result, preset)) or b"<!doctype html>")
+    shown = actions.store.run.shown
+    actions.handle({"action": "report"})
+    assert actions.toolbar.reporting
+    actions.handle({"action": "report"})
+    loop.until(lambda: not actions.toolbar.reporting)
+    (file,) = actions.sent  # type: ignore[attr-defined]
+    assert file["name"] == "wfsobs-report.html" and base64.b64decode(file["content"]) == b"<!doctype html>"
+    assert shown is not None and asked == [(shown.result, "paper")]
+
+
+@pytest.mark.parametrize(("error", "line"), [(ReportError("stopped"), "Report: stopped"), (KeyError("x"), f"Report: {FAILED}")])
+def test_a_report_that_fails_is_one_line(
+    actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch, error: Exception, line: str,
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(actions.maker, "make", fail)
+    actions.handle({"action": "report"})
+    loop.until(lambda: actions.toolbar.notes)
+    assert actions.toolbar.notes == [line] and not actions.toolbar.reporting
+    assert not actions.sent  # type: ignore[attr-defined]
 
 
 def test_too_much_data_is_refused_with_a_line(actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,116 @@
+"""What a report keeps of a run: points of lines, and how they are written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from wfsobs.app.report.data import LEVELS, Grid, Pool, Report, bins_for, coded, packed, state_of, unpacked, window_of
+from wfsobs.app.work import TRUTH
+from wfsobs.pipeline import Result
+from wfsobs.scenario import Scenario
+from wfsobs.scores import cumulative_rms, welch_psd
+from wfsobs.tables import rows
+from wfsobs.variations import Variation
+
+
+@given(st.integers(2, 30_000), st.integers(10, 800), st.sampled_from([1e-2, 1e-3, 2e-4]))
+def test_points_keep_extremes_ends_and_the_window(n: int, bins: int, dt: float) -> None:
+    grid = Grid(n, dt, bins)
+    x = np.random.default_rng(n).normal(size=n)
+    x[-1] = 50.0  # in the last, ragged bin
+    x[n // 3] = -60.0
+    times, points = grid.times(), grid.thin(x)
+    assert times.size == points.size <= 2 * bins + grid.width or grid.whole
+    assert points.min() == -60.0 or n // 3 == n - 1
+    assert points.max() == 50.0
+    assert np.all(np.diff(times) > 0) and times[0] >= 0 and times[-1] <= (n - 1) * dt * (1 + 1e-12)
+    inside = (times > (grid.first - 0.5) * dt) & (times < (grid.last - 0.5) * dt)
+    np.testing.assert_array_equal(points[inside], x[grid.first : grid.last].astype(np.float32))
+    np.testing.assert_allclose(times[inside], dt * np.arange(grid.first, grid.last), rtol=1e-12)
+    assert grid.width == min(round(0.5 / dt), n)
+    if grid.whole:
+        np.testing.assert_array_equal(points, x.astype(np.float32))
+
+
+def test_more_states_leave_fewer_points() -> None:
+    kept = [bins_for(n, 10, 2) for n in range(1, 61)]
+    assert kept == sorted(kept, reverse=True) and kept[0] == 10_000 and kept[-1] == 200
+    assert kept[11] > 400, "about a pair a pixel for twelve"
+
+
+@given(st.lists(st.floats(-1e6, 1e6) | st.just(float("nan")), min_size=1, max_size=50))
+def test_a_line_is_written_to_half_a_step(line: list[float]) -> None:
+    pool = Pool()
+    index, low, step = coded(line, pool)
+    levels = np.frombuffer(pool.all()[int(index)], dtype="<u2").astype(float)
+    x = np.array(line)
+    read = np.where(levels == LEVELS + 1, np.nan, low + step * levels)
+    assert np.array_equal(np.isnan(read), np.isnan(x))
+    known = ~np.isnan(x)
+    if known.any():
+        assert step <= max((x[known].max() - x[known].min()) / LEVELS, 1.0) * (1 + 1e-9)
+        assert np.abs(read - x)[known].max() <= 0.5 * step * (1 + 1e-6) + 1e-9
+
+
+def test_densities_are_written_as_logarithms_and_zero_is_none() -> None:
+    pool = Pool()
+    density = np.array([0.0, 1e-9, 1e-3, 10.0])
+    index, low, step = coded(density, pool, logarithmic=True)
+    levels = np.frombuffer(pool.all()[int(index)], dtype="<u2")
+    assert levels[0] == LEVELS + 1
+    np.testing.assert_allclose(10 ** (low + step * levels[1:].astype(float)), density[1:], rtol=10 / LEVELS * 2.31)
+
+
+def test_what_two_states_share_is_there_once() -> None:
+    pool = Pool()
+    line = np.arange(5.0)
+    assert coded(line, pool)[0] == coded(2 * line + 1, pool)[0] and len(pool.all()) == 1, "the same levels"
+
+
+def test_a_state_has_the_lines_of_the_result(result: Result) -> None:
+    state = state_of(result)
+    assert state.rows == rows(result.scores, 1) and state.reasons == () and state.grid.whole
+    truth = result.record.vibration
+    estimate = result.estimate("gpr-online", "vibration")
+    assert truth is not None and estimate is not None
+    np.testing.assert_array_equal(state.lines["signal/vibration/gpr-online/tilt"], estimate.values[:, 1].astype(np.float32))
+    error = (estimate.values - truth)[:, 1]
+    np.testing.assert_array_equal(state.lines["error/vibration/gpr-online/tilt"], error.astype(np.float32))
+    frequency, density = welch_psd(error[500:, None], result.record.dt)
+    total = cumulative_rms(frequency[1:], density[1:, 0])
+    kept, shown = state.lines["frequency"], state.lines["psd-error/vibration/gpr-online/tilt"]
+    np.testing.assert_allclose(shown[:399], density[1:400, 0], rtol=1e-6)
+    assert kept.size == shown.size and kept[0] == pytest.approx(frequency[1]) and shown.max() == pytest.approx(density[1:].max())
+    summed = state.lines["cumulative-error/vibration/gpr-online/tilt"]
+    assert state.lines["frequency-cumulative"].size == summed.size
+    assert (summed[0], summed[-1]) == (pytest.approx(total[0]), pytest.approx(total[-1]))
+    assert f"error/vibration/{TRUTH}/tip" not in state.lines and not any("/zero/" in name for name in state.lines)
+
+
+def test_an_unfinished_observer_is_named(result: Result) -> None:
+    part = replace(result, estimates=tuple(e for e in result.estimates if e.observer != "gpr-online"))
+    assert state_of(part).reasons == ("gpr-online left out: not finished when the report was made",)
+
+
+def test_to_another_process_and_back(result: Result, short: Scenario) -> None:
+    state = state_of(result)
+    report = Report("paper", short, (Variation("loop.gain", (0.3, 0.2)),), (state, replace(state, reasons=("why",))))
+    again = unpacked(packed(report))
+    assert again.base == short and again.variations == report.variations and again.preset == "paper" and again.start == 0
+    for ours, theirs in zip(report.states, again.states, strict=True):
+        assert (theirs.rows, theirs.reasons, theirs.grid, theirs.scenario) == (ours.rows, ours.reasons, ours.grid, ours.scenario)
+        assert theirs.lines.keys() == ours.lines.keys()
+        assert all(np.array_equal(theirs.lines[name], line, equal_nan=True) for name, line in ours.lines.items())
+
+
+def test_the_window_is_told_where_all_states_share_it(result: Result) -> None:
+    state = state_of(result)
+    assert window_of([state]) is None
+    cut = replace(state, grid=Grid(2000, 1e-3, 100))
+    assert window_of([cut, cut]) == (0.75, pytest.approx(1.249))
+    assert window_of([cut, replace(state, grid=Grid(1000, 1e-3, 100))]) is None

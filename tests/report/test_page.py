@@ -1,0 +1,176 @@
+"""The file: well formed, closed to the network, every number that of the run, every text escaped."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs import __version__
+from wfsobs.app.display import number
+from wfsobs.app.report.data import Grid, Report, state_of
+from wfsobs.app.report.page import page
+from wfsobs.app.report.text import FILE, LONGEST, command_of
+from wfsobs.configfile import from_toml, scenario_from
+from wfsobs.observers import OBSERVERS
+from wfsobs.pipeline import Result, run
+from wfsobs.scenario import Scenario
+from wfsobs.tables import TIME
+from wfsobs.variations import Variation, parse_variation, scenarios
+
+MADE = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
+HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"
+
+
+@pytest.fixture(scope="module")
+def report(short: Scenario) -> Report:
+    base = short.replace({"loop.gain": 0.4})
+    variations = (parse_variation("turbulence.wind_speed=5,15"), parse_variation("loop.gain=0.2,0.4"))
+    states = tuple(state_of(run(s, observers=["kf-lgs", "butterworth-ol", "zero"]), 4) for s in scenarios(base, variations))
+    return Report("paper", base, variations, states)
+
+
+@pytest.fixture(scope="module")
+def text(report: Report) -> str:
+    return page(report, MADE)
+
+
+def test_it_is_well_formed(text: str, parse: Any) -> None:
+    it = parse(text)
+    assert text.startswith("<!doctype html>") and ("html", {"lang": "en"}) in it.tags
+    assert len(it.data("data")["states"]) == 4
+
+
+def test_the_policy_lets_nothing_out_and_only_these_scripts_run(text: str, parse: Any) -> None:
+    it = parse(text)
+    (policy,) = [a["content"] for tag, a in it.tags if tag == "meta" and a.get("http-equiv") == "Content-Security-Policy"]
+    rules = {name: values.split() for name, _, values in (rule.strip().partition(" ") for rule in policy.split(";"))}
+    assert rules["default-src"] == ["'none'"] and "connect-src" not in rules and "frame-src" not in rules
+    run = [body for attributes, body in it.scripts if attributes.get("type") != "application/json"]
+    sums = [f"'sha256-{base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()}'" for body in run]
+    assert rules["script-src"] == sums and len(run) == 3
+    assert rules["img-src"] == ["data:", "blob:"] and rules["base-uri"] == rules["form-action"] == ["'none'"]
+    fetching = ("link", "iframe", "base", "object", "embed")
+    assert [(tag, a) for tag, a in it.tags if {"src", "srcset", "action"} & set(a) or tag in fetching] == []
+    links = [a["href"] for _, a in it.tags if "href" in a]
+    assert all(link.startswith(("#line-", "data:application/toml;base64,")) for link in links)
+    assert not any(name.startswith("on") for _, a in it.tags for name in a)
+
+
+def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any) -> None:
+    """In the file to every digit; in the tables that need no script to three."""
+    it = parse(text)
+    embedded = it.data("rows")
+    assert [state["rows"] for state in embedded] == [state.rows for state in report.states]
+    names = [f"Wind speed V₀ {v} m/s, Integrator gain g {g}" for v in (5, 15) for g in (0.2, 0.4)]
+    assert [state["state"] for state in embedded] == names and all(name in it.text for name in names)
+    tables = [table for table in it.tables if table[0][0] == "Observer"]
+    assert len(tables) == 4
+    for table, state in zip(tables, report.states, strict=True):
+        title, got = "", {}
+        for first, *cells in table[1:]:
+            title = title if cells else first
+            if cells:
+                got[title, first] = cells
+        want = {}
+        for row in state.rows:
+            name = OBSERVERS[row["observer"]].label + ("" if OBSERVERS[row["observer"]].causal else " looks ahead")
+            lag = "–" if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−")
+            want[f"{row['target'].capitalize()}, {row['mode']}", name] = [
+                number(1e3 * row["rms_um"]), number(1e3 * row["truth_rms_um"]), number(row["normalised_rms"]), lag,
+                number(row[TIME]), number(row[TIME] / 1000.0, 2)]
+        plain = {key: [re.sub(r"^(best|above truth) ", "", cell) for cell in cells] for key, cells in got.items()}
+        assert plain == want
+        for key in {title for title, _ in want}:
+            causal = {name: c for (title, name), c in got.items() if title == key and "looks ahead" not in name}
+            best = [name for name, cells in causal.items() if cells[0].startswith("best ")]
+            assert best == [next(iter(causal))], "the first of them is the best"
+        above = {key for key, cells in got.items() if cells[2].startswith("above truth")}
+        assert above == {key for key, cells in want.items() if cells[2] != "1.00" and float(cells[2]) > 1}
+
+
+def test_lines_are_those_of_the_state(report: Report, text: str, parse: Any) -> None:
+    data = parse(text).data("data")
+    for state, kept in zip(data["states"], report.states, strict=True):
+        assert set(state["lines"]) == {name for name in kept.lines if "/" in name}
+        for name in ("signal/vibration/truth/tilt", "error/turbulence/kf-lgs/tip", "psd/vibration/butterworth-ol/tip"):
+            index, low, step = state["lines"][name]
+            levels = np.frombuffer(base64.b64decode(data["arrays"][index]), dtype="<u2").astype(float)
+            line = np.where(levels > 65534, np.nan, low + step * levels)
+            expected = np.log10(kept.lines[name]) if name.startswith("psd") else kept.lines[name]
+            np.testing.assert_allclose(line, expected, rtol=0, atol=0.51 * step + 1e-7 * abs(low))
+        time = np.frombuffer(base64.b64decode(data["arrays"][state["axes"]["time"]]), dtype="<f4")
+        np.testing.assert_allclose(time, kept.grid.times(), rtol=1e-6)
+
+
+def test_it_says_what_it_is_made_with_and_how_to_make_it_again(report: Report, text: str, parse: Any) -> None:
+    it = parse(text)
+    assert f"wfsobs {__version__}, Python" in it.text and "2026-03-04 05:06:07 UTC" in it.text and "bokeh 3" in it.text
+    command, by_file = command_of(report)
+    assert command in it.text and not by_file
+    program, verb, out, *words = shlex.split(command)
+    assert (program, verb, out) == ("wfsobs", "export", "report.html")
+    given = list(zip(words[::2], words[1::2], strict=True))
+    values = {option: [v for o, v in given if o == option] for option in ("--preset", "--set", "--vary")}
+    assert scenario_from(*values["--preset"], None, tuple(values["--set"])) == report.base
+    assert tuple(map(parse_variation, values["--vary"])) == report.variations
+    (saved,) = [a["href"] for tag, a in it.tags if tag == "a"]
+    toml = base64.b64decode(saved.partition(",")[2]).decode()
+    assert from_toml(toml) == report.base and tomllib.loads(toml)["preset"] == "paper" and toml in it.text
+
+
+def test_settings_too_long_for_a_command_go_by_file(result: Result) -> None:
+    base = result.scenario.replace({"vibration.psd.frequency": [1.0 + i / 100 for i in range(3000)]})
+    command, by_file = command_of(Report("paper", base, (Variation("loop.gain", (0.1,)),), ()))
+    assert by_file and command == f"wfsobs export report.html --config {FILE} --vary loop.gain=0.1" and len(command) < LONGEST
+
+
+def test_what_changed_is_listed(text: str, parse: Any) -> None:
+    (table,) = [table for table in parse(text).tables if table[0][0] == "Setting"]
+    assert ["Integrator gain gloop.gain", "0.3", "0.4"] in table
+    assert ["Duration [s]run.duration", "10", "2"] in table
+    assert len(table) == 1 + 7
+
+
+def test_the_words_fit_the_report(report: Report, text: str, result: Result, parse: Any) -> None:
+    words = " ".join(parse(text).text.split())
+    for part in ("no controller can have it", "a baseline and not an observer", "The traces keep every sample", "4 variations"):
+        assert part in words
+    cut = replace(report.states[0], grid=Grid(2000, 1e-3, 100))
+    said = parse(page(replace(report, states=(cut,), variations=()), MADE)).text
+    assert "Each trace keeps 700 points" in said and "every sample from 0.750 to 1.249 s" in said
+    manual = result.scenario.replace({"kalman.process_noise": "manual", "kalman.measurement_noise": "manual"})
+    one = Report("paper", manual, (), (replace(state_of(result), scenario=manual),))
+    assert "are told the strength" not in parse(page(one, MADE)).text
+
+
+def test_no_text_escapes(result: Result, parse: Any) -> None:
+    """Whatever reaches the page as text stays text: reasons, values of settings, names of modes."""
+    state = replace(state_of(result), reasons=(HOSTILE,))
+    base = result.scenario
+    it = parse(page(Report("paper", base, (Variation(HOSTILE, (HOSTILE,)),), (state,)), MADE))
+    assert it.text.count(HOSTILE) >= 3
+    assert len([tag for tag, _ in it.tags if tag == "script"]) == 6 and not [tag for tag, _ in it.tags if tag == "img"]
+    assert HOSTILE[:57] in it.data("rows")[0]["state"]
+
+
+def test_no_panel_in_the_process() -> None:
+    code = (
+        "import sys\n"
+        "for name in ('panel', 'panel_material_ui', 'holoviews'):\n"
+        "    sys.modules[name] = None\n"
+        "import pkgutil, importlib, wfsobs.app.report as it\n"
+        "for m in pkgutil.iter_modules(it.__path__):\n"
+        "    importlib.import_module(f'wfsobs.app.report.{m.name}')\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
