@@ -8,7 +8,8 @@ Slopes and fit are linear, so an output is one sum over the cells of the pupil, 
 
     M_j(k) = sum_cells i (k_x w_xj + k_y w_yj) sinc(k_x h / 2) sinc(k_y h / 2) exp(i k . r_cell),    sinc(x) = sin(x) / x,
 
-with w the weights of the cells of side h. No slope is ever formed: that costs as much as the wanted modes are few.
+with w the weights of the cells of side h. No slope is formed on the way: the cost is that of the modes wanted,
+whatever the number of subapertures.
 """
 
 from __future__ import annotations
@@ -101,8 +102,10 @@ class ShackHartmann:
     def _on_grid(self, wave: Wave, scale: float, kx: Array) -> Array:
         """The transform at `kx` and the wave's k_y through a beam of that scale, (len(kx), n_outputs, Ny). That of the last
         wave is kept: guide stars of one height differ in their shifts alone."""
-        if self._known is None or self._known[0] is not wave or self._known[1] != scale:
+        known = self._known  # another thread may replace it
+        if known is None or known[0] is not wave or known[1] != scale:
             x, y = replace(wave, kx=kx).in_pupil()
             made = self.transform(scale * x, scale * y)
-            self._known = wave, scale, np.moveaxis(made, 2, 0).astype(np.complex64, order="C")
-        return self._known[2]
+            known = wave, scale, np.moveaxis(made, 2, 0).astype(np.complex64, order="C")
+            self._known = known
+        return known[2]
