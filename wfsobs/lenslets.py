@@ -14,9 +14,6 @@ import numpy as np
 
 from wfsobs.arrays import Array
 
-CELLS = 160
-"""At least so many cells across the aperture: 5 cm on 8 m."""
-
 
 @dataclass(frozen=True)
 class Lenslets:
@@ -26,17 +23,19 @@ class Lenslets:
     across       : subapertures along a side
     illumination : smallest lit fraction of a subaperture that counts
     obscuration  : diameter of the dark centre over that of the aperture
+    cells        : across the aperture, at least so many: 160 are 5 cm on 8 m
     """
 
     diameter: float = 8.0
     across: int = 40
     illumination: float = 0.5
     obscuration: float = 0.0
+    cells: int = 160
 
     @property
     def per_side(self) -> int:
         """Cells along a side of a subaperture: an even number."""
-        return 2 * -(-CELLS // (2 * self.across))
+        return 2 * -(-self.cells // (2 * self.across))
 
     @property
     def pitch(self) -> float:
