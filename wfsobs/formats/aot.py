@@ -40,9 +40,10 @@ def read(file: IO[bytes], most: int) -> Contents:
             _check_lists(hdu, most)
     from aotpy.io.fits._file import AOTFITSErrorLevel
 
+    critical = AOTFITSErrorLevel.CRITICAL
     try:
         reader = aotpy.AOTFITSReader(
-            io.BytesIO(read_whole(file)), externals="disallow", exception_level=AOTFITSErrorLevel.CRITICAL, log_level=AOTFITSErrorLevel.CRITICAL)
+            io.BytesIO(read_whole(file)), externals="disallow", exception_level=critical, log_level=critical)
         return _contents(reader.get_system(), aotpy)
     except RecordError:
         raise

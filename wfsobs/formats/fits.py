@@ -65,7 +65,8 @@ def opened(file: IO[bytes], most: int) -> Iterator[HDUList]:
                 yield hdus
     except RecordError:
         raise
-    except (OSError, ValueError, TypeError, KeyError, IndexError, EOFError, AttributeError, MemoryError, fits.VerifyError):
+    except (OSError, ValueError, TypeError, KeyError, IndexError, EOFError, AttributeError, MemoryError, OverflowError,
+            AssertionError, ZeroDivisionError, fits.VerifyError):
         raise RecordError(DAMAGED) from None
 
 
@@ -94,7 +95,7 @@ def _contents(hdus: HDUList) -> Contents:
         if isinstance(hdu, fits.BinTableHDU):
             _read_table(hdu, contents, flat)
         elif name in SIGNALS or name in CLOCKS:
-            contents.arrays[name] = _native(hdu.data, name)
+            contents.arrays[name] = _native(hdu.data, name, hdu.header.get("BLANK"))
             if name in SIGNALS and "BUNIT" in hdu.header:
                 contents.state_unit(name, str(hdu.header["BUNIT"]))
         for key, keyword in KEYWORDS.items():
@@ -115,18 +116,22 @@ def _read_table(hdu: Any, contents: Contents, flat: dict[str, Array]) -> None:
                 raise RecordError(f"{name} is a column of rows of unlike lengths")
             continue
         if known:
-            contents.arrays[name] = _native(hdu.data[column.name], name)
+            values = _native(hdu.data[column.name], name, column.null)
+            contents.arrays[name] = values[:, None] if name in SIGNALS and values.ndim == 1 else values  # of one mode
             if name in SIGNALS and column.unit:
                 contents.state_unit(name, column.unit)
         elif "/" in name or name.removesuffix("_s") in CLOCKS:
-            flat[column.name] = _native(hdu.data[column.name], column.name)
+            flat[column.name] = _native(hdu.data[column.name], column.name, column.null)
 
 
-def _native(data: Any, name: str) -> Array:
-    """Numbers in the machine's own byte order, integers scaled as the header says."""
+def _native(data: Any, name: str, blank: int | None) -> Array:
+    """Numbers in the machine's own byte order, integers scaled as the header says; the integer `blank` is a missing one."""
     if data is None or np.asarray(data).dtype.kind not in "fiu":
         raise RecordError(f"{name} does not hold numbers")
-    return np.array(data, dtype=np.float64)
+    out = np.array(data, dtype=np.float64)
+    if blank is not None and np.asarray(data).dtype.kind in "iu":
+        out[np.asarray(data) == blank] = np.nan
+    return out
 
 
 def write(file: IO[bytes], arrays: Mapping[str, Array]) -> None:

@@ -31,14 +31,19 @@ def read(file: IO[bytes], most: int) -> Contents:
         with zipfile.ZipFile(file) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             known = {name: members[name] for name in NAMES if name in members}
-            # What the directory says; a member that holds more than that is read no further.
             if sum(info.file_size for info in known.values()) > most:
                 raise TooMuch(most)
-            return Contents({name: _array(archive.read(info), name) for name, info in known.items()})
+            return Contents({name: _array(_member(archive, info), name) for name, info in known.items()})
     except RecordError:
         raise
     except (ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError, NotImplementedError, MemoryError):
         raise RecordError(DAMAGED) from None
+
+
+def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
+    """As much of a member as the directory says, and no more: a read without a size would unpack all that is there."""
+    with archive.open(info) as stream:
+        return stream.read(info.file_size)
 
 
 def _array(content: bytes, name: str) -> Array:

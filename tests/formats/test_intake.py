@@ -1,0 +1,226 @@
+"""What a file means: units, signs, delays, clocks, frames of another rate, and one line where it cannot be."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import numpy as np
+import pytest
+
+from wfsobs.formats.contents import Contents
+from wfsobs.intake import Stated, record_of
+from wfsobs.record import RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.telemetry import read_record, record_arrays
+
+RNG = np.random.default_rng(1)
+N = 40
+Y, U = RNG.standard_normal((N, 2)), RNG.standard_normal((N, 2))
+DT = np.array(0.001)
+
+
+def taken(stated: Stated | None = None, scenario: Scenario | None = None, units=None, **arrays):
+    plain = {"y_lgs": Y, "u": U, "dt": DT} | {k: np.asarray(v) for k, v in arrays.items()}
+    present = {k: v for k, v in plain.items() if v.ndim > 0 or v.dtype != object}
+    return record_of(Contents(present, units or {}), scenario or Scenario(), stated or Stated())
+
+
+NONE = np.array(None, dtype=object)
+
+
+# ---------------------------------------------------------------------- units and signs
+
+
+@pytest.mark.parametrize(("unit", "factor"), [
+    ("um", 1.0), ("nm", 1e-3), ("rad", 2e6), ("arcsec", 2e6 * math.pi / 648_000), ("mas", 2e3 * math.pi / 648_000)])
+def test_units_by_statement_by_file_and_by_signal(unit: str, factor: float) -> None:
+    """On 8 m an angle is 4 / 8 of the tip over the aperture: 2 m of tip in one radian."""
+    for record in (taken(Stated(unit=unit)), taken(unit=unit), taken(units={"y_lgs": unit, "u": unit}),
+                   taken(Stated(unit=unit), units={"y_lgs": unit})):
+        np.testing.assert_allclose(record.y_lgs, Y * factor, rtol=1e-12)
+        np.testing.assert_allclose(record.u, U * factor, rtol=1e-12)
+        assert (f"unit {unit}" in record.origin) == (unit != "um")
+    mixed = taken(units={"u": unit})
+    np.testing.assert_allclose(mixed.y_lgs, Y)
+    np.testing.assert_allclose(mixed.u, U * factor, rtol=1e-12)
+
+
+def test_100_nm_of_tip_on_8_m_are_10_3133_mas() -> None:
+    record = taken(Stated(unit="mas"), y_lgs=np.full((N, 2), 10.3133))
+    np.testing.assert_allclose(record.y_lgs, 0.1, rtol=1e-4)
+    keck = taken(Stated(unit="mas"), Scenario().replace({"telescope.diameter": 10.0}), y_lgs=np.full((N, 2), 10.3133))
+    np.testing.assert_allclose(keck.y_lgs, 0.125, rtol=1e-4)
+    assert keck.origin == "unit mas, aperture 10 m"
+
+
+def test_the_sign_of_commands() -> None:
+    record = taken(Stated(command_sign=-1), training_y=Y, training_u=U)
+    np.testing.assert_array_equal(record.u, -U)
+    np.testing.assert_array_equal(record.training.u, -U)
+    np.testing.assert_array_equal(record.y_lgs, Y)
+    assert record.origin == "command sign -1"
+    np.testing.assert_array_equal(taken(command_sign=-1).u, -U)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3, 7])
+def test_the_delay_of_commands(delay: int) -> None:
+    """z[k] = y[k] - u[k-delay], and of a frame the mean of u[k-delay] ... u[k-delay-n+1]."""
+    ngs = np.full((N, 2), np.nan)
+    ngs[5::5] = 1.0
+    for record in (taken(Stated(command_delay=delay), y_ngs=ngs, ratio=5), taken(delay=delay, y_ngs=ngs, ratio=5)):
+        for k in range(N):
+            np.testing.assert_array_equal(record.z[k], Y[k] - (U[k - delay] if k >= delay else 0.0))
+            if k % 5 == 0 and k:
+                mirror = np.mean([U[j] if j >= 0 else np.zeros(2) for j in range(k - delay - 4, k - delay + 1)], axis=0)
+                np.testing.assert_allclose(record.z_ngs[k], 1.0 - mirror, rtol=1e-12)
+
+
+def test_what_was_stated_is_kept_and_not_applied_twice() -> None:
+    record = taken(Stated("nm", -1, 3))
+    again = record_of(Contents(record_arrays(record)), Scenario(), Stated())
+    np.testing.assert_array_equal(again.y_lgs, record.y_lgs)
+    np.testing.assert_array_equal(again.u, record.u)
+    assert (again.origin, again.delay) == (record.origin, 3) == ("unit nm, command sign -1", 3)
+    with pytest.raises(RecordError, match="y_lgs is in um, but nm is stated"):
+        record_of(Contents(record_arrays(record)), Scenario(), Stated("nm"))
+
+
+# ---------------------------------------------------------------------- clocks
+
+
+@pytest.mark.parametrize("start", [0.0, -3.0, 1.7e9])
+@pytest.mark.parametrize("lost", [[], [7], [1, 2, 3], [5, 20, 38]])
+def test_jumps_of_the_clock_are_missing_frames(start: float, lost: list[int]) -> None:
+    """Stamps with a jitter of a tenth of a step; at 1.7e9 s a double resolves 0.2 us, so the step is known to 1e-5."""
+    there = np.delete(np.arange(N), lost)
+    time = start + 0.001 * there + 1e-4 * np.random.default_rng(2).uniform(-1, 1, there.size) * (there % (N - 1) > 0)
+    record = taken(y_lgs=Y[there], u=U[there], time=time, dt=NONE)
+    assert record.n_steps == N and record.missing == len(lost)
+    assert record.dt == pytest.approx(0.001, rel=1e-4)
+    np.testing.assert_array_equal(record.y_lgs[there], Y[there])
+    assert np.isnan(record.y_lgs[lost]).all() and np.isnan(record.u[lost]).all()
+
+
+def test_a_stated_rate_counts_and_must_agree() -> None:
+    assert taken(Stated(rate=500.0), dt=NONE).dt == 0.002
+    assert taken(Stated(rate=1000.0), time=0.001 * np.arange(N), dt=NONE).dt == 0.001
+    for arrays in ({"dt": 0.001}, {"dt": NONE, "time": 0.001 * np.arange(N)}):
+        with pytest.raises(RecordError, match="stated"):
+            taken(Stated(rate=500.0), **arrays)
+
+
+def clock(change) -> np.ndarray:
+    out = 0.001 * np.arange(float(N))
+    change(out)
+    return out
+
+
+WRONG_CLOCKS = [
+    (clock(lambda t: t.__setitem__(9, 0.0075)), "time goes backwards at row 9, from 0.008 to 0.0075 s"),
+    (clock(lambda t: t.__setitem__(9, t[8])), "time stands still at row 9"),
+    (clock(lambda t: t.__setitem__(3, np.nan)), "time is nan in row 3"),
+    (0.001 * np.arange(N) ** 1.2, "the rate is not constant"),
+    (np.cumsum(np.where(np.arange(N) % 2, 0.001, 0.0015)), "the rate is not constant"),
+    (clock(lambda t: t.__iadd__(np.where(np.arange(N) > 20, 100.0, 0.0))), "frames are missing, 40 are there: cut it"),
+    (np.zeros(3), "time takes 40 numbers"),
+]
+
+
+@pytest.mark.parametrize(("time", "message"), WRONG_CLOCKS, ids=[m[:24] for _, m in WRONG_CLOCKS])
+def test_what_is_no_clock(time: np.ndarray, message: str) -> None:
+    with pytest.raises(RecordError, match=message):
+        taken(time=time, dt=NONE)
+
+
+# ---------------------------------------------------------------------- another rate
+
+
+def test_one_row_per_frame() -> None:
+    frames = RNG.standard_normal((7, 2))  # steps 5 ... 35
+    for rows in (frames, np.vstack([frames, frames[:1]])):  # the last would come with step 40
+        record = taken(y_ngs=rows, ratio=5)
+        np.testing.assert_array_equal(record.y_ngs[5::5], frames)
+        assert np.isnan(np.delete(record.y_ngs, np.arange(5, N, 5), axis=0)).all()
+    with pytest.raises(RecordError, match="y_ngs has 6 rows; it takes 40, or one per frame, 7"):
+        taken(y_ngs=frames[:6], ratio=5)
+
+
+@pytest.mark.parametrize("phase", [0, 1, 3])
+def test_frames_with_a_clock_of_their_own(phase: int) -> None:
+    """The record starts where its first frame began, and a frame that is not there is NaN."""
+    steps = np.array([5, 10, 20, 25, 30]) + phase
+    frames = RNG.standard_normal((5, 2))
+    record = taken(time=7.0 + 0.001 * np.arange(N), time_ngs=7.0 + 0.001 * steps + 1e-4, y_ngs=frames, dt=NONE)
+    assert record.ratio == 5 and record.n_steps == N - phase
+    np.testing.assert_array_equal(record.y_lgs, Y[phase:])
+    np.testing.assert_array_equal(record.y_ngs[steps - phase], frames)
+    assert np.isnan(record.y_ngs[15]).all()
+
+
+@pytest.mark.parametrize(("steps", "message"), [
+    ([5, 10, 17, 20, 25], "frame in row 2 is not a whole number of 5 steps"),
+    ([5, 10, 15.5, 20, 25], "time_ngs is 0.0155 s in row 2, which is no step"),
+    ([5, 10, 10, 15, 20], "time_ngs goes backwards or stands still at row 2"),
+])
+def test_frames_off_their_clock(steps: list[float], message: str) -> None:
+    with pytest.raises(RecordError, match=message):
+        taken(time=0.001 * np.arange(N), time_ngs=0.001 * np.array(steps), y_ngs=np.zeros((5, 2)))
+
+
+def test_a_frame_that_lacks_a_mode_is_lost() -> None:
+    ngs = np.full((N, 2), np.nan)
+    ngs[5::5] = 1.0
+    ngs[10, 1] = np.nan
+    ngs[15] = np.nan
+    assert np.isnan(taken(y_ngs=ngs, ratio=5).y_ngs[[10, 15]]).all()
+
+
+# ---------------------------------------------------------------------- one line
+
+
+@pytest.mark.parametrize(("arrays", "message"), [
+    ({"unit": "V"}, "unit is 'V', which is no unit"),
+    ({"command_sign": 0}, "command_sign takes 1 or -1, not 0"),
+    ({"delay": 0}, "delay takes a whole number from 1, not 0"),
+    ({"delay": 1.5}, "delay takes a whole number, not 1.5"),
+    ({"dt": NONE}, "has no dt and no time"),
+    ({"y_ngs": np.zeros((N, 2))}, "y_ngs needs ratio"),
+    ({"y_ngs": np.zeros((N, 1)), "ratio": 1}, r"y_ngs has shape \(40, 1\); expected \(40, 2\)"),
+    ({"u": U * 1j}, "u holds complex128, not numbers"),
+])
+def test_wrong_contents(arrays: dict, message: str) -> None:
+    with pytest.raises(RecordError, match=message) as caught:
+        taken(**arrays)
+    assert "\n" not in str(caught.value)
+
+
+CSV = [
+    ("y_lgs/tip_um,u/tip_um\n1,2\n3,x\n", "line 3, u/tip_um: 'x' is not a number"),
+    ("y_lgs/tip_um,u/tip_um\n1,2\n3\n", "line 3 has 1 cells, the heading 2"),
+    ("y_lgs/tip_um;u/tip_um\n1;2\n", "line 2, y_lgs/tip_um;u/tip_um: '1;2' is not a number"),
+    ("frame,seeing\n1,2\n", "has no y_lgs; a record needs y_lgs, u and dt"),
+    ("y_lgs/tip_um,y_lgs/tip_um,u/tip_um\n1,2,3\n", "two columns have the same heading"),
+    ("y_lgs/tip_um,y_lgs/tip_nm,u/tip_um\n1,2,3\n", "two columns are y_lgs/tip"),
+    ("y_lgs/tip_um,y_lgs/tilt_nm,u/tip_um,u/tilt_um\n1,2,3,4\n", "y_lgs is in um and in nm"),
+    ("y_lgs/tip_V,u/tip_um\n1,2\n", "y_lgs is in 'V', which is no unit"),
+    ("y_lgs/tip_um,y_lgs/tilt_um,u/tip_um\n1,2,3\n", "u has the modes tip; y_lgs has tip, tilt"),
+    ("# dt: fast\ny_lgs/tip_um,u/tip_um\n1,2\n", "line 1: dt takes a number, not 'fast'"),
+    ("", "holds no table"),
+    ("y_lgs/tip_um,u/tip_um\n" + "1" * 70_000, "line 2 is longer than 65536 bytes"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), CSV, ids=[m[:30] for _, m in CSV])
+def test_wrong_tables(text: str, message: str) -> None:
+    with pytest.raises(RecordError, match=message):
+        read_record(io.BytesIO(text.encode()), "r.csv")
+
+
+def test_empty_cells_are_missing_samples_and_ends() -> None:
+    text = "\ufeffu/tip,y_lgs/tip_nm,training_y/tip,training_u/tip\n1,1000,5,6\n2,,7,8\n\n3,3000,,\n4,nan,,\n"
+    record = read_record(io.BytesIO(text.encode()), "r.csv", stated=Stated(rate=100.0, unit=None))
+    np.testing.assert_array_equal(record.y_lgs[:, 0], [1.0, np.nan, 3.0, np.nan])
+    np.testing.assert_array_equal(record.u[:, 0], [1, 2, 3, 4])
+    np.testing.assert_array_equal(record.training.u[:, 0], [6, 8])
+    assert record.dt == 0.01 and record.missing == 2 and record.origin == "unit nm"

@@ -1,0 +1,91 @@
+"""A user's own spectrum from a file."""
+
+from __future__ import annotations
+
+import io
+import json
+from importlib.resources import files
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from click.testing import CliRunner
+
+from wfsobs.cli import main
+from wfsobs.formats.psd import load_psd, read_psd
+from wfsobs.record import RecordError
+
+F, TIP, TILT = np.array([5.0, 10.0, 20.0]), np.array([1.0, 4.0, 2.0]), np.array([0.0, 3.0, 1.5])
+CSV = "# measured\nfrequency [Hz],tip [{u}],extra,tilt [{u}]\n" + "".join(
+    f"{f},{a},x,{b}\n" for f, a, b in zip(F, TIP, TILT, strict=True))
+
+
+def fits_image(unit: str | None) -> bytes:
+    hdu = fits.PrimaryHDU(np.array([F, TIP, TILT]))
+    if unit:
+        hdu.header["BUNIT"] = unit
+    file = io.BytesIO()
+    hdu.writeto(file)
+    return file.getvalue()
+
+
+def fits_table(unit: str | None) -> bytes:
+    columns = [fits.Column("FREQUENCY", "D", unit="Hz", array=F),
+               *(fits.Column(n, "D", unit=unit, array=x) for n, x in (("TIP", TIP), ("TILT", TILT)))]
+    file = io.BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns)]).writeto(file)
+    return file.getvalue()
+
+
+MAKE = {"a.csv": lambda unit: CSV.replace(" [{u}]", f" [{unit}]" if unit else "").encode(), "image.fits": fits_image,
+        "table.fits": fits_table}
+
+
+@pytest.mark.parametrize("name", MAKE)
+@pytest.mark.parametrize(("unit", "factor"), [("um", 1.0), ("nm", 1e-6), ("mas", (2e3 * np.pi / 648_000) ** 2)])
+def test_every_format_and_unit(name: str, unit: str, factor: float) -> None:
+    for written, told in ((f"{unit}^2/Hz", None), (f"{unit}2 / Hz", unit), (f"{unit}**2/Hz", None), (None, unit)):
+        if name == "table.fits" and written and "**" in written:
+            continue
+        table = read_psd(io.BytesIO(MAKE[name](written)), name, told)
+        assert list(table) == ["frequency", "tip", "tilt"] and table["frequency"] == F.tolist()
+        np.testing.assert_allclose(table["tip"], TIP * factor, rtol=1e-12)
+        np.testing.assert_allclose(table["tilt"], TILT * factor, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", MAKE)
+def test_a_unit_is_never_guessed(name: str) -> None:
+    with pytest.raises(RecordError, match=f"{name}: does not say the unit of tip: say it, one of um, nm, mas, arcsec, rad"):
+        read_psd(io.BytesIO(MAKE[name](None)), name)
+    with pytest.raises(RecordError, match=r"tip is in nm\^2/Hz, but um is stated"):
+        read_psd(io.BytesIO(MAKE[name]("nm^2/Hz")), name, "um")
+    with pytest.raises(RecordError, match="tip is in 'nm/Hz'; it takes the square"):
+        read_psd(io.BytesIO(MAKE[name]("nm/Hz")), name)
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("", "holds no table"),
+    ("f,tip,tilt\n1,2,3\n", "has no column frequency"),
+    ("frequency [kHz],tip [nm^2/Hz],tilt [nm^2/Hz]\n1,2,3\n", "frequency is in 'kHz'; it takes Hz"),
+    ("frequency,tip,tilt\n1,2\n", "line 2: tilt is not a number"),
+    ("frequency,tip,tilt\n1,nan,2\n", "tip does not hold one finite number per row"),
+])
+def test_wrong_tables(text: str, message: str) -> None:
+    with pytest.raises(RecordError, match=message):
+        read_psd(io.BytesIO(text.encode()), "a.csv", "nm")
+
+
+def test_the_command_runs_on_it(tmp_path) -> None:
+    """The shipped table is such a file; the vibration's rms is that of its bins, joined by straight lines."""
+    path = tmp_path / "eris.csv"
+    path.write_text(files("wfsobs.assets").joinpath("eris_ut4.csv").read_text(encoding="utf-8"))
+    table = load_psd(path)
+    quick = ["--set", "run.duration=2", "--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=50"]
+    done = CliRunner().invoke(
+        main, ["run", "--vibration-psd", str(path), *quick, "--set", "run.warm_up=0", "--set", "vibration.cutoff=100", "--json"])
+    assert done.exit_code == 0, done.stderr
+    zero = {r["mode"]: r["rms_um"] for r in json.loads(done.stdout) if (r["observer"], r["target"]) == ("zero", "vibration")}
+    for mode in ("tip", "tilt"):
+        assert zero[mode] == pytest.approx(np.sqrt(np.trapezoid(table[mode], table["frequency"])), rel=1e-6)
+    none = CliRunner().invoke(main, ["run", "--vibration-psd", str(tmp_path / "none.csv")])
+    assert none.exit_code == 2 and "none.csv: cannot be read" in none.stderr and none.stderr.count("\n") == 1

@@ -1,0 +1,145 @@
+"""Missing samples: bridged by prediction, exactly so for the filter whose model it is, causally, and counted in no score."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from wfsobs import PRESETS, observe, simulate
+from wfsobs.gaps import bridged, held
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.kalman import kalman_model, measurement_noise
+from wfsobs.pipeline import each_estimate
+from wfsobs.record import Record
+from wfsobs.riccati import steady_state
+from wfsobs.scenario import Scenario
+from wfsobs.scores import PREDICTION, RESIDUAL, rms
+
+
+def scenario() -> Scenario:
+    s = PRESETS["paper"]()
+    s.update({
+        "run": {"duration": 1.5, "warm_up": 0.3}, "gpr_offline": {"training_size": 60, "depth": 25},
+        "gpr_online": {"training_size": 60, "depth": 25}})
+    return s
+
+
+WHOLE = simulate(scenario())
+LOST = np.unique(np.concatenate([[0, 1], np.arange(400, 412), [700, 1499], np.random.default_rng(5).integers(0, 1500, 60)]))
+FRAMES = np.array([5, 405, 410, 1495])
+
+
+def gappy(record: Record = WHOLE) -> Record:
+    y, u, ngs, twin = record.y_lgs.copy(), record.u.copy(), record.y_ngs.copy(), record.open_loop_y.copy()
+    y[LOST], twin[LOST], u[[0, 300, 301]], ngs[FRAMES] = np.nan, np.nan, np.nan, np.nan
+    y[900, 1] = np.nan  # of one mode alone
+    return replace(record, y_lgs=y, u=u, y_ngs=ngs, open_loop_y=twin)
+
+
+def test_nothing_missing_nothing_changed() -> None:
+    again = bridged(WHOLE, scenario())
+    for name in ("y_lgs", "u", "y_ngs", "open_loop_y"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(WHOLE, name))
+
+
+def test_all_is_bridged_and_the_rest_stays() -> None:
+    record, n = gappy(), WHOLE.ratio
+    out = bridged(record, scenario())
+    assert record.missing == LOST.size + 1
+    for name in ("y_lgs", "u", "open_loop_y"):
+        was, now = getattr(record, name), getattr(out, name)
+        assert np.isfinite(now).all()
+        np.testing.assert_allclose(now[~np.isnan(was)], was[~np.isnan(was)], rtol=1e-12)
+    assert np.isfinite(out.y_ngs[n::n]).all() and np.isnan(np.delete(out.y_ngs, np.arange(n, 1500, n), axis=0)).all()
+
+
+def test_the_kalman_filter_predicts_through_a_gap() -> None:
+    """Oracle: the textbook filter that leaves out its correction where there is no measurement."""
+    s, record = scenario(), replace(gappy(), u=WHOLE.u)
+    estimates = {(e.observer, e.target): e.values for e in each_estimate(record, s, observers=["kf-lgs"])}
+    for mode in range(2):
+        model = kalman_model(s, mode, record.dt)
+        L = steady_state(model.A, model.C, model.Q, np.array(measurement_noise(s)[0] ** 2)).L[:, 0]
+        rows, x, want = model.output_rows(TARGETS), np.zeros(len(model.A)), []
+        for z in record.z[:, mode]:
+            if not np.isnan(z):
+                x = x + L * (z - model.C @ x)
+            want.append(rows @ x)
+            x = model.A @ x
+        for i, target in enumerate(TARGETS):
+            got = estimates["kf-lgs", target][:, mode]
+            np.testing.assert_allclose(got, np.array(want)[:, i], atol=1e-9 * np.abs(got).max())
+
+
+def test_prediction_beats_holding() -> None:
+    """Over single lost frames the true z is missed by little more than its noise, holding by the noise of two samples and
+    more. The ratio would be sqrt(1/2) with a perfect prediction."""
+    rng = np.random.default_rng(8)
+    lost = 1 + np.sort(rng.permutation(1400)[:150])
+    y = WHOLE.y_lgs.copy()
+    y[lost] = np.nan
+    record = replace(WHOLE, y_lgs=y)
+    predicted, simple = bridged(record, scenario().replace({"kalman.process_noise": "matched"})).z, held(record.z)
+    error, worse = rms((predicted - WHOLE.z)[lost]), rms((simple - WHOLE.z)[lost])
+    noise = scenario().sensors.lgs_noise / np.sqrt(2)
+    assert noise < error and np.sqrt(0.5) < error / worse < 0.95
+
+
+@pytest.mark.parametrize("k", [399, 400, 405, 411, 700, 1000])
+def test_bridging_is_causal(k: int) -> None:
+    """What comes after step k, the ends of its gaps included, changes nothing up to k."""
+    record, s = gappy(), scenario()
+    rng = np.random.default_rng(k)
+
+    def later(x: np.ndarray, start: int) -> np.ndarray:
+        out = x.copy()
+        out[start:] = rng.standard_normal(out[start:].shape)
+        return out
+
+    n = record.ratio
+    ngs = record.y_ngs.copy()
+    ngs[k + 1 :][np.arange(k + 1, 1500) % n == 0] = 0.1
+    other = replace(record, y_lgs=later(record.y_lgs, k + 1), u=later(record.u, k), y_ngs=ngs)
+    a, b = bridged(record, s), bridged(other, s)
+    np.testing.assert_array_equal(a.y_lgs[: k + 1], b.y_lgs[: k + 1])
+    np.testing.assert_array_equal(a.u[:k], b.u[:k])
+    np.testing.assert_array_equal(a.y_ngs[: k + 1], b.y_ngs[: k + 1])
+
+
+def test_every_observer_runs_on_a_record_with_gaps_nearly_as_well() -> None:
+    """5 % of the frames gone: the errors of causal observers grow by a few per cent, never by half."""
+    s = scenario()
+    full, gaps = (observe(r, s) for r in (WHOLE, gappy()))
+    assert not gaps.failures and {x.observer for x in gaps.scores} == set(OBSERVERS)
+    for a, b in zip(full.scores, gaps.scores, strict=True):
+        assert (a.observer, a.target, a.mode) == (b.observer, b.target, b.mode)
+        assert 0.8 * a.rms <= b.rms <= 1.5 * a.rms + 1e-12, a.observer
+
+
+def test_filled_samples_count_in_no_prediction_score() -> None:
+    """Numbers in place of the gaps would change the scores; only what was measured counts."""
+    s = scenario()
+    record = replace(gappy(), turbulence=None, vibration=None, u=WHOLE.u)
+    result = observe(record, s, observers=["kf-lgs", "zero"])
+    start = round(s.run.warm_up / record.dt)
+    for mode, name in enumerate(("tip", "tilt")):
+        total = sum(result.estimate("kf-lgs", target).values[:, mode] for target in TARGETS)
+        errors = [record.z[k + 1, mode] - total[k] for k in range(start, 1499) if not np.isnan(record.y_lgs[k + 1, mode])]
+        left = [y for y in record.y_lgs[start + 1 :, mode] if not np.isnan(y)]
+        found = {(x.observer, x.target): x.rms for x in result.scores if x.mode == name}
+        assert found["kf-lgs", PREDICTION] == pytest.approx(rms(np.array(errors)), rel=1e-12)
+        assert found["loop", RESIDUAL] == pytest.approx(rms(np.array(left)), rel=1e-12)
+
+
+def test_holding() -> None:
+    x = np.array([[np.nan], [1.0], [np.nan], [np.nan], [3.0]])
+    np.testing.assert_array_equal(held(x), [[0.0], [1.0], [1.0], [1.0], [3.0]])
+
+
+def test_a_model_of_nothing_predicts_nothing() -> None:
+    s = scenario().replace({"turbulence.source": "none", "vibration.source": "none", "kalman.process_noise": "matched"})
+    record = gappy()
+    np.testing.assert_allclose(bridged(record, s).z[LOST], 0.0, atol=1e-12)
