@@ -1,8 +1,8 @@
 """Settings as links, command lines and Python: only what differs from the preset, each field in its own words.
 
 A link's query is `preset=ut4&turbulence.wind_speed=20&vibration.peaks=45,0.03,0.01,0.01;...`: lists with commas, a
-peak as frequency, damping and its rms per mode, peaks with semicolons. Whatever of a query cannot be used is
-named, and the rest is used. Nothing of it is ever opened or evaluated.
+peak as frequency, damping and its rms per mode, a layer likewise, peaks and layers with semicolons. Whatever of a
+query cannot be used is named, and the rest is used. Nothing of it is ever opened or evaluated.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from wfsobs.app.controls.fields import parsed
 from wfsobs.configfile import from_toml, pristine, to_toml
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
+from wfsobs.settings import SettingError, holds_groups, settings_of
 
 Check = Callable[[Scenario], None]
 
@@ -36,7 +36,6 @@ ROUNDS = 3
 MOST = 200
 """Fields of a query that are read."""
 
-PEAKS = "vibration.peaks"
 PASSED_OVER = ("theme",)
 """Keys of a query that are not ours."""
 
@@ -89,8 +88,9 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
 
 def written(path: str, value: Any) -> str:
     """A setting's plain value as a link has it."""
-    if path == PEAKS:
-        return ";".join(",".join(map(_word, (p["frequency"], p["damping"], *p["rms"]))) for p in value)
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return ";".join(written(path, [v for one in item.values() for v in (one if isinstance(one, list) else [one])])
+                        for item in value)
     if isinstance(value, list):
         return ",".join(map(_word, value))
     return _word(value)
@@ -98,9 +98,9 @@ def written(path: str, value: Any) -> str:
 
 def read(path: str, text: str, known: Mapping[str, param.Parameter]) -> Any:
     """The value that a link has written; what makes no sense stays text, for the setting itself to refuse."""
-    if path == PEAKS:
-        return [_peak(part) for part in text.split(";")] if text else []
     p = known.get(path)
+    if isinstance(p, param.List) and holds_groups(p):
+        return [_item(part, settings_of(p)) for part in text.split(";")] if text else []
     if isinstance(p, param.List):
         return [parsed(part) for part in text.split(",")] if text else []
     if isinstance(p, param.Boolean):
@@ -108,16 +108,19 @@ def read(path: str, text: str, known: Mapping[str, param.Parameter]) -> Any:
     return parsed(text) if isinstance(p, param.Number) else text
 
 
-def _peak(text: str) -> Any:
+def _item(text: str, settings: Mapping[str, param.Parameter]) -> Any:
+    """One group of a list: its numbers in the order of its settings, a list of numbers at the end."""
     numbers = [parsed(part) for part in text.split(",")]
-    if len(numbers) < 3:
+    *names, last = settings
+    rest = numbers[len(names) :]
+    if not rest or (len(rest) > 1 and not isinstance(settings[last], param.List)):
         return text
-    return {"frequency": numbers[0], "damping": numbers[1], "rms": numbers[2:]}
+    return {**dict(zip(names, numbers, strict=False)), last: rest if isinstance(settings[last], param.List) else rest[0]}
 
 
 def _apply(base: Scenario, fields: Mapping[str, str], check: Check) -> tuple[Scenario, list[str]]:
     """Every field that can be applied, whatever their order, and a line for every other."""
-    known = {path: p for path, _, p in base.walk()}
+    known = {path: p for path, _, p in base.walk()} | dict(base.lists())
     values, refused = {}, {}
     scenario = base.copy()
     for path, text in fields.items():

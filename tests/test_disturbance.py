@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.disturbance import Disturbance, make_disturbance, turbulence_process, vibration_variance
+from wfsobs.disturbance import Disturbance, make_disturbance, vibration_variance
 from wfsobs.scenario import Scenario
+from wfsobs.turbulence import turbulence_process
 
 N = 4000
 

@@ -129,7 +129,10 @@ def test_every_number_states_its_unit_or_has_none(path: str) -> None:
     """A quantity's documentation starts or goes on with its unit in [brackets]; pure numbers have none."""
     p = next(p for found, _, p in Scenario().walk() if found == path)
     assert p.doc and p.label
-    pure = {"damping", "gain", "leak", "order", "seed", "training_size", "depth", "lgs_count", "exposure_ratio"}
+    pure = {
+        "damping", "fraction", "wind_factor", "radial_order", "gain", "leak", "order", "seed", "training_size", "depth",
+        "lgs_count", "exposure_ratio",
+    }
     is_quantity = isinstance(p, (param.Number, Reals)) and path.rsplit(".", 1)[-1] not in pure
     assert bool(unit_of(p)) == is_quantity
     if is_quantity:

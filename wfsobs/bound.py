@@ -18,10 +18,11 @@ import numpy as np
 
 from wfsobs.ar2 import Ar2
 from wfsobs.arrays import Array
-from wfsobs.disturbance import peak_rms, turbulence_process, vibration_power
+from wfsobs.disturbance import peak_rms, vibration_power
 from wfsobs.observers.base import TURBULENCE, VIBRATION
 from wfsobs.scenario import Scenario
 from wfsobs.sensing import low_frequency_process
+from wfsobs.turbulence import turbulence_process
 from wfsobs.wiener import Complex, advanced, causal_error, factorise
 
 BOUND = "bound"

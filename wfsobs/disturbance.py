@@ -1,26 +1,23 @@
 """`Disturbance`: turbulence and vibration of one run, made from a scenario.
 
-A new source of either is one more function in `TURBULENCE` or `VIBRATION`, under the name the
-scenario's `source` setting knows it by.
+A new source of vibration is one more function in `VIBRATION`, under the name the scenario's `source`
+setting knows it by; turbulence has a module of its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from wfsobs.ar2 import Ar2, turbulence_corner
+from wfsobs.ar2 import Ar2
 from wfsobs.arrays import Array
 from wfsobs.groups.vibration import Peak
 from wfsobs.measured import measured_spectrum
 from wfsobs.scenario import Scenario
 from wfsobs.spectrum import bin_edges, bin_frequencies, random_phase_signal, resonance_power, table_power
+from wfsobs.turbulence import SOURCES, ModeSource, columns, mode_power
 from wfsobs.watch import QUIET, Watch
-
-Source = Callable[[Scenario, int, int, np.random.Generator], Array]
-"""(scenario, mode index, number of steps, generator) -> one signal [um], shape (n_steps,)."""
 
 MIN_AR2_DAMPING = 1e-6
 """A pure line has no stationary AR(2) process; this damping stands for it."""
@@ -28,10 +25,15 @@ MIN_AR2_DAMPING = 1e-6
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Turbulence and vibration [um], each of shape (n_steps, n_modes)."""
+    """Turbulence and vibration [um], each of shape (n_steps, n_modes).
+
+    ngs_turbulence, lgs_turbulence : what the NGS and each of the LGS see of the turbulence, None where all see it as it is
+    """
 
     turbulence: Array
     vibration: Array
+    ngs_turbulence: Array | None = None
+    lgs_turbulence: tuple[Array, ...] | None = None
 
     @property
     def total(self) -> Array:
@@ -45,25 +47,9 @@ def make_disturbance(
     """Both disturbances over `n_steps`. Every source and mode has a random stream of its own, so
     changing one setting leaves the others' numbers as they were."""
     turbulence_rng, vibration_rng = rng.spawn(2)
-    return Disturbance(
-        _columns(TURBULENCE[scenario.turbulence.source], scenario, n_steps, turbulence_rng, watch),
-        _columns(VIBRATION[scenario.vibration.source], scenario, n_steps, vibration_rng, watch),
-    )
-
-
-def _columns(source: Source, scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch) -> Array:
-    columns = []
-    for mode, stream in enumerate(rng.spawn(len(scenario.modes))):
-        watch.check()
-        columns.append(source(scenario, mode, n_steps, stream))
-    return np.column_stack(columns)
-
-
-def turbulence_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
-    """The AR(2) turbulence of one mode (paper, eq. 1), sampled every `dt` [s], rms in [um]."""
-    t = scenario.turbulence
-    corner = turbulence_corner(t.wind_speed, scenario.telescope.diameter, scenario.modes[mode].radial_order)
-    return Ar2(corner, t.damping, t.rms, dt)
+    turbulence = SOURCES[scenario.turbulence.source](scenario, n_steps, turbulence_rng, watch)
+    vibration = columns(VIBRATION[scenario.vibration.source], scenario, n_steps, vibration_rng, watch)
+    return Disturbance(turbulence.on_axis, vibration, turbulence.ngs, turbulence.lgs)
 
 
 def peak_rms(peak_rms_list: list[float], mode: int) -> float:
@@ -90,12 +76,8 @@ def vibration_power(scenario: Scenario, mode: int, n: int) -> Array:
     return power
 
 
-def _no_disturbance(_scenario: Scenario, _mode: int, n: int, _rng: np.random.Generator) -> Array:
+def _no_vibration(_scenario: Scenario, _mode: int, n: int, _rng: np.random.Generator) -> Array:
     return np.zeros(n)
-
-
-def _ar2_turbulence(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
-    return turbulence_process(scenario, mode, scenario.dt).sample(n, rng)
 
 
 def _ar2_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
@@ -130,9 +112,7 @@ def _bin_power(scenario: Scenario, mode: int, n: int) -> Array:
     v, dt = scenario.vibration, scenario.dt
     power = np.zeros(n // 2 + 1)
     if v.source == "psd":
-        density = getattr(v.psd, scenario.modes[mode].name, None)
-        if density is not None:
-            power = table_power(v.psd.frequency, density, n, dt)
+        power = mode_power(v.psd, scenario, mode, n)
     elif v.source == "measured":
         spectrum = measured_spectrum(v.spectrum)
         if mode < spectrum.density.shape[1]:
@@ -146,7 +126,6 @@ def _bin_power(scenario: Scenario, mode: int, n: int) -> Array:
     return np.where((f > 0) & (f <= v.cutoff) & (f < 0.5 / dt), power, 0.0)
 
 
-TURBULENCE: dict[str, Source] = {"ar2": _ar2_turbulence, "none": _no_disturbance}
-VIBRATION: dict[str, Source] = {
-    "peaks": _dft_vibration, "psd": _dft_vibration, "measured": _dft_vibration, "ar2": _ar2_vibration, "none": _no_disturbance,
+VIBRATION: dict[str, ModeSource] = {
+    "peaks": _dft_vibration, "psd": _dft_vibration, "measured": _dft_vibration, "ar2": _ar2_vibration, "none": _no_vibration,
 }

@@ -207,7 +207,7 @@ def waves(
 
     reach : spatial frequency [rad/m] up to which waves are resolved finely at least
     """
-    streams = dict(zip(("core", "far", "beside", "ahead"), rng.spawn(4), strict=True))
+    streams: dict[str, np.random.Generator] = dict(zip(("core", "far", "beside", "ahead"), rng.spawn(4), strict=True))
     kx = 2.0 * np.pi * grid.f / layer.speed
     k0 = 2.0 * np.pi / outer_scale
     core, front = CORE / (0.5 * diameter), FAR / (0.5 * diameter)

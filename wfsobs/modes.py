@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
+
+from wfsobs.zernike import name, noll, up_to_order
 
 
 class Mode(NamedTuple):
@@ -13,4 +16,14 @@ class Mode(NamedTuple):
     radial_order: int
 
 
-TIP_TILT = (Mode("tip", 2, 1), Mode("tilt", 3, 1))
+@cache
+def modes_up_to(order: int) -> tuple[Mode, ...]:
+    """All modes up to a radial order, piston left out, in Noll's order.
+
+    >>> [mode.name for mode in modes_up_to(2)]
+    ['tip', 'tilt', 'defocus', 'oblique astigmatism', 'vertical astigmatism']
+    """
+    return tuple(Mode(name(j), j, noll(j)[0]) for j in up_to_order(order))
+
+
+TIP_TILT = modes_up_to(1)

@@ -9,13 +9,18 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from wfsobs.groups.atmosphere import Telescope, Turbulence
+from wfsobs.groups.atmosphere import PsdTable, Telescope, Turbulence
 from wfsobs.groups.observers import Butterworth, Kalman, MultiRate, OfflineGpr, OnlineGpr
 from wfsobs.groups.run import Loop, Run
 from wfsobs.groups.sensors import Sensors
 from wfsobs.groups.vibration import Vibration
-from wfsobs.modes import TIP_TILT, Mode
+from wfsobs.modes import Mode, modes_up_to
 from wfsobs.settings import Group, SettingError, section
+
+HIGHEST = 0.9
+"""Height of a layer over that of the laser guide stars: in a higher one the beam all but ends."""
+SLOWEST = 4e6
+"""Steps in which a layer crosses the aperture: frozen flow takes Fourier transforms of four times as many."""
 
 
 class Scenario(Group):
@@ -43,7 +48,7 @@ class Scenario(Group):
     @property
     def modes(self) -> tuple[Mode, ...]:
         """The Zernike modes of the run, one column of every array each."""
-        return TIP_TILT
+        return modes_up_to(self.telescope.radial_order)
 
     @property
     def dt(self) -> float:
@@ -67,19 +72,35 @@ class Scenario(Group):
         if self.kalman.frequency >= nyquist:
             raise SettingError(f"kalman.frequency = {self.kalman.frequency:g}: must be below half the LGS rate, {nyquist:g} Hz")
         if self.vibration.source == "psd":
-            self._validate_psd()
+            _validate_psd(self.vibration.psd, "vibration")
+        if self.turbulence.source == "psd":
+            _validate_psd(self.turbulence.psd, "turbulence")
+        if self.turbulence.source == "frozen-flow":
+            self._validate_layers()
         widest = max(self.butterworth.bandwidth_offline, self.butterworth.bandwidth_online) / 2
         for i, f in enumerate(self.butterworth.frequencies):
             if not (f - widest > 0 and f + widest < nyquist):
                 raise SettingError(f"butterworth.frequencies.{i} = {f:g}: the band of +- {widest:g} Hz around it must lie "
                                    f"between 0 and half the LGS rate, {nyquist:g} Hz")
 
-    def _validate_psd(self) -> None:
-        psd = self.vibration.psd
-        f = psd.frequency
-        if len(f) < 2 or any(b <= a for a, b in pairwise(f)):
-            raise SettingError("vibration.psd.frequency: needs at least two frequencies, increasing, for vibration.source = psd")
-        for name in ("tip", "tilt"):
-            if len(getattr(psd, name)) != len(f):
-                raise SettingError(f"vibration.psd.{name}: has {len(getattr(psd, name))} numbers, "
-                                   f"vibration.psd.frequency {len(f)}")
+    def _validate_layers(self) -> None:
+        layers = self.turbulence.layers
+        if not sum(layer.fraction for layer in layers) > 0:
+            raise SettingError("turbulence.layers: needs a layer of a fraction above 0, for turbulence.source = frozen-flow")
+        for i, layer in enumerate(layers):
+            if layer.height > HIGHEST * self.sensors.lgs_altitude:
+                raise SettingError(f"turbulence.layers.{i}.height = {layer.height:g}: takes up to {HIGHEST:g} of "
+                                   f"sensors.lgs_altitude, {HIGHEST * self.sensors.lgs_altitude:g} m")
+            crossing = self.telescope.diameter / (self.turbulence.wind_speed * layer.wind_factor)
+            if crossing * self.sensors.lgs_rate > SLOWEST:
+                raise SettingError(f"turbulence.layers.{i}.wind_factor = {layer.wind_factor:g}: it takes {crossing:.3g} s to "
+                                   f"cross the aperture, at most {SLOWEST / self.sensors.lgs_rate:.3g} s at this LGS rate")
+
+
+def _validate_psd(psd: PsdTable, group: str) -> None:
+    f = psd.frequency
+    if len(f) < 2 or any(b <= a for a, b in pairwise(f)):
+        raise SettingError(f"{group}.psd.frequency: needs at least two frequencies, increasing, for {group}.source = psd")
+    for name in ("tip", "tilt"):
+        if len(getattr(psd, name)) != len(f):
+            raise SettingError(f"{group}.psd.{name}: has {len(getattr(psd, name))} numbers, {group}.psd.frequency {len(f)}")

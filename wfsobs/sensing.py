@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from wfsobs import atmosphere
 from wfsobs.ar2 import Ar2, turbulence_corner
 from wfsobs.arrays import Array
 from wfsobs.disturbance import Disturbance
 from wfsobs.record import delayed, frame_mean
 from wfsobs.scenario import Scenario
+from wfsobs.turbulence import turbulence_process
 from wfsobs.watch import QUIET, Watch
 
 
 @dataclass(frozen=True)
 class OpenLoop:
-    """Open-loop measurements [um]: lgs (n_steps, n_modes), the plain mean over the LGS, and ngs, NaN
-    in steps without a frame."""
+    """Open-loop measurements [um]: lgs (n_steps, n_modes), that of the LGS together, and ngs, NaN in
+    steps without a frame."""
 
     lgs: Array
     ngs: Array
@@ -28,38 +30,77 @@ def measure(
 ) -> OpenLoop:
     """LGS at every step, NGS at every n-th, both of the wavefront up to the step before.
 
-    LGS: the mean over the guide stars of phi_dist[k-1] + low-frequency error + noise (paper, eq. 3),
-    each guide star with noise and error of its own. NGS at k = n, 2n, ...: the mean of phi_dist[k-1]
-    ... phi_dist[k-n], plus noise. With tip-tilt indetermination the LGS see no turbulence.
+    LGS: the mean over the guide stars of phi_dist[k-1] + error (paper, eq. 3), each guide star with noise and error of its
+    own; of frozen flow, each sees what is in its own beam. NGS at k = n, 2n, ...: the mean of phi_dist[k-1] ...
+    phi_dist[k-n], plus noise. With tip-tilt indetermination the LGS see no turbulence in tip and tilt.
     """
     lgs_rng, ngs_rng = rng.spawn(2)
     n_steps, n_modes = disturbance.total.shape
-    seen = disturbance.vibration if scenario.sensors.tip_tilt_indetermination else disturbance.total
     errors = [_lgs_error(scenario, n_steps, n_modes, stream, watch) for stream in lgs_rng.spawn(scenario.sensors.lgs_count)]
-    lgs = delayed(seen, 1) + np.mean(errors, axis=0)
+    seen = [_without_blind(scenario, x) for x in disturbance.lgs_turbulence or [disturbance.turbulence]]
+    if len(seen) == 1:
+        lgs = delayed(seen[0] + disturbance.vibration, 1) + np.mean(errors, axis=0)
+    else:
+        lgs = delayed(np.mean(seen, axis=0) + disturbance.vibration, 1) + np.mean(errors, axis=0)
 
     n = scenario.sensors.exposure_ratio
-    noise = scenario.sensors.ngs_noise * ngs_rng.standard_normal((n_steps, n_modes))
+    noise = scenario.sensors.ngs_noise * _normal(ngs_rng, n_steps, n_modes)
     frame = np.arange(n_steps)
     is_frame = (frame % n == 0) & (frame >= n)
-    ngs = np.where(is_frame[:, None], frame_mean(disturbance.total, n) + noise, np.nan)
+    ngs_turbulence = disturbance.turbulence if disturbance.ngs_turbulence is None else disturbance.ngs_turbulence
+    total = ngs_turbulence + disturbance.vibration
+    ngs = np.where(is_frame[:, None], frame_mean(total, n) + noise, np.nan)
     return OpenLoop(lgs, ngs)
 
 
+def _without_blind(scenario: Scenario, turbulence: Array) -> Array:
+    """What is left of the turbulence where an LGS cannot see tip and tilt."""
+    if not scenario.sensors.tip_tilt_indetermination:
+        return turbulence
+    visible = [mode.radial_order > 1 for mode in scenario.modes[: turbulence.shape[1]]]
+    return np.where(visible, turbulence, 0.0)
+
+
+def _normal(rng: np.random.Generator, n_steps: int, n_modes: int) -> Array:
+    """White noise (n_steps, n_modes); higher modes leave tip and tilt the numbers that they have alone."""
+    tip_tilt = rng.standard_normal((n_steps, min(n_modes, 2)))
+    return np.hstack([tip_tilt, rng.standard_normal((n_steps, n_modes - 2))]) if n_modes > 2 else tip_tilt
+
+
 def _lgs_error(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.Generator, watch: Watch) -> Array:
-    """Error of one guide star [um], (n_steps, n_modes): white noise plus a slow AR(2) with the corner
-    of the turbulence, since the part of the beam it misses moves with the same wind."""
+    """Error of one guide star [um], (n_steps, n_modes): white noise, plus what stands for the cone effect where turbulence
+    has no layers."""
     noise_rng, slow_rng = rng.spawn(2)
-    out = scenario.sensors.lgs_noise * noise_rng.standard_normal((n_steps, n_modes))
+    out = scenario.sensors.lgs_noise * _normal(noise_rng, n_steps, n_modes)
     for mode, stream in enumerate(slow_rng.spawn(n_modes)):
         watch.check()
         process = low_frequency_process(scenario, mode)
-        out[:, mode] += process.sample(n_steps, stream)
+        if process.rms > 0:
+            out[:, mode] += process.sample(n_steps, stream)
     return out
 
 
 def low_frequency_process(scenario: Scenario, mode: int) -> Ar2:
-    """The AR(2) that stands for cone effect and uplink turbulence of one LGS in one mode."""
+    """The AR(2) that stands for cone effect and uplink turbulence of one LGS in one mode; none with frozen flow.
+
+    It has the corner of the turbulence, since the part of the beam that an LGS misses moves with the same wind. A higher
+    order has the rms of tip in the ratio of their cone effects.
+    """
     t = scenario.turbulence
     corner = turbulence_corner(t.wind_speed, scenario.telescope.diameter, scenario.modes[mode].radial_order)
-    return Ar2(corner, t.damping, scenario.sensors.lgs_low_frequency_rms, scenario.dt)
+    rms = 0.0
+    if t.source != "frozen-flow":
+        rms = scenario.sensors.lgs_low_frequency_rms * atmosphere.relative_cone_error(scenario, mode)
+    return Ar2(corner, t.damping, rms, scenario.dt)
+
+
+def lgs_error_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
+    """The slow error of the mean over the LGS in one mode, sampled every `dt` [s]; of frozen flow the AR(2) process of its
+    variance with the corner of the turbulence."""
+    if scenario.turbulence.source == "frozen-flow":
+        if scenario.sensors.tip_tilt_indetermination and scenario.modes[mode].radial_order == 1:
+            return turbulence_process(scenario, mode, dt)
+        rms = float(np.sqrt(atmosphere.mean_lgs_error_variance(scenario, mode)))
+        return replace(turbulence_process(scenario, mode, dt), rms=rms)
+    one = low_frequency_process(scenario, mode)
+    return replace(one, rms=one.rms / np.sqrt(scenario.sensors.lgs_count), dt=dt)

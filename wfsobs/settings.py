@@ -91,7 +91,7 @@ class Group(param.Parameterized):
                 raise SettingError(f"{path} = {value!r}: this is a group of settings, not a value")
             current.update(value, f"{path}.")
             return
-        if isinstance(p, param.List) and _holds_groups(p):
+        if isinstance(p, param.List) and holds_groups(p):
             value = _groups(p, value, path)
         elif isinstance(value, Group):
             value = value.copy()
@@ -143,11 +143,20 @@ class Group(param.Parameterized):
             value = getattr(self, name)
             if isinstance(value, Group):
                 yield from value.walk(f"{prefix}{name}.")
-            elif isinstance(p, param.List) and _holds_groups(p):
+            elif isinstance(p, param.List) and holds_groups(p):
                 for i, item in enumerate(value):
                     yield from item.walk(f"{prefix}{name}.{i}.")
             else:
                 yield f"{prefix}{name}", self, p
+
+    def lists(self, prefix: str = "") -> Iterator[tuple[str, param.List]]:
+        """(dotted path, parameter) of every list of groups."""
+        for name, p in self.settings().items():
+            value = getattr(self, name)
+            if isinstance(value, Group):
+                yield from value.lists(f"{prefix}{name}.")
+            elif isinstance(p, param.List) and holds_groups(p):
+                yield f"{prefix}{name}", p
 
 
 def section(kind: type[G], label: str, doc: str = "") -> G:
@@ -163,8 +172,14 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _holds_groups(p: param.List) -> bool:
+def holds_groups(p: param.List) -> bool:
+    """Whether a list's items are groups of settings."""
     return isinstance(p.item_type, type) and issubclass(p.item_type, Group)
+
+
+def settings_of(p: param.List) -> dict[str, param.Parameter]:
+    """The settings of an item of a list of groups."""
+    return cast(type[Group], p.item_type).settings()
 
 
 def _groups(p: param.List, value: Any, path: str) -> list[Group]:

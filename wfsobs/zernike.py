@@ -6,6 +6,7 @@ Reference: R. J. Noll, "Zernike polynomials and atmospheric turbulence", J. Opt.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from math import gamma
@@ -48,16 +49,23 @@ def up_to_order(order: int) -> range:
     return range(2, (order + 1) * (order + 2) // 2 + 1)
 
 
-def transform(j: int, kx: Array, ky: Array) -> Array:
+def over_argument(order: int, x: Array) -> Array:
+    """J_order(x) / x for an order of 1 or more, its limit at 0."""
+    at_zero = 0.5 if order == 1 else 0.0
+    return np.where(x > 0, jv(order, x) / np.where(x > 0, x, 1.0), at_zero)
+
+
+def transform(j: int, kx: Array, ky: Array, bessel: Callable[[int, Array], Array] = over_argument) -> Array:
     """What mode j makes of exp(i k . r), r in units of the aperture's radius: complex, shape of k.
 
     (1 / pi) integral over the unit disc of Z_j(r) exp(i k . r), Noll's eq. 8 in angular frequencies:
     2 sqrt(n + 1) (-1)^((n - m) / 2) i^m J_(n+1)(k) / k, times sqrt(2) cos or sin of m times the angle of k where m > 0.
+    bessel : (n, x) -> J_n(x) / x
     """
     n, signed = noll(j)
     m = abs(signed)
     k = np.hypot(kx, ky)
-    factor = 2.0 * math.sqrt(n + 1.0) * (-1) ** ((n - m) // 2) * 1j**m * over_argument(n + 1, k)
+    factor = 2.0 * math.sqrt(n + 1.0) * (-1) ** ((n - m) // 2) * 1j**m * bessel(n + 1, k)
     if m == 0:
         return factor
     turn = ((kx + 1j * ky) / np.where(k > 0, k, 1.0)) ** m
@@ -81,12 +89,6 @@ def noll_covariance(j: int, i: int) -> float:
     sign = (-1) ** ((n + p - 2 * abs(m)) // 2)
     return numeric * sign * math.sqrt((n + 1.0) * (p + 1.0)) * gamma((n + p - 5 / 3) / 2) / (
         gamma((n - p + 17 / 3) / 2) * gamma((p - n + 17 / 3) / 2) * gamma((n + p + 23 / 3) / 2))
-
-
-def over_argument(order: int, x: Array) -> Array:
-    """J_order(x) / x for an order of 1 or more, its limit at 0."""
-    at_zero = 0.5 if order == 1 else 0.0
-    return np.where(x > 0, jv(order, x) / np.where(x > 0, x, 1.0), at_zero)
 
 
 TABLE_STEP, TABLE_END = 0.005, 1024.0
@@ -127,11 +129,13 @@ class ZernikeProjection:
         """The projection smooths: it asks for nothing beyond what the layer has anyway [rad/m]."""
         return 0.0
 
-    def transform(self, kx: Array, ky: Array, footprint: Footprint) -> Array:
+    def transform(
+        self, kx: Array, ky: Array, footprint: Footprint, bessel: Callable[[int, Array], Array] = over_argument
+    ) -> Array:
         """M(k) of every mode, shift included, complex (n_outputs, *shape of k)."""
         radius = 0.5 * self.diameter * footprint.scale
         turn = np.exp(1j * (kx * footprint.shift[0] + ky * footprint.shift[1]))
-        return np.array([transform(j, radius * kx, radius * ky) * turn for j in self.modes])
+        return np.array([transform(j, radius * kx, radius * ky, bessel) * turn for j in self.modes])
 
     def measure(self, wave: Wave, footprint: Footprint) -> Array:
         """See `wave.Sensor`. Modes are even or odd across the wind, so k_y and -k_y are added up first; an angle

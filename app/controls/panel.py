@@ -11,8 +11,7 @@ import param
 from panel.custom import JSComponent
 
 from wfsobs.app.controls.fields import ROOM, Field, make_field
-from wfsobs.app.controls.peaks import PATH as PEAKS
-from wfsobs.app.controls.peaks import PeakEditor
+from wfsobs.app.controls.rows import RowEditor
 from wfsobs.app.run import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset
@@ -44,7 +43,7 @@ class Controls:
     def __init__(self, store: Store):
         self.store = store
         self.fields: dict[str, Field] = {}
-        self.peaks: PeakEditor | None = None
+        self.lists: dict[str, RowEditor] = {}
         self.preset = pmui.Select(
             label="Preset", value=store.preset, options={_title(name): name for name in PRESETS}, size="small", **ROOM)
         self.reset = pmui.Button(
@@ -82,14 +81,12 @@ class Controls:
         column = self.rooms[name]
         if len(column):
             return
-        views: list[Any] = []
-        if name == "vibration":
-            self.peaks = PeakEditor(self.store)
-            views.append(self.peaks.view)
         group = getattr(self.store.scenario, name)
+        self.lists |= {path: RowEditor(self.store, path, p) for path, p in group.lists(f"{name}.")}
+        views: list[Any] = [editor.view for path, editor in self.lists.items() if path.startswith(f"{name}.")]
         heading = name
         for path, _, _ in group.walk(f"{name}."):
-            if path in FIRST or path.startswith(f"{PEAKS}."):
+            if path in FIRST or any(path.startswith(f"{listed}.") for listed in self.lists):
                 continue
             *_, above, _setting = path.split(".")
             if above != heading:

@@ -10,12 +10,13 @@ import pytest
 
 from wfsobs.app.controls.fields import SliderField, label_of, parsed, written_unit
 from wfsobs.app.controls.panel import FIRST, Controls, status_of
-from wfsobs.app.controls.peaks import PATH
 from wfsobs.app.work import Shown
 from wfsobs.pipeline import Result
 from wfsobs.presets import PRESETS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
+
+PATH = "vibration.peaks"
 
 
 def nothing(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
@@ -71,10 +72,12 @@ def error_of(controls: Controls, path: str) -> str:
 
 def test_every_setting_has_one_field(controls: Controls) -> None:
     open_all(controls)
-    settings = [path for path, _, _ in controls.store.scenario.walk() if not path.startswith(PATH)]
+    lists = [path for path, _ in controls.store.scenario.lists()]
+    settings = [path for path, _, _ in controls.store.scenario.walk() if not any(path.startswith(f"{at}.") for at in lists)]
     assert sorted(controls.fields) == sorted(settings)
-    assert controls.peaks is not None
-    assert len(controls.peaks.table.rows) == len(controls.store.scenario.vibration.peaks)
+    assert sorted(controls.lists) == sorted(lists) == ["turbulence.layers", PATH]
+    for path in lists:
+        assert len(controls.lists[path].table.rows) == len(controls.store.value(path))
 
 
 def test_labels_come_from_the_settings(controls: Controls) -> None:
@@ -222,24 +225,21 @@ def test_run_and_cancel(controls: Controls, loop: Any) -> None:
 
 class TestPeaks:
     def test_add(self, controls: Controls, loop: Any) -> None:
-        assert controls.peaks is not None
-        n = len(controls.peaks.table.rows)
-        controls.peaks.table._handle_msg({"action": "add"})
-        assert len(controls.store.scenario.vibration.peaks) == n + 1 == len(controls.peaks.table.rows)
+        n = len(controls.lists[PATH].table.rows)
+        controls.lists[PATH].table._handle_msg({"action": "add"})
+        assert len(controls.store.scenario.vibration.peaks) == n + 1 == len(controls.lists[PATH].table.rows)
         assert controls.store.run.state == "running"
         loop.finish(controls.store)
 
     def test_remove(self, controls: Controls, loop: Any) -> None:
-        assert controls.peaks is not None
         second = controls.store.scenario.vibration.peaks[1]
-        controls.peaks.table._handle_msg({"action": "remove", "row": 0})
+        controls.lists[PATH].table._handle_msg({"action": "remove", "row": 0})
         assert controls.store.scenario.vibration.peaks[0] == second
         loop.finish(controls.store)
 
     def test_remove_all(self, controls: Controls, loop: Any) -> None:
-        assert controls.peaks is not None
-        while controls.peaks.table.rows:
-            controls.peaks.table._handle_msg({"action": "remove", "row": 0})
+        while controls.lists[PATH].table.rows:
+            controls.lists[PATH].table._handle_msg({"action": "remove", "row": 0})
         loop.finish(controls.store)
         assert controls.store.run.state == "done"
 
@@ -247,11 +247,10 @@ class TestPeaks:
         ("frequency", "33.3", 33.3), ("damping", "0", 0.0), ("rms.0", "0.02", 0.02), ("rms.1", "2e-3", 0.002),
     ])
     def test_edit_in_place(self, controls: Controls, loop: Any, key: str, text: str, expected: float) -> None:
-        assert controls.peaks is not None
         before = controls.store.run.shown
-        controls.peaks.table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
+        controls.lists[PATH].table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
         assert controls.store.value(f"{PATH}.2.{key}") == expected
-        assert controls.peaks.table.errors == {}
+        assert controls.lists[PATH].table.errors == {}
         loop.finish(controls.store)
         assert controls.store.run.shown is not before
         assert controls.store.run.shown.scenario == controls.store.scenario
@@ -261,21 +260,19 @@ class TestPeaks:
         ("rms.1", "-1", "from 0 to 100"),
     ])
     def test_bad_cell(self, controls: Controls, key: str, text: str, says: str) -> None:
-        assert controls.peaks is not None
-        shown, rows = controls.store.run.shown, controls.peaks.table.rows
-        controls.peaks.table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
-        error = controls.peaks.table.errors[f"2.{key}"]
+        shown, rows = controls.store.run.shown, controls.lists[PATH].table.rows
+        controls.lists[PATH].table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
+        error = controls.lists[PATH].table.errors[f"2.{key}"]
         assert error["text"] == text and says in error["reason"]
-        assert controls.store.run.shown is shown and controls.peaks.table.rows == rows
+        assert controls.store.run.shown is shown and controls.lists[PATH].table.rows == rows
         good = {"frequency": rows[2][0], "damping": rows[2][1], "rms.1": rows[2][3]}[key]
-        controls.peaks.table._handle_msg({"action": "edit", "row": 2, "key": key, "text": good})
-        assert controls.peaks.table.errors == {} and controls.store.run.shown is shown
+        controls.lists[PATH].table._handle_msg({"action": "edit", "row": 2, "key": key, "text": good})
+        assert controls.lists[PATH].table.errors == {} and controls.store.run.shown is shown
 
     def test_removing_a_bad_row_removes_its_error(self, controls: Controls, loop: Any) -> None:
-        assert controls.peaks is not None
-        controls.peaks.table._handle_msg({"action": "edit", "row": 0, "key": "damping", "text": "7"})
-        controls.peaks.table._handle_msg({"action": "remove", "row": 0})
-        assert controls.peaks.table.errors == {}
+        controls.lists[PATH].table._handle_msg({"action": "edit", "row": 0, "key": "damping", "text": "7"})
+        controls.lists[PATH].table._handle_msg({"action": "remove", "row": 0})
+        assert controls.lists[PATH].table.errors == {}
         loop.finish(controls.store)
 
 

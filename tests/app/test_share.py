@@ -16,10 +16,11 @@ from hypothesis import strategies as st
 import wfsobs
 from wfsobs.app.share import LONGEST, changes, from_file, from_query, to_command, to_file, to_python, to_query
 from wfsobs.cli import main
+from wfsobs.groups.atmosphere import Layer
 from wfsobs.groups.vibration import Peak
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
+from wfsobs.settings import Group, SettingError
 
 QUICK = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50}
 LEAVES = [(path, p) for path, _, p in Scenario().walk() if not path.startswith("vibration.peaks")]
@@ -33,7 +34,7 @@ def allowed(p: Any) -> st.SearchStrategy[Any]:
         return st.sampled_from(list(p.objects))
     if isinstance(p, param.List):
         low, high = p.item_bounds  # type: ignore[attr-defined]
-        return st.lists(st.floats(low, high), min_size=p.bounds[0], max_size=5)
+        return st.lists(st.floats(low, high), min_size=p.bounds[0], max_size=min(5, p.bounds[1]))
     low, high = p.bounds
     if isinstance(p, param.Integer):
         return st.integers(low, high)
@@ -41,8 +42,8 @@ def allowed(p: Any) -> st.SearchStrategy[Any]:
     return st.floats(low, high, exclude_min=not above, exclude_max=not below)
 
 
-def peaks() -> st.SearchStrategy[list[dict[str, Any]]]:
-    fields = {name: allowed(p) for name, p in Peak.settings().items()}
+def items(kind: type[Group]) -> st.SearchStrategy[list[dict[str, Any]]]:
+    fields = {name: allowed(p) for name, p in kind.settings().items()}
     return st.lists(st.fixed_dictionaries(fields), max_size=4)
 
 
@@ -69,9 +70,9 @@ def test_every_setting_survives_a_link_and_a_file(path: str, p: Any, data: st.Da
 
 
 @settings(max_examples=20, deadline=None, derandomize=True)
-@given(listed=peaks())
-def test_peaks_survive_a_link(listed: list[dict[str, Any]]) -> None:
-    scenario = Scenario().replace({"vibration.peaks": listed, "sensors.lgs_rate": 20_000.0})
+@given(peaks=items(Peak), layers=items(Layer))
+def test_peaks_and_layers_survive_a_link(peaks: list[dict[str, Any]], layers: list[dict[str, Any]]) -> None:
+    scenario = Scenario().replace({"vibration.peaks": peaks, "turbulence.layers": layers, "sensors.lgs_rate": 20_000.0})
     query = to_query(scenario, "ut4")
     assert query is not None and from_query(query).scenario == scenario
 
@@ -97,7 +98,9 @@ def test_a_bad_field_is_named_and_the_rest_applies() -> None:
 
 @pytest.mark.parametrize("query", [
     "preset=other", "preset=", "run.seed=", "run.seed=__import__('os')", "run.duration=/etc/passwd", "telescope=1",
-    "loop.closed=yes", "vibration.peaks=1,2", "vibration.peaks=a,b,c", "vibration.peaks=1,0,nan", "run.duration=nan",
+    "loop.closed=yes", "vibration.peaks=1,2",
+    "turbulence.layers=1,1,1", "turbulence.layers=1,1,1,1,1",
+    "vibration.peaks=a,b,c", "vibration.peaks=1,0,nan", "run.duration=nan",
     "run.seed=1.5", "turbulence.wind_speed=1e999", f"run.seed={'9' * 5000}", "loop.=1", ".=1", "=1", "vibration.peaks.x=1",
     "vibration.peaks.999.frequency=3", "turbulence.wind_speed=%FF%00", "_refused=1", "name=x", "turbulence.name=x",
     "kalman.frequency=600", "run.warm_up=20", f"x={'a' * LONGEST}",

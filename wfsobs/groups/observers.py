@@ -20,9 +20,10 @@ class Kalman(Group):
         default="matched", objects=["matched", "manual"], label="Process noise Q",
         doc="matched: Q from the rms of the scenario's turbulence and vibration; manual: from the two numbers below.")
     turbulence_rms = Real(0.5, bounds=(1e-6, 100.0), softbounds=(0.001, 2.0), label="Model turbulence rms",
-                          doc="Standard deviation of the modelled turbulence [um], for process noise manual.")
+                          doc="Standard deviation of the modelled turbulence in tip and tilt [um], for process noise manual; a "
+                              "higher order has it in the ratio that r0 and L0 give.")
     vibration_rms = Real(0.015, bounds=(1e-6, 100.0), softbounds=(0.001, 0.2), label="Model vibration rms",
-                         doc="Standard deviation of the modelled vibration [um], for process noise manual.")
+                         doc="Standard deviation of the modelled vibration in tip and tilt [um], for process noise manual.")
     measurement_noise = param.Selector(
         default="matched", objects=["matched", "manual"], label="Measurement noise R",
         doc="matched: R from the white noise of the scenario's sensors; manual: from the two numbers below.")

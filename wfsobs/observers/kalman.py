@@ -8,10 +8,13 @@ y up to k - 1. Here phi_hat[k] uses y[k] too, like the GPR. The mirror's part is
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from wfsobs.ar2 import Ar2, turbulence_corner
+from wfsobs.ar2 import Ar2
 from wfsobs.arrays import Array
+from wfsobs.atmosphere import relative_rms
 from wfsobs.disturbance import vibration_variance
 from wfsobs.lifted import PeriodicFilter
 from wfsobs.observers.base import TARGETS
@@ -19,6 +22,7 @@ from wfsobs.record import Record
 from wfsobs.riccati import SteadyState, steady_state
 from wfsobs.scenario import Scenario
 from wfsobs.statespace import MIN_MODEL_DAMPING, DisturbanceModel, disturbance_model
+from wfsobs.turbulence import turbulence_process
 from wfsobs.watch import Watch
 
 MIN_NOISE = 1e-6
@@ -27,13 +31,13 @@ MIN_NOISE = 1e-6
 
 def modelled_processes(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2, Ar2]:
     """The turbulence and the one vibration peak of the model, sampled every `dt` [s] (paper, Tables 1 and 2)."""
-    k, t = scenario.kalman, scenario.turbulence
-    matched = k.process_noise == "matched"
-    turbulence_rms = (t.rms if t.source != "none" else 0.0) if matched else k.turbulence_rms
-    vibration_rms = float(np.sqrt(vibration_variance(scenario, mode))) if matched else k.vibration_rms
-    corner = turbulence_corner(t.wind_speed, scenario.telescope.diameter, scenario.modes[mode].radial_order)
-    vibration_damping = max(k.damping, MIN_MODEL_DAMPING)
-    return Ar2(corner, t.damping, turbulence_rms, dt), Ar2(2.0 * np.pi * k.frequency, vibration_damping, vibration_rms, dt)
+    k, tip_tilt = scenario.kalman, scenario.modes[mode].radial_order == 1
+    manual = k.process_noise == "manual"
+    turbulence = turbulence_process(scenario, mode, dt)
+    if manual:
+        turbulence = replace(turbulence, rms=k.turbulence_rms * relative_rms(scenario, mode))
+    vibration_rms = k.vibration_rms if manual and tip_tilt else float(np.sqrt(vibration_variance(scenario, mode)))
+    return turbulence, Ar2(2.0 * np.pi * k.frequency, max(k.damping, MIN_MODEL_DAMPING), vibration_rms, dt)
 
 
 def kalman_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:

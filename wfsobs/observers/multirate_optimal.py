@@ -10,8 +10,6 @@ the periodic Riccati equation of the n steps. Optimal for its model only; the pa
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.linalg import block_diag
 
@@ -24,7 +22,7 @@ from wfsobs.observers.multirate import MultiRateFilter, multirate_noise, run_mod
 from wfsobs.record import Record
 from wfsobs.riccati import SteadyState, Step, periodic_steady_state
 from wfsobs.scenario import Scenario
-from wfsobs.sensing import low_frequency_process
+from wfsobs.sensing import lgs_error_process
 from wfsobs.statespace import DisturbanceModel, process_model
 from wfsobs.watch import Watch
 
@@ -75,8 +73,7 @@ def optimal_model(scenario: Scenario, mode: int, dt: float, ratio: int) -> tuple
     model = kalman_model(scenario, mode, dt)
     error = None
     if scenario.multirate.model_lgs_error:
-        one = low_frequency_process(scenario, mode)
-        error = replace(one, rms=one.rms / np.sqrt(scenario.sensors.lgs_count), dt=dt)
+        error = lgs_error_process(scenario, mode, dt)
     cycle = optimal_cycle(model, ratio, *multirate_noise(scenario), error)
     rows = model.output_rows(TARGETS)
     return cycle, np.hstack([rows, np.zeros((len(rows), len(cycle[0][0]) - rows.shape[1]))])

@@ -10,7 +10,7 @@ export function render({model, el}) {
   const add = document.createElement("button")
   add.type = "button"
   add.className = "add"
-  add.textContent = "+ Add peak"
+  add.textContent = `+ Add ${model.noun}`
   add.onclick = () => model.send_msg({action: "add"})
   const scroll = document.createElement("div")
   scroll.className = "rows"
@@ -23,7 +23,7 @@ export function render({model, el}) {
     input.value = value
     input.inputMode = "decimal"
     input.dataset.cell = `${row}.${column.key}`
-    input.setAttribute("aria-label", `Peak ${row + 1}: ${column.name}`)
+    input.setAttribute("aria-label", `${model.noun[0].toUpperCase()}${model.noun.slice(1)} ${row + 1}: ${column.name}`)
     input.onchange = () => model.send_msg({action: "edit", row, key: column.key, text: input.value})
     return input
   }
@@ -49,8 +49,8 @@ export function render({model, el}) {
       remove.type = "button"
       remove.className = "remove"
       remove.textContent = "×"
-      remove.title = `Remove peak ${i + 1}`
-      remove.setAttribute("aria-label", `Remove peak ${i + 1}`)
+      remove.title = `Remove ${model.noun} ${i + 1}`
+      remove.setAttribute("aria-label", `Remove ${model.noun} ${i + 1}`)
       remove.onclick = () => model.send_msg({action: "remove", row: i})
       line.insertCell().append(remove)
     })

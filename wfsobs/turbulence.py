@@ -1,0 +1,107 @@
+"""Turbulence of one run, made from a scenario, and what the stars see of it.
+
+A new source is one more function in `SOURCES`, under the name that the scenario's `turbulence.source` knows it by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from wfsobs import atmosphere
+from wfsobs.ar2 import Ar2, turbulence_corner
+from wfsobs.arrays import Array
+from wfsobs.frozen_flow import frozen_flow
+from wfsobs.groups.atmosphere import PsdTable
+from wfsobs.scenario import Scenario
+from wfsobs.spectrum import random_phase_signal, table_power
+from wfsobs.watch import Watch
+
+
+@dataclass(frozen=True)
+class Turbulence:
+    """Turbulence [um], each array (n_steps, n_modes).
+
+    on_axis  : the truth
+    ngs, lgs : what the NGS and each of the LGS see of it, or None where all see the truth
+    """
+
+    on_axis: Array
+    ngs: Array | None = None
+    lgs: tuple[Array, ...] | None = None
+
+
+Source = Callable[[Scenario, int, np.random.Generator, Watch], Turbulence]
+"""(scenario, number of steps, generator, watch) -> turbulence."""
+ModeSource = Callable[[Scenario, int, int, np.random.Generator], Array]
+"""(scenario, mode index, number of steps, generator) -> one signal [um], shape (n_steps,)."""
+
+
+def turbulence_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
+    """The AR(2) turbulence of one mode (paper, eq. 1), sampled every `dt` [s], rms in [um]; where turbulence is made
+    another way, the AR(2) process of its variance and effective wind."""
+    corner = turbulence_corner(
+        atmosphere.effective_wind(scenario), scenario.telescope.diameter, scenario.modes[mode].radial_order)
+    return Ar2(corner, scenario.turbulence.damping, turbulence_rms(scenario, mode), dt)
+
+
+def turbulence_rms(scenario: Scenario, mode: int) -> float:
+    """Standard deviation [um] that the scenario's turbulence has in one mode."""
+    t = scenario.turbulence
+    if t.source == "none":
+        return 0.0
+    if t.source == "psd":
+        return float(np.sqrt(mode_power(t.psd, scenario, mode, scenario.n_steps)[1:].sum()))
+    if t.source == "frozen-flow":
+        return float(np.sqrt(atmosphere.frozen_flow_variance(scenario, mode)))
+    return t.rms * atmosphere.relative_rms(scenario, mode)
+
+
+def mode_power(table: PsdTable, scenario: Scenario, mode: int, n: int) -> Array:
+    """Variance [um^2] that a table gives one mode in each DFT bin of `n` steps; modes that it does not hold have none."""
+    density = getattr(table, scenario.modes[mode].name, None)
+    return np.zeros(n // 2 + 1) if density is None else table_power(table.frequency, density, n, scenario.dt)
+
+
+def columns(source: ModeSource, scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch) -> Array:
+    """One signal per mode, each with a random stream of its own, (n_steps, n_modes)."""
+    out = []
+    for mode, stream in enumerate(rng.spawn(len(scenario.modes))):
+        watch.check()
+        out.append(source(scenario, mode, n_steps, stream))
+    return np.column_stack(out)
+
+
+def _mode_by_mode(source: ModeSource) -> Source:
+    """A source that knows no stars."""
+    return lambda scenario, n, rng, watch: Turbulence(columns(source, scenario, n, rng, watch))
+
+
+def _none(_scenario: Scenario, _mode: int, n: int, _rng: np.random.Generator) -> Array:
+    return np.zeros(n)
+
+
+def _ar2(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
+    return turbulence_process(scenario, mode, scenario.dt).sample(n, rng)
+
+
+def _psd(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
+    """Inverse DFT of the table, all of it up to half the rate."""
+    return random_phase_signal(mode_power(scenario.turbulence.psd, scenario, mode, n), n, rng)
+
+
+def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Watch) -> Turbulence:
+    """Von Karman layers, projected on the axis, on the NGS and on every LGS."""
+    layers, sensor = atmosphere.layers(scenario), atmosphere.ideal_sensor(scenario)
+    stars = [atmosphere.on_axis(), atmosphere.natural_star(scenario), *atmosphere.laser_stars(scenario)]
+    views = [atmosphere.view(sensor, star, layers) for star in stars]
+    on_axis, ngs, *lgs = frozen_flow(
+        layers, scenario.turbulence.outer_scale, scenario.telescope.diameter, views, n, scenario.dt, rng, watch)
+    return Turbulence(on_axis, ngs, tuple(lgs))
+
+
+SOURCES: dict[str, Source] = {
+    "ar2": _mode_by_mode(_ar2), "frozen-flow": _frozen_flow, "psd": _mode_by_mode(_psd), "none": _mode_by_mode(_none),
+}
