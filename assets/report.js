@@ -155,13 +155,9 @@ function hide(figure, target) {
 // ------------------------------------------------------------------ time window
 
 function zoom(figure, state) {
-  const range = figure.x_range
-  const whole = {start: 0, end: state.length}
-  const [start, end] = data.window ?? [state.length / 2 - 0.25, state.length / 2 + 0.25]
-  const middle = 0.5 * (start + end)
-  const now = {whole, 2: {start: middle - 1, end: middle + 1}, window: {start, end}}[shown.zoom]
-  range.setv({
-    start: Math.max(now.start, 0), end: Math.min(now.end, state.length), reset_start: whole.start, reset_end: whole.end})
+  const width = shown.zoom === "whole" ? state.length : Math.min(Number(shown.zoom), state.length)
+  const start = 0.5 * (state.length - width)
+  figure.x_range.setv({start, end: start + width, reset_start: 0, reset_end: state.length})
 }
 
 // ------------------------------------------------------------------ cards and table
@@ -197,6 +193,7 @@ function card(target, name) {
 function drawTable() {
   const copy = document.querySelector(`[data-state="${shown.state}"]`).cloneNode(true)
   copy.removeAttribute("data-state")
+  copy.querySelector(".scroll").setAttribute("aria-label", "RMS errors")
   for (const body of copy.querySelectorAll("tbody")) body.hidden = body.dataset.mode !== shown.mode
   inUnit(copy, data.states[shown.state].scale[shown.unit])
   document.getElementById("table").replaceChildren(copy)

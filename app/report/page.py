@@ -98,7 +98,7 @@ def _controls(report: Report) -> str:
         _switch("mode", "Mode", modes), _switch("unit", "Unit", UNITS),
         _switch("show", "Show", {SIGNAL: "Signal", ERROR: "Error"}),
         _switch("spectrum", "Spectrum", {PSD: "PSD", CUMULATIVE: "Cumulative rms"}),
-        _switch("zoom", "Time window", {"whole": "Whole record", "2": "2 s", "window": "0.5 s"})))
+        _switch("zoom", "Time window", {"whole": "Whole record", "2": "2 s", "0.5": "0.5 s"})))
     return f'{sliders}<div class="switches">{switches}</div><p id="fault" role="alert" hidden></p>'
 
 
@@ -121,12 +121,14 @@ def _target(target: str) -> str:
 def _tables(report: Report) -> str:
     """The table of the state shown, for scripts, and that of every state."""
     several = len(report.states) > 1
+    names = [state_name(report, state, i) or "All modes" for i, state in enumerate(report.states)]
     tables = "".join(
-        f'<details{" open" * (i == report.start)}><summary>{escape(state_name(report, state, i) or "All modes")}</summary>'
-        f'<div data-state="{i}">{state_table(state)}</div></details>' for i, state in enumerate(report.states))
+        f'<details{" open" * (i == report.start)}><summary>{escape(name)}</summary>'
+        f'<div data-state="{i}">{state_table(state, name)}</div></details>'
+        for i, (name, state) in enumerate(zip(names, report.states, strict=True)))
     heading = f"<h3>Every variation</h3>{tables}" if several else tables
     return (
-        '<noscript><p>The figures need JavaScript; the numbers are here.</p></noscript>'
+        '<p class="no-script">The figures need JavaScript; the numbers are here.</p>'
         f'<div id="table" class="script-only"></div><div{"" if several else " class=no-script"}>{heading}</div>')
 
 

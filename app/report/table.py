@@ -25,14 +25,14 @@ COLUMNS = {
 BEST, ABOVE = '<span class="tag best">best</span> ', '<span class="tag above">above truth</span> '
 
 
-def state_table(state: State) -> str:
-    """Every score of a state, one body per target and mode, best first, and what is missing."""
+def state_table(state: State, name: str) -> str:
+    """Every score of a state of some name, one body per target and mode, best first, and what is missing."""
     head = "".join(f'<th scope=col title="{why}">{name}</th>' for name, why in COLUMNS.items())
     groups = [list(rows) for _, rows in groupby(sorted(state.rows, key=_order(state.rows)), _group)]
     bodies = "".join(_body(state, rows) for rows in groups)
     why = "".join(f'<p class="failure">{escape(reason)}</p>' for reason in state.reasons)
     return (
-        '<div class="scroll" tabindex=0 role=region aria-label="RMS errors">'
+        f'<div class="scroll" tabindex=0 role=region aria-label="RMS errors: {escape(name)}">'
         f'<table class="rms"><thead><tr>{head}</tr></thead>{bodies}</table></div>{why}')
 
 

@@ -1,0 +1,293 @@
+"""The report from disk, without a network: every state's numbers, the switches, the keyboard, without JavaScript."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from importlib.resources import files
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from playwright.sync_api import Browser, Page, expect
+
+import wfsobs
+from wfsobs.app.display import UNITS, number, per_micrometre
+from wfsobs.cli import main
+from wfsobs.observers import OBSERVERS
+from wfsobs.scores import cumulative_rms, spectra
+
+SETTINGS = {
+    "run.duration": 2.0, "run.warm_up": 0.5, "gpr_online.training_size": 20, "gpr_offline.training_size": 50,
+    "gpr_online.depth": 20, "gpr_offline.depth": 20,
+}
+SHORT = [word for path, value in SETTINGS.items() for word in ("--set", f"{path}={value}")]
+SPEEDS, GAINS = (5, 15), (0.2, 0.3)
+START = (1, 1)
+"""The settings as they are, among the variations."""
+
+TABLE = """() => Object.fromEntries([...document.querySelectorAll("#table tbody:not([hidden])")].flatMap(body =>
+    [...body.querySelectorAll("tr[data-observer]")].map(tr =>
+        [`${body.dataset.target}/${tr.dataset.observer}`, [...tr.cells].map(c => c.textContent.trim())])))"""
+
+CARDS = """() => Object.fromEntries(["turbulence", "vibration"].flatMap(target =>
+    [...document.querySelectorAll(`#cards-${target} .card`)].map(c =>
+        [`${target}/${c.dataset.name}`, c.querySelector(".value").textContent])))"""
+
+LINE = """([figure, name]) => {
+  const it = Bokeh.documents[0].get_model_by_name(figure)
+  const line = it.renderers.find(r => r.name === name)
+  const data = line.data_source.data
+  return {y: [...data[name]].map(v => Number.isFinite(v) ? v : null), x: [...data.x], visible: line.visible,
+          label: it.left[0].axis_label, range: [it.x_range.start, it.x_range.end], colour: line.glyph.line_color.value}
+}"""
+
+VIOLATIONS = """async () => (await axe.run(document, {resultTypes: ["violations"]})).violations
+    .flatMap(v => v.nodes.map(n => [v.id, n.html.slice(0, 300), (n.any[0] ?? n.all[0] ?? n.none[0])?.message ?? ""]))"""
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("report") / "r.html"
+    vary = [f"turbulence.wind_speed={','.join(map(str, SPEEDS))}", f"loop.gain={','.join(map(str, GAINS))}"]
+    command = [sys.executable, "-m", "wfsobs", "export", str(path), *SHORT, "--vary", vary[0], "--vary", vary[1]]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == done.stderr == ""
+    return path
+
+
+@pytest.fixture
+def open_report(browser: Browser, report: Path) -> Iterator[Callable[..., Page]]:
+    """A function that opens the report from disk with the network off; a request or an error on the console fails."""
+    faults: list[str] = []
+    allowed: list[str] = []
+    contexts = []
+
+    def open_it(width: int = 1300, **options: Any) -> Page:
+        context = browser.new_context(viewport={"width": width, "height": 900}, offline=True, **options)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("console", lambda m: faults.append(f"console: {m.text}") if m.type in ("error", "warning") else None)
+        page.on("pageerror", lambda e: faults.append(f"page: {e}"))
+        page.on("request", lambda r: faults.append(f"request: {r.url}") if r.url != report.as_uri() else None)
+        page.goto(report.as_uri())
+        if options.get("java_script_enabled", True):
+            page.locator("#table tbody").first.wait_for()
+        return page
+
+    open_it.allowed = allowed  # type: ignore[attr-defined]
+    yield open_it
+    for context in contexts:
+        context.close()
+    assert [fault for fault in faults if not any(text in fault for text in allowed)] == []
+
+
+def choose(page: Page, name: str) -> None:
+    page.get_by_role("radio", name=name, exact=True).check(force=True)
+
+
+def line(page: Page, figure: str, name: str) -> dict[str, Any]:
+    return page.evaluate(LINE, [figure, name])
+
+
+def slide(page: Page, *places: int) -> None:
+    for i, place in enumerate(places):
+        page.locator(f"#vary-{i}").fill(str(place))
+
+
+def scenario(speed: float, gain: float) -> wfsobs.Scenario:
+    return wfsobs.PRESETS["paper"]().replace({**SETTINGS, "turbulence.wind_speed": speed, "loop.gain": gain})
+
+
+def test_every_state_shows_the_numbers_of_its_run(open_report: Any) -> None:
+    page = open_report()
+    diameter = scenario(5, 0.2).telescope.diameter
+    for (i, speed), (j, gain) in product(enumerate(SPEEDS), enumerate(GAINS)):
+        slide(page, i, j)
+        said = CliRunner().invoke(main, [
+            "run", *SHORT, "--set", f"turbulence.wind_speed={speed}", "--set", f"loop.gain={gain}", "--json"]).stdout
+        rows = json.loads(said)
+        embedded = json.loads(page.locator("#rows").text_content())[i * len(GAINS) + j]["rows"]
+        assert [{k: v for k, v in row.items() if k in rows[0]} for row in embedded] == rows
+        for (mode, title), (unit, written) in product((("tip", "Tip"), ("tilt", "Tilt")), UNITS.items()):
+            choose(page, title)
+            choose(page, written)
+            scale = per_micrometre(unit, diameter)
+            table, cards = page.evaluate(TABLE), page.evaluate(CARDS)
+            of_mode = [row for row in rows if row["mode"] == mode]
+            assert len(of_mode) == len(table) == 12
+            for row in of_mode:
+                key = f"{row['target']}/{row['observer']}"
+                cells = [re.sub(r"^(best|above truth) ", "", cell) for cell in table[key]]
+                assert cells[0].startswith(OBSERVERS[row["observer"]].label)
+                error, truth = number(row["rms_um"] * scale), number(row["truth_rms_um"] * scale)
+                assert cells[1:4] == [error, truth, number(row["normalised_rms"])]
+                assert cells[4] == ("–" if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−"))
+                assert cards.get(key, f"{error} {written}") == f"{error} {written}"
+            assert len(cards) == 12
+            assert page.locator("#table .unit").first.text_content() == written
+
+
+def test_lines_follow_the_switches(open_report: Any) -> None:
+    page = open_report()
+    result = wfsobs.run(scenario(SPEEDS[0], GAINS[0]))
+    estimate, truth = result.estimate("kf-lgs", "vibration"), result.record.vibration
+    assert estimate is not None and truth is not None
+    slide(page, 0, 0)
+
+    def shows(name: str, values: np.ndarray, scale: float) -> dict[str, Any]:
+        got = line(page, "trace-vibration", name)
+        y = np.array(got["y"], dtype=float)
+        assert len(y) == len(got["x"]) == result.record.n_steps, "every sample of a short record"
+        np.testing.assert_allclose(y, values * scale, rtol=0, atol=np.ptp(values) * scale / 65000)
+        return got
+
+    assert shows("kf-lgs", estimate.values[:, 0], 1e3)["label"] == "tip [nm]"
+    choose(page, "Tilt")
+    shows("truth", truth[:, 1], 1e3)
+    choose(page, "Error")
+    choose(page, "mas")
+    mas = per_micrometre("mas", result.scenario.telescope.diameter)
+    assert shows("kf-lgs", (estimate.values - truth)[:, 1], mas)["label"] == "error of tilt [mas]"
+    assert all(v is None for v in line(page, "trace-vibration", "truth")["y"])
+
+    power = line(page, "spectrum-vibration", "kf-lgs")
+    assert power["label"] == "PSD of error, tilt [mas²/Hz]"
+    choose(page, "Cumulative rms")
+    summed = line(page, "spectrum-vibration", "kf-lgs")
+    assert summed["label"] == "cumulative rms of error, tilt [mas]"
+    found = spectra(result.record, "vibration", estimate.values, 0.5)
+    assert found is not None
+    frequency, _, density = found
+    np.testing.assert_allclose(power["y"][:300], density[1:301, 1] * mas**2, rtol=1e-3)
+    total = cumulative_rms(frequency[1:], density[1:])[:, 1]
+    at = np.searchsorted(frequency[1:], np.array(summed["x"]) - 1e-3)
+    np.testing.assert_allclose(summed["y"], total[at] * mas, rtol=1e-3)
+
+
+def test_a_card_hides_its_line(open_report: Any) -> None:
+    page = open_report()
+    card = page.locator('#cards-vibration [data-name="kf-lgs"]')
+    canvas = page.locator("#trace-vibration")
+    page.mouse.move(0, 0)
+    before = canvas.screenshot()
+    card.click()
+    expect(card).to_have_attribute("aria-pressed", "false")
+    page.mouse.move(0, 0)
+    page.wait_for_timeout(100)
+    assert not line(page, "trace-vibration", "kf-lgs")["visible"]
+    assert not line(page, "spectrum-vibration", "kf-lgs")["visible"]
+    assert line(page, "trace-turbulence", "kf-lgs")["visible"]
+    assert canvas.screenshot() != before
+    slide(page, 0, 0)
+    assert not line(page, "trace-vibration", "kf-lgs")["visible"], "it stays hidden"
+    card.press("Enter")
+    assert line(page, "trace-vibration", "kf-lgs")["visible"]
+    expect(card).to_be_focused()
+
+
+def test_time_windows(open_report: Any) -> None:
+    page = open_report()
+    assert line(page, "trace-turbulence", "truth")["range"] == [0, 2]
+    choose(page, "0.5 s")
+    assert line(page, "trace-turbulence", "truth")["range"] == line(page, "trace-vibration", "truth")["range"] == [0.75, 1.25]
+    choose(page, "Whole record")
+    box = page.locator("#trace-vibration").bounding_box()
+    assert box is not None
+    across = [box["x"] + box["width"] * part for part in (0.4, 0.6)]
+    page.mouse.move(across[0], box["y"] + 120)
+    page.mouse.down()
+    page.mouse.move(across[1], box["y"] + 120, steps=3)
+    page.mouse.up()
+    start, end = line(page, "trace-turbulence", "truth")["range"]
+    assert 0.4 < start < 1.0 < end < 1.5, "a drag zooms both"
+
+
+def test_by_keyboard(open_report: Any) -> None:
+    page = open_report()
+    slider = page.get_by_role("slider", name=re.compile("Wind speed"))
+    assert slider.get_attribute("aria-valuetext") == str(SPEEDS[START[0]])
+    before = page.evaluate(TABLE)
+    slider.press("ArrowLeft")
+    expect(slider).to_have_attribute("aria-valuetext", "5")
+    assert page.evaluate(TABLE) != before
+    slider.press("ArrowRight")
+    assert page.evaluate(TABLE) == before
+    page.get_by_role("radio", name="Tip", exact=True).focus()
+    page.keyboard.press("ArrowRight")
+    expect(page.get_by_role("radio", name="Tilt", exact=True)).to_be_checked()
+    expect(page.locator("#table th.target").filter(visible=True)).to_have_text(["Turbulence, tilt", "Vibration, tilt"])
+
+
+def test_without_javascript_the_numbers_are_there(open_report: Any) -> None:
+    page = open_report(java_script_enabled=False)
+    expect(page.get_by_role("heading", name="Scenario")).to_be_visible()
+    expect(page.get_by_text("The figures need JavaScript")).to_be_visible()
+    expect(page.locator(".controls")).to_be_hidden()
+    expect(page.locator("#cards-vibration")).to_be_hidden()
+    shown = page.locator("details[open] table.rms")
+    expect(shown).to_have_count(1)
+    result = wfsobs.run(scenario(SPEEDS[START[0]], GAINS[START[1]]), observers=["kf-ngs"])
+    for score in result.scores:
+        row = shown.locator(f'tbody[data-target="{score.target}"][data-mode="{score.mode}"] tr[data-observer="kf-ngs"] td').first
+        expect(row).to_have_text(re.compile(re.escape(number(1e3 * score.rms)) + "$"))
+    other = page.locator("summary", has_text="Wind speed V₀ 5 m/s, Integrator gain g 0.2")
+    other.click()
+    expect(page.locator("details[open] table.rms")).to_have_count(2)
+    page.get_by_text("Every setting, as TOML").click()
+    expect(page.locator("pre", has_text="[gpr_online]")).to_be_visible()
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1300, "light"), (1300, "dark"), (390, "light")], ids=["light", "dark", "phone"])
+def test_accessible_and_no_wider_than_the_window(open_report: Any, width: int, scheme: str) -> None:
+    page = open_report(width, color_scheme=scheme, bypass_csp=True)
+    page.evaluate("() => document.querySelectorAll('details').forEach(it => { it.open = true })")
+    page.evaluate(files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8"))
+    assert page.evaluate(VIOLATIONS) == []
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= width
+    colour = {"light": "#FF6600", "dark": "#FF8533"}
+    assert line(page, "trace-vibration", "kf-lgs")["colour"] == colour[scheme]
+    page.emulate_media(color_scheme={"light": "dark", "dark": "light"}[scheme])
+    page.wait_for_timeout(50)
+    assert line(page, "trace-vibration", "kf-lgs")["colour"] != colour[scheme], "it follows the system"
+
+
+def test_the_policy_holds(open_report: Any) -> None:
+    """A script that got into the page after all could neither run nor call out."""
+    open_report.allowed.append("Content Security Policy")
+    page = open_report()
+    ran = page.evaluate("""async () => {
+      const script = document.createElement("script")
+      script.textContent = "window.ran = true"
+      const refused = new Promise(done => document.addEventListener("securitypolicyviolation", e => done(e.effectiveDirective)))
+      document.body.append(script)
+      return [await refused, window.ran ?? false]
+    }""")
+    assert ran == ["script-src-elem", False]
+
+
+def test_the_button_saves_what_is_shown(open_page: Any, server: Any, tmp_path: Path) -> None:
+    link = "&".join(f"{path}={value}" for path, value in SETTINGS.items())
+    page = open_page(url=f"{server.url}?{link}&turbulence.wind_speed=22")
+    button = page.get_by_role("button", name="Report", exact=True)
+    with page.expect_download() as waiting:
+        button.click()
+        expect(page.get_by_role("button", name="Making the report …")).to_have_attribute("aria-disabled", "true")
+    assert waiting.value.suggested_filename == "wfsobs-report.html"
+    path = tmp_path / "r.html"
+    waiting.value.save_as(path)
+    expect(button).to_have_attribute("aria-disabled", "false")
+    text = path.read_text(encoding="utf-8")
+    (found,) = re.findall(r'id="rows">(.*?)</script>', text)
+    rows = json.loads(found)[0]["rows"]
+    cells = page.locator('tr[data-target="vibration"] td:nth-child(2)')
+    shown = [re.sub(r"^best ", "", cell.strip()) for cell in cells.all_inner_texts()]
+    want = sorted(row["rms_um"] for row in rows if (row["target"], row["mode"]) == ("vibration", "tip"))
+    assert shown == [number(1e3 * error) for error in want]
+    assert "--set turbulence.wind_speed=22.0" in text
