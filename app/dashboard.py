@@ -24,6 +24,7 @@ from wfsobs.app.pages.pages import Pages
 from wfsobs.app.run import FAILED, IDLE, Post
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, theme
+from wfsobs.app.views.modes import ModeSwitch
 from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.spectra import MODEL, PEAKS, Spectra
 from wfsobs.app.views.strip import Strip
@@ -73,6 +74,7 @@ class Dashboard:
         self.display = Display()
         self.controls = Controls(self.store)
         self.actions = Actions(self.store)
+        self.modes = ModeSwitch(self.store.run, self.display)
         self.traces = Traces(self.store.run, self.display)
         self.spectra = Spectra(self.store.run, self.display)
         self.strips = {target: Strip(target, self.store.run, self.display) for target in TARGETS}
@@ -124,9 +126,8 @@ class Dashboard:
 
     def _top(self) -> pn.FlexBox:
         """The pages, and what holds on all of them."""
-        modes = {m.name.capitalize(): m.name for m in self.store.scenario.modes}
         return pn.FlexBox(
-            self.pages.switch, self._group("mode", modes),
+            self.pages.switch, *self.modes.view(),
             self._group("unit", {written: unit for unit, written in UNITS.items()}),
             gap="12px", align_items="center", **WIDE)
 

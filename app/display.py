@@ -8,7 +8,7 @@ import re
 import param
 
 from wfsobs.app.pin import Pin
-from wfsobs.modes import TIP_TILT
+from wfsobs.modes import HIGHEST_ORDER, modes_up_to
 
 SIGNAL, ERROR = "signal", "error"
 PSD, CUMULATIVE = "psd", "cumulative"
@@ -16,6 +16,12 @@ UNITS = {"nm": "nm", "mas": "mas", "um": "µm"}
 """Unit -> how it is written."""
 
 NOTHING = "–"
+
+NO_ANGLE = ("mas",)
+"""Units that only tip and tilt can be in."""
+
+MODES = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
+"""Every mode that a run can have; it has the first of them."""
 
 MAS_PER_RADIAN = math.degrees(1.0) * 3600.0 * 1000.0
 
@@ -55,7 +61,7 @@ def written_unit(unit: str) -> str:
 class Display(param.Parameterized):
     """The switches above the figures."""
 
-    mode = param.Selector(default=TIP_TILT[0].name, objects=[m.name for m in TIP_TILT], label="Mode")
+    mode = param.Selector(default=MODES[0], objects=MODES, label="Mode")
     show = param.Selector(default=SIGNAL, objects=[SIGNAL, ERROR], label="Show")
     unit = param.Selector(default="nm", objects=list(UNITS), label="Unit")
     hidden = param.Dict({}, doc="Target -> names of its hidden lines.")
@@ -67,7 +73,12 @@ class Display(param.Parameterized):
     @property
     def column(self) -> int:
         """The column of the mode in every array."""
-        return [m.name for m in TIP_TILT].index(self.mode)
+        return MODES.index(self.mode)
+
+    @property
+    def compared(self) -> Pin | None:
+        """The pinned run, where it has the mode shown."""
+        return self.pinned if self.pinned is not None and self.column < len(self.pinned.scenario.modes) else None
 
     @property
     def error(self) -> bool:

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 from wfsobs.zernike import name, noll, up_to_order
 
+HIGHEST_ORDER = 6
+
 
 class Mode(NamedTuple):
     """One Zernike mode: name, Noll index, radial order n(i) of the paper's eq. 1d."""

@@ -42,7 +42,9 @@ class Model:
 
     def _refresh(self, *_: object) -> None:
         if self.visible:
-            self.pane.object = html(describe(self.store.scenario, self.display.column), self.display.dark)
+            scenario = self.store.scenario
+            mode = min(self.display.column, len(scenario.modes) - 1)
+            self.pane.object = html(describe(scenario, mode), self.display.dark)
 
 
 def html(told: Description, dark: bool) -> str:

@@ -99,7 +99,7 @@ class _Spectrum:
 
     def draw_pinned(self, display: Display) -> list[Array]:
         """Send the pinned run's visible lines; what was sent."""
-        kept, lines = display.pinned, {}
+        kept, lines = display.compared, {}
         if kept is not None:
             diameter = kept.scenario.telescope.diameter
             for name, line in self.lines.items():

@@ -11,6 +11,7 @@ from bokeh.models import CrosshairTool
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import number, per_micrometre
+from wfsobs.app.downloads import data_csv
 from wfsobs.app.style import LOOKS, look
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.traces import BINS
@@ -220,3 +221,38 @@ class TestLooks:
 def test_tilt_on_sky() -> None:
     assert per_micrometre("mas", 8.0) / 1e3 == pytest.approx(0.1031, abs=5e-5)
     assert per_micrometre("nm", 8.0) == 1e3 and per_micrometre("um", 8.0) == 1.0
+
+
+class TestHigherModes:
+    def test_the_switch_offers_what_the_run_has(self, dashboard: Dashboard, loop: Any) -> None:
+        switch, display, store = dashboard.modes, dashboard.display, dashboard.store
+        assert switch.buttons.visible and not switch.list.visible
+        display.unit = "mas"
+        store.change("telescope.radial_order", 2)
+        loop.finish(store)
+        assert switch.list.visible and list(switch.list.options.values()) == [m.name for m in store.scenario.modes]
+        switch.list.value = "defocus"
+        assert (display.mode, display.column, display.unit) == ("defocus", 2, "nm")
+        truth = dashboard.traces.traces["turbulence"].figure
+        assert "defocus" in truth.yaxis[0].axis_label and "Turbulence, defocus" in dashboard.table.pane.object
+        dashboard.pinning._pressed(None)
+        store.change("telescope.radial_order", 1)
+        loop.finish(store)
+        assert display.mode == "tip" and switch.buttons.visible and not switch.list.visible
+        store.change("telescope.radial_order", 3)
+        loop.finish(store)
+        switch.list.value = "oblique trefoil"  # the pinned run has no such mode
+        assert display.compared is None and "oblique trefoil" in dashboard.table.pane.object
+
+    def test_buttons_and_display_agree(self, dashboard: Dashboard) -> None:
+        dashboard.modes.buttons.value = "tilt"
+        assert dashboard.display.mode == "tilt" == dashboard.modes.list.value
+        dashboard.display.mode = "tip"
+        assert dashboard.modes.buttons.value == "tip"
+
+    def test_csv_names_every_mode(self, dashboard: Dashboard, loop: Any) -> None:
+        dashboard.store.change("telescope.radial_order", 2)
+        loop.finish(dashboard.store)
+        shown = dashboard.store.run.shown
+        head = next(line for line in data_csv(shown).decode().splitlines() if line.startswith("time_s"))
+        assert all(f"truth/turbulence/{mode.name}_um" in head for mode in dashboard.store.scenario.modes)
