@@ -41,7 +41,10 @@ def data_csv(shown: Shown) -> bytes:
     """
     _check(shown)
     names, columns = zip(*_columns(shown), strict=True)
-    head = [f"# {line}".rstrip() for line in to_toml(shown.scenario).splitlines()]
+    record = shown.result.record
+    # comments of the TOML text too, and what a record is read by
+    head = [f"# # dt: {record.dt!r}", *([f"# # ratio: {record.ratio}"] if record.ratio else [])]
+    head += [f"# {line}".rstrip() for line in to_toml(shown.scenario).splitlines()]
     row = ",".join(["%.9g"] * len(names))
     lines = [row % tuple(values) for values in np.column_stack(columns).tolist()]
     return "\n".join([*head, ",".join(names), *lines, ""]).encode()

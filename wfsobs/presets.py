@@ -59,13 +59,16 @@ def paper() -> Scenario:
 
 
 def ut4() -> Scenario:
-    """The vibration lines measured at VLT UT4 with ERIS.
+    """Frozen flow, and the vibration lines measured at VLT UT4 with ERIS.
 
-    What stands above the synthetic floor of the spectrum, 36.9 nm rms on tip and 50.7 nm on tilt; the Kalman filters are
-    matched to the scenario, their one peak on the strongest line above 12 Hz, 48.31 Hz with 26.5 nm on tilt.
+    - turbulence: one von Karman layer at 8 km carried along at 15 m/s, r0 = 0.157 m, L0 = 25 m; guide stars on the axis, so
+      that both LGS have the same cone effect (49 nm rms per axis) and their mean has all of it;
+    - vibration: what stands above the synthetic floor of the spectrum, 36.9 nm rms on tip and 50.7 nm on tilt;
+    - Kalman filters matched to the scenario, their one peak on the strongest line above 12 Hz, 48.31 Hz with 26.5 nm on tilt.
     """
     s = Scenario()
     s.update({
+        "turbulence": {"source": "frozen-flow"},
         "vibration": {"source": "measured", "spectrum": "eris-ut4", "part": "lines", "cutoff": 100.0},
         "kalman": {"frequency": 48.31, "damping": 0.001},
     })
@@ -73,7 +76,7 @@ def ut4() -> Scenario:
 
 
 def ut4_floor() -> Scenario:
-    """The whole ERIS spectrum of VLT UT4, synthetic floor included."""
+    """Frozen flow, and the whole ERIS spectrum of VLT UT4, synthetic floor included."""
     s = ut4()
     s.update({"vibration": {"part": "all"}})
     return s

@@ -35,11 +35,11 @@ Errors = dict[tuple[str, str, str], list[float]]
 """(observer, target, mode) -> RMS error [nm] of every seed; observer "truth" -> rms of the truth."""
 
 
-def errors(changes: dict[str, object], observers: Sequence[str] | None = None) -> Errors:
+def errors(changes: dict[str, object], observers: Sequence[str] | None = None, preset: str = "paper") -> Errors:
     """Run all the seeds with some settings changed."""
     out: Errors = {}
     for seed in SEEDS:
-        scenario = wfsobs.PRESETS["paper"]().replace(changes | {"run.seed": seed})
+        scenario = wfsobs.PRESETS[preset]().replace(changes | {"run.seed": seed})
         for s in wfsobs.run(scenario, observers=observers).scores:
             out.setdefault((s.observer, s.target, s.mode), []).append(s.rms * 1e3)
             if s.observer == "zero":
@@ -226,9 +226,20 @@ def lgs_model() -> None:
     table(("LGS slow error [nm]", "in the model", "not in the model"), rows)
 
 
+def ut4() -> None:
+    """Frozen flow and the ERIS spectrum of UT4, its lines alone and with its floor."""
+    runs = [errors({}, None, preset) for preset in ("ut4", "ut4-floor")]
+    for target, names in (("turbulence", TURBULENCE), ("vibration", (*PRINTED, "multirate-optimal"))):
+        rows = []
+        for name in (*names, "truth"):
+            rows.append((NAMES.get(name, "Truth"), *(
+                middle(e[name, target, mode], e is runs[0]) for mode in ("tip", "tilt") for e in runs)))
+        table((target, "tip, lines", "tip, all", "tilt, lines", "tilt, all"), rows)
+
+
 TABLES: dict[str, Callable[[], None]] = {f.__name__: f for f in (
     vibration, fit, butterworth, training, all_peaks, gpr_turbulence, turbulence, lgs_error, indetermination, ngs_noise,
-    weights, lgs_model,
+    weights, lgs_model, ut4,
 )}
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from wfsobs.cli import main
 from wfsobs.configfile import from_toml
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
-from wfsobs.telemetry import load_record
+from wfsobs.telemetry import load_record, read_record
 
 WIND = "turbulence.wind_speed"
 
@@ -174,6 +174,15 @@ def test_csv(shown: Shown) -> None:
         assert values is not None
         for i, mode in enumerate(("tip", "tilt")):
             np.testing.assert_allclose(table[f"{name}/{mode}_um"], values[:, i], rtol=1e-8)
+
+
+def test_csv_is_a_record(shown: Shown) -> None:
+    """What was saved is observed again, to nine digits."""
+    record = read_record(io.BytesIO(data_csv(shown)), "wfsobs.csv")
+    kept = shown.result.record
+    assert (record.dt, record.ratio) == (kept.dt, kept.ratio)
+    for name in ("y_lgs", "u", "y_ngs", "turbulence", "vibration"):
+        np.testing.assert_allclose(getattr(record, name), getattr(kept, name), rtol=1e-8)
 
 
 def test_npz_is_a_record_and_its_estimates(shown: Shown, tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ NUMBERS = ("dt", "ratio", "delay", "command_sign")
 TEXTS = ("unit", "origin", "scenario")
 NAMES = (*SIGNALS, *CLOCKS, *NUMBERS, *TEXTS)
 
-COLUMN = re.compile(r"(?:truth/)?(?P<array>[a-z_]+)/(?P<mode>[A-Za-z0-9-]+?)(?:_(?P<unit>[A-Za-zµμ]+))?$")
+COLUMN = re.compile(r"(?:truth/)?(?P<array>[a-z_]+)/(?P<mode>[A-Za-z0-9 -]+?)(?:_(?P<unit>[A-Za-zµμ]+))?$")
 """A column of one mode, such as y_lgs/tip_um."""
 
 
