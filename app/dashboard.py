@@ -65,6 +65,12 @@ class Frame(JSComponent):
     _esm = asset("frame.js")
 
 
+class Idle(param.Parameterized):
+    """Never busy."""
+
+    busy = param.Boolean(default=False, constant=True)
+
+
 class Dashboard:
     """One session: its store, its controls and its views."""
 
@@ -104,7 +110,8 @@ class Dashboard:
         )
         self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")
         with edit_readonly(page):
-            page.busy = False  # unties it: each of its changes, of any session's work, walks all models of the page
+            # Tied to what all sessions do, each change walks all models of the page, and the page outlives its session.
+            page.busy = Idle().param.busy
         page.param.watch(lambda event: self.display.param.update(dark=event.new), "dark_theme")
         return page
 

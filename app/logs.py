@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import logging
 import sys
+import traceback
 from typing import Any, TextIO
 
 log = logging.getLogger("wfsobs.serve")
 
 FORMAT = "%(asctime)s %(levelname)s %(message)s"
+
+LONGEST = 200
+"""Characters of what a library says."""
 
 
 def event(name: str, level: int = logging.INFO, **fields: Any) -> None:
@@ -22,12 +26,31 @@ def to_stream(level: str, requests: bool = False, stream: TextIO | None = None) 
     requests : also Tornado's line per request, which holds the visitor's address and what was asked for
     """
     logging.basicConfig(format=FORMAT, level=logging.WARNING, stream=stream or sys.stderr, force=True)
+    for handler in logging.getLogger().handlers:
+        handler.addFilter(without_visitors_data)
     logging.getLogger("wfsobs").setLevel(level.upper())
     panel = logging.getLogger("panel")  # comes with a handler of its own, on standard output
     panel.handlers.clear()
     panel.propagate = True
     panel.setLevel(logging.WARNING)
     logging.getLogger("tornado.access").setLevel(logging.INFO if requests else logging.ERROR)
+
+
+def without_visitors_data(record: logging.LogRecord) -> bool:
+    """Of what Bokeh and Tornado say of a visitor's message or request, the beginning; of one that they could not read,
+    without a traceback, which is kept where code of this package is part of it."""
+    if record.name.startswith(("bokeh.", "tornado.")):
+        ours = _is_ours(record.exc_info)
+        text = " ".join(record.getMessage().split())
+        record.msg, record.args = text[:LONGEST] + " ..." * (len(text) > LONGEST), ()
+        if not ours:
+            record.exc_info = record.exc_text = None
+    return True
+
+
+def _is_ours(exc_info: Any) -> bool:
+    frames = traceback.walk_tb(exc_info[2]) if exc_info else ()
+    return any(str(frame.f_globals.get("__name__")).startswith("wfsobs") for frame, _ in frames)
 
 
 def _word(value: Any) -> str:

@@ -70,6 +70,12 @@ class Queue:
         with self._changed:
             return len(self._waiting)
 
+    @property
+    def running(self) -> int:
+        """How many are being done."""
+        with self._changed:
+            return len(self._running)
+
     def close(self, timeout: float) -> bool:
         """Start nothing any more, and wait [s] for what is being done; whether all of that has ended."""
         with self._changed:

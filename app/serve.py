@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from html import escape
 from ipaddress import ip_address
 from typing import Any
@@ -46,6 +46,7 @@ class Options:
     origins    : HOST or HOST:PORT that browsers reach the server by, where it is not the address: behind a proxy
     prefix     : path of the page, where a proxy serves other things beside it
     runs       : at once; 0 for as many as there are processors
+    lifetime   : of the settings of a page that is not connected any more, or has never been [s]
     cache_mb   : results kept [MB]
     log_level  : debug, info, warning or error
     log_requests : also a line per request, which holds the address it came from
@@ -59,6 +60,7 @@ class Options:
     limits: Limits = NONE
     runs: int = 0
     cache_mb: int = CACHE_MB
+    lifetime: float = 15.0
     log_level: str = "info"
     log_requests: bool = False
 
@@ -115,7 +117,19 @@ def prepare() -> None:
 def shared() -> Service:
     """The one service of a process that is served by something else: `panel serve app`."""
     prepare()
-    return make_service(NONE)
+    service = make_service(NONE)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, partial(_end, service, signal.getsignal(number)))
+    return service
+
+
+def _end(service: Service, then: Any, number: int, frame: Any) -> None:
+    """Have the runs stop on a signal, and leave the rest to whoever was to hear of it."""
+    service.closing = True
+    if callable(then):
+        then(number, frame)
+    else:
+        sys.exit(0)
 
 
 def new_page(service: Service) -> Any:
@@ -136,6 +150,8 @@ def make_server(options: Options, service: Service) -> Server:
         websocket_max_message_size=MESSAGE_BYTES, use_xheaders=bool(options.origins),
         # A session is reached by a name that this server has signed, and keeps nothing of who the visitor is.
         sign_sessions=True, secret_key=generate_secret_key(), include_headers=[], include_cookies=[],
+        unused_session_lifetime_milliseconds=round(1000 * options.lifetime),
+        check_unused_sessions_milliseconds=round(1000 * options.lifetime),
         extra_patterns=[("/liveness", Liveness, {"service": service})],
     )
     router = server._tornado.wildcard_router
@@ -195,7 +211,8 @@ class Liveness(RequestHandler):
 
     def get(self) -> None:
         """Answer in JSON."""
-        self.write({"ok": True, "sessions": self.service.visits, "waiting": self.service.queue.length})
+        queue = self.service.queue
+        self.write({"ok": True, "sessions": self.service.visits, "running": queue.running, "waiting": queue.length})
 
 
 def full_html(line: str) -> str:

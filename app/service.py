@@ -36,8 +36,12 @@ class Full(Exception):
 class Flight:
     """One run under way, for all who want its result."""
 
-    def __init__(self, number: int, scenario: Scenario, work: Callable[[Callable[[], bool], Report], Shown]):
+    def __init__(
+        self, number: int, scenario: Scenario, work: Callable[[Callable[[], bool], Report], Shown],
+        closing: Callable[[], bool],
+    ):
         self.number, self.scenario = number, scenario
+        self._closing = closing
         self.landed = threading.Event()
         self.shown: Shown | None = None
         self.error: Exception | None = None
@@ -73,13 +77,6 @@ class Flight:
             self._unwanted = self._unwanted or not self._wanting
             return self._unwanted or self.landed.is_set()
 
-    def stop(self) -> None:
-        """Give it up, whoever wants it."""
-        with self._lock:
-            self._unwanted = True
-            self.error = self.error or Cancelled()
-        self.landed.set()
-
     def moved(self, place: int) -> None:
         """Its place in the line has changed."""
         self._tell(0.0, None, place)
@@ -104,8 +101,8 @@ class Flight:
 
     def _given_up(self) -> bool:
         with self._lock:
-            self._unwanted = self._unwanted or _ending() or all(cancelled() for _, cancelled, _ in self._wanting.values())
-            return self._unwanted
+            self._unwanted = self._unwanted or all(cancelled() for _, cancelled, _ in self._wanting.values())
+            return self._unwanted or self._closing()
 
     def _report(self, fraction: float, shown: Shown | None) -> None:
         self._tell(fraction, shown, 0)
@@ -129,6 +126,7 @@ class Service:
         self.cache: Cache[Shown] = Cache(most_bytes)
         self.queue = Queue(workers)
         self.visits = 0
+        self.closing = False
         self._work = work
         self._flights: dict[str, Flight] = {}
         self._lock = threading.Lock()
@@ -172,7 +170,8 @@ class Service:
             if shown is not None:
                 return shown
             if flight is None or not joined:
-                flight = self._flights[key] = Flight(next(self._run_numbers), scenario, partial(self._compute, key, scenario))
+                flight = self._flights[key] = Flight(
+                    next(self._run_numbers), scenario, partial(self._compute, key, scenario), lambda: self.closing)
                 flight.join(ticket, owner, cancelled, tell)
                 self.queue.put(flight)
         return flight, partial(self._leave, key, flight, ticket)
@@ -189,11 +188,8 @@ class Service:
             self.queue.drop(flight)
 
     def close(self, timeout: float = 1.5) -> bool:
-        """Stop every run; whether all have ended in time [s]."""
-        with self._lock:
-            flights = list(self._flights.values())
-        for flight in flights:
-            flight.stop()
+        """Stop every run, those to come too; whether all have ended in time [s]. To set `closing` alone does the same later."""
+        self.closing = True
         return self.queue.close(timeout)
 
 
@@ -213,7 +209,7 @@ class Visit:
         flight, leave = joined
         try:
             while not flight.landed.wait(POLL):
-                if cancelled() or _ending():
+                if cancelled() or self.service.closing:
                     raise Cancelled
         finally:
             leave()
@@ -228,7 +224,3 @@ class Visit:
             self.service.left()
             event("session-end", session=self.number, seconds=monotonic() - self._since, sessions=self.service.visits)
 
-
-def _ending() -> bool:
-    """Whether the interpreter is on its way out, which waits for threads."""
-    return not threading.main_thread().is_alive()

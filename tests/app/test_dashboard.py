@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import threading
+import weakref
 from typing import Any
 
 import pytest
@@ -106,3 +108,13 @@ def test_importing_the_package_imports_no_panel() -> None:
 
     code = "import sys, wfsobs.app, wfsobs; assert not {'panel', 'bokeh', 'holoviews'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_session_that_has_ended_leaves_nothing_behind(short: Scenario) -> None:
+    dashboard = Dashboard(lambda function: function(), short)
+    page = dashboard.page()
+    dashboard.close()
+    gone = weakref.ref(dashboard), weakref.ref(page)
+    del dashboard, page
+    gc.collect()
+    assert [ref() for ref in gone] == [None, None]
