@@ -1,4 +1,4 @@
-"""The command line: `wfsobs run`, `observe`, `export`, `presets`, `bench`, `serve`."""
+"""The command line: `wfsobs run`, `observe`, `loop`, `export`, `presets`, `bench`, `serve`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from typing import Any
 import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from wfsobs import __version__, configfile
+from wfsobs.control import tables as loop_tables
+from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.files import check_writable, write_whole
 from wfsobs.formats.psd import load_psd
 from wfsobs.intake import Stated
@@ -130,6 +133,31 @@ def observe(
 
 
 @main.command()
+@scenario_options
+@click.option("--controller", "controllers", multiple=True, metavar="NAME",
+              help="Run this controller alone; can be given many times.")
+@click.option("--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N",
+              help="Repeat with seeds run.seed ... run.seed + N - 1.")
+@click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
+def loop(
+    preset: str | None, config: str | None, assignments: tuple[str, ...], controllers: tuple[str, ...], seeds: int, as_json: bool,
+) -> None:
+    """Close the loop with every controller on the same disturbance and print what is left of it (docs/closed_loop.md)."""
+    scenario = configfile.scenario_from(preset, config, assignments)
+    all_rows: list[Row] = []
+    with progress_bar("controllers") as update:
+        plan = design(scenario, controllers or None)
+        for i in range(seeds):
+            one = scenario.replace({"run.seed": scenario.run.seed + i})
+            result = closed_loop(simulate(one), plan, Watch(progress=lambda f, i=i: update((i + f) / seeds)))
+            all_rows += loop_tables.rows(result, one.run.seed)
+    if as_json:
+        click.echo(json.dumps(all_rows, allow_nan=False))
+    else:
+        show_table(loop_tables.table(all_rows))
+
+
+@main.command()
 @click.argument("out", metavar="OUT.html")
 @scenario_options
 @click.option("--vary", multiple=True, metavar="NAME=VALUE,VALUE,...",
@@ -227,9 +255,13 @@ def show(all_rows: list[Row], as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps([{k: v for k, v in row.items() if k != TIME} for row in all_rows], allow_nan=False))
     else:
-        table = score_table(all_rows)
-        console = Console()
-        (console if console.is_terminal else Console(width=124)).print(table)
+        show_table(score_table(all_rows))
+
+
+def show_table(table: Table) -> None:
+    """Print a table as wide as the terminal, or where there is none as wide as a page."""
+    console = Console()
+    (console if console.is_terminal else Console(width=160)).print(table)
 
 
 def _warn(result: Result) -> None:

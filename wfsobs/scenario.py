@@ -10,6 +10,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 from wfsobs.groups.atmosphere import PsdTable, Telescope, Turbulence
+from wfsobs.groups.control import Control
 from wfsobs.groups.observers import Butterworth, Kalman, MultiRate, OfflineGpr, OnlineGpr
 from wfsobs.groups.run import Loop, Run
 from wfsobs.groups.sensors import Sensors
@@ -43,6 +44,7 @@ class Scenario(Group):
     butterworth = section(Butterworth, "Butterworth reference")
     gpr_offline = section(OfflineGpr, "Offline GPR")
     gpr_online = section(OnlineGpr, "Online GPR")
+    control = section(Control, "Closed loop")
     run = section(Run, "Run")
 
     @property

@@ -48,15 +48,18 @@ class MultiRateFilter:
         return np.vstack([J @ start, rest])
 
 
-def multirate_filter(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float) -> MultiRateFilter:
+def multirate_filter(
+    model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, outputs: Array | None = None
+) -> MultiRateFilter:
     """The filter for an NGS frame every `ratio` steps; lgs_noise, ngs_noise: square roots of r [um].
 
+    outputs : rows wanted of the state x_hat[k], (p, n); every target by default.
     Raises SettingError where the two gains, each stable, make an unstable cycle.
     """
     C_lgs, C_both = np.atleast_2d(model.C), np.vstack([model.C, model.C])
     L_lgs = steady_state(model.A, C_lgs, model.Q, np.array(lgs_noise**2)).L
     L_both = steady_state(model.A, C_both, model.Q, np.diag([lgs_noise**2, ngs_noise**2])).L
-    rows = model.output_rows(TARGETS)
+    rows = model.output_rows(TARGETS) if outputs is None else outputs
     alone = filter_step(model.A, C_both, np.hstack([L_lgs, np.zeros_like(L_lgs)]), rows)
     cycle = PeriodicFilter([*([alone] * (ratio - 1)), filter_step(model.A, C_both, L_both, rows)])
     radius = np.abs(np.linalg.eigvals(cycle.cycle_matrix())).max()

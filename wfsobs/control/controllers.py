@@ -1,0 +1,67 @@
+"""The controllers, by id: what each is, and what it has to be given."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from wfsobs.arrays import Array
+from wfsobs.bound import TrueSpectra
+from wfsobs.control.integrator import best_gain, integrator_law
+from wfsobs.control.law import Law
+from wfsobs.control.lqg import LQG
+from wfsobs.control.mirror import Mirror
+from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.watch import Watch
+
+MakeLaw = Callable[[Scenario, int, Mirror, TrueSpectra], Law]
+"""(scenario, mode, mirror, its true spectra) -> law. Raises ValueError saying why there is none."""
+
+Predict = Callable[[Record, Scenario, Mirror, Watch], Array]
+"""Vibration while u[k] acts, (n_steps, n_modes) [um], NaN where it is not known yet."""
+
+
+@dataclass(frozen=True)
+class Controller:
+    """An entry of the registry: a linear law, or an integrator beside a prediction of the vibration, or nothing.
+
+    id, label : for tables and files, and for people
+    needs     : what it must be given beside measurements
+    law       : of one mode; of an integrator with a prediction, that of the integrator
+    predict   : of the vibration
+    ngs       : whether it uses NGS frames
+    weight    : its computing time relative to a linear law's
+    """
+
+    id: str
+    label: str
+    needs: str
+    law: MakeLaw | None = None
+    predict: Predict | None = None
+    ngs: bool = False
+    weight: float = 1.0
+
+
+def _integrator(scenario: Scenario, mode: int, mirror: Mirror, spectra: TrueSpectra) -> Law:
+    c = scenario.control
+    return integrator_law(mirror, c.gain if c.integrator == "manual" else best_gain(spectra, mirror, c.leak), c.leak)
+
+
+def _lqg(id_: str) -> MakeLaw:
+    return lambda scenario, mode, mirror, _spectra: LQG[id_](scenario, mode, mirror)
+
+
+NOTHING, SPECTRUM, MODEL, TRAINING = "nothing", "true spectra", "model", "training data"
+
+CONTROLLERS: dict[str, Controller] = {c.id: c for c in (
+    Controller("none", "No control", NOTHING, weight=0.1),
+    Controller("integrator", "Integrator", SPECTRUM, _integrator),
+    Controller("lqg-kf-lgs", "LQG, LGS KF", MODEL, _lqg("lqg-kf-lgs")),
+    Controller("lqg-multirate", "LQG, multi-rate KF", MODEL, _lqg("lqg-multirate"), ngs=True),
+    Controller("lqg-multirate-optimal", "LQG, optimal multi-rate KF", MODEL, _lqg("lqg-multirate-optimal"), ngs=True),
+    Controller("integrator+gpr-offline", "Integrator and offline GPR", TRAINING, _integrator, gpr_offline_ahead, weight=20.0),
+    Controller("integrator+gpr-online", "Integrator and online GPR", NOTHING, _integrator, gpr_online_ahead, weight=200.0),
+)}
+"""Every controller, in the order of tables and legends."""

@@ -1,0 +1,98 @@
+"""The integrator u[k] = leak u[k-1] - g y[k], the yardstick of every other controller, and its best gain."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from wfsobs.arrays import Array
+from wfsobs.bound import TrueSpectra
+from wfsobs.control.law import Law, steady_law
+from wfsobs.control.mirror import Mirror
+from wfsobs.lifted import PeriodicFilter
+from wfsobs.wiener import circle_mean
+
+FINE, COARSE = 2048, 64
+"""Bins kept as they are, and how many of the others count as one: the integrator's response is smooth there."""
+
+
+def integrator_law(mirror: Mirror, gain: float, leak: float) -> Law:
+    """The integrator on y = z + P u, as a filter of z: its state is the last commands."""
+    taps = mirror.taps
+    row = -gain * taps[1:]
+    row[0] += leak
+    n = row.size
+    A = np.vstack([row, np.eye(n)[:-1]])
+    into = np.array([-gain])
+    cycle = PeriodicFilter([(A, np.eye(n)[:, :1] * into, row[None, :], into[:, None])])
+    return steady_law(cycle, gain)
+
+
+def highest_stable_gain(mirror: Mirror, leak: float) -> float:
+    """The gain at which the loop becomes unstable, by bisection on the poles: they only grow with it."""
+    low, high = 0.0, 5.0  # the limit is highest, 4, for a pure integrator and a delay of 1.25
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if integrator_law(mirror, middle, leak).stable else (low, middle)
+    return low
+
+
+def best_gain(spectra: TrueSpectra, mirror: Mirror, leak: float) -> float:
+    """The stable gain of least residual variance for the true spectra of a mode."""
+    omega, weight, target, cross, measured = _binned(spectra)
+    P, one = mirror.response(omega), 1.0 - leak * np.exp(-1j * omega)
+
+    def variance(gain: float) -> float:
+        T = gain * P / (one + gain * P)
+        return float(weight @ residual_density(T, target, cross, measured))
+
+    highest = highest_stable_gain(mirror, leak)
+    return float(minimize_scalar(variance, bounds=(0.0, highest), method="bounded", options={"xatol": 1e-5}).x)
+
+
+def residual_density(T: Array, target: Array, cross: Array, measured: Array) -> Array:
+    """Spectrum of the residual phi_dist + phi_corr where T = P F: what is not rejected, and the noise let in.
+
+    target : of phi_dist; cross : between phi_dist[k] and z[k + 1]; measured : of z
+    """
+    return target + np.abs(T) ** 2 * measured - 2.0 * np.real(np.conj(cross) * T)
+
+
+def residual_variance(law: Law, spectra: TrueSpectra, mirror: Mirror) -> float:
+    """Variance [um^2] of the residual that a time-invariant law leaves, by theory."""
+    n = spectra.measured.size
+    omega = np.pi * np.arange(n) / (n - 1)
+    target, cross = spectra.total
+    return circle_mean(residual_density(mirror.response(omega) * law.response(omega), target, cross, spectra.measured))
+
+
+def _binned(spectra: TrueSpectra) -> tuple[Array, Array, Array, Array, Array]:
+    """(omega, weight in the mean over the circle, and the three spectra of `residual_density`) on fewer points."""
+    n = spectra.measured.size
+    weight = np.full(n, 1.0 / (n - 1))
+    weight[[0, -1]] *= 0.5
+    starts = np.concatenate([np.arange(min(FINE, n)), np.arange(FINE, n, COARSE)])
+    total = np.add.reduceat(weight, starts)
+
+    def mean(x: Array) -> Array:
+        return np.add.reduceat(weight * x, starts) / total
+
+    target, cross = spectra.total
+    return mean(np.pi * np.arange(n) / (n - 1)), total, mean(target), mean(cross), mean(spectra.measured)
+
+
+def limited_integrator(mirror: Mirror, gain: float, leak: float, z: Array, forward: Array) -> tuple[Array, Array]:
+    """Commands (n_steps,) of an integrator on z (n_steps,) plus `forward` (n_steps,), that a mirror with limits took; and wanted.
+
+    Anti-windup: the integrator goes on from what the mirror took, less `forward`.
+    """
+    taps = mirror.taps[1:].tolist()
+    own = [0.0] * len(taps)  # the integrator's part of the last commands, newest first
+    taken, wanted, last = [], [], 0.0
+    for measured, ahead in zip(z.tolist(), forward.tolist(), strict=True):
+        y = measured + sum(tap * u for tap, u in zip(taps, own, strict=True))
+        wanted.append(leak * own[0] - gain * y + ahead)
+        last = mirror.allowed(wanted[-1], last)
+        taken.append(last)
+        own = [last - ahead, *own[:-1]]
+    return np.array(taken), np.array(wanted)

@@ -1,0 +1,68 @@
+"""LQG control: command against the disturbance what a Kalman filter predicts of it.
+
+The mirror follows a command at once and without cost, so the best command is minus the prediction of what the disturbance
+will be while it acts (certainty equivalence): u[k] = -(turb_hat[k+1] + vib_hat[k+1]) for the paper's delay of two
+frames, and for n + f frames the mean over the time that the command is held,
+
+    u[k] = -((1 - f) phi_hat[k+n-1] + f phi_hat[k+n]).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from wfsobs.arrays import Array
+from wfsobs.control.law import Law, steady_law
+from wfsobs.control.mirror import Mirror
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.kalman import kalman_model, measurement_noise, steady_filter
+from wfsobs.observers.multirate import MultiRateFilter, multirate_filter, multirate_noise
+from wfsobs.observers.multirate_optimal import optimal_filter, optimal_model
+from wfsobs.scenario import Scenario
+from wfsobs.statespace import DisturbanceModel
+
+
+def command_rows(model: DisturbanceModel, mirror: Mirror) -> Array:
+    """Row (1, n) that makes the command of the estimated state x_hat[k]."""
+    row = -model.output_rows(TARGETS).sum(axis=0)
+    out = np.zeros_like(row)
+    for tap in mirror.taps[1:]:
+        out += tap * row
+        row = row @ model.A
+    return out[None, :]
+
+
+def lqg_of(model: DisturbanceModel, noise: float, mirror: Mirror) -> Law:
+    """LQG on the LGS with any model; noise [um] of a measurement. Raises RiccatiError."""
+    return steady_law(steady_filter(model, noise, command_rows(model, mirror))[0])
+
+
+def lqg_kf_lgs(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
+    """With the model of the LGS Kalman filter: turbulence and one vibration peak."""
+    return lqg_of(kalman_model(scenario, mode, scenario.dt), measurement_noise(scenario)[0], mirror)
+
+
+def lqg_multirate(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
+    """With the paper's multi-rate filter. Raises SettingError where its cycle is unstable."""
+    model = kalman_model(scenario, mode, scenario.dt)
+    filter_ = multirate_filter(model, scenario.sensors.exposure_ratio, *multirate_noise(scenario), command_rows(model, mirror))
+    return _two_sensors(filter_)
+
+
+def lqg_multirate_optimal(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
+    """With the optimal multi-rate filter."""
+    model = kalman_model(scenario, mode, scenario.dt)
+    ratio = scenario.sensors.exposure_ratio
+    return _two_sensors(optimal_filter(*optimal_model(scenario, mode, scenario.dt, ratio, command_rows(model, mirror)))[0])
+
+
+def _two_sensors(filter_: MultiRateFilter) -> Law:
+    return Law(filter_.cycle, lambda z: filter_.run(z)[:, 0])
+
+
+LQG: dict[str, Callable[[Scenario, int, Mirror], Law]] = {
+    "lqg-kf-lgs": lqg_kf_lgs, "lqg-multirate": lqg_multirate, "lqg-multirate-optimal": lqg_multirate_optimal,
+}
+"""Controller -> its law in one mode."""

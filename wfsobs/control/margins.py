@@ -1,0 +1,77 @@
+"""How far a linear loop is from instability: gain, phase and delay margin.
+
+With T = P F = L / (1 + L) (`law`), nothing needs to be divided by what may vanish:
+
+    L real      where Im T = 0; the gain can be multiplied by kappa = 1 - 1 / T before 1 + kappa L = 0
+    |L| = 1     where Re T = 1/2; L can be turned by its angle from -1
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from wfsobs.arrays import Array
+from wfsobs.wiener import Complex
+
+Response = Callable[[Array], Complex]
+"""omega (n,) [rad per step] -> (n,)."""
+
+
+@dataclass(frozen=True)
+class Margins:
+    """gain, least_gain : factors above and below 1 by which the loop gain may be multiplied, None if by any
+    phase : by which the loop gain may be turned, either way [rad]; delay : that it may be delayed more [s]; None if by any
+    """
+
+    gain: float | None
+    least_gain: float | None
+    phase: float | None
+    delay: float | None
+
+
+def margins(T: Response, omega: Array, dt: float) -> Margins:
+    """Margins of a stable loop; omega (n,): points from 0 to pi between which T crosses a line at most once."""
+    values = T(omega)
+    real = np.concatenate([values.real[[0, -1]], T(crossings(lambda w: T(w).imag, omega, values.imag)).real])
+    with np.errstate(divide="ignore"):
+        factors = 1.0 - 1.0 / real
+    unit = crossings(lambda w: T(w).real - 0.5, omega, values.real - 0.5)
+    at_unit = T(unit)
+    lag = np.angle(-at_unit / (1.0 - at_unit)) % (2.0 * np.pi)  # to -1 by turning clockwise, as a delay does
+    return Margins(
+        _least(factors[(factors > 1.0) & np.isfinite(factors)]),
+        max(factors[(factors >= 0.0) & (factors < 1.0)].tolist(), default=None),
+        _least(np.minimum(lag, 2.0 * np.pi - lag)),
+        _least(lag / unit * dt),
+    )
+
+
+def _least(x: Array) -> float | None:
+    return float(x.min()) if x.size else None
+
+
+def crossings(f: Callable[[Array], Array], x: Array, values: Array) -> Array:
+    """Where f, whose values at x (n,) are given, changes its sign, to rounding."""
+    i = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
+    low, high, below = x[i], x[i + 1], np.signbit(values[i])
+    parts, rows = np.linspace(0.0, 1.0, 17), np.arange(i.size)
+    for _ in range(12 if i.size else 0):  # 16^12 parts are more than a double resolves
+        points = low[:, None] + (high - low)[:, None] * parts
+        changed = np.signbit(f(points.ravel()).reshape(points.shape)) != below[:, None]
+        changed[:, 0], changed[:, -1] = False, True
+        first = np.argmax(changed, axis=1)
+        low, high = points[rows, first - 1], points[rows, first]
+    return 0.5 * (low + high)
+
+
+def frequencies(poles: Complex, n: int = 400) -> Array:
+    """Points from 0 to pi [rad per step] for a filter with these poles: even, on a logarithmic scale, and close
+    together near its poles."""
+    spread = np.concatenate([[0.0], np.geomspace(0.05, 40.0, 24)])
+    angle, width = np.abs(np.angle(poles)), np.maximum(-np.log(np.maximum(np.abs(poles), 1e-3)), 1e-9)
+    near = (angle[:, None] + width[:, None] * np.concatenate([-spread, spread])).ravel()
+    points = np.concatenate([np.geomspace(1e-5 * np.pi, np.pi, n), np.linspace(0.0, np.pi, n), near])
+    return np.unique(points[(points >= 0.0) & (points <= np.pi)])

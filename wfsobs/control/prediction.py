@@ -1,0 +1,90 @@
+"""Vibration as the GPR predict it for a controller: what it will be while the next command acts.
+
+In a loop that the prediction itself drives, u[k] does not exist yet at step k, so windows are of z whatever the settings of
+the observer say. With a delay of two frames the target of the window ending at step j is phi_vib[j+1]; the Butterworth
+bank on z says so at step j + 2, one step after the prediction was used.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wfsobs.arrays import Array
+from wfsobs.bandpass import StreamingBank, bandpass_bank
+from wfsobs.control.late_regression import LateRegression
+from wfsobs.control.mirror import Mirror
+from wfsobs.observers.gpr_offline import train, training_targets
+from wfsobs.observers.gpr_online import kernel_of
+from wfsobs.observers.modes import over_modes
+from wfsobs.record import Record, RecordError, pseudo_open_loop
+from wfsobs.scenario import Scenario
+from wfsobs.watch import Watch
+
+
+def gpr_offline_ahead(record: Record, scenario: Scenario, mirror: Mirror, watch: Watch) -> Array:
+    """Prediction of the vibration during the time that u[k] acts, (n_steps, n_modes) [um], NaN before the first full
+    window; trained once on the training record, its targets as many steps later."""
+    g, training = scenario.gpr_offline, record.training
+    if training is None:
+        raise RecordError("the record has no training record")
+    if record.n_steps < g.depth:
+        raise RecordError(f"the record has {record.n_steps} steps; depth needs {g.depth}")
+    targets = _ahead(training_targets(training, scenario, record.dt, record.delay), mirror)
+    training_z = pseudo_open_loop(training.y_lgs, training.u, record.delay)
+
+    def one(mode: int, watch: Watch) -> Array:
+        model = train(training_z[:, [mode]], targets[:, mode], g.depth, g.training_size, kernel_of(g), watch)
+        return model.predict(record.z[:, [mode]], watch)
+
+    return over_modes(record.n_modes, one, watch)
+
+
+def _ahead(x: Array, mirror: Mirror) -> Array:
+    """What x (n, ...) is on average while u[k] acts; NaN at the end, where it is not known."""
+    out = np.zeros_like(x)
+    for steps, tap in enumerate(mirror.taps[1:]):
+        if tap:
+            out += tap * np.concatenate([x[steps:], np.full((steps, *x.shape[1:]), np.nan)])
+    return out
+
+
+class VibrationPredictor:
+    """The online GPR of one mode as a control loop calls it: one sample in, one prediction out, then an update.
+
+    At step k it has learnt from the windows whose target is known by then: those up to k - mirror.taps.size + 1.
+    """
+
+    def __init__(self, scenario: Scenario, mirror: Mirror):
+        g, b = scenario.gpr_online, scenario.butterworth
+        self._taps = mirror.taps
+        self._bank = StreamingBank(bandpass_bank(b.frequencies, b.bandwidth_online, b.order, scenario.dt))
+        self._regression = LateRegression(g.depth, g.training_size, 1, kernel_of(g), late=self._taps.size - 2)
+        self._filtered = np.zeros(self._taps.size - 1)  # newest first; of step k it tells phi_vib[k-1]
+
+    def step(self, z: float) -> float:
+        """Prediction [um] of the vibration while the command of this step acts; NaN until the training set is full."""
+        self._filtered = np.roll(self._filtered, 1)
+        self._filtered[0] = self._bank.push(z)
+        # of the window that ended as many steps ago as there are taps after the first
+        target = self._taps[1:] @ self._filtered[::-1]
+        value = self._regression.predict(np.array([z]), float(target))
+        self._regression.update()
+        self._bank.settle()
+        return value
+
+
+def gpr_online_ahead(record: Record, scenario: Scenario, mirror: Mirror, watch: Watch) -> Array:
+    """As `gpr_offline_ahead`, by `VibrationPredictor`."""
+    done = np.zeros(record.n_modes)
+
+    def one(mode: int, watch: Watch) -> Array:
+        predictor, z = VibrationPredictor(scenario, mirror), record.z[:, mode].tolist()
+        out = np.empty(record.n_steps)
+        for k, sample in enumerate(z):
+            if k % 256 == 0:
+                done[mode] = k / record.n_steps
+                watch.step(float(done.mean()))
+            out[k] = predictor.step(sample)
+        return out
+
+    return over_modes(record.n_modes, one, watch)
