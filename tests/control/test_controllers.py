@@ -7,12 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.control.closed_loop import ClosedLoop, closed_loop, design, residual_rms, strehl
-from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.closed_loop import ClosedLoop, closed_loop, design, residual_rms
 from wfsobs.loop import simulate
-from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
 
 # The loop of one 530 nm turbulence, one 50 nm line at 47.5 Hz, 20 nm of noise, and a model that is the truth.
 MATCHED = Scenario().replace({

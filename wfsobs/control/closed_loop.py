@@ -20,7 +20,7 @@ from math import pi
 import numpy as np
 
 from wfsobs.arrays import Array
-from wfsobs.bound import TrueSpectra, bound, true_spectra
+from wfsobs.bound import TURBULENCE_SPECTRA, TrueSpectra, bound, true_spectra
 from wfsobs.control.controllers import CONTROLLERS, Controller
 from wfsobs.control.integrator import limited_integrator, residual_variance
 from wfsobs.control.law import Law
@@ -58,13 +58,14 @@ class Design:
     """All controllers of a scenario, before any random number.
 
     laws  : controller -> one per mode
-    bound : per mode, rms [um] of the least residual of any causal controller of the LGS alone
+    bound : per mode, rms [um] of the least residual of any causal controller of the LGS alone; None where the spectrum of
+        the turbulence is not known
     """
 
     scenario: Scenario
     mirror: Mirror
     laws: dict[str, tuple[Designed, ...]]
-    bound: tuple[float, ...]
+    bound: tuple[float, ...] | None
 
 
 @dataclass(frozen=True)
@@ -104,12 +105,13 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None) -> Desi
     scenario.validate()
     mirror = mirror_of(scenario)
     modes = range(len(scenario.modes))
-    spectra = [true_spectra(scenario, mode) for mode in modes]
+    known = scenario.turbulence.source in TURBULENCE_SPECTRA
+    spectra = [true_spectra(scenario, mode) if known else None for mode in modes]
     laws = {
         c.id: tuple(_designed(c, scenario, mode, mirror, spectra[mode]) for mode in modes) for c in chosen(controllers)}
     # A fraction of a frame comes on top of the whole ones, which alone bound what can be known.
-    least = tuple(bound(scenario, mode, ahead=int(mirror.delay) - 1)["total"] for mode in modes)
-    return Design(scenario, mirror, laws, least)
+    least = tuple(bound(scenario, mode, ahead=int(mirror.delay) - 1)["total"] for mode in modes if known)
+    return Design(scenario, mirror, laws, least if known else None)
 
 
 def chosen(controllers: Sequence[str] | None) -> list[Controller]:
@@ -120,7 +122,7 @@ def chosen(controllers: Sequence[str] | None) -> list[Controller]:
     return [c for c in CONTROLLERS.values() if controllers is None or c.id in controllers]
 
 
-def _designed(controller: Controller, scenario: Scenario, mode: int, mirror: Mirror, spectra: TrueSpectra) -> Designed:
+def _designed(controller: Controller, scenario: Scenario, mode: int, mirror: Mirror, spectra: TrueSpectra | None) -> Designed:
     if controller.law is None:
         return Designed(None, True)
     try:
@@ -130,7 +132,7 @@ def _designed(controller: Controller, scenario: Scenario, mode: int, mirror: Mir
     stable = law.stable
     if not stable or controller.predict is not None or not law.time_invariant:
         return Designed(law, stable)
-    predicted = float(np.sqrt(residual_variance(law, spectra, mirror)))
+    predicted = None if spectra is None else float(np.sqrt(residual_variance(law, spectra, mirror)))
     return Designed(law, stable, predicted, margins(
         lambda omega: mirror.response(omega) * law.response(omega), frequencies(law.poles), scenario.dt))
 

@@ -16,8 +16,8 @@ from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.watch import Watch
 
-MakeLaw = Callable[[Scenario, int, Mirror, TrueSpectra], Law]
-"""(scenario, mode, mirror, its true spectra) -> law. Raises ValueError saying why there is none."""
+MakeLaw = Callable[[Scenario, int, Mirror, TrueSpectra | None], Law]
+"""(scenario, mode, mirror, its true spectra if known) -> law. Raises ValueError saying why there is none."""
 
 Predict = Callable[[Record, Scenario, Mirror, Watch], Array]
 """Vibration while u[k] acts, (n_steps, n_modes) [um], NaN where it is not known yet."""
@@ -28,7 +28,7 @@ class Controller:
     """An entry of the registry: a linear law, or an integrator beside a prediction of the vibration, or nothing.
 
     id, label : for tables and files, and for people
-    needs     : what it must be given beside measurements
+    needs     : what it must be given beside measurements, the gain of an integrator aside
     law       : of one mode; of an integrator with a prediction, that of the integrator
     predict   : of the vibration
     ngs       : whether it uses NGS frames
@@ -37,31 +37,41 @@ class Controller:
 
     id: str
     label: str
-    needs: str
+    needs: tuple[str, ...] = ()
     law: MakeLaw | None = None
     predict: Predict | None = None
     ngs: bool = False
     weight: float = 1.0
 
+    def needed(self, scenario: Scenario) -> str:
+        """What it must be given beside measurements, for people; an optimised gain takes the true spectra."""
+        gain = (SPECTRA,) if self.law is _integrator and scenario.control.integrator == "optimised" else ()
+        return ", ".join((*gain, *self.needs)) or NOTHING
 
-def _integrator(scenario: Scenario, mode: int, mirror: Mirror, spectra: TrueSpectra) -> Law:
+
+def _integrator(scenario: Scenario, mode: int, mirror: Mirror, spectra: TrueSpectra | None) -> Law:
     c = scenario.control
-    return integrator_law(mirror, c.gain if c.integrator == "manual" else best_gain(spectra, mirror, c.leak), c.leak)
+    if c.integrator == "manual":
+        return integrator_law(mirror, c.gain, c.leak)
+    if spectra is None:
+        raise ValueError(f"the spectrum of turbulence from {scenario.turbulence.source} is not known: set control.integrator "
+                         "to manual, and control.gain")
+    return integrator_law(mirror, best_gain(spectra, mirror, c.leak), c.leak)
 
 
 def _lqg(id_: str) -> MakeLaw:
     return lambda scenario, mode, mirror, _spectra: LQG[id_](scenario, mode, mirror)
 
 
-NOTHING, SPECTRUM, MODEL, TRAINING = "nothing", "true spectra", "model", "training data"
+NOTHING, SPECTRA, MODEL, TRAINING = "nothing", "true spectra", "model", "training data"
 
 CONTROLLERS: dict[str, Controller] = {c.id: c for c in (
-    Controller("none", "No control", NOTHING, weight=0.1),
-    Controller("integrator", "Integrator", SPECTRUM, _integrator),
-    Controller("lqg-kf-lgs", "LQG, LGS KF", MODEL, _lqg("lqg-kf-lgs")),
-    Controller("lqg-multirate", "LQG, multi-rate KF", MODEL, _lqg("lqg-multirate"), ngs=True),
-    Controller("lqg-multirate-optimal", "LQG, optimal multi-rate KF", MODEL, _lqg("lqg-multirate-optimal"), ngs=True),
-    Controller("integrator+gpr-offline", "Integrator and offline GPR", TRAINING, _integrator, gpr_offline_ahead, weight=20.0),
-    Controller("integrator+gpr-online", "Integrator and online GPR", NOTHING, _integrator, gpr_online_ahead, weight=200.0),
+    Controller("none", "No control", weight=0.1),
+    Controller("integrator", "Integrator", law=_integrator),
+    Controller("lqg-kf-lgs", "LQG, LGS KF", (MODEL,), _lqg("lqg-kf-lgs")),
+    Controller("lqg-multirate", "LQG, multi-rate KF", (MODEL,), _lqg("lqg-multirate"), ngs=True),
+    Controller("lqg-multirate-optimal", "LQG, optimal multi-rate KF", (MODEL,), _lqg("lqg-multirate-optimal"), ngs=True),
+    Controller("integrator+gpr-offline", "Integrator and offline GPR", (TRAINING,), _integrator, gpr_offline_ahead, weight=20.0),
+    Controller("integrator+gpr-online", "Integrator and online GPR", (), _integrator, gpr_online_ahead, weight=200.0),
 )}
 """Every controller, in the order of tables and legends."""

@@ -11,12 +11,12 @@ from rich.table import Table
 
 from wfsobs.bound import BOUND
 from wfsobs.control.closed_loop import ClosedLoop, residual_rms, strehl
-from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.controllers import CONTROLLERS, SPECTRA
 from wfsobs.units import micrometres_per
 
 Row = dict[str, Any]
 
-BOUND_LABEL, BOUND_NEEDS = "Bound of the LGS alone", "true spectra"
+BOUND_LABEL = "Bound of the LGS alone"
 
 
 def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
@@ -24,12 +24,12 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
 
     residual_rms_nm, residual_rms_mas, strehl : of the simulation after the warm-up, null where the loop is not stable or could
         not run (`note` says why); strehl is that of all modes together
-    predicted_rms_nm : by theory;  gain : of an integrator, optimised or set
+    residual_rms_mas : of tip and tilt alone;  predicted_rms_nm : by theory;  gain : of an integrator, optimised or set
     gain_margin_db, phase_margin_deg, delay_margin_ms : null where a loop has no frequency response or no such limit
     limited : share of the steps in which a limit of the mirror changed the command
     """
     plan, warm_up = result.design, result.scenario.run.warm_up
-    names = [m.name for m in result.scenario.modes]
+    modes = result.scenario.modes
     mas = micrometres_per("mas", result.scenario.telescope.diameter)
     wavelength = result.scenario.control.wavelength
 
@@ -37,9 +37,9 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
         known = {name: more.get(name) for name in (
             "predicted_rms_nm", "gain", "gain_margin_db", "phase_margin_deg", "delay_margin_ms", "limited")}
         return {
-            "controller": controller, "mode": names[mode], "needs": needs, "stable": stable,
+            "controller": controller, "mode": modes[mode].name, "needs": needs, "stable": stable,
             "residual_rms_nm": None if left is None else left[mode] * 1e3,
-            "residual_rms_mas": None if left is None else left[mode] / mas,
+            "residual_rms_mas": None if left is None or modes[mode].radial_order > 1 else left[mode] / mas,
             "strehl": None if left is None else strehl(left, wavelength),
             **known, "note": more.get("note", ""), "seed": seed,
         }
@@ -50,7 +50,7 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
         for mode, designed in enumerate(plan.laws[outcome.controller]):
             m = designed.margins
             out.append(row(
-                outcome.controller, CONTROLLERS[outcome.controller].needs, mode, outcome.stable[mode], left,
+                outcome.controller, CONTROLLERS[outcome.controller].needed(result.scenario), mode, outcome.stable[mode], left,
                 predicted_rms_nm=None if designed.predicted is None else designed.predicted * 1e3,
                 gain=designed.law.gain if designed.law else None,
                 gain_margin_db=20 * log10(m.gain) if m and m.gain else None,
@@ -59,7 +59,8 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
                 limited=outcome.limited[mode] if outcome.limited else None,
                 note=outcome.note,
             ))
-    out += [row(BOUND, BOUND_NEEDS, mode, True, plan.bound) for mode in range(len(names))]
+    if plan.bound is not None:
+        out += [row(BOUND, SPECTRA, mode, True, plan.bound) for mode in range(len(modes))]
     return out
 
 
