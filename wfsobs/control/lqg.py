@@ -24,19 +24,26 @@ from wfsobs.scenario import Scenario
 from wfsobs.statespace import DisturbanceModel
 
 
-def command_rows(model: DisturbanceModel, mirror: Mirror) -> Array:
-    """Row (1, n) that makes the command of the estimated state x_hat[k]."""
-    row = -model.output_rows(TARGETS).sum(axis=0)
+def command_rows(A: Array, phi: Array, mirror: Mirror) -> Array:
+    """Row (1, n) that makes the command of the estimated state x_hat[k].
+
+    A (n, n): transition; phi (n,): row that gives phi_dist[k], which no other part of the state drives later on
+    """
+    row = -phi
     out = np.zeros_like(row)
     for tap in mirror.taps[1:]:
         out += tap * row
-        row = row @ model.A
+        row = row @ A
     return out[None, :]
+
+
+def _rows_of(model: DisturbanceModel, mirror: Mirror) -> Array:
+    return command_rows(model.A, model.output_rows(TARGETS).sum(axis=0), mirror)
 
 
 def lqg_of(model: DisturbanceModel, noise: float, mirror: Mirror) -> Law:
     """LQG on the LGS with any model; noise [um] of a measurement. Raises RiccatiError."""
-    return steady_law(steady_filter(model, noise, command_rows(model, mirror))[0])
+    return steady_law(steady_filter(model, noise, _rows_of(model, mirror))[0])
 
 
 def lqg_kf_lgs(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
@@ -47,15 +54,14 @@ def lqg_kf_lgs(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
 def lqg_multirate(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
     """With the paper's multi-rate filter. Raises SettingError where its cycle is unstable."""
     model = kalman_model(scenario, mode, scenario.dt)
-    filter_ = multirate_filter(model, scenario.sensors.exposure_ratio, *multirate_noise(scenario), command_rows(model, mirror))
-    return _two_sensors(filter_)
+    return _two_sensors(multirate_filter(
+        model, scenario.sensors.exposure_ratio, *multirate_noise(scenario), _rows_of(model, mirror)))
 
 
 def lqg_multirate_optimal(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
     """With the optimal multi-rate filter."""
-    model = kalman_model(scenario, mode, scenario.dt)
-    ratio = scenario.sensors.exposure_ratio
-    return _two_sensors(optimal_filter(*optimal_model(scenario, mode, scenario.dt, ratio, command_rows(model, mirror)))[0])
+    cycle, rows = optimal_model(scenario, mode, scenario.dt, scenario.sensors.exposure_ratio)
+    return _two_sensors(optimal_filter(cycle, command_rows(cycle[0][0], rows.sum(axis=0), mirror))[0])
 
 
 def _two_sensors(filter_: MultiRateFilter) -> Law:

@@ -68,17 +68,14 @@ def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[MultiRateFilter, 
     return MultiRateFilter(filter_step(A, alone, L, outputs), PeriodicFilter(steps)), states
 
 
-def optimal_model(
-    scenario: Scenario, mode: int, dt: float, ratio: int, outputs: Array | None = None
-) -> tuple[list[Step], Array]:
-    """The cycle and output rows of one mode of a scenario; outputs: rows wanted of the disturbance model's state, (p, n),
-    every target by default."""
+def optimal_model(scenario: Scenario, mode: int, dt: float, ratio: int) -> tuple[list[Step], Array]:
+    """The cycle and output rows of one mode of a scenario."""
     model = kalman_model(scenario, mode, dt)
     error = None
     if scenario.multirate.model_lgs_error:
         error = lgs_error_process(scenario, mode, dt)
     cycle = optimal_cycle(model, ratio, *multirate_noise(scenario), error)
-    rows = model.output_rows(TARGETS) if outputs is None else outputs
+    rows = model.output_rows(TARGETS)
     return cycle, np.hstack([rows, np.zeros((len(rows), len(cycle[0][0]) - rows.shape[1]))])
 
 
