@@ -26,6 +26,7 @@ class Aliasing:
     """The error of one sensor; made once, it serves layers and beams of every kind."""
 
     def __init__(self, sensor: ShackHartmann) -> None:
+        self.sensor = sensor
         self._radius = sensor.lenslets.diameter / 2.0
         kx, ky = RADII[:, None] * np.cos(ANGLES), RADII[:, None] * np.sin(ANGLES)
         wrong = sensor.transform(kx / self._radius, ky / self._radius)

@@ -22,6 +22,7 @@ from wfsobs.disturbance import peak_rms, vibration_power
 from wfsobs.observers.base import TURBULENCE, VIBRATION
 from wfsobs.scenario import Scenario
 from wfsobs.sensing import low_frequency_process
+from wfsobs.sensors import noise_rms
 from wfsobs.turbulence import turbulence_process
 from wfsobs.wiener import Complex, advanced, causal_error, factorise
 
@@ -84,8 +85,7 @@ def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
     if scenario.sensors.tip_tilt_indetermination:
         seen, shared = np.zeros_like(seen), np.zeros_like(shared)
     vibration = _vibration(scenario, mode, n)
-    s = scenario.sensors
-    noise = max(s.lgs_noise**2 / s.lgs_count, FLOOR**2)
+    noise = max(noise_rms(scenario, "lgs")[mode] ** 2 / scenario.sensors.lgs_count, FLOOR**2)
     return TrueSpectra(
         measured=seen + vibration + noise,
         signal={TURBULENCE: turbulence, VIBRATION: vibration},

@@ -72,7 +72,7 @@ def describe(scenario: Scenario, mode: int = 0) -> Description:
     """The numbers of a scenario's observers for one mode; a filter that cannot be has its reason in place of numbers."""
     dt, ratio = scenario.dt, scenario.sensors.exposure_ratio
     turbulence, vibration = modelled_processes(scenario, mode, dt)
-    lgs_noise, ngs_noise = measurement_noise(scenario)
+    lgs_noise, ngs_noise = measurement_noise(scenario, mode)
     filters = {
         "kf-lgs": _facts(dt, dt, lambda: _kalman(scenario, mode, dt, lgs_noise, "LGS")),
         "kf-ngs": _facts(ratio * dt, ratio * dt, lambda: _kalman(scenario, mode, ratio * dt, ngs_noise, "NGS")),
@@ -109,7 +109,7 @@ def _kalman(scenario: Scenario, mode: int, dt: float, noise: float, sensor: str)
 def _multirate(scenario: Scenario, mode: int) -> tuple[Gains, Array]:
     """The paper's two gains (eq. 11), and the product of the A - K C of one cycle. Raises where that is unstable."""
     model = kalman_model(scenario, mode, scenario.dt)
-    lgs, ngs = multirate_noise(scenario)
+    lgs, ngs = multirate_noise(scenario, mode)
     cycle = multirate_filter(model, scenario.sensors.exposure_ratio, lgs, ngs).cycle
     alone = steady_state(model.A, model.C, model.Q, np.array(lgs**2)).L
     both = steady_state(model.A, np.vstack([model.C, model.C]), model.Q, np.diag([lgs**2, ngs**2])).L

@@ -47,6 +47,8 @@ END = 700.0
 """k_x D / 2 where waves end: 370 times the knee of tip, less than 1e-11 of its variance."""
 FIELD = 1e-3
 """Shifts between beams [m per m of height, 3.4 arcmin] that the spacing across the wind resolves."""
+NARROWEST = 0.5
+"""Beams narrower than that part of the aperture get no more waves: a layer halfway up to a guide star."""
 COLUMNS = 512
 """Most columns k_x of a block: 512 by 60 waves are half a megabyte."""
 
@@ -115,7 +117,7 @@ def layer_signals(
     """What each beam sees of one layer, [(n_outputs, n_steps) um]."""
     grid = Grid.of(layer, outer_scale, diameter, n_steps, dt)
     amplitudes = [np.zeros((sensor.n_outputs, grid.f.size), complex) for sensor, _ in beams]
-    reaches = [sensor.reach / footprint.scale for sensor, footprint in beams]
+    reaches = [sensor.reach / max(footprint.scale, NARROWEST) for sensor, footprint in beams]
     for part, wave in waves(grid, layer, outer_scale, diameter, rng, max(reaches)):
         watch.check()
         exposure = np.sinc(grid.f[part] * dt)

@@ -18,22 +18,24 @@ from wfsobs.record import Record, delayed, frame_mean
 from wfsobs.riccati import steady_state
 from wfsobs.scenario import Scenario
 
+LGS, NGS = 0, 1
+"""Which of the two of `measurement_noise`."""
+
 
 def bridged(record: Record, scenario: Scenario) -> Record:
     """The record without NaN, but in y_ngs at steps without a frame."""
     u = held(record.u)
     y_lgs, open_loop_y, y_ngs = record.y_lgs, record.open_loop_y, record.y_ngs
-    lgs_noise, ngs_noise = measurement_noise(scenario)
     if np.isnan(y_lgs).any():
         mirror = delayed(u, record.delay)
-        y_lgs = predicted(y_lgs - mirror, scenario, record.dt, lgs_noise) + mirror
+        y_lgs = predicted(y_lgs - mirror, scenario, record.dt, LGS) + mirror
     if open_loop_y is not None and np.isnan(open_loop_y).any():
-        open_loop_y = predicted(open_loop_y, scenario, record.dt, lgs_noise)
+        open_loop_y = predicted(open_loop_y, scenario, record.dt, LGS)
     if y_ngs is not None and record.ratio is not None and np.isnan(y_ngs[record.ratio :: record.ratio]).any():
         n = record.ratio
         mirror = frame_mean(delayed(u, record.delay - 1), n)[n::n]
         y_ngs = y_ngs.copy()
-        y_ngs[n::n] = predicted(y_ngs[n::n] - mirror, scenario, n * record.dt, ngs_noise) + mirror
+        y_ngs[n::n] = predicted(y_ngs[n::n] - mirror, scenario, n * record.dt, NGS) + mirror
     return replace(record, y_lgs=y_lgs, u=u, y_ngs=y_ngs, open_loop_y=open_loop_y)
 
 
@@ -46,12 +48,12 @@ def held(x: Array) -> Array:
     return np.where(last < 0, 0.0, np.take_along_axis(x, np.maximum(last, 0), axis=0))
 
 
-def predicted(z: Array, scenario: Scenario, dt: float, noise: float) -> Array:
+def predicted(z: Array, scenario: Scenario, dt: float, star: int) -> Array:
     """z (n, n_modes) with every NaN replaced by the prediction of the steady-state Kalman filter of the scenario's model;
-    noise [um] of a measurement. Where the model has no such filter the last measurement is held."""
+    star : LGS or NGS. Where the model has no such filter the last measurement is held."""
     out = z.copy()
     for mode in range(z.shape[1]):
-        model = kalman_model(scenario, mode, dt)
+        model, noise = kalman_model(scenario, mode, dt), measurement_noise(scenario, mode)[star]
         try:
             K = model.A @ steady_state(model.A, model.C, model.Q, np.array(noise**2)).L[:, 0]
         except ValueError:

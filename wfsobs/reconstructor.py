@@ -35,6 +35,19 @@ def reconstructor(lenslets: Lenslets, order: int) -> Array:
     return out
 
 
+def fittable(lenslets: Lenslets, at_most: int) -> int:
+    """The highest radial order that the slopes determine, `at_most` and one for each subaperture along a side at most.
+    Raises ValueError, in one line, where it is none."""
+    for order in range(min(at_most, lenslets.across), 1, -1):
+        try:
+            reconstructor(lenslets, order)
+        except ValueError:
+            continue
+        return order
+    reconstructor(lenslets, 1)
+    return 1
+
+
 def interaction(lenslets: Lenslets, order: int) -> Array:
     """Slopes [um/m] of one [um] of each mode up to a radial order, piston left out: (2 lenslets.count, modes)."""
     radius = lenslets.diameter / 2.0

@@ -12,6 +12,7 @@ from wfsobs.arrays import Array
 from wfsobs.disturbance import Disturbance
 from wfsobs.record import delayed, frame_mean
 from wfsobs.scenario import Scenario
+from wfsobs.sensors import white_noise
 from wfsobs.turbulence import turbulence_process
 from wfsobs.watch import QUIET, Watch
 
@@ -44,7 +45,7 @@ def measure(
         lgs = delayed(np.mean(seen, axis=0) + disturbance.vibration, 1) + np.mean(errors, axis=0)
 
     n = scenario.sensors.exposure_ratio
-    noise = scenario.sensors.ngs_noise * _normal(ngs_rng, n_steps, n_modes)
+    noise = white_noise(scenario, "ngs", n_steps, ngs_rng)
     frame = np.arange(n_steps)
     is_frame = (frame % n == 0) & (frame >= n)
     ngs_turbulence = disturbance.turbulence if disturbance.ngs_turbulence is None else disturbance.ngs_turbulence
@@ -61,17 +62,11 @@ def _without_blind(scenario: Scenario, turbulence: Array) -> Array:
     return np.where(visible, turbulence, 0.0)
 
 
-def _normal(rng: np.random.Generator, n_steps: int, n_modes: int) -> Array:
-    """White noise (n_steps, n_modes); higher modes leave tip and tilt the numbers that they have alone."""
-    tip_tilt = rng.standard_normal((n_steps, min(n_modes, 2)))
-    return np.hstack([tip_tilt, rng.standard_normal((n_steps, n_modes - 2))]) if n_modes > 2 else tip_tilt
-
-
 def _lgs_error(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.Generator, watch: Watch) -> Array:
     """Error of one guide star [um], (n_steps, n_modes): white noise, plus what stands for the cone effect where turbulence
     has no layers."""
     noise_rng, slow_rng = rng.spawn(2)
-    out = scenario.sensors.lgs_noise * _normal(noise_rng, n_steps, n_modes)
+    out = white_noise(scenario, "lgs", n_steps, noise_rng)
     for mode, stream in enumerate(slow_rng.spawn(n_modes)):
         watch.check()
         process = low_frequency_process(scenario, mode)

@@ -16,6 +16,7 @@ from wfsobs.arrays import Array
 from wfsobs.frozen_flow import frozen_flow
 from wfsobs.groups.atmosphere import PsdTable
 from wfsobs.scenario import Scenario
+from wfsobs.sensors import sensor
 from wfsobs.spectrum import random_phase_signal, table_power
 from wfsobs.watch import Watch
 
@@ -93,10 +94,12 @@ def _psd(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Arr
 
 
 def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Watch) -> Turbulence:
-    """Von Karman layers, projected on the axis, on the NGS and on every LGS."""
-    layers, sensor = atmosphere.layers(scenario), atmosphere.ideal_sensor(scenario)
-    stars = [atmosphere.on_axis(), atmosphere.natural_star(scenario), *atmosphere.laser_stars(scenario)]
-    views = [atmosphere.view(sensor, star, layers) for star in stars]
+    """Von Karman layers: their modes on the axis, and what the sensors on the NGS and on every LGS see."""
+    layers = atmosphere.layers(scenario)
+    ideal, on_ngs, on_lgs = atmosphere.ideal_sensor(scenario), sensor(scenario, "ngs"), sensor(scenario, "lgs")
+    looking = [(ideal, atmosphere.on_axis()), (on_ngs, atmosphere.natural_star(scenario))]
+    looking += [(on_lgs, star) for star in atmosphere.laser_stars(scenario)]
+    views = [atmosphere.view(what, star, layers) for what, star in looking]
     on_axis, ngs, *lgs = frozen_flow(
         layers, scenario.turbulence.outer_scale, scenario.telescope.diameter, views, n, scenario.dt, rng, watch)
     return Turbulence(on_axis, ngs, tuple(lgs))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import param
 
+from wfsobs.groups.shack_hartmann import LensletArrays, Spots
 from wfsobs.parameters import Real, Reals, Whole
-from wfsobs.settings import Group
+from wfsobs.settings import Group, section
 
 
 class Sensors(Group):
@@ -20,10 +21,19 @@ class Sensors(Group):
         default="mean", objects=["mean", "minimum-variance"], label="LGS combined by",
         doc="mean: the plain mean over the LGS (paper); minimum-variance: the linear combination of all their modes that is "
             "nearest to the disturbance on the axis, from the covariances of the model.")
+    kind = param.Selector(
+        default="shack-hartmann", objects=["shack-hartmann", "zernike"], label="Kind",
+        doc="What sees frozen flow: shack-hartmann, modes fitted to slopes; zernike, the modes themselves. Turbulence that is "
+            "made mode by mode is seen as it is.")
+    noise_from = param.Selector(
+        default="nm", objects=["nm", "photons"], label="Noise from",
+        doc="nm: white noise of the rms below in every mode; photons: the noise that photons and read noise have in the slopes "
+            "of the Shack-Hartmann sensors, correlated between modes.")
     lgs_noise = Real(0.02, bounds=(0.0, 10.0), softbounds=(0.0, 0.2), step=0.001, label="LGS noise",
-                     doc="White measurement noise of each LGS and mode, rms [um]; not given in the paper.")
+                     doc="White measurement noise of each LGS and mode, rms [um], for noise from nm; not given in the paper.")
     ngs_noise = Real(0.01, bounds=(0.0, 10.0), softbounds=(0.0, 0.2), step=0.001, label="NGS noise",
-                     doc="White measurement noise of an NGS frame and mode, rms [um]; not given in the paper.")
+                     doc="White measurement noise of an NGS frame and mode, rms [um], for noise from nm; not given in the "
+                         "paper.")
     lgs_low_frequency_rms = Real(
         0.049, bounds=(0.0, 10.0), softbounds=(0.0, 0.2), step=0.005, label="LGS low-frequency error",
         doc="Slow tip-tilt error of each LGS, rms [um], independent between LGS: the stand-in for cone effect and "
@@ -43,3 +53,5 @@ class Sensors(Group):
         False, label="Tip-tilt indetermination",
         doc="An LGS that cannot see turbulent tip and tilt at all, as in reality; off in the paper, whose "
             "simulator does not model it.")
+    lenslets = section(LensletArrays, "Shack-Hartmann", "Lenslets of the Shack-Hartmann sensors, and the fit to their slopes.")
+    spots = section(Spots, "Spots", "Light and detectors of the Shack-Hartmann sensors, for noise from photons.")

@@ -21,6 +21,7 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.record import Record
 from wfsobs.riccati import SteadyState, steady_state
 from wfsobs.scenario import Scenario
+from wfsobs.sensors import noise_rms
 from wfsobs.statespace import MIN_MODEL_DAMPING, DisturbanceModel, disturbance_model
 from wfsobs.turbulence import turbulence_process
 from wfsobs.watch import Watch
@@ -46,12 +47,13 @@ def kalman_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
     return disturbance_model([turbulence], [vibration])
 
 
-def measurement_noise(scenario: Scenario) -> tuple[float, float]:
-    """Standard deviation of the modelled noise [um] of the mean LGS measurement and of an NGS frame."""
-    k, s = scenario.kalman, scenario.sensors
+def measurement_noise(scenario: Scenario, mode: int = 0) -> tuple[float, float]:
+    """Standard deviation of the modelled noise [um] of the mean LGS measurement and of an NGS frame in one mode."""
+    k = scenario.kalman
     if k.measurement_noise == "manual":
         return k.lgs_noise, k.ngs_noise
-    return max(s.lgs_noise / np.sqrt(s.lgs_count), MIN_NOISE), max(s.ngs_noise, MIN_NOISE)
+    lgs, ngs = noise_rms(scenario, "lgs")[mode], noise_rms(scenario, "ngs")[mode]
+    return max(lgs / np.sqrt(scenario.sensors.lgs_count), MIN_NOISE), max(ngs, MIN_NOISE)
 
 
 def filter_step(A: Array, C: Array, L: Array, outputs: Array) -> tuple[Array, Array, Array, Array]:
@@ -75,11 +77,11 @@ def steady_filter(
 
 def kf_lgs(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
     """The Kalman filter on the LGS measurement, at every fast step."""
-    z, noise = record.z, measurement_noise(scenario)[0]
+    z = record.z
     columns = []
     for mode in range(record.n_modes):
         watch.step(mode / record.n_modes)
-        kalman, _ = steady_filter(kalman_model(scenario, mode, record.dt), noise)
+        kalman, _ = steady_filter(kalman_model(scenario, mode, record.dt), measurement_noise(scenario, mode)[0])
         columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
     return by_target(columns)
 
@@ -91,13 +93,13 @@ def kf_ngs(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]
     step i, the fast steps k ... k + n - 1. It is held over them, or spread by the fast model.
     """
     assert record.ratio is not None
-    n, noise = record.ratio, measurement_noise(scenario)[1]
+    n = record.ratio
     frames = record.z_ngs[n::n]
     columns = []
     for mode in range(record.n_modes):
         watch.step(mode / record.n_modes)
         model = kalman_model(scenario, mode, n * record.dt)
-        kalman, _ = steady_filter(model, noise, model.pairs)
+        kalman, _ = steady_filter(model, measurement_noise(scenario, mode)[1], model.pairs)
         slow = kalman.run(frames[:, None, mode, None])[:, :, 0]  # of each process, slow steps i and i - 1
         fast = np.full((record.n_steps, len(TARGETS)), np.nan)
         for target, process in enumerate(modelled_processes(scenario, mode, record.dt)):

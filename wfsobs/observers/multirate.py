@@ -27,10 +27,10 @@ from wfsobs.statespace import DisturbanceModel
 from wfsobs.watch import Watch
 
 
-def multirate_noise(scenario: Scenario) -> tuple[float, float]:
-    """Square roots of r_LGS and r_NGS [um]."""
+def multirate_noise(scenario: Scenario, mode: int = 0) -> tuple[float, float]:
+    """Square roots of r_LGS and r_NGS [um] in one mode."""
     m = scenario.multirate
-    return (m.lgs_noise, m.ngs_noise) if m.measurement_noise == "manual" else measurement_noise(scenario)
+    return (m.lgs_noise, m.ngs_noise) if m.measurement_noise == "manual" else measurement_noise(scenario, mode)
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,8 @@ def run_modes(record: Record, watch: Watch, make: Callable[[int], MultiRateFilte
 def multirate(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
     """The multi-rate filter over a record, for turbulence."""
     assert record.ratio is not None
-    ratio, noise = record.ratio, multirate_noise(scenario)
+    ratio = record.ratio
     columns = run_modes(
-        record, watch, lambda mode: multirate_filter(kalman_model(scenario, mode, record.dt), ratio, *noise))
+        record, watch, lambda mode: multirate_filter(
+            kalman_model(scenario, mode, record.dt), ratio, *multirate_noise(scenario, mode)))
     return {TURBULENCE: by_target(columns)[TURBULENCE]}

@@ -74,7 +74,7 @@ def optimal_model(scenario: Scenario, mode: int, dt: float, ratio: int) -> tuple
     error = None
     if scenario.multirate.model_lgs_error:
         error = lgs_error_process(scenario, mode, dt)
-    cycle = optimal_cycle(model, ratio, *multirate_noise(scenario), error)
+    cycle = optimal_cycle(model, ratio, *multirate_noise(scenario, mode), error)
     rows = model.output_rows(TARGETS)
     return cycle, np.hstack([rows, np.zeros((len(rows), len(cycle[0][0]) - rows.shape[1]))])
 
