@@ -138,7 +138,7 @@ function drawSpectrum(figure, target, state) {
 function paint(figure) {
   const text = dark ? "#e8e8e8" : "#1c1c1c"
   const line = dark ? "#777777" : "#999999"
-  figure.setv({background_fill_alpha: 0, border_fill_alpha: 0, outline_line_color: line, outline_line_alpha: 0.5})
+  figure.setv({outline_line_color: line, outline_line_alpha: 0.5})
   for (const it of [...figure.left, ...figure.below]) {
     it.setv({
       axis_label_text_color: text, major_label_text_color: text, axis_line_color: line, major_tick_line_color: line,
@@ -272,11 +272,24 @@ function sliders() {
 }
 
 function switches() {
-  for (const input of document.querySelectorAll(".switch input")) {
+  for (const input of document.querySelectorAll(".switches input, .switches select")) {
     input.onchange = () => {
       shown[input.name] = input.value
+      if (input.name === "mode") withoutAngle()
       if (input.name === "zoom") drawAxes()
       else draw()
+    }
+  }
+}
+
+// What is no tilt of the wavefront has no angle.
+function withoutAngle() {
+  const tilt = data.tilts.includes(shown.mode)
+  for (const unit of document.querySelectorAll(".switches input[name=unit]")) {
+    unit.disabled = !tilt && data.angles.includes(unit.value)
+    if (unit.disabled && unit.checked) {
+      document.querySelector(".switches input[name=unit]").checked = true
+      shown.unit = "nm"
     }
   }
 }

@@ -123,7 +123,7 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         words, out = (words[:-2], words[-1]) if ">" in words else (words, None)
         if "--seeds" in words:
             words[words.index("--seeds") + 1] = "2"
-        result = CliRunner().invoke(main, [*words[1:], *(SHORT if words[1] in ("run", "observe") else ())])
+        result = CliRunner().invoke(main, [*words[1:], *(SHORT if words[1] in ("run", "observe", "export") else ())])
         assert result.exit_code == 0, (line, result.output)
         if out:
             Path(out).write_text(result.stdout, encoding="utf-8")

@@ -12,6 +12,10 @@ from wfsobs.observers.base import TARGETS, VIBRATION
 
 TRACE, SPECTRUM = "trace", "spectrum"
 
+WARM_UP, WINDOW = "warm-up", "window"
+SHADES = {WARM_UP: "#808080", WINDOW: "#2B8AB3"}
+"""Stretches of a trace that are shaded."""
+
 
 def all_figures() -> dict[str, figure]:
     """"trace-turbulence" and the like -> figure; the traces share their time axis, the spectra their frequencies."""
@@ -19,8 +23,8 @@ def all_figures() -> dict[str, figure]:
     crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
     made = {f"{TRACE}-{target}": _trace(target, times, crosshair) for target in TARGETS}
     made |= {f"{SPECTRUM}-{target}": _spectrum(target, frequencies) for target in TARGETS}
-    for name, fig in made.items():
-        fig.name = name
+    for name, fig in made.items():  # see-through from the start: a white ground leaves its edge behind in dark mode
+        fig.update(name=name, background_fill_alpha=0.0, border_fill_alpha=0.0)
     return made
 
 
@@ -29,7 +33,7 @@ def _trace(target: str, times: Range1d, crosshair: CrosshairTool) -> figure:
     fig = new_figure(x_range=times, y_range=Range1d(start=-1.0, end=1.0))
     fig.xaxis.axis_label = "time [s]"
     fig.add_tools(crosshair)
-    for name, colour in (("warm-up", "#808080"), ("window", "#2B8AB3")):
+    for name, colour in SHADES.items():
         fig.add_layout(BoxAnnotation(
             left=0, right=0, fill_color=colour, fill_alpha=0.10, line_width=0, level="underlay", name=name))
     source = ColumnDataSource({"x": [], **{name: [] for name in _names(target)}})

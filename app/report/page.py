@@ -17,9 +17,9 @@ from bokeh.document import Document
 from bokeh.resources import Resources
 
 from wfsobs import __version__
-from wfsobs.app.display import CUMULATIVE, ERROR, PSD, SIGNAL, UNITS, per_micrometre
+from wfsobs.app.display import CUMULATIVE, ERROR, NO_ANGLE, PSD, SIGNAL, UNITS, per_micrometre
 from wfsobs.app.report.data import Pool, Report, State, coded, window_of
-from wfsobs.app.report.figures import SPECTRUM, TRACE, all_figures
+from wfsobs.app.report.figures import SHADES, SPECTRUM, TRACE, WARM_UP, WINDOW, all_figures
 from wfsobs.app.report.table import state_table
 from wfsobs.app.report.text import (
     meaning_section,
@@ -33,6 +33,7 @@ from wfsobs.app.report.text import (
 from wfsobs.app.style import LOOKS, PRIMARY, asset, look, observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, marked_peaks
 from wfsobs.app.work import TRUTH
+from wfsobs.modes import TIP_TILT
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION
 
@@ -73,7 +74,7 @@ def _body(report: Report, made: datetime) -> str:
     """The sections from the top."""
     sections: list[tuple[str, str, Callable[[], str]]] = [
         ("", "controls script-only", lambda: _controls(report)),
-        *((target.capitalize(), "script-only", lambda target=target: _target(target)) for target in TARGETS),
+        *((target.capitalize(), "script-only", lambda target=target: _target(report, target)) for target in TARGETS),
         ("RMS errors", "", lambda: _tables(report)),
         ("Scenario", "", lambda: scenario_section(report)),
         ("What the numbers mean", "text", lambda: meaning_section(report)),
@@ -93,12 +94,13 @@ def _controls(report: Report) -> str:
         f'<div class="slider"><label for="vary-{i}">{escape(name_of(report.base, v.path))} <code>{escape(v.path)}</code></label>'
         f'<input type="range" id="vary-{i}" min="0" max="{len(v.values) - 1}" value="0" step="1" autocomplete="off">'
         f'<output for="vary-{i}"></output></div>' for i, v in enumerate(report.variations))
-    modes = {m.name: m.name.capitalize() for m in report.base.modes}
+    modes = {name: name[0].upper() + name[1:] for name in _modes(report)}
     switches = "".join((
-        _switch("mode", "Mode", modes), _switch("unit", "Unit", UNITS),
+        (_switch if len(modes) <= len(TIP_TILT) else _list)("mode", "Mode", modes), _switch("unit", "Unit", UNITS),
         _switch("show", "Show", {SIGNAL: "Signal", ERROR: "Error"}),
         _switch("spectrum", "Spectrum", {PSD: "PSD", CUMULATIVE: "Cumulative rms"}),
         _switch("zoom", "Time window", {"whole": "Whole record", "2": "2 s", "0.5": "0.5 s"})))
+    sliders = f'<div class="sliders">{sliders}</div>' if sliders else ""
     return f'{sliders}<div class="switches">{switches}</div><p id="fault" role="alert" hidden></p>'
 
 
@@ -109,13 +111,28 @@ def _switch(name: str, title: str, options: Any) -> str:
     return f'<fieldset class="switch"><legend class="hidden">{title}</legend>{buttons}</fieldset>'
 
 
-def _target(target: str) -> str:
+def _list(name: str, title: str, options: Any) -> str:
+    items = "".join(f'<option value="{escape(value)}">{escape(label)}</option>' for value, label in options.items())
+    return f'<label class="list">{title} <select name="{name}" autocomplete="off">{items}</select></label>'
+
+
+def _modes(report: Report) -> list[str]:
+    """The modes of the states, by name; those with fewer have the first of them."""
+    return [mode.name for mode in max((state.scenario.modes for state in report.states), key=len)]
+
+
+def _target(report: Report, target: str) -> str:
     """The cards and the two figures of one target."""
+    shades = _shade("warm-up", WARM_UP) + (_shade("every sample", WINDOW) if window_of(report.states) else "")
     figures = "".join(
         f'<figure><figcaption class="caption">{title}{marks}</figcaption><div id="{kind}-{target}"></div></figure>'
         for kind, title, marks in (
-            (TRACE, "Time trace", ""), (SPECTRUM, "Spectrum", MARKS if target == VIBRATION else "")))
+            (TRACE, "Time trace", shades), (SPECTRUM, "Spectrum", MARKS if target == VIBRATION else "")))
     return f'<div id="cards-{target}"></div><div class="figures">{figures}</div>'
+
+
+def _shade(title: str, name: str) -> str:
+    return f'<span class="mark shade" style="--shade:{SHADES[name]}">{title}</span>'
 
 
 def _tables(report: Report) -> str:
@@ -147,7 +164,7 @@ def _data(report: Report) -> dict[str, Any]:
         "looks": {name: {"label": look(name).label, "light": look(name).light, "dark": look(name).dark,
                          "dash": look(name).dash} for name in LOOKS},
         "names": {target: [TRUTH, *observers_of(target)] for target in TARGETS},
-        "modes": [m.name for m in report.base.modes], "units": UNITS, "start": report.start,
+        "modes": _modes(report), "tilts": [m.name for m in TIP_TILT], "angles": NO_ANGLE, "units": UNITS, "start": report.start,
         "variations": [[value_of(value) for value in v.values] for v in report.variations],
         "window": window_of(report.states), "states": states,
         "arrays": [base64.b64encode(array).decode() for array in pool.all()],

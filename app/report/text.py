@@ -155,7 +155,7 @@ def origin_section(report: Report, made: datetime) -> str:
     }
     listed = "".join(f"<dt>{name}</dt><dd>{escape(fact)}</dd>" for name, fact in facts.items())
     note = f" with the settings above saved as {FILE}" if by_file else ""
-    return f"<dl>{listed}</dl><p>This report again{note}:</p><pre tabindex=0><code>{escape(command)}</code></pre>"
+    return f"<dl>{listed}</dl><p>This report again{note}:</p><pre class=command><code>{escape(command)}</code></pre>"
 
 
 def command_of(report: Report) -> tuple[str, bool]:
