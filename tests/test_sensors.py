@@ -97,7 +97,7 @@ def test_more_light_less_noise() -> None:
 ])
 def test_settings_that_do_not_go_together(changes: dict, told: str) -> None:
     with pytest.raises(SettingError, match=told) as error:
-        simulate(scenario(changes))
+        scenario(changes).validate()
     assert "\n" not in str(error.value)
 
 

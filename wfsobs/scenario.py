@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+from wfsobs.fit import fit
 from wfsobs.groups.atmosphere import PsdTable, Telescope, Turbulence
 from wfsobs.groups.control import Control
 from wfsobs.groups.observers import Butterworth, Kalman, MultiRate, OfflineGpr, OnlineGpr
@@ -79,6 +80,10 @@ class Scenario(Group):
             _validate_psd(self.turbulence.psd, "turbulence")
         if self.turbulence.source == "frozen-flow":
             self._validate_layers()
+        if self.sensors.noise_from == "photons" or (
+                self.turbulence.source == "frozen-flow" and self.sensors.kind == "shack-hartmann"):
+            for kind in ("lgs", "ngs"):
+                fit(self.sensors.lenslets, kind, self.telescope.diameter, self.telescope.radial_order)
         widest = max(self.butterworth.bandwidth_offline, self.butterworth.bandwidth_online) / 2
         for i, f in enumerate(self.butterworth.frequencies):
             if not (f - widest > 0 and f + widest < nyquist):

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 
 from wfsobs import atmosphere
 from wfsobs.aliasing import Aliasing
 from wfsobs.arrays import Array
+from wfsobs.fit import Kind, fit
 from wfsobs.lenslets import Lenslets
-from wfsobs.reconstructor import fittable
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
 from wfsobs.shack_hartmann import ShackHartmann
 from wfsobs.spots import Spots
 from wfsobs.wave import Sensor
-
-Kind = Literal["lgs", "ngs"]
 
 
 def sensor(scenario: Scenario, kind: Kind) -> Sensor:
@@ -28,17 +24,7 @@ def sensor(scenario: Scenario, kind: Kind) -> Sensor:
 
 def shack_hartmann(scenario: Scenario, kind: Kind) -> ShackHartmann:
     """The Shack-Hartmann sensor on an LGS or on the NGS, see `sensor`."""
-    s = scenario.sensors.lenslets
-    across = s.lgs_subapertures if kind == "lgs" else s.ngs_subapertures
-    lenslets = Lenslets(scenario.telescope.diameter, across, s.illumination, s.obscuration)
-    name = f"sensors.lenslets.{kind}_subapertures = {across}"
-    try:
-        order = fittable(lenslets, s.fitted_order)
-    except ValueError as error:
-        raise SettingError(f"{name}: {error}") from None
-    if order < scenario.telescope.radial_order:
-        raise SettingError(f"{name}: with sensors.lenslets.fitted_order = {s.fitted_order} these fit modes up to radial order "
-                           f"{order}, fewer than telescope.radial_order = {scenario.telescope.radial_order}")
+    lenslets, order = fit(scenario.sensors.lenslets, kind, scenario.telescope.diameter, scenario.telescope.radial_order)
     return _made(lenslets, tuple(mode.noll for mode in scenario.modes), order)
 
 
