@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import sys
 import traceback
 from typing import Any, TextIO
@@ -12,7 +13,12 @@ log = logging.getLogger("wfsobs.serve")
 FORMAT = "%(asctime)s %(levelname)s %(message)s"
 
 LONGEST = 200
-"""Characters of what a library says."""
+"""Characters that are kept of what a library says."""
+
+SECRET = re.compile(r"[\w.-]{40,}")
+"""The name of a session."""
+
+ADDRESS = re.compile(r" \([\da-f.:]+\)")
 
 
 def event(name: str, level: int = logging.INFO, **fields: Any) -> None:
@@ -29,22 +35,27 @@ def to_stream(level: str, requests: bool = False, stream: TextIO | None = None) 
     for handler in logging.getLogger().handlers:
         handler.addFilter(without_visitors_data)
     logging.getLogger("wfsobs").setLevel(level.upper())
-    panel = logging.getLogger("panel")  # comes with a handler of its own, on standard output
-    panel.handlers.clear()
-    panel.propagate = True
-    panel.setLevel(logging.WARNING)
+    for name in ("panel", "bokeh"):  # which come with handlers of their own
+        library = logging.getLogger(name)
+        library.handlers.clear()
+        library.propagate = True
+        library.setLevel(logging.WARNING)
     logging.getLogger("tornado.access").setLevel(logging.INFO if requests else logging.ERROR)
 
 
 def without_visitors_data(record: logging.LogRecord) -> bool:
-    """Of what Bokeh and Tornado say of a visitor's message or request, the beginning; of one that they could not read,
-    without a traceback, which is kept where code of this package is part of it."""
-    if record.name.startswith(("bokeh.", "tornado.")):
-        ours = _is_ours(record.exc_info)
+    """Cuts what Bokeh and Tornado say of a visitor's message or request down to what happened.
+
+    Where no code of this package was under way it is the visitor's mistake: a warning, without a traceback.
+    """
+    if record.name.startswith(("bokeh.", "tornado.")) and record.name != "tornado.access":
         text = " ".join(record.getMessage().split())
-        record.msg, record.args = text[:LONGEST] + " ..." * (len(text) > LONGEST), ()
-        if not ours:
+        for after in (" HTTPServerRequest(", ": "):
+            text = text.partition(after)[0]
+        record.msg, record.args = ADDRESS.sub("", SECRET.sub("...", text))[:LONGEST], ()
+        if not _is_ours(record.exc_info):
             record.exc_info = record.exc_text = None
+            record.levelno, record.levelname = logging.WARNING, logging.getLevelName(logging.WARNING)
     return True
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import signal
@@ -96,6 +97,7 @@ def serve(options: Options) -> None:
     server.stop(wait=False)
     ended = service.close()
     event("stopped", sessions=service.visits)
+    gc.freeze()  # what is left need not be looked through once more
     if not ended:  # a computation that does not listen must not keep the process
         logging.shutdown()
         sys.stdout.flush()
