@@ -1,0 +1,67 @@
+"""The regression with late targets, and the prediction built on it, against a Gaussian process solved anew at every step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from wfsobs.arrays import Array
+from wfsobs.control.late_regression import LateRegression
+from wfsobs.control.mirror import Mirror
+from wfsobs.control.prediction import VibrationPredictor
+from wfsobs.observers.kernels import SquaredExponential
+from wfsobs.observers.reference import online_reference
+from wfsobs.scenario import Scenario
+
+
+def plain_prediction(z: Array, targets: Array, k: int, depth: int, m: int, late: int, kernel: SquaredExponential) -> float:
+    """Textbook mean at step k from those of the windows k - m ... k - 1 whose targets are known, up to k - 1 - late."""
+    windows = np.array([z[j - depth + 1 : j + 1] for j in (*range(k - m, k - late), k)])
+    distance2 = ((windows[:, None] - windows[None]) ** 2).sum(axis=2)
+    K = kernel.variance * np.exp(-0.5 * distance2 / kernel.length_scale**2)
+    train = K[:-1, :-1] + kernel.noise_std**2 * np.eye(m - late)
+    return float(K[-1, :-1] @ np.linalg.solve(train, targets[k - m : k - late]))
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(depth=st.integers(1, 6), m=st.integers(2, 12), late=st.integers(0, 4), seed=st.integers(0, 2**31))
+def test_it_is_the_process_without_the_points_that_have_no_target_yet(depth: int, m: int, late: int, seed: int) -> None:
+    late = min(late, m - 1)
+    rng = np.random.default_rng(seed)
+    z, targets = rng.standard_normal((2, 60))
+    kernel = SquaredExponential(1.5, 3.0, 0.3)
+    regression = LateRegression(depth, m, 1, kernel, late)
+    for k in range(60):
+        value = regression.predict(z[k : k + 1], targets[max(k - 1 - late, 0)])
+        regression.update()
+        if k < depth + m - 1:
+            assert np.isnan(value)
+        else:
+            # condition number up to 2.25 m / 0.09 = 300: nine digits are left with room
+            assert value == pytest.approx(plain_prediction(z, targets, k, depth, m, late, kernel), rel=1e-9, abs=1e-9)
+
+
+def test_one_without_a_known_target_is_refused() -> None:
+    with pytest.raises(ValueError, match="training size 3"):
+        LateRegression(2, 3, 1, SquaredExponential(1.0, 1.0, 0.1), 3)
+
+
+@pytest.mark.parametrize("delay", [1.0, 2.0, 2.5, 3.0])
+def test_the_vibration_is_predicted_for_the_time_that_the_command_acts(delay: float) -> None:
+    """Window j learns sum_i taps[i] f[j + i], f the causal bank on z, once that is known."""
+    depth, m, n = 4, 9, 80
+    scenario = Scenario().replace({
+        "gpr_online.depth": depth, "gpr_online.training_size": m, "gpr_online.length_scale": 3.0, "gpr_online.signal_std": 1.0})
+    z = np.random.default_rng(5).standard_normal(n)
+    f = online_reference(scenario, z[:, None], scenario.dt)[:, 0]
+    taps = Mirror(delay).taps
+    late = taps.size - 2
+    targets = np.array([taps[1:] @ f[j + 1 : j + taps.size] for j in range(n - taps.size)])
+    predictor = VibrationPredictor(scenario, Mirror(delay))
+    values = [predictor.step(x) for x in z]
+    kernel = SquaredExponential(1.0, 3.0, scenario.gpr_online.noise_std)
+    for k in range(depth + m - 1, n - taps.size):
+        expected = plain_prediction(z, targets, k, depth, m, late, kernel)
+        assert values[k] == pytest.approx(expected, rel=1e-8, abs=1e-9 * np.abs(targets).max())

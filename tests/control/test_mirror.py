@@ -1,0 +1,60 @@
+"""The mirror: delay as a plain sum, response, limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from wfsobs.control.mirror import Mirror, mirror_of
+from wfsobs.record import delayed
+from wfsobs.scenario import Scenario
+
+delays = st.floats(1.0, 10.0) | st.integers(1, 10).map(float)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(delays, st.integers(0, 2**31))
+def test_a_command_acts_for_one_frame_after_its_delay(delay: float, seed: int) -> None:
+    u = np.random.default_rng(seed).standard_normal((50, 2))
+    n, f = int(delay), delay - int(delay)
+    mirror = Mirror(delay)
+    assert mirror.taps.sum() == pytest.approx(1.0) and mirror.taps[0] == 0.0
+    expected = (1 - f) * delayed(u, n - 1) + f * delayed(u, n)
+    assert np.allclose(mirror.correction(u), expected, rtol=0, atol=1e-14)
+    assert np.allclose(mirror.seen(u), delayed(expected, 1), rtol=0, atol=1e-14)
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(delays, st.floats(0.0, np.pi))
+def test_the_response_is_that_of_a_sine(delay: float, omega: float) -> None:
+    mirror, k = Mirror(delay), np.arange(200)
+    u = np.exp(1j * omega * k)
+    out = mirror.seen(u.real) + 1j * mirror.seen(u.imag)
+    assert out[50] / u[50] == pytest.approx(complex(mirror.response(np.array([omega]))[0]), abs=1e-12)
+
+
+def test_the_paper_s_mirror_is_one_step_late() -> None:
+    u = np.arange(1.0, 6.0)
+    assert mirror_of(Scenario()).correction(u).tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert not mirror_of(Scenario()).limited
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.floats(0.1, 5.0), st.floats(0.05, 3.0), st.integers(0, 2**31))
+def test_commands_keep_the_limits_and_go_as_far_as_they_allow(stroke: float, slew: float, seed: int) -> None:
+    wanted = 2.0 * np.random.default_rng(seed).standard_normal(60)
+    mirror = Mirror(2.0, stroke, slew)
+    u = mirror.follow(wanted)
+    assert mirror.within(u * (1 - 1e-12))
+    last = np.concatenate([[0.0], u[:-1]])
+    low, high = np.maximum(last - slew, -stroke), np.minimum(last + slew, stroke)
+    assert np.allclose(u, np.clip(wanted, low, high), rtol=0, atol=1e-12)
+    free = Mirror(2.0, 100.0, 100.0)
+    assert free.within(wanted) and free.follow(wanted) is wanted
+
+
+def test_the_rate_is_given_per_millisecond() -> None:
+    scenario = Scenario().replace({"control.rate": 0.2, "control.stroke": 3.0, "sensors.lgs_rate": 500.0})
+    assert mirror_of(scenario).slew == pytest.approx(0.4) and mirror_of(scenario).stroke == 3.0
