@@ -28,7 +28,7 @@ def shack_hartmann(scenario: Scenario, kind: Kind) -> ShackHartmann:
     return _made(lenslets, tuple(mode.noll for mode in scenario.modes), order)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=4)  # tens of megabytes each, for many modes
 def _made(lenslets: Lenslets, nolls: tuple[int, ...], order: int) -> ShackHartmann:
     return ShackHartmann(lenslets, nolls, order)
 
@@ -75,6 +75,6 @@ def aliasing_rms(scenario: Scenario, kind: Kind) -> Array:
     return np.sqrt(variance)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=4)
 def _aliasing(of: ShackHartmann) -> Aliasing:
     return Aliasing(of)

@@ -44,7 +44,8 @@ class TrigonometricSum:
         padded = np.zeros((m, self._size, self._size))
         padded[:, p[:, None], p[None, :]] = weights * correction[:, None] * correction
         grid = ifft2(padded, norm="forward")
-        self._table = np.ascontiguousarray(np.moveaxis(grid, 0, -1).reshape(-1, m)).view(float)  # (size^2, 2 m)
+        table = np.moveaxis(grid, 0, -1).reshape(-1, m).astype(np.complex64, order="C")
+        self._table = table.view(np.float32)  # (size^2, 2 m); single precision is finer than the window
 
     def __call__(self, x: Array, y: Array) -> Array:
         """The sums at the points (x, y) [rad]: complex (m, *shape of x)."""
@@ -52,7 +53,7 @@ class TrigonometricSum:
         out = np.empty((points.shape[1], self._table.shape[1] // 2), dtype=complex)
         for start in range(0, len(out), CHUNK):
             part = slice(start, start + CHUNK)
-            out[part] = (self._interpolation(*points[:, part]) @ self._table).view(complex)
+            out[part] = (self._interpolation(*points[:, part]) @ self._table).view(np.complex64)
         out *= np.exp(0.5j * points.sum(axis=0))[:, None]
         return out.T.reshape(-1, *np.shape(x))
 
@@ -71,7 +72,7 @@ class TrigonometricSum:
         place = (first - at) * FINE
         below = place.astype(np.intp)
         weights = WINDOW[below] + (WINDOW[below + 1] - WINDOW[below]) * (place - below)[:, None]
-        return (first.astype(np.int64)[:, None] + np.arange(WIDTH)) % self._size, weights
+        return (first.astype(np.int64)[:, None] + np.arange(WIDTH)) % self._size, weights.astype(np.float32)
 
 
 def lagrange_weights(t: Array, taps: int) -> Array:
