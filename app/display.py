@@ -9,6 +9,7 @@ import param
 
 from wfsobs.app.pin import Pin
 from wfsobs.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.parameters import unit_of
 
 SIGNAL, ERROR = "signal", "error"
 PSD, CUMULATIVE = "psd", "cumulative"
@@ -56,6 +57,12 @@ def written_unit(unit: str) -> str:
     'µm²/Hz'
     """
     return re.sub(r"\bum\b", "µm", unit).replace("^2", "²")
+
+
+def label_of(p: param.Parameter) -> str:
+    """A setting's label with its unit in [brackets]."""
+    unit = written_unit(unit_of(p))
+    return f"{p.label} [{unit}]" if unit else str(p.label)
 
 
 class Display(param.Parameterized):

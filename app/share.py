@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import shlex
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import reduce
 from typing import Any
@@ -18,6 +18,7 @@ from urllib.parse import parse_qsl, quote
 
 import param
 
+from wfsobs import configfile
 from wfsobs.app.controls.fields import parsed
 from wfsobs.configfile import from_toml, pristine, to_toml
 from wfsobs.presets import PRESETS
@@ -53,7 +54,7 @@ class Link:
 
 def changes(scenario: Scenario, preset: str) -> dict[str, Any]:
     """Dotted path -> plain value of the settings that differ from the preset's."""
-    return dict(_leaves(scenario.difference(pristine(preset))))
+    return configfile.changes(scenario, pristine(preset))
 
 
 # ---------------------------------------------------------------------- links
@@ -172,21 +173,13 @@ def _word(value: Any) -> str:
     return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
 
 
-def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
-
-
 # ---------------------------------------------------------------------- other languages
 
 def to_command(scenario: Scenario, preset: str) -> str:
     """The command that prints the RMS table of these settings."""
     words = ["wfsobs", "run", "--preset", preset]
     for path, value in changes(scenario, preset).items():
-        words += ["--set", f"{path}={_inline(value)}"]
+        words += ["--set", f"{path}={configfile.written(value)}"]
     command = shlex.join(words)
     return command if len(command) <= LONGEST else f"wfsobs run --config {FILE}"
 
@@ -222,18 +215,3 @@ def from_file(text: str) -> Link:
     except (ValueError, RecursionError):
         raise SettingError("file: not TOML that can be read") from None
     return Link(scenario, preset)
-
-
-def _inline(value: Any) -> str:
-    """A plain value in TOML's syntax, on one line; words as they are."""
-    if isinstance(value, str):
-        return value
-    return _toml(value)
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key} = {_toml(v)}" for key, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return json.dumps(value)

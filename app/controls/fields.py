@@ -15,6 +15,7 @@ import panel as pn
 import panel_material_ui as pmui
 import param
 
+from wfsobs.app.display import label_of, written_unit
 from wfsobs.app.store import Store
 from wfsobs.parameters import Reals, unit_of
 
@@ -23,21 +24,6 @@ NUMBER_WIDTH = 92
 
 SOON = 5
 """How long a message of a slider waits for the next to go with it [ms]: by default 50, a tenth of what a redraw takes."""
-
-
-def written_unit(unit: str) -> str:
-    """A unit as the page writes it.
-
-    >>> written_unit("um^2/Hz")
-    'µm²/Hz'
-    """
-    return re.sub(r"\bum\b", "µm", unit).replace("^2", "²")
-
-
-def label_of(p: param.Parameter) -> str:
-    """A setting's label with its unit in [brackets]."""
-    unit = written_unit(unit_of(p))
-    return f"{p.label} [{unit}]" if unit else str(p.label)
 
 
 def number_text(value: float) -> str:

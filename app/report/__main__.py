@@ -6,7 +6,7 @@ import os
 import sys
 from datetime import datetime
 
-from wfsobs.app.report.data import unpacked
+from wfsobs.app.report.packing import unpacked
 from wfsobs.app.report.page import page
 
 

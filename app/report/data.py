@@ -1,12 +1,10 @@
-"""What a report holds: the rows of every state, and its lines as few points. Plain arrays, to be sent to another process.
+"""What a report holds: the rows of every state, and its lines as few points.
 
 Nothing in this package imports Panel: with it in the process Bokeh's files do not work offline.
 """
 
 from __future__ import annotations
 
-import io
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,7 +15,6 @@ from numpy.typing import NDArray
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.work import TRUTH
-from wfsobs.configfile import from_toml, to_toml
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.pipeline import Result
@@ -186,39 +183,6 @@ def _spectra(frequency: Array, density: Array) -> tuple[Floats, Floats]:
 def _spaced(n: int) -> NDArray[np.int64]:
     """Indices from 1 to n - 1, evenly on a logarithmic axis."""
     return np.unique(np.round(np.geomspace(1, n - 1, CUMULATIVE)).astype(np.int64))
-
-
-# ---------------------------------------------------------------------- from one process to another
-
-def packed(report: Report) -> bytes:
-    """A report as a file of plain arrays and text."""
-    words = {
-        "preset": report.preset, "base": to_toml(report.base),
-        "variations": [[v.path, v.values] for v in report.variations],
-        "states": [
-            {"toml": to_toml(s.scenario), "rows": s.rows, "reasons": s.reasons, "grid": [s.grid.n, s.grid.dt, s.grid.bins]}
-            for s in report.states],
-    }
-    arrays = {f"{i}/{name}": line for i, s in enumerate(report.states) for name, line in s.lines.items()}
-    file = io.BytesIO()
-    np.savez(file, allow_pickle=False, words=np.array(json.dumps(words)), **arrays)
-    return file.getvalue()
-
-
-def unpacked(content: bytes) -> Report:
-    """The report of `packed`."""
-    with np.load(io.BytesIO(content), allow_pickle=False) as file:
-        words = json.loads(str(file["words"]))
-        lines: list[dict[str, Floats]] = [{} for _ in words["states"]]
-        for key in file.files:
-            number, slash, name = key.partition("/")
-            if slash:
-                lines[int(number)][name] = file[key]
-    states = tuple(
-        State(from_toml(s["toml"]), s["rows"], tuple(s["reasons"]), Grid(*s["grid"]), of)
-        for s, of in zip(words["states"], lines, strict=True))
-    variations = tuple(Variation(path, tuple(values)) for path, values in words["variations"])
-    return Report(words["preset"], from_toml(words["base"]), variations, states)
 
 
 # ---------------------------------------------------------------------- into the file

@@ -10,7 +10,8 @@ import threading
 from pathlib import Path
 
 import wfsobs
-from wfsobs.app.report.data import Report, packed, state_of
+from wfsobs.app.report.data import Report, state_of
+from wfsobs.app.report.packing import packed
 from wfsobs.pipeline import Result
 
 log = logging.getLogger(__name__)

@@ -10,11 +10,10 @@ from html import escape
 from typing import Any
 
 from wfsobs import __version__
-from wfsobs.app.display import written_unit
+from wfsobs.app.display import label_of
 from wfsobs.app.report.data import Report, State, window_of
 from wfsobs.bench.measure import machine
 from wfsobs.configfile import changes, pristine, to_toml, written
-from wfsobs.parameters import unit_of
 from wfsobs.scenario import Scenario
 
 LONGEST = 8000
@@ -40,10 +39,7 @@ def summary(report: Report, made: datetime) -> str:
 def name_of(scenario: Scenario, path: str) -> str:
     """A setting's label, its unit in [brackets]; the path itself of what has none."""
     p = {known: p for known, _, p in scenario.walk()}.get(path)
-    if p is None:
-        return path
-    unit = written_unit(unit_of(p))
-    return f"{p.label} [{unit}]" if unit else str(p.label)
+    return path if p is None else label_of(p)
 
 
 def value_of(value: Any) -> str:

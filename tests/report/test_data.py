@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wfsobs.app.report.data import LEVELS, Grid, Pool, Report, bins_for, coded, packed, state_of, unpacked, window_of
+from wfsobs.app.report.data import LEVELS, Grid, Pool, Report, bins_for, coded, state_of, window_of
+from wfsobs.app.report.packing import packed, unpacked
 from wfsobs.app.work import TRUTH
 from wfsobs.pipeline import Result
 from wfsobs.scenario import Scenario
