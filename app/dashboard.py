@@ -24,6 +24,7 @@ from wfsobs.app.pages.pages import Pages
 from wfsobs.app.run import FAILED, IDLE, Post
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, theme
+from wfsobs.app.upload import Upload
 from wfsobs.app.views.modes import ModeSwitch
 from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.spectra import MODEL, PEAKS, Spectra
@@ -76,7 +77,11 @@ class Dashboard:
 
     def __init__(self, post: Post, scenario: Scenario | None = None, work: Any = compute, **store: Any):
         self._post = post
-        self.store = Store(post, scenario, work, **store)
+        self.upload = Upload()
+        if "held" in store:
+            store["held"] = self.upload.unless(store["held"])
+        self.store = Store(post, scenario, self.upload.over(work), **store)
+        self.upload.attach(self.store)
         self.display = Display()
         self.controls = Controls(self.store)
         self.actions = Actions(self.store)
@@ -105,7 +110,7 @@ class Dashboard:
         page = pmui.Page(
             title="wfsobs", sidebar=[self.controls.view()], sidebar_width=340, theme_config=theme(), favicon=None,
             main=[_title(), pn.Column(
-                self._top(), self.actions.toolbar, self.alert, self.stale, self.pages.view, self.frame,
+                self._top(), self.actions.toolbar, self.upload.view, self.alert, self.stale, self.pages.view, self.frame,
                 sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
         )
         self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")

@@ -17,13 +17,14 @@ from wfsobs.app.limits import Limits
 from wfsobs.app.logs import event
 from wfsobs.app.queue import Queue
 from wfsobs.app.run import Tell
-from wfsobs.app.work import Report, Shown, compute
+from wfsobs.app.work import Loaded, Report, Shown, compute
 from wfsobs.cost import run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 from wfsobs.watch import Cancelled
 
-Work = Callable[[Scenario, Callable[[], bool], Report], Shown]
+Work = Callable[..., Shown]
+"""(scenario, cancelled, report), and the record where one is loaded -> results."""
 
 POLL = 0.1
 """How often somebody who waits looks whether they still want to [s]."""
@@ -158,10 +159,10 @@ class Service:
         return key_of(scenario) in self.cache
 
     def join(
-        self, owner: int, scenario: Scenario, cancelled: Callable[[], bool], tell: Tell
+        self, owner: int, scenario: Scenario, cancelled: Callable[[], bool], tell: Tell, loaded: Loaded | None = None
     ) -> Shown | tuple[Flight, Callable[[], None]]:
         """The results; or the run that will bring them, in the line from now on if it was not, and how to leave it."""
-        key, ticket = key_of(scenario), object()
+        key, ticket = key_of(scenario, loaded.key if loaded else ""), object()
         with self._lock:
             shown = self.cache.get(key)
             flight = self._flights.get(key)
@@ -171,13 +172,15 @@ class Service:
                 return shown
             if flight is None or not joined:
                 flight = self._flights[key] = Flight(
-                    next(self._run_numbers), scenario, partial(self._compute, key, scenario), lambda: self.closing)
+                    next(self._run_numbers), scenario, partial(self._compute, key, scenario, loaded), lambda: self.closing)
                 flight.join(ticket, owner, cancelled, tell)
                 self.queue.put(flight)
         return flight, partial(self._leave, key, flight, ticket)
 
-    def _compute(self, key: str, scenario: Scenario, cancelled: Callable[[], bool], report: Report) -> Shown:
-        return self.cache.put(key, self._work(scenario, cancelled, report))
+    def _compute(
+        self, key: str, scenario: Scenario, loaded: Loaded | None, cancelled: Callable[[], bool], report: Report
+    ) -> Shown:
+        return self.cache.put(key, self._work(scenario, cancelled, report, *([loaded] if loaded else [])))
 
     def _leave(self, key: str, flight: Flight, ticket: object) -> None:
         with self._lock:
@@ -200,10 +203,12 @@ class Visit:
         self.service, self.number = service, number
         self._since, self._open = monotonic(), True
 
-    def compute(self, scenario: Scenario, cancelled: Callable[[], bool], tell: Tell) -> Shown:
+    def compute(
+        self, scenario: Scenario, cancelled: Callable[[], bool], tell: Tell, loaded: Loaded | None = None
+    ) -> Shown:
         """The results of a scenario, kept or computed, whoever asked first. Raises SettingError, Cancelled."""
         self.service.limits.check(scenario)
-        joined = self.service.join(self.number, scenario, cancelled, tell)
+        joined = self.service.join(self.number, scenario, cancelled, tell, loaded)
         if isinstance(joined, Shown):
             return joined
         flight, leave = joined

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter, sleep
 
 import numpy as np
@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Estimate
-from wfsobs.pipeline import Failure, Result, collect, each_estimate
+from wfsobs.pipeline import Failure, Result, as_stated, collect, each_estimate
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scores import scored_samples, welch_psd
@@ -77,6 +77,15 @@ class Shown:
         return estimate.values if estimate else self.partial.get((observer, target))
 
 
+@dataclass(frozen=True)
+class Loaded:
+    """A record that takes the place of the simulation; its key names its content and what was said of it."""
+
+    record: Record
+    name: str
+    key: str
+
+
 Report = Callable[[float, Shown | None], None]
 """Told the fraction done, and what is done where that has grown."""
 
@@ -86,14 +95,18 @@ def one_blas_thread() -> None:
     threadpool_limits(limits=1, user_api="blas")
 
 
-def compute(scenario: Scenario, cancelled: Callable[[], bool], report: Report) -> Shown:
-    """Run everything on a scenario. Raises SettingError, Cancelled."""
-    return _Work(scenario, cancelled, report).run()
+def compute(
+    scenario: Scenario, cancelled: Callable[[], bool], report: Report, loaded: Loaded | None = None
+) -> Shown:
+    """Run everything on a scenario, or the observers on a record. Raises SettingError, Cancelled."""
+    return _Work(scenario, cancelled, report, loaded).run()
 
 
 class _Work:
-    def __init__(self, scenario: Scenario, cancelled: Callable[[], bool], report: Report):
-        self.scenario, self.report = scenario, report
+    def __init__(
+        self, scenario: Scenario, cancelled: Callable[[], bool], report: Report, loaded: Loaded | None = None
+    ):
+        self.scenario, self.report, self.loaded = scenario, report, loaded
         self.watch = Watch(progress=self._progress, cancelled=cancelled)
         self.estimates: list[Estimate] = []
         self.failures: list[Failure] = []
@@ -107,9 +120,16 @@ class _Work:
 
     def run(self) -> Shown:
         self.watch.step(0.0)
-        self.record = record = simulate(self.scenario, watch=self.watch)
+        stated = self.scenario
+        if self.loaded is None:
+            record = simulate(stated, watch=self.watch)
+        else:
+            record = self.loaded.record
+            stated = as_stated(record, stated)
+            stated.validate()
+        self.record = record
         self._add_truth(record)
-        for item in each_estimate(record, self.scenario, self.watch, on_partial=self._grow):
+        for item in each_estimate(record, stated, self.watch, on_partial=self._grow):
             with self.lock:
                 if isinstance(item, Failure):
                     self.failures.append(item)
@@ -162,10 +182,9 @@ class _Work:
         self.estimates.append(estimate)
         self.growing.pop(key, None)
         truth = record.truth(estimate.target)
-        if truth is not None:
-            spectrum = self._spectrum(record, truth, estimate.values)
-            if spectrum is not None:
-                self.spectra[key] = spectrum
+        spectrum = self._spectrum(record, estimate.values if truth is None else truth, estimate.values)
+        if spectrum is not None:
+            self.spectra[key] = spectrum if truth is not None else replace(spectrum, error=np.full_like(spectrum.error, np.nan))
 
     def _add_truth(self, record: Record) -> None:
         for target in TARGETS:

@@ -13,7 +13,7 @@ from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import Shown
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.scores import Score
+from wfsobs.scores import LOOP, RESIDUAL, Score
 
 BEST = '<span class="tag best">best</span> '
 ABOVE = '<span class="tag above">above truth</span> '
@@ -41,7 +41,7 @@ class Table:
         """The table."""
         columns = self._columns()
         head = "".join(f'<th scope=col title="{why}">{name}</th>' for name, why in columns.items())
-        body = "".join(self._target(target, len(columns)) for target in TARGETS)
+        body = self._measured(len(columns)) or "".join(self._target(target, len(columns)) for target in TARGETS)
         table = f'<table class="rms"><thead><tr>{head}</tr></thead>{body}</table>'
         return f'<div class="scroll" tabindex=0 role=region aria-label="RMS errors">{table}</div>{self._notes()}'
 
@@ -51,12 +51,42 @@ class Table:
         pinned = {
             f"Pinned [{unit}]": "RMS error in the pinned run", "Change [%]": "from the pinned run to this one",
         } if self.display.pinned else {}
+        base = "z" if self._without_truth() else "truth"
         return {
             "Observer": "and its line in the figures", f"RMS error [{unit}]": "of the estimate, after the warm-up", **pinned,
-            f"RMS truth [{unit}]": "the error of answering zero", "error / truth": "above 1 is worse than answering zero",
+            f"RMS {base} [{unit}]": "the error of answering zero", f"error / {base}": "above 1 is worse than answering zero",
             "Lag [ms]": "how late the estimate is", "Time per step [µs]": "computing time per step and mode",
             "Real-time factor": "time per step over the step of the loop; below 1 keeps up with it",
         }
+
+    def _without_truth(self) -> list[Score]:
+        """The scores of a record without truth, of the mode shown."""
+        shown = self.run.shown
+        scores = [s for s in shown.result.scores if s.mode == self.display.mode] if shown else []
+        return scores if any(s.target == RESIDUAL for s in scores) else []
+
+    def _measured(self, columns: int) -> str:
+        """The rows of a record without truth: predictions of the next measurement, and what the recorded loop left."""
+        rows = self._without_truth()
+        if self.display.best_first:
+            rows.sort(key=lambda s: (s.target == RESIDUAL, s.rms))
+        shown, pinned = self.run.shown, [NOTHING] * (2 if self.display.pinned else 0)
+        out = []
+        for score in rows:
+            assert shown is not None
+            scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
+            loop = score.observer == LOOP
+            cells = [number(score.rms * scale), *pinned, number(score.truth_rms * scale), number(score.normalised_rms), NOTHING,
+                     *([NOTHING] * 2 if loop else [
+                         number(1e6 * score.seconds_per_step), number(score.seconds_per_step / shown.result.record.dt, 2)])]
+            label = "Recorded loop, residual" if loop else (
+                f"{swatch(score.observer, self.display.dark)}{escape(OBSERVERS[score.observer].label)}")
+            values = "".join(f"<td>{c}</td>" for c in cells)
+            head = f"<th scope=row>{label}</th>"
+            out.append(f'<tr data-observer="{score.observer}" data-target="{score.target}">{head}{values}</tr>')
+        title = f"Next measurement z, {self.display.mode}, one step ahead: the record has no truth"
+        head = f'<tr><th colspan={columns} class="target" scope=rowgroup>{title}</th></tr>'
+        return f"<tbody>{head}{''.join(out)}</tbody>" if out else ""
 
     def _target(self, target: str, columns: int) -> str:
         """The rows of a target, best first if asked for, those without a score last."""

@@ -1,0 +1,258 @@
+"""A record of the visitor's own in place of the simulation: a file, a preview to confirm, then the same views.
+
+The browser sends the file in parts. What it is said to be can be changed while the preview stands; nothing runs before it
+is confirmed. Reading is done beside the page, in a thread.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+from collections.abc import Callable
+from functools import partial
+from html import escape
+from typing import Any
+
+import panel as pn
+import panel_material_ui as pmui
+import param
+from bokeh.models import ColumnDataSource
+from panel.custom import JSComponent
+
+from wfsobs.app.store import Store
+from wfsobs.app.style import asset
+from wfsobs.app.views.plots import new_figure, send
+from wfsobs.app.work import Loaded
+from wfsobs.intake import Stated
+from wfsobs.modes import TIP_TILT
+from wfsobs.pipeline import as_stated
+from wfsobs.preview import Preview, preview, safe_name
+from wfsobs.record import RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.settings import SettingError
+from wfsobs.units import UNITS
+
+LARGEST = 20_000_000
+"""Of a file [bytes]."""
+
+PART = 1_000_000
+"""Of what the browser sends at a time [bytes]."""
+
+SILENT = "as the file says"
+COLOURS = ("#0B4F6C", "#FF6600")
+
+
+class Picker(JSComponent):
+    """The button and what is said beside it; files up in parts."""
+
+    said = param.String("", doc="What there is to say, in one line.")
+    loaded = param.String("", doc="What takes the place of the simulation.")
+    largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
+    part = param.Integer(PART, doc="How much is sent at a time [bytes].")
+
+    _esm = asset("upload.js")
+    _stylesheets = [asset("actions.css")]  # noqa: RUF012
+
+    def __init__(self, **params: Any):
+        self.on_message: Callable[[dict[str, Any]], None] | None = None
+        super().__init__(**params)
+
+    def _handle_msg(self, data: dict[str, Any]) -> None:
+        if self.on_message is not None:
+            self.on_message(data)
+
+
+class Upload:
+    """The record of a session, and how it comes in. `loaded` is None while results are simulated."""
+
+    def __init__(self) -> None:
+        self.loaded: Loaded | None = None
+        self.picker = Picker(sizing_mode="stretch_width", margin=0)
+        self.picker.on_message = self.handle
+        self.unit = self._select("Unit", [SILENT, *UNITS])
+        self.sign = self._select("Commands", {SILENT: None, "add to what is seen (+1)": 1, "are taken off (-1)": -1})
+        self.delay, self.rate = self._text("Delay of commands [steps]"), self._text("Rate [Hz]")
+        self.use = pmui.Button(label="Use this record", color="primary", size="small", margin=4)
+        self.drop = pmui.Button(label="Discard", variant="outlined", size="small", margin=4)
+        self.text = pn.pane.HTML("", sizing_mode="stretch_width", margin=(4, 0))
+        self.figure = new_figure(x_axis_type="log", y_axis_type="log")
+        self.figure.name = "Spectrum of the record"
+        self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = "frequency [Hz]", "PSD of z [µm²/Hz]"
+        self.sources = [ColumnDataSource({"x": [], "y": []}) for _ in TIP_TILT]
+        for source, colour, mode in zip(self.sources, COLOURS, TIP_TILT, strict=True):
+            self.figure.line("x", "y", source=source, color=colour, line_width=1.4, legend_label=mode.name)
+        self.room = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
+        self.view = pn.Column(self.picker, self.room, sizing_mode="stretch_width", margin=0)
+        self._name, self._parts, self._size = "", [], 0
+        self._content = b""
+        self._preview: Preview | None = None
+        self._asked = 0
+        self.use.on_click(lambda _event: self.confirm())
+        self.drop.on_click(lambda _event: self.discard())
+        for widget in (self.unit, self.sign, self.delay, self.rate):
+            widget.param.watch(lambda _event: self.look(), "value")
+
+    def over(self, work: Callable[..., Any]) -> Callable[..., Any]:
+        """The work of a run, on the loaded record where there is one."""
+        def with_record(scenario: Scenario, cancelled: Callable[[], bool], tell: Any) -> Any:
+            loaded = self.loaded
+            return work(scenario, cancelled, tell, *([loaded] if loaded else []))
+        return with_record
+
+    def unless(self, held: Callable[[Scenario], bool]) -> Callable[[Scenario], bool]:
+        """Whether the results of a scenario are there already, which is not known of a record."""
+        return lambda scenario: self.loaded is None and held(scenario)
+
+    def attach(self, store: Store) -> None:
+        """The store whose runs are to be on the record."""
+        self.store = store
+
+    # ------------------------------------------------------------------ the file
+
+    def handle(self, msg: dict[str, Any]) -> None:
+        """Do what a message of the browser says; one that makes no sense is a file that cannot be read."""
+        action = msg.get("action")
+        if action == "simulate":
+            self.simulate()
+        elif action == "large":
+            self._say(f"{safe_name(str(msg.get('name', '')))}: larger than {LARGEST // 1_000_000} MB")
+        elif action == "part":
+            try:
+                self._take(msg)
+            except (KeyError, TypeError, ValueError, binascii.Error):
+                self.discard("The file did not arrive whole.")
+
+    def _take(self, msg: dict[str, Any]) -> None:
+        index, count = int(msg["index"]), int(msg["count"])
+        if index == 0:
+            self.discard()
+            self._name, self._size = safe_name(str(msg.get("name", ""))), 0
+        part = base64.b64decode(msg["data"], validate=True)
+        if index != len(self._parts) or not index < count:
+            raise ValueError("a part is missing")
+        self._size += len(part)
+        if self._size > LARGEST:
+            self.discard(f"{self._name}: larger than {LARGEST // 1_000_000} MB")
+            return
+        self._parts.append(part)
+        if index == count - 1:
+            self._content, self._parts = b"".join(self._parts), []
+            if not self._content:
+                self._say(f"{self._name}: is empty")
+            self.look()
+
+    # ------------------------------------------------------------------ the preview
+
+    def stated(self) -> Stated:
+        """What the fields say. Raises RecordError where one holds no number."""
+        def number(field: Any, kind: type, least: float) -> Any:
+            text = str(field.value or "").strip()
+            if not text:
+                return None
+            try:
+                value = kind(text)
+            except ValueError:
+                value = -1
+            if not least <= value < 1e6:
+                raise RecordError(f"{field.label}: takes a number from {least:g}, not {text[:40]!r}")
+            return value
+        unit = None if self.unit.value == SILENT else self.unit.value
+        return Stated(unit, self.sign.value, number(self.delay, int, 1), number(self.rate, float, 1e-3))
+
+    def look(self) -> None:
+        """Read the file, beside the page, as what the fields say."""
+        if not self._content:
+            return
+        self._asked += 1
+        asked, content, name = self._asked, self._content, self._name
+        scenario = self.store.scenario.replace({"telescope.radial_order": 6})  # as many modes as there may be
+        try:
+            stated = self.stated()
+        except RecordError as error:
+            self._land(asked, error)
+            return
+        self.picker.said = f"Reading {name} …"
+
+        def read() -> None:
+            try:
+                found: Preview | RecordError = preview(content, name, scenario, stated)
+            except RecordError as error:
+                found = error
+            except Exception:  # whatever a stranger's file may do
+                found = RecordError(f"{name}: cannot be read")
+            self.store.run.post(partial(self._land, asked, found))
+
+        self.store.run.aside(read)
+
+    def _land(self, asked: int, found: Preview | RecordError) -> None:
+        if asked != self._asked:
+            return
+        self._preview = found if isinstance(found, Preview) else None
+        self.picker.said = "" if self._preview else str(found)
+        self.use.disabled = self._preview is None
+        lines = self._preview.lines() if self._preview else [str(found)]
+        self.text.object = f"<p><b>{escape(self._name)}</b></p><ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
+        for mode, source in enumerate(self.sources):
+            there = self._preview is not None and mode < self._preview.spectrum.shape[1]
+            x, y = (self._preview.frequency[1:], self._preview.spectrum[1:, mode]) if self._preview and there else ([], [])
+            send(source, {"x": x, "y": y})
+        if not len(self.room):
+            self.room[:] = [
+                self.text, pn.FlexBox(self.unit, self.sign, self.delay, self.rate, gap="8px", margin=0),
+                pn.pane.Bokeh(self.figure, sizing_mode="stretch_width", margin=0), pn.Row(self.use, self.drop, margin=0)]
+        self.room.visible = True
+
+    def confirm(self) -> None:
+        """Let the record take the place of the simulation, the settings of rate, ratio and length with it."""
+        found = self._preview
+        if found is None:
+            return
+        record = found.record
+        key = hashlib.sha256(self._content + repr((self.stated(), self.store.scenario.telescope.diameter)).encode()).hexdigest()
+        before = self.loaded
+        try:
+            scenario = fitting(record, self.store.scenario)
+            self.loaded, same = Loaded(record, found.name, key), scenario == self.store.scenario
+            self.store.load(scenario)
+        except SettingError as error:
+            self.loaded = before
+            self._say(f"{found.name}: {error}")
+            return
+        if same:  # other settings have started it
+            self.store.follow()
+        self.discard()
+        self.picker.loaded = f"{found.name}: {found.lines()[0]}"
+
+    def simulate(self) -> None:
+        """Go back to the simulation."""
+        if self.loaded is not None:
+            self.loaded = None
+            self.picker.loaded = ""
+            self.store.follow()
+
+    def discard(self, why: str = "") -> None:
+        """Forget the file that is being looked at."""
+        self._asked += 1
+        self._content, self._parts, self._preview = b"", [], None
+        self.room.visible = False
+        self._say(why)
+
+    def _say(self, line: str) -> None:
+        self.picker.said = line
+
+    def _select(self, label: str, options: Any) -> pmui.Select:
+        first = options[0] if isinstance(options, list) else next(iter(options.values()))
+        return pmui.Select(label=label, options=options, value=first, size="small", width=190, margin=(4, 0))
+
+    def _text(self, label: str) -> pmui.TextInput:
+        return pmui.TextInput(label=label, value="", placeholder=SILENT, size="small", width=190, margin=(4, 0))
+
+
+def fitting(record: Any, scenario: Scenario) -> Scenario:
+    """The scenario with the rate, ratio, length and modes of a record. Raises SettingError."""
+    order = next((n for n in range(1, 7) if (n + 1) * (n + 2) // 2 - 1 >= record.n_modes), 6)
+    duration = record.n_steps * record.dt
+    changes = {
+        "telescope.radial_order": order, "run.duration": duration, "run.warm_up": min(scenario.run.warm_up, 0.2 * duration)}
+    return as_stated(record, scenario).replace(changes)

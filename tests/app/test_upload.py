@@ -1,0 +1,158 @@
+"""A visitor's record: sent in parts, previewed, confirmed, in place of the simulation until it is taken back."""
+
+from __future__ import annotations
+
+import base64
+import io
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app import upload as module
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.limits import Limits
+from wfsobs.app.service import Service
+from wfsobs.app.upload import LARGEST, SILENT
+from wfsobs.formats import format_of
+from wfsobs.loop import simulate
+from wfsobs.pipeline import observe
+from wfsobs.scenario import Scenario
+from wfsobs.telemetry import read_record, record_arrays
+
+
+def file_of(short: Scenario, ending: str = ".csv", **changes: Any) -> bytes:
+    record = simulate(short.replace({"run.seed": 9, "run.duration": 1.5, "sensors.lgs_rate": 500.0}))
+    file = io.BytesIO()
+    format_of(ending).write(file, record_arrays(replace(record, **{"turbulence": None, "vibration": None} | changes)))
+    return file.getvalue()
+
+
+def sent(dashboard: Dashboard, content: bytes, name: str = "night.csv", part: int = 50_000) -> None:
+    count = max(1, -(-len(content) // part))
+    for i in range(count):
+        data = base64.b64encode(content[i * part : (i + 1) * part]).decode()
+        dashboard.upload.handle({"action": "part", "name": name, "index": i, "count": count, "data": data})
+
+
+def previewed(dashboard: Dashboard, loop: Any, content: bytes, name: str = "night.csv") -> None:
+    sent(dashboard, content, name)
+    loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
+
+
+def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    content = file_of(short)
+    before = dashboard.store.run.shown
+    previewed(dashboard, loop, content)
+    assert "750 steps at 500 Hz, 1.5 s, 0 missing" in dashboard.upload.text.object and dashboard.upload.room.visible
+    assert dashboard.store.run.shown is before  # nothing runs before it is confirmed
+    dashboard.upload.confirm()
+    loop.finish(dashboard.store)
+    shown = dashboard.store.run.shown
+    assert dashboard.store.run.state == "done", dashboard.store.run.message
+    scenario = dashboard.store.scenario
+    assert (scenario.sensors.lgs_rate, scenario.run.duration, scenario.run.warm_up) == (500.0, 1.5, pytest.approx(0.3))
+    assert not dashboard.store.stale and not dashboard.upload.room.visible
+    expected = observe(read_record(io.BytesIO(content), "night.csv"), scenario)
+    assert [(s.observer, s.target, s.mode, s.rms) for s in shown.result.scores] == [
+        (s.observer, s.target, s.mode, s.rms) for s in expected.scores]
+    table = dashboard.table.html()
+    assert "one step ahead: the record has no truth" in table and "Recorded loop, residual" in table and "error / z" in table
+    assert "nan" not in table
+    line = dashboard.traces.traces["vibration"].source.data
+    assert np.isfinite(line["kf-lgs"]).all() and np.isnan(line["truth"]).all()
+    spectrum = dashboard.spectra.spectra["vibration"].sources["kf-lgs"].data
+    assert len(spectrum["y"]) and np.isfinite(spectrum["y"]).all()
+    dashboard.display.show = "error"  # there is none, and nothing breaks
+
+    dashboard.upload.handle({"action": "simulate"})
+    loop.finish(dashboard.store)
+    assert dashboard.store.run.shown.result.record.turbulence is not None and dashboard.upload.picker.loaded == ""
+
+
+def test_settings_change_what_runs_on_the_record(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    previewed(dashboard, loop, file_of(short))
+    dashboard.upload.confirm()
+    loop.finish(dashboard.store)
+    first = dashboard.store.run.shown.result
+    dashboard.store.change("kalman.vibration_rms", 0.2)
+    loop.finish(dashboard.store)
+    second = dashboard.store.run.shown.result
+    np.testing.assert_array_equal(first.record.y_lgs, second.record.y_lgs)
+    assert first.scores[0].rms != second.scores[0].rms
+
+
+def test_what_is_said_of_it(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    content = file_of(short).replace(b"_um", b"").replace(b"# unit: um\n", b"").replace(b"# command_sign: 1\n", b"")
+    content = content.replace(b"# delay: 2\n", b"")
+    previewed(dashboard, loop, content)
+    plain = dashboard.upload._preview.rms["z"]
+    for widget, value in ((dashboard.upload.unit, "nm"), (dashboard.upload.sign, -1), (dashboard.upload.delay, "3")):
+        widget.value = value
+        loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
+    found = dashboard.upload._preview
+    assert found.record.origin == "unit nm, command sign -1" and found.record.delay == 3
+    assert found.rms["y_lgs"][0] < 1e-2 * plain[0]
+    dashboard.upload.delay.value = "soon"
+    assert dashboard.upload.picker.said == "Delay of commands [steps]: takes a number from 1, not 'soon'"
+    assert dashboard.upload.use.disabled
+    dashboard.upload.delay.value = ""
+    loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
+    assert not dashboard.upload.use.disabled and dashboard.upload.unit.value != SILENT
+
+
+@pytest.mark.parametrize(("content", "name", "line"), [
+    (b"hello", "a.npz", "a.npz: not an .npz file"),
+    (b"", "a.csv", "a.csv: is empty"),
+    (b"# nothing", "a.csv", "a.csv: holds no table"),
+    (b"x", "<b>.exe", "_b_.exe: its name ends in none of"),
+])
+def test_what_is_no_record(dashboard: Dashboard, loop: Any, content: bytes, name: str, line: str) -> None:
+    before = dashboard.store.run.shown
+    previewed(dashboard, loop, content, name)
+    assert dashboard.upload.picker.said.startswith(line)
+    assert "<b>.exe" not in dashboard.upload.text.object
+    dashboard.upload.confirm()
+    assert dashboard.upload.loaded is None and dashboard.store.run.shown is before
+
+
+def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
+    upload = dashboard.upload
+    for msg in (
+        {"index": 1, "count": 2, "data": "AAAA"}, {"index": 0, "count": 0, "data": "AAAA"},
+        {"index": "x", "count": 1, "data": ""}, {"index": 0, "count": 1, "data": "%%%"},
+        {"index": 0, "count": 1, "data": None}, {},
+    ):
+        upload.handle({"action": "part", "name": "a.csv", **msg})
+        assert upload.picker.said == "The file did not arrive whole." and upload._content == b""
+    upload.handle({"action": "large", "name": "../x.csv"})
+    assert upload.picker.said == f"x.csv: larger than {LARGEST // 1_000_000} MB"
+    monkeypatch.setattr(module, "LARGEST", 1000)
+    sent(dashboard, bytes(3000), part=400)
+    assert upload._content == b"" and not upload._parts
+
+
+def test_on_a_server_with_limits(loop: Any, short: Scenario) -> None:
+    """The line of runs and the limits hold for records as well, and nobody gets the results of another's."""
+    service = Service(Limits(duration=2.0), 1, 100_000_000)
+    try:
+        boards = []
+        for seed in (1, 2):
+            visit = service.enter()
+            board = Dashboard(loop.queue.put, short, work=visit.compute, check=service.limits.check, held=service.held)
+            loop.closing.append(board)
+            record = simulate(short.replace({"run.seed": seed}))
+            previewed(board, loop, file_of(short, y_lgs=record.y_lgs[:750]), "same.csv")
+            board.upload.confirm()
+            loop.finish(board.store)
+            boards.append(board.store.run.shown.result)
+        assert not np.array_equal(boards[0].record.y_lgs, boards[1].record.y_lgs)
+        assert boards[0].scores[0].rms != boards[1].scores[0].rms
+        long = simulate(short.replace({"run.duration": 2.5}))
+        previewed(board, loop, file_of(short, **{k: getattr(long, k) for k in ("y_lgs", "u", "y_ngs", "open_loop_y")}))
+        board.upload.confirm()
+        assert "run.duration = 5: at most 2 s on this server" in board.upload.picker.said
+        np.testing.assert_array_equal(board.store.run.shown.result.record.y_lgs, boards[1].record.y_lgs)
+    finally:
+        service.close()

@@ -1,0 +1,57 @@
+"""The script for the Keck telemetry, on files of the same form: what it writes is the open-loop signal of its authors."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wfsobs import configfile
+from wfsobs.cli import main
+from wfsobs.telemetry import load_record
+
+DOCS = Path(__file__).parents[2] / "docs" / "scripts"
+
+
+def convert(folder: Path, out: Path) -> None:
+    spec = importlib.util.spec_from_file_location("keck_record", DOCS / "keck_record.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.convert(folder, out)
+
+
+def test_the_record_of_a_keck_like_loop(tmp_path, capsys) -> None:
+    """An integrator of gain 0.1 on a line of 20 Hz and noise, in arcsec; commands are taken off, seen one row later."""
+    rng = np.random.default_rng(4)
+    n = 8000
+    disturbance = 0.05 * np.cos(2 * np.pi * 19.96e-3 * np.arange(n))[:, None] + 0.02 * rng.standard_normal((n, 2))
+    centroid, commands = np.zeros((n, 2)), np.zeros((n, 2))
+    for k in range(n):
+        centroid[k] = disturbance[k] - (commands[k - 1] if k else 0.0)
+        commands[k] = (commands[k - 1] if k else 0.0) + 0.1 * centroid[k]
+    np.save(tmp_path / "Centroid_n0001.npy", centroid.astype(">f4"))
+    np.save(tmp_path / "Commands_n0001.npy", commands.astype(">f4"))
+    np.save(tmp_path / "OpenLoop_n0001.npy", (commands[:-1] + centroid[1:]).astype("f4"))
+    convert(tmp_path, tmp_path / "keck.npz")
+    assert "Commands[k] + Centroid[k+1]" in capsys.readouterr().out
+    scenario = configfile.load(DOCS / "keck.toml")
+    record = load_record(tmp_path / "keck.npz", scenario)
+    um_per_arcsec = 1e6 * np.deg2rad(1 / 3600) * 10.0 / 4.0
+    assert (record.n_steps, record.delay, record.training.y_lgs.shape) == (3000, 1, (5000, 2))
+    np.testing.assert_allclose(record.z[1:], disturbance[5001:] * um_per_arcsec, atol=1e-5)
+    done = CliRunner().invoke(main, [
+        "observe", str(tmp_path / "keck.npz"), "--config", str(DOCS / "keck.toml"), "--set", "gpr_online.training_size=20",
+        "--set", "gpr_offline.training_size=50"])
+    assert done.exit_code == 0 and "next z" in done.stdout, done.stderr
+
+
+def test_files_that_do_not_go_together(tmp_path) -> None:
+    with pytest.raises(ValueError, match=r"has 0 files Centroid\*\.npy, not one"):
+        convert(tmp_path, tmp_path / "keck.npz")
+    np.save(tmp_path / "Centroid_n1.npy", np.zeros((5, 2)))
+    np.save(tmp_path / "Commands_n1.npy", np.zeros((6, 2)))
+    with pytest.raises(ValueError, match=r"Centroid has shape \(5, 2\), Commands \(6, 2\)"):
+        convert(tmp_path, tmp_path / "keck.npz")
