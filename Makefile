@@ -30,7 +30,7 @@ define install
 endef
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: help run test setup check wheel wheel-check bench clean
+.PHONY: help run test setup check wheel wheel-check load container-check bench clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' Makefile
@@ -57,6 +57,12 @@ wheel: $(TEST)  ## build dist/*.tar.gz, and from it dist/*.whl
 
 wheel-check: wheel  ## install that wheel in an empty environment elsewhere, run it and serve from it
 	scripts/check_wheel.sh "$(PYTHON)" dist/*.whl
+
+load: $(TEST)  ## a load and abuse run against the served dashboard, about four minutes
+	$(BIN)/python scripts/load.py
+
+container-check:  ## run the steps of the Dockerfile in an empty environment, without a container
+	scripts/prove_dockerfile.sh "$(PYTHON)"
 
 bench: $(BENCH)  ## time the observers, and compare them with other libraries
 	$(BIN)/wfsobs bench

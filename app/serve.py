@@ -166,8 +166,7 @@ def make_server(options: Options, service: Service) -> Server:
 
 def origins(options: Options) -> list[str]:
     """HOST:PORT that a page may come from to open a websocket."""
-    here = {options.address, "localhost", "127.0.0.1"} if is_local(options.address) else {options.address}
-    own = [f"{name}:{options.port}" for name in here]
+    own = [f"{name}:{options.port}" for name in (options.address, "localhost", "127.0.0.1")]
     return sorted({*own, *options.origins})
 
 

@@ -160,4 +160,5 @@ def test_every_limit_has_a_flag() -> None:
 
 def test_pages_come_from_where_the_server_is_reached() -> None:
     assert origins(Options(port=5007)) == ["127.0.0.1:5007", "localhost:5007"]
-    assert origins(Options(address="10.0.0.5", origins=["ao.example.org"])) == ["10.0.0.5:5006", "ao.example.org"]
+    assert origins(Options(address="10.0.0.5", origins=["ao.example.org"])) == [
+        "10.0.0.5:5006", "127.0.0.1:5006", "ao.example.org", "localhost:5006"]
