@@ -13,6 +13,7 @@ from typing import Any
 
 from wfsobs.app.work import TRUTH
 from wfsobs.observers import OBSERVERS
+from wfsobs.scores import BOUND
 
 
 @dataclass(frozen=True)
@@ -40,11 +41,16 @@ LOOKS: Mapping[str, Look] = MappingProxyType({
     "butterworth-cl": Look("Butterworth CL", "#B40000", "#FF7A70", (8, 3)),
     "gpr-offline": Look("Offline GPR", "#0A960A", "#4FD64F", (12, 2, 2, 2, 2, 2)),
     "gpr-online": Look("Online GPR", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
+    "kf-multi": Look("Multi-peak KF", "#00707F", "#4DD0E1", (14, 3)),
+    "ridge": Look("Ridge", "#6B6B00", "#C8C84D", (4, 2)),
+    "ridge-30": Look("30-tap predictor", "#8A5A00", "#D8A44D", (2, 3)),
+    "persistence": Look("Persistence", "#707070", "#A8A8A8", (1, 3)),
+    BOUND: Look("Bound, LGS alone", "#202020", "#E8E8E8", (1, 2)),
     "zero": Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4)),
 })
 
-HIDDEN = ("zero",)
-"""Observers in the table only: their line would be the axis, their error the truth."""
+HIDDEN = ("ridge", "ridge-30", "persistence", "zero")
+"""Observers in the table only: their lines would be the axis, or hide the others."""
 
 PRIMARY = "#0B4F6C"
 

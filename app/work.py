@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from wfsobs.bound import bound_scores
 from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.pipeline import Failure, Result, as_stated, collect, each_estimate
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.scores import scored_samples, welch_psd
+from wfsobs.scores import Score, scored_samples, welch_psd
 from wfsobs.watch import Watch
 
 Array = NDArray[np.float64]
@@ -110,6 +111,7 @@ class _Work:
         self.watch = Watch(progress=self._progress, cancelled=cancelled)
         self.estimates: list[Estimate] = []
         self.failures: list[Failure] = []
+        self.bounds: list[Score] = []
         self.growing: dict[Key, Array] = {}  # written to by the observers' threads
         self.spectra: dict[Key, Spectrum] = {}
         self.started = self.told = self.delivered = perf_counter()
@@ -141,6 +143,7 @@ class _Work:
             if shown is not None:
                 self.report(self.fraction, shown)
                 self._let_draw()
+                self.bounds = bound_scores(self.scenario, record)
         return self._so_far(record)
 
     def _let_draw(self) -> None:
@@ -155,7 +158,7 @@ class _Work:
         return self._so_far(record)
 
     def _so_far(self, record: Record) -> Shown:
-        result = collect(self.scenario, record, self.estimates, self.failures)
+        result = collect(self.scenario, record, self.estimates, self.failures, bounds=self.bounds)
         partial = {key: values.copy() for key, values in self.growing.items()}
         return Shown(result, partial, dict(self.spectra), perf_counter() - self.started)
 

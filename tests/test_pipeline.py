@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from wfsobs import PRESETS, Record, Scenario, SettingError, observe, run, simulate
+from wfsobs.bound import bound
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.pipeline import Failure, as_stated, each_estimate
@@ -33,6 +34,7 @@ def test_results_come_in_the_order_of_the_registry() -> None:
     pairs = [(e.observer, e.target) for e in result.estimates]
     assert pairs == [(name, target) for name in order for target in sorted(OBSERVERS[name].targets)]
     rows = [(*pair, mode) for pair in pairs for mode in ("tip", "tilt")]
+    rows += [("bound", target, mode) for mode in ("tip", "tilt") for target in TARGETS]
     assert [(s.observer, s.target, s.mode) for s in result.scores] == rows
     found = result.estimate("kf-lgs", "vibration")
     assert found is not None and found.values.shape == result.record.y_lgs.shape and found.seconds_per_step > 0
@@ -42,6 +44,11 @@ def test_results_come_in_the_order_of_the_registry() -> None:
 def test_scores_are_those_of_the_estimates() -> None:
     result = run(scenario(), observers=["kf-lgs", "butterworth-ol"])
     for s in result.scores:
+        if s.observer == "bound":
+            truth, mode = result.record.truth(s.target), ("tip", "tilt").index(s.mode)
+            assert truth is not None and s.truth_rms == pytest.approx(np.sqrt(np.mean(truth[300:, mode] ** 2)), rel=1e-12)
+            assert s.rms == bound(scenario(), mode)[s.target]
+            continue
         e, truth = result.estimate(s.observer, s.target), result.record.truth(s.target)
         assert e is not None and truth is not None
         mode = ("tip", "tilt").index(s.mode)
@@ -66,7 +73,7 @@ def test_same_seed_same_result_and_a_subset_is_part_of_it() -> None:
 @pytest.mark.parametrize(("missing", "left_out"), [
     ({"y_ngs": None, "ratio": None}, ["kf-ngs", "multirate", "multirate-optimal"]),
     ({"open_loop_y": None}, ["butterworth-ol"]),
-    ({"training": None}, ["gpr-offline"]),
+    ({"training": None}, ["gpr-offline", "ridge", "ridge-30"]),
 ])
 def test_what_a_record_lacks_is_one_line_per_observer(missing: dict[str, None], left_out: list[str]) -> None:
     record = replace(simulate(scenario()), **missing)

@@ -93,7 +93,7 @@ def run(
             record = simulate(one)
             if save:
                 save_record(save, record, configfile.to_toml(one))
-            result = observe_record(record, one, Watch(progress=lambda f, i=i: update((i + f) / seeds)))
+            result = observe_record(record, one, Watch(progress=lambda f, i=i: update((i + f) / seeds)), simulated=True)
             _warn(result)
             all_rows += rows(result.scores, one.run.seed)
     show(all_rows, as_json)

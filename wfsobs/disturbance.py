@@ -76,6 +76,18 @@ def vibration_power(scenario: Scenario, mode: int, n: int) -> Array:
     return power
 
 
+def vibration_lines(scenario: Scenario, mode: int) -> list[tuple[float, float, float]]:
+    """(frequency [Hz], damping, rms [um]) of every line that the vibration of a mode has; none where it is a table."""
+    v = scenario.vibration
+    if v.source == "measured":
+        found = [(line.frequency, 0.0, peak_rms(list(line.rms), mode)) for line in measured_spectrum(v.spectrum).lines()]
+    elif v.source in ("peaks", "ar2"):
+        found = [(peak.frequency, peak.damping, peak_rms(peak.rms, mode)) for peak in v.peaks]
+    else:
+        found = []
+    return [line for line in found if line[2] > 0 and (line[0] <= v.cutoff or v.source == "ar2")]
+
+
 def _no_vibration(_scenario: Scenario, _mode: int, n: int, _rng: np.random.Generator) -> Array:
     return np.zeros(n)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from time import perf_counter
 
 from wfsobs.arrays import Array
+from wfsobs.bound import bound_scores
 from wfsobs.gaps import bridged
 from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
@@ -46,18 +47,24 @@ class Result:
 
 def run(scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | None = None) -> Result:
     """Simulate a record and run the observers (all unless named) on it. Raises SettingError, Cancelled."""
-    return observe(simulate(scenario, watch=watch), scenario, watch, observers)
+    return observe(simulate(scenario, watch=watch), scenario, watch, observers, simulated=True)
 
 
-def observe(record: Record, scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | None = None) -> Result:
-    """Run the observers on a record. What the record states (step, exposure ratio) overrides the scenario."""
+def observe(
+    record: Record, scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | None = None, simulated: bool = False
+) -> Result:
+    """Run the observers on a record. What the record states (step, exposure ratio) overrides the scenario.
+
+    simulated : whether the record was made from the scenario, so that its bound is known
+    """
     scenario = as_stated(record, scenario)
     scenario.validate()
     estimates: list[Estimate] = []
     failures: list[Failure] = []
     for item in each_estimate(record, scenario, watch, observers):
         (failures if isinstance(item, Failure) else estimates).append(item)  # type: ignore[arg-type]
-    return collect(scenario, record, estimates, failures, watch)
+    bounds = bound_scores(scenario, record) if simulated else []
+    return collect(scenario, record, estimates, failures, watch, bounds)
 
 
 def as_stated(record: Record, scenario: Scenario) -> Scenario:
@@ -71,9 +78,10 @@ def as_stated(record: Record, scenario: Scenario) -> Scenario:
 
 
 def collect(
-    scenario: Scenario, record: Record, estimates: Sequence[Estimate], failures: Sequence[Failure], watch: Watch = QUIET
+    scenario: Scenario, record: Record, estimates: Sequence[Estimate], failures: Sequence[Failure], watch: Watch = QUIET,
+    bounds: Sequence[Score] = (),
 ) -> Result:
-    """A Result with its scores, everything in the order of the registry. Raises Cancelled."""
+    """A Result with its scores, everything in the order of the registry, the bounds last. Raises Cancelled."""
     order = {name: i for i, name in enumerate(OBSERVERS)}
     names = [m.name for m in scenario.modes][: record.n_modes]
     ordered = sorted(estimates, key=lambda e: (order[e.observer], e.target))
@@ -83,7 +91,7 @@ def collect(
         scores += score(record, estimate, scenario.run.warm_up, names)
     if record.turbulence is None and record.vibration is None:
         scores = unsupervised_scores(record, ordered, scenario.run.warm_up, names)
-    return Result(scenario, record, tuple(ordered), tuple(scores), tuple(sorted(failures, key=lambda f: order[f.observer])))
+    return Result(scenario, record, tuple(ordered), (*scores, *bounds), tuple(sorted(failures, key=lambda f: order[f.observer])))
 
 
 def each_estimate(

@@ -12,7 +12,7 @@ from itertools import pairwise
 from wfsobs.fit import fit
 from wfsobs.groups.atmosphere import PsdTable, Telescope, Turbulence
 from wfsobs.groups.control import Control
-from wfsobs.groups.observers import Butterworth, Kalman, MultiRate, OfflineGpr, OnlineGpr
+from wfsobs.groups.observers import Butterworth, Kalman, MultiPeak, MultiRate, OfflineGpr, OnlineGpr
 from wfsobs.groups.run import Loop, Run
 from wfsobs.groups.sensors import Sensors
 from wfsobs.groups.vibration import Vibration
@@ -41,6 +41,7 @@ class Scenario(Group):
     sensors = section(Sensors, "Sensors")
     loop = section(Loop, "Loop")
     kalman = section(Kalman, "Kalman filters")
+    multipeak = section(MultiPeak, "Multi-peak Kalman filter")
     multirate = section(MultiRate, "Multi-rate filter")
     butterworth = section(Butterworth, "Butterworth reference")
     gpr_offline = section(OfflineGpr, "Offline GPR")

@@ -15,8 +15,8 @@ from wfsobs.record import Record
 PREDICTION, RESIDUAL = "next z", "residual y"
 """What takes the place of a target where there is no truth: the next measurement, and what the loop left of it."""
 
-LOOP = "loop"
-"""In the place of an observer: the loop that made the record."""
+LOOP, BOUND = "loop", "bound"
+"""In the place of an observer: the loop that made the record, and the least error that any observer of the LGS could have."""
 
 MAX_LAG = 0.025
 """Lags beyond this [s] are not looked for."""

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from wfsobs.ar2 import Ar2
+from wfsobs.ar3 import Ar3
 from wfsobs.arrays import Array
 
 MIN_MODEL_DAMPING = 1e-4
@@ -27,11 +28,11 @@ MIN_MODEL_DAMPING = 1e-4
 
 @dataclass(frozen=True)
 class DisturbanceModel:
-    """Sum of AR(2) processes measured one step late, z[k] = C x[k] + w[k].
+    """Sum of autoregressive processes measured one step late, z[k] = C x[k] + w[k].
 
-    A (n, n), C (n,), Q (n, n); x holds two numbers per process (`process_model`).
+    A (n, n), C (n,), Q (n, n); x holds as many numbers per process as it has poles (`process_model`).
     outputs : target -> row (n,) that gives its phi[k] [um].
-    pairs   : (n, n) that gives the paper's state (phi_1[k], phi_1[k-1], phi_2[k], ...) [um].
+    pairs   : (two per process, n) that gives the paper's state (phi_1[k], phi_1[k-1], phi_2[k], ...) [um].
     """
 
     A: Array
@@ -46,7 +47,7 @@ class DisturbanceModel:
 
 
 class ProcessModel(NamedTuple):
-    """One AR(2) process as a state-space model: A, Q (2, 2); rows (2,) that give phi[k] and phi[k-1]."""
+    """One process of p poles as a state-space model: A, Q (p, p); rows (p,) that give phi[k] and phi[k-1]."""
 
     A: Array
     Q: Array
@@ -77,11 +78,29 @@ def process_model(p: Ar2) -> ProcessModel:
     )
 
 
-def disturbance_model(turbulence: list[Ar2], vibration: list[Ar2]) -> DisturbanceModel:
+def third_order_model(p: Ar3) -> ProcessModel:
+    """A third-order process in coordinates of variance one, uncorrelated with each other, like `process_model`.
+
+    xi_0 is phi[k], xi_1 what phi[k-1] has beyond it, xi_2 what phi[k-2] has beyond both, each over its own rms. With the
+    partial autocorrelations k_i and s_i = sqrt(1 - k_i^2), (A | drive) has orthonormal rows (the normalised lattice of Gray and
+    Markel, IEEE Trans. ASSP 23, 268, 1975), so the state keeps its variance whatever rounding did to the k_i.
+    """
+    k1, k2, k3 = p.reflections
+    s1, s2, s3 = np.sqrt(1.0 - p.reflections**2)
+    drive = np.array([s1 * s2 * s3, -k1 * s2 * s3, -k2 * s3])
+    return ProcessModel(
+        A=np.array([[k1, k2 * s1, k3 * s1 * s2], [s1, -k1 * k2, -k1 * k3 * s2], [0.0, s2, -k2 * k3]]),
+        Q=np.outer(drive, drive),
+        now=p.rms * np.array([1.0, 0.0, 0.0]),
+        before=p.rms * np.array([k1, s1, 0.0]),
+    )
+
+
+def disturbance_model(turbulence: Sequence[Ar2 | Ar3], vibration: Sequence[Ar2]) -> DisturbanceModel:
     """The model of all the given processes, each with its own drive (paper, eq. 1, 2 and 7)."""
-    models = [process_model(p) for p in (*turbulence, *vibration)]
+    models = [third_order_model(p) if isinstance(p, Ar3) else process_model(p) for p in (*turbulence, *vibration)]
     now = np.concatenate([m.now for m in models])
-    first = np.arange(now.size) < 2 * len(turbulence)
+    first = np.arange(now.size) < sum(m.now.size for m in models[: len(turbulence)])
     return DisturbanceModel(
         A=block_diag(*(m.A for m in models)),
         C=np.concatenate([m.before for m in models]),

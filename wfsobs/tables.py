@@ -9,7 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from wfsobs.observers import OBSERVERS
-from wfsobs.scores import LOOP, RESIDUAL, Score
+from wfsobs.scores import BOUND, LOOP, RESIDUAL, Score
 
 Row = dict[str, Any]
 
@@ -17,12 +17,17 @@ TIME = "time_per_step_us"
 """Computing time per step and mode [us]: in the table, but not part of the result, which the seed fixes."""
 
 
+NOT_OBSERVERS = {LOOP: "Recorded loop", BOUND: "Bound, LGS alone"}
+"""Labels of rows that stand among the observers' and are none."""
+
+
 def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
     """One plain dictionary per score: the keys of `wfsobs run --json`, and TIME."""
     return [
         {
             "observer": s.observer, "target": s.target, "mode": s.mode, "rms_um": s.rms, "truth_rms_um": s.truth_rms,
-            "normalised_rms": s.normalised_rms, "lag_s": s.lag, "seed": seed, TIME: s.seconds_per_step * 1e6,
+            "normalised_rms": s.normalised_rms, "lag_s": s.lag, "seed": seed,
+            TIME: None if s.observer in NOT_OBSERVERS else s.seconds_per_step * 1e6,
         }
         for s in scores
     ]
@@ -47,7 +52,7 @@ def score_table(rows: Sequence[Row]) -> Table:
             table.add_section()
         last = (target, mode)
         table.add_row(
-            target, mode, _label(observer), f"{median(errors):.2f}",
+            target, mode, label_of(observer) + (" (looks ahead)" if looks_ahead(observer) else ""), f"{median(errors):.2f}",
             *((f"{min(errors):.2f} - {max(errors):.2f}",) if several else ()),
             f"{median(r['truth_rms_um'] for r in same) * 1e3:.2f}", _number(same, "normalised_rms", 1.0, 3),
             _number(same, "lag_s", 1e3, 2), _number(same, TIME, 1.0, 2),
@@ -55,10 +60,19 @@ def score_table(rows: Sequence[Row]) -> Table:
     return table
 
 
-def _label(observer: str) -> str:
-    if observer == LOOP:
-        return "Recorded loop"
-    return OBSERVERS[observer].label + ("" if OBSERVERS[observer].causal else " (looks ahead)")
+def label_of(observer: str) -> str:
+    """What a row is called."""
+    return NOT_OBSERVERS.get(observer) or OBSERVERS[observer].label
+
+
+def competes(observer: str) -> bool:
+    """Whether a row can be the best: not the bound, nor what looks ahead."""
+    return observer not in NOT_OBSERVERS and OBSERVERS[observer].causal
+
+
+def looks_ahead(observer: str) -> bool:
+    """Whether an estimate uses later samples."""
+    return observer not in NOT_OBSERVERS and not OBSERVERS[observer].causal
 
 
 def _number(same: Sequence[Row], key: str, scale: float, digits: int) -> str:

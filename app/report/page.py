@@ -36,6 +36,7 @@ from wfsobs.app.work import TRUTH
 from wfsobs.modes import TIP_TILT
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION
+from wfsobs.scores import BOUND
 
 START = 'document.documentElement.classList.add("js")'
 """Run before anything is drawn: what is for scripts alone may show."""
@@ -217,4 +218,4 @@ def _symbols() -> str:
 
 
 def _drawn() -> list[str]:
-    return [TRUTH, *OBSERVERS]
+    return [TRUTH, *OBSERVERS, BOUND]

@@ -8,8 +8,7 @@ from itertools import groupby
 
 from wfsobs.app.display import NOTHING, number, per_micrometre
 from wfsobs.app.report.data import State
-from wfsobs.observers import OBSERVERS
-from wfsobs.tables import TIME, Row
+from wfsobs.tables import TIME, Row, competes, label_of, looks_ahead
 
 COLUMNS = {
     "Observer": "and its line in the figures",
@@ -48,7 +47,7 @@ def _order(rows: list[Row]):
 
 def _body(state: State, rows: list[Row]) -> str:
     target, mode = _group(rows[0])
-    best = min((row["rms_um"] for row in rows if OBSERVERS[row["observer"]].causal), default=math.inf)
+    best = min((row["rms_um"] for row in rows if competes(row["observer"])), default=math.inf)
     title = f'<tr><th colspan={len(COLUMNS)} class="target" scope=rowgroup>{target.capitalize()}, {escape(mode)}</th></tr>'
     return (
         f'<tbody data-target="{target}" data-mode="{escape(mode)}">{title}'
@@ -56,17 +55,17 @@ def _body(state: State, rows: list[Row]) -> str:
 
 
 def _row(state: State, row: Row, best: bool) -> str:
-    observer = OBSERVERS[row["observer"]]
-    label = escape(observer.label) + ("" if observer.causal else " <sup>looks ahead</sup>")
+    name, time = row["observer"], row[TIME]
+    label = escape(label_of(name)) + (" <sup>looks ahead</sup>" if looks_ahead(name) else "")
     lag = NOTHING if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−")
     cells = [
-        f"<td>{BEST if best and observer.causal else ''}{length(row['rms_um'])}</td>",
+        f"<td>{BEST if best and competes(name) else ''}{length(row['rms_um'])}</td>",
         f"<td>{length(row['truth_rms_um'])}</td>",
         f"<td>{ABOVE if (row['normalised_rms'] or 0.0) > 1.0 else ''}{number(row['normalised_rms'])}</td>",
         f"<td>{lag}</td>",
-        f"<td>{number(row[TIME])}</td>", f"<td>{number(1e-6 * row[TIME] / state.grid.dt, 2)}</td>",
+        f"<td>{number(time)}</td>", f"<td>{number(None if time is None else 1e-6 * time / state.grid.dt, 2)}</td>",
     ]
-    return f'<tr data-observer="{observer.id}"><th scope=row>{swatch(observer.id)}{label}</th>{"".join(cells)}</tr>'
+    return f'<tr data-observer="{name}"><th scope=row>{swatch(name)}{label}</th>{"".join(cells)}</tr>'
 
 
 def length(um: float) -> str:

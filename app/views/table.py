@@ -11,9 +11,9 @@ from wfsobs.app.display import NOTHING, Display, number, per_micrometre
 from wfsobs.app.run import Run
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import Shown
-from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.scores import LOOP, RESIDUAL, Score
+from wfsobs.scores import BOUND, LOOP, RESIDUAL, Score
+from wfsobs.tables import NOT_OBSERVERS, competes, label_of, looks_ahead
 
 BEST = '<span class="tag best">best</span> '
 ABOVE = '<span class="tag above">above truth</span> '
@@ -77,10 +77,9 @@ class Table:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             loop = score.observer == LOOP
             cells = [number(score.rms * scale), *pinned, number(score.truth_rms * scale), number(score.normalised_rms), NOTHING,
-                     *([NOTHING] * 2 if loop else [
-                         number(1e6 * score.seconds_per_step), number(score.seconds_per_step / shown.result.record.dt, 2)])]
+                     *_times(score, shown.result.record.dt)]
             label = "Recorded loop, residual" if loop else (
-                f"{swatch(score.observer, self.display.dark)}{escape(OBSERVERS[score.observer].label)}")
+                f"{swatch(score.observer, self.display.dark)}{escape(label_of(score.observer))}")
             values = "".join(f"<td>{c}</td>" for c in cells)
             head = f"<th scope=row>{label}</th>"
             out.append(f'<tr data-observer="{score.observer}" data-target="{score.target}">{head}{values}</tr>')
@@ -93,8 +92,8 @@ class Table:
         shown = self.run.shown
         scores = {
             name: find(shown, name, target, self.display.mode) if shown else None
-            for name in observers_of(target, hidden=True)}
-        best = min((s.rms for n, s in scores.items() if s and OBSERVERS[n].causal), default=None)
+            for name in (*observers_of(target, hidden=True), BOUND)}
+        best = min((s.rms for n, s in scores.items() if s and competes(n)), default=None)
         order = list(scores.items())
         if self.display.best_first:
             order.sort(key=lambda item: item[1].rms if item[1] else math.inf)
@@ -103,18 +102,18 @@ class Table:
         return f'<tbody><tr><th colspan={columns} class="target" scope=rowgroup>{title}</th></tr>{rows}</tbody>'
 
     def _row(self, name: str, target: str, score: Score | None, best: float | None) -> str:
-        label = escape(OBSERVERS[name].label) + ("" if OBSERVERS[name].causal else " <sup>looks ahead</sup>")
+        label = escape(label_of(name)) + (" <sup>looks ahead</sup>" if looks_ahead(name) else "")
         shown, pinned = self.run.shown, self._pinned(name, target, score)
         cells = [NOTHING, *pinned, *[NOTHING] * 5]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
-            is_best = score.rms == best and OBSERVERS[name].causal
+            is_best = score.rms == best and competes(name)
             cells = [
                 (BEST if is_best else "") + number(score.rms * scale), *pinned,
                 number(score.truth_rms * scale),
                 (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
                 NOTHING if score.lag is None else f"{1e3 * score.lag:.2f}".replace("-", "−"),
-                number(1e6 * score.seconds_per_step), number(score.seconds_per_step / shown.result.record.dt, 2),
+                *_times(score, shown.result.record.dt),
             ]
         values = "".join(f"<td>{c}</td>" for c in cells)
         head = f"<th scope=row>{swatch(name, self.display.dark)}{label}</th>"
@@ -135,6 +134,13 @@ class Table:
         shown = self.run.shown
         failures = shown.result.failures if shown else ()
         return "".join(f'<p class="failure">{escape(f.reason)}</p>' for f in failures)
+
+
+def _times(score: Score, dt: float) -> list[str]:
+    """Time per step [us], and over the step of the loop."""
+    if score.observer in NOT_OBSERVERS:
+        return [NOTHING] * 2
+    return [number(1e6 * score.seconds_per_step), number(score.seconds_per_step / dt, 2)]
 
 
 def change(before: float, now: float | None) -> str:

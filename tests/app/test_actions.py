@@ -167,7 +167,7 @@ def test_csv(shown: Shown) -> None:
     columns = np.loadtxt(io.StringIO("\n".join(lines)), delimiter=",", unpack=True)
     table = dict(zip(names.split(","), columns, strict=True))
     record, estimate = shown.result.record, shown.result.estimate("gpr-online", "vibration")
-    assert estimate is not None and columns.shape == (1 + 2 * (5 + 12), record.n_steps)
+    assert estimate is not None and columns.shape == (1 + 2 * (5 + len(shown.result.estimates)), record.n_steps)
     np.testing.assert_allclose(table["time_s"], np.arange(record.n_steps) * 1e-3, rtol=1e-8)
     for name, values in (("truth/turbulence", record.turbulence), ("y_lgs", record.y_lgs), ("y_ngs", record.y_ngs),
                          ("u", record.u), ("gpr-online/vibration", estimate.values)):

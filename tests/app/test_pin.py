@@ -10,6 +10,7 @@ import pytest
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.pin import differences, name_of, pin
+from wfsobs.app.style import observers_of
 from wfsobs.app.views.table import change, number
 from wfsobs.app.work import TRUTH
 from wfsobs.observers.base import TARGETS
@@ -54,14 +55,14 @@ class TestPin:
     def test_faint_lines(self, pinned: Dashboard) -> None:
         trace, kept = pinned.traces.traces["turbulence"], pinned.display.pinned
         data = trace.faint.source.data
-        assert len(data["xs"]) == len(data["colour"]) == 5
+        assert len(data["xs"]) == len(data["colour"]) == 1 + len(observers_of("turbulence"))
         assert np.nanmax(data["ys"][0]) == pytest.approx(1e3 * np.nanmax(kept.signals[TRUTH, "turbulence"][:, 0]))
         spectrum = pinned.spectra.spectra["vibration"].faint.source.data
         assert np.allclose(spectrum["ys"][0], 1e6 * kept.spectra[TRUTH, "vibration"].signal[1:, 0])
         pinned.display.show = "error"
-        assert len(trace.faint.source.data["xs"]) == 4, "the truth has no error"
+        assert len(trace.faint.source.data["xs"]) == len(observers_of("turbulence")), "the truth has no error"
         pinned.display.hidden = {"turbulence": ["kf-lgs"]}
-        assert len(trace.faint.source.data["xs"]) == 3
+        assert len(trace.faint.source.data["xs"]) == len(observers_of("turbulence")) - 1
 
     def test_a_zoom_cuts_the_pinned_lines(self, pinned: Dashboard) -> None:
         pinned.traces.x_range.update(start=1.0, end=1.1)

@@ -52,7 +52,7 @@ class TestTraces:
     def test_signal(self, dashboard: Dashboard) -> None:
         shown = dashboard.store.run.shown
         data = trace(dashboard, "turbulence")
-        assert set(data) == {"x", TRUTH, "kf-lgs", "kf-ngs", "multirate", "multirate-optimal"}
+        assert set(data) == {"x", TRUTH, "kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal"}
         expected = 1e3 * envelope(shown.values("kf-lgs", "turbulence")[:, 0], BINS)
         assert np.allclose(data["kf-lgs"], expected, rtol=1e-6)
         assert data["x"][0] >= 0 and data["x"][-1] <= 2.0 and data["x"].size == data[TRUTH].size
@@ -162,7 +162,7 @@ class TestNumbers:
         for score in dashboard.store.run.shown.result.scores:
             if score.mode == "tip":
                 assert number(1e3 * score.rms) in html
-        assert html.count("<tr data-observer") == sum(len(o.targets) for o in OBSERVERS.values())
+        assert html.count("<tr data-observer") == 2 + sum(len(o.targets) for o in OBSERVERS.values()), "and the bounds"
         assert "RMS error [nm]" in html and "Turbulence, tip" in html
 
     def test_the_table_follows_mode_and_unit(self, dashboard: Dashboard) -> None:

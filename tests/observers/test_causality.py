@@ -19,6 +19,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.watch import QUIET
 
 GPR = ("gpr-offline", "gpr-online")
+WINDOWS = (*GPR, "ridge")
 CAUSAL = [name for name, observer in OBSERVERS.items() if observer.causal]
 
 
@@ -64,9 +65,9 @@ def test_only_the_reference_looks_ahead() -> None:
 def test_nothing_after_a_step_changes_its_estimate(name: str, k: int, record: Record) -> None:
     """48 is a border of the filters' blocks, 5 and 300 are NGS frames."""
     s = scenario()
-    # u[k] enters the GPR's window of step k (paper, eq. 14): of commands, those from k + 1 on are later
+    # u[k] enters the window of step k (paper, eq. 14): of commands, those from k + 1 on are later
     later = changed_after(record, k)
-    if name in GPR:
+    if name in WINDOWS:
         u = later.u.copy()
         u[k] = record.u[k]
         later = replace(later, u=u)
@@ -106,7 +107,7 @@ def test_the_command_of_the_step_itself_is_used_only_where_the_paper_has_it(
     other = OBSERVERS[name].run(replace(record, u=u), s, QUIET)
     for target, values in base.items():
         moved = np.abs(other[target][k] - values[k]).max() > 1e-9 * np.nanstd(values)
-        assert moved == (name in GPR and inputs == "u-y")
+        assert moved == (name in WINDOWS and inputs == "u-y")
 
 
 @pytest.mark.parametrize("name", OBSERVERS)

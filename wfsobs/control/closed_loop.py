@@ -20,7 +20,7 @@ from math import pi
 import numpy as np
 
 from wfsobs.arrays import Array
-from wfsobs.bound import TURBULENCE_SPECTRA, TrueSpectra, bound, true_spectra
+from wfsobs.bound import bound
 from wfsobs.control.controllers import CONTROLLERS, Controller
 from wfsobs.control.integrator import limited_integrator, residual_variance
 from wfsobs.control.law import Law
@@ -32,6 +32,7 @@ from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scores import rms
 from wfsobs.settings import SettingError
+from wfsobs.true_spectra import TURBULENCE_SPECTRA, TrueSpectra, true_spectra
 from wfsobs.watch import QUIET, Watch
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from wfsobs.arrays import Array
-from wfsobs.bound import TrueSpectra
 from wfsobs.control.integrator import best_gain, integrator_law
 from wfsobs.control.law import Law
 from wfsobs.control.lqg import LQG
@@ -14,6 +13,7 @@ from wfsobs.control.mirror import Mirror
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
+from wfsobs.true_spectra import TrueSpectra
 from wfsobs.watch import Watch
 
 MakeLaw = Callable[[Scenario, int, Mirror, TrueSpectra | None], Law]

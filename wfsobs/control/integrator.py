@@ -6,10 +6,10 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from wfsobs.arrays import Array
-from wfsobs.bound import TrueSpectra
 from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror
 from wfsobs.lifted import PeriodicFilter
+from wfsobs.true_spectra import TrueSpectra
 from wfsobs.wiener import circle_mean
 
 FINE, COARSE = 2048, 64

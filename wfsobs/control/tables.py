@@ -9,9 +9,9 @@ from typing import Any
 
 from rich.table import Table
 
-from wfsobs.bound import BOUND
 from wfsobs.control.closed_loop import ClosedLoop, residual_rms, strehl
 from wfsobs.control.controllers import CONTROLLERS, SPECTRA
+from wfsobs.scores import BOUND
 from wfsobs.units import micrometres_per
 
 Row = dict[str, Any]

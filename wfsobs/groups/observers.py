@@ -36,6 +36,15 @@ class Kalman(Group):
         doc="hold: the NGS filter's estimate stays until the next frame (paper); propagate: it follows the fast model.")
 
 
+class MultiPeak(Group):
+    """The Kalman filter with every peak of the scenario in its model."""
+
+    turbulence_order = Whole(2, bounds=(2, 3), label="Order of the turbulence model",
+                             doc="2: the AR(2) of the paper; 3: one more pole, fitted to the scenario's true spectrum.")
+    line_width = Real(0.025, bounds=(1e-4, 10.0), softbounds=(0.005, 1.0), label="Least line width",
+                      doc="Width at half maximum that lines have at least [Hz]; the filter averages over the inverse of it.")
+
+
 class MultiRate(Group):
     """Noise weights of the multi-rate Kalman filter."""
 

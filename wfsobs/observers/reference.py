@@ -11,7 +11,7 @@ import numpy as np
 
 from wfsobs.arrays import Array
 from wfsobs.bandpass import bandpass_bank, filter_causal, filter_zero_phase
-from wfsobs.observers.base import TARGETS, VIBRATION
+from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.watch import Watch
@@ -41,6 +41,12 @@ def butterworth_cl(record: Record, scenario: Scenario, watch: Watch) -> dict[str
     """Causal, on the record's own pseudo-open-loop measurement."""
     watch.step(0.0)
     return {VIBRATION: online_reference(scenario, record.z, record.dt)}
+
+
+def persistence(record: Record, _scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """The newest measurement taken for the turbulence: no model, all of the noise and the vibration, one step late."""
+    watch.step(0.0)
+    return {TURBULENCE: record.z}
 
 
 def zero(record: Record, _scenario: Scenario, watch: Watch) -> dict[str, Array]:

@@ -1,0 +1,62 @@
+"""The Kalman filter that knows every peak of the scenario, which the paper expects to help (its conclusion).
+
+The filter is that of `kalman`, its model one AR(2) per line of the vibration and, as an option, turbulence of third order.
+"""
+
+from __future__ import annotations
+
+from math import pi, sqrt
+
+import numpy as np
+
+from wfsobs.ar2 import Ar2
+from wfsobs.ar3 import Ar3, fitted_ar3
+from wfsobs.arrays import Array
+from wfsobs.disturbance import vibration_lines
+from wfsobs.observers.kalman import by_target, measurement_noise, modelled_processes, steady_filter
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.statespace import DisturbanceModel, disturbance_model
+from wfsobs.true_spectra import seen_turbulence
+from wfsobs.watch import Watch
+
+
+def multi_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
+    """Turbulence and all the lines of one mode. Raises ValueError where the vibration names no lines."""
+    if scenario.vibration.source == "psd":
+        raise ValueError("vibration.source = psd is a table, not lines that a model could have")
+    least = pi * scenario.multipeak.line_width  # as xi w
+    lines = []
+    for frequency, damping, rms in vibration_lines(scenario, mode):
+        omega = 2.0 * pi * frequency
+        lines.append(Ar2(omega, min(max(damping, least / omega), 1.0), rms, dt))
+    return disturbance_model([modelled_turbulence(scenario, mode, dt)], lines)
+
+
+def modelled_turbulence(scenario: Scenario, mode: int, dt: float) -> Ar2 | Ar3:
+    """The turbulence of the model: that of `kalman`, or of third order and nearest to the true spectrum that the LGS see."""
+    process, _ = modelled_processes(scenario, mode, dt)
+    if scenario.multipeak.turbulence_order == 2 or process.rms == 0:
+        return process
+    noise = measurement_noise(scenario)[0]
+    start = Ar3(process.omega, process.damping, 5.0 * process.omega, process.rms, dt)
+    return fitted_ar3(seen_turbulence(scenario, mode), noise**2, start)
+
+
+def kf_multi(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """The filter on the LGS measurement, at every fast step."""
+    z, noise = record.z, measurement_noise(scenario)[0]
+    columns = []
+    for mode in range(record.n_modes):
+        watch.step(mode / record.n_modes)
+        kalman, _ = steady_filter(multi_model(scenario, mode, record.dt), noise)
+        columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
+    return by_target(columns)
+
+
+def predicted_rms(scenario: Scenario, mode: int) -> float:
+    """What the filter believes its error of the next phi_dist to be, rms [um]."""
+    model = multi_model(scenario, mode, scenario.dt)
+    row = np.sum(list(model.outputs.values()), axis=0)
+    _, steady = steady_filter(model, measurement_noise(scenario)[0])
+    return sqrt(float(row @ steady.P @ row))

@@ -1,0 +1,148 @@
+"""The spectra that a scenario really has, mode by mode, from its settings alone.
+
+How wide lines are decides how well they can be told ahead: a pure line, after long enough, without any error. So the width
+is stated: lines of no width of their own (pure lines, tables) and those narrower are taken to be `line_width` wide at half
+maximum, a sixteenth of what a record could show; narrower still, and the bound would be that of a longer record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+
+from wfsobs.ar2 import Ar2
+from wfsobs.arrays import Array
+from wfsobs.disturbance import peak_rms, vibration_power
+from wfsobs.scenario import Scenario
+from wfsobs.sensing import low_frequency_process
+from wfsobs.sensors import noise_rms
+from wfsobs.turbulence import turbulence_process
+
+LONGEST = 30.0
+"""Longest record whose resolution counts [s]."""
+
+SHARPER = 16
+"""Lines over the width that a record can show."""
+
+DECAYED = 2.5
+"""How far correlations have decayed after half the DFT, as an exponent; a line that turns round by then is nothing new."""
+
+SMOOTH = 8.0
+"""The same for processes of a known width, whose correlations may not come round at all: exp(-20) of them does."""
+
+FLOOR = 1e-6
+"""Least noise of a measurement [um]."""
+
+
+@dataclass(frozen=True)
+class TrueSpectra:
+    """What one mode of a scenario really is, on the frequencies of `wiener`, all (n // 2 + 1,) [um^2 per sample].
+
+    measured : S_z of the pseudo-open-loop LGS measurement, noise and all
+    signal   : target -> S_s;  shared : target -> spectrum between s[k] and what z[k + 1] has of it
+    """
+
+    measured: Array
+    signal: dict[str, Array]
+    shared: dict[str, Array]
+
+    @property
+    def total(self) -> tuple[Array, Array]:
+        """(signal, shared) of the whole disturbance; turbulence and vibration are independent."""
+        return sum_of(self.signal), sum_of(self.shared)
+
+
+def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
+    """The spectra of one mode, from the settings alone."""
+    n = n_frequencies(scenario)
+    turbulence, seen, shared = TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n)
+    if scenario.sensors.tip_tilt_indetermination:
+        seen, shared = np.zeros_like(seen), np.zeros_like(shared)
+    vibration = _vibration(scenario, mode, n)
+    noise = max(noise_rms(scenario, "lgs")[mode] ** 2 / scenario.sensors.lgs_count, FLOOR**2)
+    return TrueSpectra(
+        measured=seen + vibration + noise,
+        signal={"turbulence": turbulence, "vibration": vibration},
+        shared={"turbulence": shared, "vibration": vibration},
+    )
+
+
+def seen_turbulence(scenario: Scenario, mode: int) -> Array:
+    """S of what the mean over the LGS sees of the turbulence, on the frequencies of `true_spectra`."""
+    return TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n_frequencies(scenario))[1]
+
+
+def line_width(scenario: Scenario) -> float:
+    """The least width of a line at half maximum [Hz]."""
+    return 1.0 / (SHARPER * min(max(scenario.run.duration, 1.0), LONGEST))
+
+
+def n_frequencies(scenario: Scenario) -> int:
+    """Length of the DFT, a power of two: the slowest correlation has decayed by its half."""
+    slowest = min(_decay_rates(scenario))
+    return 2 ** int(np.ceil(np.log2(2.0 * DECAYED / (slowest * scenario.dt))))
+
+
+def _decay_rates(scenario: Scenario) -> list[float]:
+    """How fast the correlations of the disturbances decay [1/s], xi w, with the margin that smooth spectra leave."""
+    v, least = scenario.vibration, pi * line_width(scenario)
+    rates = [2.0, turbulence_process(scenario, 0, scenario.dt).omega * scenario.turbulence.damping / SMOOTH]
+    if v.source in ("psd", "measured"):
+        rates.append(least)
+    elif v.source != "none":
+        rates += [max(2.0 * pi * p.frequency * p.damping / SMOOTH, least) for p in v.peaks]
+    return rates
+
+
+def sum_of(spectra: dict[str, Array]) -> Array:
+    """The spectrum of a sum of independent signals."""
+    return np.sum(list(spectra.values()), axis=0)
+
+
+def _density(process: Ar2, n: int) -> Array:
+    """Of an AR(2) process, per sample."""
+    return process.psd(np.fft.rfftfreq(n, process.dt)) / (2.0 * process.dt)
+
+
+def _ar2_turbulence(scenario: Scenario, mode: int, n: int) -> tuple[Array, Array, Array]:
+    """(S of the turbulence, of what the mean over the LGS sees of it, between the two)."""
+    own = _density(turbulence_process(scenario, mode, scenario.dt), n)
+    error = _density(low_frequency_process(scenario, mode), n) / scenario.sensors.lgs_count
+    return own, own + error, own
+
+
+def _no_turbulence(scenario: Scenario, mode: int, n: int) -> tuple[Array, Array, Array]:
+    error = _density(low_frequency_process(scenario, mode), n) / scenario.sensors.lgs_count
+    nothing = np.zeros_like(error)
+    return nothing, error, nothing
+
+
+def _vibration(scenario: Scenario, mode: int, n: int) -> Array:
+    v, dt = scenario.vibration, scenario.dt
+    if v.source == "ar2":
+        out = np.zeros(n // 2 + 1)
+        for peak in v.peaks:
+            omega = 2.0 * pi * peak.frequency
+            damping = min(max(peak.damping, pi * line_width(scenario) / omega), 1.0)
+            out += _density(Ar2(omega, damping, peak_rms(peak.rms, mode), dt), n)
+        return out
+    spectrum = 0.5 * n * vibration_power(scenario, mode, n)
+    if v.source == "peaks" and all(peak.damping > 0 for peak in v.peaks):
+        return spectrum
+    return widened(spectrum, line_width(scenario) * dt)
+
+
+def widened(spectrum: Array, width: float) -> Array:
+    """A spectrum whose lines are `width` wider [cycles per sample]: correlations decay as exp(-pi width |lag|)."""
+    n = 2 * (spectrum.size - 1)
+    lag = np.minimum(np.arange(n), n - np.arange(n))
+    return np.maximum(np.fft.rfft(np.fft.irfft(spectrum, n) * np.exp(-pi * width * lag)).real, 0.0)
+
+
+TURBULENCE_SPECTRA: dict[str, Callable[[Scenario, int, int], tuple[Array, Array, Array]]] = {
+    "ar2": _ar2_turbulence, "none": _no_turbulence,
+}
+"""How the turbulence of each source looks to `true_spectra`."""
