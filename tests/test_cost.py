@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from wfsobs.cost import gpr_offline_seconds, gpr_online_seconds, part_seconds, run_seconds
+from wfsobs.cost import frozen_flow_seconds, gpr_offline_seconds, gpr_online_seconds, part_seconds, run_seconds
 from wfsobs.presets import paper, ut4
 
 
@@ -24,6 +24,22 @@ def test_offline_gpr_near_what_was_measured(m: int, depth: int, measured: float)
 @pytest.mark.parametrize(("changes", "measured"), [({}, 0.410), ({"run.duration": 60}, 2.647)])
 def test_whole_runs_of_the_benchmarks_page(changes: dict[str, float], measured: float) -> None:
     assert 0.7 < run_seconds(paper().replace(changes)) / measured < 1.3
+
+
+@pytest.mark.parametrize(("order", "layers", "duration", "sensors", "measured"), [
+    (1, 1, 10.0, {}, 0.23), (1, 1, 60.0, {}, 0.71), (6, 1, 10.0, {}, 0.59), (5, 10, 10.0, {}, 11.2),
+    (1, 1, 60.0, {"sensors.kind": "zernike"}, 0.090), (5, 10, 10.0, {"sensors.kind": "zernike"}, 1.41),
+])
+def test_frozen_flow_near_what_was_measured(order: int, layers: int, duration: float, sensors: dict, measured: float) -> None:
+    s = paper().replace({
+        "turbulence.source": "frozen-flow", "telescope.radial_order": order, "run.duration": duration, **sensors,
+        "turbulence.layers": [{"wind_factor": 0.4 + 0.2 * i if layers > 1 else 1.0} for i in range(layers)],
+        "sensors.lgs_count": 4 if layers > 1 else 2, "sensors.lgs_radius": 64.0 if layers > 1 else 0.0})
+    assert 0.5 < frozen_flow_seconds(s, s.n_steps) / measured < 2.0
+
+
+def test_other_turbulence_costs_no_waves() -> None:
+    assert frozen_flow_seconds(paper(), 10_000) == 0.0
 
 
 def test_the_presets_are_a_moment() -> None:
