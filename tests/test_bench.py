@@ -23,7 +23,7 @@ TINY = Sizes(
         "gpr_offline.depth": 20,
     },
     duration=0.4, filter_duration=1.0, repeats=1, textbook_steps=6, library_steps=2, exact_steps=3,
-    more_online=((40, 5),), more_steps=50, longest_duration=0.3)
+    more_online=((40, 5),), more_steps=50, order=1, layers=2, longest_duration=0.3)
 
 KEYS = {
     "task", "size", "variant", "steps", "median_s", "per_step_us", "p999_us", "ready_us", "ratio_to_ours",
@@ -36,6 +36,7 @@ REQUIRED = {
     "offline-gpr-predict": {OURS, "gemm-stored-weights"},
     "kalman-record": {OURS, "numpy-loop"},
     "multirate-record": {OURS, "numpy-loop"},
+    "frozen-flow": {OURS, "ideal-sensors"},
     "whole-run": {OURS, "without-online-gpr"},
 }
 
@@ -57,14 +58,15 @@ def test_rows_are_complete(rows):
         assert r["median_s"] > 0 and r["ratio_to_ours"] > 0
         assert (r["per_step_us"] is None) == (r["steps"] is None) == (r["task"] == "offline-gpr-train")
         assert (r["ready_us"] is None) == (r["task"] != "online-gpr-stream")
-        assert (r["max_error_over_std"] is None) == (r["task"] == "whole-run")
+        assert (r["max_error_over_std"] is None) == (r["task"] in ("frozen-flow", "whole-run"))
         assert r["variant"] != OURS or r["ratio_to_ours"] == 1.0
-    assert [r["size"] for r in rows if r["peak_memory_mb"] is not None] == ["0.3 s, 2 modes"]
+    assert {r["size"] for r in rows if r["peak_memory_mb"] is not None} == {
+        "0.3 s, 2 modes", "0.4 s, 2 modes, 1 layer", "0.4 s, 2 modes, 2 layers"}
     assert {r["size"] for r in rows if r["task"] == "online-gpr-record"} == {"m=30 d=12", "m=40 d=5"}
 
 
 def test_every_version_computes_the_same(rows):
-    errors = {(r["task"], r["variant"]): r["max_error_over_std"] for r in rows if r["task"] != "whole-run"}
+    errors = {(r["task"], r["variant"]): r["max_error_over_std"] for r in rows if r["max_error_over_std"] is not None}
     for (task, variant), error in errors.items():
         ill_conditioned = variant.startswith("gemm")
         assert 0 <= error < (1e-5 if ill_conditioned else 1e-9), (task, variant)

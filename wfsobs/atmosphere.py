@@ -157,10 +157,3 @@ def _covariance(sensor: ZernikeProjection, of: tuple[Layer, ...], outer_scale: f
         total += parts[np.ix_(rows, rows)]
     total.flags.writeable = False
     return total.reshape(len(stars), sensor.n_outputs, len(stars), sensor.n_outputs)
-
-
-def mean_lgs_error_variance(scenario: Scenario, mode: int) -> float:
-    """Variance [um^2] of the mean over the LGS less the truth, noise aside, of frozen flow."""
-    covariance = star_covariance(scenario)[:, mode, :, mode]
-    weights = np.array([-1.0, *np.full(len(covariance) - 1, 1.0 / (len(covariance) - 1))])
-    return float(weights @ covariance @ weights)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from wfsobs import atmosphere
-from wfsobs.ar2 import Ar2, turbulence_corner
 from wfsobs.arrays import Array
 from wfsobs.disturbance import Disturbance
+from wfsobs.lgs import MEAN, lgs_weights, low_frequency_process
 from wfsobs.record import delayed, frame_mean
 from wfsobs.scenario import Scenario
 from wfsobs.sensors import white_noise
-from wfsobs.turbulence import turbulence_process
 from wfsobs.watch import QUIET, Watch
 
 
@@ -31,18 +29,21 @@ def measure(
 ) -> OpenLoop:
     """LGS at every step, NGS at every n-th, both of the wavefront up to the step before.
 
-    LGS: the mean over the guide stars of phi_dist[k-1] + error (paper, eq. 3), each guide star with noise and error of its
-    own; of frozen flow, each sees what is in its own beam. NGS at k = n, 2n, ...: the mean of phi_dist[k-1] ...
-    phi_dist[k-n], plus noise. With tip-tilt indetermination the LGS see no turbulence in tip and tilt.
+    LGS: the mean over the guide stars of phi_dist[k-1] + error (paper, eq. 3), or their combination of minimum variance, each
+    guide star with noise and error of its own; of frozen flow, each sees what is in its own beam. NGS at k = n, 2n, ...: the
+    mean of phi_dist[k-1] ... phi_dist[k-n], plus noise. With tip-tilt indetermination the LGS see no turbulence in tip and tilt.
     """
     lgs_rng, ngs_rng = rng.spawn(2)
     n_steps, n_modes = disturbance.total.shape
     errors = [_lgs_error(scenario, n_steps, n_modes, stream, watch) for stream in lgs_rng.spawn(scenario.sensors.lgs_count)]
     seen = [_without_blind(scenario, x) for x in disturbance.lgs_turbulence or [disturbance.turbulence]]
-    if len(seen) == 1:
-        lgs = delayed(seen[0] + disturbance.vibration, 1) + np.mean(errors, axis=0)
+    if scenario.sensors.lgs_combination == MEAN:
+        turbulence = seen[0] if len(seen) == 1 else np.mean(seen, axis=0)
+        lgs = delayed(turbulence + disturbance.vibration, 1) + np.mean(errors, axis=0)
     else:
-        lgs = delayed(np.mean(seen, axis=0) + disturbance.vibration, 1) + np.mean(errors, axis=0)
+        every = seen * len(errors) if len(seen) == 1 else seen
+        stars = [delayed(x + disturbance.vibration, 1) + error for x, error in zip(every, errors, strict=True)]
+        lgs = np.tensordot(np.stack(stars, axis=1), lgs_weights(scenario), ([1, 2], [1, 2]))
 
     n = scenario.sensors.exposure_ratio
     noise = white_noise(scenario, "ngs", n_steps, ngs_rng)
@@ -73,29 +74,3 @@ def _lgs_error(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.Ge
         if process.rms > 0:
             out[:, mode] += process.sample(n_steps, stream)
     return out
-
-
-def low_frequency_process(scenario: Scenario, mode: int) -> Ar2:
-    """The AR(2) that stands for cone effect and uplink turbulence of one LGS in one mode; none with frozen flow.
-
-    It has the corner of the turbulence, since the part of the beam that an LGS misses moves with the same wind. A higher
-    order has the rms of tip in the ratio of their cone effects.
-    """
-    t = scenario.turbulence
-    corner = turbulence_corner(t.wind_speed, scenario.telescope.diameter, scenario.modes[mode].radial_order)
-    rms = 0.0
-    if t.source != "frozen-flow":
-        rms = scenario.sensors.lgs_low_frequency_rms * atmosphere.relative_cone_error(scenario, mode)
-    return Ar2(corner, t.damping, rms, scenario.dt)
-
-
-def lgs_error_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
-    """The slow error of the mean over the LGS in one mode, sampled every `dt` [s]; of frozen flow the AR(2) process of its
-    variance with the corner of the turbulence."""
-    if scenario.turbulence.source == "frozen-flow":
-        if scenario.sensors.tip_tilt_indetermination and scenario.modes[mode].radial_order == 1:
-            return turbulence_process(scenario, mode, dt)
-        rms = float(np.sqrt(atmosphere.mean_lgs_error_variance(scenario, mode)))
-        return replace(turbulence_process(scenario, mode, dt), rms=rms)
-    one = low_frequency_process(scenario, mode)
-    return replace(one, rms=one.rms / np.sqrt(scenario.sensors.lgs_count), dt=dt)

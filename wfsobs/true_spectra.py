@@ -16,8 +16,8 @@ import numpy as np
 from wfsobs.ar2 import Ar2
 from wfsobs.arrays import Array
 from wfsobs.disturbance import peak_rms, vibration_power
+from wfsobs.lgs import low_frequency_process
 from wfsobs.scenario import Scenario
-from wfsobs.sensing import low_frequency_process
 from wfsobs.sensors import noise_rms
 from wfsobs.turbulence import turbulence_process
 

@@ -23,6 +23,7 @@ class Sizes:
     exact_steps       : steps at which GPR results are compared with a direct solve
     more_online       : further (m, d) of the online GPR
     more_steps        : predicted steps of each of these
+    order, layers     : radial order and number of layers of the larger frozen-flow task
     longest_duration  : of a whole run of which the memory is measured too [s], or None
     """
 
@@ -35,6 +36,8 @@ class Sizes:
     exact_steps: int = 8
     more_online: tuple[tuple[int, int], ...] = ()
     more_steps: int = 2048
+    order: int = 5
+    layers: int = 10
     longest_duration: float | None = None
 
     def scenario(self, duration: float, changes: Mapping[str, Any] | None = None) -> Scenario:

@@ -18,8 +18,8 @@ class Telescope(Group):
                          doc="Zernike modes up to this radial order, piston left out: 1 is tip and tilt (paper), 2 to 6 are 5, "
                              "9, 14, 20 and 27 modes.")
     zenith_angle = Real(0.0, bounds=(0.0, 70.0), softbounds=(0.0, 60.0), step=1.0, label="Zenith angle",
-                        doc="Angle of the line of sight to the zenith [deg]; frozen flow: the airmass 1 / cos strengthens r0 and "
-                            "lengthens the way to layers and guide stars.")
+                        doc="Angle of the line of sight to the zenith [deg]; of frozen flow, the airmass 1 / cos strengthens the "
+                            "turbulence and lengthens the way to layers and guide stars.")
 
 
 class PsdTable(Group):

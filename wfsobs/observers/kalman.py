@@ -16,6 +16,7 @@ from wfsobs.ar2 import Ar2
 from wfsobs.arrays import Array
 from wfsobs.atmosphere import relative_rms
 from wfsobs.disturbance import vibration_variance
+from wfsobs.lgs import lgs_noise_rms
 from wfsobs.lifted import PeriodicFilter
 from wfsobs.observers.base import TARGETS
 from wfsobs.record import Record
@@ -48,12 +49,11 @@ def kalman_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
 
 
 def measurement_noise(scenario: Scenario, mode: int = 0) -> tuple[float, float]:
-    """Standard deviation of the modelled noise [um] of the mean LGS measurement and of an NGS frame in one mode."""
+    """Standard deviation of the modelled noise [um] of the LGS together and of an NGS frame in one mode."""
     k = scenario.kalman
     if k.measurement_noise == "manual":
         return k.lgs_noise, k.ngs_noise
-    lgs, ngs = noise_rms(scenario, "lgs")[mode], noise_rms(scenario, "ngs")[mode]
-    return max(lgs / np.sqrt(scenario.sensors.lgs_count), MIN_NOISE), max(ngs, MIN_NOISE)
+    return max(lgs_noise_rms(scenario, mode), MIN_NOISE), max(noise_rms(scenario, "ngs")[mode], MIN_NOISE)
 
 
 def filter_step(A: Array, C: Array, L: Array, outputs: Array) -> tuple[Array, Array, Array, Array]:

@@ -15,6 +15,7 @@ from scipy.linalg import block_diag
 
 from wfsobs.ar2 import Ar2
 from wfsobs.arrays import Array
+from wfsobs.lgs import lgs_error_process
 from wfsobs.lifted import PeriodicFilter
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman import by_target, filter_step, kalman_model
@@ -22,7 +23,6 @@ from wfsobs.observers.multirate import MultiRateFilter, multirate_noise, run_mod
 from wfsobs.record import Record
 from wfsobs.riccati import SteadyState, Step, periodic_steady_state
 from wfsobs.scenario import Scenario
-from wfsobs.sensing import lgs_error_process
 from wfsobs.statespace import DisturbanceModel, process_model
 from wfsobs.watch import Watch
 
