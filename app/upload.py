@@ -71,7 +71,7 @@ class Upload:
         self.picker = Picker(sizing_mode="stretch_width", margin=0)
         self.picker.on_message = self.handle
         self.unit = self._select("Unit", [SILENT, *UNITS])
-        self.sign = self._select("Commands", {SILENT: None, "add to what is seen (+1)": 1, "are taken off (-1)": -1})
+        self.sign = self._select("Commands", {SILENT: 0, "add to what is seen (+1)": 1, "are taken off (-1)": -1})
         self.delay, self.rate = self._text("Delay of commands [steps]"), self._text("Rate [Hz]")
         self.use = pmui.Button(label="Use this record", color="primary", size="small", margin=4)
         self.drop = pmui.Button(label="Discard", variant="outlined", size="small", margin=4)
@@ -105,8 +105,16 @@ class Upload:
         return lambda scenario: self.loaded is None and held(scenario)
 
     def attach(self, store: Store) -> None:
-        """The store whose runs are to be on the record."""
+        """The store whose runs are to be on the record, and whose aperture turns angles into wavefronts."""
         self.store = store
+        self._diameter = store.scenario.telescope.diameter
+        store.param.watch(self._follow, "scenario")
+
+    def _follow(self, _event: object) -> None:
+        diameter = self.store.scenario.telescope.diameter
+        if diameter != self._diameter:
+            self._diameter = diameter
+            self.look()
 
     # ------------------------------------------------------------------ the file
 
@@ -158,7 +166,7 @@ class Upload:
                 raise RecordError(f"{field.label}: takes a number from {least:g}, not {text[:40]!r}")
             return value
         unit = None if self.unit.value == SILENT else self.unit.value
-        return Stated(unit, self.sign.value, number(self.delay, int, 1), number(self.rate, float, 1e-3))
+        return Stated(unit, self.sign.value or None, number(self.delay, int, 1), number(self.rate, float, 1e-3))
 
     def look(self) -> None:
         """Read the file, beside the page, as what the fields say."""

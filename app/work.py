@@ -143,7 +143,8 @@ class _Work:
             if shown is not None:
                 self.report(self.fraction, shown)
                 self._let_draw()
-                self.bounds = bound_scores(self.scenario, record)
+                if self.loaded is None:
+                    self.bounds = bound_scores(self.scenario, record)
         return self._so_far(record)
 
     def _let_draw(self) -> None:

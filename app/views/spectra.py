@@ -118,7 +118,8 @@ class _Spectrum:
             self.figure.y_range.update(start=max(low / room, high * 10.0**-decades), end=high * room)
 
     def _draw_marks(self, shown: Shown) -> None:
-        drawn, kalman = marked_peaks(shown.scenario), shown.scenario.kalman
+        simulated = shown.result.record.vibration is not None  # peaks of the settings are not those of a record
+        drawn, kalman = marked_peaks(shown.scenario) if simulated else [], shown.scenario.kalman
         send(self.peaks, {
             "x": [p.frequency for p in drawn],
             "text": [f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}" for p in drawn],

@@ -45,6 +45,8 @@ class Strip:
     def _observer(self, name: str, shown: Shown | None) -> dict[str, Any]:
         score = find(shown, name, self.target, self.display.mode) if shown else None
         if shown is None or score is None:
+            if shown is not None and shown.result.estimate(name, self.target) is not None:
+                return self._card(name, None, "no truth to compare")
             waiting = self.run.state == RUNNING
             return self._card(name, None, "computing …" if waiting else "no result")
         relative = f"{score.normalised_rms:.2f} × truth" if score.normalised_rms is not None else ""

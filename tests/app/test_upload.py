@@ -64,6 +64,9 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     assert np.isfinite(line["kf-lgs"]).all() and np.isnan(line["truth"]).all()
     spectrum = dashboard.spectra.spectra["vibration"].sources["kf-lgs"].data
     assert len(spectrum["y"]) and np.isfinite(spectrum["y"]).all()
+    assert dashboard.spectra.spectra["vibration"].peaks.data["x"] == []  # of the settings, not of the record
+    notes = {card["name"]: card["note"] for card in dashboard.strips["vibration"].items()}
+    assert notes["kf-lgs"] == "no truth to compare" and notes["butterworth-ol"] in ("no result", "no truth to compare")
     dashboard.display.show = "error"  # there is none, and nothing breaks
 
     dashboard.upload.handle({"action": "simulate"})
@@ -94,6 +97,12 @@ def test_what_is_said_of_it(dashboard: Dashboard, loop: Any, short: Scenario) ->
     found = dashboard.upload._preview
     assert found.record.origin == "unit nm, command sign -1" and found.record.delay == 3
     assert found.rms["y_lgs"][0] < 1e-2 * plain[0]
+    dashboard.upload.unit.value = "mas"
+    loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
+    on_eight = dashboard.upload._preview.rms["y_lgs"][0]
+    dashboard.store.change("telescope.diameter", 10.0)
+    loop.until(lambda: "aperture 10 m" in dashboard.upload.text.object)
+    assert dashboard.upload._preview.rms["y_lgs"][0] == pytest.approx(1.25 * on_eight)
     dashboard.upload.delay.value = "soon"
     assert dashboard.upload.picker.said == "Delay of commands [steps]: takes a number from 1, not 'soon'"
     assert dashboard.upload.use.disabled
