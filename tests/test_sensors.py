@@ -11,6 +11,8 @@ from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
 from wfsobs.sensors import aliasing_rms, noise_covariance, noise_rms, sensor, shack_hartmann
 from wfsobs.settings import SettingError
+from wfsobs.turbulence import SOURCES
+from wfsobs.watch import QUIET
 from wfsobs.zernike import ZernikeProjection
 
 SHORT = {"run.duration": 0.4, "run.warm_up": 0.1, "gpr_offline.training_size": 2, "gpr_offline.depth": 2}
@@ -41,16 +43,15 @@ def test_the_truth_is_nearly_the_same_whatever_looks_at_it() -> None:
 
 
 def test_coarse_ngs_measures_the_mean_gradient() -> None:
-    """NGS less truth on the axis, open loop, no noise: 166 nm of rms to 50 % in five seeds of two axes, each but one draw."""
-    base = {"sensors.ngs_noise": 0.0, "vibration.source": "none", "loop.closed": False, "run.duration": 0.11,
-            "sensors.lenslets.ngs_subapertures": 2, "sensors.lenslets.lgs_subapertures": 2}
+    """NGS of 2 x 2 less truth on the axis: 166 nm of rms to 40 % in eight seeds of two axes, each but one draw."""
+    s = scenario({"sensors.lenslets.ngs_subapertures": 2, "sensors.lenslets.lgs_subapertures": 2})
     off = []
-    for seed in range(5):
-        record = simulate(scenario({**base, "run.seed": seed}))
-        assert record.y_ngs is not None and record.turbulence is not None
-        off.append(record.y_ngs[50] - record.turbulence[45:50].mean(axis=0))
-    assert 1e3 * aliasing_rms(scenario(base), "ngs") == pytest.approx(165.7, abs=1.0)
-    assert 1e3 * np.sqrt(np.mean(np.square(off))) == pytest.approx(165.7, rel=0.5)
+    for seed in range(8):
+        made = SOURCES["frozen-flow"](s, 10, np.random.default_rng(seed), QUIET)
+        assert made.ngs is not None
+        off.append((made.ngs - made.on_axis)[5])
+    assert 1e3 * aliasing_rms(s, "ngs") == pytest.approx(165.7, abs=1.0)
+    assert 1e3 * np.sqrt(np.mean(np.square(off))) == pytest.approx(165.7, rel=0.4)
 
 
 def test_aliasing_needs_layers_and_lenslets() -> None:
@@ -103,7 +104,7 @@ def test_settings_that_do_not_go_together(changes: dict, told: str) -> None:
 
 @pytest.mark.parametrize("obscuration", [0.0, 0.3, 0.5])
 def test_every_number_of_subapertures_has_a_fit(obscuration: float) -> None:
-    for across in (1, 2, 3, 4, 5, 6, 7, 8, 9, 13, 100):
+    for across in (1, 2, 3, 4, 5, 6, 7, 8, 9, 13, 50):
         changes = {"sensors.lenslets.ngs_subapertures": across, "sensors.lenslets.obscuration": obscuration}
         found = shack_hartmann(scenario(changes), "ngs")
         assert 1 <= found.order <= min(across, 8)
