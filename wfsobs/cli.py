@@ -193,7 +193,7 @@ def presets(name: str | None) -> None:
         click.echo(configfile.to_toml(configfile.preset(name)), nl=False)
         return
     for key, make in PRESETS.items():
-        click.echo(f"{key:10} {(make.__doc__ or '').splitlines()[0]}")
+        click.echo(f"{key:{max(map(len, PRESETS))}} {(make.__doc__ or '').splitlines()[0]}")
 
 
 @main.command()

@@ -8,7 +8,9 @@ three times as long: what counts here is whether it will be a moment or a wait.
 
 from __future__ import annotations
 
+from wfsobs.frozen_flow import FIELD
 from wfsobs.loop import TRAINING_MARGIN
+from wfsobs.observers.modes import AT_ONCE
 from wfsobs.scenario import Scenario
 
 CORES = 2
@@ -32,18 +34,21 @@ def part_seconds(scenario: Scenario) -> dict[str, float]:
     return {
         "gpr-online": turns * gpr_online_seconds(n, online.training_size, online.depth),
         "gpr-offline": turns * gpr_offline_seconds(n, offline.training_size, offline.depth),
-        "rest": 5e-6 * (n + training) + frozen_flow_seconds(scenario, n + training),
+        "rest": 2.5e-6 * len(scenario.modes) * (n + training) + frozen_flow_seconds(scenario, n + training),
     }
 
 
 def frozen_flow_seconds(scenario: Scenario, n_steps: int) -> float:
     """Turbulence as frozen flow and the sensors' view of it [s], nothing where it is made another way: for every aperture's
-    width of a layer and every beam, 3 ms and 0.3 ms for each mode, and a tenth of that through ideal sensors."""
+    width of a layer and every beam, 3 ms and 0.3 ms for each mode, and a tenth of that through ideal sensors. Where stars may be
+    far apart against the aperture, waves are closer."""
     t, s = scenario.turbulence, scenario.sensors
     if t.source != "frozen-flow":
         return 0.0
-    duration = n_steps / s.lgs_rate
-    widths = sum(1.0 + duration * t.wind_speed * layer.wind_factor / scenario.telescope.diameter for layer in t.layers)
+    duration, diameter = n_steps / s.lgs_rate, scenario.telescope.diameter
+    widths = sum(
+        (1.0 + duration * t.wind_speed * layer.wind_factor / diameter) * 0.5 * (1.0 + FIELD * layer.height / diameter)
+        for layer in t.layers)
     beams = 2 + (s.lgs_count if s.lgs_radius > 0 else 1)
     finest = max(40, s.lenslets.lgs_subapertures, s.lenslets.ngs_subapertures)
     each = 0.1 if s.kind == "zernike" else (finest / 40) ** 2
@@ -66,7 +71,7 @@ def run_bytes(scenario: Scenario) -> float:
     """About how much memory a run takes at its height [bytes], both modes at once.
 
     Measured from 10 s to 300 s of record and m from 20 to 2048, where it is within a third: what is kept of every
-    step, and the windows of the larger GPR.
+    step, and the windows of the larger GPR, or the waves of frozen flow that are at work.
 
     >>> from wfsobs.presets import paper
     >>> round(run_bytes(paper()) / 1e6), round(run_bytes(paper().replace({"run.duration": 300})) / 1e6)
@@ -74,4 +79,7 @@ def run_bytes(scenario: Scenario) -> float:
     """
     n_modes = len(scenario.modes)
     windows = max(100e3 * scenario.gpr_online.training_size, 35e3 * scenario.gpr_offline.training_size)
-    return n_modes * (300.0 * scenario.n_steps + windows)
+    waves = 0.0
+    if scenario.turbulence.source == "frozen-flow":
+        waves = 20e6 * (n_modes if scenario.sensors.kind == "shack-hartmann" else 1)
+    return n_modes * 300.0 * scenario.n_steps + max(min(n_modes, AT_ONCE) * windows, waves)

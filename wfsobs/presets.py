@@ -32,6 +32,20 @@ MAVIS_PEAKS = (
     (47.44, 0.004, 0.0079, 0.0027),
 )
 
+# height above the telescope [m], share, wind [m/s], blowing to [deg] (astro-tiptop/TIPTOP, tiptop/perfTest/MUSE_LTAO.ini, MIT)
+MUSE_LAYERS = (
+    (30.0, 0.59, 6.6, 0.0),
+    (140.0, 0.02, 5.9, 0.0),
+    (281.0, 0.04, 5.1, 0.0),
+    (562.0, 0.06, 4.5, 0.0),
+    (1125.0, 0.01, 5.1, 90.0),
+    (2250.0, 0.05, 8.3, -90.0),
+    (4500.0, 0.09, 16.3, -90.0),
+    (7750.0, 0.04, 30.2, 90.0),
+    (11000.0, 0.05, 34.3, 0.0),
+    (14000.0, 0.05, 17.5, 0.0),
+)
+
 
 def paper() -> Scenario:
     """The paper's system, with every number that it publishes.
@@ -82,4 +96,47 @@ def ut4_floor() -> Scenario:
     return s
 
 
-PRESETS: dict[str, Callable[[], Scenario]] = {"paper": paper, "ut4": ut4, "ut4-floor": ut4_floor}
+def galacsi_nfm() -> Scenario:
+    """MUSE's narrow field on UT4: four LGS at 7.5", ten layers of wind.
+
+    Stars, rates and atmosphere of astro-tiptop/TIPTOP, tiptop/perfTest/MUSE_LTAO.ini (MIT): seeing 0.67", L0 = 27.44 m, 24 deg
+    from the zenith, sodium at 90 km, 40 x 40 subapertures at 1 kHz on the LGS, an NGS at 200 Hz. Its 2 x 2 subapertures look
+    through what the LGS have corrected; here nothing is corrected, they would see coma for tip, and the NGS has 40 x 40. A
+    layer's wind is a multiple of `turbulence.wind_speed` = 10 m/s. Noise is the default, vibration that of `ut4`.
+    """
+    s = ut4()
+    s.update({
+        "telescope": {"zenith_angle": 24.0},
+        "turbulence": {"r0": 0.151, "outer_scale": 27.44, "wind_speed": 10.0, "layers": [
+            {"height": h, "fraction": share, "wind_factor": wind / 10.0, "wind_direction": to}
+            for h, share, wind, to in MUSE_LAYERS
+        ]},
+        "sensors": {"lgs_count": 4, "lgs_radius": 7.5},
+    })
+    return s
+
+
+def galacsi_wfm() -> Scenario:
+    """MUSE's wide field on UT4: as galacsi-nfm, the four LGS at 64".
+
+    The radius is that of Stroebele et al., "GALACSI system design and analysis", Proc. SPIE 8447 (2012).
+    """
+    s = galacsi_nfm()
+    s.update({"sensors": {"lgs_radius": 64.0}})
+    return s
+
+
+def higher_orders() -> Scenario:
+    """Frozen flow as in ut4, with the 14 modes up to radial order 4.
+
+    The paper expects more of its multi-rate filter on orders above tip and tilt, where the LGS is no handicap.
+    """
+    s = ut4()
+    s.update({"telescope": {"radial_order": 4}})
+    return s
+
+
+PRESETS: dict[str, Callable[[], Scenario]] = {
+    "paper": paper, "ut4": ut4, "ut4-floor": ut4_floor, "galacsi-nfm": galacsi_nfm, "galacsi-wfm": galacsi_wfm,
+    "higher-orders": higher_orders,
+}

@@ -94,7 +94,7 @@ def changes(scenario: Group, base: Group, prefix: str = "") -> list[tuple[str, s
         if isinstance(mine, Group):
             out += changes(mine, other, f"{prefix}{name}.")
         elif isinstance(mine, list) and mine != other and mine and isinstance(mine[0], Group):
-            out.append((f"{prefix}{name}", f"{len(mine)} peaks"))
+            out.append((f"{prefix}{name}", f"{len(mine)} {name}"))
         elif mine != other:
             out.append((f"{prefix}{name}", shown(mine)))
     return out
