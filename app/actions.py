@@ -133,7 +133,7 @@ class Actions:
 
         def work() -> None:
             try:
-                content = self.maker.make(shown.result, preset)
+                content = self.maker.make(shown, preset)
             except ReportError as error:
                 run.post(partial(self._reported, f"Report: {error}"))
             except Exception:

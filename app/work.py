@@ -58,12 +58,14 @@ class Shown:
 
     partial : values so far, NaN where there are none yet, of observers still at work
     spectra : of the truth and of every finished estimate
+    recorded : whether on a record that was loaded, not simulated
     """
 
     result: Result
     partial: Mapping[Key, Array] = field(default_factory=dict)
     spectra: Mapping[Key, Spectrum] = field(default_factory=dict)
     seconds: float = 0.0
+    recorded: bool = False
 
     @property
     def scenario(self) -> Scenario:
@@ -161,7 +163,7 @@ class _Work:
     def _so_far(self, record: Record) -> Shown:
         result = collect(self.scenario, record, self.estimates, self.failures, bounds=self.bounds)
         partial = {key: values.copy() for key, values in self.growing.items()}
-        return Shown(result, partial, dict(self.spectra), perf_counter() - self.started)
+        return Shown(result, partial, dict(self.spectra), perf_counter() - self.started, self.loaded is not None)
 
     def _progress(self, fraction: float) -> None:
         """Called from any thread of the observers."""

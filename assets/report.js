@@ -4,7 +4,8 @@
 const read = (id) => JSON.parse(document.getElementById(id).textContent)
 const data = read("data")
 const states = read("rows")
-const shown = {state: data.start, mode: data.modes[0], unit: "nm", show: "signal", spectrum: "psd", zoom: "whole"}
+const shown = {state: data.start, mode: data.modes[0], unit: "nm", show: "signal", spectrum: "psd", zoom: "whole",
+               over: Object.keys(data.sweeps)[0]}
 const hidden = Object.fromEntries(Object.keys(data.names).map((target) => [target, []]))
 const night = matchMedia("screen and (prefers-color-scheme: dark)")
 let dark = night.matches
@@ -135,6 +136,50 @@ function drawSpectrum(figure, target, state) {
   }
 }
 
+// The places of the sliders of a state, and the state of some places; the last slider runs fastest.
+function places(index) {
+  return data.variations.map(({length}, i) => {
+    const below = data.variations.slice(i + 1).reduce((n, v) => n * v.length, 1)
+    return Math.floor(index / below) % length
+  })
+}
+
+function stateAt(of) {
+  return of.reduce((index, place, i) => index * data.variations[i].length + place, 0)
+}
+
+// RMS errors over the setting chosen, the others as they stand.
+function drawSweep(figure, target) {
+  const [label, values] = data.sweeps[shown.over]
+  const now = places(shown.state)
+  const order = values.map((_, i) => i).sort((a, b) => values[a] - values[b])
+  const runs = order.map((place) => stateAt(now.with(Number(shown.over), place)))
+  const error = (index, name) => {
+    const row = rowOf(index, target, name)
+    return row ? (name === "truth" ? row.truth_rms_um : row.rms_um) * data.states[index].scale[shown.unit] : NaN
+  }
+  const columns = Object.fromEntries(data.names[target].map((name) => [name, runs.map((index) => error(index, name))]))
+  const x = order.map((place) => values[place])
+  fill(figure, x, columns)
+  const top = (names) => Math.max(...names.filter((name) => !hidden[target].includes(name))
+    .flatMap((name) => columns[name]).filter(Number.isFinite), 0)
+  const errors = top(data.names[target].slice(1))
+  const truth = top(["truth"])
+  const high = errors > 0 && truth > 3 * errors ? errors : Math.max(errors, truth)  // the truth where it leaves room
+  if (high > 0) figure.y_range.setv({start: 0, end: 1.05 * high, reset_start: 0, reset_end: 1.05 * high})
+  const room = 0.03 * (x[x.length - 1] - x[0])
+  const ends = {start: x[0] - room, end: x[x.length - 1] + room}
+  figure.x_range.setv({...ends, reset_start: ends.start, reset_end: ends.end})
+  figure.renderers.find((it) => it.name === "now").data_source.data = {x: [values[now[shown.over]]]}
+  figure.below[0].axis_label = label
+  figure.left[0].axis_label = `rms error, ${shown.mode} [${data.units[shown.unit]}]`
+}
+
+function rowOf(index, target, name) {
+  const rows = states[index].rows.filter((r) => r.target === target && r.mode === shown.mode)
+  return name === "truth" ? rows[0] : rows.find((r) => r.observer === name)
+}
+
 function paint(figure) {
   const text = dark ? "#e8e8e8" : "#1c1c1c"
   const line = dark ? "#777777" : "#999999"
@@ -145,7 +190,10 @@ function paint(figure) {
       minor_tick_line_color: line, axis_label_text_font_style: "normal"})
   }
   for (const it of figure.center.filter((r) => r.type === "Grid")) it.setv({grid_line_color: line, grid_line_alpha: 0.25})
-  for (const it of lines(figure)) it.glyph.line_color = {value: data.looks[it.name][dark ? "dark" : "light"]}
+  for (const it of lines(figure)) {
+    const colour = {value: data.looks[it.name][dark ? "dark" : "light"]}
+    it.glyph.setv(it.glyph.type === "Scatter" ? {line_color: colour, fill_color: colour} : {line_color: colour})
+  }
 }
 
 function hide(figure, target) {
@@ -179,8 +227,7 @@ function cards(target) {
 
 function card(target, name) {
   const look = data.looks[name]
-  const rows = states[shown.state].rows.filter((r) => r.target === target && r.mode === shown.mode)
-  const row = name === "truth" ? rows[0] : rows.find((r) => r.observer === name)
+  const row = rowOf(shown.state, target, name)
   const value = row && (name === "truth" ? row.truth_rms_um : row.rms_um)
   const relative = row && row.normalised_rms !== null ? `${row.normalised_rms.toFixed(2)} × truth` : ""
   return {
@@ -212,6 +259,7 @@ const strips = {}
 function toggled(target) {
   hide(figures[`trace-${target}`], target)
   hide(figures[`spectrum-${target}`], target)
+  if (shown.over) hide(figures[`sweep-${target}`], target)
   drawFigures(target)
 }
 
@@ -219,6 +267,7 @@ function drawFigures(target) {
   const state = data.states[shown.state]
   drawTrace(figures[`trace-${target}`], target, state)
   drawSpectrum(figures[`spectrum-${target}`], target, state)
+  if (shown.over) drawSweep(figures[`sweep-${target}`], target)
 }
 
 function draw() {
@@ -247,21 +296,16 @@ function repaint() {
 
 function sliders() {
   const all = data.variations.map((_, i) => document.getElementById(`vary-${i}`))
-  const place = () => all.reduce((at, slider, i) => at * data.variations[i].length + Number(slider.value), 0)
   const say = () => all.forEach((slider, i) => {
     const text = data.variations[i][Number(slider.value)]
     slider.setAttribute("aria-valuetext", text)
     slider.nextElementSibling.textContent = text
   })
-  let left = data.start
-  for (let i = all.length - 1; i >= 0; i--) {
-    all[i].value = left % data.variations[i].length
-    left = Math.floor(left / data.variations[i].length)
-  }
+  places(data.start).forEach((place, i) => { all[i].value = place })
   for (const slider of all) {
     slider.oninput = () => {
       const before = data.states[shown.state]
-      shown.state = place()
+      shown.state = stateAt(all.map((it) => Number(it.value)))
       const after = data.states[shown.state]
       say()
       draw()

@@ -110,13 +110,15 @@ class State:
 class Report:
     """All of a report: states are the product of the variations, the last one running fastest.
 
-    preset : what the settings are compared with; base : the settings that were varied
+    preset : what the settings are compared with; base : the settings that were varied; recorded : whether on a record
+    that was loaded, not simulated
     """
 
     preset: str
     base: Scenario
     variations: tuple[Variation, ...]
     states: tuple[State, ...]
+    recorded: bool = False
 
     @property
     def start(self) -> int:

@@ -5,24 +5,31 @@ from __future__ import annotations
 from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, DataRenderer, HoverTool, Range1d, Span, VSpan
 from bokeh.plotting import figure
 
-from wfsobs.app.style import observers_of
+from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, add_line, new_figure
 from wfsobs.app.work import TRUTH
 from wfsobs.observers.base import TARGETS, VIBRATION
 
-TRACE, SPECTRUM = "trace", "spectrum"
+TRACE, SPECTRUM, SWEEP = "trace", "spectrum", "sweep"
 
 WARM_UP, WINDOW = "warm-up", "window"
+NOW = "now"
 SHADES = {WARM_UP: "#808080", WINDOW: "#2B8AB3"}
 """Stretches of a trace that are shaded."""
 
 
-def all_figures() -> dict[str, figure]:
-    """"trace-turbulence" and the like -> figure; the traces share their time axis, the spectra their frequencies."""
+def all_figures(sweeps: bool) -> dict[str, figure]:
+    """"trace-turbulence" and the like -> figure; the traces share their time axis, the spectra their frequencies.
+
+    sweeps : with those of errors over a setting that varies
+    """
     times, frequencies = Range1d(start=0.0, end=10.0), Range1d(start=0.5, end=500.0)
     crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
     made = {f"{TRACE}-{target}": _trace(target, times, crosshair) for target in TARGETS}
     made |= {f"{SPECTRUM}-{target}": _spectrum(target, frequencies) for target in TARGETS}
+    if sweeps:
+        values = Range1d(start=0.0, end=1.0)
+        made |= {f"{SWEEP}-{target}": _sweep(target, values) for target in TARGETS}
     for name, fig in made.items():  # see-through from the start: a white ground leaves its edge behind in dark mode
         fig.update(name=name, background_fill_alpha=0.0, border_fill_alpha=0.0)
     return made
@@ -57,6 +64,17 @@ def _spectrum(target: str, frequencies: Range1d) -> figure:
     source = ColumnDataSource({"x": [], **{name: [] for name in _names(target)}})
     for name in _names(target):
         add_line(fig, name, source, name)
+    return fig
+
+
+def _sweep(target: str, values: Range1d) -> figure:
+    """RMS errors over the values of a setting, a dot for every run; the present one marked."""
+    fig = new_figure(x_range=values, y_range=Range1d(start=0.0, end=1.0))
+    fig.add_glyph(ColumnDataSource({"x": []}), VSpan(x="x", line_color=PEAKS, line_alpha=0.6, line_width=1.5), name=NOW)
+    source = ColumnDataSource({"x": [], **{name: [] for name in _names(target)}})
+    for name in _names(target):
+        add_line(fig, name, source, name)
+        fig.scatter("x", name, source=source, size=5, color=look(name).light, name=name)
     return fig
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import wfsobs
 from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.packing import packed
-from wfsobs.pipeline import Result
+from wfsobs.app.work import Shown
 
 log = logging.getLogger(__name__)
 
@@ -36,9 +36,9 @@ class Maker:
         self._process: subprocess.Popen[bytes] | None = None
         self._closed = False
 
-    def make(self, result: Result, preset: str) -> bytes:
-        """The file of a result; blocks, so that it belongs into a thread. Raises ReportError."""
-        content = packed(Report(preset, result.scenario, (), (state_of(result),)))
+    def make(self, shown: Shown, preset: str) -> bytes:
+        """The file of the results shown; blocks, so that it belongs into a thread. Raises ReportError."""
+        content = packed(Report(preset, shown.scenario, (), (state_of(shown.result),), shown.recorded))
         if not _room.acquire(timeout=LIMIT):
             raise ReportError("the server is busy with other reports, try again")
         try:

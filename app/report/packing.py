@@ -15,7 +15,7 @@ from wfsobs.variations import Variation
 def packed(report: Report) -> bytes:
     """A report as a file of plain arrays and text."""
     words = {
-        "preset": report.preset, "base": to_toml(report.base),
+        "preset": report.preset, "base": to_toml(report.base), "recorded": report.recorded,
         "variations": [[v.path, v.values] for v in report.variations],
         "states": [
             {"toml": to_toml(s.scenario), "rows": s.rows, "reasons": s.reasons, "grid": [s.grid.n, s.grid.dt, s.grid.bins]}
@@ -40,4 +40,4 @@ def unpacked(content: bytes) -> Report:
         State(from_toml(s["toml"]), s["rows"], tuple(s["reasons"]), Grid(*s["grid"]), of)
         for s, of in zip(words["states"], lines, strict=True))
     variations = tuple(Variation(path, tuple(values)) for path, values in words["variations"])
-    return Report(words["preset"], from_toml(words["base"]), variations, states)
+    return Report(words["preset"], from_toml(words["base"]), variations, states, words["recorded"])

@@ -19,7 +19,7 @@ from bokeh.resources import Resources
 from wfsobs import __version__
 from wfsobs.app.display import CUMULATIVE, ERROR, NO_ANGLE, PSD, SIGNAL, UNITS, per_micrometre
 from wfsobs.app.report.data import Pool, Report, State, coded, window_of
-from wfsobs.app.report.figures import SHADES, SPECTRUM, TRACE, WARM_UP, WINDOW, all_figures
+from wfsobs.app.report.figures import SHADES, SPECTRUM, SWEEP, TRACE, WARM_UP, WINDOW, all_figures
 from wfsobs.app.report.table import state_table
 from wfsobs.app.report.text import (
     meaning_section,
@@ -30,7 +30,7 @@ from wfsobs.app.report.text import (
     summary,
     value_of,
 )
-from wfsobs.app.style import LOOKS, PRIMARY, asset, look, observers_of
+from wfsobs.app.style import PRIMARY, asset, look, observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, marked_peaks
 from wfsobs.app.work import TRUTH
 from wfsobs.modes import TIP_TILT
@@ -50,7 +50,7 @@ MARKS = (
 def page(report: Report, made: datetime) -> str:
     """The whole file; made: now, in the zone to write it in."""
     document = Document()
-    for figure in all_figures().values():
+    for figure in all_figures(bool(_sweeps(report))).values():
         document.add_root(figure)
     roots = {root.id: str(root.name) for root in document.roots}
     figures = {"document": document.to_json(deferred=False), "roots": roots}
@@ -76,6 +76,7 @@ def _body(report: Report, made: datetime) -> str:
     sections: list[tuple[str, str, Callable[[], str]]] = [
         ("", "controls script-only", lambda: _controls(report)),
         *((target.capitalize(), "script-only", lambda target=target: _target(report, target)) for target in TARGETS),
+        *([("RMS error over a setting", "script-only", lambda: _sweep(report))] if _sweeps(report) else []),
         ("RMS errors", "", lambda: _tables(report)),
         ("Scenario", "", lambda: scenario_section(report)),
         ("What the numbers mean", "text", lambda: meaning_section(report)),
@@ -132,6 +133,25 @@ def _target(report: Report, target: str) -> str:
     return f'<div id="cards-{target}"></div><div class="figures">{figures}</div>'
 
 
+def _sweep(report: Report) -> str:
+    """Errors over a setting that varies, the others where their sliders stand."""
+    paths = {str(i): name_of(report.base, report.variations[i].path) for i in _sweeps(report)}
+    choice = f'<div class="switches">{_list("over", "Over", paths)}</div>' if len(paths) > 1 else ""
+    figures = "".join(
+        f'<figure><figcaption class="caption">{target.capitalize()}</figcaption><div id="{SWEEP}-{target}"></div></figure>'
+        for target in TARGETS)
+    return f'{choice}<div class="figures even">{figures}</div>'
+
+
+def _sweeps(report: Report) -> list[int]:
+    """Which variations are of several numbers."""
+    return [i for i, v in enumerate(report.variations) if len(v.values) > 1 and all(map(_is_number, v.values))]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
 def _shade(title: str, name: str) -> str:
     return f'<span class="mark shade" style="--shade:{SHADES[name]}">{title}</span>'
 
@@ -163,10 +183,11 @@ def _data(report: Report) -> dict[str, Any]:
     states = [_state(state, pool) for state in report.states]
     return {
         "looks": {name: {"label": look(name).label, "light": look(name).light, "dark": look(name).dark,
-                         "dash": look(name).dash} for name in LOOKS},
+                         "dash": look(name).dash} for name in _drawn()},
         "names": {target: [TRUTH, *observers_of(target)] for target in TARGETS},
         "modes": _modes(report), "tilts": [m.name for m in TIP_TILT], "angles": NO_ANGLE, "units": UNITS, "start": report.start,
         "variations": [[value_of(value) for value in v.values] for v in report.variations],
+        "sweeps": {i: [name_of(report.base, report.variations[i].path), report.variations[i].values] for i in _sweeps(report)},
         "window": window_of(report.states), "states": states,
         "arrays": [base64.b64encode(array).decode() for array in pool.all()],
     }

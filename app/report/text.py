@@ -15,6 +15,7 @@ from wfsobs.app.report.data import Report, State, window_of
 from wfsobs.bench.measure import machine
 from wfsobs.configfile import changes, pristine, to_toml, written
 from wfsobs.scenario import Scenario
+from wfsobs.scores import BOUND
 
 LONGEST = 8000
 """Characters of a command line; settings that need more go by file."""
@@ -25,9 +26,11 @@ FILE = "wfsobs.toml"
 def summary(report: Report, made: datetime) -> str:
     """One line on what this is."""
     base, count = report.base, len(changes(report.base, pristine(report.preset)))
+    length = report.states[0].grid.n * report.states[0].grid.dt
     parts = [
         f"Preset {escape(report.preset)}" + (f", {count} setting{'s' * (count > 1)} changed" if count else ""),
-        f"{base.run.duration:g} s at {base.sensors.lgs_rate:g} Hz", f"seed {base.run.seed}",
+        f"{length:g} s at {base.sensors.lgs_rate:g} Hz",
+        "of a loaded record" if report.recorded else f"seed {base.run.seed}",
         *([f"{len(report.states)} variations"] if len(report.states) > 1 else []),
         f"made {made:%Y-%m-%d %H:%M %Z}".rstrip() + f" with wfsobs {__version__}",
     ]
@@ -105,6 +108,8 @@ def meaning_section(report: Report) -> str:
         "<b>Looks ahead</b>: the open-loop Butterworth runs forward and backward over measurements with the mirror at rest. It "
         "uses later samples, so no controller can have it, and it is never marked best. All others are causal: an estimate at "
         "a step uses nothing measured after it.",
+        "<b>Bound, LGS alone</b>: the least error that any causal observer of the LGS could have with the true spectra of the "
+        "scenario, the mean over all records; no observer, and never marked best." if _bounded(report) else "",
         "<b>Lag</b>: the delay at which an estimate is most like the truth; positive is late. Of signals with a strong line it "
         "can be negative without any look ahead.",
         "<b>Time per step</b>: measured once on the machine named below, per mode; the one column that is not reproducible.",
@@ -116,6 +121,10 @@ def meaning_section(report: Report) -> str:
         points.append("Variations of the same seed and length share their random numbers, so that differences come from the "
                       "settings and not from chance.")
     return f"<ul>{''.join(f'<li>{point}</li>' for point in points if point)}</ul>"
+
+
+def _bounded(report: Report) -> bool:
+    return any(row["observer"] == BOUND for state in report.states for row in state.rows)
 
 
 def _matched(base: Scenario) -> str:
@@ -147,11 +156,14 @@ def origin_section(report: Report, made: datetime) -> str:
     command, by_file = command_of(report)
     facts = {
         "Program": f"wfsobs {__version__}, {machine(('bokeh',))}", "Made": f"{made:%Y-%m-%d %H:%M:%S %Z}".rstrip(),
-        "Seed": str(report.base.run.seed),
+        **({} if report.recorded else {"Seed": str(report.base.run.seed)}),
     }
+    if report.recorded:
+        command, by_file = f"wfsobs observe RECORD --config {FILE}", True
     listed = "".join(f"<dt>{name}</dt><dd>{escape(fact)}</dd>" for name, fact in facts.items())
     note = f" with the settings above saved as {FILE}" if by_file else ""
-    return f"<dl>{listed}</dl><p>This report again{note}:</p><pre class=command><code>{escape(command)}</code></pre>"
+    what = "These estimates of the record again" if report.recorded else "This report again"
+    return f"<dl>{listed}</dl><p>{what}{note}:</p><pre class=command><code>{escape(command)}</code></pre>"
 
 
 def command_of(report: Report) -> tuple[str, bool]:

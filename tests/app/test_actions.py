@@ -117,7 +117,7 @@ def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
     actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[tuple[Any, str]] = []
-    monkeypatch.setattr(actions.maker, "make", lambda result, preset: asked.append((result, preset)) or b"<!doctype html>")
+    monkeypatch.setattr(actions.maker, "make", lambda shown, preset: asked.append((shown, preset)) or b"<!doctype html>")
     shown = actions.store.run.shown
     actions.handle({"action": "report"})
     assert actions.toolbar.reporting
@@ -125,7 +125,7 @@ def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
     loop.until(lambda: not actions.toolbar.reporting)
     (file,) = actions.sent  # type: ignore[attr-defined]
     assert file["name"] == "wfsobs-report.html" and base64.b64decode(file["content"]) == b"<!doctype html>"
-    assert shown is not None and asked == [(shown.result, "paper")]
+    assert shown is not None and asked == [(shown, "paper")]
 
 
 @pytest.mark.parametrize(("error", "line"), [(ReportError("stopped"), "Report: stopped"), (KeyError("x"), f"Report: {FAILED}")])

@@ -15,6 +15,7 @@ from click.testing import CliRunner, Result
 from wfsobs import pipeline
 from wfsobs.app.report import maker
 from wfsobs.app.report.maker import Maker, ReportError
+from wfsobs.app.work import Shown
 from wfsobs.cli import main
 from wfsobs.scenario import Scenario
 from wfsobs.tables import TIME, rows
@@ -95,7 +96,7 @@ def test_a_run_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: pyt
 
 
 def test_the_dashboards_report_has_the_numbers_given_to_it(result: Any, parse: Any) -> None:
-    it = parse(Maker().make(result, "paper").decode())
+    it = parse(Maker().make(Shown(result), "paper").decode())
     assert it.data("rows")[0]["rows"] == rows(result.scores, result.scenario.run.seed)
     assert "wfsobs export report.html --preset paper --set" in it.text
 
@@ -128,7 +129,7 @@ def test_a_process_that_fails_is_one_line(result: Any, monkeypatch: pytest.Monke
 
 def failure(it: Maker, result: Any) -> str:
     with pytest.raises(ReportError) as caught:
-        it.make(result, "paper")
+        it.make(Shown(result), "paper")
     return str(caught.value)
 
 

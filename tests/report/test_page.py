@@ -22,7 +22,7 @@ from wfsobs.app.report.data import Grid, Report, state_of
 from wfsobs.app.report.page import page
 from wfsobs.app.report.text import FILE, LONGEST, command_of
 from wfsobs.configfile import from_toml, scenario_from
-from wfsobs.pipeline import Result, run
+from wfsobs.pipeline import Result, observe, run
 from wfsobs.scenario import Scenario
 from wfsobs.tables import TIME, label_of, looks_ahead
 from wfsobs.variations import Variation, parse_variation, scenarios
@@ -152,6 +152,35 @@ def test_the_words_fit_the_report(report: Report, text: str, result: Result, par
     manual = result.scenario.replace({"kalman.process_noise": "manual", "kalman.measurement_noise": "manual"})
     one = Report("paper", manual, (), (replace(state_of(result), scenario=manual),))
     assert "are told the strength" not in parse(page(one, MADE)).text
+
+
+def test_a_run_of_more_modes_has_a_list_of_them(short: Scenario, parse: Any) -> None:
+    """The states have tip and tilt, and five modes; the list has the five."""
+    variations = (parse_variation("telescope.radial_order=1,2"),)
+    states = tuple(state_of(run(s, observers=["kf-lgs", "zero"]), 2) for s in scenarios(short, variations))
+    it = parse(page(Report("paper", short, variations, states), MADE))
+    modes = [m.name for m in states[1].scenario.modes]
+    assert len(modes) == 5 and it.data("data")["modes"] == modes
+    assert [a["value"] for tag, a in it.tags if tag == "option"] == modes
+    assert "psd/vibration/kf-lgs/defocus" in it.data("data")["states"][1]["lines"]
+
+
+def test_errors_are_drawn_over_what_varies_in_numbers(report: Report, text: str, result: Result, parse: Any) -> None:
+    data = parse(text).data("data")
+    assert data["sweeps"] == {"0": ["Wind speed V₀ [m/s]", [5, 15]], "1": ["Integrator gain g", [0.2, 0.4]]}
+    words = (Variation("kalman.process_noise", ("matched", "manual")), Variation("loop.closed", (True, False)))
+    it = parse(page(replace(report, variations=words), MADE))
+    assert it.data("data")["sweeps"] == {} and "RMS error over a setting" not in it.text
+    assert len(it.data("figures")["roots"]) == 4
+
+
+def test_a_loaded_record_promises_no_simulation(result: Result, parse: Any) -> None:
+    record = replace(result.record, turbulence=None, vibration=None)
+    state = state_of(observe(record, result.scenario, observers=["kf-lgs", "zero"]))
+    said = parse(page(Report("paper", result.scenario, (), (state,), recorded=True), MADE)).text
+    assert "of a loaded record" in said and f"wfsobs observe RECORD --config {FILE}" in said and "wfsobs export" not in said
+    assert {row["target"] for row in state.rows} == {"next z", "residual y"}
+    assert "Next z, tip" in said and "psd/vibration/kf-lgs/tip" in state.lines and "error/vibration/kf-lgs/tip" not in state.lines
 
 
 def test_no_text_escapes(result: Result, parse: Any) -> None:
