@@ -56,6 +56,23 @@ def test_scores_are_those_of_the_estimates() -> None:
         assert s.rms == pytest.approx(np.sqrt(np.nanmean(error**2)), rel=1e-12)
 
 
+@pytest.mark.parametrize("changes", [
+    {"turbulence.source": "frozen-flow", "sensors.kind": "zernike", "telescope.radial_order": 3},
+    {"turbulence.source": "frozen-flow", "sensors.lgs_radius": 30.0, "sensors.lgs_combination": "minimum-variance"},
+    {"telescope.radial_order": 2, "sensors.tip_tilt_indetermination": True},
+    {"turbulence.source": "psd", "turbulence.psd": {"frequency": [0.5, 50.0], "tip": [1e-2, 1e-3], "tilt": [1e-2, 1e-3]}},
+])
+def test_every_observer_on_every_turbulence_and_mode(changes: dict[str, Any]) -> None:
+    s = scenario(changes)
+    result = run(s)
+    assert not result.failures
+    assert {score.mode for score in result.scores if score.observer != "bound"} == {mode.name for mode in s.modes}
+    assert all(np.isfinite(score.rms) for score in result.scores)
+    again = run(s)
+    for one, other in zip(result.estimates, again.estimates, strict=True):
+        assert np.array_equal(one.values, other.values, equal_nan=True)
+
+
 def test_same_seed_same_result_and_a_subset_is_part_of_it() -> None:
     one, same = run(scenario()), run(scenario())
     some = run(scenario(), observers=["gpr-online", "multirate"])

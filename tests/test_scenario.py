@@ -15,6 +15,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 
 TABLE = {"frequency": [1.0, 2.0, 3.0], "tip": [1.0, 1.0, 1.0], "tilt": [1.0, 1.0, 1.0]}
+FLOW: dict[str, Any] = {"turbulence.source": "frozen-flow"}
 PSD: dict[str, Any] = {"vibration.source": "psd"}
 
 
@@ -29,6 +30,12 @@ PSD: dict[str, Any] = {"vibration.source": "psd"}
     (PSD, "vibration.psd.frequency", "two frequencies"),
     (PSD | {"vibration.psd": TABLE | {"frequency": [1.0, 1.0, 3.0]}}, "vibration.psd.frequency", "increasing"),
     (PSD | {"vibration.psd": TABLE | {"tilt": [1.0]}}, "vibration.psd.tilt", "1 numbers"),
+    ({"turbulence.source": "psd"}, "turbulence.psd.frequency", "two frequencies"),
+    ({"turbulence.source": "psd", "turbulence.psd": TABLE | {"tip": []}}, "turbulence.psd.tip", "0 numbers"),
+    (FLOW | {"turbulence.layers": []}, "turbulence.layers", "above 0"),
+    (FLOW | {"turbulence.layers.0.fraction": 0.0}, "turbulence.layers", "above 0"),
+    (FLOW | {"sensors.lgs_altitude": 8500.0}, "turbulence.layers.0.height = 8000", "7650 m"),
+    (FLOW | {"turbulence.wind_speed": 0.1, "sensors.lgs_rate": 1e5}, "turbulence.layers.0.wind_factor = 1", "40 s"),
 ])
 def test_settings_that_do_not_go_together(changes: dict[str, Any], named: str, limit: str) -> None:
     s = Scenario().replace(changes)
@@ -41,6 +48,17 @@ def test_what_goes_together_passes() -> None:
     Scenario().validate()
     Scenario().replace({"vibration.source": "psd", "vibration.psd": TABLE}).validate()
     Scenario().replace({"vibration.psd": {"frequency": [3.0, 1.0]}}).validate()  # a table that is not used
+    Scenario().replace(FLOW).validate()
+    Scenario().replace({"turbulence.layers": [], "sensors.lgs_altitude": 1000.0}).validate()  # layers that are not used
+    Scenario().replace(FLOW | {"turbulence.layers": [{"fraction": 0.0}, {"height": 0.0, "fraction": 1e-6}]}).validate()
+
+
+@pytest.mark.parametrize(("order", "count"), [(1, 2), (2, 5), (3, 9), (4, 14), (5, 20), (6, 27)])
+def test_modes_up_to_an_order(order: int, count: int) -> None:
+    modes = Scenario().replace({"telescope.radial_order": order}).modes
+    assert len(modes) == count == len({mode.name for mode in modes})
+    assert [mode.noll for mode in modes] == list(range(2, count + 2))
+    assert [mode.name for mode in modes[:2]] == ["tip", "tilt"] and modes[-1].radial_order == order
 
 
 def test_steps_and_time_step() -> None:
