@@ -18,6 +18,7 @@ import numpy as np
 import wfsobs
 from wfsobs.ar2 import Ar2
 from wfsobs.bandpass import bandpass_bank, filter_causal, filter_zero_phase
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.kalman import by_target, measurement_noise, modelled_processes, steady_filter
 from wfsobs.record import Record, Training
 from wfsobs.scores import rms
@@ -229,11 +230,10 @@ def lgs_model() -> None:
 def ut4() -> None:
     """Frozen flow and the ERIS spectrum of UT4, its lines alone and with its floor."""
     runs = [errors({}, None, preset) for preset in ("ut4", "ut4-floor")]
-    for target, names in (("turbulence", TURBULENCE), ("vibration", (*PRINTED, "multirate-optimal"))):
-        rows = []
-        for name in (*names, "truth"):
-            rows.append((NAMES.get(name, "Truth"), *(
-                middle(e[name, target, mode], e is runs[0]) for mode in ("tip", "tilt") for e in runs)))
+    for target, names in (("turbulence", (*TURBULENCE, "kf-multi")),
+                          ("vibration", (*PRINTED, "multirate-optimal", "kf-multi", "ridge-30"))):
+        rows = [(OBSERVERS[name].label if name in OBSERVERS else "Truth", *(
+            middle(e[name, target, mode], e is runs[0]) for mode in ("tip", "tilt") for e in runs)) for name in (*names, "truth")]
         table((target, "tip, lines", "tip, all", "tilt, lines", "tilt, all"), rows)
 
 
