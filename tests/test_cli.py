@@ -134,7 +134,8 @@ def test_as_a_program():
 def test_the_core_needs_numpy_scipy_and_param_alone():
     code = (
         "import sys\n"
-        "for name in ('panel', 'bokeh', 'holoviews', 'click', 'rich', 'tomli_w', 'matplotlib', 'pandas', 'threadpoolctl'):\n"
+        "for name in ('panel', 'bokeh', 'holoviews', 'click', 'rich', 'tomli_w', 'matplotlib', 'pandas', 'threadpoolctl',\n"
+        "    'astropy', 'aotpy'):\n"
         "    sys.modules[name] = None\n"
         "import wfsobs\n"
         "s = wfsobs.PRESETS['paper']().replace({'run.duration': 2.0, 'gpr_online.training_size': 20})\n"

@@ -109,6 +109,24 @@ def test_bridging_is_causal(k: int) -> None:
     np.testing.assert_array_equal(a.y_ngs[: k + 1], b.y_ngs[: k + 1])
 
 
+def test_no_observer_sees_behind_a_gap() -> None:
+    """Within a gap of the LGS and of a frame: what comes later changes no causal estimate."""
+    s, k = scenario(), 405
+    record = gappy()
+    rng = np.random.default_rng(2)
+    y, u, ngs = record.y_lgs.copy(), record.u.copy(), record.y_ngs.copy()
+    for x, start in ((y, k + 1), (u, k + 1), (ngs, k + 1)):
+        there = ~np.isnan(x[start:])
+        x[start:][there] += rng.standard_normal(there.sum())
+    other = replace(record, y_lgs=y, u=u, y_ngs=ngs, open_loop_y=None)
+    causal = [name for name, observer in OBSERVERS.items() if observer.causal]
+    a, b = (list(each_estimate(r, s, observers=causal)) for r in (record, other))
+    assert len(a) == len(b) >= 12
+    for one, two in zip(a, b, strict=True):
+        size = np.nanmax(np.abs(one.values), initial=1e-3)
+        np.testing.assert_allclose(two.values[: k + 1], one.values[: k + 1], rtol=0, atol=1e-9 * size, err_msg=one.observer)
+
+
 def test_every_observer_runs_on_a_record_with_gaps_nearly_as_well() -> None:
     """5 % of the frames gone: the errors of causal observers grow by a few per cent, never by half."""
     s = scenario()
