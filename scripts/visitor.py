@@ -17,7 +17,7 @@ from bokeh.protocol.receiver import Receiver
 from tornado.httpclient import AsyncHTTPClient, HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
-WAIT = 60.0
+WAIT = 120.0
 ROW = re.compile(r'<tr data-observer="([^"]+)" data-target="([^"]+)"><th.*?</th>(.*?)</tr>')
 NUMBER = re.compile(r"[\d.]+$")
 
@@ -39,7 +39,7 @@ class Visitor:
 
     async def open(self, query: str = "") -> Visitor:
         """Load the page, open its websocket, and tell the server that the page is there."""
-        answer = await AsyncHTTPClient().fetch(f"http://{self.base}/{query}", request_timeout=WAIT)
+        answer = await AsyncHTTPClient().fetch(f"http://{self.base}/{query}", request_timeout=WAIT, connect_timeout=WAIT)
         token = re.search(r'"token":"([^"]+)"', answer.body.decode())
         assert token, "a page without a session"
         await self.connect(token.group(1))
@@ -51,7 +51,8 @@ class Visitor:
 
     async def connect(self, token: str, origin: str = "") -> None:
         """Open the websocket."""
-        request = HTTPRequest(f"ws://{self.base}/ws", headers={"Origin": origin or f"http://{self.base}"})
+        request = HTTPRequest(f"ws://{self.base}/ws", headers={"Origin": origin or f"http://{self.base}"},
+                              connect_timeout=WAIT, request_timeout=WAIT)
         self._socket = await websocket_connect(request, subprotocols=["bokeh", token], max_message_size=10**8)
         self._listening = asyncio.create_task(self._listen(self._socket))
         await self.until(lambda: "ACK" in self.answered)

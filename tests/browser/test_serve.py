@@ -1,16 +1,121 @@
-"""The command's own server."""
+"""The command's own server, as strangers meet it."""
 
 from __future__ import annotations
 
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import pytest
+from playwright.sync_api import Browser, Page, expect
 
-def test_serve(open_page: Any, make_server: Any, tmp_path: Path) -> None:
-    server = make_server(["-m", "wfsobs", "serve", "--port", "{port}"], tmp_path / "log", "/")
-    try:
-        page = open_page(url=server.url)
-        assert page.title() == "wfsobs"
-        assert server.errors(0) == []
-    finally:
+FLAGS = ["--public", "--runs", "1", "--max-duration", "100"]
+LONG = "?run.duration=90&gpr_online.training_size=1000&run.seed="
+
+
+@pytest.fixture
+def serve(make_server: Any, tmp_path: Path) -> Iterator[Any]:
+    server = make_server(["-m", "wfsobs", "serve", "--port", "{port}", *FLAGS], tmp_path / "log", "/")
+    yield server
+    if server.process.poll() is None:
         server.close()
+    assert server.errors(0) == []
+
+
+@pytest.fixture
+def visit(browser: Browser, serve: Any) -> Iterator[Callable[..., Page]]:
+    """A function that opens the page for one more visitor."""
+    opened: list[Any] = []
+
+    def open_it(query: str = "") -> Page:
+        context = browser.new_context(viewport={"width": 1400, "height": 1000})
+        opened.append(context)
+        page = context.new_page()
+        page.set_default_timeout(60_000)
+        page.goto(serve.url + query)
+        return page
+
+    yield open_it
+    for context in opened:
+        context.close()
+
+
+def status(page: Page, text: str) -> None:
+    """Wait until the line on the run reads so."""
+    page.locator("[role=status]", has_text=text).first.wait_for(state="attached")
+
+
+def start(page: Page) -> None:
+    status(page, "press Run")
+    page.get_by_role("button", name="Run", exact=True).first.click()
+
+
+def test_serve(open_page: Any, serve: Any) -> None:
+    page = open_page(url=serve.url)
+    assert page.title() == "wfsobs"
+    assert serve.errors(0) == []
+
+
+def test_two_visitors_wait_in_line(visit: Callable[..., Page]) -> None:
+    first, second = visit(LONG + "1"), visit(LONG + "2")
+    start(first)
+    status(first, "Running")
+    start(second)
+    status(second, "Waiting: position 1")
+    first.get_by_role("button", name="Cancel", exact=True).click()
+    status(first, "Cancelled")
+    status(second, "Running")
+
+
+def test_more_than_the_limits_is_refused(visit: Callable[..., Page]) -> None:
+    page = visit("?run.duration=101&turbulence.wind_speed=21")
+    status(page, "Done in")
+    note = page.get_by_text("Not used from the link: run.duration = 101: at most 100 s on this server")
+    expect(note).to_be_visible()
+    expect(page.get_by_role("textbox", name="m/s")).to_have_value("21")
+
+
+@pytest.fixture
+def elsewhere() -> Iterator[str]:
+    """Another site, on another port."""
+    site = ThreadingHTTPServer(("localhost", 0), BaseHTTPRequestHandler)
+    thread = threading.Thread(target=site.serve_forever)
+    thread.start()
+    yield f"http://localhost:{site.server_port}"
+    site.shutdown()
+    thread.join()
+    site.server_close()
+
+
+def test_a_page_of_elsewhere_cannot_connect(visit: Callable[..., Page], serve: Any, elsewhere: str) -> None:
+    """A page of another origin, which has got hold of a session's token, opens a websocket with it."""
+    page = visit()
+    status(page, "Done in")
+    token = page.evaluate("() => document.documentElement.innerHTML.match(/\"token\":\"([^\"]+)\"/)[1]")
+    connect = """([url, token]) => new Promise((done) => {
+        const socket = new WebSocket(url, ["bokeh", token])
+        socket.onmessage = () => done("connected")
+        socket.onclose = () => done("refused")
+    })"""
+    url = serve.url.replace("http://", "ws://") + "ws"
+    assert page.evaluate(connect, [url, token]) == "connected", "the page's own origin may"
+    page.goto(elsewhere)
+    assert page.evaluate(connect, [url, token]) == "refused"
+    assert f"Refusing websocket connection from Origin '{elsewhere}'" in serve.log.read_text()
+
+
+def test_told_to_stop_in_the_middle_of_a_run(visit: Callable[..., Page], serve: Any) -> None:
+    page = visit(LONG + "3")
+    start(page)
+    status(page, "Running")
+    begin = time.monotonic()
+    serve.process.send_signal(signal.SIGTERM)
+    assert serve.process.wait(20) == 0
+    assert time.monotonic() - begin < 20
+    log = serve.log.read_text()
+    assert "Traceback" not in log and "ERROR" not in log
+    assert log.rstrip().splitlines()[-1].endswith("INFO stopped sessions=1")
