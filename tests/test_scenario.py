@@ -35,6 +35,7 @@ PSD: dict[str, Any] = {"vibration.source": "psd"}
     (FLOW | {"turbulence.layers": []}, "turbulence.layers", "above 0"),
     (FLOW | {"turbulence.layers.0.fraction": 0.0}, "turbulence.layers", "above 0"),
     (FLOW | {"sensors.lgs_altitude": 8500.0}, "turbulence.layers.0.height = 8000", "7650 m"),
+    (FLOW | {"turbulence.outer_scale": 2.0, "telescope.diameter": 39.0}, "turbulence.outer_scale = 2", "9.75 m"),
     (FLOW | {"turbulence.wind_speed": 0.1, "sensors.lgs_rate": 1e5}, "turbulence.layers.0.wind_factor = 1", "40 s"),
 ])
 def test_settings_that_do_not_go_together(changes: dict[str, Any], named: str, limit: str) -> None:

@@ -21,6 +21,8 @@ from wfsobs.settings import Group, SettingError, section
 
 HIGHEST = 0.9
 """Height of a layer over that of the laser guide stars: in a higher one the beam all but ends."""
+SMALLEST = 0.25
+"""Outer scale over the aperture: below, variance moves to waves that frozen flow samples coarsely."""
 SLOWEST = 4e6
 """Steps in which a layer crosses the aperture: frozen flow takes Fourier transforms of four times as many."""
 
@@ -92,7 +94,10 @@ class Scenario(Group):
                                    f"between 0 and half the LGS rate, {nyquist:g} Hz")
 
     def _validate_layers(self) -> None:
-        layers = self.turbulence.layers
+        layers, smallest = self.turbulence.layers, SMALLEST * self.telescope.diameter
+        if self.turbulence.outer_scale < smallest:
+            raise SettingError(f"turbulence.outer_scale = {self.turbulence.outer_scale:g}: frozen flow takes {SMALLEST:g} of "
+                               f"telescope.diameter or more, {smallest:g} m")
         if not sum(layer.fraction for layer in layers) > 0:
             raise SettingError("turbulence.layers: needs a layer of a fraction above 0, for turbulence.source = frozen-flow")
         for i, layer in enumerate(layers):
