@@ -141,3 +141,8 @@ def test_slow_turbulence_is_resolved_at_any_wind() -> None:
     process = Ar2(turbulence_corner(0.5, 8.0, 1), 0.9, 0.5, 1e-3)
     spectrum = process.psd(np.fft.rfftfreq(2**17, 1e-3)) / 2e-3
     assert circle_mean(spectrum) == pytest.approx(0.25, rel=1e-6)
+
+
+def test_no_vibration_has_no_spectrum() -> None:
+    s = MATCHED.replace({"vibration.source": "none"})
+    assert bound(s, 0)["vibration"] == 0.0 and vibration_variance(s, 0) == 0.0

@@ -69,6 +69,8 @@ def vibration_variance(scenario: Scenario, mode: int) -> float:
 
 def vibration_power(scenario: Scenario, mode: int, n: int) -> Array:
     """Variance [um^2] of the vibration in each DFT bin of `n` steps, pure lines in the bin that they lie in, (n // 2 + 1,)."""
+    if scenario.vibration.source == "none":
+        return np.zeros(n // 2 + 1)
     power = _bin_power(scenario, mode, n)
     for peak in scenario.vibration.peaks:
         if _is_pure_line(scenario, peak):

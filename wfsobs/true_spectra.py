@@ -13,13 +13,15 @@ from math import pi
 
 import numpy as np
 
+from wfsobs import atmosphere
 from wfsobs.ar2 import Ar2
 from wfsobs.arrays import Array
 from wfsobs.disturbance import peak_rms, vibration_power
-from wfsobs.lgs import low_frequency_process
+from wfsobs.flow_spectra import flow_spectra
+from wfsobs.lgs import lgs_noise_rms, lgs_weights, low_frequency_process
 from wfsobs.scenario import Scenario
-from wfsobs.sensors import noise_rms
-from wfsobs.turbulence import turbulence_process
+from wfsobs.turbulence import mode_power, turbulence_process
+from wfsobs.wiener import Complex
 
 LONGEST = 30.0
 """Longest record whose resolution counts [s]."""
@@ -47,31 +49,28 @@ class TrueSpectra:
 
     measured: Array
     signal: dict[str, Array]
-    shared: dict[str, Array]
+    shared: dict[str, Complex | Array]
 
     @property
-    def total(self) -> tuple[Array, Array]:
+    def total(self) -> tuple[Array, Complex | Array]:
         """(signal, shared) of the whole disturbance; turbulence and vibration are independent."""
-        return sum_of(self.signal), sum_of(self.shared)
+        return sum(self.signal.values(), np.zeros(1)), sum(self.shared.values(), np.zeros(1))
 
 
 def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
     """The spectra of one mode, from the settings alone."""
     n = n_frequencies(scenario)
     turbulence, seen, shared = TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n)
-    if scenario.sensors.tip_tilt_indetermination:
-        seen, shared = np.zeros_like(seen), np.zeros_like(shared)
-    vibration = _vibration(scenario, mode, n)
-    noise = max(noise_rms(scenario, "lgs")[mode] ** 2 / scenario.sensors.lgs_count, FLOOR**2)
+    vibration, gain = _vibration(scenario, mode, n), lgs_weights(scenario)[mode, :, mode].sum()
     return TrueSpectra(
-        measured=seen + vibration + noise,
+        measured=seen + gain**2 * vibration + max(lgs_noise_rms(scenario, mode), FLOOR) ** 2,
         signal={"turbulence": turbulence, "vibration": vibration},
-        shared={"turbulence": shared, "vibration": vibration},
+        shared={"turbulence": shared, "vibration": gain * vibration},
     )
 
 
 def seen_turbulence(scenario: Scenario, mode: int) -> Array:
-    """S of what the mean over the LGS sees of the turbulence, on the frequencies of `true_spectra`."""
+    """S of what the LGS together see of the turbulence, on the frequencies of `true_spectra`."""
     return TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n_frequencies(scenario))[1]
 
 
@@ -94,12 +93,11 @@ def _decay_rates(scenario: Scenario) -> list[float]:
         rates.append(least)
     elif v.source != "none":
         rates += [max(2.0 * pi * p.frequency * p.damping / SMOOTH, least) for p in v.peaks]
+    if scenario.turbulence.source == "frozen-flow":
+        rates.append(min(layer.speed for layer in atmosphere.layers(scenario)) / (16.0 * scenario.turbulence.outer_scale))
+    elif scenario.turbulence.source == "psd":
+        rates.append(least)
     return rates
-
-
-def sum_of(spectra: dict[str, Array]) -> Array:
-    """The spectrum of a sum of independent signals."""
-    return np.sum(list(spectra.values()), axis=0)
 
 
 def _density(process: Ar2, n: int) -> Array:
@@ -107,17 +105,37 @@ def _density(process: Ar2, n: int) -> Array:
     return process.psd(np.fft.rfftfreq(n, process.dt)) / (2.0 * process.dt)
 
 
-def _ar2_turbulence(scenario: Scenario, mode: int, n: int) -> tuple[Array, Array, Array]:
-    """(S of the turbulence, of what the mean over the LGS sees of it, between the two)."""
-    own = _density(turbulence_process(scenario, mode, scenario.dt), n)
-    error = _density(low_frequency_process(scenario, mode), n) / scenario.sensors.lgs_count
-    return own, own + error, own
+Looks = tuple[Array, Array, Complex | Array]
+"""S of the turbulence, of what the LGS together see of it, errors of their own included, and between the two."""
 
 
-def _no_turbulence(scenario: Scenario, mode: int, n: int) -> tuple[Array, Array, Array]:
-    error = _density(low_frequency_process(scenario, mode), n) / scenario.sensors.lgs_count
-    nothing = np.zeros_like(error)
-    return nothing, error, nothing
+def _through_lgs(scenario: Scenario, mode: int, own: Array) -> Looks:
+    """Turbulence that all stars see alike, each LGS with a slow error of its own."""
+    weights = lgs_weights(scenario)[mode, :, mode]
+    error = _density(low_frequency_process(scenario, mode), 2 * (own.size - 1)) * np.sum(weights**2)
+    blind = scenario.sensors.tip_tilt_indetermination and scenario.modes[mode].radial_order == 1
+    gain = 0.0 if blind else weights.sum()
+    return own, gain**2 * own + error, gain * own
+
+
+def _ar2_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
+    return _through_lgs(scenario, mode, _density(turbulence_process(scenario, mode, scenario.dt), n))
+
+
+def _no_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
+    return _through_lgs(scenario, mode, np.zeros(n // 2 + 1))
+
+
+def _table(scenario: Scenario, mode: int, n: int) -> Looks:
+    own = 0.5 * n * mode_power(scenario.turbulence.psd, scenario, mode, n)
+    own[0] = 0.0
+    return _through_lgs(scenario, mode, widened(own, line_width(scenario) * scenario.dt))
+
+
+def _frozen_flow(scenario: Scenario, mode: int, n: int) -> Looks:
+    own, seen, shared = flow_spectra(scenario, mode, np.fft.rfftfreq(n, scenario.dt))
+    per_sample = 0.5 / scenario.dt
+    return per_sample * own, per_sample * seen, per_sample * shared
 
 
 def _vibration(scenario: Scenario, mode: int, n: int) -> Array:
@@ -142,7 +160,7 @@ def widened(spectrum: Array, width: float) -> Array:
     return np.maximum(np.fft.rfft(np.fft.irfft(spectrum, n) * np.exp(-pi * width * lag)).real, 0.0)
 
 
-TURBULENCE_SPECTRA: dict[str, Callable[[Scenario, int, int], tuple[Array, Array, Array]]] = {
-    "ar2": _ar2_turbulence, "none": _no_turbulence,
+TURBULENCE_SPECTRA: dict[str, Callable[[Scenario, int, int], Looks]] = {
+    "ar2": _ar2_turbulence, "frozen-flow": _frozen_flow, "psd": _table, "none": _no_turbulence,
 }
 """How the turbulence of each source looks to `true_spectra`."""

@@ -68,6 +68,6 @@ def circle_mean(spectrum: Array) -> float:
     return float((2.0 * spectrum.sum() - spectrum[0] - spectrum[-1]) / (2 * (spectrum.size - 1)))
 
 
-def advanced(spectrum: Array, steps: int) -> Complex:
+def advanced(spectrum: Complex | Array, steps: int) -> Complex:
     """S_sz of z[k] = s[k - steps] + anything independent: the spectrum, turned `steps` ahead."""
     return spectrum * np.exp(2j * np.pi * steps * np.arange(spectrum.size) / (2 * (spectrum.size - 1)))
