@@ -111,19 +111,17 @@ def test_what_is_said_of_it(dashboard: Dashboard, loop: Any, short: Scenario) ->
     assert not dashboard.upload.use.disabled and dashboard.upload.unit.value != SILENT
 
 
-@pytest.mark.parametrize(("content", "name", "line"), [
-    (b"hello", "a.npz", "a.npz: not an .npz file"),
-    (b"", "a.csv", "a.csv: is empty"),
-    (b"# nothing", "a.csv", "a.csv: holds no table"),
-    (b"x", "<b>.exe", "_b_.exe: its name ends in none of"),
-])
-def test_what_is_no_record(dashboard: Dashboard, loop: Any, content: bytes, name: str, line: str) -> None:
+def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
     before = dashboard.store.run.shown
-    previewed(dashboard, loop, content, name)
-    assert dashboard.upload.picker.said.startswith(line)
-    assert "<b>.exe" not in dashboard.upload.text.object
-    dashboard.upload.confirm()
-    assert dashboard.upload.loaded is None and dashboard.store.run.shown is before
+    for content, name, line in (
+        (b"hello", "a.npz", "a.npz: not an .npz file"), (b"", "a.csv", "a.csv: is empty"),
+        (b"# nothing", "a.csv", "a.csv: holds no table"), (b"x", "<b>.exe", "_b_.exe: its name ends in none of"),
+    ):
+        previewed(dashboard, loop, content, name)
+        assert dashboard.upload.picker.said.startswith(line)
+        assert "<b>.exe" not in dashboard.upload.text.object
+        dashboard.upload.confirm()
+        assert dashboard.upload.loaded is None and dashboard.store.run.shown is before
 
 
 def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -74,12 +74,17 @@ def written(record: Record, ending: str) -> io.BytesIO:
     return file
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("ending", [ending for ending in ENDINGS if ending != AOT])
 @settings(max_examples=25, deadline=None)
 @given(record=records())
 def test_every_record_comes_back(ending: str, record: Record) -> None:
-    again = read_record(written(record, ending), f"r{ending}")
-    same(record, again, NOT_IN_AOT if ending == AOT else ())
+    same(record, read_record(written(record, ending), f"r{ending}"))
+
+
+@settings(max_examples=6, deadline=None)  # aotpy takes a tenth of a second
+@given(record=records())
+def test_what_aot_has_a_place_for_comes_back(record: Record) -> None:
+    same(record, read_record(written(record, AOT), f"r{AOT}"), NOT_IN_AOT)
 
 
 @pytest.mark.parametrize("ending", [".npz", ".csv", ".fits", AOT])

@@ -16,7 +16,7 @@ QUICK = ("kf-lgs", "kf-ngs", "multirate", "multirate-optimal", "butterworth-ol",
          "kf-multi", "ridge-30")
 
 
-@pytest.fixture(scope="module", params=[1, 2, 3], name="scores")
+@pytest.fixture(scope="module", params=[1, 2], name="scores")
 def _scores(request: pytest.FixtureRequest) -> tuple[Score, ...]:
     return wfsobs.run(wfsobs.PRESETS["ut4"]().replace({"run.seed": request.param}), observers=QUICK).scores
 
