@@ -5,6 +5,7 @@ A run that several sessions want is done once: each hears of its progress, and i
 
 from __future__ import annotations
 
+import gc
 import itertools
 import logging
 import threading
@@ -15,7 +16,7 @@ from time import monotonic
 from wfsobs.app.cache import Cache, key_of
 from wfsobs.app.limits import Limits
 from wfsobs.app.logs import event
-from wfsobs.app.queue import Queue
+from wfsobs.app.queue import Queue, give_back
 from wfsobs.app.run import Tell
 from wfsobs.app.work import Loaded, Report, Shown, compute
 from wfsobs.cost import run_seconds
@@ -153,6 +154,10 @@ class Service:
         """A session has ended."""
         with self._lock:
             self.visits -= 1
+            last = self.visits == 0
+        if last:  # nobody is kept waiting
+            gc.collect()
+            give_back()
 
     def held(self, scenario: Scenario) -> bool:
         """Whether the results are there already."""
