@@ -62,6 +62,15 @@ def test_the_mean_is_the_plain_mean() -> None:
     assert lgs_noise_rms(s, 3) == pytest.approx(0.01) and measurement_noise(s, 3)[0] == lgs_noise_rms(s, 3)
 
 
+def test_weights_follow_the_settings() -> None:
+    s = scenario(BEST)
+    before = lgs_weights(s).copy()
+    s.sensors.lgs_noise = 0.5
+    assert not np.allclose(lgs_weights(s), before)
+    s.sensors.lgs_noise = 0.02
+    assert np.array_equal(lgs_weights(s), before)
+
+
 def test_it_is_never_worse_than_the_mean() -> None:
     """Error, noise and what of the vibration is lost, together."""
     blind, single = {"sensors.tip_tilt_indetermination": True}, {"turbulence.source": "ar2"}

@@ -13,6 +13,7 @@ taken, so that a loop sees its own commands in full.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -47,15 +48,22 @@ def lgs_weights(scenario: Scenario) -> Array:
     stars, modes = scenario.sensors.lgs_count, len(scenario.modes)
     if scenario.sensors.lgs_combination == MEAN:
         return np.tile(np.eye(modes)[:, None] / stars, (1, stars, 1))
-    seen = seen_turbulence(scenario)
+    return _best_weights(scenario)
+
+
+@lru_cache(maxsize=8)  # a scenario is what its settings are, whenever it was asked
+def _best_weights(scenario: Scenario) -> Array:
+    """Those of minimum variance."""
+    stars, modes = scenario.sensors.lgs_count, len(scenario.modes)
+    seen, noise = seen_turbulence(scenario), noise_covariance(scenario, "lgs")
     for mode in range(modes):
         seen[:, mode, :, mode] += vibration_variance(scenario, mode)
-    noise = noise_covariance(scenario, "lgs")
     for star in range(1, stars + 1):
         seen[star, :, star] += noise
     n = stars * modes
     measured = seen[1:, :, 1:].reshape(n, n)
     found = seen[0, :, 1:].reshape(modes, n) @ np.linalg.pinv(measured, rcond=1e-12, hermitian=True)
+    found.flags.writeable = False
     return found.reshape(modes, stars, modes)
 
 

@@ -14,7 +14,7 @@ class Telescope(Group):
 
     diameter = Real(8.0, bounds=(0.1, 100.0), label="Aperture diameter D",
                     doc="Diameter of the aperture [m] (paper, Table 1).")
-    radial_order = Whole(1, bounds=(1, HIGHEST_ORDER), label="Highest radial order",
+    radial_order = Whole(1, bounds=(1, HIGHEST_ORDER), softbounds=(1, HIGHEST_ORDER), label="Highest radial order",
                          doc="Zernike modes up to this radial order, piston left out: 1 is tip and tilt (paper), 2 to 6 are 5, "
                              "9, 14, 20 and 27 modes.")
     zenith_angle = Real(0.0, bounds=(0.0, 70.0), softbounds=(0.0, 60.0), step=1.0, label="Zenith angle",
