@@ -10,6 +10,7 @@ from functools import partial
 from html import escape
 from types import MappingProxyType
 from typing import Any
+from urllib.parse import quote, urlencode
 
 import panel as pn
 import panel_material_ui as pmui
@@ -213,8 +214,8 @@ def page(build: Callable[[Post], Dashboard] = Dashboard) -> Any:
     """The page of a new session; a page that says what went wrong where it cannot be built."""
     try:
         dashboard = build(post_to_session())
-        if pn.state.location is not None and pn.state.location.search:
-            dashboard.actions.open_link(pn.state.location.search)
+        if query := asked_for():
+            dashboard.actions.open_link(query)
         page = dashboard.page()
         dashboard.start()
         pn.state.on_session_destroyed(lambda _context: dashboard.close())
@@ -222,6 +223,15 @@ def page(build: Callable[[Post], Dashboard] = Dashboard) -> Any:
     except Exception as error:
         log.exception("the page could not be built")
         return error_page(error)
+
+
+def asked_for() -> str:
+    """The query of the page's address; where a browser connects so late that its session is made anew, as the page was
+    given it."""
+    if pn.state.location is not None and pn.state.location.search:
+        return str(pn.state.location.search)
+    texts = [(key, value) for key, values in pn.state.session_args.items() for value in values]
+    return urlencode(texts, quote_via=quote)
 
 
 def post_to_session() -> Post:

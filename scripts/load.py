@@ -36,7 +36,7 @@ from wfsobs.app.views.table import number
 from wfsobs.scenario import Scenario
 
 ROOT = Path(__file__).parents[1]
-LIFETIME = 2.0
+LIFETIME = 3.0
 SHORT = {
     "run.duration": 2.0, "run.warm_up": 0.5, "gpr_offline.training_size": 60, "gpr_offline.depth": 30,
     "gpr_online.training_size": 60, "gpr_online.depth": 30,
@@ -82,10 +82,11 @@ class Server:
                         raise
                 await asyncio.sleep(0.1)
 
-    def megabytes(self) -> float:
-        """Resident memory [MB]."""
-        answer = subprocess.run(["ps", "-o", "rss=", "-p", str(self.process.pid)], capture_output=True, text=True, check=True)
-        return int(answer.stdout) / 1e3
+    def used(self) -> tuple[float, int]:
+        """Resident memory [MB], and processor time so far [s]."""
+        command = ["ps", "-o", "rss=,cputimes=", "-p", str(self.process.pid)]
+        memory, seconds = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+        return int(memory) / 1e3, int(seconds)
 
     async def stop(self) -> tuple[float, int]:
         """Ask it to end: seconds that took, and its status."""
@@ -144,9 +145,10 @@ def expected(settings: dict[str, Any]) -> dict[tuple[str, str], tuple[str, str]]
 Seen = tuple[dict[str, Any], dict[tuple[str, str], tuple[str, ...]]]
 
 
-async def session(base: str, changes: int, rng: random.Random) -> tuple[list[Seen], list[float]]:
-    """One visitor: what was shown for which settings, and how long each took [s]."""
-    visitor = await Visitor(base).open(query_of(SHORT))
+async def session(base: str, changes: int, rng: random.Random, door: asyncio.Lock) -> tuple[list[Seen], list[float]]:
+    """One visitor, who comes in after the one before: what was shown for which settings, and how long each took [s]."""
+    async with door:
+        visitor = await Visitor(base).open(query_of(SHORT))
     await visitor.until(lambda: visitor.status.startswith("Done"))
     box = visitor.find("TextInput", label="m/s")
     seen: list[Seen] = []
@@ -166,15 +168,17 @@ async def session(base: str, changes: int, rng: random.Random) -> tuple[list[See
 
 async def batch(server: Server, report: Report, name: str, sessions: int, changes: int, seed: int) -> tuple[list[Seen], float]:
     """Many sessions at once: all that they saw, and the server's memory once they are gone [MB]."""
-    start = time.monotonic()
-    done = await asyncio.gather(*(session(server.base, changes, random.Random(seed + i)) for i in range(sessions)))
+    start, (_, before) = time.monotonic(), server.used()
+    door = asyncio.Lock()
+    done = await asyncio.gather(*(session(server.base, changes, random.Random(seed + i), door) for i in range(sessions)))
     took = time.monotonic() - start
     seconds = [second for _, own in done for second in own]
     await server.until(lambda health: health["sessions"] == 0)
     await asyncio.sleep(LIFETIME)
-    memory = server.megabytes()
+    memory, processor = server.used()
     report.add(f"{name}: {sessions} sessions, {changes} changes each",
-               f"{took:.0f} s; a change {statistics.median(seconds):.2f} s, worst {max(seconds):.2f} s; then {memory:.0f} MB",
+               f"{took:.0f} s ({processor - before} s of processor); a change {statistics.median(seconds):.2f} s, "
+               f"worst {max(seconds):.2f} s; then {memory:.0f} MB",
                "no error", True)
     return [one for own, _ in done for one in own], memory
 
@@ -244,7 +248,7 @@ async def dropped(server: Server, report: Report) -> None:
     await server.until(lambda health: health["sessions"] == health["running"] == health["waiting"] == 0)
     seconds = time.monotonic() - start
     report.add("5 sessions dropped mid-run", f"{len(places)} of them in the line; all gone after {seconds:.1f} s",
-               f"within {3 * LIFETIME:.0f} s", seconds < 3 * LIFETIME)
+               f"within {4 * LIFETIME:.0f} s", seconds < 4 * LIFETIME)
 
 
 async def crowded(report: Report) -> None:
