@@ -277,8 +277,8 @@ def test_accessible_and_no_wider_than_the_window(open_report: Any, width: int, s
     colour = {"light": "#FF6600", "dark": "#FF8533"}
     assert line(page, "trace-vibration", "kf-lgs")["colour"] == colour[scheme]
     page.emulate_media(color_scheme={"light": "dark", "dark": "light"}[scheme])
-    page.wait_for_timeout(50)
-    assert line(page, "trace-vibration", "kf-lgs")["colour"] != colour[scheme], "it follows the system"
+    follows = f"before => ({LINE})(['trace-vibration', 'kf-lgs']).colour !== before"
+    page.wait_for_function(follows, arg=colour[scheme])
 
 
 def test_the_policy_holds(open_report: Any) -> None:
