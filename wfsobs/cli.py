@@ -118,6 +118,8 @@ def observe(
     scenario = configfile.scenario_from(preset, config, assignments)
     stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
     record = load_record(record_file, scenario, stated)
+    if record.origin:
+        click.echo(f"wfsobs: {record_file}: read as {record.origin}", err=True)
     if record.missing:
         click.echo(f"wfsobs: {record_file}: {record.missing} of {record.n_steps} frames are missing; they are bridged by "
                    "prediction and count in no score of one", err=True)

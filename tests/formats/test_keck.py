@@ -46,6 +46,7 @@ def test_the_record_of_a_keck_like_loop(tmp_path, capsys) -> None:
         "observe", str(tmp_path / "keck.npz"), "--config", str(DOCS / "keck.toml"), "--set", "gpr_online.training_size=20",
         "--set", "gpr_offline.training_size=50"])
     assert done.exit_code == 0 and "next z" in done.stdout, done.stderr
+    assert "keck.npz: read as unit arcsec, aperture 10 m, command sign -1\n" in done.stderr
 
 
 def test_files_that_do_not_go_together(tmp_path) -> None:
