@@ -53,7 +53,7 @@ def test_simulated_records_have_these_spectra() -> None:
     band = (f >= 1.5) & (f <= 8.0)
     expected = flow_spectra(s, 0, f)
     for i, name in enumerate(names):
-        # 8 records of 4 segments, 53 frequencies: 3 % at one sigma for the mean of the ratios; leakage fills the ripples a little.
+        # 8 records of 4 segments, 53 frequencies: 3 % at one sigma for the mean of the ratios; leakage fills ripples a little.
         ratio = (total[i, band] / getattr(expected, name)[band]).mean()
         assert ratio == pytest.approx(1.0, abs=0.15), name
 

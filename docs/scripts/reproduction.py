@@ -166,6 +166,18 @@ def gpr_turbulence() -> None:
     table(("turbulence [um]", "offline, tip", "online, tip", "offline, tilt", "online, tilt"), rows)
 
 
+def gpr_inputs() -> None:
+    """The two GPR in turbulence of 2 um (preset strong-turbulence), by what is done to their inputs."""
+    rows = []
+    kinds = (("raw", "raw", 300.0), ("high-pass, 10 Hz", "high-pass", 300.0), ("standardised, l = 1000", "standardised", 1000.0))
+    for name, kind, length in kinds:
+        changes: dict[str, object] = {f"{gpr}.{key}": value for gpr in ("gpr_offline", "gpr_online")
+                                      for key, value in (("inputs_filter", kind), ("length_scale", length))}
+        e = errors(changes, ("gpr-offline", "gpr-online", "kf-multi", "zero"), "strong-turbulence")
+        rows.append((name, *(middle(e[n, "vibration", "tip"], False) for n in ("gpr-offline", "gpr-online", "kf-multi", "zero"))))
+    table(("inputs", "offline", "online", "multi-peak KF", "zero"), rows)
+
+
 def turbulence() -> None:
     """The turbulence comparison at the preset."""
     e = errors({}, (*TURBULENCE, "zero"))
@@ -238,8 +250,8 @@ def ut4() -> None:
 
 
 TABLES: dict[str, Callable[[], None]] = {f.__name__: f for f in (
-    vibration, fit, butterworth, training, all_peaks, gpr_turbulence, turbulence, lgs_error, indetermination, ngs_noise,
-    weights, lgs_model, ut4,
+    vibration, fit, butterworth, training, all_peaks, gpr_turbulence, gpr_inputs, turbulence, lgs_error, indetermination,
+    ngs_noise, weights, lgs_model, ut4,
 )}
 
 if __name__ == "__main__":

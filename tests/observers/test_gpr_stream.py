@@ -7,6 +7,7 @@ from scipy.signal import lfilter
 from wfsobs.loop import simulate
 from wfsobs.observers.gpr_online import gpr_online, predict_sliding
 from wfsobs.observers.gpr_stream import OnlineGprStream, SlidingRegression
+from wfsobs.observers.inputs import scale_of
 from wfsobs.observers.kernels import ConditionError, SquaredExponential
 from wfsobs.presets import paper
 from wfsobs.watch import QUIET
@@ -53,14 +54,15 @@ def split_direct(signals, targets, depth, m, kernel, steps):
     return np.array(out), worst
 
 
+@pytest.mark.parametrize("kind", ["raw", "high-pass", "standardised"])
 @pytest.mark.parametrize("inputs", ["u-y", "z"])
-def test_the_stream_gives_the_numbers_of_the_record_version(inputs):
+def test_the_stream_gives_the_numbers_of_the_record_version(inputs, kind):
     scenario = paper().replace({
         "run.duration": 1.5, "run.warm_up": 0.5, "gpr_online.training_size": 100, "gpr_online.depth": 40,
-        "gpr_online.inputs": inputs})
+        "gpr_online.inputs": inputs, "gpr_online.inputs_filter": kind})
     record = simulate(scenario)
     expected = gpr_online(record, scenario, QUIET)["vibration"][:, 1]
-    observer = OnlineGprStream(scenario)
+    observer = OnlineGprStream(scenario, scale_of(scenario.gpr_online, record.training, record.delay, 1))
     got = np.array([observer.step(y, u) for y, u in zip(record.y_lgs[:, 1], record.u[:, 1], strict=True)])
     assert np.array_equal(np.isnan(got), np.isnan(expected))
     # Both round; cond is about 1e4 here, so 100 eps cond is 2e-10 of the spread.

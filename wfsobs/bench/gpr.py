@@ -17,8 +17,9 @@ from wfsobs.bench.sizes import Sizes
 from wfsobs.loop import simulate
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.gpr_offline import train, training_targets
-from wfsobs.observers.gpr_online import gpr_online, kernel_of, window_signals
+from wfsobs.observers.gpr_online import gpr_online, kernel_of
 from wfsobs.observers.gpr_stream import OnlineGprStream
+from wfsobs.observers.inputs import window_signals
 from wfsobs.observers.kernels import SquaredExponential
 from wfsobs.observers.reference import online_reference
 from wfsobs.record import Record, pseudo_open_loop
@@ -54,7 +55,7 @@ class Online:
 def online_problem(record: Record, scenario: Scenario, mode: int, count: int) -> Online:
     """The problem of one mode, with `count` rows for the others."""
     g = scenario.gpr_online
-    X = textbook.windows(window_signals(g, record.y_lgs, record.u, record.z, mode), g.depth)
+    X = textbook.windows(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt), g.depth)
     f = np.append(online_reference(scenario, record.z, record.dt)[g.depth :, mode], 0.0)
     rows = np.unique(np.linspace(g.training_size, len(X) - 1, count).astype(int))
     return Online(X, f, g.training_size, g.depth, kernel_of(g), rows)
@@ -162,8 +163,8 @@ def offline(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
     training, kernel, d, m = record.training, kernel_of(g), g.depth, g.training_size
     assert training is not None
     task, size = "offline-gpr-train", f"m={m} d={d}"
-    learn = window_signals(g, training.y_lgs, training.u, pseudo_open_loop(training.y_lgs, training.u), 0)
-    signals = window_signals(g, record.y_lgs, record.u, record.z, 0)
+    learn = window_signals(g, training.y_lgs, training.u, pseudo_open_loop(training.y_lgs, training.u), 0, record.dt)
+    signals = window_signals(g, record.y_lgs, record.u, record.z, 0, record.dt)
     targets = training_targets(training, scenario, record.dt)[:, 0]
     X, f, T = textbook.windows(learn, d)[:m], targets[d - 1 : d - 1 + m], textbook.windows(signals, d)
     exact, constant = textbook.exact_weights(X, f, kernel)

@@ -79,6 +79,12 @@ class _Gpr(Group):
     inputs = param.Selector(
         default="u-y", objects=["u-y", "z"], label="Inputs",
         doc="What a window holds: commands and LGS measurements (paper, eq. 14) or pseudo-open-loop measurements z.")
+    inputs_filter = param.Selector(
+        default="raw", objects=["raw", "high-pass", "standardised"], label="Inputs are",
+        doc="What is done to the inputs first. raw: nothing (paper); high-pass: turbulence taken out below the corner; "
+            "standardised: each channel over its standard deviation in the training record, so that l has no unit.")
+    highpass = Real(10.0, bounds=(0.1, 1000.0), softbounds=(1.0, 30.0), step=0.5, label="High-pass corner",
+                    doc="Corner of the inputs' high-pass [Hz], a Butterworth of second order; not in the paper.")
     training_size = Whole(1000, bounds=(2, 2048), label="Training size m", doc="Number of training windows (paper, Table 4).")
     depth = Whole(407, bounds=(1, 2000), label="Depth d", doc="Samples in a window (paper, Table 4).")
     signal_std = Real(10.0, bounds=(1e-3, 1e4), softbounds=(0.1, 100.0), label="Output scale σ_SE",

@@ -17,7 +17,8 @@ from numpy.lib.stride_tricks import as_strided
 from wfsobs.arrays import Array
 from wfsobs.blas import eliminate, solved_rows
 from wfsobs.observers.base import VIBRATION
-from wfsobs.observers.gpr_online import kernel_of, window_signals
+from wfsobs.observers.gpr_online import kernel_of
+from wfsobs.observers.inputs import scale_of, window_signals
 from wfsobs.observers.kernels import (
     Points,
     SquaredExponential,
@@ -107,8 +108,9 @@ def gpr_offline(record: Record, scenario: Scenario, watch: Watch) -> dict[str, A
     training_z = pseudo_open_loop(training.y_lgs, training.u, record.delay)
 
     def one(mode: int, watch: Watch) -> Array:
-        signals = window_signals(g, training.y_lgs, training.u, training_z, mode)
+        scale = scale_of(g, training, record.delay, mode)
+        signals = window_signals(g, training.y_lgs, training.u, training_z, mode, record.dt, scale)
         model = train(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), watch)
-        return model.predict(window_signals(g, record.y_lgs, record.u, record.z, mode), watch)
+        return model.predict(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt, scale), watch)
 
     return {VIBRATION: over_modes(record.n_modes, one, watch)}

@@ -13,6 +13,7 @@ import numpy as np
 from wfsobs.arrays import Array
 from wfsobs.groups.observers import OfflineGpr, OnlineGpr
 from wfsobs.observers.base import VIBRATION
+from wfsobs.observers.inputs import scale_of, window_signals
 from wfsobs.observers.kernels import SquaredExponential, band, check_condition, square_from_band
 from wfsobs.observers.modes import over_modes
 from wfsobs.observers.reference import online_reference
@@ -28,11 +29,6 @@ BAND_ENTRIES, BAND_ROWS = 4_000_000, 8192
 def kernel_of(settings: OfflineGpr | OnlineGpr) -> SquaredExponential:
     """The kernel with the numbers of the settings."""
     return SquaredExponential(settings.signal_std, settings.length_scale, settings.noise_std)
-
-
-def window_signals(settings: OfflineGpr | OnlineGpr, y: Array, u: Array, z: Array, mode: int) -> Array:
-    """The channels of a window, (n_steps, channels): u and y_lgs (paper, eq. 14), or z."""
-    return z[:, [mode]] if settings.inputs == "z" else np.column_stack([u[:, mode], y[:, mode]])
 
 
 def gpr_online(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
@@ -52,7 +48,8 @@ def gpr_online(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Ar
             watch.step(float(done.mean()))
             watch.partial(VIBRATION, values)
 
-        signals = window_signals(g, record.y_lgs, record.u, record.z, mode)
+        scale = scale_of(g, record.training, record.delay, mode)
+        signals = window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt, scale)
         return predict_sliding(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), deliver, watch.check)[0]
 
     return {VIBRATION: over_modes(record.n_modes, one, watch)}

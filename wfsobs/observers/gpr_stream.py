@@ -25,6 +25,7 @@ from scipy.linalg.blas import dsymv, dsyr2
 from wfsobs.arrays import Array
 from wfsobs.bandpass import StreamingBank, bandpass_bank
 from wfsobs.observers.gpr_online import kernel_of
+from wfsobs.observers.inputs import Scale, StreamingInputs
 from wfsobs.observers.kernels import ConditionError, SquaredExponential, restart_interval
 from wfsobs.scenario import Scenario
 
@@ -166,10 +167,11 @@ class OnlineGprStream:
     [True, True, True, True, False]
     """
 
-    def __init__(self, scenario: Scenario):
+    def __init__(self, scenario: Scenario, scale: Scale | None = None):
+        """Scale: of standardised inputs, from `inputs.scale_of`."""
         g, b = scenario.gpr_online, scenario.butterworth
         bank = bandpass_bank(b.frequencies, b.bandwidth_online, b.order, scenario.dt)
-        self._inputs = g.inputs
+        self._inputs, self._prepared = g.inputs, StreamingInputs(g, scenario.dt, scale)
         self._bank = StreamingBank(bank)
         self._regression = SlidingRegression(g.depth, g.training_size, 1 if g.inputs == "z" else 2, kernel_of(g))
         self._u = (0.0, 0.0)  # u[k-1], u[k-2]
@@ -189,7 +191,7 @@ class OnlineGprStream:
         else:
             sample = np.array([u, y])
         self._now, self._pending = u, True
-        return self._regression.predict(sample, self._bank.push(z))
+        return self._regression.predict(self._prepared.step(sample), self._bank.push(z))
 
     def update(self, u: float | None = None) -> None:
         """Learn from the last sample. u: its command [um], where `estimate` was not told."""

@@ -14,7 +14,7 @@ from scipy.linalg import solve
 from wfsobs.arrays import Array
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.gpr_offline import training_targets
-from wfsobs.observers.gpr_online import window_signals
+from wfsobs.observers.inputs import scale_of, window_signals
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.watch import Watch
@@ -62,9 +62,10 @@ def ridge(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
     columns = []
     for mode in range(record.n_modes):
         watch.step(mode / record.n_modes)
-        known = window_signals(g, training.y_lgs, training.u, training_z, mode)
+        scale = scale_of(g, training, record.delay, mode)
+        known = window_signals(g, training.y_lgs, training.u, training_z, mode, record.dt, scale)
         fitted = fit(known, targets[:, mode], g.depth, g.training_size, penalty)
-        columns.append(predict(window_signals(g, record.y_lgs, record.u, record.z, mode), *fitted))
+        columns.append(predict(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt, scale), *fitted))
     return {VIBRATION: np.column_stack(columns)}
 
 
