@@ -1,4 +1,5 @@
-"""A record of the visitor's own in place of the simulation: a file, a preview to confirm, then the same views.
+"""A record of the visitor's own in place of the simulation, or a vibration spectrum: a file, a preview to confirm, then the
+same views.
 
 The browser sends the file in parts. What it is said to be can be changed while the preview stands; nothing runs before it
 is confirmed. Reading is done beside the page, in a thread.
@@ -6,61 +7,33 @@ is confirmed. Reading is done beside the page, in a thread.
 
 from __future__ import annotations
 
-import base64
-import binascii
 import hashlib
 from collections.abc import Callable
 from functools import partial
 from html import escape
 from typing import Any
 
+import numpy as np
 import panel as pn
 import panel_material_ui as pmui
-import param
 from bokeh.models import ColumnDataSource
-from panel.custom import JSComponent
 
+from wfsobs.app.picker import Parcel, Picker, too_large
 from wfsobs.app.store import Store
-from wfsobs.app.style import asset
 from wfsobs.app.views.plots import new_figure, send
 from wfsobs.app.work import Loaded
 from wfsobs.intake import Stated
 from wfsobs.modes import TIP_TILT
 from wfsobs.pipeline import as_stated
-from wfsobs.preview import Preview, preview, safe_name
+from wfsobs.preview import Preview, SpectrumPreview, preview_any, safe_name
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 from wfsobs.units import UNITS
 
-LARGEST = 20_000_000
-"""Of a file [bytes]."""
-
-PART = 1_000_000
-"""Of what the browser sends at a time [bytes]."""
-
 SILENT = "as the file says"
+NOTHING = np.empty(0)
 COLOURS = ("#0B4F6C", "#FF6600")
-
-
-class Picker(JSComponent):
-    """The button and what is said beside it; files up in parts."""
-
-    said = param.String("", doc="What there is to say, in one line.")
-    loaded = param.String("", doc="What takes the place of the simulation.")
-    largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
-    part = param.Integer(PART, doc="How much is sent at a time [bytes].")
-
-    _esm = asset("upload.js")
-    _stylesheets = [asset("actions.css")]  # noqa: RUF012
-
-    def __init__(self, **params: Any):
-        self.on_message: Callable[[dict[str, Any]], None] | None = None
-        super().__init__(**params)
-
-    def _handle_msg(self, data: dict[str, Any]) -> None:
-        if self.on_message is not None:
-            self.on_message(data)
 
 
 class Upload:
@@ -84,9 +57,9 @@ class Upload:
             self.figure.line("x", "y", source=source, color=colour, line_width=1.4, legend_label=mode.name)
         self.room = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
         self.view = pn.Column(self.picker, self.room, sizing_mode="stretch_width", margin=0)
-        self._name, self._parts, self._size = "", [], 0
-        self._content = b""
-        self._preview: Preview | None = None
+        self._parcel: Parcel | None = None
+        self._name, self._content = "", b""
+        self._preview: Preview | SpectrumPreview | None = None
         self._asked = 0
         self.use.on_click(lambda _event: self.confirm())
         self.drop.on_click(lambda _event: self.discard())
@@ -124,29 +97,25 @@ class Upload:
         if action == "simulate":
             self.simulate()
         elif action == "large":
-            self._say(f"{safe_name(str(msg.get('name', '')))}: larger than {LARGEST // 1_000_000} MB")
+            self._say(too_large(safe_name(str(msg.get("name", "")))))
         elif action == "part":
-            try:
-                self._take(msg)
-            except (KeyError, TypeError, ValueError, binascii.Error):
-                self.discard("The file did not arrive whole.")
+            self._take(msg)
 
     def _take(self, msg: dict[str, Any]) -> None:
-        index, count = int(msg["index"]), int(msg["count"])
-        if index == 0:
+        if msg.get("index") == 0:
             self.discard()
-            self._name, self._size = safe_name(str(msg.get("name", ""))), 0
-        part = base64.b64decode(msg["data"], validate=True)
-        if index != len(self._parts) or not index < count:
-            raise ValueError("a part is missing")
-        self._size += len(part)
-        if self._size > LARGEST:
-            self.discard(f"{self._name}: larger than {LARGEST // 1_000_000} MB")
+            self._parcel = Parcel(safe_name(str(msg.get("name", ""))))
+        if self._parcel is None:  # more of a file that has been given up
             return
-        self._parts.append(part)
-        if index == count - 1:
-            self._content, self._parts = b"".join(self._parts), []
-            if not self._content:
+        try:
+            content = self._parcel.take(msg)
+        except ValueError as error:
+            self.discard(str(error))
+            return
+        if content is not None:
+            self._name, self._content = self._parcel.name, content
+            self._parcel = None
+            if not content:
                 self._say(f"{self._name}: is empty")
             self.look()
 
@@ -184,7 +153,7 @@ class Upload:
 
         def read() -> None:
             try:
-                found: Preview | RecordError = preview(content, name, scenario, stated)
+                found: Preview | SpectrumPreview | RecordError = preview_any(content, name, scenario, stated)
             except RecordError as error:
                 found = error
             except Exception:  # whatever a stranger's file may do
@@ -193,18 +162,21 @@ class Upload:
 
         self.store.run.aside(read)
 
-    def _land(self, asked: int, found: Preview | RecordError) -> None:
+    def _land(self, asked: int, found: Preview | SpectrumPreview | RecordError) -> None:
         if asked != self._asked:
             return
-        self._preview = found if isinstance(found, Preview) else None
+        self._preview = None if isinstance(found, RecordError) else found
+        spectrum = isinstance(found, SpectrumPreview)
+        self.use.label = "Use this spectrum" if spectrum else "Use this record"
+        self.figure.yaxis.axis_label = "PSD [µm²/Hz]" if spectrum else "PSD of z [µm²/Hz]"
         self.picker.said = "" if self._preview else str(found)
         self.use.disabled = self._preview is None
         lines = self._preview.lines() if self._preview else [str(found)]
         self.text.object = f"<p><b>{escape(self._name)}</b></p><ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
         for mode, source in enumerate(self.sources):
             there = self._preview is not None and mode < self._preview.spectrum.shape[1]
-            x, y = (self._preview.frequency[1:], self._preview.spectrum[1:, mode]) if self._preview and there else ([], [])
-            send(source, {"x": x, "y": y})
+            x, y = (self._preview.frequency, self._preview.spectrum[:, mode]) if self._preview and there else (NOTHING, NOTHING)
+            send(source, {"x": x[x > 0], "y": y[x > 0]})
         if not len(self.room):
             self.room[:] = [
                 self.text, pn.FlexBox(self.unit, self.sign, self.delay, self.rate, gap="8px", margin=0),
@@ -214,7 +186,9 @@ class Upload:
     def confirm(self) -> None:
         """Let the record take the place of the simulation, the settings of rate, ratio and length with it."""
         found = self._preview
-        if found is None:
+        if isinstance(found, SpectrumPreview):
+            self._vibrate(found)
+        if not isinstance(found, Preview):
             return
         record = found.record
         key = hashlib.sha256(self._content + repr((self.stated(), self.store.scenario.telescope.diameter)).encode()).hexdigest()
@@ -232,6 +206,15 @@ class Upload:
         self.discard()
         self.picker.loaded = f"{found.name}: {found.lines()[0]}"
 
+    def _vibrate(self, found: SpectrumPreview) -> None:
+        """Take a spectrum as that of the vibration."""
+        try:
+            self.store.load(self.store.scenario.replace({"vibration.source": "psd", "vibration.psd": found.table}))
+        except SettingError as error:
+            self._say(f"{found.name}: {str(error)[:300]}")
+        else:
+            self.discard(f"The vibration has the spectrum of {found.name}.")
+
     def simulate(self) -> None:
         """Go back to the simulation."""
         if self.loaded is not None:
@@ -242,7 +225,7 @@ class Upload:
     def discard(self, why: str = "") -> None:
         """Forget the file that is being looked at."""
         self._asked += 1
-        self._content, self._parts, self._preview = b"", [], None
+        self._content, self._parcel, self._preview = b"", None, None
         self.room.visible = False
         self._say(why)
 

@@ -26,7 +26,7 @@ export function render({model, el}) {
     input.value = ""
   }
   const open = Object.assign(document.createElement("button"), {type: "button", textContent: "Load data"})
-  open.title = "A record of telemetry in place of the simulation: .npz, .csv, .fits"
+  open.title = "A record of telemetry in place of the simulation, or a vibration spectrum: .npz, .csv, .fits"
   open.onclick = () => input.click()
   const back = Object.assign(document.createElement("button"), {type: "button", textContent: "Back to the simulation"})
   back.onclick = () => model.send_msg({action: "simulate"})

@@ -1,4 +1,4 @@
-"""What a record from a stranger is, before anything is done with it: rate, unit, gaps, rms and spectrum, or one line.
+"""What a record or a spectrum from a stranger is, before anything is done with it: rate, unit, gaps, rms, or one line.
 
 The bytes may be anything. Nothing is unpickled, no path is opened, and what a file would grow to in memory is known before
 it grows.
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wfsobs.arrays import Array
+from wfsobs.formats.psd import NoSpectrumError, read_psd
 from wfsobs.gaps import held
 from wfsobs.intake import Stated
 from wfsobs.record import Record, RecordError
@@ -68,6 +69,43 @@ class Preview:
             f"NGS: {ngs}",
             f"truth: {' and '.join(truth) or 'none, scored by prediction of the next measurement'}",
         ]
+
+
+@dataclass(frozen=True)
+class SpectrumPreview:
+    """A vibration spectrum. table : as vibration.psd takes it; the rest as in `Preview`."""
+
+    table: dict[str, list[float]]
+    name: str
+    frequency: Array
+    spectrum: Array
+
+    def lines(self) -> list[str]:
+        """What to confirm, in words."""
+        tip, tilt = np.sqrt(np.trapezoid(self.spectrum, self.frequency, axis=0)) * 1e3
+        low, high = self.frequency[[0, -1]]
+        return [
+            f"a vibration spectrum: {self.frequency.size} frequencies from {low:.4g} to {high:.4g} Hz",
+            f"{tip:.4g} nm rms of tip, {tilt:.4g} nm of tilt",
+        ]
+
+
+def preview_any(
+    data: bytes, name: str, scenario: Scenario | None = None, stated: Stated | None = None
+) -> Preview | SpectrumPreview:
+    """A record, or where it is none a vibration spectrum. Raises RecordError with one clear line."""
+    try:
+        return preview(data, name, scenario, stated)
+    except RecordError as error:
+        if "has no y_lgs" not in str(error):
+            raise
+        no_record = error
+    shown, diameter = safe_name(name), (scenario or Scenario()).telescope.diameter
+    try:
+        table = read_psd(io.BytesIO(data), shown, stated.unit if stated else None, diameter)
+    except NoSpectrumError:
+        raise no_record from None
+    return SpectrumPreview(table, shown, np.array(table["frequency"]), np.column_stack([table["tip"], table["tilt"]]))
 
 
 def preview(data: bytes, name: str, scenario: Scenario | None = None, stated: Stated | None = None) -> Preview:

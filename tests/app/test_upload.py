@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.app import upload as module
+from wfsobs.app import picker as module
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.limits import Limits
+from wfsobs.app.picker import LARGEST
 from wfsobs.app.service import Service
-from wfsobs.app.upload import LARGEST, SILENT
+from wfsobs.app.upload import SILENT
 from wfsobs.formats import format_of
 from wfsobs.loop import simulate
 from wfsobs.pipeline import observe
@@ -111,6 +112,26 @@ def test_what_is_said_of_it(dashboard: Dashboard, loop: Any, short: Scenario) ->
     assert not dashboard.upload.use.disabled and dashboard.upload.unit.value != SILENT
 
 
+def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
+    """10 um^2/Hz over 1 Hz about 30 Hz on tip, nothing on tilt; without a unit it is asked for."""
+    rows = "29.4,0,0\n29.5,10,0\n30.5,10,0\n30.6,0,0\n"
+    previewed(dashboard, loop, f"frequency,tip,tilt\n{rows}".encode(), "lines.csv")
+    assert dashboard.upload.picker.said.startswith("lines.csv: does not say the unit of tip")
+    dashboard.upload.unit.value = "nm"
+    loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
+    assert "4 frequencies from 29.4 to 30.6 Hz" in dashboard.upload.text.object and "3.317 nm rms of tip, 0 nm" in (
+        dashboard.upload.text.object)
+    assert dashboard.upload.use.label == "Use this spectrum"
+    dashboard.upload.confirm()
+    loop.finish(dashboard.store)
+    vibration = dashboard.store.scenario.vibration
+    assert vibration.source == "psd" and dashboard.upload.loaded is None
+    assert vibration.psd.tip == pytest.approx([0.0, 1e-5, 1e-5, 0.0], rel=1e-12)
+    assert dashboard.store.run.shown.result.record.vibration.std(axis=0) == pytest.approx([np.sqrt(1.1e-5), 0.0], rel=0.02)
+    previewed(dashboard, loop, b"seeing,airmass\n1,2\n", "log.csv")
+    assert dashboard.upload.picker.said.startswith("log.csv: has no y_lgs")
+
+
 def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
     before = dashboard.store.run.shown
     for content, name, line in (
@@ -127,9 +148,8 @@ def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
 def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
     upload = dashboard.upload
     for msg in (
-        {"index": 1, "count": 2, "data": "AAAA"}, {"index": 0, "count": 0, "data": "AAAA"},
-        {"index": "x", "count": 1, "data": ""}, {"index": 0, "count": 1, "data": "%%%"},
-        {"index": 0, "count": 1, "data": None}, {},
+        {"index": 0, "count": 0, "data": "AAAA"}, {"index": 0, "count": "x", "data": ""}, {"index": 0, "count": 1, "data": "%%%"},
+        {"index": 0, "count": 1, "data": None}, {"index": 0},
     ):
         upload.handle({"action": "part", "name": "a.csv", **msg})
         assert upload.picker.said == "The file did not arrive whole." and upload._content == b""
@@ -137,7 +157,7 @@ def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.Monk
     assert upload.picker.said == f"x.csv: larger than {LARGEST // 1_000_000} MB"
     monkeypatch.setattr(module, "LARGEST", 1000)
     sent(dashboard, bytes(3000), part=400)
-    assert upload._content == b"" and not upload._parts
+    assert upload._content == b"" and upload.picker.said == "night.csv: larger than 0 MB"
 
 
 def test_on_a_server_with_limits(loop: Any, short: Scenario) -> None:

@@ -27,6 +27,10 @@ Table = tuple[dict[str, Array], dict[str, str]]
 """Columns, and the units stated for them."""
 
 
+class NoSpectrumError(RecordError):
+    """A file without the columns or rows of a spectrum."""
+
+
 def load_psd(path: str | Path, unit: str | None = None, diameter: float = 8.0) -> dict[str, list[float]]:
     """The table as vibration.psd takes it, {frequency, tip, tilt}, densities in [um^2/Hz].
 
@@ -47,13 +51,13 @@ def read_psd(file: IO[bytes], name: str, unit: str | None = None, diameter: floa
         columns, units = _from_fits(file) if fits else _from_csv(file)
         return _scaled(columns, units, unit, diameter)
     except RecordError as error:
-        raise RecordError(f"{name}: {error}") from None
+        raise type(error)(f"{name}: {error}") from None
 
 
 def _from_csv(file: IO[bytes]) -> Table:
     rows = [(n, text.split(",")) for n, text in lines_of(file) if not text.startswith("#")]
     if not rows:
-        raise RecordError("holds no table")
+        raise NoSpectrumError("holds no table")
     found: dict[str, int] = {}
     units: dict[str, str] = {}
     for i, heading in enumerate(rows[0][1]):
@@ -62,7 +66,7 @@ def _from_csv(file: IO[bytes]) -> Table:
         units[name.strip().lower()] = rest.rstrip("] ")
     missing = [name for name in COLUMNS if name not in found]
     if missing:
-        raise RecordError(f"has no column {missing[0]}; it takes frequency [Hz], tip [nm^2/Hz], tilt [nm^2/Hz]")
+        raise NoSpectrumError(f"has no column {missing[0]}; it takes frequency [Hz], tip [nm^2/Hz], tilt [nm^2/Hz]")
     columns: dict[str, list[float]] = {name: [] for name in COLUMNS}
     for line, cells in rows[1:]:
         for name in COLUMNS:
@@ -84,7 +88,7 @@ def _from_fits(file: IO[bytes]) -> Table:
                 density = str(hdu.header.get("BUNIT", ""))
                 rows = np.array(hdu.data, dtype=np.float64)
                 return dict(zip(COLUMNS, rows, strict=True)), {"frequency": "Hz", "tip": density, "tilt": density}
-    raise RecordError("has neither a table of frequency, tip and tilt nor an image of three rows")
+    raise NoSpectrumError("has neither a table of frequency, tip and tilt nor an image of three rows")
 
 
 def _scaled(columns: dict[str, Array], units: dict[str, str], unit: str | None, diameter: float) -> dict[str, list[float]]:

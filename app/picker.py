@@ -1,0 +1,66 @@
+"""How a file comes from the browser: a button, and parts that are put together again."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections.abc import Callable
+from typing import Any
+
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.style import asset
+
+LARGEST = 20_000_000
+"""Of a file [bytes]."""
+
+PART = 1_000_000
+"""Of what the browser sends at a time [bytes]."""
+
+
+class Picker(JSComponent):
+    """The button and what is said beside it; files up in parts."""
+
+    said = param.String("", doc="What there is to say, in one line.")
+    loaded = param.String("", doc="What takes the place of the simulation.")
+    largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
+    part = param.Integer(PART, doc="How much is sent at a time [bytes].")
+
+    _esm = asset("upload.js")
+    _stylesheets = [asset("actions.css")]  # noqa: RUF012
+
+    def __init__(self, **params: Any):
+        self.on_message: Callable[[dict[str, Any]], None] | None = None
+        super().__init__(**params)
+
+    def _handle_msg(self, data: dict[str, Any]) -> None:
+        if self.on_message is not None:
+            self.on_message(data)
+
+
+class Parcel:
+    """A file on its way, in parts that come one after the other."""
+
+    def __init__(self, name: str):
+        self.name = name
+        self._parts: list[bytes] = []
+
+    def take(self, msg: dict[str, Any]) -> bytes | None:
+        """Add a part {index, count, data}; the whole file with the last one. Raises ValueError, one line."""
+        try:
+            index, count = int(msg["index"]), int(msg["count"])
+            part = base64.b64decode(msg["data"], validate=True)
+        except (KeyError, TypeError, ValueError, binascii.Error):
+            index, count, part = 0, 0, b""
+        if index != len(self._parts) or not index < count:
+            raise ValueError("The file did not arrive whole.")
+        self._parts.append(part)
+        if sum(map(len, self._parts)) > LARGEST:
+            raise ValueError(too_large(self.name))
+        return b"".join(self._parts) if index == count - 1 else None
+
+
+def too_large(name: str) -> str:
+    """Says that a file is."""
+    return f"{name}: larger than {LARGEST // 1_000_000} MB"
