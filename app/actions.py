@@ -13,7 +13,7 @@ from panel.custom import JSComponent
 
 from wfsobs.app.downloads import TooLarge, data_csv, data_npz
 from wfsobs.app.report.maker import FAILED, Maker, ReportError
-from wfsobs.app.share import FILE, from_file, from_query, to_command, to_file, to_python, to_query
+from wfsobs.app.share import FILE, Link, from_file, from_query, to_command, to_file, to_python, to_query
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset
 from wfsobs.app.work import Shown
@@ -48,7 +48,7 @@ class Toolbar(JSComponent):
         super().__init__(**params)
 
     def _handle_msg(self, data: dict[str, Any]) -> None:
-        if self.on_action is not None:
+        if self.on_action is not None and isinstance(data, dict) and isinstance(data.get("action"), str):
             self.on_action(data)
 
     def save(self, name: str, kind: str, content: bytes) -> None:
@@ -90,17 +90,32 @@ class Actions:
         self.toolbar.notes = [f"Not used from the link: {line}" for line in link.rejected]
 
     def open_file(self, name: str, text: object) -> None:
-        """Take the settings of a TOML file, or say in one line why not; then nothing changes."""
+        """Take the settings of a TOML file, read in a thread, or say in one line why not; then nothing changes."""
         if not isinstance(text, str) or len(text) > LARGEST:
             self._note(f"{name[:80]}: larger than {LARGEST // 1_000_000} MB, not a scenario")
             return
+        run = self.store.run
+
+        def work() -> None:
+            try:
+                link = from_file(text)
+            except SettingError as error:
+                run.post(partial(self._refuse, name, error))
+            else:
+                run.post(partial(self._take, name, link))
+
+        run.aside(work)
+
+    def _take(self, name: str, link: Link) -> None:
         try:
-            link = from_file(text)
             self.store.load(link.scenario, link.preset or None)
         except SettingError as error:
-            self._note(f"{name[:80]}: {str(error).removeprefix('file: ')[:300]}")
-            return
-        self.toolbar.param.update(notes=[], said=f"Opened {name[:80]}.")
+            self._refuse(name, error)
+        else:
+            self.toolbar.param.update(notes=[], said=f"Opened {name[:80]}.")
+
+    def _refuse(self, name: str, error: SettingError) -> None:
+        self._note(f"{name[:80]}: {str(error).removeprefix('file: ')[:300]}")
 
     def save_scenario(self) -> None:
         """Send the settings as TOML."""

@@ -53,6 +53,11 @@ class Limits:
         _whole(run_seconds(scenario), self.seconds, "s")
         _whole(run_bytes(scenario) / 1e6, self.megabytes, "MB of memory")
 
+    def check_steps(self, n_steps: int) -> None:
+        """Raises SettingError where a loaded record is longer than the server allows."""
+        if n_steps > self.steps:
+            raise SettingError(f"The record has {n_steps} steps; at most {self.steps:g} on this server")
+
 
 NONE = Limits()
 """For those who serve themselves."""

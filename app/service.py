@@ -213,6 +213,8 @@ class Visit:
     ) -> Shown:
         """The results of a scenario, kept or computed, whoever asked first. Raises SettingError, Cancelled."""
         self.service.limits.check(scenario)
+        if loaded is not None:
+            self.service.limits.check_steps(loaded.record.n_steps)
         joined = self.service.join(self.number, scenario, cancelled, tell, loaded)
         if isinstance(joined, Shown):
             return joined

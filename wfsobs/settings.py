@@ -185,6 +185,9 @@ def settings_of(p: param.List) -> dict[str, param.Parameter]:
 def _groups(p: param.List, value: Any, path: str) -> list[Group]:
     if not isinstance(value, (list, tuple)):
         raise SettingError(f"{path} = {_short(value)}: takes a list of tables")
+    _, high = p.bounds or (0, None)
+    if high is not None and len(value) > high:
+        raise SettingError(f"{path}: {len(value)} entries, at most {high} are allowed")
     out: list[Group] = []
     for i, item in enumerate(value):
         if isinstance(item, Group):
@@ -195,9 +198,6 @@ def _groups(p: param.List, value: Any, path: str) -> list[Group]:
             out.append(made)
         else:
             raise SettingError(f"{path}.{i} = {_short(item)}: takes a table of settings")
-    _, high = p.bounds or (0, None)
-    if high is not None and len(out) > high:
-        raise SettingError(f"{path}: {len(out)} entries, at most {high} are allowed")
     return out
 
 

@@ -74,10 +74,11 @@ def test_a_link_is_one_step_and_names_what_it_could_not_use(actions: Actions) ->
     assert store.scenario == before and store.preset == "paper"
 
 
-def test_a_file_is_one_step(actions: Actions) -> None:
+def test_a_file_is_one_step(actions: Actions, loop: Any) -> None:
     before = actions.store.scenario
     actions.handle({"action": "open", "name": "mine.toml", "text": 'preset = "ut4"\nloop.gain = 0.2'})
     store = actions.store
+    loop.until(lambda: actions.toolbar.said != "")
     assert store.scenario == PRESETS["ut4"]().replace({"loop.gain": 0.2}) and store.preset == "ut4"
     assert actions.toolbar.said == "Opened mine.toml."
     store.undo()
@@ -85,14 +86,15 @@ def test_a_file_is_one_step(actions: Actions) -> None:
 
 
 @pytest.mark.parametrize("text", ["loop.gain = 9", "nonsense", "run.warm_up = 20", "#" * (LARGEST + 1), None, 3])
-def test_a_bad_file_changes_nothing_and_has_one_line(actions: Actions, text: Any) -> None:
+def test_a_bad_file_changes_nothing_and_has_one_line(actions: Actions, loop: Any, text: Any) -> None:
     before = actions.store.scenario
     actions.handle({"action": "open", "name": "mine.toml", "text": text})
+    loop.until(lambda: actions.toolbar.notes != [])
     assert actions.store.scenario is before
     (note,) = actions.toolbar.notes
     assert note.startswith("mine.toml: ") and "\n" not in note
     actions.handle({"action": "open", "name": "mine.toml", "text": "loop.gain = 0.2"})
-    assert actions.toolbar.notes == []
+    loop.until(lambda: actions.toolbar.notes == [])
 
 
 def test_the_scenario_file(actions: Actions) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.app.cache import Cache, arrays_in, key_of, size_of
@@ -108,6 +108,7 @@ class Model:
         return self.kept.get(key)
 
 
+@settings(deadline=None)
 @given(
     st.integers(0, 40),
     st.lists(st.tuples(st.booleans(), st.integers(0, 5), st.integers(0, 25)), max_size=60),

@@ -7,7 +7,7 @@ from dataclasses import fields
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.app.dashboard import Dashboard
@@ -51,6 +51,7 @@ def test_the_presets_are_allowed(preset: str) -> None:
     PUBLIC.check(PRESETS[preset]())
 
 
+@settings(deadline=None)
 @given(
     st.floats(2.0, 3600.0), st.sampled_from([10.0, 500.0, 1000.0, 20_000.0, 100_000.0]), st.integers(2, 2048),
     st.integers(1, 2000), st.integers(2, 2048),
@@ -71,6 +72,12 @@ def test_what_is_allowed_is_within_every_bound(duration: float, rate: float, m: 
 def test_the_whole_run_is_bounded_where_each_setting_is_not() -> None:
     assert refused(Limits(seconds=3), {"run.duration": 100}).startswith("The run would take about 4 s, at most 3 on this server")
     assert refused(Limits(megabytes=50), {}).startswith("The run would take about 108 MB of memory, at most 50")
+
+
+def test_a_loaded_record_is_bounded() -> None:
+    Limits(steps=100).check_steps(100)
+    with pytest.raises(SettingError, match="The record has 101 steps; at most 100 on this server"):
+        Limits(steps=100).check_steps(101)
 
 
 # ---------------------------------------------------------------------- every way in
@@ -99,6 +106,7 @@ def test_a_link_and_a_file_say_it(loop: Any, short: Scenario) -> None:
     assert dashboard.store.scenario.turbulence.wind_speed == 20.0, "the rest of the link is used"
     before = dashboard.store.scenario
     actions.open_file("mine.toml", to_file(paper().replace({"run.duration": 31}), "paper"))
+    loop.until(lambda: actions.toolbar.notes[0].startswith("mine.toml"))
     assert actions.toolbar.notes == ["mine.toml: run.duration = 31: at most 30 s on this server"]
     assert dashboard.store.scenario is before
 
