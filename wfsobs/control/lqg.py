@@ -48,14 +48,14 @@ def lqg_of(model: DisturbanceModel, noise: float, mirror: Mirror) -> Law:
 
 def lqg_kf_lgs(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
     """With the model of the LGS Kalman filter: turbulence and one vibration peak."""
-    return lqg_of(kalman_model(scenario, mode, scenario.dt), measurement_noise(scenario)[0], mirror)
+    return lqg_of(kalman_model(scenario, mode, scenario.dt), measurement_noise(scenario, mode)[0], mirror)
 
 
 def lqg_multirate(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
     """With the paper's multi-rate filter. Raises SettingError where its cycle is unstable."""
     model = kalman_model(scenario, mode, scenario.dt)
     return _two_sensors(multirate_filter(
-        model, scenario.sensors.exposure_ratio, *multirate_noise(scenario), _rows_of(model, mirror)))
+        model, scenario.sensors.exposure_ratio, *multirate_noise(scenario, mode), _rows_of(model, mirror)))
 
 
 def lqg_multirate_optimal(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
