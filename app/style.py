@@ -1,4 +1,4 @@
-"""Colours, dashes and names: how an observer looks wherever it appears.
+"""Colours, dashes and names: how an observer or a controller looks wherever it appears.
 
 The colours are the paper's. In dark mode each has a lighter relative; dashes tell apart what comes close in colour.
 """
@@ -47,6 +47,14 @@ LOOKS: Mapping[str, Look] = MappingProxyType({
     "persistence": Look("Persistence", "#707070", "#A8A8A8", (1, 3)),
     BOUND: Look("Bound, LGS alone", "#202020", "#E8E8E8", (1, 2)),
     "zero": Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4)),
+    "none": Look("No control", "#606060", "#C8C8C8", (6, 3)),
+    "integrator": Look("Integrator", "#003DE6", "#7AA2FF"),
+    "lqg-kf-lgs": Look("LQG, LGS KF", "#FF6600", "#FF8533"),
+    "lqg-kf-multi": Look("LQG, all peaks", "#B40000", "#FF7A70", (8, 3)),
+    "lqg-multirate": Look("LQG, multi-rate", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
+    "lqg-multirate-optimal": Look("LQG, opt. multi-rate", "#7A1FA2", "#C9A0FF", (3, 2)),
+    "integrator+gpr-offline": Look("Int. + offline GPR", "#0A960A", "#4FD64F", (12, 2, 2, 2, 2, 2)),
+    "integrator+gpr-online": Look("Int. + online GPR", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
 })
 
 HIDDEN = ("ridge", "ridge-30", "persistence", "zero")

@@ -48,7 +48,7 @@ class Scenario(Group):
     butterworth = section(Butterworth, "Butterworth reference")
     gpr_offline = section(OfflineGpr, "Offline GPR")
     gpr_online = section(OnlineGpr, "Online GPR")
-    control = section(Control, "Closed loop")
+    control = section(Control, "Controllers")
     run = section(Run, "Run")
 
     @property

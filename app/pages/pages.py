@@ -11,12 +11,14 @@ import panel_material_ui as pmui
 import param
 
 from wfsobs.app.display import Display
+from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.figures import Figures
 from wfsobs.app.pages.model import Model
 from wfsobs.app.store import Store
 
-EXPLORE, FIGURES, MODEL = "explore", "figures", "model"
-TITLES: Mapping[str, str] = MappingProxyType({"Explore": EXPLORE, "Paper figures": FIGURES, "Model": MODEL})
+EXPLORE, LOOP, FIGURES, MODEL = "explore", "loop", "figures", "model"
+TITLES: Mapping[str, str] = MappingProxyType(
+    {"Explore": EXPLORE, "Closed loop": LOOP, "Paper figures": FIGURES, "Model": MODEL})
 
 
 class Page(Protocol):
@@ -37,7 +39,8 @@ class Pages(param.Parameterized):
     def __init__(self, explore: Any, store: Store, display: Display):
         super().__init__()
         self._makers: dict[str, Callable[[], Page]] = {
-            FIGURES: lambda: Figures(store.run, display), MODEL: lambda: Model(store, display)}
+            LOOP: lambda: ClosedLoopPage(store.run, display), FIGURES: lambda: Figures(store.run, display),
+            MODEL: lambda: Model(store, display)}
         self.made: dict[str, Page] = {}
         self.rooms = {EXPLORE: explore, **{
             name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers}}

@@ -1,0 +1,90 @@
+"""The closed loop of the results shown, computed in a thread beside the run: quick controllers first, each as it is done."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+from wfsobs.app.run import Run
+from wfsobs.app.work import Shown
+from wfsobs.arrays import Array
+from wfsobs.control.closed_loop import ClosedLoop, design, each_outcome
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.curves import Curves, curves
+from wfsobs.control.tables import Row, rows
+from wfsobs.scores import welch_psd
+from wfsobs.watch import Cancelled, Watch
+
+
+@dataclass(frozen=True)
+class LoopShown:
+    """What a closed loop has given so far.
+
+    rows    : those of `wfsobs loop --json`
+    spectra : controller -> (frequency (n,) [Hz], density of the residual (n, n_modes) [um^2/Hz])
+    curves  : controller -> per mode, of stable time-invariant laws
+    """
+
+    result: ClosedLoop
+    rows: tuple[Row, ...] = ()
+    spectra: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+    curves: Mapping[str, tuple[Curves, ...]] = field(default_factory=dict)
+    done: bool = False
+
+    def residual(self, controller: str) -> Array | None:
+        """(n_steps, n_modes) [um], or None."""
+        return next((o.residual for o in self.result.outcomes if o.controller == controller), None)
+
+
+class LoopRun:
+    """The one closed loop of a session. What it gives lands on the session's thread, unless superseded."""
+
+    def __init__(self, run: Run, land: Callable[[LoopShown | None, str], None]):
+        """Land is called with the results so far, or None and why there are none."""
+        self._run, self._land = run, land
+        self._cancel = threading.Event()
+
+    def start(self, of: Shown) -> None:
+        """Compute for a record that is shown, in place of whatever is being computed."""
+        self.stop()
+        self._cancel = cancel = threading.Event()
+        self._run.aside(partial(self._work, of, cancel))
+
+    def stop(self) -> None:
+        """Nothing more lands."""
+        self._cancel.set()
+
+    def _work(self, of: Shown, cancel: threading.Event) -> None:
+        """In a thread of the pool."""
+        def land(shown: LoopShown | None, reason: str = "") -> None:
+            self._run.post(lambda: None if cancel.is_set() else self._land(shown, reason))
+
+        try:
+            compute(of, Watch(cancelled=cancel.is_set), land)
+        except Cancelled:
+            pass
+        except ValueError as error:  # settings or a record that no loop can be made of
+            land(None, str(error))
+
+
+def compute(of: Shown, watch: Watch, land: Callable[[LoopShown], None]) -> None:
+    """Run every controller on the record shown; hand over what is done once the quick ones are, and after each of the others."""
+    record, plan = of.result.record, design(of.scenario)
+    linear = {
+        name: tuple(curves(d.law, plan.mirror, record.dt) for d in laws if d.law)
+        for name, laws in plan.laws.items() if all(d.margins for d in laws)}
+    outcomes: list[Any] = []
+    spectra: dict[str, tuple[Array, Array]] = {}
+    start = round(of.scenario.run.warm_up / record.dt)
+    names = list(plan.laws)
+    quick = [name for name in names if CONTROLLERS[name].predict is None]
+    for outcome in each_outcome(record, plan, watch):
+        outcomes.append(outcome)
+        if outcome.residual is not None:
+            spectra[outcome.controller] = welch_psd(outcome.residual[start:], record.dt)
+        if outcome.controller not in quick[:-1]:
+            result = ClosedLoop(plan, record, tuple(outcomes))
+            land(LoopShown(result, tuple(rows(result, None)), dict(spectra), linear, outcome.controller == names[-1]))

@@ -1,0 +1,160 @@
+"""What every controller leaves of the disturbance of the results shown, and how far each is from instability."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import Any
+
+import panel as pn
+from bokeh.plotting import figure
+
+from wfsobs.app.display import NOTHING, Display, number, per_micrometre
+from wfsobs.app.loop_work import LoopRun, LoopShown
+from wfsobs.app.pages.loop_figures import Nyquist, Response, Spectrum, Trace
+from wfsobs.app.pages.loop_table import margins_html, table_html
+from wfsobs.app.run import RUNNING, Run
+from wfsobs.app.style import asset, look
+from wfsobs.app.views.strip import Cards
+from wfsobs.control.controllers import CONTROLLERS
+
+ZOOM_S = 0.5
+"""Length of the zoomed trace [s], in the middle of the record."""
+
+GRID = """
+:host { display: grid !important; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 10px; }
+@media (max-width: 1000px) { :host { grid-template-columns: minmax(0, 1fr); } }
+"""
+INTRO = (
+    "The disturbance and the noise are those of the results shown, the same for every controller, with the delay and the "
+    "limits of the mirror set under Controllers. Strehl counts the simulated modes alone.")
+ABOUT = (
+    "Rejection |E| bold, noise transfer faint. L is the loop gain: how far it stays from −1 is how far the loop is from "
+    "instability; ○ marks the gain margin, □ the phase margin. Multi-rate loops change from step to step, and a GPR is not "
+    "linear: they have neither.")
+
+
+class ClosedLoopPage:
+    """The page; computed anew when the results change, while it is visible."""
+
+    def __init__(self, run: Run, display: Display):
+        self.run, self.display = run, display
+        self.work = LoopRun(run, self._land)
+        self.shown: LoopShown | None = None
+        self.visible, self._of = False, object()
+        sheet: Any = {"sizing_mode": "stretch_width", "margin": 0, "stylesheets": [asset("style.css")]}
+        self.note = pn.pane.HTML("", **sheet)
+        self.table, self.margins = pn.pane.HTML("", **sheet), pn.pane.HTML("", **sheet)
+        self.cards = Cards(items=[], hidden=[], sizing_mode="stretch_width", margin=0)
+        self.whole, self.zoomed = Trace("whole record"), Trace("zoomed")
+        self.spectrum, self.response, self.nyquist = Spectrum(), Response(), Nyquist()
+        self._drawn = (self.whole, self.zoomed, self.spectrum, self.response, self.nyquist)
+        run.param.watch(self._follow, ["shown", "state"])
+        display.param.watch(self._redraw, ["mode", "unit"])
+        display.param.watch(self._restyle, "dark")
+        self.cards.param.watch(self._restyle, "hidden")
+
+    def view(self) -> pn.Column:
+        """What is shown."""
+        wide: Any = {"sizing_mode": "stretch_width", "margin": 0}
+        box = [asset("box.css")]
+        figures = pn.Column(
+            *(_captioned(text, drawn.figure) for text, drawn in (
+                ("Residual, whole record", self.whole), ("Spectrum of the residual", self.spectrum),
+                ("Residual, zoomed", self.zoomed), ("Rejection and noise transfer", self.response))),
+            **wide, stylesheets=[GRID])
+        stability = pn.Column(
+            _captioned("Loop gain L, unit circle", self.nyquist.figure), pn.Column(_text(ABOUT), self.margins, **wide),
+            **wide, stylesheets=[GRID])
+        return pn.Column(
+            pn.Column(_heading("Residual in closed loop"), _text(INTRO), self.note, self.cards, figures, **wide, stylesheets=box),
+            pn.Column(_heading("Controllers"), self.table, **wide, stylesheets=box),
+            pn.Column(_heading("Stability"), stability, **wide, stylesheets=box),
+            **wide, stylesheets=[":host { gap: 10px; }"])
+
+    def show(self, visible: bool) -> None:
+        """Compute what has changed meanwhile, and go on while visible."""
+        self.visible = visible
+        self._follow()
+
+    def _follow(self, *_: object) -> None:
+        """Start the loop of the results shown, once their run is over; stop where the page is hidden."""
+        of = self.run.shown
+        if not self.visible:
+            self.work.stop()
+            if self.shown is None or not self.shown.done:
+                self._of = object()
+            return
+        if of is None or self.run.state == RUNNING or of is self._of:
+            return
+        self._of = of
+        self.note.object = '<p class="text" role="status">computing …</p>'
+        self.work.start(of)
+
+    def _land(self, shown: LoopShown | None, reason: str) -> None:
+        self.shown = shown
+        with pn.io.hold():
+            text = "" if shown and shown.done else "computing …" if shown else f"No closed loop: {reason}"
+            self.note.object = f'<p class="text" role="status">{escape(text)}</p>' if text else ""
+            self._redraw()
+
+    def _redraw(self, *_: object) -> None:
+        shown = self.shown
+        if shown is None or not self.visible or self.display.column >= len(shown.result.scenario.modes):
+            return
+        with pn.io.hold():
+            n, dt = shown.result.record.n_steps, shown.result.record.dt
+            half = min(round(ZOOM_S / dt), n) // 2
+            begin = min(round(shown.result.scenario.run.warm_up / dt), n - 2)
+            middle = (begin + n) // 2
+            self.whole.draw(shown, self.display, begin, n)
+            self.zoomed.draw(shown, self.display, max(middle - half, begin), min(middle + half, n))
+            for drawn in (self.spectrum, self.response, self.nyquist):
+                drawn.draw(shown, self.display)
+            self._restyle()
+
+    def _restyle(self, *_: object) -> None:
+        with pn.io.hold():
+            for drawn in self._drawn:
+                drawn.restyle(self.display.dark, self.cards.hidden)
+            for trace in (self.whole, self.zoomed):
+                trace.fit(self.cards.hidden)
+            if self.shown is not None:
+                self.table.object = table_html(self.shown, self.display)
+                self.margins.object = margins_html(self.shown, self.display)
+                self.cards.items = self._items(self.shown)
+
+    def _items(self, shown: LoopShown) -> list[dict[str, Any]]:
+        """A card per controller."""
+        scale = 1e-3 * per_micrometre(self.display.unit, shown.result.scenario.telescope.diameter)
+        left = {r["controller"]: r for r in shown.rows if r["mode"] == self.display.mode}
+        out = []
+        for name in CONTROLLERS:
+            it, row = look(name), left.get(name)
+            value, unit = NOTHING, ""
+            if row is None:
+                note = "computing …"
+            elif row["residual_rms_nm"] is None:
+                note = "unstable" if row["stable"] is False else "could not run"
+            else:
+                value, unit = number(row["residual_rms_nm"] * scale), self.display.unit_label
+                note = f"Strehl {row['strehl']:.3f}"
+            out.append({
+                "name": name, "label": it.label, "colour": it.colour(self.display.dark), "dash": list(it.dash),
+                "note": note, "value": value, "unit": unit})
+        return out
+
+
+def _heading(title: str) -> pn.pane.HTML:
+    return pn.pane.HTML(f'<h2 class="title">{escape(title)}</h2>', margin=0, stylesheets=[asset("style.css")])
+
+
+def _text(text: str) -> pn.pane.HTML:
+    return pn.pane.HTML(
+        f'<p class="text">{escape(text)}</p>', sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
+
+
+def _captioned(text: str, fig: figure) -> pn.Column:
+    fig.name = text
+    caption = pn.pane.HTML(f'<div class="caption">{escape(text)}</div>', margin=(8, 0, 0, 0), stylesheets=[asset("style.css")])
+    return pn.Column(
+        caption, pn.pane.Bokeh(fig, sizing_mode="stretch_width", margin=0), sizing_mode="stretch_width", margin=0)

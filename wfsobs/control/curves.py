@@ -1,0 +1,43 @@
+"""What a time-invariant loop does at every frequency.
+
+    rejection       E = 1 / (1 + L) = 1 - P F       from the disturbance to the residual
+    noise transfer  N = P F = L / (1 + L)           from the measurement's noise to the residual, its sign and delay aside
+    loop gain       L = P F / (1 - P F)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wfsobs.arrays import Array
+from wfsobs.control.law import Law
+from wfsobs.control.margins import frequencies
+from wfsobs.control.mirror import Mirror
+from wfsobs.wiener import Complex
+
+
+@dataclass(frozen=True)
+class Curves:
+    """frequency (n,) [Hz], above zero, closer where the loop changes faster; noise (n,) = P F."""
+
+    frequency: Array
+    noise: Complex
+
+    @property
+    def rejection(self) -> Complex:
+        """E (n,)."""
+        return 1.0 - self.noise
+
+    @property
+    def loop_gain(self) -> Complex:
+        """L (n,); infinite where nothing is left of a disturbance."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self.noise / self.rejection
+
+
+def curves(law: Law, mirror: Mirror, dt: float) -> Curves:
+    """Of a time-invariant law and a step `dt` [s]."""
+    omega = frequencies(law.poles)[1:]
+    return Curves(omega / (2.0 * np.pi * dt), mirror.response(omega) * law.response(omega))
