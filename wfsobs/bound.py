@@ -13,13 +13,17 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scores import BOUND, Score, rms
-from wfsobs.true_spectra import TURBULENCE_SPECTRA, true_spectra
+from wfsobs.true_spectra import TURBULENCE_SPECTRA, TrueSpectra, true_spectra
 from wfsobs.wiener import advanced, causal_error, factorise
 
 
 def bound(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:
     """Target -> rms [um] of the least error of phi[k + ahead] from z[k], z[k-1], ...; "total" is that of both together."""
-    spectra = true_spectra(scenario, mode)
+    return bound_of(true_spectra(scenario, mode), ahead)
+
+
+def bound_of(spectra: TrueSpectra, ahead: int = 0) -> dict[str, float]:
+    """As `bound`, from the spectra of a mode."""
     whitener = factorise(spectra.measured)
     signal, shared = spectra.total
     wanted = {name: (spectra.signal[name], spectra.shared[name]) for name in spectra.signal} | {"total": (signal, shared)}

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.arrays import Array
-from wfsobs.bound import true_spectra
 from wfsobs.control.closed_loop import ClosedLoop, Outcome, closed_loop, design, residual_rms, strehl
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.integrator import best_gain, highest_stable_gain, integrator_law, limited_integrator, residual_variance
@@ -27,6 +26,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scores import welch_psd
 from wfsobs.settings import SettingError
 from wfsobs.statespace import paper_matrices
+from wfsobs.true_spectra import true_spectra
 from wfsobs.watch import QUIET
 
 # The loop of one 530 nm turbulence, one 50 nm line at 47.5 Hz, 20 nm of noise, and a model that is the truth.

@@ -20,7 +20,7 @@ from math import pi
 import numpy as np
 
 from wfsobs.arrays import Array
-from wfsobs.bound import bound
+from wfsobs.bound import bound_of
 from wfsobs.control.controllers import CONTROLLERS, Controller
 from wfsobs.control.integrator import limited_integrator, residual_variance
 from wfsobs.control.law import Law
@@ -111,7 +111,7 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None) -> Desi
     laws = {
         c.id: tuple(_designed(c, scenario, mode, mirror, spectra[mode]) for mode in modes) for c in chosen(controllers)}
     # A fraction of a frame comes on top of the whole ones, which alone bound what can be known.
-    least = tuple(bound(scenario, mode, ahead=int(mirror.delay) - 1)["total"] for mode in modes if known)
+    least = tuple(bound_of(one, ahead=int(mirror.delay) - 1)["total"] for one in spectra if one)
     return Design(scenario, mirror, laws, least if known else None)
 
 

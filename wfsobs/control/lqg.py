@@ -18,6 +18,7 @@ from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman import kalman_model, measurement_noise, steady_filter
+from wfsobs.observers.kalman_multi import multi_model
 from wfsobs.observers.multirate import MultiRateFilter, multirate_filter, multirate_noise
 from wfsobs.observers.multirate_optimal import optimal_filter, optimal_model
 from wfsobs.scenario import Scenario
@@ -51,6 +52,11 @@ def lqg_kf_lgs(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
     return lqg_of(kalman_model(scenario, mode, scenario.dt), measurement_noise(scenario, mode)[0], mirror)
 
 
+def lqg_kf_multi(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
+    """With every peak of the vibration in the model."""
+    return lqg_of(multi_model(scenario, mode, scenario.dt), measurement_noise(scenario, mode)[0], mirror)
+
+
 def lqg_multirate(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
     """With the paper's multi-rate filter. Raises SettingError where its cycle is unstable."""
     model = kalman_model(scenario, mode, scenario.dt)
@@ -60,7 +66,16 @@ def lqg_multirate(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
 
 def lqg_multirate_optimal(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
     """With the optimal multi-rate filter."""
-    cycle, rows = optimal_model(scenario, mode, scenario.dt, scenario.sensors.exposure_ratio)
+    return _optimal(scenario, mode, mirror, None)
+
+
+def lqg_multirate_multi(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
+    """With the optimal multi-rate filter and every peak of the vibration in its model."""
+    return _optimal(scenario, mode, mirror, multi_model(scenario, mode, scenario.dt))
+
+
+def _optimal(scenario: Scenario, mode: int, mirror: Mirror, model: DisturbanceModel | None) -> Law:
+    cycle, rows = optimal_model(scenario, mode, scenario.dt, scenario.sensors.exposure_ratio, model)
     return _two_sensors(optimal_filter(cycle, command_rows(cycle[0][0], rows.sum(axis=0), mirror))[0])
 
 
@@ -69,6 +84,7 @@ def _two_sensors(filter_: MultiRateFilter) -> Law:
 
 
 LQG: dict[str, Callable[[Scenario, int, Mirror], Law]] = {
-    "lqg-kf-lgs": lqg_kf_lgs, "lqg-multirate": lqg_multirate, "lqg-multirate-optimal": lqg_multirate_optimal,
+    "lqg-kf-lgs": lqg_kf_lgs, "lqg-kf-multi": lqg_kf_multi, "lqg-multirate": lqg_multirate,
+    "lqg-multirate-optimal": lqg_multirate_optimal, "lqg-multirate-multi": lqg_multirate_multi,
 }
 """Controller -> its law in one mode."""

@@ -68,9 +68,11 @@ def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[MultiRateFilter, 
     return MultiRateFilter(filter_step(A, alone, L, outputs), PeriodicFilter(steps)), states
 
 
-def optimal_model(scenario: Scenario, mode: int, dt: float, ratio: int) -> tuple[list[Step], Array]:
-    """The cycle and output rows of one mode of a scenario."""
-    model = kalman_model(scenario, mode, dt)
+def optimal_model(
+    scenario: Scenario, mode: int, dt: float, ratio: int, model: DisturbanceModel | None = None
+) -> tuple[list[Step], Array]:
+    """The cycle and output rows of one mode of a scenario; model: of the disturbance, that of `kalman` unless given."""
+    model = model or kalman_model(scenario, mode, dt)
     error = None
     if scenario.multirate.model_lgs_error:
         error = lgs_error_process(scenario, mode, dt)
