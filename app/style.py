@@ -49,13 +49,13 @@ LOOKS: Mapping[str, Look] = MappingProxyType({
     "zero": Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4)),
     "none": Look("No control", "#606060", "#C8C8C8", (6, 3)),
     "integrator": Look("Integrator", "#003DE6", "#7AA2FF"),
-    "lqg-kf-lgs": Look("LQG, LGS KF", "#FF6600", "#FF8533"),
-    "lqg-kf-multi": Look("LQG, multi-peak", "#00707F", "#4DD0E1", (14, 3)),
-    "lqg-multirate": Look("LQG, multi-rate", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
-    "lqg-multirate-optimal": Look("LQG, opt. multi-rate", "#7A1FA2", "#C9A0FF", (3, 2)),
-    "lqg-multirate-multi": Look("LQG, m.-rate m.-peak", "#B40000", "#FF7A70", (8, 3)),
-    "integrator+gpr-offline": Look("Int. + offline GPR", "#0A960A", "#4FD64F", (12, 2, 2, 2, 2, 2)),
-    "integrator+gpr-online": Look("Int. + online GPR", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
+    "lqg-kf-lgs": Look("LQG LGS KF", "#FF6600", "#FF8533"),
+    "lqg-kf-multi": Look("LQG multi-peak", "#00707F", "#4DD0E1", (14, 3)),
+    "lqg-multirate": Look("LQG multi-rate", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
+    "lqg-multirate-optimal": Look("LQG optimal", "#7A1FA2", "#C9A0FF", (3, 2)),
+    "lqg-multirate-multi": Look("LQG opt. peaks", "#B40000", "#FF7A70", (8, 3)),
+    "integrator+gpr-offline": Look("Int. + offline", "#0A960A", "#4FD64F", (12, 2, 2, 2, 2, 2)),
+    "integrator+gpr-online": Look("Int. + online", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
 })
 
 HIDDEN = ("ridge", "ridge-30", "persistence", "zero")

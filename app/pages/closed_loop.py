@@ -157,4 +157,4 @@ def _captioned(text: str, fig: figure) -> pn.Column:
     fig.name = text
     caption = pn.pane.HTML(f'<div class="caption">{escape(text)}</div>', margin=(8, 0, 0, 0), stylesheets=[asset("style.css")])
     return pn.Column(
-        caption, pn.pane.Bokeh(fig, sizing_mode="stretch_width", margin=0), sizing_mode="stretch_width", margin=0)
+        caption, pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), sizing_mode="stretch_width", margin=0)

@@ -137,7 +137,7 @@ class Nyquist(Lines):
     def __init__(self) -> None:
         fig = new_figure(
             x_range=Range1d(start=-NYQUIST, end=NYQUIST), y_range=Range1d(start=-NYQUIST, end=NYQUIST))
-        fig.update(height=420, match_aspect=True)
+        fig.update(height=None, aspect_ratio=1.0, max_width=480)
         turn = np.linspace(0.0, 2.0 * np.pi, 181)
         fig.line(np.cos(turn), np.sin(turn), line_color="#888888", line_dash=[4, 3])
         fig.scatter([-1.0], [0.0], marker="x", size=11, line_color="#888888", line_width=2)
