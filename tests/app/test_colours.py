@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from wfsobs.app.style import PRIMARY, look, observers_of
 from wfsobs.app.work import TRUTH
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers.base import TARGETS
 
 Array = NDArray[np.float64]
@@ -27,6 +28,9 @@ SIGHT: Mapping[str, Array] = MappingProxyType({
         [1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]),
 })
 XYZ = np.array([[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]])
+
+TOGETHER = {**{target: [TRUTH, *observers_of(target)] for target in TARGETS}, "controllers": list(CONTROLLERS)}
+"""Lines that share a figure."""
 
 TOLD_APART = 20.0
 """A difference in CIE L*a*b* that thin lines show as well."""
@@ -53,10 +57,10 @@ def contrast(one: str, other: str) -> float:
 
 @pytest.mark.parametrize("dark", [False, True])
 @pytest.mark.parametrize("sight", SIGHT)
-@pytest.mark.parametrize("target", TARGETS)
-def test_lines_differ_in_colour_or_dash(target: str, sight: str, dark: bool) -> None:
+@pytest.mark.parametrize("together", TOGETHER.values(), ids=TOGETHER)
+def test_lines_differ_in_colour_or_dash(together: list[str], sight: str, dark: bool) -> None:
     alike = []
-    for one, other in combinations([TRUTH, *observers_of(target)], 2):
+    for one, other in combinations(together, 2):
         a, b = look(one), look(other)
         difference = np.linalg.norm(lab(SIGHT[sight] @ linear(a.colour(dark))) - lab(SIGHT[sight] @ linear(b.colour(dark))))
         if difference < TOLD_APART and a.dash == b.dash:
@@ -66,7 +70,7 @@ def test_lines_differ_in_colour_or_dash(target: str, sight: str, dark: bool) -> 
 
 @pytest.mark.parametrize(("dark", "background"), [(False, "#FFFFFF"), (True, "#121212")])
 def test_lines_stand_out(dark: bool, background: str) -> None:
-    faint = {name: contrast(look(name).colour(dark), background) for target in TARGETS for name in (TRUTH, *observers_of(target))}
+    faint = {name: contrast(look(name).colour(dark), background) for names in TOGETHER.values() for name in names}
     assert {name: c for name, c in faint.items() if c < 2.9} == {}
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,7 +15,6 @@ from wfsobs.control.lqg import lqg_kf_lgs
 from wfsobs.control.margins import Margins, crossings, frequencies, margins
 from wfsobs.control.mirror import Mirror
 from wfsobs.presets import PRESETS
-from wfsobs.wiener import Complex
 
 DT = 1e-3
 
@@ -54,7 +55,7 @@ def test_the_gain_margin_leads_to_instability_and_no_further(delay: float, leak:
     assert not integrator_law(mirror, gain * m.gain * 1.0001, leak).stable
 
 
-def polynomials(law: Law, mirror: Mirror) -> tuple[Complex, Complex]:
+def polynomials(law: Law, mirror: Mirror) -> tuple[Any, Any]:
     """Numerator and denominator of T = P F in z, of equal length."""
     F, G, H, J = law.cycle.steps[0]
     denominator = np.poly(F)

@@ -1,0 +1,130 @@
+"""The page of the closed loop: what it computes and when, true to the core, at rest while hidden."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.display import per_micrometre
+from wfsobs.app.pages.closed_loop import ClosedLoopPage
+from wfsobs.app.pages.loop_figures import CURVES
+from wfsobs.app.pages.pages import EXPLORE, LOOP
+from wfsobs.app.style import LOOKS
+from wfsobs.app.views.envelope import envelope
+from wfsobs.bound import BOUND
+from wfsobs.control.closed_loop import closed_loop, design
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.tables import rows
+
+
+def opened(dashboard: Dashboard) -> ClosedLoopPage:
+    dashboard.pages.current = LOOP
+    page = dashboard.pages.made[LOOP]
+    assert isinstance(page, ClosedLoopPage)
+    return page
+
+
+def done(page: ClosedLoopPage, loop: Any) -> ClosedLoopPage:
+    """The page once all controllers have run on the results shown."""
+    of = page.run.shown
+    assert of is not None
+    loop.until(lambda: page.shown is not None and page.shown.done and page.shown.result.scenario is of.scenario)
+    return page
+
+
+def top(page: ClosedLoopPage) -> float:
+    """How far the axis of the residuals reaches."""
+    return float(page.whole.figure.y_range.end)  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def page(dashboard: Dashboard, loop: Any) -> ClosedLoopPage:
+    return done(opened(dashboard), loop)
+
+
+def test_it_says_what_the_command_says(page: ClosedLoopPage, dashboard: Dashboard) -> None:
+    of = dashboard.store.run.shown
+    assert of is not None and page.shown is not None
+    expected = rows(closed_loop(of.result.record, design(of.scenario)), None)
+    assert list(page.shown.rows) == expected
+    cards = {card["name"]: card for card in page.cards.items}
+    assert list(cards) == list(CONTROLLERS)
+    for row in (r for r in expected if r["mode"] == "tip" and r["controller"] != BOUND):
+        assert float(cards[row["controller"]]["value"]) == pytest.approx(row["residual_rms_nm"], rel=5e-3)
+        assert f'data-controller="{row["controller"]}"' in page.table.object
+    assert page.table.object.count("best</span>") == 1 and f'data-controller="{BOUND}"' in page.table.object
+    assert page.margins.object.count("data-controller") == len(CURVES)
+    assert page.note.object == ""
+
+
+def test_the_lines_are_the_results(page: ClosedLoopPage, dashboard: Dashboard) -> None:
+    dashboard.display.param.update(mode="tilt", unit="mas")
+    shown = page.shown
+    assert shown is not None
+    scale = per_micrometre("mas", 8.0)
+    start = round(shown.result.scenario.run.warm_up / shown.result.record.dt)
+    for name, source in page.whole.sources.items():
+        residual = shown.residual(name)
+        assert residual is not None
+        assert np.allclose(source.data["y"], scale * envelope(residual[start:, 1], 600), rtol=1e-6)
+        density = shown.spectra[name][1][1:, 1]
+        assert np.allclose(page.spectrum.sources[name].data["y"], scale**2 * density)
+    for name in CURVES:
+        L = np.array(page.nyquist.sources[name].data["x"]) + 1j * np.array(page.nyquist.sources[name].data["y"])
+        E = 10 ** (np.array(page.response.sources[name].data["y"]) / 20)
+        known = ~np.isnan(L)
+        assert np.allclose(E[known], np.abs(1 / (1 + L[known])), rtol=1e-6)
+    assert page.whole.figure.yaxis.axis_label == "residual tilt [mas]"
+
+
+def test_the_marks_lie_on_the_curves_where_the_margins_are(page: ClosedLoopPage) -> None:
+    marks = page.nyquist.marks.data
+    assert set(marks["marker"]) == {"circle", "square"}
+    points = np.array(marks["x"]) + 1j * np.array(marks["y"])
+    L = np.concatenate([np.array(s.data["x"]) + 1j * np.array(s.data["y"]) for s in page.nyquist.sources.values()])
+    for point, marker in zip(points, marks["marker"], strict=True):
+        assert np.nanmin(np.abs(L - point)) < 0.05
+        assert abs(point) == pytest.approx(1.0) if marker == "square" else -1.0 < point.real < 0.0 == point.imag
+
+
+def test_hiding_and_colours(page: ClosedLoopPage, dashboard: Dashboard) -> None:
+    before = top(page)
+    page.cards.hidden = [name for name in CONTROLLERS if name != "lqg-multirate-multi"]
+    assert not page.whole.lines["integrator"].visible and page.whole.lines["lqg-multirate-multi"].visible
+    assert top(page) < before and not len(page.nyquist.marks.data["x"])
+    dashboard.display.dark = True
+    assert page.whole.lines["integrator"].glyph.line_color == LOOKS["integrator"].dark
+
+
+def test_it_follows_the_settings_while_it_is_seen(page: ClosedLoopPage, dashboard: Dashboard, loop: Any) -> None:
+    dashboard.store.change("control.integrator", "manual")
+    dashboard.store.change("control.gain", 1.5)
+    loop.finish(dashboard.store)
+    done(page, loop)
+    assert page.table.object.count("unstable</span>") == 3
+    assert {c["note"] for c in page.cards.items if "integrator" in c["name"]} == {"unstable"}
+    assert not len(page.whole.sources["integrator"].data["x"])
+    dashboard.pages.current = EXPLORE
+    before = page.shown
+    dashboard.store.change("control.gain", 0.5)
+    loop.finish(dashboard.store)
+    assert page.shown is before
+    done(opened(dashboard), loop)
+    assert "unstable</span>" not in page.table.object
+
+
+def test_more_modes_than_tip_and_tilt(page: ClosedLoopPage, dashboard: Dashboard, loop: Any) -> None:
+    dashboard.store.change("telescope.radial_order", 2)
+    loop.finish(dashboard.store)
+    done(page, loop)
+    dashboard.display.mode = "defocus"
+    assert page.whole.figure.yaxis.axis_label == "residual defocus [nm]"
+    assert len(page.whole.sources["integrator"].data["x"]) > 100
+
+
+def test_a_record_without_a_truth_has_no_closed_loop(page: ClosedLoopPage) -> None:
+    page._land(None, "the record has no truth")
+    assert "No closed loop: the record has no truth" in page.note.object
