@@ -15,7 +15,7 @@ from wfsobs.app.downloads import TooLarge, data_csv, data_npz
 from wfsobs.app.report.maker import FAILED, Maker, ReportError
 from wfsobs.app.share import FILE, Link, from_file, from_query, to_command, to_file, to_python, to_query
 from wfsobs.app.store import Store
-from wfsobs.app.style import asset
+from wfsobs.app.style import LOOKS, asset
 from wfsobs.app.work import Shown
 from wfsobs.settings import SettingError
 
@@ -38,9 +38,10 @@ class Toolbar(JSComponent):
     reporting = param.Boolean(False, doc="Whether a report is being made.")
     said = param.String("", doc="What was done, in one line.")
     notes = param.List([], doc="What was refused, a line each.")
+    labels = param.Dict({}, doc="Name of a line in the figures -> what it is called, for the legends of figures that are saved.")
     largest = param.Integer(LARGEST, doc="The largest scenario file that is read [bytes].")
 
-    _esm = asset("actions.js")
+    _esm = asset("figures.js") + asset("actions.js")
     _stylesheets = [asset("actions.css")]  # noqa: RUF012
 
     def __init__(self, **params: Any):
@@ -61,7 +62,8 @@ class Actions:
 
     def __init__(self, store: Store):
         self.store = store
-        self.toolbar = Toolbar(sizing_mode="stretch_width", margin=0)
+        self.toolbar = Toolbar(
+            labels={name: it.label for name, it in LOOKS.items()}, sizing_mode="stretch_width", margin=0)
         self.toolbar.on_action = self.handle
         self.maker = Maker()
         store.param.watch(self._refresh, ["scenario", "preset"])

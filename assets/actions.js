@@ -1,8 +1,6 @@
 // The row of actions: menus to share and to save, opening a scenario, and what there is to say about it. It also keeps the
 // address in step with the settings, and hears the keys for undo and redo.
 
-const KINDS = ["svg", "png"]
-
 function tag(name, parent, properties = {}, attributes = {}) {
   const it = Object.assign(document.createElement(name), properties)
   for (const [key, value] of Object.entries(attributes)) it.setAttribute(key, value)
@@ -72,17 +70,8 @@ function ground(element) {
 
 // ------------------------------------------------------------------ figures
 
-function figures() {
-  const seen = (view) => view.model.type === "Figure" && view.el.getBoundingClientRect().width > 0
-  const views = [...Bokeh.index.query(seen)]
-  return views.map((view) => {
-    const axes = [view.model.left[0]?.axis_label, view.model.below[0]?.axis_label]
-    return [view.model.name ?? axes.filter(Boolean).join(" over "), view]
-  })
-}
-
 async function saveFigure(name, view, kind, model) {
-  const blob = await view.export(kind).to_blob()
+  const blob = await exported(view, kind, model.labels)
   save(`${name.toLowerCase().replaceAll(/[^a-z0-9]+/g, "-")}.${kind}`, blob)
   model.said = `Saved ${name} as ${kind.toUpperCase()}.`
 }

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Download, Page, expect
 
+from wfsobs.app.style import look, observers_of
+
 SHORT = "run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40"
 
 
@@ -111,7 +113,11 @@ def test_data_and_figures(open_short: Any, tmp_path: Path) -> None:
     for name in ("Turbulence time trace", "Vibration spectrum"):
         root = ET.parse(saved(page, f"{name} as SVG", tmp_path)).getroot()
         assert root.tag == "{http://www.w3.org/2000/svg}svg" and len(list(root.iter())) > 50
-        assert saved(page, f"{name} as PNG", tmp_path).read_bytes().startswith(b"\x89PNG")
+        target = name.split()[0].lower()
+        labels = {look(line).label for line in ("truth", *observers_of(target))}
+        assert labels <= {it.text for it in root.iter("{http://www.w3.org/2000/svg}text")}, "the legend"
+        png = saved(page, f"{name} as PNG", tmp_path).read_bytes()
+        assert png.startswith(b"\x89PNG") and int.from_bytes(png[20:24]) == int(float(root.get("height", 0))) > 240
 
 
 def test_a_scenario_out_and_in_again(open_short: Any, tmp_path: Path) -> None:
