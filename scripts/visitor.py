@@ -80,12 +80,12 @@ class Visitor:
         events = [{"kind": "ModelChanged", "model": {"id": model}, "attr": key, "new": new} for key, new in values.items()]
         await self.ask("PATCH-DOC", {"events": events})
 
-    async def click(self, model: str, value: str, drawings: int) -> float:
-        """Change a switch, and wait until so many sets of data have come: how long that took [s]."""
+    async def click(self, model: str, value: str, drawings: int) -> tuple[float, float]:
+        """Change a switch, and wait until so many sets of data have come: how long the first and all of them took [s]."""
         start, before = perf_counter(), len(self.drawn)
         await self.set(model, value=value)
         await self.until(lambda: len(self.drawn) >= before + drawings)
-        return self.drawn[before + drawings - 1] - start
+        return self.drawn[before] - start, self.drawn[before + drawings - 1] - start
 
     async def message(self, model: str, data: Any) -> None:
         """Send what a component of the page sends."""

@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,9 +16,10 @@ FLAGS = ["--public", "--runs", "1", "--max-duration", "100"]
 LONG = "?run.duration=90&gpr_online.training_size=1000&run.seed="
 
 
-@pytest.fixture
-def serve(make_server: Any, tmp_path: Path) -> Iterator[Any]:
-    server = make_server(["-m", "wfsobs", "serve", "--port", "{port}", *FLAGS], tmp_path / "log", "/")
+@pytest.fixture(scope="module")
+def serve(make_server: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A server with limits, which has to have gone without a fault."""
+    server = make_server(["-m", "wfsobs", "serve", "--port", "{port}", *FLAGS], tmp_path_factory.mktemp("serve") / "log", "/")
     yield server
     if server.process.poll() is None:
         server.close()
@@ -109,6 +109,7 @@ def test_a_page_of_elsewhere_cannot_connect(visit: Callable[..., Page], serve: A
 
 
 def test_told_to_stop_in_the_middle_of_a_run(visit: Callable[..., Page], serve: Any) -> None:
+    """The last of this module: the server of all ends here."""
     page = visit(LONG + "3")
     start(page)
     status(page, "Running")
@@ -118,4 +119,4 @@ def test_told_to_stop_in_the_middle_of_a_run(visit: Callable[..., Page], serve: 
     assert time.monotonic() - begin < 20
     log = serve.log.read_text()
     assert "Traceback" not in log and "ERROR" not in log
-    assert log.rstrip().splitlines()[-1].endswith("INFO stopped sessions=1")
+    assert " INFO stopped sessions=" in log.rstrip().splitlines()[-1]
