@@ -15,6 +15,9 @@ from wfsobs.wiener import circle_mean
 FINE, COARSE = 2048, 64
 """Bins kept as they are, and how many of the others count as one: the integrator's response is smooth there."""
 
+GRID = 40
+"""Gains tried before the best of them is refined."""
+
 
 def integrator_law(mirror: Mirror, gain: float, leak: float) -> Law:
     """The integrator on y = z + P u, as a filter of z: its state is the last commands."""
@@ -46,8 +49,11 @@ def best_gain(spectra: TrueSpectra, mirror: Mirror, leak: float) -> float:
         T = gain * P / (one + gain * P)
         return float(weight @ residual_density(T, target, cross, measured))
 
-    highest = highest_stable_gain(mirror, leak)
-    return float(minimize_scalar(variance, bounds=(0.0, highest), method="bounded", options={"xatol": 1e-5}).x)
+    # Vibration above the crossover can make a second minimum: the best of a grid tells which of them to go down to.
+    gains = highest_stable_gain(mirror, leak) * np.linspace(0.0, 1.0, GRID + 2)
+    best = 1 + int(np.argmin([variance(gain) for gain in gains[1:-1]]))
+    around = (gains[best - 1], gains[best + 1])
+    return float(minimize_scalar(variance, bounds=around, method="bounded", options={"xatol": 1e-5}).x)
 
 
 def residual_density(T: Array, target: Array, cross: Array, measured: Array) -> Array:
