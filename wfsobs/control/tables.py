@@ -12,11 +12,8 @@ from rich.table import Table
 from wfsobs.control.closed_loop import ClosedLoop, residual_rms, strehl
 from wfsobs.control.controllers import CONTROLLERS, SPECTRA
 from wfsobs.scores import BOUND
+from wfsobs.tables import NOT_OBSERVERS, Row
 from wfsobs.units import micrometres_per
-
-Row = dict[str, Any]
-
-BOUND_LABEL = "Bound of the LGS alone"
 
 
 def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
@@ -66,7 +63,7 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
 
 def label(controller: str) -> str:
     """A controller's name for people."""
-    return BOUND_LABEL if controller == BOUND else CONTROLLERS[controller].label
+    return NOT_OBSERVERS[BOUND] if controller == BOUND else CONTROLLERS[controller].label
 
 
 def table(rows: Sequence[Row]) -> Table:
