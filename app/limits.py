@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import reduce
 
 from wfsobs.cost import run_bytes, run_seconds
+from wfsobs.parameters import Reals
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 
@@ -18,7 +20,7 @@ class Limits:
     steps         : of a record
     training_size : m of either GPR
     depth         : d of either GPR
-    items         : entries in a list of settings: peaks, bands, rows of a PSD table
+    items         : entries in a list of settings: peaks, layers, bands, rows of a PSD table
     seconds       : how long a run takes, as estimated from its settings [s]
     megabytes     : memory of a run, likewise [MB]
     sessions      : open pages
@@ -43,13 +45,11 @@ class Limits:
             group = getattr(scenario, name)
             _most(f"{name}.training_size", group.training_size, self.training_size)
             _most(f"{name}.depth", group.depth, self.depth)
-        for path, items in (
-            ("vibration.peaks", scenario.vibration.peaks), ("vibration.psd.frequency", scenario.vibration.psd.frequency),
-            ("vibration.psd.tip", scenario.vibration.psd.tip), ("vibration.psd.tilt", scenario.vibration.psd.tilt),
-            ("butterworth.frequencies", scenario.butterworth.frequencies),
-        ):
-            if len(items) > self.items:
-                raise SettingError(f"{path}: {len(items)} entries, at most {self.items:g} on this server")
+        of_groups = [(path, len(reduce(getattr, path.split("."), scenario))) for path, _ in scenario.lists()]
+        of_numbers = [(path, len(getattr(owner, p.name))) for path, owner, p in scenario.walk() if isinstance(p, Reals)]
+        for path, items in (*of_groups, *of_numbers):
+            if items > self.items:
+                raise SettingError(f"{path}: {items} entries, at most {self.items:g} on this server")
         _whole(run_seconds(scenario), self.seconds, "s")
         _whole(run_bytes(scenario) / 1e6, self.megabytes, "MB of memory")
 

@@ -40,6 +40,7 @@ def refused(limits: Limits, changes: dict[str, Any]) -> str:
     ({"gpr_online.training_size": 2048}, "gpr_online.training_size = 2048: at most 1024 on this server"),
     ({"gpr_online.depth": 1001}, "gpr_online.depth = 1001: at most 1000 on this server"),
     ({"vibration.psd.tip": [0.0] * 101}, "vibration.psd.tip: 101 entries, at most 100 on this server"),
+    ({"turbulence.psd.frequency": [0.0] * 101}, "turbulence.psd.frequency: 101 entries, at most 100 on this server"),
 ])
 def test_one_line_says_what_and_how_much(changes: dict[str, Any], line: str) -> None:
     assert refused(PUBLIC, changes) == line
