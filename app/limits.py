@@ -46,7 +46,7 @@ class Limits:
             _most(f"{name}.training_size", group.training_size, self.training_size)
             _most(f"{name}.depth", group.depth, self.depth)
         of_groups = [(path, len(reduce(getattr, path.split("."), scenario))) for path, _ in scenario.lists()]
-        of_numbers = [(path, len(getattr(owner, p.name))) for path, owner, p in scenario.walk() if isinstance(p, Reals)]
+        of_numbers = [(path, len(getattr(owner, str(p.name)))) for path, owner, p in scenario.walk() if isinstance(p, Reals)]
         for path, items in (*of_groups, *of_numbers):
             if items > self.items:
                 raise SettingError(f"{path}: {items} entries, at most {self.items:g} on this server")
