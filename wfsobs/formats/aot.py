@@ -16,7 +16,7 @@ from typing import IO, Any
 import numpy as np
 
 from wfsobs.arrays import Array
-from wfsobs.formats.contents import Contents, TooMuch, numbers_and_texts
+from wfsobs.formats.contents import NUMBERS, Contents, TooMuch, numbers_and_texts
 from wfsobs.formats.fits import opened, read_whole
 from wfsobs.record import DELAY, RecordError
 
@@ -89,7 +89,8 @@ def _contents(system: Any, aotpy: Any) -> Contents:
         contents.arrays["delay"] = np.array(max(1, round(float(loop.delay))))
     for entry in system.metadata:
         if entry.key.upper().startswith(PREFIX):
-            contents.arrays[entry.key[len(PREFIX):].lower()] = np.array(entry.value)
+            name = entry.key[len(PREFIX):].lower()
+            contents.arrays[name] = np.array(float(entry.value) if name in NUMBERS else entry.value)
     return contents
 
 
@@ -134,6 +135,6 @@ def write(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
     system = aotpy.AOSystem(
         ao_mode="LTAO", name="wfsobs", main_telescope=telescope, sources=sources, wavefront_sensors=sensors,
         wavefront_correctors=[mirror], loops=[loop], config="; ".join(str(plain.get("scenario", "")).splitlines()) or None,
-        metadata=[aotpy.Metadatum(PREFIX + key.upper(), plain[key])
-                  for key in ("dt", "ratio", "delay", "command_sign", "origin") if key in plain])
+        # as texts: a number in a header has sixteen digits, one less than dt may need
+        metadata=[aotpy.Metadatum(PREFIX + key.upper(), str(plain[key])) for key in (*NUMBERS, "origin") if key in plain])
     aotpy.AOTFITSWriter(system).get_hdulist().writeto(file)

@@ -23,6 +23,9 @@ HDUList = Any
 """Astropy's, which is imported only where it is needed."""
 
 KEYWORDS = {"dt": "DT", "ratio": "RATIO", "delay": "DELAY", "command_sign": "CMDSIGN", "unit": "BUNIT", "origin": "STATED"}
+EXACT = "DTEXACT"
+"""The time step as text: a number in a header has sixteen digits, one less than it may need."""
+
 AOT = "AOT-VERS"
 """The keyword by which a file says that it is an AOT file."""
 
@@ -101,6 +104,8 @@ def _contents(hdus: HDUList) -> Contents:
         for key, keyword in KEYWORDS.items():
             if keyword in hdu.header and not (key == "unit" and hdu.name.lower() in SIGNALS):
                 contents.arrays[key] = np.array(hdu.header[keyword])
+        if EXACT in hdu.header:
+            contents.arrays["dt"] = np.array(float(hdu.header[EXACT]))
     columns = from_columns(flat)
     contents.arrays |= columns.arrays
     contents.units |= columns.units
@@ -146,6 +151,8 @@ def write(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
     for key in (*NUMBERS, "origin"):
         if key in plain:
             header[KEYWORDS[key]] = plain[key]
+    if "dt" in plain:
+        header[EXACT] = repr(float(plain["dt"]))
     for line in str(plain.get("scenario", "")).splitlines():
         header.add_history(line)
     with warnings.catch_warnings():
