@@ -123,7 +123,7 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         words, out = (words[:-2], words[-1]) if ">" in words else (words, None)
         if "--seeds" in words:
             words[words.index("--seeds") + 1] = "2"
-        result = CliRunner().invoke(main, [*words[1:], *(SHORT if words[1] in ("run", "observe", "export") else ())])
+        result = CliRunner().invoke(main, [*words[1:], *(SHORT if words[1] in ("run", "observe", "loop", "export") else ())])
         assert result.exit_code == 0, (line, result.output)
         if out:
             Path(out).write_text(result.stdout, encoding="utf-8")
@@ -169,6 +169,15 @@ def test_model_page_prints_what_the_script_prints(capsys: pytest.CaptureFixture[
     page = (ROOT / "docs" / "model.md").read_text(encoding="utf-8")
     lines = capsys.readouterr().out.splitlines()
     assert lines
+    for line in lines:
+        assert line in page
+
+
+def test_closed_loop_page_prints_what_the_theory_says(capsys: pytest.CaptureFixture[str]) -> None:
+    script("closed_loop").delays()
+    page = (ROOT / "docs" / "closed_loop.md").read_text(encoding="utf-8")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) > 5
     for line in lines:
         assert line in page
 
