@@ -15,9 +15,13 @@ from numpy.typing import NDArray
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.work import TRUTH
+from wfsobs.control.closed_loop import closed_loop, design
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.tables import rows as controller_rows
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.pipeline import Result
+from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scores import cumulative_rms, spectra
 from wfsobs.tables import Row, rows
@@ -97,6 +101,7 @@ class State:
     grid    : the points kept of the traces
     lines   : "kind/target/observer/mode" -> points; kind is signal, error [um], psd, psd-error [um^2/Hz], cumulative or
               cumulative-error [um]; frequencies [Hz] of the latter two pairs as "frequency", "frequency-cumulative"
+    loop    : as `wfsobs loop --json` gives them, of the controllers without a GPR; none where the record has no truth
     """
 
     scenario: Scenario
@@ -104,6 +109,7 @@ class State:
     reasons: tuple[str, ...]
     grid: Grid
     lines: Mapping[str, Floats]
+    loop: Sequence[Row] = ()
 
 
 @dataclass(frozen=True)
@@ -156,7 +162,16 @@ def state_of(result: Result, states: int = 1) -> State:
                 lines |= _frequencies(found[0])
                 for suffix, density in zip(("", "-error") if "error" in signals else ("",), found[1:], strict=False):
                     lines[f"psd{suffix}/{where}"], lines[f"cumulative{suffix}/{where}"] = _spectra(found[0], density[:, i])
-    return State(scenario, rows(result.scores, scenario.run.seed), tuple(_reasons(result)), grid, lines)
+    return State(scenario, rows(result.scores, scenario.run.seed), tuple(_reasons(result)), grid, lines, loop_rows(result))
+
+
+def loop_rows(result: Result) -> list[Row]:
+    """The closed loop on the record of a run, of the controllers that take a moment; none where the truth is not known."""
+    quick = [name for name, controller in CONTROLLERS.items() if controller.predict is None]
+    try:
+        return controller_rows(closed_loop(result.record, design(result.scenario, quick)), result.scenario.run.seed)
+    except RecordError:
+        return []
 
 
 def _reasons(result: Result) -> list[str]:

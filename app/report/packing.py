@@ -18,7 +18,8 @@ def packed(report: Report) -> bytes:
         "preset": report.preset, "base": to_toml(report.base), "recorded": report.recorded,
         "variations": [[v.path, v.values] for v in report.variations],
         "states": [
-            {"toml": to_toml(s.scenario), "rows": s.rows, "reasons": s.reasons, "grid": [s.grid.n, s.grid.dt, s.grid.bins]}
+            {"toml": to_toml(s.scenario), "rows": s.rows, "reasons": s.reasons, "grid": [s.grid.n, s.grid.dt, s.grid.bins],
+             "loop": list(s.loop)}
             for s in report.states],
     }
     arrays = {f"{i}/{name}": line for i, s in enumerate(report.states) for name, line in s.lines.items()}
@@ -37,7 +38,7 @@ def unpacked(content: bytes) -> Report:
             if slash:
                 lines[int(number)][name] = file[key]
     states = tuple(
-        State(from_toml(s["toml"]), s["rows"], tuple(s["reasons"]), Grid(*s["grid"]), of)
+        State(from_toml(s["toml"]), s["rows"], tuple(s["reasons"]), Grid(*s["grid"]), of, s["loop"])
         for s, of in zip(words["states"], lines, strict=True))
     variations = tuple(Variation(path, tuple(values)) for path, values in words["variations"])
     return Report(words["preset"], from_toml(words["base"]), variations, states, words["recorded"])

@@ -20,6 +20,7 @@ from wfsobs import __version__
 from wfsobs.app.display import CUMULATIVE, ERROR, NO_ANGLE, PSD, SIGNAL, UNITS, per_micrometre
 from wfsobs.app.report.data import Pool, Report, State, coded, window_of
 from wfsobs.app.report.figures import SHADES, SPECTRUM, SWEEP, TRACE, WARM_UP, WINDOW, all_figures
+from wfsobs.app.report.loop import loop_section
 from wfsobs.app.report.table import state_table
 from wfsobs.app.report.text import (
     meaning_section,
@@ -78,6 +79,7 @@ def _body(report: Report, made: datetime) -> str:
         *((target.capitalize(), "script-only", lambda target=target: _target(report, target)) for target in TARGETS),
         *([("RMS error over a setting", "script-only", lambda: _sweep(report))] if _sweeps(report) else []),
         ("RMS errors", "", lambda: _tables(report)),
+        *([("Closed loop", "", lambda: loop_section(report))] if any(state.loop for state in report.states) else []),
         ("Scenario", "", lambda: scenario_section(report)),
         ("What the numbers mean", "text", lambda: meaning_section(report)),
         ("Made with", "", lambda: origin_section(report, made)),
