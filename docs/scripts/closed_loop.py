@@ -56,7 +56,7 @@ def presets() -> None:
 
 def no_cone() -> None:
     """The lines of UT4 where the LGS see what is on the axis."""
-    _compare("`ut4`, no cone effect", PRESETS["ut4"]().replace(NO_CONE), LINEAR, range(1, 11))
+    _compare("The lines of `ut4`, no cone effect", PRESETS["ut4"]().replace(NO_CONE), LINEAR, range(1, 11))
 
 
 def delays() -> None:
