@@ -19,6 +19,7 @@ from panel.custom import JSComponent
 from panel.util.parameters import edit_readonly
 
 from wfsobs.app.actions import Actions
+from wfsobs.app.controls.fields import SOON
 from wfsobs.app.controls.panel import Controls, waiting_text
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, SIGNAL, UNITS, Display
 from wfsobs.app.pages.pages import Pages
@@ -135,6 +136,7 @@ class Dashboard:
         widget = pmui.RadioButtonGroup.from_param(
             self.display.param[name], options=options, size="small", margin=0, variant="outlined")
         widget.label = ""
+        widget._debounce = SOON  # type: ignore[misc]
         return widget
 
     def _top(self) -> pn.FlexBox:

@@ -23,7 +23,7 @@ ROOM = {"sizing_mode": "stretch_width", "margin": (4, 0)}
 NUMBER_WIDTH = 92
 
 SOON = 5
-"""How long a message of a slider waits for the next to go with it [ms]: by default 50, a tenth of what a redraw takes."""
+"""How long a message of a slider or switch waits for the next to go with it [ms]: by default 50, a tenth of a redraw."""
 
 
 def number_text(value: float) -> str:
