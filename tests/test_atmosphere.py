@@ -10,12 +10,12 @@ from scipy.special import jv
 
 from wfsobs import atmosphere
 from wfsobs.disturbance import make_disturbance
-from wfsobs.frozen_flow import spectrum
 from wfsobs.lgs import lgs_error_process, lgs_error_variance, low_frequency_process
 from wfsobs.observers.kalman import modelled_processes
 from wfsobs.scenario import Scenario
 from wfsobs.sensing import measure
 from wfsobs.turbulence import turbulence_process, turbulence_rms
+from wfsobs.von_karman import spectrum
 from wfsobs.zernike import noll_covariance
 
 FLOW: dict[str, Any] = {"turbulence.source": "frozen-flow", "sensors.kind": "zernike"}

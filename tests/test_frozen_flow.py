@@ -9,7 +9,8 @@ import pytest
 from scipy.signal import welch
 from scipy.special import j0, jv
 
-from wfsobs.frozen_flow import Grid, Layer, View, frozen_flow, period_steps, spectrum, waves
+from wfsobs.frozen_flow import Grid, View, frozen_flow, period_steps, waves
+from wfsobs.von_karman import Layer, spectrum
 from wfsobs.wave import Footprint
 from wfsobs.zernike import ZernikeProjection, noll, noll_covariance, over_argument
 

@@ -13,12 +13,13 @@ from scipy.special import j1, jv
 
 from wfsobs import zernike
 from wfsobs.aliasing import Aliasing
-from wfsobs.frozen_flow import Grid, Layer, View, frozen_flow, spectrum, waves
+from wfsobs.frozen_flow import Grid, View, frozen_flow, waves
 from wfsobs.lenslets import Lenslets
 from wfsobs.reconstructor import interaction, polynomials, reconstructor
 from wfsobs.shack_hartmann import ShackHartmann
 from wfsobs.spots import ARCSEC, Spots
 from wfsobs.trigonometric import TrigonometricSum, lagrange_weights
+from wfsobs.von_karman import Layer, spectrum
 from wfsobs.wave import Footprint, Wave
 from wfsobs.zernike import ZernikeProjection, up_to_order
 

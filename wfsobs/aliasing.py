@@ -10,8 +10,8 @@ import numpy as np
 
 from wfsobs import zernike
 from wfsobs.arrays import Array
-from wfsobs.frozen_flow import spectrum
 from wfsobs.shack_hartmann import ShackHartmann
+from wfsobs.von_karman import spectrum
 
 RINGS, SPOKES = 800, 40
 RADII = np.geomspace(0.005, 2000.0, RINGS)

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from wfsobs.arrays import Array
-from wfsobs.frozen_flow import CORE, Layer, View, across, fine_rule, spectrum
+from wfsobs.frozen_flow import View
 from wfsobs.scenario import Scenario
+from wfsobs.von_karman import CORE, Layer, across, fine_rule, spectrum
 from wfsobs.wave import Footprint, Sensor
 from wfsobs.zernike import ZernikeProjection, looked_up, over_argument
 

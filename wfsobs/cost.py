@@ -8,10 +8,10 @@ three times as long: what counts here is whether it will be a moment or a wait.
 
 from __future__ import annotations
 
-from wfsobs.frozen_flow import FIELD
 from wfsobs.loop import TRAINING_MARGIN
 from wfsobs.observers.modes import AT_ONCE
 from wfsobs.scenario import Scenario
+from wfsobs.von_karman import FIELD
 
 CORES = 2
 

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from wfsobs import atmosphere
 from wfsobs.arrays import Array
-from wfsobs.frozen_flow import CORE, Layer, across, fine_rule, spectrum
 from wfsobs.lgs import lgs_weights
 from wfsobs.scenario import Scenario
+from wfsobs.von_karman import CORE, Layer, across, fine_rule, spectrum
 from wfsobs.wave import Footprint
 from wfsobs.zernike import ZernikeProjection, looked_up
 

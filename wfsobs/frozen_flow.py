@@ -9,8 +9,7 @@ is not smooth on that grid near f = 0, where most of the power is, so below TAPE
 Gauss-Legendre nodes, panel by panel down to the outer scale, that are summed one by one. Both together have the right
 covariance at all lags of the record, the first step like the last, and none of the FFT's period.
 
-Across the wind: the trapezoidal rule in u(k_y) = asinh(k_y / q) / h + k_y / delta, q^2 = k_x^2 + k_0^2. The first term
-follows the von Karman spectrum, analytic in u; the second keeps the spacing below delta, which resolves the aperture.
+Across the wind: the rule of `von_karman`.
 
 Small waves that a Zernike mode averages away are what a Shack-Hartmann sensor's aliasing is made of. Where a sensor reaches
 for them they are there, with random numbers of their own.
@@ -26,11 +25,9 @@ from scipy.fft import irfft, next_fast_len
 from scipy.special import erfc
 
 from wfsobs.arrays import Array
+from wfsobs.von_karman import CORE, FIELD, Layer, across, fine_rule, spectrum
 from wfsobs.watch import QUIET, Watch
 from wfsobs.wave import Footprint, Sensor, Wave
-
-SEEING_WAVELENGTH = 0.5
-"""Wavelength that r0 is given at [um]."""
 
 TAPER = 16
 """Multiples of 1 / P below which the FFT gives way to single nodes."""
@@ -39,33 +36,14 @@ STEEPNESS = 7.0
 PANEL_NODES = 20
 """Gauss-Legendre nodes of a panel: the phase of a wave turns by less than 8 pi over it."""
 
-CORE = 64.0
-"""k D / 2 up to which waves are resolved finely across the wind; beyond lie less than 1e-4 of the variance of radial order 6."""
 FAR = 32.0
 """k_x D / 2 beyond which a coarse rule across the wind does: less than 2e-3 of the variance of order 6, 1e-6 of tip."""
 END = 700.0
 """k_x D / 2 where waves end: 370 times the knee of tip, less than 1e-11 of its variance."""
-FIELD = 1e-3
-"""Shifts between beams [m per m of height, 3.4 arcmin] that the spacing across the wind resolves."""
 NARROWEST = 0.5
 """Beams narrower than that part of the aperture get no more waves: a layer halfway up to a guide star."""
 COLUMNS = 512
 """Most columns k_x of a block: 512 by 60 waves are half a megabyte."""
-
-
-@dataclass(frozen=True)
-class Layer:
-    """One layer along the line of sight.
-
-    strength : r0^(-5/3) of the layer alone [m^(-5/3)], r0 at 500 nm
-    height   : distance along the line of sight [m]; speed [m/s]
-    angle    : direction that the wind blows to, from the pupil's x axis to its y axis [rad]
-    """
-
-    strength: float
-    height: float
-    speed: float
-    angle: float
 
 
 @dataclass(frozen=True)
@@ -74,16 +52,6 @@ class View:
 
     sensor: Sensor
     footprints: tuple[Footprint, ...]
-
-
-def spectrum(k2: Array, strength: float, outer_scale: float) -> Array:
-    """Von Karman density of the wavefront [um^2 m^2] at squared angular spatial frequency k2 [rad^2/m^2].
-
-    Its integral over the plane d^2k is the variance. 0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6) rad^2 m^2 with k = 2 pi f
-    (Noll 1976, eq. 21, with an outer scale); L0 = `outer_scale` [m].
-    """
-    in_angular = 0.0229 * strength * (2.0 * np.pi) ** (11.0 / 3.0 - 2.0)
-    return in_angular * (k2 + (2.0 * np.pi / outer_scale) ** 2) ** (-11.0 / 6.0) * (SEEING_WAVELENGTH / (2.0 * np.pi)) ** 2
 
 
 def frozen_flow(
@@ -238,11 +206,6 @@ def waves(
                 yield made(part, "beside", *(np.concatenate([x[: x.size // 2 - n], x[x.size // 2 + n :]]) for x in wider))
 
 
-def fine_rule(height: float, diameter: float) -> tuple[float, float]:
-    """(delta, h) of the rule across the wind where waves matter."""
-    return np.pi / (diameter + FIELD * height), 0.5
-
-
 def blocks(kx: Array, n_low: int, borders: tuple[float, ...]) -> Iterator[slice]:
     """The single nodes, then columns whose k_x at most doubles and does not cross a border."""
     yield slice(0, n_low)
@@ -252,22 +215,3 @@ def blocks(kx: Array, n_low: int, borders: tuple[float, ...]) -> Iterator[slice]
         stop = min(max(int(np.searchsorted(kx[n_low:], end)) + n_low, start + 1), start + COLUMNS, kx.size)
         yield slice(start, stop)
         start = stop
-
-
-def across(q: float, end: float, delta: float, h: float) -> tuple[Array, Array]:
-    """Nodes k_y, symmetric about 0, and weights [rad/m] of the rule of the module's head, out to about `end`."""
-    def u(k: Array) -> Array:
-        return np.arcsinh(k / q) / h + k / delta
-
-    n = int(np.ceil(float(u(np.array(end)))))
-    wanted = np.arange(n) + 0.5
-    table = q * np.sinh(np.linspace(0.0, np.arcsinh(end / q) + 1.0, 8 * n + 2))
-    k = np.interp(wanted, u(table), table)
-    for _ in range(3):
-        k -= (u(k) - wanted) * _spacing(k, q, delta, h)
-    weight = _spacing(k, q, delta, h)
-    return np.concatenate([-k[::-1], k]), np.concatenate([weight[::-1], weight])
-
-
-def _spacing(k: Array, q: float, delta: float, h: float) -> Array:
-    return 1.0 / (1.0 / (h * np.hypot(k, q)) + 1.0 / delta)

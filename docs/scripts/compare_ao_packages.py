@@ -21,11 +21,11 @@ import numpy as np
 
 from wfsobs import zernike
 from wfsobs.arrays import Array
-from wfsobs.frozen_flow import spectrum
 from wfsobs.lenslets import Lenslets
 from wfsobs.reconstructor import reconstructor
 from wfsobs.shack_hartmann import ShackHartmann
 from wfsobs.spots import ARCSEC
+from wfsobs.von_karman import spectrum
 
 R0, L0 = 0.157, 25.0  # [m]
 PERIOD = 32.0  # of a screen [m]
