@@ -100,3 +100,12 @@ def test_edges() -> None:
     assert told.mode == "tilt" and all(f.reason == "" for f in told.filters.values())
     assert told.filters["kf-lgs"].gains["LGS"][2] == 0.0
     assert set(told.filters["multirate-optimal"].gains) == {"LGS with NGS", "NGS"}
+
+
+def test_sensors_by_themselves() -> None:
+    """A coarse NGS on frozen flow takes the mean gradient for the tip, 166 nm off; AR(2) turbulence is seen as it is."""
+    s = PRESETS["ut4"]().replace({"sensors.lenslets.ngs_subapertures": 2, "sensors.ngs_noise": 0.03})
+    facts = describe(s, 1).sensors
+    assert facts["NGS"].aliasing == pytest.approx(0.1657, abs=1e-3) and facts["NGS"].noise == pytest.approx(0.03)
+    assert 0.0 < facts["LGS"].aliasing < 0.003 and facts["LGS"].noise == pytest.approx(s.sensors.lgs_noise)
+    assert describe(s.replace({"turbulence.source": "ar2"})).sensors["NGS"].aliasing == 0.0

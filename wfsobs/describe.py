@@ -18,6 +18,7 @@ from wfsobs.observers.multirate import multirate_filter, multirate_noise
 from wfsobs.observers.multirate_optimal import optimal_filter, optimal_model
 from wfsobs.riccati import steady_state
 from wfsobs.scenario import Scenario
+from wfsobs.sensors import aliasing_rms, noise_rms
 from wfsobs.statespace import paper_matrices
 
 
@@ -54,6 +55,14 @@ class GprFacts:
 
 
 @dataclass(frozen=True)
+class SensorFacts:
+    """What one LGS, or the NGS, gets wrong by itself, rms [um]: white noise of a frame, and aliasing, see `sensors`."""
+
+    noise: float
+    aliasing: float
+
+
+@dataclass(frozen=True)
 class Description:
     """The model of one mode. turbulence, vibration: the processes modelled, per fast step; A, B, C (paper, eq. 7)."""
 
@@ -66,6 +75,7 @@ class Description:
     C: Array
     filters: dict[str, FilterFacts]
     gprs: dict[str, GprFacts]
+    sensors: dict[str, SensorFacts]
 
 
 def describe(scenario: Scenario, mode: int = 0) -> Description:
@@ -83,8 +93,12 @@ def describe(scenario: Scenario, mode: int = 0) -> Description:
         name: GprFacts((g.noise_std * g.length_scale / g.signal_std) ** 2, g.depth * dt, (g.training_size + g.depth - 1) * dt)
         for name, g in (("gpr-offline", scenario.gpr_offline), ("gpr-online", scenario.gpr_online))
     }
+    sensors = {
+        kind.upper(): SensorFacts(float(noise_rms(scenario, kind)[mode]), float(aliasing_rms(scenario, kind)[mode]))
+        for kind in ("lgs", "ngs")
+    }
     matrices = paper_matrices(turbulence, vibration)
-    return Description(scenario.modes[mode].name, ratio, turbulence, vibration, *matrices, filters, gprs)
+    return Description(scenario.modes[mode].name, ratio, turbulence, vibration, *matrices, filters, gprs, sensors)
 
 
 Gains = dict[str, Array]

@@ -49,7 +49,7 @@ class Model:
 
 def html(told: Description, dark: bool) -> str:
     """The whole page."""
-    parts = (_processes(told), _state_space(told), _filters(told, dark), _gprs(told, dark))
+    parts = (_processes(told), _sensors(told), _state_space(told), _filters(told, dark), _gprs(told, dark))
     intro = f"The numbers are those of the settings, mode {told.mode}, in micrometres and steps of the loop."
     return f'<p class="text">{intro}</p>' + "".join(f'<section class="part">{part}</section>' for part in parts)
 
@@ -82,6 +82,18 @@ def _processes(told: Description) -> str:
         "Modelled process", "ω [rad/s]", "ξ", "rms [µm]", "a<sub>1</sub>", "a<sub>2</sub>", "variance of v [µm²]"))
     table = f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>'
     return _title("Disturbances: AR(2), equations 1 and 2") + _scroll("Disturbances", general + first + lines + table)
+
+
+def _sensors(told: Description) -> str:
+    """What the sensors get wrong by themselves."""
+    head = "".join(f"<th scope=col>{h}</th>" for h in ("Sensor", "noise of a frame, rms [µm]", "aliasing, rms [µm]"))
+    rows = "".join(
+        f"<tr><th scope=row>{'One LGS' if name == 'LGS' else name}</th><td>{m.short(facts.noise)}</td>"
+        f"<td>{m.short(facts.aliasing)}</td></tr>" for name, facts in told.sensors.items())
+    table = f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>'
+    note = ('<p class="text">Aliasing is what a Shack-Hartmann sensor takes for the mode and is none of those it fits: its '
+            "output less the Zernike coefficient of frozen flow in the same beam. No filter knows of it.</p>")
+    return _title("Sensors") + _scroll("Sensors", table) + note
 
 
 def _process(kind: str, p: Ar2) -> str:

@@ -131,6 +131,8 @@ class TestModel:
         for facts in told.filters.values():
             assert f"Radius {mathml.short(facts.radius or 0.0, 6)}" in text
         assert mathml.short(told.gprs["gpr-offline"].ridge) in text and "mode tip" in text
+        for facts in told.sensors.values():
+            assert mathml.short(facts.noise) in text and mathml.short(facts.aliasing) in text
 
     def test_it_follows_settings_and_mode(self, dashboard: Dashboard) -> None:
         page = opened(dashboard, MODEL)
