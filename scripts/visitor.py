@@ -132,13 +132,17 @@ class Visitor:
         """What was refused, a line each."""
         return self.models[self.find("Toolbar")].get("notes", [])
 
+    @property
+    def numbers(self) -> str:
+        """The table as it came."""
+        texts = (html.unescape(m["text"]) for m in self.models.values() if isinstance(m.get("text"), str))
+        return next(text for text in texts if 'class="rms"' in text)
+
     def table(self) -> dict[tuple[str, str], tuple[str, ...]]:
         """(observer, target) -> error and truth [nm] as the table has them."""
-        texts = (html.unescape(m["text"]) for m in self.models.values() if isinstance(m.get("text"), str))
-        text = next(text for text in texts if 'class="rms"' in text)
         return {
             (observer, target): tuple(_number(cell) for cell in re.findall(r"<td>(.*?)</td>", cells)[:2])
-            for observer, target, cells in ROW.findall(text)}
+            for observer, target, cells in ROW.findall(self.numbers)}
 
     # ------------------------------------------------------------------ what the server says
 
