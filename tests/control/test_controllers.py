@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from wfsobs.arrays import Array
 from wfsobs.control.closed_loop import ClosedLoop, Outcome, closed_loop, design, residual_rms, strehl
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.integrator import best_gain, highest_stable_gain, integrator_law, limited_integrator, residual_variance
+from wfsobs.control.integrator import best_gain, highest_stable_gain, integrator_law, limited_integrator
 from wfsobs.control.lqg import lqg_kf_lgs
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.prediction import gpr_offline_ahead
+from wfsobs.control.residual import residual_variance
 from wfsobs.loop import simulate
 from wfsobs.observers.kalman import kalman_model, measurement_noise, modelled_processes
 from wfsobs.observers.reference import online_reference

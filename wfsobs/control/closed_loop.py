@@ -22,10 +22,11 @@ import numpy as np
 from wfsobs.arrays import Array
 from wfsobs.bound import bound_of
 from wfsobs.control.controllers import CONTROLLERS, Controller
-from wfsobs.control.integrator import limited_integrator, residual_variance
+from wfsobs.control.integrator import limited_integrator
 from wfsobs.control.law import Law
 from wfsobs.control.margins import Margins, frequencies, margins
 from wfsobs.control.mirror import Mirror, mirror_of
+from wfsobs.control.residual import residual_variance
 from wfsobs.observers.reference import online_reference
 from wfsobs.pipeline import as_stated
 from wfsobs.record import Record, RecordError

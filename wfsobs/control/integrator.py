@@ -8,9 +8,9 @@ from scipy.optimize import minimize_scalar
 from wfsobs.arrays import Array
 from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror
+from wfsobs.control.residual import residual_density
 from wfsobs.lifted import PeriodicFilter
 from wfsobs.true_spectra import TrueSpectra
-from wfsobs.wiener import circle_mean
 
 FINE, COARSE = 2048, 64
 """Bins kept as they are, and how many of the others count as one: the integrator's response is smooth there."""
@@ -54,22 +54,6 @@ def best_gain(spectra: TrueSpectra, mirror: Mirror, leak: float) -> float:
     best = 1 + int(np.argmin([variance(gain) for gain in gains[1:-1]]))
     around = (gains[best - 1], gains[best + 1])
     return float(minimize_scalar(variance, bounds=around, method="bounded", options={"xatol": 1e-5}).x)
-
-
-def residual_density(T: Array, target: Array, cross: Array, measured: Array) -> Array:
-    """Spectrum of the residual phi_dist + phi_corr where T = P F: what is not rejected, and the noise let in.
-
-    target : of phi_dist; cross : between phi_dist[k] and z[k + 1]; measured : of z
-    """
-    return target + np.abs(T) ** 2 * measured - 2.0 * np.real(np.conj(cross) * T)
-
-
-def residual_variance(law: Law, spectra: TrueSpectra, mirror: Mirror) -> float:
-    """Variance [um^2] of the residual that a time-invariant law leaves, by theory."""
-    n = spectra.measured.size
-    omega = np.pi * np.arange(n) / (n - 1)
-    target, cross = spectra.total
-    return circle_mean(residual_density(mirror.response(omega) * law.response(omega), target, cross, spectra.measured))
 
 
 def _binned(spectra: TrueSpectra) -> tuple[Array, Array, Array, Array, Array]:
