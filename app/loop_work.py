@@ -63,7 +63,7 @@ class LoopRun:
             self._run.post(lambda: None if cancel.is_set() else self._land(shown, reason))
 
         try:
-            compute(of, Watch(cancelled=cancel.is_set), land)
+            compute(of, Watch(cancelled=lambda: cancel.is_set() or self._run.closed), land)
         except Cancelled:
             pass
         except ValueError as error:  # settings or a record that no loop can be made of

@@ -55,6 +55,7 @@ class Run(param.Parameterized):
         self._cancel = threading.Event()
         self._news: dict[str, Any] = {}
         self._posted = False
+        self.closed = False
 
     def start(self, scenario: Scenario) -> None:
         """Run a scenario, in place of whatever is running."""
@@ -78,6 +79,7 @@ class Run(param.Parameterized):
 
     def close(self) -> None:
         """Stop and let the threads go: the session has ended."""
+        self.closed = True
         self._supersede()
         self._pool.shutdown(wait=False, cancel_futures=True)
 

@@ -267,7 +267,7 @@ def test_an_unstable_loop_is_said_to_be_one(changes: dict[str, Any]) -> None:
 def test_what_cannot_run_says_why() -> None:
     both = {"multirate.measurement_noise": "manual", "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001}
     (one,) = run(QUICK | both, ("lqg-multirate",)).outcomes
-    assert one.residual is None and "unstable" in one.note
+    assert one.stable == (False, False) and one.residual is None and "unstable" in one.note
     (one,) = run(QUICK | {"gpr_online.training_size": 2, "control.delay": 4.0}, ("integrator+gpr-online",)).outcomes
     assert one.residual is None and "training size 2" in one.note
     scenario = MATCHED.replace(QUICK)

@@ -27,6 +27,7 @@ from wfsobs.control.law import Law
 from wfsobs.control.margins import Margins, frequencies, margins
 from wfsobs.control.mirror import Mirror, mirror_of
 from wfsobs.control.residual import residual_variance
+from wfsobs.observers.multirate import UnstableCycle
 from wfsobs.observers.reference import online_reference
 from wfsobs.pipeline import as_stated
 from wfsobs.record import Record, RecordError
@@ -129,6 +130,8 @@ def _designed(controller: Controller, scenario: Scenario, mode: int, mirror: Mir
         return Designed(None, True)
     try:
         law = controller.law(scenario, mode, mirror, spectra)
+    except UnstableCycle as error:
+        return Designed(None, False, note=str(error))
     except ValueError as error:
         return Designed(None, None, note=str(error))
     stable = law.stable

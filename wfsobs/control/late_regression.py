@@ -31,24 +31,32 @@ class LateRegression(SlidingRegression):
 
         NaN until there are m windows before this one. `update` must follow before the next sample.
         """
-        k = self.step + 1
-        known = k - 1 - self.late
-        if known >= self.depth - 1:
-            self._weights[0] += last_target * self._column(known)
-        super().predict(sample, 0.0)
+        self.step += 1
+        self._last_target = 0.0  # none for the newest window; `_learn` brings them in when they come
+        self._learn(last_target)
+        self._slide(sample)
+        self._covariances()
         if not self.ready:
             return float("nan")
-        waiting = [(k - 1 - i) % self.m for i in range(self.late)]
-        a, b, _ = self._weights
-        parts = np.vstack([a, *(self._column(slot) for slot in waiting)])  # of the known targets, of a 1 at each that waits
-        delta = self._points.delta
-        constants = parts @ delta / (1.0 / self.kernel.variance + b @ delta)
-        weights = parts - np.outer(constants, b)
-        targets = np.linalg.solve(weights[1:, waiting].T, -weights[0, waiting])
-        mean = weights @ self._kappa + constants * self._newest.delta[0]
+        waiting = [(self.step - 1 - i) % self.m for i in range(self.late)]
+        # weights a of the known targets, and of a 1 at each window that waits, the newest first
+        parts = self._weights[: 2 * self.late + 1 : 2]
+        if self.late > 1:
+            parts = np.vstack([parts, *(self._column(slot) for slot in waiting[1:])])
+        b, both = self._weights[1], np.array([self._kappa, self._points.delta])
+        (along, _), over = both @ b, parts @ both.T
+        constants = over[:, 1] / (1.0 / self.kernel.variance + both[1] @ b)
+        mean = over[:, 0] + constants * (self._newest.delta[0] - along)
+        own = parts[:, waiting] - np.outer(constants, b[waiting])  # weights of the windows that wait: to become zero
+        targets = np.linalg.solve(own[1:].T, -own[0]) if self.late > 1 else -own[0] / own[1:].ravel()
         return float(mean[0] + targets @ mean[1:])
 
-    def _column(self, window: int) -> Array:
-        """What a target of 1 of that window adds to the weights a."""
-        s, N = window % self.m, self._N
-        return np.concatenate([N[s, :s], N[s:, s]])
+    def _learn(self, target: float) -> None:
+        """Bring in the target of the newest window that has one."""
+        window = self.step - 1 - self.late
+        if window >= self.depth - 1:
+            self._weights[0] += target * self._column(window % self.m)
+
+    def _column(self, s: int) -> Array:
+        """What a target of 1 in slot s adds to the weights a."""
+        return np.concatenate([self._N[s, :s], self._N[s:, s]])

@@ -27,6 +27,10 @@ from wfsobs.statespace import DisturbanceModel
 from wfsobs.watch import Watch
 
 
+class UnstableCycle(SettingError):
+    """Two gains, each stable, that make an unstable cycle."""
+
+
 def multirate_noise(scenario: Scenario, mode: int = 0) -> tuple[float, float]:
     """Square roots of r_LGS and r_NGS [um] in one mode."""
     m = scenario.multirate
@@ -54,7 +58,7 @@ def multirate_filter(
     """The filter for an NGS frame every `ratio` steps; lgs_noise, ngs_noise: square roots of r [um].
 
     outputs : rows wanted of the state x_hat[k], (p, n); every target by default.
-    Raises SettingError where the two gains, each stable, make an unstable cycle.
+    Raises UnstableCycle.
     """
     C_lgs, C_both = np.atleast_2d(model.C), np.vstack([model.C, model.C])
     L_lgs = steady_state(model.A, C_lgs, model.Q, np.array(lgs_noise**2)).L
@@ -64,7 +68,7 @@ def multirate_filter(
     cycle = PeriodicFilter([*([alone] * (ratio - 1)), filter_step(model.A, C_both, L_both, rows)])
     radius = np.abs(np.linalg.eigvals(cycle.cycle_matrix())).max()
     if radius >= 1.0:
-        raise SettingError(
+        raise UnstableCycle(
             f"multi-rate filter: the cycle of {ratio} steps is unstable (spectral radius {radius:.3g}) with LGS noise "
             f"{lgs_noise * 1e3:.4g} nm and NGS noise {ngs_noise * 1e3:.4g} nm; bring the two closer together")
     return MultiRateFilter(alone, cycle)
