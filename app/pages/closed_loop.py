@@ -9,7 +9,7 @@ import panel as pn
 from bokeh.plotting import figure
 
 from wfsobs.app.display import NOTHING, Display, number, per_micrometre
-from wfsobs.app.loop_work import LoopRun, LoopShown
+from wfsobs.app.loop_work import LoopRun, LoopShown, seconds
 from wfsobs.app.pages.loop_figures import Nyquist, Response, Spectrum, Trace
 from wfsobs.app.pages.loop_table import margins_html, table_html
 from wfsobs.app.run import RUNNING, Run
@@ -132,7 +132,7 @@ class ClosedLoopPage:
             it, row = look(name), left.get(name)
             value, unit = NOTHING, ""
             if row is None:
-                note = "computing …"
+                note = f"left out, {seconds(name, shown.result.scenario):.0f} s" if shown.done else "computing …"
             elif row["residual_rms_nm"] is None:
                 note = "unstable" if row["stable"] is False else "could not run"
             else:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from wfsobs.app import loop_work
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import per_micrometre
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
@@ -123,6 +124,24 @@ def test_more_modes_than_tip_and_tilt(page: ClosedLoopPage, dashboard: Dashboard
     dashboard.display.mode = "defocus"
     assert page.whole.figure.yaxis.axis_label == "residual defocus [nm]"
     assert len(page.whole.sources["integrator"].data["x"]) > 100
+
+
+def test_what_would_take_minutes_is_left_out(
+    dashboard: Dashboard, loop: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    long = dashboard.store.scenario.replace({"run.duration": 60.0, "gpr_online.training_size": 2048})
+    assert loop_work.seconds("integrator+gpr-online", long) > loop_work.PATIENCE
+    assert loop_work.seconds("integrator+gpr-online", dashboard.store.scenario) < 1.0
+    monkeypatch.setattr(loop_work, "PATIENCE", 0.1)
+    page = done(opened(dashboard), loop)
+    (card,) = [c for c in page.cards.items if c["name"] == "integrator+gpr-online"]
+    assert card["note"].startswith("left out") and "integrator+gpr-online" not in page.table.object
+
+
+def test_a_session_that_ends_takes_its_loop_with_it(dashboard: Dashboard) -> None:
+    page = opened(dashboard)
+    dashboard.close()
+    assert page.run.closed and page.shown is None
 
 
 def test_a_record_without_a_truth_has_no_closed_loop(page: ClosedLoopPage) -> None:
