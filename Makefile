@@ -40,8 +40,8 @@ run: $(RUN)  ## serve the dashboard on localhost:5006 (another port: make run PO
 
 test: setup  ## run all tests, those in a browser after the others
 	@status=0; \
-	$(BIN)/python -m pytest || status=1; \
-	$(BIN)/python -m pytest tests/browser || status=1; \
+	$(BIN)/python -m pytest -n auto --dist loadfile || status=1; \
+	$(BIN)/python -m pytest -n auto --dist loadfile tests/browser || status=1; \
 	exit $$status
 
 setup: $(TEST)  ## install all that the tests need, the browser included

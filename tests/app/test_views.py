@@ -16,7 +16,9 @@ from wfsobs.app.style import LOOKS, look
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.traces import BINS
 from wfsobs.app.work import TRUTH
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
+from wfsobs.scores import BOUND
 
 
 def trace(dashboard: Dashboard, target: str) -> dict[str, Any]:
@@ -207,8 +209,9 @@ class TestLooks:
         assert set(OBSERVERS) <= set(LOOKS)
         assert look("a-new-one").label == "a-new-one"
 
-    def test_lines_of_one_colour_differ_by_dash(self) -> None:
-        seen = [(it.light, it.dash) for it in LOOKS.values()]
+    @pytest.mark.parametrize("together", [[TRUTH, *OBSERVERS, BOUND], [*CONTROLLERS, BOUND]], ids=["observers", "controllers"])
+    def test_lines_of_one_colour_differ_by_dash(self, together: list[str]) -> None:
+        seen = [(LOOKS[name].light, LOOKS[name].dash) for name in together]
         assert len(seen) == len(set(seen))
 
     def test_dark_mode(self, dashboard: Dashboard) -> None:

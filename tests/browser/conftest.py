@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 ROOT = Path(__file__).parents[2]
 FLAGS = [
@@ -27,6 +27,9 @@ FLAGS = [
 CLOSED_MID_UPDATE = ("WebSocketClosedError", "StreamClosedError", "self.connection.session.notify_connection_lost()")
 """What a page that closes during an update, or (the last, Bokeh's own) before its session is there, leaves in the log;
 nothing else is let through."""
+
+
+expect.set_options(timeout=30_000)  # a busy machine is no fault
 
 
 class Server:

@@ -237,6 +237,6 @@ def strehl(rms_per_mode: Sequence[float], wavelength: float) -> float:
     simulated modes together: no other error counts. rms and wavelength [um].
 
     >>> round(strehl([0.1, 0.1], 2.2), 4)
-    0.8494
+    0.8495
     """
     return float(np.exp(-((2.0 * pi / wavelength) ** 2) * np.sum(np.square(rms_per_mode))))
