@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from wfsobs.arrays import Array
 from wfsobs.control.late_regression import LateRegression
 from wfsobs.control.mirror import Mirror
-from wfsobs.control.prediction import VibrationPredictor
+from wfsobs.control.prediction import VibrationPredictor, of_z
+from wfsobs.observers.inputs import Scale, window_signals
 from wfsobs.observers.kernels import SquaredExponential
 from wfsobs.observers.reference import online_reference
 from wfsobs.scenario import Scenario
@@ -48,20 +49,25 @@ def test_one_without_a_known_target_is_refused() -> None:
         LateRegression(2, 3, 1, SquaredExponential(1.0, 1.0, 0.1), 3)
 
 
-@pytest.mark.parametrize("delay", [1.0, 2.0, 2.5, 3.0])
-def test_the_vibration_is_predicted_for_the_time_that_the_command_acts(delay: float) -> None:
+@pytest.mark.parametrize(("delay", "inputs"), [
+    (1.0, "raw"), (2.0, "raw"), (2.5, "raw"), (3.0, "raw"), (2.0, "high-pass"), (2.0, "standardised")])
+def test_the_vibration_is_predicted_for_the_time_that_the_command_acts(delay: float, inputs: str) -> None:
     """Window j learns sum_i taps[i] f[j + i], f the causal bank on z, once that is known."""
     depth, m, n = 4, 9, 80
     scenario = Scenario().replace({
-        "gpr_online.depth": depth, "gpr_online.training_size": m, "gpr_online.length_scale": 3.0, "gpr_online.signal_std": 1.0})
+        "gpr_online.depth": depth, "gpr_online.training_size": m, "gpr_online.length_scale": 3.0, "gpr_online.signal_std": 1.0,
+        "gpr_online.inputs_filter": inputs})
     z = np.random.default_rng(5).standard_normal(n)
     f = online_reference(scenario, z[:, None], scenario.dt)[:, 0]
     taps = Mirror(delay).taps
     late = taps.size - 2
     targets = np.array([taps[1:] @ f[j + 1 : j + taps.size] for j in range(n - taps.size)])
-    predictor = VibrationPredictor(scenario, Mirror(delay))
+    scale = Scale(np.array([0.1]), np.array([0.7])) if inputs == "standardised" else None
+    predictor = VibrationPredictor(scenario, Mirror(delay), scale)
+    nothing = np.zeros((n, 1))
+    seen = window_signals(of_z(scenario.gpr_online), nothing, nothing, z[:, None], 0, scenario.dt, scale)[:, 0]
     values = [predictor.step(x) for x in z]
     kernel = SquaredExponential(1.0, 3.0, scenario.gpr_online.noise_std)
     for k in range(depth + m - 1, n - taps.size):
-        expected = plain_prediction(z, targets, k, depth, m, late, kernel)
+        expected = plain_prediction(seen, targets, k, depth, m, late, kernel)
         assert values[k] == pytest.approx(expected, rel=1e-8, abs=1e-9 * np.abs(targets).max())

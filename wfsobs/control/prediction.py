@@ -1,11 +1,13 @@
 """Vibration as the GPR predict it for a controller: what it will be while the next command acts.
 
-In a loop that the prediction itself drives, u[k] does not exist yet at step k, so windows are of z whatever the settings of
-the observer say. With a delay of two frames the target of the window ending at step j is phi_vib[j+1]; the Butterworth
-bank on z says so at step j + 2, one step after the prediction was used.
+In a loop that the prediction itself drives, u[k] does not exist yet at step k, so windows are of z whatever the settings of the
+observer say; high-passed or standardised they are as those say. With a delay of two frames the target of the window ending at
+step j is phi_vib[j+1]; the Butterworth bank on z says so at step j + 2, one step after the prediction was used.
 """
 
 from __future__ import annotations
+
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,18 +15,22 @@ from wfsobs.arrays import Array
 from wfsobs.bandpass import StreamingBank, bandpass_bank
 from wfsobs.control.late_regression import LateRegression
 from wfsobs.control.mirror import Mirror
+from wfsobs.groups.observers import OfflineGpr, OnlineGpr
 from wfsobs.observers.gpr_offline import train, training_targets
 from wfsobs.observers.gpr_online import kernel_of
+from wfsobs.observers.inputs import Scale, StreamingInputs, scale_of, window_signals
 from wfsobs.observers.modes import over_modes
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.watch import Watch
 
+G = TypeVar("G", OfflineGpr, OnlineGpr)
+
 
 def gpr_offline_ahead(record: Record, scenario: Scenario, mirror: Mirror, watch: Watch) -> Array:
     """Prediction of the vibration during the time that u[k] acts, (n_steps, n_modes) [um], NaN before the first full
     window; trained once on the training record, its targets as many steps later."""
-    g, training = scenario.gpr_offline, record.training
+    g, training = of_z(scenario.gpr_offline), record.training
     if training is None:
         raise RecordError("the record has no training record")
     if record.n_steps < g.depth:
@@ -33,10 +39,19 @@ def gpr_offline_ahead(record: Record, scenario: Scenario, mirror: Mirror, watch:
     training_z = pseudo_open_loop(training.y_lgs, training.u, record.delay)
 
     def one(mode: int, watch: Watch) -> Array:
-        model = train(training_z[:, [mode]], targets[:, mode], g.depth, g.training_size, kernel_of(g), watch)
-        return model.predict(record.z[:, [mode]], watch)
+        scale = scale_of(g, training, record.delay, mode)
+        signals = window_signals(g, training.y_lgs, training.u, training_z, mode, record.dt, scale)
+        model = train(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), watch)
+        return model.predict(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt, scale), watch)
 
     return over_modes(record.n_modes, one, watch)
+
+
+def of_z(settings: G) -> G:
+    """The settings of a GPR with windows of z."""
+    out = settings.copy()
+    out.inputs = "z"
+    return out
 
 
 def _ahead(x: Array, mirror: Mirror) -> Array:
@@ -54,8 +69,10 @@ class VibrationPredictor:
     At step k it has learnt from the windows whose target is known by then: those up to k - mirror.taps.size + 1.
     """
 
-    def __init__(self, scenario: Scenario, mirror: Mirror):
-        g, b = scenario.gpr_online, scenario.butterworth
+    def __init__(self, scenario: Scenario, mirror: Mirror, scale: Scale | None = None):
+        """Scale: of standardised inputs, from `inputs.scale_of`."""
+        g, b = of_z(scenario.gpr_online), scenario.butterworth
+        self._inputs = StreamingInputs(g, scenario.dt, scale)
         self._taps = mirror.taps
         self._bank = StreamingBank(bandpass_bank(b.frequencies, b.bandwidth_online, b.order, scenario.dt))
         self._regression = LateRegression(g.depth, g.training_size, 1, kernel_of(g), late=self._taps.size - 2)
@@ -67,7 +84,7 @@ class VibrationPredictor:
         self._filtered[0] = self._bank.push(z)
         # of the window that ended as many steps ago as there are taps after the first
         target = self._taps[1:] @ self._filtered[::-1]
-        value = self._regression.predict(np.array([z]), float(target))
+        value = self._regression.predict(self._inputs.step(np.array([z])), float(target))
         self._regression.update()
         self._bank.settle()
         return value
@@ -78,7 +95,8 @@ def gpr_online_ahead(record: Record, scenario: Scenario, mirror: Mirror, watch: 
     done = np.zeros(record.n_modes)
 
     def one(mode: int, watch: Watch) -> Array:
-        predictor, z = VibrationPredictor(scenario, mirror), record.z[:, mode].tolist()
+        scale = scale_of(of_z(scenario.gpr_online), record.training, record.delay, mode)
+        predictor, z = VibrationPredictor(scenario, mirror, scale), record.z[:, mode].tolist()
         out = np.empty(record.n_steps)
         for k, sample in enumerate(z):
             if k % 256 == 0:
