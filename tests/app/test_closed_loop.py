@@ -59,9 +59,10 @@ def test_it_says_what_the_command_says(page: ClosedLoopPage, dashboard: Dashboar
     assert page.table.object.count("best</span>") == 1 and f'data-controller="{BOUND}"' in page.table.object
     assert page.margins.object.count("data-controller") == len(CURVES)
     assert page.note.object == ""
+    the_lines_are_the_results(page, dashboard)
 
 
-def test_the_lines_are_the_results(page: ClosedLoopPage, dashboard: Dashboard) -> None:
+def the_lines_are_the_results(page: ClosedLoopPage, dashboard: Dashboard) -> None:
     dashboard.display.param.update(mode="tilt", unit="mas")
     shown = page.shown
     assert shown is not None
@@ -81,7 +82,19 @@ def test_the_lines_are_the_results(page: ClosedLoopPage, dashboard: Dashboard) -
     assert page.whole.figure.yaxis.axis_label == "residual tilt [mas]"
 
 
-def test_the_marks_lie_on_the_curves_where_the_margins_are(page: ClosedLoopPage) -> None:
+def test_marks_hiding_colours_and_reasons(page: ClosedLoopPage, dashboard: Dashboard) -> None:
+    the_marks_lie_on_the_curves_where_the_margins_are(page)
+    before = top(page)
+    page.cards.hidden = [name for name in CONTROLLERS if name != "lqg-multirate-multi"]
+    assert not page.whole.lines["integrator"].visible and page.whole.lines["lqg-multirate-multi"].visible
+    assert top(page) < before and not len(page.nyquist.marks.data["x"])
+    dashboard.display.dark = True
+    assert page.whole.lines["integrator"].glyph.line_color == LOOKS["integrator"].dark
+    page._land(None, "the record has no truth")
+    assert "No closed loop: the record has no truth" in page.note.object
+
+
+def the_marks_lie_on_the_curves_where_the_margins_are(page: ClosedLoopPage) -> None:
     marks = page.nyquist.marks.data
     assert set(marks["marker"]) == {"circle", "square"}
     points = np.array(marks["x"]) + 1j * np.array(marks["y"])
@@ -89,15 +102,6 @@ def test_the_marks_lie_on_the_curves_where_the_margins_are(page: ClosedLoopPage)
     for point, marker in zip(points, marks["marker"], strict=True):
         assert np.nanmin(np.abs(L - point)) < 0.05
         assert abs(point) == pytest.approx(1.0) if marker == "square" else -1.0 < point.real < 0.0 == point.imag
-
-
-def test_hiding_and_colours(page: ClosedLoopPage, dashboard: Dashboard) -> None:
-    before = top(page)
-    page.cards.hidden = [name for name in CONTROLLERS if name != "lqg-multirate-multi"]
-    assert not page.whole.lines["integrator"].visible and page.whole.lines["lqg-multirate-multi"].visible
-    assert top(page) < before and not len(page.nyquist.marks.data["x"])
-    dashboard.display.dark = True
-    assert page.whole.lines["integrator"].glyph.line_color == LOOKS["integrator"].dark
 
 
 def test_it_follows_the_settings_while_it_is_seen(page: ClosedLoopPage, dashboard: Dashboard, loop: Any) -> None:
@@ -136,14 +140,5 @@ def test_what_would_take_minutes_is_left_out(
     page = done(opened(dashboard), loop)
     (card,) = [c for c in page.cards.items if c["name"] == "integrator+gpr-online"]
     assert card["note"].startswith("left out") and "integrator+gpr-online" not in page.table.object
-
-
-def test_a_session_that_ends_takes_its_loop_with_it(dashboard: Dashboard) -> None:
-    page = opened(dashboard)
     dashboard.close()
-    assert page.run.closed and page.shown is None
-
-
-def test_a_record_without_a_truth_has_no_closed_loop(page: ClosedLoopPage) -> None:
-    page._land(None, "the record has no truth")
-    assert "No closed loop: the record has no truth" in page.note.object
+    assert page.run.closed, "a session that ends takes its loop with it"
