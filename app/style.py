@@ -41,7 +41,7 @@ LOOKS: Mapping[str, Look] = MappingProxyType({
     "butterworth-cl": Look("Butterworth CL", "#B40000", "#FF7A70", (8, 3)),
     "gpr-offline": Look("Offline GPR", "#0A960A", "#4FD64F", (12, 2, 2, 2, 2, 2)),
     "gpr-online": Look("Online GPR", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
-    "kf-multi": Look("Multi-peak KF", "#00707F", "#4DD0E1", (14, 3)),
+    "kf-multi": Look("Multi-peak", "#00707F", "#4DD0E1", (14, 3)),
     "ridge": Look("Ridge", "#6B6B00", "#C8C84D", (4, 2)),
     "ridge-30": Look("30-tap predictor", "#8A5A00", "#D8A44D", (2, 3)),
     "persistence": Look("Persistence", "#707070", "#A8A8A8", (1, 3)),

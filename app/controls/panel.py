@@ -169,6 +169,14 @@ def _names() -> dict[str, str]:
     return {name: settings[name] for name in (*TOPICS, *(n for n in settings if n not in TOPICS))}
 
 
+ACRONYMS = ("ut4", "galacsi", "nfm", "wfm")
+
+
 def _title(preset: str) -> str:
-    """A preset's name as the page writes it: short ones are abbreviations."""
-    return preset.upper() if len(preset) <= 4 else preset.capitalize()
+    """A preset's name as the page writes it.
+
+    >>> _title("ut4-floor"), _title("strong-turbulence")
+    ('UT4 floor', 'Strong turbulence')
+    """
+    words = [word.upper() if word in ACRONYMS else word for word in preset.split("-")]
+    return " ".join([words[0] if words[0].isupper() else words[0].capitalize(), *words[1:]])

@@ -15,7 +15,7 @@ PINNED = f"""() => {MODELS}.filter(m => m.type === "GlyphRenderer" && m.name ===
 LABELS = f"""() => {MODELS}.filter(m => m.type === "LinearAxis" || m.type === "LogAxis").map(m => m.axis_label).join()"""
 SLOW = 30_000
 """What a page may take on a machine that is busy with other things [ms]."""
-LINES_OF_FIRST_PAGE = 2 * (5 + 7)
+LINES_OF_FIRST_PAGE = 2 * (6 + 8)
 LINES_OF_FIGURES = 2 * 2 + 2 * 2 + 2 * 4 + 3 * 4
 
 
@@ -78,7 +78,7 @@ def test_pin_and_compare(open_page: Any) -> None:
     before = cells(page, "kf-lgs", "turbulence")[0].split()[-1]
     page.get_by_role("button", name="Pin this run to compare others with it").click()
     expect(page.get_by_text("Pinned, faint in the figures: the same settings")).to_be_visible(timeout=SLOW)
-    page.wait_for_function(f"({PINNED})().join() === '5,7,5,7' || ({PINNED})().join() === '5,5,7,7'")
+    page.wait_for_function(f"({PINNED})().join() === '6,8,6,8' || ({PINNED})().join() === '6,6,8,8'")
     box = page.get_by_role("textbox", name="m/s")
     box.fill("30")
     box.press("Enter")
