@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import logging
-import threading
-import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from html import escape
 from types import MappingProxyType
 from typing import Any
-from urllib.parse import quote, urlencode
 
 import panel as pn
 import panel_material_ui as pmui
@@ -37,12 +33,14 @@ from wfsobs.app.work import compute
 from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.scenario import Scenario
 
-log = logging.getLogger(__name__)
-
 WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
 GRID = """
 :host { display: grid !important; grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); gap: 10px; }
 @media (max-width: 1000px) { :host { grid-template-columns: minmax(0, 1fr); } }
+"""
+ACTIONS = """
+:host { display: flex !important; flex-wrap: wrap; gap: 8px; }
+:host > * { flex: 0 1 auto; width: auto !important; }
 """
 BOX = """
 :host { border: 1px solid color-mix(in srgb, currentColor 18%, transparent); border-radius: 6px; padding: 8px 10px;
@@ -112,7 +110,7 @@ class Dashboard:
         page = pmui.Page(
             title="wfsobs", sidebar=[self.controls.view()], sidebar_width=340, theme_config=theme(), favicon=None,
             main=[_title(), pn.Column(
-                self._top(), self.actions.toolbar, self.upload.view, self.alert, self.stale, self.pages.view, self.frame,
+                self._top(), self._row_of_actions(), self.upload.room, self.alert, self.stale, self.pages.view, self.frame,
                 sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
         )
         self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")
@@ -145,6 +143,9 @@ class Dashboard:
             self.pages.switch, *self.modes.view(),
             self._group("unit", {written: unit for unit, written in UNITS.items()}),
             gap="12px", align_items="center", **WIDE)
+
+    def _row_of_actions(self) -> pn.Row:
+        return pn.Row(self.actions.toolbar, self.upload.picker, **WIDE, stylesheets=[ACTIONS])
 
     def _switches(self) -> pn.FlexBox:
         return pn.FlexBox(
@@ -210,71 +211,3 @@ def _caption(text: str, marks: str = "") -> pn.pane.HTML:
     return pn.pane.HTML(
         f'<div class="caption">{escape(text)}{marks}</div>', sizing_mode="stretch_width", margin=(8, 0, 0, 0),
         stylesheets=[asset("style.css")])
-
-
-def page(build: Callable[[Post], Dashboard] = Dashboard) -> Any:
-    """The page of a new session; a page that says what went wrong where it cannot be built."""
-    try:
-        dashboard = build(post_to_session())
-        if query := asked_for():
-            dashboard.actions.open_link(query)
-        page = dashboard.page()
-        dashboard.start()
-        pn.state.on_session_destroyed(lambda _context: dashboard.close())
-        return page
-    except Exception as error:
-        log.exception("the page could not be built")
-        return error_page(error)
-
-
-def asked_for() -> str:
-    """The query of the page's address; where a browser connects so late that its session is made anew, as the page was
-    given it."""
-    if pn.state.location is not None and pn.state.location.search:
-        return str(pn.state.location.search)
-    texts = [(key, value) for key, values in pn.state.session_args.items() for value in values]
-    return urlencode(texts, quote_via=quote)
-
-
-def post_to_session() -> Post:
-    """How another thread has something done on this session's, from when its page has been drawn.
-
-    What is changed before does not reach a browser that is just being told of the page, so it waits.
-    """
-    doc = pn.state.curdoc
-    if doc is None:
-        return lambda function: function()
-    waiting: list[Callable[[], None]] | None = []
-    lock = threading.Lock()
-
-    def loaded() -> None:
-        nonlocal waiting
-        with lock:
-            functions, waiting = waiting or [], None
-        for function in functions:
-            held(function)
-
-    def held(function: Callable[[], None]) -> None:
-        with pn.io.hold():
-            function()
-
-    def post(function: Callable[[], None]) -> None:
-        with lock:
-            if waiting is not None:
-                waiting.append(function)
-                return
-        if doc.session_context is not None and not doc.session_context.destroyed:
-            doc.add_next_tick_callback(partial(held, function))
-
-    pn.state.onload(loaded)
-    return post
-
-
-def error_page(error: Exception) -> pn.Column:
-    """What went wrong, in place of a page that never comes."""
-    line = "".join(traceback.format_exception_only(error)).strip()
-    return pn.Column(
-        pn.pane.HTML(
-            "<h1>wfsobs could not start</h1><p>The page could not be built. The server's log has the details.</p>"
-            f"<pre>{escape(line)}</pre>"),
-        margin=40)

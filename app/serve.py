@@ -22,10 +22,11 @@ from bokeh.util.token import generate_secret_key
 from panel.io.server import DocHandler, get_server
 from tornado.web import RequestHandler
 
-from wfsobs.app.dashboard import Dashboard, page
+from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.limits import NONE, PUBLIC, Limits
 from wfsobs.app.logs import event, to_stream
 from wfsobs.app.service import Full, Service
+from wfsobs.app.session import page
 from wfsobs.app.share import LONGEST
 from wfsobs.app.work import one_blas_thread
 

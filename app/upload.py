@@ -56,7 +56,6 @@ class Upload:
         for source, colour, mode in zip(self.sources, COLOURS, TIP_TILT, strict=True):
             self.figure.line("x", "y", source=source, color=colour, line_width=1.4, legend_label=mode.name)
         self.room = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
-        self.view = pn.Column(self.picker, self.room, sizing_mode="stretch_width", margin=0)
         self._parcel: Parcel | None = None
         self._name, self._content = "", b""
         self._preview: Preview | SpectrumPreview | None = None

@@ -35,6 +35,9 @@ DECAYED = 2.5
 SMOOTH = 8.0
 """The same for processes of a known width, whose correlations may not come round at all: exp(-20) of them does."""
 
+MOST = 2**20
+"""Length of the DFT at most: what decays more slowly still comes round, which moves the bound by little."""
+
 FLOOR = 1e-6
 """Least noise of a measurement [um]."""
 
@@ -82,7 +85,7 @@ def line_width(scenario: Scenario) -> float:
 def n_frequencies(scenario: Scenario) -> int:
     """Length of the DFT, a power of two: the slowest correlation has decayed by its half."""
     slowest = min(_decay_rates(scenario))
-    return 2 ** int(np.ceil(np.log2(2.0 * DECAYED / (slowest * scenario.dt))))
+    return min(2 ** int(np.ceil(np.log2(2.0 * DECAYED / (slowest * scenario.dt)))), MOST)
 
 
 def _decay_rates(scenario: Scenario) -> list[float]:

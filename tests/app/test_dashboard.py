@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from wfsobs.app import dashboard as module
-from wfsobs.app.dashboard import Dashboard, page
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.session import page
 from wfsobs.app.work import Shown, compute
 from wfsobs.scenario import Scenario
 

@@ -130,7 +130,12 @@ def open_page(server: Server, browser: Browser) -> Iterator[Any]:
     assert server.errors(start) == []
 
 
+DONE = """() => [...(window.Bokeh?.index?.roots?.[0]?.model.document._all_models.values() ?? [])]
+    .some(m => typeof m.text === "string" && m.text.startsWith("Done in"))"""
+"""Asked of the models: on a phone the line that says so may be in a drawer that has not been opened."""
+
+
 def finished(page: Page) -> None:
     """Wait until the run is over."""
-    page.locator("[role=status]", has_text="Done in").first.wait_for(state="attached")
+    page.wait_for_function(DONE, polling=100)
     page.wait_for_timeout(300)

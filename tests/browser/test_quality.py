@@ -48,7 +48,7 @@ ONLINE = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
     .map(m => [...m.data["gpr-online"]].filter(Number.isFinite).length / m.data["gpr-online"].length)[0]"""
 
 BROKEN = """
-from wfsobs.app.dashboard import page
+from wfsobs.app.session import page
 
 def build(post):
     raise RuntimeError("no such mirror")

@@ -260,7 +260,7 @@ def test_without_javascript_the_numbers_are_there(open_report: Any) -> None:
     for score in (s for s in result.scores if s.observer == "kf-ngs"):
         row = shown.locator(f'tbody[data-target="{score.target}"][data-mode="{score.mode}"] tr[data-observer="kf-ngs"] td').first
         expect(row).to_have_text(re.compile(re.escape(number(1e3 * score.rms)) + "$"))
-    other = page.locator("summary", has_text="Wind speed V₀ 5 m/s, Integrator gain g 0.2").first  # the observers'; the controllers' come after
+    other = page.locator("summary", has_text="Wind speed V₀ 5 m/s, Integrator gain g 0.2").first
     other.click()
     expect(shown).to_have_count(2)
     page.get_by_text("Every setting, as TOML").click()

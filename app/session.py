@@ -1,0 +1,87 @@
+"""A new session's page: built, tied to its address, and told of what other threads do; or what went wrong instead."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import traceback
+from collections.abc import Callable
+from functools import partial
+from html import escape
+from typing import Any
+from urllib.parse import quote, urlencode
+
+import panel as pn
+
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.run import Post
+
+log = logging.getLogger(__name__)
+
+
+def page(build: Callable[[Post], Dashboard] = Dashboard) -> Any:
+    """The page of a new session; a page that says what went wrong where it cannot be built."""
+    try:
+        dashboard = build(post_to_session())
+        if query := asked_for():
+            dashboard.actions.open_link(query)
+        page = dashboard.page()
+        dashboard.start()
+        pn.state.on_session_destroyed(lambda _context: dashboard.close())
+        return page
+    except Exception as error:
+        log.exception("the page could not be built")
+        return error_page(error)
+
+
+def asked_for() -> str:
+    """The query of the page's address; where a browser connects so late that its session is made anew, as the page was
+    given it."""
+    if pn.state.location is not None and pn.state.location.search:
+        return str(pn.state.location.search)
+    texts = [(key, value) for key, values in pn.state.session_args.items() for value in values]
+    return urlencode(texts, quote_via=quote)
+
+
+def post_to_session() -> Post:
+    """How another thread has something done on this session's, from when its page has been drawn.
+
+    What is changed before does not reach a browser that is just being told of the page, so it waits.
+    """
+    doc = pn.state.curdoc
+    if doc is None:
+        return lambda function: function()
+    waiting: list[Callable[[], None]] | None = []
+    lock = threading.Lock()
+
+    def loaded() -> None:
+        nonlocal waiting
+        with lock:
+            functions, waiting = waiting or [], None
+        for function in functions:
+            held(function)
+
+    def held(function: Callable[[], None]) -> None:
+        with pn.io.hold():
+            function()
+
+    def post(function: Callable[[], None]) -> None:
+        with lock:
+            if waiting is not None:
+                waiting.append(function)
+                return
+        if doc.session_context is not None and not doc.session_context.destroyed:
+            doc.add_next_tick_callback(partial(held, function))
+
+    pn.state.onload(loaded)
+    return post
+
+
+def error_page(error: Exception) -> pn.Column:
+    """What went wrong, in place of a page that never comes."""
+    line = "".join(traceback.format_exception_only(error)).strip()
+    return pn.Column(
+        pn.pane.HTML(
+            "<h1>wfsobs could not start</h1><p>The page could not be built. The server's log has the details.</p>"
+            f"<pre>{escape(line)}</pre>"),
+        margin=40)
