@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.signal import csd, welch
 
-from wfsobs.bound import bound
+from wfsobs.bound import bound, bound_scores
 from wfsobs.flow_spectra import flow_spectra
 from wfsobs.lgs import lgs_error_variance
 from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
-from wfsobs.true_spectra import true_spectra
+from wfsobs.true_spectra import is_known, n_frequencies, true_spectra
 from wfsobs.turbulence import turbulence_rms
 from wfsobs.watch import QUIET
 from wfsobs.wiener import circle_mean
@@ -79,3 +79,12 @@ def test_on_frozen_flow_a_third_order_model_is_within_a_tenth_of_the_bound() -> 
     # 12 signals of 3.5 s, errors with a correlation time of about 50 ms: 4 % at one sigma.
     assert 0.92 * least < np.sqrt(np.mean(errors[3])) < 1.1 * least
     assert np.mean(errors[2]) > np.mean(errors[3])
+
+
+def test_too_slow_a_flow_has_no_bound_rather_than_a_wrong_one() -> None:
+    slow = FLOW.replace({"turbulence.wind_speed": 0.2})
+    assert not is_known(slow) and bound_scores(slow, simulate(slow)) == []
+    assert is_known(FLOW) and n_frequencies(FLOW.replace({"turbulence.wind_speed": 1.0})) == 2**20
+    # In slower air all is easier: at 2 m/s as little of the cone effect is left as at 1.
+    assert bound(FLOW.replace({"turbulence.wind_speed": 1.0}), 0)["total"] == pytest.approx(
+        bound(FLOW.replace({"turbulence.wind_speed": 2.0}), 0)["total"], rel=0.05)

@@ -13,7 +13,7 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scores import BOUND, Score, rms
-from wfsobs.true_spectra import TURBULENCE_SPECTRA, TrueSpectra, true_spectra
+from wfsobs.true_spectra import TrueSpectra, is_known, true_spectra
 from wfsobs.wiener import advanced, causal_error, factorise
 
 
@@ -33,7 +33,7 @@ def bound_of(spectra: TrueSpectra, ahead: int = 0) -> dict[str, float]:
 
 def bound_scores(scenario: Scenario, record: Record) -> list[Score]:
     """The rows of the bound, for a record that was simulated from the scenario; none where its spectra are not known."""
-    if scenario.turbulence.source not in TURBULENCE_SPECTRA:
+    if not is_known(scenario):
         return []
     out, start = [], round(scenario.run.warm_up / record.dt)
     for mode, it in enumerate(scenario.modes[: record.n_modes]):

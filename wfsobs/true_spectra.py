@@ -36,7 +36,7 @@ SMOOTH = 8.0
 """The same for processes of a known width, whose correlations may not come round at all: exp(-20) of them does."""
 
 MOST = 2**20
-"""Length of the DFT at most: what decays more slowly still comes round, which moves the bound by little."""
+"""Length of the DFT at most: of an AR(2) what decays more slowly comes round, which moves the bound by little."""
 
 FLOOR = 1e-6
 """Least noise of a measurement [um]."""
@@ -84,8 +84,17 @@ def line_width(scenario: Scenario) -> float:
 
 def n_frequencies(scenario: Scenario) -> int:
     """Length of the DFT, a power of two: the slowest correlation has decayed by its half."""
-    slowest = min(_decay_rates(scenario))
-    return min(2 ** int(np.ceil(np.log2(2.0 * DECAYED / (slowest * scenario.dt)))), MOST)
+    return min(_wanted_frequencies(scenario), MOST)
+
+
+def is_known(scenario: Scenario) -> bool:
+    """Whether the spectra can be told: not those of frozen flow so slow that its low frequencies would not be resolved."""
+    source = scenario.turbulence.source
+    return source in TURBULENCE_SPECTRA and (source != "frozen-flow" or _wanted_frequencies(scenario) <= 2 * MOST)
+
+
+def _wanted_frequencies(scenario: Scenario) -> int:
+    return 2 ** int(np.ceil(np.log2(2.0 * DECAYED / (min(_decay_rates(scenario)) * scenario.dt))))
 
 
 def _decay_rates(scenario: Scenario) -> list[float]:

@@ -34,7 +34,7 @@ from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scores import rms
 from wfsobs.settings import SettingError
-from wfsobs.true_spectra import TURBULENCE_SPECTRA, TrueSpectra, true_spectra
+from wfsobs.true_spectra import TrueSpectra, is_known, true_spectra
 from wfsobs.watch import QUIET, Watch
 
 
@@ -108,7 +108,7 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None) -> Desi
     scenario.validate()
     mirror = mirror_of(scenario)
     modes = range(len(scenario.modes))
-    known = scenario.turbulence.source in TURBULENCE_SPECTRA
+    known = is_known(scenario)
     spectra = [true_spectra(scenario, mode) if known else None for mode in modes]
     laws = {
         c.id: tuple(_designed(c, scenario, mode, mirror, spectra[mode]) for mode in modes) for c in chosen(controllers)}
