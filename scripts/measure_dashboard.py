@@ -124,13 +124,13 @@ def _first_page(browser: Any, url: str) -> dict[str, float]:
 
 
 def _release(page: Page, i: int) -> dict[str, float]:
-    """Drag the slider to another value and let go."""
+    """Drag the slider to a value that it has not had, so that the results are not there yet, and let go."""
     box = page.locator(".MuiSlider-root").first.bounding_box()
     assert box is not None
     y = box["y"] + box["height"] / 2
     page.mouse.move(box["x"] + box["width"] * (0.30 + 0.05 * (i % 5)), y)
     page.mouse.down()
-    page.mouse.move(box["x"] + box["width"] * (0.33 + 0.07 * (i % 5)), y, steps=4)
+    page.mouse.move(box["x"] + box["width"] * (0.15 + 0.0617 * i % 0.8), y, steps=4)
     page.mouse.up()
     page.wait_for_function(DONE, polling=100)
     page.wait_for_timeout(200)
