@@ -1,4 +1,4 @@
-"""The command line: `wfsobs run`, `observe`, `loop`, `export`, `presets`, `bench`, `serve`."""
+"""The command line: `wfsobs run`, `observe`, `identify`, `loop`, `export`, `presets`, `bench`, `serve`."""
 
 from __future__ import annotations
 
@@ -19,13 +19,18 @@ from wfsobs.control import tables as loop_tables
 from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.files import check_writable, write_whole
 from wfsobs.formats.psd import load_psd
+from wfsobs.identify import identify as identify_record
+from wfsobs.identify import report as identified
+from wfsobs.identify.identification import LEVEL
+from wfsobs.identify.search import LOWEST
 from wfsobs.intake import Stated
 from wfsobs.loop import simulate
-from wfsobs.pipeline import Result
+from wfsobs.pipeline import Result, as_stated
 from wfsobs.pipeline import observe as observe_record
 from wfsobs.pipeline import run as run_scenario
 from wfsobs.presets import PRESETS
-from wfsobs.record import DELAY, RecordError
+from wfsobs.record import DELAY, Record, RecordError
+from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 from wfsobs.tables import TIME, Row, rows, score_table
 from wfsobs.telemetry import load_record, save_arrays, save_record
@@ -54,6 +59,21 @@ def scenario_options(command: Callable) -> Callable:
                      help="Change one setting, such as turbulence.wind_speed=20; can be given many times."),
         click.option("--config", metavar="F.toml", help="Settings from a TOML file, on top of the preset."),
         click.option("--preset", metavar="NAME", help=f"Start from {', '.join(PRESETS)}; paper unless told."),
+    ):
+        command = option(command)
+    return command
+
+
+def record_options(command: Callable) -> Callable:
+    """--unit, --command-sign, --command-delay and --rate: what a record does not say of itself."""
+    for option in (
+        click.option("--rate", type=click.FloatRange(0, min_open=True), metavar="HZ",
+                     help="Rate of the rows where they have no time."),
+        click.option("--command-delay", type=click.IntRange(1, 100), metavar="N",
+                     help=f"Steps from a command to the first measurement that sees it; {DELAY} unless told."),
+        click.option("--command-sign", type=click.Choice(["+1", "-1"]),
+                     help="+1 where a command adds to what the sensor sees (the default), -1 where it is taken off."),
+        click.option("--unit", type=click.Choice(UNITS), help="Unit of the record where it states none; um unless told."),
     ):
         command = option(command)
     return command
@@ -102,12 +122,7 @@ def run(
 @main.command()
 @click.argument("record_file", metavar="RECORD")
 @scenario_options
-@click.option("--unit", type=click.Choice(UNITS), help="Unit of the record where it states none; um unless told.")
-@click.option("--command-sign", type=click.Choice(["+1", "-1"]),
-              help="+1 where a command adds to what the sensor sees (the default), -1 where it is taken off.")
-@click.option("--command-delay", type=click.IntRange(1, 100), metavar="N",
-              help=f"Steps from a command to the first measurement that sees it; {DELAY} unless told.")
-@click.option("--rate", type=click.FloatRange(0, min_open=True), metavar="HZ", help="Rate of the rows where they have no time.")
+@record_options
 @click.option("--out", metavar="ESTIMATES.npz", help="Save every estimate under the key observer/target.")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def observe(
@@ -116,13 +131,7 @@ def observe(
 ) -> None:
     """Run the observers on a record: .npz, .csv, .fits or AOT (preset paper unless told)."""
     scenario = configfile.scenario_from(preset, config, assignments)
-    stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
-    record = load_record(record_file, scenario, stated)
-    if record.origin:
-        click.echo(f"wfsobs: {record_file}: read as {record.origin}", err=True)
-    if record.missing:
-        click.echo(f"wfsobs: {record_file}: {record.missing} of {record.n_steps} frames are missing; they are bridged by "
-                   "prediction and count in no score of one", err=True)
+    record = _loaded(record_file, scenario, Stated(unit, int(command_sign) if command_sign else None, command_delay, rate))
     with progress_bar() as update:
         result = observe_record(record, scenario, Watch(progress=update))
     _warn(result)
@@ -132,6 +141,39 @@ def observe(
         click.echo(f"wfsobs: {record_file}: {len(result.estimates)} estimates, no scores: nothing after the warm-up", err=True)
         return
     show(rows(result.scores, None), as_json)
+
+
+@main.command()
+@click.argument("record_file", metavar="RECORD")
+@scenario_options
+@record_options
+@click.option("--level", type=click.FloatRange(0, 0.5, min_open=True), default=LEVEL, show_default=True, metavar="P",
+              help="Probability of finding any peak where there is none.")
+@click.option("--lowest", type=click.FloatRange(0, min_open=True), default=LOWEST, show_default=True, metavar="HZ",
+              help="Frequency from which peaks are looked for.")
+@click.option("--out", metavar="F.toml", help="Save what was found as settings, on top of the preset.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+def identify(
+    record_file: str, preset: str | None, config: str | None, assignments: tuple[str, ...], unit: str | None,
+    command_sign: str | None, command_delay: int | None, rate: float | None, level: float, lowest: float, out: str | None,
+    as_json: bool,
+) -> None:
+    """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
+    scenario = configfile.scenario_from(preset, config, assignments)
+    record = _loaded(record_file, scenario, Stated(unit, int(command_sign) if command_sign else None, command_delay, rate))
+    if out:
+        check_writable(out)
+    with progress_bar("sweeps") as update:
+        result = identify_record(record, scenario, level, lowest, Watch(progress=update))
+    if out:
+        text = identified.toml(result, result.scenario(as_stated(record, scenario)))
+        write_whole(out, lambda file: file.write(text.encode()))
+    if as_json:
+        click.echo(json.dumps(identified.plain(result), allow_nan=False))
+        return
+    show_table(identified.table(result))
+    for line in identified.verdict(result):
+        click.echo(line)
 
 
 @main.command()
@@ -250,6 +292,17 @@ def serve(**options: Any) -> None:
     except ModuleNotFoundError as error:
         raise SettingError(f"serve: the dashboard needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
     server.serve(server.options(**options))
+
+
+def _loaded(record_file: str, scenario: Scenario, stated: Stated) -> Record:
+    """The record of a file; what was understood of it is said on standard error."""
+    record = load_record(record_file, scenario, stated)
+    if record.origin:
+        click.echo(f"wfsobs: {record_file}: read as {record.origin}", err=True)
+    if record.missing:
+        click.echo(f"wfsobs: {record_file}: {record.missing} of {record.n_steps} frames are missing; they are bridged by "
+                   "prediction and count in no score of one", err=True)
+    return record
 
 
 def show(all_rows: list[Row], as_json: bool) -> None:

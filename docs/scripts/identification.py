@@ -1,0 +1,147 @@
+"""The figures of docs/identification.md: what is found and what is not, over seeds. `identification.py [seeds] [duration]`."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from math import pi, sqrt
+from typing import Any
+
+import numpy as np
+
+from wfsobs import PRESETS, Record, Scenario, observe, simulate
+from wfsobs.identify import Identified, identify
+from wfsobs.lgs import lgs_error_process, lgs_noise_rms
+from wfsobs.turbulence import turbulence_process
+
+QUIET: dict[str, Any] = {"vibration.source": "none"}
+"""Turbulence and noise alone."""
+LINES, RESONANCES = (15.3, 23.77, 41.13, 70.031), ((11.0, 0.02), (30.0, 0.02), (52.0, 0.01))
+"""Frequency [Hz] of pure lines; frequency and damping of resonances."""
+IN_ONE_BIN, ABOVE_FLOOR = 20.0, 5.0
+"""Power of a line over the floor of a bin of 1 / T; density of a resonance over the floor, at its maximum."""
+THRESHOLD = 0.1
+"""Error of a frequency that always counts as found [Hz]."""
+
+
+def floor(scenario: Scenario, f: float) -> float:
+    """Density [um^2/Hz] of turbulence, slow LGS error and noise in tip at f [Hz]."""
+    at, dt = np.array([f]), scenario.dt
+    slow = turbulence_process(scenario, 0, dt).psd(at) + lgs_error_process(scenario, 0, dt).psd(at)
+    return float(slow[0]) + 2.0 * dt * lgs_noise_rms(scenario, 0) ** 2
+
+
+def known_peaks(duration: float, modes: int = 2, level: float = IN_ONE_BIN) -> Scenario:
+    """The preset `paper` with LINES and RESONANCES for its peaks, in tip and tilt or in tip alone."""
+    s = PRESETS["paper"]().replace({"run.duration": duration, "vibration.cutoff": 200.0})
+    peaks = [(f, 0.0, sqrt(level * floor(s, f) / duration)) for f in LINES]
+    peaks += [(f, xi, sqrt(ABOVE_FLOOR * floor(s, f) * pi * xi * f)) for f, xi in RESONANCES]
+    return s.replace({"vibration.peaks": [
+        {"frequency": f, "damping": xi, "rms": [rms] * modes} for f, xi, rms in sorted(peaks)]})
+
+
+def hits(result: Identified, scenario: Scenario) -> tuple[list[tuple[float, bool, bool]], int]:
+    """(frequency, pure, found) of every peak in every mode that has it, and the number of peaks found that there are not."""
+    out, false = [], 0
+    for i, mode in enumerate(result.modes):
+        free = list(mode.peaks)
+        for peak in scenario.vibration.peaks if scenario.vibration.source != "none" else []:
+            if i >= len(peak.rms) or not peak.rms[i]:
+                continue
+            near = [p for p in free if abs(p.frequency.value - peak.frequency) <= max(THRESHOLD, 3.0 * p.frequency.std)]
+            if near:
+                free.remove(min(near, key=lambda p: abs(p.frequency.value - peak.frequency)))
+            out.append((peak.frequency, peak.damping == 0, bool(near)))
+        false += len(free)
+    return out, false
+
+
+def found(scenario: Scenario, seeds: range) -> str:
+    """Share of lines and resonances found, and of records with a false peak, as a row."""
+    lines: list[bool] = []
+    resonances: list[bool] = []
+    false = white = 0
+    for seed in seeds:
+        s = scenario.replace({"run.seed": seed})
+        result = identify(simulate(s))
+        hit, wrong = hits(result, s)
+        lines += [ok for _, pure, ok in hit if pure]
+        resonances += [ok for _, pure, ok in hit if not pure]
+        false += wrong > 0
+        white += result.white
+    shares = [f"{np.mean(x):.1%}" if x else "-" for x in (lines, resonances)]
+    return " | ".join([*shares, f"{false} of {len(seeds)}", f"{white} of {len(seeds)}"])
+
+
+def spread(scenario: Scenario, seeds: range) -> dict[str, Any]:
+    """Standard deviation of (estimate - truth) over the standard deviation that is stated, by quantity, tip."""
+    truth = turbulence_process(scenario, 0, scenario.dt)
+    scores: dict[str, list[float]] = {}
+    for seed in seeds:
+        m = identify(simulate(scenario.replace({"run.seed": seed}))).modes[0]
+        pairs = [("noise", m.noise, scenario.sensors.lgs_noise / sqrt(scenario.sensors.lgs_count))]
+        if m.turbulence:
+            pairs += [("corner", m.turbulence.frequency, truth.omega / (2 * pi)),
+                      ("damping of turbulence", m.turbulence.damping, truth.damping)]
+        for peak in scenario.vibration.peaks:
+            for p in m.peaks:
+                if abs(p.frequency.value - peak.frequency) <= THRESHOLD * 5 and p.pure == (peak.damping == 0):
+                    kind = "line" if p.pure else "resonance"
+                    pairs += [(f"{kind}, frequency", p.frequency, peak.frequency), (f"{kind}, rms", p.rms, peak.rms[0])]
+                    pairs += [] if p.pure else [("resonance, damping", p.damping, peak.damping)]
+        for name, n, value in pairs:
+            scores.setdefault(name, []).append((n.value - value) / n.std)
+    return {name: f"{np.sqrt(np.mean(np.square(x))):.2f}" for name, x in scores.items()}
+
+
+def filters(scenario: Scenario, seeds: range) -> str:
+    """Error of the multi-peak Kalman filter built from what was found in one record over that of the filter built from the
+    truth, both on another record: vibration and turbulence, worst of tip and tilt; median, largest, share within 5 %."""
+    ratios: dict[str, list[float]] = {"turbulence": [], "vibration": []}
+    for seed in seeds:
+        s = scenario.replace({"run.seed": seed})
+        model = identify(simulate(s)).scenario(s)
+        test = simulate(s.replace({"run.seed": seed + 10_000}))
+        errors = [{(e.target, e.mode): e.rms for e in observe(test, x, observers=["kf-multi"]).scores} for x in (model, s)]
+        for target, values in ratios.items():
+            values.append(max(errors[0][key] / errors[1][key] for key in errors[1] if key[0] == target))
+    return "; ".join(
+        f"{target} {np.median(r):.3f} (up to {max(r):.3f}), {np.mean(np.array(r) < 1.05):.0%} below 1.05"
+        for target, r in ratios.items())
+
+
+def twin(record: Record) -> Record:
+    """The record with the mirror at rest."""
+    assert record.open_loop_y is not None
+    return replace(record, y_lgs=record.open_loop_y, u=np.zeros_like(record.u))
+
+
+def twins(scenario: Scenario, seeds: range) -> str:
+    """Largest difference between closed loop and open loop, in standard deviations, and whether the same peaks are found."""
+    worst, same = 0.0, True
+    for seed in seeds:
+        record = simulate(scenario.replace({"run.seed": seed}))
+        a, b = identify(record), identify(twin(record))
+        for one, other in zip(a.modes, b.modes, strict=True):
+            same &= len(one.peaks) == len(other.peaks)
+            for p, q in zip(one.peaks, other.peaks, strict=False):
+                worst = max(worst, abs(p.frequency.value - q.frequency.value) / p.frequency.std,
+                            abs(p.rms.value - q.rms.value) / p.rms.std)
+    return f"{worst:.1e} standard deviations; the same peaks: {'yes' if same else 'no'}"
+
+
+if __name__ == "__main__":
+    count, duration = int(sys.argv[1]) if len(sys.argv) > 1 else 100, float(sys.argv[2]) if len(sys.argv) > 2 else 60.0
+    seeds, few = range(1, count + 1), range(1, max(count // 2, 2) + 1)
+    quiet = PRESETS["paper"]().replace({**QUIET, "run.duration": duration})
+    resonant = PRESETS["paper"]().replace({"run.duration": duration, "vibration.source": "ar2"})
+    print(f"{count} seeds, {duration:g} s\n\n| Record | lines found | resonances found | records with a false peak | white |")
+    print("|---|---|---|---|---|")
+    print("| turbulence and noise alone |", found(quiet, seeds), "|", flush=True)
+    print("| lines and resonances in tip and tilt |", found(known_peaks(duration), seeds), "|", flush=True)
+    print("| the same in tip alone |", found(known_peaks(duration, 1), seeds), "|", flush=True)
+    print("| in tip alone, lines at 30 times the floor |", found(known_peaks(duration, 1, 30.0), seeds), "|\n", flush=True)
+    print("Filters, known peaks:", filters(known_peaks(duration), few), flush=True)
+    print("Filters, peaks of the paper:", filters(resonant, few), flush=True)
+    print("Closed against open loop:", twins(known_peaks(duration), range(1, 4)), flush=True)
+    print("Error over stated standard deviation:", spread(known_peaks(duration, 2, 40.0), seeds), flush=True)

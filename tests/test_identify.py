@@ -1,0 +1,270 @@
+"""Identification: what is put into a record comes out of it, with the errors that are stated, and nothing else."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from math import pi, sqrt
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.stats import kstest
+
+from wfsobs import configfile
+from wfsobs.ar2 import Ar2
+from wfsobs.cli import main
+from wfsobs.identify import Identified, identify
+from wfsobs.identify.lines import Line, nearest_line
+from wfsobs.identify.model import Spectrum
+from wfsobs.identify.periodogram import Cells, fast_length, frequencies, inflation, periodogram
+from wfsobs.identify.process import Number, Process, merged
+from wfsobs.identify.report import annotated, plain, written
+from wfsobs.identify.search import PAD, search
+from wfsobs.identify.whiteness import autocorrelation_test, cumulated_test, innovations
+from wfsobs.identify.whittle import fitted, information, negative_log_likelihood
+from wfsobs.loop import simulate
+from wfsobs.pipeline import observe
+from wfsobs.presets import PRESETS
+from wfsobs.record import Record, RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.telemetry import save_record
+from wfsobs.watch import Cancelled, Watch
+
+DT = 1e-3
+MODEL = Spectrum(0.014, DT, Ar2(7.0, 0.9, 0.5, DT), (Ar2(2 * pi * 30.0, 0.02, 0.004, DT),))
+
+
+def known(duration: float = 60.0, **more: object) -> Scenario:
+    """A line and a resonance in tip and tilt, another line in tilt alone."""
+    s = PRESETS["paper"]().replace({"run.duration": duration, "kalman.process_noise": "matched", **more})
+    return s.replace({"vibration.peaks": [
+        {"frequency": 24.3, "damping": 0.0, "rms": [0.0012, 0.0015]},
+        {"frequency": 47.5, "damping": 0.01, "rms": [0.004, 0.006]},
+        {"frequency": 61.7, "damping": 0.0, "rms": [0.0, 0.0015]},
+    ]})
+
+
+@pytest.fixture(scope="module")
+def record() -> Record:
+    return simulate(known())
+
+
+@pytest.fixture(scope="module")
+def found(record: Record) -> Identified:
+    return identify(record)
+
+
+def test_periodogram_of_white_noise_has_its_density() -> None:
+    rng = np.random.default_rng(1)
+    I = periodogram(rng.standard_normal(100_000), DT)  # noqa: E741
+    assert I.mean() == pytest.approx(2.0 * DT, rel=4.0 * sqrt(inflation(100_000) / len(I)))
+    assert len(frequencies(100_000, DT)) == len(I) and frequencies(100_000, DT)[0] == pytest.approx(0.01)
+
+
+def test_turbulence_does_not_leak_over_the_noise() -> None:
+    """Far above the corner the mean periodogram of steep turbulence is its density."""
+    turbulence, f = Ar2(7.0, 0.9, 0.5, DT), frequencies(20_000, DT)
+    I = np.mean([periodogram(turbulence.sample(20_000, np.random.default_rng(i)), DT) for i in range(4)], axis=0)  # noqa: E741
+    ratio = (I / turbulence.psd(f))[f > 100.0]
+    assert ratio.mean() == pytest.approx(1.0, abs=0.05)  # untapered it is several hundred
+
+
+def test_cells_keep_every_bin_once() -> None:
+    f = frequencies(20_000, DT)
+    keep = np.where((f > 20.0) & (f < 25.0), 0.0, 1.0)
+    cells = Cells(f, f**2, keep, [30.0])
+    assert cells.count.sum() == keep.sum()
+    assert cells.count @ cells.frequency == pytest.approx(keep @ f)
+    assert cells.count @ cells.mean == pytest.approx(keep @ f**2)
+    assert np.all(cells.count[np.abs(cells.frequency - 30.0) < 0.4] == 1.0)
+
+
+@pytest.mark.parametrize("n", [2000, 59_998, 60_013])
+def test_fast_length(n: int) -> None:
+    assert 0.98 * n < fast_length(n) <= n
+
+
+def test_slopes_and_information_are_derivatives_of_the_likelihood() -> None:
+    f = frequencies(20_000, DT)
+    cells = Cells(f, MODEL.psd(f), np.ones(len(f)), [30.0])  # the mean of the periodogram: information is the curvature
+    x, F = MODEL.vector, information(MODEL, cells)
+    steps = 1e-2 / np.sqrt(np.diag(F))
+    here = negative_log_likelihood(MODEL, cells)
+    for i, step in enumerate(steps):
+        moves = [negative_log_likelihood(MODEL.moved(x + sign * step * np.eye(len(x))[i]), cells) for sign in (-1, 1)]
+        assert (sum(moves) - 2 * here) / step**2 == pytest.approx(F[i, i], rel=0.02)  # cells take S at their middle
+
+
+def test_fit_finds_the_model_that_the_spectrum_has() -> None:
+    f = frequencies(60_000, DT)
+    cells = Cells(f, MODEL.psd(f), np.ones(len(f)), [30.0])
+    off = MODEL.moved(MODEL.vector + np.array([0.2, 0.3, 0.5, -0.3, 0.005, 0.4, 0.3]))
+    std = 1.0 / np.sqrt(np.diag(information(MODEL, cells)))
+    assert np.all(np.abs(fitted(off, cells).vector - MODEL.vector) < 0.3 * std)
+
+
+def test_line_is_found_to_the_stated_error() -> None:
+    n, rng, rho = 10_000, np.random.default_rng(2), 100.0
+    floor, scores = 2.0 * DT, []
+    for phase in rng.uniform(0.0, 2.0 * pi, 40):
+        true = Line(41.13, sqrt(2.0 * rho * floor / (n * DT)) * complex(np.cos(phase), np.sin(phase)))
+        got = nearest_line(true.signal(n, DT) + rng.standard_normal(n), DT, 41.15, 0.05)
+        std = true.standard_deviations(n, DT, floor)
+        scores.append([(got.frequency - true.frequency) / std[0], (got.rms - true.rms) / std[1]])
+    assert np.all(np.abs(np.std(scores, axis=0) - 1.0) < 0.4)  # 3.5 standard deviations of a standard deviation of 40
+
+
+def test_line_has_the_cramer_rao_bound() -> None:
+    """Of a real line in white noise, var f = 12 / ((2 pi)^2 eta N^3 dt^2), eta = A^2 / 2 sigma^2; the taper costs 7 %."""
+    n, amplitude = 60_000, 0.1
+    std = Line(20.0, amplitude).standard_deviations(n, DT, 2.0 * DT)[0]
+    bound = sqrt(12.0 / ((2 * pi) ** 2 * amplitude**2 / 2.0 * n**3)) / DT
+    assert bound < std < 1.1 * bound
+
+
+@pytest.mark.parametrize("modes", [1, 2])
+def test_search_finds_nothing_in_white_noise_as_often_as_it_says(modes: int) -> None:
+    n, level, runs = 4000, 0.2, 150
+    rng = np.random.default_rng(3)
+    hits = sum(
+        search(sum(periodogram(rng.standard_normal(n), DT, PAD) for _ in range(modes)) / (2.0 * DT), n, DT, modes, level).best
+        is not None for _ in range(runs))
+    assert 0.2 * level * runs < hits < level * runs + 3.0 * sqrt(level * runs)  # a bound, near since the widths overlap
+
+
+def test_whiteness_tests_are_uniform_on_white_noise_and_see_what_is_not() -> None:
+    n, rng = 4000, np.random.default_rng(4)
+    noise = [rng.standard_normal(n) for _ in range(60)]
+    flat = Spectrum(1.0, DT)
+    p = np.array([
+        (cumulated_test(periodogram(x, DT) / (2 * DT), n), autocorrelation_test(innovations(x, flat), 1)) for x in noise])
+    assert min(kstest(column, "uniform").pvalue for column in p.T) > 1e-3
+    coloured = Ar2(2 * pi * 100.0, 0.5, 0.5, DT).sample(n, rng) + noise[0]
+    assert cumulated_test(periodogram(coloured, DT) / (2 * DT), n) < 1e-6 > autocorrelation_test(innovations(coloured, flat), 1)
+
+
+def test_innovations_have_the_variance_that_the_spectrum_says() -> None:
+    """Kolmogorov: log of the variance of one-step prediction is the mean of log S."""
+    rng = np.random.default_rng(5)
+    z = 0.014 * rng.standard_normal(40_000) + sum(p.sample(40_000, rng) for p in MODEL.processes)
+    f = np.linspace(0.0, 0.5 / DT, 200_001)
+    least = np.exp(np.mean(np.log(MODEL.psd(f) / (2.0 * DT))))
+    assert np.var(innovations(z, MODEL)) == pytest.approx(least, rel=4.0 * sqrt(2.0 / 40_000))
+
+
+def test_known_peaks_are_found_and_no_others(found: Identified) -> None:
+    assert found.white
+    truth = known()
+    for i, mode in enumerate(found.modes):
+        there = [p for p in truth.vibration.peaks if p.rms[i] > 0]
+        assert len(mode.peaks) == len(there)
+        for p, peak in zip(mode.peaks, there, strict=True):
+            assert abs(p.frequency.value - peak.frequency) < max(0.1, 3.0 * p.frequency.std)
+            assert p.pure == (peak.damping == 0)
+            assert abs(p.rms.value - peak.rms[i]) < 4.0 * p.rms.std
+        assert abs(mode.noise.value - 0.02 / sqrt(2.0)) < 4.0 * mode.noise.std
+        assert mode.turbulence and abs(mode.turbulence.frequency.value - 7.0686 / (2 * pi)) < 4.0 * mode.turbulence.frequency.std
+
+
+def test_closed_loop_is_its_open_loop_twin(record: Record, found: Identified) -> None:
+    assert record.open_loop_y is not None
+    opened = identify(replace(record, y_lgs=record.open_loop_y, u=np.zeros_like(record.u)))
+    for a, b in zip(found.modes, opened.modes, strict=True):
+        assert len(a.peaks) == len(b.peaks)
+        for p, q in zip(a.peaks, b.peaks, strict=True):
+            assert abs(p.frequency.value - q.frequency.value) < 0.01 * p.frequency.std
+            assert abs(p.rms.value - q.rms.value) < 0.01 * p.rms.std
+
+
+def test_missing_frames_change_little(record: Record, found: Identified) -> None:
+    y = record.y_lgs.copy()
+    y[5000:5020], y[np.random.default_rng(6).integers(0, len(y), 50)] = np.nan, np.nan
+    gappy = identify(replace(record, y_lgs=y), known())
+    for a, b in zip(found.modes, gappy.modes, strict=True):
+        assert [p.pure for p in a.peaks] == [p.pure for p in b.peaks]
+        for p, q in zip(a.peaks, b.peaks, strict=True):
+            assert abs(p.frequency.value - q.frequency.value) < p.frequency.std
+
+
+def test_nothing_is_found_in_turbulence_and_noise_nor_turbulence_in_noise() -> None:
+    for seed in (1, 2):
+        quiet = identify(simulate(known(30.0, **{"run.seed": seed}).replace({"vibration.source": "none"})))
+        assert not quiet.peaks and all(mode.turbulence for mode in quiet.modes)
+    bare = {"vibration.source": "none", "turbulence.source": "none", "sensors.lgs_low_frequency_rms": 0.0}
+    nothing = identify(simulate(known(20.0).replace(bare)))
+    assert not nothing.peaks and not any(mode.turbulence for mode in nothing.modes)
+    assert nothing.scenario().turbulence.source == "none" and nothing.scenario().vibration.source == "none"
+
+
+def test_filter_built_from_the_result_is_as_good_as_from_the_truth(found: Identified) -> None:
+    truth = known()
+    model = found.scenario(truth)
+    test = simulate(known(20.0, **{"run.seed": 99}))
+    a, b = ([s.rms for s in observe(test, s, observers=["kf-multi"]).scores] for s in (model, truth))
+    assert np.all(np.array(a) < 1.05 * np.array(b))
+
+
+def test_result_as_a_file_of_settings(record: Record, found: Identified, tmp_path: Path) -> None:
+    save_record(tmp_path / "r.npz", record)
+    out = tmp_path / "f.toml"
+    done = CliRunner().invoke(main, ["identify", str(tmp_path / "r.npz"), "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    assert "resonance" in done.stdout and "what is left is white at 1%" in done.stdout
+    saved = configfile.load(out)
+    saved.validate()
+    assert saved == found.scenario(PRESETS["paper"]())
+    assert out.read_text().count("+-") >= 4 + 2 * len(found.peaks)
+    assert saved.turbulence.wind_speed == pytest.approx(15.0, abs=4 * found.shared(saved)["turbulence.wind_speed"].std)
+
+
+def test_rows_are_the_numbers(found: Identified) -> None:
+    said = json.loads(json.dumps(plain(found), allow_nan=False))
+    assert [len(m["peaks"]) for m in said["modes"]] == [len(m.peaks) for m in found.modes]
+    assert said["modes"][0]["noise"] == found.modes[0].noise.value
+    assert said["modes"][1]["peaks"][0]["frequency_std"] == found.modes[1].peaks[0].frequency.std
+
+
+def test_neighbours_that_look_like_one_are_told_apart() -> None:
+    rng = np.random.default_rng(7)
+    two = [Ar2(2 * pi * 23.87, 0.011, 0.0036, DT), Ar2(2 * pi * 25.25, 0.009, 0.0042, DT)]
+    z = 0.014 * rng.standard_normal(60_000) + sum(p.sample(60_000, rng) for p in (Ar2(7.0, 0.9, 0.5, DT), *two))
+    peaks = identify(Record(np.column_stack([z]), np.zeros((60_000, 1)), DT)).modes[0].peaks
+    assert len(peaks) == 2
+    for p, true in zip(peaks, two, strict=True):
+        assert abs(p.frequency.value - true.omega / (2 * pi)) < 4.0 * p.frequency.std
+
+
+def test_peaks_that_agree_are_one() -> None:
+    def peak(f: float, xi: float = 0.01, rms: float = 0.01) -> Process:
+        return Process(Number(f, 0.01), Number(xi, 0.001 if xi else 0.0), Number(rms, 0.001))
+
+    both, *alone, line = merged([(peak(20.0), peak(30.0), peak(40.0, 0.0, 0.02)), (peak(20.03), peak(31.0), peak(40.0))])
+    assert both.frequency.value == pytest.approx(20.015) and all(both.rms)
+    assert [p.frequency.value for p in alone] == [30.0, 31.0]
+    assert line.damping == Number(0.0, 0.0)  # tip, where it stands out more, says so
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    ({"y_lgs": np.zeros((900, 2)), "u": np.zeros((900, 2))}, "900 samples, to identify it takes"),
+    ({"y_lgs": np.zeros((4000, 2)), "u": np.zeros((4000, 2))}, "tip: z does not change"),
+    ({"y_lgs": np.ones((4000, 2)), "u": np.zeros((4000, 2)), "dt": 0.1}, "peaks from 5 Hz: .* 2.5 Hz"),
+])
+def test_unusable_records_are_refused(change: dict, said: str) -> None:
+    with pytest.raises(RecordError, match=said):
+        identify(Record(**{"dt": DT, **change}))
+
+
+def test_cancel_and_progress(record: Record) -> None:
+    told: list[float] = []
+    identify(replace(record, y_lgs=record.y_lgs[:8000], u=record.u[:8000]), watch=Watch(progress=told.append))
+    assert told == sorted(told) and told[-1] == 1.0
+    with pytest.raises(Cancelled):
+        identify(record, watch=Watch(cancelled=lambda: True))
+
+
+def test_written_and_annotated() -> None:
+    assert written(Number(0.00312, 0.00099)) == "0.00312 +- 0.00099"
+    text = annotated('[a]\nx = 1\n\n[[a.b]]\nx = 2\n\n[[a.b]]\nx = 3\n', {"a.x": "one", "a.b.1.x": "three"})
+    assert text == '[a]\nx = 1  # one\n\n[[a.b]]\nx = 2\n\n[[a.b]]\nx = 3  # three\n'

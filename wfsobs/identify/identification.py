@@ -1,0 +1,129 @@
+"""From a record to its model: noise, turbulence, then peaks one at a time until the residual is white."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import gamma
+
+from wfsobs.arrays import Array
+from wfsobs.gaps import bridged
+from wfsobs.identify.one_mode import OneMode
+from wfsobs.identify.periodogram import fast_length
+from wfsobs.identify.result import Identified, IdentifiedMode, read_off
+from wfsobs.identify.search import LOWEST, PAD, Found, search
+from wfsobs.identify.whiteness import Whiteness, autocorrelation_test, cumulated_test, innovations
+from wfsobs.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.pipeline import as_stated
+from wfsobs.record import Record, RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.watch import QUIET, Watch
+
+LEVEL = 0.04
+"""Probability of any false peak in a record."""
+MOST_PEAKS = 40
+"""Per mode."""
+SHORTEST = 1000
+"""Samples of a record at least."""
+JOINT = 1e-3
+"""A candidate of all modes together belongs to those in which white noise would be as high with this probability."""
+
+
+def identify(
+    record: Record, scenario: Scenario | None = None, level: float = LEVEL, lowest: float = LOWEST, watch: Watch = QUIET
+) -> Identified:
+    """The model of every mode of a record, from its pseudo-open-loop measurement z.
+
+    scenario : what bridges lost samples
+    level    : probability of finding any peak where there is none;  lowest : frequency from which peaks are looked for [Hz]
+    Raises RecordError for a record that is too short or does not move, Cancelled.
+    """
+    scenario = as_stated(record, scenario or Scenario())
+    z = bridged(record, scenario).z[record.delay :]
+    z = z[: fast_length(len(z))]
+    if len(z) < SHORTEST:
+        raise RecordError(f"the record has {record.n_steps} samples, to identify it takes {SHORTEST + record.delay} or more")
+    if not lowest < 0.25 / record.dt:
+        raise RecordError(f"peaks from {lowest:g} Hz: takes a frequency below a quarter of the rate, {0.25 / record.dt:g} Hz")
+    names = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
+    if record.n_modes > len(names):
+        raise RecordError(f"the record has {record.n_modes} modes, at most {len(names)} can be identified")
+    for name, column in zip(names, z.T, strict=False):
+        if not np.ptp(column) > 0:
+            raise RecordError(f"{name}: z does not change, there is nothing to identify")
+    modes = []
+    for column in z.T:
+        watch.check()
+        modes.append(OneMode(column, record.dt))
+    grow(modes, level, lowest, watch)
+    left = unexplained(modes, level, lowest)
+    found = tuple(
+        IdentifiedMode(name, *read_off(mode), tested(mode, count)) for name, mode, count in zip(names, modes, left, strict=False))
+    watch.step(1.0)
+    return Identified(found, record.dt, len(z), level)
+
+
+def grow(modes: Sequence[OneMode], level: float, lowest: float, watch: Watch) -> None:
+    """Add peaks to the modes, one to each at a time, until no test sees any more; then polish, and look once more."""
+    polished = False
+    for sweep in range(3 * MOST_PEAKS):
+        watch.step(1.0 - 1.0 / (1.0 + 0.1 * sweep))
+        seen = False
+        for mode, found in zip(modes, candidates(modes, level, lowest), strict=True):
+            mode.flagged = np.logical_or.reduce([one.flagged for one in found])
+            best = max((one.best for one in found if one.best), key=lambda c: c.strength, default=None)
+            if best is None or mode.peaks >= MOST_PEAKS:
+                continue
+            seen = True
+            if mode.explain(best):
+                mode.refit()
+        if not seen:
+            if polished:
+                return
+            for mode in modes:
+                mode.polish()
+        polished = not seen
+
+
+def candidates(modes: Sequence[OneMode], level: float, lowest: float) -> list[list[Found]]:
+    """What the search finds in every mode, alone and with all the others."""
+    whitened = [mode.whitened() for mode in modes]
+    n, dt, several = modes[0].n, modes[0].dt, len(modes) > 1
+    share = level / 2 if several else level
+    out = [[search(fine, n, dt, 1, share / len(modes), lowest)] for fine in whitened]
+    if several:
+        together = search(sum(whitened, np.zeros_like(whitened[0])), n, dt, len(modes), share, lowest)
+        for own, fine in zip(out, whitened, strict=True):
+            if together.best is not None and _has_part(fine, n * dt, together.best.frequency, together.best.width):
+                own.append(together)
+    return out
+
+
+def _has_part(fine: Array, T: float, frequency: float, width: int) -> bool:
+    """Whether a mode is high itself where all of them together are."""
+    if width == 1:
+        return bool(fine[max(round(frequency * PAD * T) - 1, 0)] > -np.log(JOINT))
+    centre = round(frequency * T)
+    bins = fine[PAD - 1 :: PAD][max(centre - width // 2 - 1, 0) : centre + width // 2]
+    return bool(bins.sum() > gamma.isf(JOINT, width))
+
+
+def unexplained(modes: Sequence[OneMode], level: float, lowest: float) -> list[int]:
+    """Per mode, how many of the candidates that no peak explained the search still sees."""
+    refused = [mode.refused for mode in modes]
+    for mode in modes:
+        mode.refused = []
+    out = []
+    for mode, were, found in zip(modes, refused, candidates(modes, level, lowest), strict=True):
+        flagged = mode.f[np.logical_or.reduce([one.flagged for one in found])]
+        out.append(sum(bool(np.any(np.abs(flagged - c.frequency) <= (c.width + 1) * mode.f[0])) for c in were))
+        mode.refused = were
+    return out
+
+
+def tested(mode: OneMode, left: int) -> Whiteness:
+    """The tests of what a mode's model leaves; left : candidates that no peak explains."""
+    ratio = mode.I / mode.spectrum.psd(mode.f)
+    e = innovations(mode.left, mode.spectrum)
+    return Whiteness(cumulated_test(ratio, mode.n), autocorrelation_test(e, len(mode.spectrum.vector)), left)

@@ -1,0 +1,198 @@
+"""The model of one mode as it grows: a spectrum, and the pure lines that have been taken off."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import pi
+
+import numpy as np
+
+from wfsobs.ar2 import Ar2
+from wfsobs.arrays import Array
+from wfsobs.identify.lines import Line, nearest_line
+from wfsobs.identify.model import Spectrum
+from wfsobs.identify.periodogram import Cells, frequencies, inflation, periodogram
+from wfsobs.identify.search import PAD, Candidate
+from wfsobs.identify.whittle import first_guess, fitted, negative_log_likelihood, standard_deviations
+
+NEIGHBOURS = 4.0
+"""Bins, beside half its width, within which something new is no peak of its own: two peaks that near are one."""
+WIDEST_LINE = 9
+"""Bins over which a pure line may be the best of what was looked at."""
+RESOLVED = 0.2
+"""Half width at half maximum of a resonance at least, in bins; what is narrower is a line."""
+WIDEST = 0.5
+"""Damping of a resonance at most."""
+WORTH = 6.0
+"""Log-likelihood that three numbers more have to gain: noise gives as much with a probability of 0.7 % (chi squared of 12)."""
+SPLIT = 8.0
+"""The same for two resonances in the place of one, which every wide one is tried for."""
+
+
+class OneMode:
+    """z (n,) of one mode, mean taken off, and what has been found in it.
+
+    spectrum, lines : the model;  left : z without the lines;  I : periodogram of that;  refused : candidates that no
+        peak explains
+    """
+
+    def __init__(self, z: Array, dt: float):
+        self.z, self.dt, self.n = z - z.mean(), dt, len(z)
+        self.f = frequencies(self.n, dt)
+        self.lines: list[Line] = []
+        self._take_off()
+        self.spectrum = first_guess(self.f, self.I, dt)
+        self.flagged = np.zeros(len(self.f), bool)
+        self.refused: list[Candidate] = []
+
+    def _take_off(self) -> None:
+        self.left = self.z - sum((line.signal(self.n, self.dt) for line in self.lines), np.zeros(self.n))
+        self.I = periodogram(self.left, self.dt)
+
+    @property
+    def peaks(self) -> int:
+        """How many there are."""
+        return len(self.lines) + len(self.spectrum.resonances)
+
+    def whitened(self) -> Array:
+        """I / S at PAD frequencies per bin, 1 at what has been refused."""
+        f = frequencies(self.n, self.dt, PAD)
+        S = np.exp(np.interp(f, self.f, np.log(self.spectrum.psd(self.f))))
+        ratio = periodogram(self.left, self.dt, PAD) / S
+        for candidate in self.refused:
+            ratio[np.abs(f - candidate.frequency) <= (0.5 * candidate.width + 0.5) * self.f[0]] = 1.0
+        return ratio
+
+    def cells(self, spectrum: Spectrum | None = None, everything: bool = False) -> Cells:
+        """The bins for a fit: all but those that a test still flags and that no resonance of the spectrum is near."""
+        spectrum = spectrum or self.spectrum
+        keep = np.ones(len(self.f)) if everything else np.where(self.flagged, 0.0, 1.0)
+        for p in spectrum.resonances:
+            centre, half = p.omega / (2 * pi), max(4.0 * p.damping * p.omega / (2 * pi), 20.0 * self.f[0])
+            keep[np.abs(self.f - centre) < half] = 1.0
+        return Cells(self.f, self.I, keep, [p.omega / (2 * pi) for p in spectrum.resonances])
+
+    def refit(self, everything: bool = False) -> None:
+        """All numbers of the spectrum at once. A resonance that has become as narrow as a line is one from then on; one that has
+        become as wide as turbulence is dropped."""
+        self.spectrum = fitted(self.spectrum, self.cells(everything=everything))
+        for p in [p for p in self.spectrum.resonances if not self._sound(p)]:
+            self.spectrum = replace(self.spectrum, resonances=tuple(q for q in self.spectrum.resonances if q is not p))
+            frequency = p.omega / (2 * pi)
+            if p.damping < WIDEST and 2.0 * self.f[0] < frequency < self.f[-1]:
+                self.lines = [*self.lines, nearest_line(self.left, self.dt, frequency, 0.75 * self.f[0])]
+            self.refused.append(Candidate(frequency, WIDEST_LINE, 0.0))  # or it would come back
+            self._take_off()
+
+    def _sound(self, p: Ar2) -> bool:
+        """Whether a resonance is wide enough to be told from a line, and narrow enough to be told from turbulence."""
+        return RESOLVED * self.f[0] < p.damping * p.omega / (2 * pi) and p.damping < WIDEST and p.omega > 4.0 * pi * self.f[0]
+
+    def explain(self, candidate: Candidate) -> bool:
+        """Add the line or the resonance that explains the candidate best, or where there are lines beside it make one
+        resonance of them; whether that is worth its numbers."""
+        window = self._window(candidate)
+        before = self._misfit(window, self.spectrum, self.I)
+        lines, spectrum = self.lines, self.spectrum
+        beside = [line for line in lines if abs(line.frequency - candidate.frequency) < self._reach(candidate)]
+        trials: list[tuple[list[Line], Spectrum]] = []
+        if beside:
+            self.lines = rest = [line for line in lines if line not in beside]
+            self._take_off()
+            centre = float(np.mean([line.frequency for line in beside]))
+            trials.append((rest, self._with_resonance(Candidate(centre, max(candidate.width, 3), candidate.strength))))
+        elif not any(abs(p.omega / (2 * pi) - candidate.frequency) < self._reach(candidate) for p in spectrum.resonances):
+            trials.append((lines, self._with_resonance(candidate)))
+            if candidate.width <= WIDEST_LINE:
+                at = self._strongest_bin(candidate)
+                trials.append(([*lines, nearest_line(self.left, self.dt, at, 0.75 * self.f[0])], spectrum))
+        outcomes = []
+        for some, shape in trials:
+            self.lines = some
+            self._take_off()
+            if len(shape.resonances) > len(spectrum.resonances) and not self._sound(shape.resonances[-1]):
+                continue
+            peaks_more = len(some) - len(lines) + len(shape.resonances) - len(spectrum.resonances)
+            gain = before - self._misfit(window, shape, self.I) - WORTH * peaks_more
+            outcomes.append((gain, some, shape))
+        gain, some, shape = max(outcomes, key=lambda o: o[0], default=(0.0, lines, spectrum))
+        if gain <= 0:
+            some, shape = lines, spectrum
+            self.refused.append(candidate)
+        self.lines, self.spectrum = some, shape
+        self._take_off()
+        return gain > 0
+
+    def _reach(self, candidate: Candidate) -> float:
+        return (NEIGHBOURS + candidate.width / 2.0) * self.f[0]
+
+    def _window(self, candidate: Candidate) -> Array:
+        """The bins over which explanations of a candidate are compared."""
+        half = max(3.0 * self._reach(candidate), 0.03 * candidate.frequency)
+        return np.abs(self.f - candidate.frequency) < half
+
+    def _misfit(self, window: Array, spectrum: Spectrum, I: Array) -> float:  # noqa: E741
+        S = spectrum.psd(self.f[window])
+        return float(np.sum(np.log(S) + I[window] / S))
+
+    def _strongest_bin(self, candidate: Candidate) -> float:
+        near = np.abs(self.f - candidate.frequency) <= candidate.width / 2.0 * self.f[0]
+        if candidate.width == 1:
+            return candidate.frequency
+        return float(self.f[near][np.argmax(self.I[near] / self.spectrum.psd(self.f[near]))])
+
+    def _with_resonance(self, candidate: Candidate) -> Spectrum:
+        """A resonance of the candidate's width more, it alone fitted to the bins about it."""
+        f0, half = candidate.frequency, 0.5 * candidate.width * self.f[0]
+        near = np.abs(self.f - f0) <= max(half, self.f[0])
+        excess = np.maximum(self.I[near] - self.spectrum.psd(self.f[near]), 0.0)
+        power, f0 = float(excess.sum() * self.f[0]), float(excess @ self.f[near] / excess.sum()) if excess.any() else f0
+        best: tuple[float, Spectrum] | None = None
+        for share in (0.15, 0.5):
+            damping = min(max(share * half / f0, 1e-6), 0.5)
+            new = Ar2(2.0 * pi * f0, damping, np.sqrt(max(power, 1e-16)), self.dt)
+            wider = replace(self.spectrum, resonances=(*self.spectrum.resonances, new))
+            window = self._window(candidate)
+            keep = np.where(window, 1.0, 0.0)
+            cells = Cells(self.f, self.I, keep, [p.omega / (2 * pi) for p in wider.resonances])
+            count = len(wider.vector)
+            shape = fitted(wider, cells, range(count - 3, count))
+            value = negative_log_likelihood(shape, cells)
+            if best is None or value < best[0]:
+                best = value, shape
+        assert best is not None
+        return best[1]
+
+    def polish(self) -> None:
+        """Every line once more with the others taken off, and all numbers on all bins."""
+        for i, line in enumerate(self.lines):
+            alone = self.left + line.signal(self.n, self.dt)
+            again = nearest_line(alone, self.dt, line.frequency, 0.25 * self.f[0])
+            self.left = alone - again.signal(self.n, self.dt)
+            self.lines[i] = again
+        self._take_off()
+        self.refit()
+        for p in self.spectrum.resonances:
+            self._split(p)
+
+    def _split(self, p: Ar2) -> None:
+        """Two resonances in the place of one that is several bins wide, where they are worth it: neighbours look like one."""
+        f0 = p.omega / (2 * pi)
+        half = p.damping * f0
+        if half < 2.0 * NEIGHBOURS * self.f[0]:
+            return
+        rest = [q for q in self.spectrum.resonances if q is not p]
+        two = [Ar2(2 * pi * (f0 + sign * 0.7 * half), 0.4 * p.damping, p.rms / np.sqrt(2.0), self.dt) for sign in (-1, 1)]
+        start = replace(self.spectrum, resonances=(*rest, *two))
+        keep = np.where(self._window(Candidate(f0, int(4.0 * half / self.f[0]), 0.0)), 1.0, 0.0)
+        cells = Cells(self.f, self.I, keep, [q.omega / (2 * pi) for q in (*start.resonances, p)])
+        count = len(start.vector)
+        shape = fitted(start, cells, range(count - 6, count))
+        gain = negative_log_likelihood(self.spectrum, cells) - negative_log_likelihood(shape, cells)
+        if gain > SPLIT and all(map(self._sound, shape.resonances[-2:])):
+            self.spectrum = shape
+            self.refit()
+
+    def errors(self) -> Array:
+        """Standard deviations of the spectrum's numbers, see `standard_deviations`."""
+        return standard_deviations(self.spectrum, self.cells(everything=True), inflation(self.n))

@@ -1,0 +1,104 @@
+"""An identification as rows for machines, as a table for people, and as a TOML file of settings."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from rich.table import Table
+
+from wfsobs.configfile import to_toml
+from wfsobs.identify.process import Number
+from wfsobs.identify.result import Identified
+from wfsobs.identify.whiteness import LEVEL
+from wfsobs.scenario import Scenario
+
+
+def plain(result: Identified) -> dict[str, Any]:
+    """What `wfsobs identify --json` prints: every number with its standard deviation as `_std`, rms in um, frequencies in Hz."""
+    def numbers(**named: Number) -> dict[str, float]:
+        return {k: v for name, n in named.items() for k, v in ((name, n.value), (f"{name}_std", n.std))}
+
+    return {
+        "duration": result.duration, "level": result.level, "white": result.white,
+        "modes": [
+            {
+                "mode": m.name, **numbers(noise=m.noise),
+                "turbulence": None if m.turbulence is None else numbers(**vars(m.turbulence)),
+                "peaks": [{**numbers(**vars(p)), "pure": p.pure} for p in m.peaks],
+                "whiteness": {"cumulated_p": m.whiteness.cumulated, "innovations_p": m.whiteness.innovations,
+                              "unexplained": m.whiteness.left, "white": m.whiteness.white},
+            }
+            for m in result.modes
+        ],
+    }
+
+
+def table(result: Identified) -> Table:
+    """Noise, turbulence and peaks of every mode."""
+    out = Table(title=f"Identified from {result.duration:.1f} s, with standard deviations")
+    for name in ("Mode", "What"):
+        out.add_column(name, no_wrap=True)
+    for name in ("frequency, Hz", "damping", "rms, nm"):
+        out.add_column(name, justify="right", no_wrap=True)
+    for m in result.modes:
+        out.add_section()
+        out.add_row(m.name, "white noise", "", "", written(_nm(m.noise)))
+        if m.turbulence is not None:
+            t = m.turbulence
+            out.add_row(m.name, "turbulence", written(t.frequency), written(t.damping), written(_nm(t.rms)))
+        for p in m.peaks:
+            out.add_row(m.name, "line" if p.pure else "resonance", written(p.frequency),
+                        "0" if p.pure else written(p.damping), written(_nm(p.rms)))
+    return out
+
+
+def verdict(result: Identified) -> list[str]:
+    """One line per mode on what is left."""
+    out = []
+    for m in result.modes:
+        w = m.whiteness
+        tests = f"cumulated spectrum p = {w.cumulated:.2g}, innovations p = {w.innovations:.2g}"
+        rest = f"; {w.left} candidates that no peak explains" if w.left else ""
+        out.append(f"{m.name}: what is left is {'white' if w.white else 'NOT white'} at {LEVEL:.0%} ({tests}{rest})")
+    return out
+
+
+def _nm(n: Number) -> Number:
+    return Number(n.value * 1e3, n.std * 1e3)
+
+
+def written(n: Number) -> str:
+    """A number to two digits of its standard deviation.
+
+    >>> written(Number(47.43812, 0.0264)), written(Number(502.3, 25.1))
+    ('47.438 +- 0.026', '502 +- 25')
+    """
+    digits = max(0, 1 - int(f"{n.std:e}".split("e")[1])) if n.std > 0 else 4
+    return f"{n.value:.{digits}f} +- {n.std:.{digits}f}"
+
+
+def toml(result: Identified, scenario: Scenario) -> str:
+    """The scenario of the result as TOML, a standard deviation beside every number that was found."""
+    notes = {path: f"+- {number.std:.2g}" for path, number in result.shared(scenario).items()}
+    for i, p in enumerate(result.peaks):
+        notes |= {f"vibration.peaks.{i}.frequency": f"+- {p.frequency.std:.2g}",
+                  f"vibration.peaks.{i}.damping": f"+- {p.damping.std:.2g}" if p.damping.std else "a pure line",
+                  f"vibration.peaks.{i}.rms": "+- " + ", ".join(f"{r.std:.2g}" if r else "not seen" for r in p.rms)}
+    head = [f"Identified from {result.duration:.1f} s; +- is one standard deviation.", *verdict(result)]
+    return "\n".join(f"# {line}" for line in head) + "\n\n" + annotated(to_toml(scenario), notes)
+
+
+def annotated(text: str, notes: dict[str, str]) -> str:
+    """TOML with a comment after the settings that have one, by dotted path."""
+    out, where, counts = [], "", dict[str, int]()
+    for line in text.splitlines():
+        if head := re.fullmatch(r"\[\[([\w.]+)\]\]", line):
+            name = head.group(1)
+            counts[name] = counts.get(name, -1) + 1
+            where = f"{name}.{counts[name]}."
+        elif head := re.fullmatch(r"\[([\w.]+)\]", line):
+            where = head.group(1) + "."
+        note = notes.get(where + line.split(" = ")[0]) if " = " in line else None
+        out.append(f"{line}  # {note}" if note else line)
+    return "\n".join(out) + "\n"

@@ -1,0 +1,129 @@
+"""What an identification found, with the standard deviation of every number, and the scenario that it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi, sqrt
+from typing import Any
+
+import numpy as np
+
+from wfsobs.ar2 import turbulence_corner
+from wfsobs.atmosphere import relative_rms
+from wfsobs.identify.model import Spectrum
+from wfsobs.identify.one_mode import OneMode
+from wfsobs.identify.process import Number, Peak, Process, mean, merged
+from wfsobs.identify.whiteness import Whiteness
+from wfsobs.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class IdentifiedMode:
+    """The model of one mode: noise, rms of z's white noise [um]; turbulence, or None; peaks by frequency; what the tests say.
+
+    spectrum : of all but the pure lines
+    """
+
+    name: str
+    noise: Number
+    turbulence: Process | None
+    peaks: tuple[Process, ...]
+    spectrum: Spectrum
+    whiteness: Whiteness
+
+
+@dataclass(frozen=True)
+class Identified:
+    """The model of a record: one IdentifiedMode per column; dt [s], samples used, level of the search."""
+
+    modes: tuple[IdentifiedMode, ...]
+    dt: float
+    n_steps: int
+    level: float
+
+    @property
+    def duration(self) -> float:
+        """What was used of the record [s]."""
+        return self.n_steps * self.dt
+
+    @property
+    def white(self) -> bool:
+        """Whether what is left of every mode passes every test."""
+        return all(mode.whiteness.white for mode in self.modes)
+
+    @property
+    def peaks(self) -> list[Peak]:
+        """The peaks of all modes together."""
+        return merged([mode.peaks for mode in self.modes])
+
+    def scenario(self, base: Scenario | None = None) -> Scenario:
+        """A scenario whose z has the spectra found: turbulence as AR(2), the peaks, the LGS noise; the Kalman filters follow it.
+
+        What the modes share in a scenario (wind, damping, strength of turbulence, noise) is the mean of what was found, weighted
+        with the errors. base : where everything else comes from.
+        """
+        out = (base or Scenario()).replace({"telescope.radial_order": _order(len(self.modes)), "sensors.lgs_rate": 1.0 / self.dt})
+        peaks = self.peaks
+        changes: dict[str, Any] = {path: number.value for path, number in self.shared(out).items()}
+        changes |= {
+            "turbulence.source": "ar2" if any(m.turbulence for m in self.modes) else "none",
+            "sensors.noise_from": "nm", "sensors.lgs_combination": "mean", "sensors.lgs_low_frequency_rms": 0.0,
+            "sensors.tip_tilt_indetermination": False,
+            "vibration.source": "peaks" if peaks else "none",
+            "vibration.peaks": [
+                {"frequency": p.frequency.value, "damping": p.damping.value, "rms": [r.value if r else 0.0 for r in p.rms]}
+                for p in peaks
+            ],
+            "kalman.process_noise": "matched", "kalman.measurement_noise": "matched",
+        }
+        if peaks:
+            highest = max(p.frequency.value for p in peaks)
+            strongest = max(peaks, key=lambda p: sum(r.value**2 for r in p.rms if r))
+            changes |= {"vibration.cutoff": max(out.vibration.cutoff, 1.2 * highest),
+                        "kalman.frequency": strongest.frequency.value, "kalman.damping": strongest.damping.value}
+        return out.replace(changes)
+
+    def shared(self, scenario: Scenario) -> dict[str, Number]:
+        """Dotted path -> number of the settings that all modes share, and their errors; within what the settings allow."""
+        modes = [*zip(self.modes, scenario.modes, strict=False)]
+        out = {"sensors.lgs_noise": mean([_scaled(m.noise, sqrt(scenario.sensors.lgs_count)) for m in self.modes])}
+        seen = [(i, m.turbulence, mode.radial_order) for i, (m, mode) in enumerate(modes) if m.turbulence]
+        if seen:
+            corner = [2 * pi / turbulence_corner(1.0, scenario.telescope.diameter, order) for _, _, order in seen]
+            winds = [_scaled(t.frequency, per) for (_, t, _), per in zip(seen, corner, strict=True)]
+            out["turbulence.wind_speed"] = _within(mean(winds), 0.1, 100.0)
+            out["turbulence.damping"] = _within(mean([t.damping for _, t, _ in seen]), 0.01, 1.0)
+            strengths = [_scaled(t.rms, 1.0 / relative_rms(scenario, i)) for i, t, _ in seen]
+            out["turbulence.rms"] = _within(mean(strengths), 0.0, 100.0)
+        return out
+
+
+def read_off(mode: OneMode) -> tuple[Number, Process | None, tuple[Process, ...], Spectrum]:
+    """The numbers of a mode and their standard deviations: noise, turbulence, peaks; and the spectrum."""
+    std = mode.errors()
+    noise = _scaled(Number(1.0, float(std[0])), mode.spectrum.noise)
+    found = [
+        Process(_scaled(Number(1.0, float(std[1 + 3 * i])), p.omega / (2 * pi)), Number(p.damping, float(std[2 + 3 * i])),
+                _scaled(Number(1.0, float(std[3 + 3 * i])), p.rms))
+        for i, p in enumerate(mode.spectrum.processes)
+    ]
+    turbulence = None if mode.spectrum.turbulence is None else found.pop(0)
+    for line in mode.lines:
+        floor = float(mode.spectrum.psd(np.array([line.frequency]))[0])
+        in_frequency, in_rms = line.standard_deviations(mode.n, mode.dt, floor)
+        found.append(Process(Number(line.frequency, in_frequency), Number(0.0, 0.0), Number(line.rms, in_rms)))
+    return noise, turbulence, tuple(sorted(found, key=lambda p: p.frequency.value)), mode.spectrum
+
+
+def _scaled(n: Number, factor: float) -> Number:
+    return Number(n.value * factor, n.std * factor)
+
+
+def _within(n: Number, low: float, high: float) -> Number:
+    return Number(min(max(n.value, low), high), n.std)
+
+
+def _order(n_modes: int) -> int:
+    """The lowest radial order of which there are as many modes."""
+    return next(order for order in range(1, HIGHEST_ORDER + 1) if len(modes_up_to(order)) >= n_modes)

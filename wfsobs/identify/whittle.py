@@ -1,0 +1,103 @@
+"""Fits of a spectrum to a periodogram: the likelihood of Whittle (Ark. Mat. 2, 423, 1953), its minimum, its information.
+
+With m bins of mean I in a cell, - log L = sum m (log S + I / S). Its expected second derivatives are sum m (d log S)(d log S)'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from scipy.optimize import least_squares, minimize
+
+from wfsobs.ar2 import Ar2
+from wfsobs.arrays import Array
+from wfsobs.identify.model import Spectrum
+from wfsobs.identify.periodogram import Cells
+
+STEPS = 40
+"""Of the minimisation, at most."""
+NOISE, TURBULENCE, RESONANCE = 3.0, (2.0, 8.0, 4.0), (0.1, 6.0, 4.0)
+"""How far the numbers of a vector may leave their start: a resonance stays at its place."""
+
+
+def negative_log_likelihood(spectrum: Spectrum, cells: Cells) -> float:
+    """- log L, less a constant."""
+    S = spectrum.psd(cells.frequency)
+    return float(cells.count @ (np.log(S) + cells.mean / S))
+
+
+def information(spectrum: Spectrum, cells: Cells) -> Array:
+    """Fisher information of `Spectrum.vector`, (p, p)."""
+    d = spectrum.slopes(cells.frequency) / spectrum.psd(cells.frequency)
+    return (d * cells.count) @ d.T
+
+
+def fitted(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = None) -> Spectrum:
+    """The spectrum of greatest likelihood near the given one; free : which numbers of its vector may move, all unless told.
+
+    Newton's method in a trust region with the Fisher information for the second derivatives, every number in units of its own
+    standard deviation at the start.
+    """
+    start = spectrum.vector
+    index = np.arange(len(start)) if free is None else np.array(free)
+    first = () if spectrum.turbulence is None else TURBULENCE
+    reach = np.array([NOISE, *first, *RESONANCE * len(spectrum.resonances)])[index]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information(spectrum, cells))[index], 1e-3))
+
+    def at(x: Array) -> Spectrum:
+        vector = start.copy()
+        vector[index] += np.clip(scale * x, -reach, reach)
+        return spectrum.moved(vector)
+
+    def value(x: Array) -> float:
+        return negative_log_likelihood(at(x), cells)
+
+    def gradient(x: Array) -> Array:
+        here = at(x)
+        S = here.psd(cells.frequency)
+        return scale * ((here.slopes(cells.frequency)[index] / S) @ (cells.count * (1.0 - cells.mean / S)))
+
+    def curvature(x: Array) -> Array:
+        F = information(at(x), cells)[np.ix_(index, index)] * np.outer(scale, scale)
+        return F + 1e-9 * np.eye(len(index))
+
+    found = minimize(value, np.zeros(len(index)), jac=gradient, hess=curvature, method="trust-exact",
+                     options={"maxiter": STEPS, "gtol": 1e-2, "initial_trust_radius": 3.0, "max_trust_radius": 1e4})
+    return at(found.x)
+
+
+def standard_deviations(spectrum: Spectrum, cells: Cells, inflation: float) -> Array:
+    """Of the numbers of the vector, but of the damping itself in the place of its logit, (p,)."""
+    F = information(spectrum, cells) + 1e-12 * np.eye(1 + 3 * len(spectrum.processes))
+    std = np.sqrt(np.maximum(np.diag(np.linalg.inv(F)) * inflation, 0.0))
+    for i, p in enumerate(spectrum.processes):
+        std[2 + 3 * i] *= p.damping * (1.0 - p.damping)
+    return std
+
+
+def first_guess(f: Array, I: Array, dt: float) -> Spectrum:  # noqa: E741
+    """Noise and turbulence from the medians of the periodogram over bands, which lines and narrow resonances leave as they are;
+    without turbulence where white noise alone is as likely."""
+    edges = np.unique(np.concatenate([[0], np.geomspace(3, len(f), 60).astype(int)]))
+    bands = [slice(a, b) for a, b in pairwise(edges)]
+    at = np.array([f[b].mean() for b in bands])
+    level = np.array([np.median(I[b]) for b in bands]) / np.log(2.0)
+    weight = np.sqrt([b.stop - b.start for b in bands])
+
+    def misfit(vector: Array, shape: Spectrum) -> Array:
+        return weight * (np.log(level) - np.log(shape.moved(vector).psd(at)))
+
+    noise = float(np.sqrt(np.median(I[len(I) // 2 :]) / np.log(2.0) / (2.0 * dt)))
+    alone = Spectrum(noise, dt)
+    rms = float(np.sqrt(max(np.sum(I) * f[0] - noise**2, 1e-4 * noise**2)))
+    found = []
+    for corner in np.geomspace(max(3 * f[0], 0.1), 0.02 / dt, 4):
+        shape = Spectrum(noise, dt, Ar2(2.0 * np.pi * corner, 0.7, rms, dt))
+        fit = least_squares(misfit, shape.vector, args=(shape,), loss="soft_l1", max_nfev=60,
+                            bounds=(shape.vector - 12.0, shape.vector + 12.0))
+        found.append((fit.cost, shape.moved(fit.x)))
+    cost, best = min(found, key=lambda pair: pair[0])
+    nothing = least_squares(misfit, alone.vector, args=(alone,), loss="soft_l1")
+    return best if nothing.cost - cost > 3.0 * np.log(len(f)) else alone.moved(nothing.x)
