@@ -7,6 +7,8 @@ gain. It is the mean over all records: on one of them an observer may be luckier
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from wfsobs.observers.base import TARGETS
@@ -36,8 +38,10 @@ def bound_scores(scenario: Scenario, record: Record) -> list[Score]:
     if not is_known(scenario):
         return []
     out, start = [], round(scenario.run.warm_up / record.dt)
-    for mode, it in enumerate(scenario.modes[: record.n_modes]):
-        least = bound(scenario, mode)
+    modes = scenario.modes[: record.n_modes]
+    with ThreadPoolExecutor(2) as pool:
+        bounds = list(pool.map(lambda mode: bound(scenario, mode), range(len(modes))))
+    for mode, (it, least) in enumerate(zip(modes, bounds, strict=True)):
         for target in TARGETS:
             truth = record.truth(target)
             if truth is not None and truth.shape[0] > start:

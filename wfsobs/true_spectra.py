@@ -32,8 +32,8 @@ SHARPER = 16
 DECAYED = 2.5
 """How far correlations have decayed after half the DFT, as an exponent; a line that turns round by then is nothing new."""
 
-SMOOTH = 8.0
-"""The same for processes of a known width, whose correlations may not come round at all: exp(-20) of them does."""
+SMOOTH = 4.0
+"""The same for processes of a known width, whose correlations may not come round at all: exp(-10) of them does."""
 
 MOST = 2**20
 """Length of the DFT at most: of an AR(2) what decays more slowly comes round, which moves the bound by little."""

@@ -12,12 +12,15 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import solve
 
 from wfsobs.arrays import Array
+from wfsobs.blas import eliminate, solved_rows
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.gpr_offline import training_targets
 from wfsobs.observers.inputs import scale_of, window_signals
+from wfsobs.observers.kernels import sliding_products, square_from_band
+from wfsobs.observers.modes import over_modes
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.watch import Watch
+from wfsobs.watch import QUIET, Watch
 
 TAPS = 30
 """Samples of z that the plain predictor sees."""
@@ -31,15 +34,35 @@ def fit(signals: Array, targets: Array, depth: int, m: int, penalty: float) -> t
     with targets (n,), one per step. Raises RecordError where the record is too short."""
     if signals.shape[0] < depth + m:
         raise RecordError(f"the training record has {signals.shape[0]} steps, depth + training size need {depth + m}")
-    X = sliding_window_view(signals, depth, axis=0)[:m].reshape(m, -1)  # channel by channel, the oldest sample first
     f = targets[depth - 1 : depth - 1 + m]
-    middle = X.mean(axis=0)
-    X, centred = X - middle, f - f.mean()
-    if m < X.shape[1]:
-        w = X.T @ solve(X @ X.T + penalty * np.eye(m), centred, assume_a="pos")
+    windows = sliding_window_view(signals[: depth - 1 + m], depth, axis=0)  # (m, channels, depth), the oldest sample first
+    middle = windows.mean(axis=0)
+    if m <= 2 * depth * signals.shape[1]:  # which of the two is cheaper
+        S = np.empty((m + 1, m + 1), order="F")  # the inner products with the targets as one more row
+        S[:m, :m] = _centred(_inner_products(signals, depth, m))
+        S.flat[: m * (m + 1) : m + 2] += penalty
+        S[m, :m] = f - f.mean()
+        eliminate(S, m, QUIET.check)
+        (a,) = solved_rows(S, m)
+        a = a - a.mean()  # on windows less their mean
+        w = np.array([np.correlate(channel, a, "valid") for channel in signals[: depth - 1 + m].T])
     else:
-        w = solve(X.T @ X + penalty * np.eye(X.shape[1]), X.T @ centred, assume_a="pos")
-    return w.reshape(signals.shape[1], depth).T[::-1], float(f.mean() - middle @ w)
+        X = (windows - middle).reshape(m, -1)
+        w = solve(X.T @ X + penalty * np.eye(X.shape[1]), X.T @ (f - f.mean()), assume_a="pos").reshape(middle.shape)
+    return w.T[::-1], float(f.mean() - np.sum(middle * w))
+
+
+def _inner_products(signals: Array, depth: int, m: int) -> Array:
+    """X X' of the first m windows, (m, m), at a cost that depth does not enter."""
+    band = sliding_products(signals, signals, depth, depth - 1, depth - 1, m, m, triangle=True)
+    lower = np.tril(square_from_band(band, 0, m))
+    return lower + np.tril(lower, -1).T
+
+
+def _centred(gram: Array) -> Array:
+    """The inner products of windows less their mean."""
+    mean = gram.mean(axis=0)
+    return gram - mean - mean[:, None] + mean.mean()
 
 
 def predict(signals: Array, weights: Array, constant: float) -> Array:
@@ -59,14 +82,15 @@ def ridge(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
     targets = training_targets(training, scenario, record.dt, record.delay)
     training_z = pseudo_open_loop(training.y_lgs, training.u, record.delay)
     penalty = (g.noise_std * g.length_scale / g.signal_std) ** 2
-    columns = []
-    for mode in range(record.n_modes):
-        watch.step(mode / record.n_modes)
+
+    def one(mode: int, watch: Watch) -> Array:
+        watch.check()
         scale = scale_of(g, training, record.delay, mode)
         known = window_signals(g, training.y_lgs, training.u, training_z, mode, record.dt, scale)
         fitted = fit(known, targets[:, mode], g.depth, g.training_size, penalty)
-        columns.append(predict(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt, scale), *fitted))
-    return {VIBRATION: np.column_stack(columns)}
+        return predict(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt, scale), *fitted)
+
+    return {VIBRATION: over_modes(record.n_modes, one, watch)}
 
 
 def ridge_30(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
