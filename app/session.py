@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import logging
 import threading
 import traceback
@@ -51,6 +53,10 @@ def post_to_session() -> Post:
     doc = pn.state.curdoc
     if doc is None:
         return lambda function: function()
+    try:
+        loop = asyncio.get_running_loop()
+    except RuntimeError:
+        loop = None
     waiting: list[Callable[[], None]] | None = []
     lock = threading.Lock()
 
@@ -70,6 +76,13 @@ def post_to_session() -> Post:
             if waiting is not None:
                 waiting.append(function)
                 return
+        if loop is None:
+            schedule(function)
+        else:  # several threads post, and a document is not made for that: one of two callbacks may be lost
+            with contextlib.suppress(RuntimeError):  # the server has stopped
+                loop.call_soon_threadsafe(schedule, function)
+
+    def schedule(function: Callable[[], None]) -> None:
         if doc.session_context is not None and not doc.session_context.destroyed:
             doc.add_next_tick_callback(partial(held, function))
 

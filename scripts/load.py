@@ -41,11 +41,11 @@ SHORT = {
     "run.duration": 2.0, "run.warm_up": 0.5, "gpr_offline.training_size": 60, "gpr_offline.depth": 30,
     "gpr_online.training_size": 60, "gpr_online.depth": 30,
 }
-LONG = {"run.duration": 110.0, "gpr_online.training_size": 1000}
+LONG = {"run.duration": 110.0, "gpr_online.training_size": 1024, "gpr_offline.training_size": 1024}
 SETTINGS = 60
 """Different settings in a batch: sessions meet in some of them."""
 
-CLICKS = 100
+CLICKS = 60
 ANSWER = 0.2
 GROWTH = 0.2
 STOP = 2.0
@@ -150,6 +150,7 @@ async def session(base: str, changes: int, rng: random.Random, door: asyncio.Loc
     async with door:
         visitor = await Visitor(base).open(query_of(SHORT))
     await visitor.until(lambda: visitor.status.startswith("Done"))
+    await visitor.ask("SERVER-INFO-REQ", {})  # all that was sent with it has arrived
     box = visitor.find("TextInput", label="m/s")
     seen: list[Seen] = []
     seconds: list[float] = []
@@ -158,8 +159,12 @@ async def session(base: str, changes: int, rng: random.Random, door: asyncio.Loc
         start, before = time.monotonic(), visitor.numbers
         await visitor.set(box, value=f"{speed:g}")
         # not the line on the run: two results that took as long read the same
-        await visitor.until(lambda before=before: visitor.numbers != before and visitor.status.startswith("Done"))
-        await visitor.ask("SERVER-INFO-REQ", {})  # all that was sent with it has arrived
+        try:
+            await visitor.until(lambda before=before: visitor.numbers != before and visitor.status.startswith("Done"))
+        except TimeoutError:
+            raise TimeoutError(f"{speed:g} m/s asked for, the page says {visitor.status!r}, settings {visitor.query!r}, "
+                               f"table {'as before' if visitor.numbers == before else 'new'}") from None
+        await visitor.ask("SERVER-INFO-REQ", {})
         seconds.append(time.monotonic() - start)
         seen.append(({**SHORT, "turbulence.wind_speed": speed}, visitor.table()))
         await asyncio.sleep(rng.uniform(0.0, 0.2))

@@ -17,7 +17,7 @@ from bokeh.protocol.receiver import Receiver
 from tornado.httpclient import AsyncHTTPClient, HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
-WAIT = 120.0
+WAIT = 60.0
 ROW = re.compile(r'<tr data-observer="([^"]+)" data-target="([^"]+)"><th.*?</th>(.*?)</tr>')
 NUMBER = re.compile(r"[\d.]+$")
 

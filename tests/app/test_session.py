@@ -1,0 +1,52 @@
+"""How other threads reach a session's page."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from wfsobs.app import session
+
+
+class Page:
+    """A document that notes who asks it for what."""
+
+    def __init__(self) -> None:
+        self.session_context = SimpleNamespace(destroyed=False)
+        self.callbacks: list[Any] = []
+        self.threads: set[int] = set()
+
+    def add_next_tick_callback(self, callback: Any) -> None:
+        self.threads.add(threading.get_ident())
+        self.callbacks.append(callback)
+
+
+def test_only_its_own_thread_touches_the_document(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eight threads at once: nothing is lost, and the document, not made for several threads, sees one."""
+    page, done = Page(), []
+    state = SimpleNamespace(curdoc=page, onload=lambda function: function())
+    monkeypatch.setattr(session, "pn", SimpleNamespace(state=state, io=session.pn.io))
+
+    async def main() -> None:
+        post = session.post_to_session()
+        def many(i: int) -> None:
+            for k in range(100):
+                post(partial(done.append, (i, k)))
+
+        threads = [threading.Thread(target=many, args=(i,)) for i in range(8)]
+        for thread in threads:
+            thread.start()
+        while any(thread.is_alive() for thread in threads):
+            await asyncio.sleep(0.001)
+        await asyncio.sleep(0.01)
+
+    asyncio.run(main())
+    assert page.threads == {threading.get_ident()}
+    for callback in page.callbacks:
+        callback()
+    assert sorted(done) == [(i, k) for i in range(8) for k in range(100)]
