@@ -22,7 +22,7 @@ from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.pipeline import Failure, Result, as_stated, collect, each_estimate
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.scores import Score, scored_samples, welch_psd
+from wfsobs.scores import Score, spectra
 from wfsobs.watch import Watch
 
 Array = NDArray[np.float64]
@@ -188,28 +188,18 @@ class _Work:
         self.estimates.append(estimate)
         self.growing.pop(key, None)
         truth = record.truth(estimate.target)
-        spectrum = self._spectrum(record, estimate.values if truth is None else truth, estimate.values)
+        spectrum = self._spectrum(record, estimate.target, estimate.values)
         if spectrum is not None:
             self.spectra[key] = spectrum if truth is not None else replace(spectrum, error=np.full_like(spectrum.error, np.nan))
 
     def _add_truth(self, record: Record) -> None:
         for target in TARGETS:
             truth = record.truth(target)
-            spectrum = self._spectrum(record, truth, truth) if truth is not None else None
+            spectrum = self._spectrum(record, target, truth) if truth is not None else None
             if spectrum is not None:
                 self.spectra[TRUTH, target] = spectrum
 
-    def _spectrum(self, record: Record, truth: Array, values: Array) -> Spectrum | None:
+    def _spectrum(self, record: Record, target: str, values: Array) -> Spectrum | None:
         """Over the samples that count for the scores; None where there are too few."""
-        columns = [
-            scored_samples(record, truth[:, mode], values[:, mode], self.scenario.run.warm_up)
-            for mode in range(record.n_modes)
-        ]
-        shortest = min(true.size for true, _ in columns)
-        if shortest < 16:
-            return None
-        true = np.column_stack([t[-shortest:] for t, _ in columns])
-        value = np.column_stack([v[-shortest:] for _, v in columns])
-        frequency, density = welch_psd(np.hstack([value, value - true]), record.dt)
-        signal, error = np.hsplit(density, 2)
-        return Spectrum(frequency, signal, error)
+        found = spectra(record, target, values, self.scenario.run.warm_up)
+        return Spectrum(*found) if found else None

@@ -252,7 +252,8 @@ def test_lists_that_share_a_heap() -> None:
 
 def test_aot_opens_nothing_else(tmp_path, monkeypatch) -> None:
     """An AOT file may name other files and addresses; none is opened."""
-    aotpy = pytest.importorskip("aotpy")
+    import aotpy
+
     monkeypatch.chdir(tmp_path)
     fits.PrimaryHDU(np.zeros((20, 1, 2))).writeto("outside.fits")
     telescope, star = aotpy.MainTelescope(uid="T"), aotpy.NaturalGuideStar(uid="S")
