@@ -1,0 +1,45 @@
+"""What commands print: tables, JSON, warnings, a progress bar."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from wfsobs.pipeline import Result
+from wfsobs.tables import TIME, Row, score_table
+
+
+def show(all_rows: list[Row], as_json: bool) -> None:
+    """Print rows to standard output, as JSON or as a table."""
+    if as_json:
+        click.echo(json.dumps([{k: v for k, v in row.items() if k != TIME} for row in all_rows], allow_nan=False))
+    else:
+        show_table(score_table(all_rows))
+
+
+def show_table(table: Table) -> None:
+    """Print a table as wide as the terminal, or where there is none as wide as a page."""
+    console = Console()
+    (console if console.is_terminal else Console(width=160)).print(table)
+
+
+def warn(result: Result) -> None:
+    """Say which observers were left out, and why."""
+    for failure in result.failures:
+        click.echo(f"wfsobs: {failure.reason}", err=True)
+
+
+@contextmanager
+def progress_bar(what: str = "observers") -> Iterator[Callable[[float], None]]:
+    """A progress bar on standard error where that is a terminal; gives the function that moves it."""
+    console = Console(stderr=True)
+    columns = (TextColumn(what), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        task = progress.add_task("", total=1.0)
+        yield lambda fraction: progress.update(task, completed=fraction)

@@ -1,0 +1,78 @@
+"""`wfsobs run` and `wfsobs loop`: simulate."""
+
+from __future__ import annotations
+
+import json
+
+import click
+
+from wfsobs import configfile
+from wfsobs.cli.options import scenario_options
+from wfsobs.cli.show import progress_bar, show, show_table, warn
+from wfsobs.control import tables as loop_tables
+from wfsobs.control.closed_loop import closed_loop, design
+from wfsobs.formats.psd import load_psd
+from wfsobs.loop import simulate
+from wfsobs.pipeline import observe as observe_record
+from wfsobs.settings import SettingError
+from wfsobs.tables import Row, rows
+from wfsobs.telemetry import save_record
+from wfsobs.units import UNITS
+from wfsobs.watch import Watch
+
+
+@click.command()
+@scenario_options
+@click.option("--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N",
+              help="Repeat with seeds run.seed ... run.seed + N - 1.")
+@click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
+@click.option("--save", metavar="RECORD", help="Also save the record of the (one) run: .npz, .csv, .fits or .aot.fits.")
+@click.option("--vibration-psd", metavar="FILE", help="Vibration with the spectrum of a CSV or FITS file (docs/data.md).")
+@click.option("--psd-unit", type=click.Choice(UNITS), help="Its unit, squared per Hz, where it states none.")
+def run(
+    preset: str | None, config: str | None, assignments: tuple[str, ...], seeds: int, as_json: bool, save: str | None,
+    vibration_psd: str | None, psd_unit: str | None,
+) -> None:
+    """Simulate the loop, run every observer and print the RMS table."""
+    if save and seeds > 1:
+        raise SettingError("--save: saves one record; leave --seeds at 1")
+    scenario = configfile.scenario_from(preset, config, assignments)
+    if vibration_psd is not None:
+        table = load_psd(vibration_psd, psd_unit, scenario.telescope.diameter)
+        scenario = scenario.replace({"vibration.source": "psd", "vibration.psd": table})
+    all_rows: list[Row] = []
+    with progress_bar() as update:
+        for i in range(seeds):
+            one = scenario.replace({"run.seed": scenario.run.seed + i})
+            record = simulate(one)
+            if save:
+                save_record(save, record, configfile.to_toml(one))
+            result = observe_record(record, one, Watch(progress=lambda f, i=i: update((i + f) / seeds)), simulated=True)
+            warn(result)
+            all_rows += rows(result.scores, one.run.seed)
+    show(all_rows, as_json)
+
+
+@click.command()
+@scenario_options
+@click.option("--controller", "controllers", multiple=True, metavar="NAME",
+              help="Run this controller alone; can be given many times.")
+@click.option("--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N",
+              help="Repeat with seeds run.seed ... run.seed + N - 1.")
+@click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
+def loop(
+    preset: str | None, config: str | None, assignments: tuple[str, ...], controllers: tuple[str, ...], seeds: int, as_json: bool,
+) -> None:
+    """Close the loop with every controller on the same disturbance and print what is left of it (docs/closed_loop.md)."""
+    scenario = configfile.scenario_from(preset, config, assignments)
+    all_rows: list[Row] = []
+    with progress_bar("controllers") as update:
+        plan = design(scenario, controllers or None)
+        for i in range(seeds):
+            one = scenario.replace({"run.seed": scenario.run.seed + i})
+            result = closed_loop(simulate(one), plan, Watch(progress=lambda f, i=i: update((i + f) / seeds)))
+            all_rows += loop_tables.rows(result, one.run.seed)
+    if as_json:
+        click.echo(json.dumps(all_rows, allow_nan=False))
+    else:
+        show_table(loop_tables.table(all_rows))

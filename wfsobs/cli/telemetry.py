@@ -1,0 +1,79 @@
+"""`wfsobs observe` and `wfsobs identify`: work on a record."""
+
+from __future__ import annotations
+
+import json
+
+import click
+
+from wfsobs import configfile
+from wfsobs.cli.options import loaded, record_options, scenario_options
+from wfsobs.cli.show import progress_bar, show, show_table, warn
+from wfsobs.files import check_writable, write_whole
+from wfsobs.identify import identify as identify_record
+from wfsobs.identify import report as identified
+from wfsobs.identify.identification import LEVEL
+from wfsobs.identify.search import LOWEST
+from wfsobs.intake import Stated
+from wfsobs.pipeline import as_stated
+from wfsobs.pipeline import observe as observe_record
+from wfsobs.tables import rows
+from wfsobs.telemetry import save_arrays
+from wfsobs.watch import Watch
+
+
+@click.command()
+@click.argument("record_file", metavar="RECORD")
+@scenario_options
+@record_options
+@click.option("--out", metavar="ESTIMATES.npz", help="Save every estimate under the key observer/target.")
+@click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
+def observe(
+    record_file: str, preset: str | None, config: str | None, assignments: tuple[str, ...], unit: str | None,
+    command_sign: str | None, command_delay: int | None, rate: float | None, out: str | None, as_json: bool,
+) -> None:
+    """Run the observers on a record: .npz, .csv, .fits or AOT (preset paper unless told)."""
+    scenario = configfile.scenario_from(preset, config, assignments)
+    record = loaded(record_file, scenario, Stated(unit, int(command_sign) if command_sign else None, command_delay, rate))
+    with progress_bar() as update:
+        result = observe_record(record, scenario, Watch(progress=update))
+    warn(result)
+    if out:
+        save_arrays(out, {f"{e.observer}/{e.target}": e.values for e in result.estimates})
+    if not result.scores and not as_json:
+        click.echo(f"wfsobs: {record_file}: {len(result.estimates)} estimates, no scores: nothing after the warm-up", err=True)
+        return
+    show(rows(result.scores, None), as_json)
+
+
+@click.command()
+@click.argument("record_file", metavar="RECORD")
+@scenario_options
+@record_options
+@click.option("--level", type=click.FloatRange(0, 0.5, min_open=True), default=LEVEL, show_default=True, metavar="P",
+              help="Probability of finding any peak where there is none.")
+@click.option("--lowest", type=click.FloatRange(0, min_open=True), default=LOWEST, show_default=True, metavar="HZ",
+              help="Frequency from which peaks are looked for.")
+@click.option("--out", metavar="F.toml", help="Save what was found as settings, on top of the preset.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+def identify(
+    record_file: str, preset: str | None, config: str | None, assignments: tuple[str, ...], unit: str | None,
+    command_sign: str | None, command_delay: int | None, rate: float | None, level: float, lowest: float, out: str | None,
+    as_json: bool,
+) -> None:
+    """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
+    scenario = configfile.scenario_from(preset, config, assignments)
+    record = loaded(record_file, scenario, Stated(unit, int(command_sign) if command_sign else None, command_delay, rate))
+    if out:
+        check_writable(out)
+    with progress_bar("sweeps") as update:
+        result = identify_record(record, scenario, level, lowest, Watch(progress=update))
+    if out:
+        text = identified.toml(result, result.scenario(as_stated(record, scenario)))
+        write_whole(out, lambda file: file.write(text.encode()))
+    if as_json:
+        click.echo(json.dumps(identified.plain(result), allow_nan=False))
+        return
+    show_table(identified.table(result))
+    for line in identified.verdict(result):
+        click.echo(line)
