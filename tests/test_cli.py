@@ -15,7 +15,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.presets import paper
 
 QUICK = ["--set", "run.duration=2", "--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=50"]
-KEYS = {"observer", "target", "mode", "rms_um", "truth_rms_um", "normalised_rms", "lag_s", "seed"}
+KEYS = {"observer", "target", "mode", "rms_um", "truth_rms_um", "normalised_rms", "lag_s", "needs", "seed"}
 SHORT = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50}
 
 

@@ -132,7 +132,7 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_readme_output_is_real() -> None:
     """The errors and truths in the table under `wfsobs run` are those of that command."""
     def table(text: str) -> list[list[str]]:
-        return [[cell.strip() for cell in line.strip("│").split("│")][:5] for line in text.splitlines() if line.startswith("│")]
+        return [[cell.strip() for cell in line.strip("│").split("│")][:6] for line in text.splitlines() if line.startswith("│")]
 
     printed = table(blocks(README, "text")[0])
     assert len(printed) > 10

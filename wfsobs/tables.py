@@ -9,6 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import SPECTRA
 from wfsobs.scores import BOUND, LOOP, RESIDUAL, Score
 
 Row = dict[str, Any]
@@ -26,7 +27,7 @@ def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
     return [
         {
             "observer": s.observer, "target": s.target, "mode": s.mode, "rms_um": s.rms, "truth_rms_um": s.truth_rms,
-            "normalised_rms": s.normalised_rms, "lag_s": s.lag, "seed": seed,
+            "normalised_rms": s.normalised_rms, "lag_s": s.lag, "needs": needs_of(s.observer), "seed": seed,
             TIME: None if s.observer in NOT_OBSERVERS else s.seconds_per_step * 1e6,
         }
         for s in scores
@@ -40,7 +41,7 @@ def score_table(rows: Sequence[Row]) -> Table:
     unknown = any(r["target"] == RESIDUAL for r in rows)
     title, base = ("One-step prediction error of z, and residual,", "z") if unknown else ("RMS error", "truth")
     table = Table(title=f"{title} after warm-up" + (", median over seeds" if several else ""))
-    for name in ("Target", "Mode", "Observer"):
+    for name in ("Target", "Mode", "Observer", "Needs"):
         table.add_column(name, no_wrap=True)
     for name in ("error, nm", *(("spread, nm",) if several else ()), f"{base}, nm", f"error / {base}", "lag, ms", "us / step"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -52,7 +53,8 @@ def score_table(rows: Sequence[Row]) -> Table:
             table.add_section()
         last = (target, mode)
         table.add_row(
-            target, mode, label_of(observer) + (" (looks ahead)" if looks_ahead(observer) else ""), f"{median(errors):.2f}",
+            target, mode, label_of(observer) + (" (looks ahead)" if looks_ahead(observer) else ""),
+            needs_of(observer), f"{median(errors):.2f}",
             *((f"{min(errors):.2f} - {max(errors):.2f}",) if several else ()),
             f"{median(r['truth_rms_um'] for r in same) * 1e3:.2f}", _number(same, "normalised_rms", 1.0, 3),
             _number(same, "lag_s", 1e3, 2), _number(same, TIME, 1.0, 2),
@@ -63,6 +65,13 @@ def score_table(rows: Sequence[Row]) -> Table:
 def label_of(observer: str) -> str:
     """What a row is called."""
     return NOT_OBSERVERS.get(observer) or OBSERVERS[observer].label
+
+
+def needs_of(observer: str) -> str:
+    """What a row has to be given beside measurements: the bound the true spectra."""
+    if observer in NOT_OBSERVERS:
+        return SPECTRA if observer == BOUND else ""
+    return OBSERVERS[observer].told
 
 
 def competes(observer: str) -> bool:

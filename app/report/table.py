@@ -15,6 +15,7 @@ COLUMNS = {
     'RMS error [<span class="unit">nm</span>]': "of the estimate, after the warm-up",
     'RMS truth [<span class="unit">nm</span>]': "the error of answering zero",
     "error / truth": "above 1 is worse than answering zero",
+    "Needs": "what has to be given beside measurements",
     "Lag [ms]": "how late the estimate is",
     "Time per step [µs]": "computing time per step and mode",
     "Real-time factor": "time per step over the step of the loop; below 1 keeps up with it",
@@ -62,6 +63,7 @@ def _row(state: State, row: Row, best: bool) -> str:
         f"<td>{BEST if best and competes(name) else ''}{length(row['rms_um'])}</td>",
         f"<td>{length(row['truth_rms_um'])}</td>",
         f"<td>{ABOVE if (row['normalised_rms'] or 0.0) > 1.0 else ''}{number(row['normalised_rms'])}</td>",
+        f"<td class=words>{row['needs']}</td>",
         f"<td>{lag}</td>",
         f"<td>{number(time)}</td>", f"<td>{number(None if time is None else 1e-6 * time / state.grid.dt, 2)}</td>",
     ]

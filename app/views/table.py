@@ -13,7 +13,7 @@ from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import Shown
 from wfsobs.observers.base import TARGETS
 from wfsobs.scores import BOUND, LOOP, RESIDUAL, Score
-from wfsobs.tables import NOT_OBSERVERS, competes, label_of, looks_ahead
+from wfsobs.tables import NOT_OBSERVERS, competes, label_of, looks_ahead, needs_of
 
 BEST = '<span class="tag best">best</span> '
 ABOVE = '<span class="tag above">above truth</span> '
@@ -55,6 +55,7 @@ class Table:
         return {
             "Observer": "and its line in the figures", f"RMS error [{unit}]": "of the estimate, after the warm-up", **pinned,
             f"RMS {base} [{unit}]": "the error of answering zero", f"error / {base}": "above 1 is worse than answering zero",
+            "Needs": "what has to be given beside measurements",
             "Lag [ms]": "how late the estimate is", "Time per step [µs]": "computing time per step and mode",
             "Real-time factor": "time per step over the step of the loop; below 1 keeps up with it",
         }
@@ -76,7 +77,8 @@ class Table:
             assert shown is not None
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             loop = score.observer == LOOP
-            cells = [number(score.rms * scale), *pinned, number(score.truth_rms * scale), number(score.normalised_rms), NOTHING,
+            cells = [number(score.rms * scale), *pinned, number(score.truth_rms * scale), number(score.normalised_rms),
+                     needs_of(score.observer), NOTHING,
                      *_times(score, shown.result.record.dt)]
             label = "Recorded loop, residual" if loop else (
                 f"{swatch(score.observer, self.display.dark)}{escape(label_of(score.observer))}")
@@ -104,7 +106,7 @@ class Table:
     def _row(self, name: str, target: str, score: Score | None, best: float | None) -> str:
         label = escape(label_of(name)) + (" <sup>looks ahead</sup>" if looks_ahead(name) else "")
         shown, pinned = self.run.shown, self._pinned(name, target, score)
-        cells = [NOTHING, *pinned, *[NOTHING] * 5]
+        cells = [NOTHING, *pinned, *[NOTHING] * 2, needs_of(name), *[NOTHING] * 3]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             is_best = score.rms == best and competes(name)
@@ -112,6 +114,7 @@ class Table:
                 (BEST if is_best else "") + number(score.rms * scale), *pinned,
                 number(score.truth_rms * scale),
                 (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
+                needs_of(name),
                 NOTHING if score.lag is None else f"{1e3 * score.lag:.2f}".replace("-", "−"),
                 *_times(score, shown.result.record.dt),
             ]

@@ -86,7 +86,7 @@ def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any)
             name = label_of(row["observer"]) + (" looks ahead" if looks_ahead(row["observer"]) else "")
             lag = "–" if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−")
             want[f"{row['target'].capitalize()}, {row['mode']}", name] = [
-                number(1e3 * row["rms_um"]), number(1e3 * row["truth_rms_um"]), number(row["normalised_rms"]), lag,
+                number(1e3 * row["rms_um"]), number(1e3 * row["truth_rms_um"]), number(row["normalised_rms"]), row["needs"], lag,
                 number(row[TIME]), "–" if row[TIME] is None else number(row[TIME] / 1000.0, 2)]
         plain = {key: [re.sub(r"^(best|above truth) ", "", cell) for cell in cells] for key, cells in got.items()}
         assert plain == want

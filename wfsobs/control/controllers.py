@@ -11,6 +11,7 @@ from wfsobs.control.law import Law
 from wfsobs.control.lqg import LQG
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
+from wfsobs.observers.base import BANDS, LINES, MODEL, NOTHING, SPECTRA, TRAINING
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.true_spectra import TrueSpectra
@@ -63,17 +64,16 @@ def _lqg(id_: str) -> MakeLaw:
     return lambda scenario, mode, mirror, _spectra: LQG[id_](scenario, mode, mirror)
 
 
-NOTHING, SPECTRA, MODEL, LINES, TRAINING = "nothing", "true spectra", "model", "model, true lines", "training data"
-
 CONTROLLERS: dict[str, Controller] = {c.id: c for c in (
     Controller("none", "No control", weight=0.1),
     Controller("integrator", "Integrator", law=_integrator),
     Controller("lqg-kf-lgs", "LQG, LGS KF", (MODEL,), _lqg("lqg-kf-lgs")),
-    Controller("lqg-kf-multi", "LQG, multi-peak KF", (LINES,), _lqg("lqg-kf-multi")),
+    Controller("lqg-kf-multi", "LQG, multi-peak KF", (MODEL, LINES), _lqg("lqg-kf-multi")),
     Controller("lqg-multirate", "LQG, multi-rate KF", (MODEL,), _lqg("lqg-multirate"), ngs=True),
     Controller("lqg-multirate-optimal", "LQG, optimal multi-rate KF", (MODEL,), _lqg("lqg-multirate-optimal"), ngs=True),
-    Controller("lqg-multirate-multi", "LQG, multi-rate multi-peak KF", (LINES,), _lqg("lqg-multirate-multi"), ngs=True),
-    Controller("integrator+gpr-offline", "Integrator and offline GPR", (TRAINING,), _integrator, gpr_offline_ahead, weight=20.0),
-    Controller("integrator+gpr-online", "Integrator and online GPR", (), _integrator, gpr_online_ahead, weight=200.0),
+    Controller("lqg-multirate-multi", "LQG, multi-rate multi-peak KF", (MODEL, LINES), _lqg("lqg-multirate-multi"), ngs=True),
+    Controller("integrator+gpr-offline", "Integrator and offline GPR", (TRAINING, BANDS), _integrator, gpr_offline_ahead,
+               weight=20.0),
+    Controller("integrator+gpr-online", "Integrator and online GPR", (BANDS,), _integrator, gpr_online_ahead, weight=200.0),
 )}
 """Every controller, in the order of tables and legends."""

@@ -10,7 +10,8 @@ from typing import Any
 from rich.table import Table
 
 from wfsobs.control.closed_loop import ClosedLoop, residual_rms, strehl
-from wfsobs.control.controllers import CONTROLLERS, SPECTRA
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.observers.base import SPECTRA
 from wfsobs.scores import BOUND
 from wfsobs.tables import NOT_OBSERVERS, Row
 from wfsobs.units import micrometres_per
