@@ -85,6 +85,11 @@ class Ar2:
         distance = np.abs(np.expm1(pole - turn) * np.expm1(pole.conjugate() - turn))
         return 2.0 * self.dt * self.drive_variance / distance**2
 
+    def expected(self, last: Array, n: int) -> Array:
+        """The `n` steps that are expected after the `last` two, (n,); of the same two the other way round, those before."""
+        denominator = [1.0, -self.a1, -self.a2]
+        return lfilter([1.0], denominator, np.zeros(n), zi=lfiltic([1.0], denominator, [last[1], last[0]]))[0]
+
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """`n` steps of the process, stationary from the first, shape (n,)."""
         start = rng.standard_normal(2)

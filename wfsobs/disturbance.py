@@ -6,15 +6,19 @@ setting knows it by; turbulence has a module of its own.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 
+from wfsobs import events
 from wfsobs.ar2 import Ar2
 from wfsobs.arrays import Array
+from wfsobs.groups.events import PEAK
 from wfsobs.groups.vibration import Peak
 from wfsobs.measured import measured_spectrum
 from wfsobs.scenario import Scenario
+from wfsobs.schedule import strength, turns
 from wfsobs.spectrum import bin_edges, bin_frequencies, random_phase_signal, resonance_power, table_power
 from wfsobs.turbulence import SOURCES, ModeSource, columns, mode_power
 from wfsobs.watch import QUIET, Watch
@@ -47,9 +51,12 @@ def make_disturbance(
     """Both disturbances over `n_steps`. Every source and mode has a random stream of its own, so
     changing one setting leaves the others' numbers as they were."""
     turbulence_rng, vibration_rng = rng.spawn(2)
-    turbulence = SOURCES[scenario.turbulence.source](scenario, n_steps, turbulence_rng, watch)
+    at = events.clock(scenario, n_steps)
+    air = SOURCES[scenario.turbulence.source](scenario, events.steps_of_air(at, n_steps), turbulence_rng, watch)
     vibration = columns(VIBRATION[scenario.vibration.source], scenario, n_steps, vibration_rng, watch)
-    return Disturbance(turbulence.on_axis, vibration, turbulence.ngs, turbulence.lgs)
+    return Disturbance(
+        events.read(air.on_axis, at), vibration, None if air.ngs is None else events.read(air.ngs, at),
+        None if air.lgs is None else tuple(events.read(x, at) for x in air.lgs))
 
 
 def peak_rms(peak_rms_list: list[float], mode: int) -> float:
@@ -97,21 +104,29 @@ def _no_vibration(_scenario: Scenario, _mode: int, n: int, _rng: np.random.Gener
 def _ar2_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
     """Each peak as an AR(2) process (paper, eq. 2)."""
     out = np.zeros(n)
-    for peak, stream in zip(scenario.vibration.peaks, rng.spawn(len(scenario.vibration.peaks)), strict=True):
+    for i, (peak, stream) in enumerate(zip(scenario.vibration.peaks, rng.spawn(len(scenario.vibration.peaks)), strict=True)):
         damping = max(peak.damping, MIN_AR2_DAMPING)
-        out += Ar2(2.0 * np.pi * peak.frequency, damping, peak_rms(peak.rms, mode), scenario.dt).sample(n, stream)
+        process = Ar2(2.0 * np.pi * peak.frequency, damping, peak_rms(peak.rms, mode), scenario.dt)
+        x, changes = process.sample(n, stream), events.of_peak(scenario, i)
+        out += events.moved_process(process, x, changes) if changes else x
     return out
 
 
 def _dft_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
-    """Inverse DFT of the spectrum below the cut-off, plus the pure lines at their own frequencies."""
-    phases, *line_streams = rng.spawn(1 + len(scenario.vibration.peaks))
-    out = random_phase_signal(_bin_power(scenario, mode, n), n, phases)
+    """Inverse DFT of the spectrum below the cut-off, plus the pure lines at their own frequencies, and the peaks that have
+    events, each with random phases of its own so that it can be moved."""
+    phases, *peak_streams = rng.spawn(1 + len(scenario.vibration.peaks))
+    moving = {event.peak for event in scenario.events if event.kind == PEAK}
+    out = random_phase_signal(_bin_power(scenario, mode, n, without=moving), n, phases)
     t = np.arange(n) * scenario.dt
-    for peak, stream in zip(scenario.vibration.peaks, line_streams, strict=True):
+    for i, (peak, stream) in enumerate(zip(scenario.vibration.peaks, peak_streams, strict=True)):
+        changes = events.of_peak(scenario, i)
         if _is_pure_line(scenario, peak):
-            amplitude = np.sqrt(2.0) * peak_rms(peak.rms, mode)
-            out += amplitude * np.cos(2.0 * np.pi * (peak.frequency * t + stream.random()))
+            amplitude = np.sqrt(2.0) * peak_rms(peak.rms, mode) * strength(changes, t)
+            out += amplitude * np.cos(2.0 * np.pi * (peak.frequency * t + turns(changes, t) + stream.random()))
+        elif i in moving:
+            power = _below_cutoff(scenario, _resonance(peak, mode, n, scenario.dt), n)
+            out += events.moved(random_phase_signal(power, n, stream), changes, scenario.dt)
     return out
 
 
@@ -120,8 +135,8 @@ def _is_pure_line(scenario: Scenario, peak: Peak) -> bool:
     return v.source == "peaks" and peak.damping == 0 and peak.frequency <= v.cutoff
 
 
-def _bin_power(scenario: Scenario, mode: int, n: int) -> Array:
-    """Variance [um^2] in each DFT bin: that of the damped peaks, of the PSD table or of the
+def _bin_power(scenario: Scenario, mode: int, n: int, without: Collection[int] = ()) -> Array:
+    """Variance [um^2] in each DFT bin: that of the damped peaks, but for those `without`, of the PSD table or of the
     measured spectrum, up to the cut-off."""
     v, dt = scenario.vibration, scenario.dt
     power = np.zeros(n // 2 + 1)
@@ -132,12 +147,20 @@ def _bin_power(scenario: Scenario, mode: int, n: int) -> Array:
         if mode < spectrum.density.shape[1]:
             power = table_power(spectrum.frequency, spectrum.part(v.part)[:, mode], n, dt)
     else:
-        edges = bin_edges(n, dt)
-        for peak in v.peaks:
-            if peak.damping > 0:
-                power = power + peak_rms(peak.rms, mode) ** 2 * resonance_power(peak.frequency, peak.damping, edges)
-    f = bin_frequencies(n, dt)
-    return np.where((f > 0) & (f <= v.cutoff) & (f < 0.5 / dt), power, 0.0)
+        for i, peak in enumerate(v.peaks):
+            if peak.damping > 0 and i not in without:
+                power = power + _resonance(peak, mode, n, dt)
+    return _below_cutoff(scenario, power, n)
+
+
+def _resonance(peak: Peak, mode: int, n: int, dt: float) -> Array:
+    """Variance [um^2] of one damped peak in each DFT bin."""
+    return peak_rms(peak.rms, mode) ** 2 * resonance_power(peak.frequency, peak.damping, bin_edges(n, dt))
+
+
+def _below_cutoff(scenario: Scenario, power: Array, n: int) -> Array:
+    f = bin_frequencies(n, scenario.dt)
+    return np.where((f > 0) & (f <= scenario.vibration.cutoff) & (f < 0.5 / scenario.dt), power, 0.0)
 
 
 VIBRATION: dict[str, ModeSource] = {

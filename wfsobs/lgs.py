@@ -43,26 +43,27 @@ def low_frequency_process(scenario: Scenario, mode: int) -> Ar2:
     return Ar2(corner, t.damping, rms, scenario.dt)
 
 
-def lgs_weights(scenario: Scenario) -> Array:
-    """Of mode j of star i in mode k of the combination, (n_modes, n_lgs, n_modes)."""
-    stars, modes = scenario.sensors.lgs_count, len(scenario.modes)
+def lgs_weights(scenario: Scenario, stars: int | None = None) -> Array:
+    """Of mode j of star i in mode k of the combination, (n_modes, n_lgs, n_modes); of the first `stars` alone if given."""
+    stars, modes = stars or scenario.sensors.lgs_count, len(scenario.modes)
     if scenario.sensors.lgs_combination == MEAN:
         return np.tile(np.eye(modes)[:, None] / stars, (1, stars, 1))
-    return _best_weights(scenario)
+    return _best_weights(scenario, stars)
 
 
 @lru_cache(maxsize=8)  # a scenario is what its settings are, whenever it was asked
-def _best_weights(scenario: Scenario) -> Array:
-    """Those of minimum variance."""
-    stars, modes = scenario.sensors.lgs_count, len(scenario.modes)
+def _best_weights(scenario: Scenario, stars: int) -> Array:
+    """Those of minimum variance, of the first so many stars."""
+    modes = len(scenario.modes)
     seen, noise = seen_turbulence(scenario), noise_covariance(scenario, "lgs")
     for mode in range(modes):
         seen[:, mode, :, mode] += vibration_variance(scenario, mode)
     for star in range(1, stars + 1):
         seen[star, :, star] += noise
     n = stars * modes
-    measured = seen[1:, :, 1:].reshape(n, n)
-    found = seen[0, :, 1:].reshape(modes, n) @ np.linalg.pinv(measured, rcond=1e-12, hermitian=True)
+    last = 1 + stars
+    measured = seen[1:last, :, 1:last].reshape(n, n)
+    found = seen[0, :, 1:last].reshape(modes, n) @ np.linalg.pinv(measured, rcond=1e-12, hermitian=True)
     found.flags.writeable = False
     return found.reshape(modes, stars, modes)
 

@@ -102,6 +102,7 @@ def each_estimate(
 
     on_partial : told (observer, target, values so far) by observers that deliver in blocks.
     """
+    scenario = scenario.before_events  # no observer is told
     record = bridged(record, scenario)
     unknown = set(observers or ()) - set(OBSERVERS)
     if unknown:

@@ -9,14 +9,19 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import numpy as np
+import param
+
 from wfsobs.fit import fit
 from wfsobs.groups.atmosphere import PsdTable, Telescope, Turbulence
 from wfsobs.groups.control import Control
+from wfsobs.groups.events import FRAMES, LASER, PEAK, WIND, Event
 from wfsobs.groups.observers import Butterworth, Kalman, MultiPeak, MultiRate, OfflineGpr, OnlineGpr
 from wfsobs.groups.run import Loop, Run
 from wfsobs.groups.sensors import Sensors
 from wfsobs.groups.vibration import Vibration
 from wfsobs.modes import Mode, modes_up_to
+from wfsobs.schedule import air_time, shift
 from wfsobs.settings import Group, SettingError, section
 
 HIGHEST = 0.9
@@ -25,6 +30,9 @@ SMALLEST = 0.25
 """Outer scale over the aperture: below, variance moves to waves that frozen flow samples coarsely."""
 SLOWEST = 4e6
 """Steps in which a layer crosses the aperture: frozen flow takes Fourier transforms of four times as many."""
+
+MOST_AIR = 10.0
+"""How much longer a record of the turbulence may be than the run, for wind that grows."""
 
 
 class Scenario(Group):
@@ -50,6 +58,7 @@ class Scenario(Group):
     gpr_online = section(OnlineGpr, "Online GPR")
     control = section(Control, "Controllers")
     run = section(Run, "Run")
+    events = param.List([], item_type=Event, bounds=(0, 20), label="Events", doc="What changes during the record.")
 
     @property
     def modes(self) -> tuple[Mode, ...]:
@@ -65,6 +74,11 @@ class Scenario(Group):
     def n_steps(self) -> int:
         """Number of steps of the record."""
         return round(self.run.duration * self.sensors.lgs_rate)
+
+    @property
+    def before_events(self) -> Scenario:
+        """The scenario as it is without its events: what observers were made for, and the training record is of."""
+        return self.replace({"events": []}) if self.events else self
 
     def validate(self) -> None:
         """Check what no single setting can: raises SettingError naming the settings and the limit."""
@@ -87,11 +101,42 @@ class Scenario(Group):
                 self.turbulence.source == "frozen-flow" and self.sensors.kind == "shack-hartmann"):
             for kind in ("lgs", "ngs"):
                 fit(self.sensors.lenslets, kind, self.telescope.diameter, self.telescope.radial_order)
+        self._validate_events()
         widest = max(self.butterworth.bandwidth_offline, self.butterworth.bandwidth_online) / 2
         for i, f in enumerate(self.butterworth.frequencies):
             if not (f - widest > 0 and f + widest < nyquist):
                 raise SettingError(f"butterworth.frequencies.{i} = {f:g}: the band of +- {widest:g} Hz around it must lie "
                                    f"between 0 and half the LGS rate, {nyquist:g} Hz")
+
+    def _validate_events(self) -> None:
+        stars = self.sensors.lgs_count
+        for i, event in enumerate(self.events):
+            if event.start >= self.run.duration:
+                raise SettingError(f"events.{i}.start = {event.start:g}: must be below run.duration = {self.run.duration:g} s")
+            if event.kind in (LASER, FRAMES) and event.duration == 0:
+                raise SettingError(f"events.{i}.duration = 0: takes a number above 0 s, for kind {event.kind}")
+            if event.kind == LASER and event.lasers > stars:
+                raise SettingError(f"events.{i}.lasers = {event.lasers}: takes up to sensors.lgs_count = {stars}")
+            if event.kind == PEAK:
+                self._validate_moving_peak(i, event)
+        blown = air_time([e for e in self.events if e.kind == WIND], np.linspace(0.0, self.run.duration, 1001))[-1]
+        if blown > MOST_AIR * self.run.duration:
+            raise SettingError(f"events: the wind carries {blown:.3g} s of turbulence past in {self.run.duration:g} s; at most "
+                               f"{MOST_AIR:g} times as much as the record is long")
+
+    def _validate_moving_peak(self, i: int, event: Event) -> None:
+        v, nyquist = self.vibration, self.sensors.lgs_rate / 2
+        if v.source not in ("peaks", "ar2"):
+            raise SettingError(f"events.{i}.kind = peak: takes vibration.source = peaks or ar2, not {v.source}")
+        if event.peak >= len(v.peaks):
+            raise SettingError(f"events.{i}.peak = {event.peak}: vibration.peaks has {len(v.peaks)} entries, numbered from 0")
+        own = [e for e in self.events if e.kind == PEAK and e.peak == event.peak]
+        turning = np.array([t for e in own for t in (np.nextafter(e.start, 0.0), e.start, e.start + e.duration)])
+        reached = v.peaks[event.peak].frequency + shift(own, np.minimum(turning, self.run.duration))
+        for f in reached:
+            if not 0 < f < nyquist:
+                raise SettingError(f"events.{i}.frequency_shift = {event.frequency_shift:g}: moves peak {event.peak} to {f:g} "
+                                   f"Hz; it must stay between 0 and half the LGS rate, {nyquist:g} Hz")
 
     def _validate_layers(self) -> None:
         layers, smallest = self.turbulence.layers, SMALLEST * self.telescope.diameter

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from wfsobs import events
 from wfsobs.arrays import Array
 from wfsobs.disturbance import Disturbance
 from wfsobs.lgs import MEAN, lgs_weights, low_frequency_process
@@ -18,7 +20,7 @@ from wfsobs.watch import QUIET, Watch
 @dataclass(frozen=True)
 class OpenLoop:
     """Open-loop measurements [um]: lgs (n_steps, n_modes), that of the LGS together, and ngs, NaN in
-    steps without a frame."""
+    steps without a frame; both NaN where a frame is lost."""
 
     lgs: Array
     ngs: Array
@@ -32,18 +34,15 @@ def measure(
     LGS: the mean over the guide stars of phi_dist[k-1] + error (paper, eq. 3), or their combination of minimum variance, each
     guide star with noise and error of its own; of frozen flow, each sees what is in its own beam. NGS at k = n, 2n, ...: the
     mean of phi_dist[k-1] ... phi_dist[k-n], plus noise. With tip-tilt indetermination the LGS see no turbulence in tip and tilt.
+    Without a laser, and where a frame is lost, NaN.
     """
-    lgs_rng, ngs_rng = rng.spawn(2)
+    lgs_rng, ngs_rng, lost_rng = rng.spawn(3)
     n_steps, n_modes = disturbance.total.shape
-    errors = [_lgs_error(scenario, n_steps, n_modes, stream, watch) for stream in lgs_rng.spawn(scenario.sensors.lgs_count)]
+    errors = _lgs_errors(scenario, n_steps, n_modes, lgs_rng, watch)
     seen = [_without_blind(scenario, x) for x in disturbance.lgs_turbulence or [disturbance.turbulence]]
-    if scenario.sensors.lgs_combination == MEAN:
-        turbulence = seen[0] if len(seen) == 1 else np.mean(seen, axis=0)
-        lgs = delayed(turbulence + disturbance.vibration, 1) + np.mean(errors, axis=0)
-    else:
-        every = seen * len(errors) if len(seen) == 1 else seen
-        stars = [delayed(x + disturbance.vibration, 1) + error for x, error in zip(every, errors, strict=True)]
-        lgs = np.tensordot(np.stack(stars, axis=1), lgs_weights(scenario), ([1, 2], [1, 2]))
+    lgs, working = np.full((n_steps, n_modes), np.nan), events.lasers(scenario, n_steps)
+    for stars in np.unique(working[working > 0]):
+        lgs[working == stars] = _together(scenario, seen, disturbance.vibration, errors[:stars])[working == stars]
 
     n = scenario.sensors.exposure_ratio
     noise = white_noise(scenario, "ngs", n_steps, ngs_rng)
@@ -52,7 +51,20 @@ def measure(
     ngs_turbulence = disturbance.turbulence if disturbance.ngs_turbulence is None else disturbance.ngs_turbulence
     total = ngs_turbulence + disturbance.vibration
     ngs = np.where(is_frame[:, None], frame_mean(total, n) + noise, np.nan)
+    lost = events.lost_frames(scenario, n_steps, lost_rng)
+    lgs[lost["lgs"]], ngs[lost["ngs"]] = np.nan, np.nan
     return OpenLoop(lgs, ngs)
+
+
+def _together(scenario: Scenario, seen: Sequence[Array], vibration: Array, errors: Sequence[Array]) -> Array:
+    """What the LGS measure together, as many as there are errors, (n_steps, n_modes)."""
+    stars = len(errors)
+    if scenario.sensors.lgs_combination == MEAN:
+        turbulence = seen[0] if len(seen) == 1 else np.mean(seen[:stars], axis=0)
+        return delayed(turbulence + vibration, 1) + np.mean(errors, axis=0)
+    every = list(seen) * stars if len(seen) == 1 else seen[:stars]
+    each = [delayed(x + vibration, 1) + error for x, error in zip(every, errors, strict=True)]
+    return np.tensordot(np.stack(each, axis=1), lgs_weights(scenario, stars), ([1, 2], [1, 2]))
 
 
 def _without_blind(scenario: Scenario, turbulence: Array) -> Array:
@@ -63,14 +75,17 @@ def _without_blind(scenario: Scenario, turbulence: Array) -> Array:
     return np.where(visible, turbulence, 0.0)
 
 
-def _lgs_error(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.Generator, watch: Watch) -> Array:
-    """Error of one guide star [um], (n_steps, n_modes): white noise, plus what stands for the cone effect where turbulence
-    has no layers."""
-    noise_rng, slow_rng = rng.spawn(2)
-    out = white_noise(scenario, "lgs", n_steps, noise_rng)
-    for mode, stream in enumerate(slow_rng.spawn(n_modes)):
-        watch.check()
-        process = low_frequency_process(scenario, mode)
-        if process.rms > 0:
-            out[:, mode] += process.sample(n_steps, stream)
+def _lgs_errors(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.Generator, watch: Watch) -> list[Array]:
+    """Errors of every guide star [um], each (n_steps, n_modes): white noise, plus what stands for the cone effect where
+    turbulence has no layers, which the wind carries along with the turbulence."""
+    out, at = [], events.clock(scenario, n_steps)
+    for star in rng.spawn(scenario.sensors.lgs_count):
+        noise_rng, slow_rng = star.spawn(2)
+        error = white_noise(scenario, "lgs", n_steps, noise_rng)
+        for mode, stream in enumerate(slow_rng.spawn(n_modes)):
+            watch.check()
+            process = low_frequency_process(scenario, mode)
+            if process.rms > 0:
+                error[:, mode] += events.read(process.sample(events.steps_of_air(at, n_steps), stream), at)
+        out.append(error)
     return out

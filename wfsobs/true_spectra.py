@@ -88,8 +88,11 @@ def n_frequencies(scenario: Scenario) -> int:
 
 
 def is_known(scenario: Scenario) -> bool:
-    """Whether the spectra can be told: not those of frozen flow so slow that its low frequencies would not be resolved."""
+    """Whether the spectra can be told: not those of frozen flow so slow that its low frequencies would not be resolved, nor
+    where events change them."""
     source = scenario.turbulence.source
+    if scenario.events:
+        return False
     return source in TURBULENCE_SPECTRA and (source != "frozen-flow" or _wanted_frequencies(scenario) <= 2 * MOST)
 
 
