@@ -19,7 +19,8 @@ export function render({model, el}) {
   el.append(box)
 
   const cell = (row, column, value) => {
-    const input = document.createElement("input")
+    const input = document.createElement(column.choices.length ? "select" : "input")
+    input.append(...column.choices.map((choice) => new Option(choice)))
     input.value = value
     input.inputMode = "decimal"
     input.dataset.cell = `${row}.${column.key}`
@@ -63,7 +64,7 @@ export function render({model, el}) {
 
   const mark = () => {
     const errors = model.errors
-    table.querySelectorAll("input").forEach((input) => {
+    table.querySelectorAll("input, select").forEach((input) => {
       const error = errors[input.dataset.cell]
       if (error) {
         input.value = error.text

@@ -81,10 +81,16 @@ class Controls:
         column = self.rooms[name]
         if len(column):
             return
+        own = {path: RowEditor(self.store, path, p) for path, p in self.store.scenario.lists() if path.split(".")[0] == name}
+        self.lists |= own
+        column[:] = [*(editor.view for editor in own.values()), *self._fields_of(name)]
+
+    def _fields_of(self, name: str) -> list[Any]:
+        """The fields of a topic under the headings of its groups; none where it is a list."""
         group = getattr(self.store.scenario, name)
-        self.lists |= {path: RowEditor(self.store, path, p) for path, p in group.lists(f"{name}.")}
-        views: list[Any] = [editor.view for path, editor in self.lists.items() if path.startswith(f"{name}.")]
-        heading = name
+        if not isinstance(group, Group):
+            return []
+        views, heading = [], name
         for path, _, _ in group.walk(f"{name}."):
             if path in FIRST or any(path.startswith(f"{listed}.") for listed in self.lists):
                 continue
@@ -93,7 +99,7 @@ class Controls:
                 heading = above
                 views.append(pn.pane.HTML(f"<b>{escape(str(group.settings()[above].label))}</b>", margin=(8, 0, 0, 0)))
             views.append(self._field(path).view)
-        column[:] = views
+        return views
 
     def _field(self, path: str) -> Field:
         if path not in self.fields:
@@ -165,7 +171,7 @@ def waiting_text(seconds: float) -> str:
 
 def _names() -> dict[str, str]:
     """Topic -> title, in the order of the drawer."""
-    settings = {name: str(p.label) for name, p in Scenario.settings().items() if issubclass(p.class_, Group)}
+    settings = {name: str(p.label) for name, p in Scenario.settings().items()}
     return {name: settings[name] for name in (*TOPICS, *(n for n in settings if n not in TOPICS))}
 
 

@@ -17,6 +17,7 @@ from wfsobs.settings import Group
 
 SHORT = {
     "frequency": "f", "damping": "ξ", "height": "h", "fraction": "share", "wind_factor": "V / V₀", "wind_direction": "wind to",
+    "frequency_shift": "shift",
 }
 """Setting -> its name above a narrow column; any other has its own."""
 
@@ -25,7 +26,7 @@ class RowTable(JSComponent):
     """The table in the browser: texts down, messages {action, row, key, text} up."""
 
     rows = param.List([], doc="One list of texts per item.")
-    columns = param.List([], doc="{key, name, doc} of every column.")
+    columns = param.List([], doc="{key, name, doc, choices} of every column.")
     errors = param.Dict({}, doc="'row.key' -> {text, reason} of refused cells.")
     noun = param.String("item", doc="What an item is called.")
 
@@ -84,10 +85,10 @@ class RowEditor:
     def refresh(self, *_: object) -> None:
         """Show the accepted items and what was refused."""
         items = self.store.value(self.path)
-        rows = [[number_text(_cell(item, column["key"])) for column in self.table.columns] for item in items]
+        rows = [[_cell(item, column["key"]) for column in self.table.columns] for item in items]
         errors: dict[str, dict[str, str]] = {}
         for path, reason in self.store.errors.items():
-            if path.startswith(f"{self.path}."):
+            if f"{path}.".startswith(f"{self.path}."):
                 errors[path.removeprefix(f"{self.path}.")] = {"text": self._texts.get(path, ""), "reason": reason}
         self.table.param.update(rows=rows, errors=errors)
 
@@ -98,21 +99,23 @@ class RowEditor:
         self.store.change(self.path, items)
 
 
-def _columns(kind: type[Group]) -> list[dict[str, str]]:
-    """One column per number, one for tip and one for tilt per list of numbers, named from the settings."""
+def _columns(kind: type[Group]) -> list[dict[str, Any]]:
+    """One column per number or word, one for tip and one for tilt per list of numbers, named from the settings."""
     out = []
     for setting, p in kind.settings().items():
         named = [(setting, SHORT.get(setting, setting))]
         if isinstance(p, Reals):
             named = [(f"{setting}.{i}", mode.name) for i, mode in enumerate(TIP_TILT)]
         unit = written_unit(unit_of(p))
-        out += [{"key": key, "name": f"{name} [{unit}]" if unit else name, "doc": p.doc or ""} for key, name in named]
+        choices = list(p.objects) if isinstance(p, param.Selector) else []
+        out += [{"key": key, "name": f"{name} [{unit}]" if unit else name, "doc": p.doc or "", "choices": choices}
+                for key, name in named]
     return out
 
 
-def _cell(item: Group, key: str) -> float:
+def _cell(item: Group, key: str) -> str:
     name, _, mode = key.partition(".")
     value = getattr(item, name)
-    if not mode:
-        return value
-    return value[int(mode)] if int(mode) < len(value) else 0.0
+    if mode:
+        value = value[int(mode)] if int(mode) < len(value) else 0.0
+    return value if isinstance(value, str) else number_text(value)

@@ -10,7 +10,7 @@ import param
 from wfsobs.parameters import Reals, unit_of
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
-from wfsobs.settings import Group
+from wfsobs.settings import Group, holds_groups
 
 PAGE = Path(__file__).parents[1] / "settings.md"
 
@@ -43,8 +43,8 @@ def sections(group: Group, prefix: str) -> list[str]:
         value = getattr(group, name)
         if isinstance(value, Group):
             inner += sections(value, f"{prefix}{name}.")
-        elif isinstance(value, list) and value and isinstance(value[0], Group):
-            inner += sections(value[0], f"{prefix}{name}.N.")
+        elif isinstance(p, param.List) and holds_groups(p):
+            inner += sections(p.item_type(), f"{prefix}{name}.N.")
         else:
             rows.append(f"| `{prefix}{name}` | {shown(value)} | {span(p)} | {unit_of(p) or '-'} | {meaning(p)} |")
     if rows:
