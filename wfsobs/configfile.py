@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -20,6 +21,21 @@ from wfsobs.settings import SettingError
 def to_toml(scenario: Scenario) -> str:
     """Every setting as TOML, peaks as [[vibration.peaks]] tables; `from_toml` gives back the very same scenario."""
     return tomli_w.dumps(scenario.to_dict())
+
+
+def annotated(text: str, notes: Mapping[str, str]) -> str:
+    """TOML with a comment after the settings that have one, by dotted path."""
+    out, where, counts = [], "", dict[str, int]()
+    for line in text.splitlines():
+        if head := re.fullmatch(r"\[\[([\w.]+)\]\]", line):
+            name = head.group(1)
+            counts[name] = counts.get(name, -1) + 1
+            where = f"{name}.{counts[name]}."
+        elif head := re.fullmatch(r"\[([\w.]+)\]", line):
+            where = head.group(1) + "."
+        note = notes.get(where + line.split(" = ")[0]) if " = " in line else None
+        out.append(f"{line}  # {note}" if note else line)
+    return "\n".join(out) + "\n"
 
 
 def from_toml(text: str, base: Scenario | None = None, where: str = "TOML") -> Scenario:

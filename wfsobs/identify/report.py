@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 from rich.table import Table
 
-from wfsobs.configfile import to_toml
+from wfsobs.configfile import annotated, to_toml
 from wfsobs.identify.process import Number
 from wfsobs.identify.result import Identified
 from wfsobs.identify.whiteness import LEVEL
@@ -87,18 +86,3 @@ def toml(result: Identified, scenario: Scenario) -> str:
                   f"vibration.peaks.{i}.rms": "+- " + ", ".join(f"{r.std:.2g}" if r else "not seen" for r in p.rms)}
     head = [f"Identified from {result.duration:.1f} s; +- is one standard deviation.", *verdict(result)]
     return "\n".join(f"# {line}" for line in head) + "\n\n" + annotated(to_toml(scenario), notes)
-
-
-def annotated(text: str, notes: dict[str, str]) -> str:
-    """TOML with a comment after the settings that have one, by dotted path."""
-    out, where, counts = [], "", dict[str, int]()
-    for line in text.splitlines():
-        if head := re.fullmatch(r"\[\[([\w.]+)\]\]", line):
-            name = head.group(1)
-            counts[name] = counts.get(name, -1) + 1
-            where = f"{name}.{counts[name]}."
-        elif head := re.fullmatch(r"\[([\w.]+)\]", line):
-            where = head.group(1) + "."
-        note = notes.get(where + line.split(" = ")[0]) if " = " in line else None
-        out.append(f"{line}  # {note}" if note else line)
-    return "\n".join(out) + "\n"

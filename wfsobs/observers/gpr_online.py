@@ -31,13 +31,18 @@ def kernel_of(settings: OfflineGpr | OnlineGpr) -> SquaredExponential:
     return SquaredExponential(settings.signal_std, settings.length_scale, settings.noise_std)
 
 
+def online_targets(record: Record, scenario: Scenario) -> Array:
+    """The vibration at every step, as far as the causal bank tells it one step later, (n, n_modes) [um]; 0 at the last step."""
+    f = online_reference(scenario, record.z, record.dt)
+    return np.vstack([f[1:], np.zeros((1, record.n_modes))])
+
+
 def gpr_online(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
     """The online GPR over a record, all modes at the same time, delivered block by block."""
     g = scenario.gpr_online
     if record.n_steps < g.depth + g.training_size:
         raise RecordError(f"the record has {record.n_steps} steps; depth + training size need {g.depth + g.training_size}")
-    f = online_reference(scenario, record.z, record.dt)
-    targets = np.vstack([f[1:], np.zeros((1, record.n_modes))])
+    targets = online_targets(record, scenario)
     values = np.full((record.n_steps, record.n_modes), np.nan)
     done = np.zeros(record.n_modes)
 

@@ -1,0 +1,66 @@
+"""`wfsobs tune`: search for the settings of an observer."""
+
+from __future__ import annotations
+
+import json
+
+import click
+
+from wfsobs import configfile
+from wfsobs.cli.options import loaded, record_options, scenario_options
+from wfsobs.cli.show import progress_bar, show_table
+from wfsobs.files import check_writable, write_whole
+from wfsobs.intake import Stated
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS
+from wfsobs.settings import SettingError
+from wfsobs.tuning import report
+from wfsobs.tuning import tune as search
+from wfsobs.tuning.space import TUNABLE
+from wfsobs.tuning.tuning import EVALUATIONS
+from wfsobs.watch import Watch
+
+NAMES = [name for name in OBSERVERS if name in TUNABLE and TUNABLE[name].usual]
+
+
+@click.command()
+@click.option("--observer", required=True, type=click.Choice(NAMES), help="What is tuned.")
+@scenario_options
+@click.option("--setting", "settings", multiple=True, metavar="NAME",
+              help="Tune this setting in the place of the usual ones; can be given many times.")
+@click.option("--target", type=click.Choice(TARGETS), help="Whose error counts; vibration where the observer estimates it.")
+@click.option("--evaluations", type=click.IntRange(1, 10_000), default=EVALUATIONS, show_default=True, metavar="N",
+              help="Runs of the observer at most.")
+@click.option("--validation", type=click.FloatRange(0, min_open=True), metavar="S",
+              help="Length of the validation record, that of the scenario unless told.")
+@click.option("--record", "record_file", metavar="RECORD", help="Tune on telemetry, cut in three, not on simulated records.")
+@record_options
+@click.option("--out", metavar="F.toml", help="Save all settings, the tuned ones with a comment.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+def tune(
+    observer: str, preset: str | None, config: str | None, assignments: tuple[str, ...], settings: tuple[str, ...],
+    target: str | None, evaluations: int, validation: float | None, record_file: str | None, unit: str | None,
+    command_sign: str | None, command_delay: int | None, rate: float | None, out: str | None, as_json: bool,
+) -> None:
+    """Search for the settings of an observer that are best on a validation record (docs/tuning.md)."""
+    scenario, record = configfile.scenario_from(preset, config, assignments), None
+    if record_file is not None:
+        if validation is not None:
+            raise SettingError("--validation: is for simulated records, leave it out with --record")
+        stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
+        record = loaded(record_file, scenario, stated)
+    if out:
+        check_writable(out)
+    with progress_bar("evaluations") as update:
+        tuned = search(scenario, observer, settings or None, evaluations, Watch(progress=update), record,
+                       target=target, validation=validation)
+    if out:
+        text = report.toml(tuned)
+        write_whole(out, lambda file: file.write(text.encode()))
+    if as_json:
+        click.echo(json.dumps(report.plain(tuned), allow_nan=False))
+        return
+    show_table(report.settings_table(tuned))
+    show_table(report.errors_table(tuned))
+    for line in report.remarks(tuned):
+        click.echo(line)

@@ -1,0 +1,76 @@
+"""How good settings are on a record: the rms error of one observer, mode by mode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite
+
+import numpy as np
+
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS, VIBRATION, Estimate
+from wfsobs.pipeline import Failure, each_estimate
+from wfsobs.record import Record, RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.scores import PREDICTION, score, unsupervised_scores
+from wfsobs.settings import SettingError
+from wfsobs.watch import Watch
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Mode -> rms error [um]."""
+
+    modes: dict[str, float]
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square over the modes [um]."""
+        return float(np.sqrt(np.mean(np.square([*self.modes.values()]))))
+
+
+@dataclass(frozen=True)
+class Judge:
+    """The errors of one observer in one target: "turbulence", "vibration", or PREDICTION where there is no truth."""
+
+    observer: str
+    target: str
+
+    def estimates(self, record: Record, scenario: Scenario, watch: Watch) -> list[Estimate]:
+        """What the observer makes of a record. Raises ValueError in one line where it cannot, Cancelled."""
+        scenario.validate()
+        out = []
+        for item in each_estimate(record, scenario, watch, [self.observer]):
+            if isinstance(item, Failure):
+                raise RecordError(item.reason)
+            out.append(item)
+        return out if self.target == PREDICTION else [e for e in out if e.target == self.target]
+
+    def errors(self, record: Record, scenario: Scenario, estimates: list[Estimate], warm_up: float) -> Errors:
+        """Over the steps after the warm-up [s] that have an estimate. Raises RecordError where there is none."""
+        names = [m.name for m in scenario.modes][: record.n_modes]
+        if self.target == PREDICTION:
+            scores = unsupervised_scores(record, estimates, warm_up, names)
+        else:
+            scores = [s for e in estimates for s in score(record, e, warm_up, names)]
+        modes = {s.mode: s.rms for s in scores if (s.observer, s.target) == (self.observer, self.target)}
+        if len(modes) < len(names) or not all(map(isfinite, modes.values())):
+            raise RecordError(f"{self.observer} has nothing to be scored after {warm_up:g} s")
+        return Errors(modes)
+
+    def begins(self, estimates: list[Estimate]) -> int:
+        """The step from which on there are estimates."""
+        silent = np.logical_or.reduce([np.isnan(e.values).any(axis=1) for e in estimates])[:-1]  # a reference lacks the last
+        return int(silent.size - np.argmax(silent[::-1])) if silent.any() else 0
+
+
+def target_of(observer: str, target: str | None) -> str:
+    """The target that is asked for, or vibration where the observer estimates it. Raises SettingError."""
+    known = OBSERVERS[observer].targets
+    if target is None:
+        return VIBRATION if VIBRATION in known else known[0]
+    if target not in TARGETS:
+        raise SettingError(f"target {target!r}: takes one of {', '.join(TARGETS)}")
+    if target not in known:
+        raise SettingError(f"target {target!r}: {observer} estimates {' and '.join(known)}")
+    return target

@@ -1,0 +1,141 @@
+"""The records of a tuning: training, validation and test, which share nothing.
+
+From a scenario they are simulated. Training and test are what `wfsobs run` has, from `run.seed`; the validation record has a
+stream of its own, SeedSequence([run.seed, 1]), from which nothing else is drawn. From telemetry they are pieces of the
+record in the order of time, with a gap between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from wfsobs.arrays import Array
+from wfsobs.gaps import bridged
+from wfsobs.loop import TRAINING_MARGIN, simulate
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS, VIBRATION
+from wfsobs.observers.reference import open_loop_reference
+from wfsobs.record import Record, RecordError, Training, delayed, frame_mean
+from wfsobs.scenario import Scenario
+from wfsobs.scores import PREDICTION
+from wfsobs.tuning.space import Space
+from wfsobs.watch import Watch
+
+VALIDATION, DESIGN = 1, 2
+"""Beside `run.seed`, the streams of the validation record and of the search."""
+
+SHARES = {True: (0.4, 0.3, 0.3), False: (0.0, 0.5, 0.5)}
+"""Parts of telemetry for training, validation and test, where a training record is needed and where not."""
+GAP = 1.0
+"""Left out between them [s]: the slowest vibrations are forgotten, and more than a window of the paper's."""
+SHORTEST = 1.0
+"""What is left of validation and test after the warm-up, at least [s]."""
+
+LENGTHS = ("gpr_offline.training_size", "gpr_offline.depth")
+"""Settings of which a training record is longer."""
+
+
+@dataclass(frozen=True)
+class Records:
+    """validation : the record that the search sees, training record included
+    test   : a scenario -> the record that it is scored on, once before and once after
+    target : what there is to compare with: "turbulence", "vibration" or PREDICTION
+    """
+
+    validation: Record
+    test: Callable[[Scenario], Record]
+    target: str
+
+
+def stream(scenario: Scenario, purpose: int) -> np.random.Generator:
+    """A random stream of a tuning, independent of those of the scenario's own record."""
+    return np.random.default_rng([scenario.run.seed, purpose])
+
+
+def simulated(scenario: Scenario, space: Space, target: str, duration: float | None, watch: Watch) -> Records:
+    """The records of a scenario; duration: of the validation record [s], that of the scenario unless given.
+
+    Where the search moves the lengths of windows or training set, the training record that it sees is as long as the largest
+    need. Those of the test are as long as `wfsobs run` makes them.
+    """
+    made: dict[tuple[int, int], Record] = {}
+
+    def record_of(s: Scenario) -> Record:
+        key = (s.gpr_offline.training_size, s.gpr_offline.depth)
+        if key not in made:
+            made[key] = simulate(s, watch=watch)
+        return made[key]
+
+    largest = scenario.replace({a.path: int(a.high) for a in space.axes if a.path in LENGTHS})
+    short = scenario if duration is None else scenario.replace({"run.duration": duration})
+    short.validate()
+    validation = simulate(short, stream(scenario, VALIDATION), watch)
+    return Records(replace(validation, training=record_of(largest).training), record_of, target)
+
+
+def cut(record: Record, scenario: Scenario, observer: str, target: str) -> Records:
+    """The pieces of telemetry, and what stands for the truth where the record has none of the target.
+
+    An observer of turbulence and vibration together is judged by its prediction of the next z; one of vibration alone by the
+    zero-phase Butterworth reference of the piece. Raises RecordError for another, and where the record is too short.
+    """
+    if record.truth(target) is None and set(OBSERVERS[observer].targets) == set(TARGETS):
+        target = PREDICTION
+    elif record.truth(target) is None and target != VIBRATION:
+        raise RecordError(f"{observer} estimates turbulence alone, which a record without the truth cannot judge")
+    g = getattr(scenario, observer.replace("-", "_"), None)
+    learns = "training" in OBSERVERS[observer].needs or getattr(g, "inputs_filter", "") == "standardised"
+    cuts = _cuts(record, scenario, learns and record.training is None)
+    training, validation, test = (piece(record, start, stop) for start, stop in cuts)
+    known = record.training or (Training(training.y_lgs, training.u, training.open_loop_y) if learns else None)
+    validation, test = (replace(r, training=known) for r in (validation, test))
+    if target == VIBRATION and record.vibration is None:
+        validation, test = (replace(r, vibration=reference(r, scenario)) for r in (validation, test))
+    return Records(validation, lambda _: test, target)
+
+
+def _cuts(record: Record, scenario: Scenario, learns: bool) -> list[tuple[int, int]]:
+    """(first step, step after the last) of training, validation and test; every piece begins where an NGS frame could."""
+    n, per = record.n_steps, record.ratio or 1
+    gap = round(GAP / record.dt)
+    ends = np.cumsum(SHARES[learns]) * n
+    out, start = [], 0
+    for end in ends:
+        out.append((start, int(end)))
+        start = -(-(int(end) + gap * (end > 0)) // per) * per
+    g = scenario.gpr_offline
+    needed = g.training_size + g.depth + round(TRAINING_MARGIN / record.dt) if learns else 0
+    scored = round((scenario.run.warm_up + SHORTEST) / record.dt)
+    if out[0][1] < needed or min(stop - start for start, stop in out[1:]) < scored:
+        least = max(needed / SHARES[learns][0] if learns else 0, (scored + gap + per) / SHARES[learns][2])
+        raise RecordError(f"the record has {n * record.dt:.1f} s; to tune on it takes {least * record.dt:.1f} s or more")
+    return out
+
+
+def piece(record: Record, start: int, stop: int) -> Record:
+    """Steps start ... stop - 1 as a record of its own, with the same z. `start` must be a multiple of the ratio.
+
+    A record begins with the mirror at rest; so what older commands did is taken off the measurements that still see it.
+    """
+    u = record.u[start:stop]
+    y_ngs = None
+    if record.y_ngs is not None and record.ratio is not None:
+        y_ngs = record.z_ngs[start:stop] + frame_mean(delayed(u, record.delay - 1), record.ratio)
+        y_ngs[:1] = np.nan  # a frame that began before the piece
+
+    def part(x: Array | None) -> Array | None:
+        return None if x is None else x[start:stop]
+
+    return replace(
+        record, y_lgs=record.z[start:stop] + delayed(u, record.delay), u=u, y_ngs=y_ngs, turbulence=part(record.turbulence),
+        vibration=part(record.vibration), open_loop_y=part(record.open_loop_y))
+
+
+def reference(record: Record, scenario: Scenario) -> Array:
+    """The zero-phase Butterworth reference of a record, (n_steps, n_modes) [um], NaN where a measurement is missing."""
+    whole = bridged(record, scenario)
+    twin = whole.z if whole.open_loop_y is None else whole.open_loop_y
+    return np.where(np.isnan(record.z), np.nan, open_loop_reference(scenario, twin, record.dt))

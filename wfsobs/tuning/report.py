@@ -1,0 +1,108 @@
+"""A tuning as a dictionary for machines, as tables for people, and as a TOML file of settings."""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import Any
+
+from rich.table import Table
+
+from wfsobs.configfile import annotated, changes, to_toml
+from wfsobs.scenario import Scenario
+from wfsobs.tables import label_of
+from wfsobs.tuning.judge import Errors
+from wfsobs.tuning.tuning import Stage, Tuned
+
+
+def plain(tuned: Tuned) -> dict[str, Any]:
+    """What `wfsobs tune --json` prints: errors in um, null where the observer failed; likelihoods in nats, null for no GPR."""
+    def stage(s: Stage) -> dict[str, Any]:
+        return {
+            "validation_rms_um": s.validation.rms if s.validation else None, "validation_um": _modes(s.validation),
+            "test_rms_um": s.test.rms if s.test else None, "test_um": _modes(s.test),
+            "log_marginal_likelihood": list(s.likelihood) if s.likelihood else None,
+        }
+
+    return {
+        "observer": tuned.observer, "target": tuned.target, "settings": changes(tuned.scenario, tuned.before.scenario),
+        "start": tuned.start, "before": stage(tuned.before), "after": stage(tuned.after),
+        "evaluations": [
+            {"settings": e.changes, "rms_um": e.errors.rms if e.errors else None, "reason": e.reason or None}
+            for e in tuned.history
+        ],
+    }
+
+
+def _modes(errors: Errors | None) -> dict[str, float] | None:
+    return dict(errors.modes) if errors else None
+
+
+def settings_table(tuned: Tuned) -> Table:
+    """The settings that were searched, and those that were set by hand for it, before and after."""
+    out = Table(title=f"{label_of(tuned.observer)}: settings after {len(tuned.history)} evaluations")
+    out.add_column("Setting", no_wrap=True)
+    for name in ("before", "after"):
+        out.add_column(name, justify="right", no_wrap=True)
+    for path, before, after in settings(tuned):
+        out.add_row(path, before, after)
+    return out
+
+
+def settings(tuned: Tuned) -> list[tuple[str, str, str]]:
+    """(dotted path, before, after) of every setting that was searched or set by hand."""
+    before, after = tuned.before.scenario, tuned.scenario
+    paths = [*changes(after, before), *tuned.start]
+    return [(path, _shown(before, path), _shown(after, path)) for path in dict.fromkeys(paths)]
+
+
+def _shown(scenario: Scenario, path: str) -> str:
+    value = reduce(getattr, path.split("."), scenario)
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def errors_table(tuned: Tuned) -> Table:
+    """Errors on validation and test record, mode by mode and together, and the log marginal likelihoods."""
+    out = Table(title=f"RMS error in {tuned.target}, nm")
+    out.add_column("", no_wrap=True)
+    for name in ("validation, before", "after", "test, before", "after"):
+        out.add_column(name, justify="right", no_wrap=True)
+    stages = (tuned.before, tuned.after)
+    cells = [s.validation for s in stages] + [s.test for s in stages]
+    for mode in next(e for e in cells if e).modes:
+        out.add_row(mode, *(_nm(e.modes[mode]) if e else "fails" for e in cells))
+    out.add_section()
+    out.add_row("rms over modes", *(_nm(e.rms) if e else "fails" for e in cells))
+    return out
+
+
+def _nm(rms: float) -> str:
+    return f"{rms * 1e3:.2f}"
+
+
+def remarks(tuned: Tuned) -> list[str]:
+    """One line on each thing that the tables do not say."""
+    out = []
+    known = [s.likelihood for s in (tuned.before, tuned.after)]
+    if all(known):
+        text = " -> ".join(", ".join(f"{x:.1f}" for x in values) for values in known if values)
+        out.append(f"log marginal likelihood of the training targets (information only), per mode: {text}")
+    if tuned.scenario == tuned.before.scenario:
+        out.append("nothing that was tried is better than the settings as they were")
+    failed = [e for e in tuned.history if not e.errors]
+    if failed:
+        out.append(f"{len(failed)} of {len(tuned.history)} evaluations failed, the last of them: {failed[-1].reason}")
+    return out
+
+
+def toml(tuned: Tuned) -> str:
+    """The tuned scenario as TOML, with what was changed beside its settings."""
+    base = tuned.before.scenario
+    notes = {path: f"tuned, {_shown(base, path)} before" for path in changes(tuned.scenario, base)}
+    head = [f"{label_of(tuned.observer)} tuned for {tuned.target} in {len(tuned.history)} evaluations.",
+            *(f"{name} rms error: {_of(before)} nm before, {_of(after)} nm after" for name, before, after in (
+                ("Validation", tuned.before.validation, tuned.after.validation), ("Test", tuned.before.test, tuned.after.test)))]
+    return "\n".join(f"# {line}" for line in head) + "\n\n" + annotated(to_toml(tuned.scenario), notes)
+
+
+def _of(errors: Errors | None) -> str:
+    return _nm(errors.rms) if errors else "no"

@@ -1,0 +1,203 @@
+"""What of an observer is tuned: which settings, between which numbers, on which scale.
+
+A new observer is one entry in `TUNABLE`. The world (turbulence, vibration, sensors, loop) is not tuned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any, NamedTuple
+
+import numpy as np
+import param
+
+from wfsobs.arrays import Array
+from wfsobs.atmosphere import relative_rms
+from wfsobs.disturbance import vibration_variance
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.kalman import measurement_noise
+from wfsobs.scenario import Scenario
+from wfsobs.settings import SettingError
+from wfsobs.turbulence import turbulence_process
+
+FROM_ZERO = 1e-3
+"""A range that begins at 0 is searched from this part of its end."""
+DIGITS = 6
+"""Digits of a number that is tried, more than matter."""
+
+
+class Tunable(NamedTuple):
+    """The settings of an observer that are tuned unless others are named, and what else it reads that could be."""
+
+    usual: tuple[str, ...]
+    others: tuple[str, ...] = ()
+
+
+_MODEL = ("kalman.frequency", "kalman.damping", "kalman.turbulence_rms", "kalman.vibration_rms")
+_RATES = ("multirate.lgs_noise", "multirate.ngs_noise")
+_OFFLINE, _ONLINE = (
+    tuple(f"{group}.{name}" for name in ("signal_std", "training_size", "highpass")) for group in ("gpr_offline", "gpr_online"))
+
+TUNABLE: dict[str, Tunable] = {
+    # The gain depends on the ratios of turbulence, vibration and noise. Turbulence tuned for vibration would be no turbulence.
+    "kf-lgs": Tunable((*_MODEL[:2], "kalman.vibration_rms"), ("kalman.turbulence_rms", "kalman.lgs_noise")),
+    "kf-multi": Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
+    "kf-ngs": Tunable(("kalman.turbulence_rms", "kalman.vibration_rms"), (*_MODEL[:2], "kalman.ngs_noise")),
+    "kf-adaptive": Tunable(("adaptive.window", "adaptive.interval")),
+    "multirate": Tunable(_RATES, _MODEL),
+    "multirate-optimal": Tunable(_RATES, _MODEL),
+    "butterworth-ol": Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
+    "butterworth-cl": Tunable(("butterworth.bandwidth_online",), ("butterworth.order",)),
+    # The mean depends on sigma_n / sigma_SE and l only: sigma_SE stays.
+    "gpr-offline": Tunable(("gpr_offline.length_scale", "gpr_offline.noise_std", "gpr_offline.depth"),
+                           (*_OFFLINE, "butterworth.bandwidth_offline", "butterworth.order")),
+    "gpr-online": Tunable(("gpr_online.length_scale", "gpr_online.noise_std", "gpr_online.depth"),
+                          (*_ONLINE, "butterworth.bandwidth_online", "butterworth.order")),
+    # The penalty (sigma_n l / sigma_SE)^2 is one number.
+    "ridge": Tunable(("gpr_offline.noise_std", "gpr_offline.depth"),
+                     ("gpr_offline.length_scale", *_OFFLINE, "butterworth.bandwidth_offline", "butterworth.order")),
+    "ridge-30": Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
+    "persistence": Tunable(()),
+    "zero": Tunable(()),
+}
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One setting that is tuned: its dotted path, its range, and whether it takes whole numbers.
+
+    A range above 0 is searched by the logarithm; 0 and 1 are its ends.
+    """
+
+    path: str
+    low: float
+    high: float
+    whole: bool
+
+    def value(self, x: float) -> float:
+        """The number at x, from 0 to 1."""
+        low, high = self._scaled(self.low), self._scaled(self.high)
+        value = low + (high - low) * x
+        value = float(f"{np.exp(value) if self.low > 0 else value:.{DIGITS}g}")
+        return min(max(round(value) if self.whole else value, self.low), self.high)
+
+    def place(self, value: float) -> float:
+        """Where a number is, from 0 to 1; what lies outside is at an end."""
+        low, high = self._scaled(self.low), self._scaled(self.high)
+        inside = self._scaled(min(max(value, self.low), self.high))
+        return (inside - low) / (high - low) if high > low else 0.0
+
+    def _scaled(self, value: float) -> float:
+        return float(np.log(value)) if self.low > 0 else value
+
+
+@dataclass(frozen=True)
+class Space:
+    """The axes, and the settings that go with them: what has to be set by hand so that they count, numbers as they were."""
+
+    axes: tuple[Axis, ...]
+    by_hand: dict[str, Any]
+
+    def changes(self, point: Array) -> dict[str, Any]:
+        """The settings (dotted path -> value) at a point (len(axes),) of the unit cube."""
+        return {**self.by_hand, **{a.path: a.value(float(x)) for a, x in zip(self.axes, point, strict=True)}}
+
+    def values(self, scenario: Scenario) -> dict[str, float]:
+        """Dotted path -> number that a scenario has for every axis."""
+        now = {**numbers(scenario), **self.by_hand}
+        return {a.path: now[a.path] for a in self.axes}
+
+    def start(self, scenario: Scenario) -> Array:
+        """Where a scenario is in the unit cube."""
+        now = self.values(scenario)
+        return np.array([a.place(now[a.path]) for a in self.axes])
+
+
+def numbers(scenario: Scenario) -> dict[str, float]:
+    """Dotted path -> value of every setting that is one number."""
+    return {path: _value(scenario, path) for path, _, p in scenario.walk() if isinstance(p, param.Number)}
+
+
+def space(scenario: Scenario, observer: str, names: Sequence[str] | None = None) -> Space:
+    """What is searched for an observer: its usual settings, or those named.
+
+    A range is that of the sliders (soft bounds), wide enough for the scenario's own number.
+    Raises SettingError for a name that is no setting, is not one number, or is not read by the observer.
+    """
+    if observer not in OBSERVERS:
+        raise SettingError(f"observer {observer!r}: no such observer; there are {', '.join(OBSERVERS)}")
+    known = TUNABLE.get(observer, Tunable(()))
+    if not known.usual:
+        raise SettingError(f"observer {observer!r}: has no settings to tune")
+    chosen = tuple(known.usual if names is None else names)
+    if not chosen:
+        raise SettingError("names: needs one setting at least")
+    for i, path in enumerate(chosen):
+        _check(scenario, observer, path)
+        if path in chosen[:i]:
+            raise SettingError(f"{path}: is given twice")
+    by_hand = {}
+    for switch, (paths, matched) in BY_HAND.items():
+        if set(paths) & set(chosen) and _value(scenario, switch) == "matched":
+            by_hand |= {switch: "manual", **{p: _allowed(scenario, p, v) for p, v in zip(paths, matched(scenario), strict=True)}}
+    values = {**numbers(scenario), **by_hand}
+    return Space(tuple(_axis(scenario, path, values[path]) for path in chosen), by_hand)
+
+
+def _check(scenario: Scenario, observer: str, path: str) -> None:
+    usual, others = TUNABLE[observer]
+    settings = {known: p for known, _, p in scenario.walk()}
+    if path not in settings:
+        raise SettingError(f"{path}: no such setting")
+    if not isinstance(settings[path], param.Number):
+        raise SettingError(f"{path}: is not one number, which is what can be tuned")
+    if path not in (*usual, *others):
+        raise SettingError(f"{path}: not a setting of {observer} that can be tuned; there are {', '.join((*usual, *others))}")
+    group, _, name = path.rpartition(".")
+    if name == "highpass" and (way := _value(scenario, f"{group}.inputs_filter")) != "high-pass":
+        raise SettingError(f"{path}: is not read while {group}.inputs_filter = {way}")
+
+
+def _value(group: Any, path: str) -> Any:
+    """The value of a setting, or of an item of a list, by its dotted path."""
+    return reduce(lambda node, key: node[int(key)] if isinstance(node, list) else getattr(node, key), path.split("."), group)
+
+
+def _parameter(scenario: Scenario, path: str) -> param.Number:
+    return next(p for known, _, p in scenario.walk() if known == path)  # type: ignore[return-value]
+
+
+def _limits(bounds: tuple[Any, Any] | None) -> tuple[float, float]:
+    """Bounds as numbers: every setting that is one has both."""
+    assert bounds is not None
+    return float(bounds[0]), float(bounds[1])
+
+
+def _allowed(scenario: Scenario, path: str, value: float) -> float:
+    low, high = _limits(_parameter(scenario, path).bounds)
+    return min(max(float(f"{value:.{DIGITS}g}"), low), high)
+
+
+def _axis(scenario: Scenario, path: str, start: float) -> Axis:
+    p = _parameter(scenario, path)
+    low, high = _limits(p.get_soft_bounds())
+    if low == 0:
+        low = FROM_ZERO * high
+    return Axis(path, min(low, start) if start > 0 else low, max(high, start), isinstance(p, param.Integer))
+
+
+def _process(scenario: Scenario) -> tuple[float, float]:
+    """Strength of turbulence and of vibration in tip and tilt that "matched" gives, rms [um]."""
+    tip_tilt = [i for i, mode in enumerate(scenario.modes) if mode.radial_order == 1]
+    variance = np.mean([vibration_variance(scenario, mode) for mode in tip_tilt])
+    return turbulence_process(scenario, 0, scenario.dt).rms / relative_rms(scenario, 0), float(np.sqrt(variance))
+
+
+BY_HAND: dict[str, tuple[tuple[str, str], Callable[[Scenario], tuple[float, float]]]] = {
+    "kalman.process_noise": (("kalman.turbulence_rms", "kalman.vibration_rms"), _process),
+    "kalman.measurement_noise": (("kalman.lgs_noise", "kalman.ngs_noise"), measurement_noise),
+    "multirate.measurement_noise": (_RATES, measurement_noise),  # type: ignore[dict-item]
+}
+"""Settings that say "matched", the two numbers that count instead once they say "manual", and what those are until then."""

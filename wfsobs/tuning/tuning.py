@@ -1,0 +1,184 @@
+"""Tuning: the settings of an observer that are best on a record which is neither the training nor the test record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from math import inf, isfinite
+from typing import Any
+
+from wfsobs.arrays import Array
+from wfsobs.pipeline import as_stated
+from wfsobs.record import Record, RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.settings import SettingError
+from wfsobs.tuning.judge import Errors, Judge, target_of
+from wfsobs.tuning.likelihood import likelihood
+from wfsobs.tuning.records import DESIGN, Records, cut, simulated, stream
+from wfsobs.tuning.search import Spent, search
+from wfsobs.tuning.space import Space, space
+from wfsobs.watch import QUIET, Watch
+
+EVALUATIONS = 40
+LEARNING = 0.25
+"""Part of the validation record that counts for nothing, so that slow starters are compared with others on the same steps."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Settings that were tried on the validation record.
+
+    changes : dotted path -> value, on top of the scenario; nothing for the scenario itself
+    errors  : per mode, or None where the observer failed, with the reason in one line
+    """
+
+    changes: dict[str, Any]
+    errors: Errors | None
+    reason: str = ""
+
+    @property
+    def rms(self) -> float:
+        """What is made as small as possible [um]: root of the mean square over the modes, infinite for a failure."""
+        return self.errors.rms if self.errors else inf
+
+
+@dataclass(frozen=True)
+class Stage:
+    """An observer before or after tuning: its errors on validation and on test record, None where it fails; for a GPR, the
+    log marginal likelihood of its training targets, a number per mode."""
+
+    scenario: Scenario
+    validation: Errors | None
+    test: Errors | None
+    likelihood: tuple[float, ...] | None
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What a tuning gives.
+
+    target  : what the errors are those of: "turbulence", "vibration", or "next z" where there is no truth
+    start   : dotted path -> number before, of the settings that were searched; of matched ones what "matched" stands for
+    history : every evaluation in its order, the scenario as it was first
+    """
+
+    observer: str
+    target: str
+    start: dict[str, float]
+    before: Stage
+    after: Stage
+    history: tuple[Evaluation, ...]
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario with the tuned settings: the one before where nothing was better."""
+        return self.after.scenario
+
+    @property
+    def best(self) -> Evaluation:
+        """The evaluation with the smallest error, the earliest of equals."""
+        return min(self.history, key=lambda e: e.rms)
+
+
+def tune(
+    scenario: Scenario, observer: str, names: Sequence[str] | None = None, evaluations: int = EVALUATIONS, watch: Watch = QUIET,
+    record: Record | None = None, *, target: str | None = None, validation: float | None = None,
+    told: Callable[[Evaluation], None] | None = None,
+) -> Tuned:
+    """Search for the settings of an observer with the least error on a validation record; the test record is scored after that.
+
+    names       : dotted paths of the settings, the observer's usual ones unless given
+    evaluations : runs of the observer on the validation record, at most; settings that come up again cost none
+    record      : telemetry, cut into pieces (`records.cut`); else the records are simulated
+    target      : of an observer that has both, "vibration" unless given
+    validation  : length of the simulated validation record [s], that of the scenario unless given
+    told        : given every evaluation as it is done; what stays of a tuning that is cancelled
+    Raises SettingError, RecordError where the observer has no estimate whatever its settings, Cancelled.
+    """
+    if evaluations < 1:
+        raise SettingError(f"evaluations = {evaluations}: takes a whole number from 1")
+    if record is not None:
+        scenario = as_stated(record, scenario)
+    scenario.validate()
+    searched, target = space(scenario, observer, names), target_of(observer, target)
+    if record is None:
+        records = simulated(scenario, searched, target, validation, watch)
+    else:
+        records = cut(record, scenario, observer, target)
+    trials = _Trials(scenario, searched, records, Judge(observer, records.target), evaluations, watch, told)
+    trials.run({})
+    search(trials.at, searched.start(scenario), evaluations, stream(scenario, DESIGN))
+    first, best = trials.history[0], min(trials.history, key=lambda e: e.rms)
+    if not isfinite(best.rms):
+        raise RecordError(first.reason)
+    before, after = (trials.stage(e) for e in (first, best))
+    watch.step(1.0)
+    return Tuned(observer, records.target, searched.values(scenario), before, after, tuple(trials.history))
+
+
+@dataclass
+class _Trials:
+    """Runs of the observer on the validation record, each once."""
+
+    scenario: Scenario
+    space: Space
+    records: Records
+    judge: Judge
+    most: int
+    watch: Watch
+    told: Callable[[Evaluation], None] | None
+    history: list[Evaluation] = field(default_factory=list)
+    known: dict[tuple[Any, ...], float] = field(default_factory=dict)
+    warm_up: float = 0.0
+
+    def at(self, point: Array) -> float:
+        """The error at a point of the unit cube. Raises Spent where that takes one evaluation too many, Cancelled."""
+        changes = self.space.changes(point)
+        key = tuple(changes.values())
+        if not self.space.by_hand and changes == self.space.values(self.scenario):
+            self.known[key] = self.history[0].rms  # the scenario itself
+        if key not in self.known:
+            if len(self.history) >= self.most:
+                raise Spent
+            self.known[key] = self.run(changes).rms
+        return self.known[key]
+
+    def run(self, changes: dict[str, Any]) -> Evaluation:
+        """One evaluation; the first sets where the scores begin. Raises Cancelled."""
+        errors, reason = None, ""
+        try:
+            errors = self._errors(self.scenario.replace(changes))
+        except ValueError as error:
+            reason = str(error)
+        done = Evaluation(changes, errors, reason)
+        self.history.append(done)
+        if self.told:
+            self.told(done)
+        return done
+
+    def _errors(self, scenario: Scenario) -> Errors:
+        record = self.records.validation
+        estimates = self.judge.estimates(record, scenario, self._inner())
+        begins = self.judge.begins(estimates) * record.dt
+        if not self.history:
+            self.warm_up = max(self.scenario.run.warm_up, LEARNING * record.n_steps * record.dt, begins)
+        if begins > self.warm_up:
+            raise RecordError(
+                f"{self.judge.observer} has its first estimate after {begins:g} s; the scores begin at {self.warm_up:g} s")
+        return self.judge.errors(record, scenario, estimates, self.warm_up)
+
+    def stage(self, evaluation: Evaluation) -> Stage:
+        """The scenario of an evaluation on the test record."""
+        scenario = self.scenario.replace(evaluation.changes)
+        record, errors = self.records.test(scenario), None
+        try:
+            estimates = self.judge.estimates(record, scenario, self._inner())
+            errors = self.judge.errors(record, scenario, estimates, scenario.run.warm_up)
+        except ValueError:
+            pass  # of the scenario as it was: the reason is in the history
+        return Stage(scenario, evaluation.errors, errors, likelihood(self.judge.observer, record, scenario, self.watch))
+
+    def _inner(self) -> Watch:
+        """The part of the progress that one run is."""
+        done, all_of_it = len(self.history), self.most + 2
+        return Watch(lambda f: self.watch.progress((done + f) / all_of_it), self.watch.cancelled)
