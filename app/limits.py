@@ -53,6 +53,11 @@ class Limits:
         _whole(run_seconds(scenario), self.seconds, "s")
         _whole(run_bytes(scenario) / 1e6, self.megabytes, "MB of memory")
 
+    def check_seconds(self, seconds: float, what: str) -> None:
+        """Raises SettingError where something beside the runs would take longer than a run may."""
+        if seconds > self.seconds:
+            raise SettingError(f"The {what} would take about {seconds:.0f} s, at most {self.seconds:g} on this server")
+
     def check_steps(self, n_steps: int) -> None:
         """Raises SettingError where a loaded record is longer than the server allows."""
         if n_steps > self.steps:

@@ -32,6 +32,10 @@ Post = Callable[[Callable[[], None]], None]
 
 IDLE, RUNNING, DONE, CANCELLED, FAILED = "idle", "running", "done", "cancelled", "failed"
 
+THREADS = 6
+"""Of a session: what has been told to stop may take a while to hear it, beside a run, a closed loop, an identification and a
+tuning. None is made before it is needed."""
+
 
 class Run(param.Parameterized):
     """The state machine of the one computation of a session.
@@ -49,7 +53,7 @@ class Run(param.Parameterized):
     def __init__(self, post: Post, work: Compute = compute):
         super().__init__()
         self._post, self._compute = post, work
-        self._pool = ThreadPoolExecutor(2, thread_name_prefix="wfsobs-run", initializer=step_back)
+        self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="wfsobs-run", initializer=step_back)
         self._lock = threading.Lock()
         self._generation = 0
         self._cancel = threading.Event()

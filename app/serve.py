@@ -142,7 +142,7 @@ def new_page(service: Service) -> Any:
     except Full as error:
         return pn.pane.HTML(full_html(str(error)), margin=40)
     pn.state.on_session_destroyed(lambda _context: visit.leave())
-    return page(lambda post: Dashboard(post, work=visit.compute, check=service.limits.check, held=service.held))
+    return page(lambda post: Dashboard(post, work=visit.compute, limits=service.limits, held=service.held))
 
 
 def make_server(options: Options, service: Service) -> Server:

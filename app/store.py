@@ -10,7 +10,7 @@ from typing import Any
 
 import param
 
-from wfsobs.app.limits import NONE
+from wfsobs.app.limits import NONE, Limits
 from wfsobs.app.run import Compute, Post, Run
 from wfsobs.app.work import compute
 from wfsobs.configfile import pristine
@@ -42,11 +42,11 @@ class Store(param.Parameterized):
 
     def __init__(
         self, post: Post, scenario: Scenario | None = None, work: Compute = compute,
-        check: Callable[[Scenario], None] = NONE.check, held: Callable[[Scenario], bool] = lambda _: False,
+        limits: Limits = NONE, held: Callable[[Scenario], bool] = lambda _: False,
     ):
-        """Check raises SettingError where a scenario is not allowed; held says whether its results are there already."""
+        """Limits are those on what a scenario may ask for; held says whether its results are there already."""
         super().__init__(scenario=scenario or PRESETS[next(iter(PRESETS))]())
-        self._check, self._held = check, held
+        self.limits, self._held = limits, held
         self._refused: dict[str, Any] = {}
         self._past: list[Step] = []
         self._future: list[Step] = []
@@ -110,7 +110,7 @@ class Store(param.Parameterized):
     def validate(self, scenario: Scenario) -> None:
         """Raises SettingError where settings do not go together, or are more than is allowed here."""
         scenario.validate()
-        self._check(scenario)
+        self.limits.check(scenario)
 
     def load(self, scenario: Scenario, preset: str | None = None) -> None:
         """Replace every setting and run. Raises SettingError where they do not go together.

@@ -3,7 +3,7 @@
 export function render({model, el}) {
   const bar = document.createElement("progress")
   bar.max = 1
-  bar.setAttribute("aria-label", "Progress of the run")
+  bar.setAttribute("aria-label", model.label)
   const line = document.createElement("div")
   line.className = "line"
   line.setAttribute("role", "status")

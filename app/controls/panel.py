@@ -32,6 +32,7 @@ class Status(JSComponent):
     progress = param.Number(0.0, doc="Fraction done.")
     text = param.String("", doc="The state, in words.")
     note = param.String("", doc="What was refused.")
+    label = param.String("Progress of the run", doc="What the bar is the progress of.")
 
     _esm = asset("status.js")
     _stylesheets = [asset("status.css")]  # noqa: RUF012

@@ -6,14 +6,14 @@ from html import escape
 from typing import Any
 
 import panel as pn
-from bokeh.plotting import figure
 
 from wfsobs.app.display import NOTHING, Display, number, per_micrometre
 from wfsobs.app.loop_work import LoopRun, LoopShown, seconds
 from wfsobs.app.pages.loop_figures import Nyquist, Response, Spectrum, Trace
 from wfsobs.app.pages.loop_table import margins_html, table_html
+from wfsobs.app.pages.parts import WIDE, box, captioned, html, text
 from wfsobs.app.run import RUNNING, Run
-from wfsobs.app.style import asset, look
+from wfsobs.app.style import look
 from wfsobs.app.views.strip import Cards
 from wfsobs.control.controllers import CONTROLLERS
 
@@ -41,9 +41,7 @@ class ClosedLoopPage:
         self.work = LoopRun(run, self._land)
         self.shown: LoopShown | None = None
         self.visible, self._of = False, object()
-        sheet: Any = {"sizing_mode": "stretch_width", "margin": 0, "stylesheets": [asset("style.css")]}
-        self.note = pn.pane.HTML("", **sheet)
-        self.table, self.margins = pn.pane.HTML("", **sheet), pn.pane.HTML("", **sheet)
+        self.note, self.table, self.margins = html(), html(), html()
         self.cards = Cards(items=[], hidden=[], sizing_mode="stretch_width", margin=0)
         self.whole, self.zoomed = Trace("whole record"), Trace("zoomed")
         self.spectrum, self.response, self.nyquist = Spectrum(), Response(), Nyquist()
@@ -55,21 +53,19 @@ class ClosedLoopPage:
 
     def view(self) -> pn.Column:
         """What is shown."""
-        wide: Any = {"sizing_mode": "stretch_width", "margin": 0}
-        box = [asset("box.css")]
         figures = pn.Column(
-            *(_captioned(text, drawn.figure) for text, drawn in (
+            *(captioned(title, drawn.figure) for title, drawn in (
                 ("Residual, whole record", self.whole), ("Spectrum of the residual", self.spectrum),
                 ("Residual, zoomed", self.zoomed), ("Rejection and noise transfer", self.response))),
-            **wide, stylesheets=[GRID])
+            **WIDE, stylesheets=[GRID])
         stability = pn.Column(
-            _captioned("Loop gain L, unit circle", self.nyquist.figure), pn.Column(_text(ABOUT), self.margins, **wide),
-            **wide, stylesheets=[GRID])
+            captioned("Loop gain L, unit circle", self.nyquist.figure), pn.Column(text(ABOUT), self.margins, **WIDE),
+            **WIDE, stylesheets=[GRID])
         return pn.Column(
-            pn.Column(_heading("Residual in closed loop"), _text(INTRO), self.note, self.cards, figures, **wide, stylesheets=box),
-            pn.Column(_heading("Controllers"), self.table, **wide, stylesheets=box),
-            pn.Column(_heading("Stability"), stability, **wide, stylesheets=box),
-            **wide, stylesheets=[":host { gap: 10px; }"])
+            box("Residual in closed loop", text(INTRO), self.note, self.cards, figures),
+            box("Controllers", self.table),
+            box("Stability", stability),
+            **WIDE, stylesheets=[":host { gap: 10px; }"])
 
     def show(self, visible: bool) -> None:
         """Compute what has changed meanwhile, and go on while visible."""
@@ -93,8 +89,8 @@ class ClosedLoopPage:
     def _land(self, shown: LoopShown | None, reason: str) -> None:
         self.shown = shown
         with pn.io.hold():
-            text = "" if shown and shown.done else "computing …" if shown else f"No closed loop: {reason}"
-            self.note.object = f'<p class="text" role="status">{escape(text)}</p>' if text else ""
+            said = "" if shown and shown.done else "computing …" if shown else f"No closed loop: {reason}"
+            self.note.object = f'<p class="text" role="status">{escape(said)}</p>' if said else ""
             self._redraw()
 
     def _redraw(self, *_: object) -> None:
@@ -142,19 +138,3 @@ class ClosedLoopPage:
                 "name": name, "label": it.label, "colour": it.colour(self.display.dark), "dash": list(it.dash),
                 "note": note, "value": value, "unit": unit})
         return out
-
-
-def _heading(title: str) -> pn.pane.HTML:
-    return pn.pane.HTML(f'<h2 class="title">{escape(title)}</h2>', margin=0, stylesheets=[asset("style.css")])
-
-
-def _text(text: str) -> pn.pane.HTML:
-    return pn.pane.HTML(
-        f'<p class="text">{escape(text)}</p>', sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
-
-
-def _captioned(text: str, fig: figure) -> pn.Column:
-    fig.name = text
-    caption = pn.pane.HTML(f'<div class="caption">{escape(text)}</div>', margin=(8, 0, 0, 0), stylesheets=[asset("style.css")])
-    return pn.Column(
-        caption, pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), sizing_mode="stretch_width", margin=0)

@@ -13,12 +13,13 @@ import param
 from wfsobs.app.display import Display
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.figures import Figures
+from wfsobs.app.pages.identify import IdentifyPage
 from wfsobs.app.pages.model import Model
 from wfsobs.app.store import Store
 
-EXPLORE, LOOP, FIGURES, MODEL = "explore", "loop", "figures", "model"
+EXPLORE, IDENTIFY, LOOP, FIGURES, MODEL = "explore", "identify", "loop", "figures", "model"
 TITLES: Mapping[str, str] = MappingProxyType(
-    {"Explore": EXPLORE, "Closed loop": LOOP, "Paper figures": FIGURES, "Model": MODEL})
+    {"Explore": EXPLORE, "Identify": IDENTIFY, "Closed loop": LOOP, "Paper figures": FIGURES, "Model": MODEL})
 
 
 class Page(Protocol):
@@ -39,6 +40,7 @@ class Pages(param.Parameterized):
     def __init__(self, explore: Any, store: Store, display: Display):
         super().__init__()
         self._makers: dict[str, Callable[[], Page]] = {
+            IDENTIFY: lambda: IdentifyPage(store, display),
             LOOP: lambda: ClosedLoopPage(store.run, display), FIGURES: lambda: Figures(store.run, display),
             MODEL: lambda: Model(store, display)}
         self.made: dict[str, Page] = {}

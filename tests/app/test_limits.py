@@ -85,7 +85,7 @@ def test_a_loaded_record_is_bounded() -> None:
 
 @pytest.fixture
 def store(loop: Any, short: Scenario) -> Store:
-    store = Store(loop.queue.put, short, check=Limits(duration=30).check)
+    store = Store(loop.queue.put, short, limits=Limits(duration=30))
     loop.closing.append(store)
     return store
 
@@ -99,7 +99,7 @@ def test_a_field_says_it_and_the_settings_stand(store: Store) -> None:
 
 
 def test_a_link_and_a_file_say_it(loop: Any, short: Scenario) -> None:
-    dashboard = Dashboard(loop.queue.put, short, check=Limits(duration=30).check)
+    dashboard = Dashboard(loop.queue.put, short, limits=Limits(duration=30))
     loop.closing.append(dashboard)
     actions = dashboard.actions
     actions.open_link("?run.duration=31&turbulence.wind_speed=20")

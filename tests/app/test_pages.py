@@ -51,17 +51,21 @@ def words(html: str) -> str:
     return checker.words
 
 
+def seen(dashboard: Dashboard) -> list[str]:
+    return [name for name, room in dashboard.pages.rooms.items() if room.visible]
+
+
 class TestPages:
     def test_nothing_is_made_before_it_is_opened(self, dashboard: Dashboard) -> None:
         assert dashboard.pages.made == {}
-        assert [room.visible for room in dashboard.pages.rooms.values()] == [True, False, False, False]
+        assert seen(dashboard) == [EXPLORE]
 
     def test_turning(self, dashboard: Dashboard) -> None:
         first = opened(dashboard, FIGURES)
-        assert [room.visible for room in dashboard.pages.rooms.values()] == [False, False, True, False]
+        assert seen(dashboard) == [FIGURES]
         assert not dashboard.pages.rooms[MODEL].objects
         dashboard.pages.current = EXPLORE
-        assert [room.visible for room in dashboard.pages.rooms.values()] == [True, False, False, False]
+        assert seen(dashboard) == [EXPLORE]
         assert opened(dashboard, FIGURES) is first
 
     def test_a_hidden_page_rests(self, dashboard: Dashboard, loop: Any) -> None:

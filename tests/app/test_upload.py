@@ -167,7 +167,7 @@ def test_on_a_server_with_limits(loop: Any, short: Scenario) -> None:
         boards = []
         for seed in (1, 2):
             visit = service.enter()
-            board = Dashboard(loop.queue.put, short, work=visit.compute, check=service.limits.check, held=service.held)
+            board = Dashboard(loop.queue.put, short, work=visit.compute, limits=service.limits, held=service.held)
             loop.closing.append(board)
             record = simulate(short.replace({"run.seed": seed}))
             previewed(board, loop, file_of(short, y_lgs=record.y_lgs[:750]), "same.csv")

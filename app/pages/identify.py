@@ -1,0 +1,152 @@
+"""The model of the record shown: its spectrum, the numbers of what is in it, and whether anything is left."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import panel as pn
+import panel_material_ui as pmui
+
+from wfsobs.app.beside import Beside
+from wfsobs.app.controls.fields import parsed
+from wfsobs.app.display import Display
+from wfsobs.app.identify_work import Measured, compute, fit, measured, same, seconds
+from wfsobs.app.pages.identify_figure import NAMES, SpectrumFigure
+from wfsobs.app.pages.identify_table import table_html, verdict_html
+from wfsobs.app.pages.parts import WIDE, Starter, box, html, legend, text
+from wfsobs.app.run import RUNNING
+from wfsobs.app.store import Store
+from wfsobs.app.work import Shown
+from wfsobs.identify import Identified
+from wfsobs.identify.identification import LEVEL
+from wfsobs.identify.search import LOWEST
+from wfsobs.record import Record, RecordError
+from wfsobs.settings import SettingError
+
+INTRO = (
+    "From the pseudo-open-loop measurement z of the record shown, simulated or loaded: white noise, turbulence as AR(2), then "
+    "vibration peaks one at a time until nothing is left that the tests see. “Use it” takes the model into the settings; a "
+    "loaded record stays, and the observers then run on it with this model.")
+ABOUT = (
+    "± is one standard deviation. What is left is called white where, in a mode, two tests of level 1 % pass and no candidate "
+    "remains unexplained: Bartlett's on the cumulated ratio of the measured to the fitted spectrum, and Ljung and Box's on the "
+    "innovations of the Kalman filter that the model gives. p is how likely white noise is to look less white than what is left.")
+EARLIER = "This model is of an earlier record than the one shown now."
+ROW = """
+:host { display: flex !important; flex-wrap: wrap; gap: 14px 10px; align-items: center; padding: 10px 0 4px; }
+:host > * { flex: 0 0 auto; }
+"""
+
+
+class IdentifyPage:
+    """The page. The measured spectrum follows the results shown while it is visible; the model comes when asked for."""
+
+    def __init__(self, store: Store, display: Display):
+        self.store, self.run, self.display = store, store.run, display
+        self.work = Beside(store.run, store.limits.seconds)
+        self.starter = Starter(self.work, "Identify the record", "Progress of the identification")
+        self.level, self.lowest = _number("Level", LEVEL), _number("Lowest peak [Hz]", LOWEST)
+        self.figure = SpectrumFigure()
+        self.legend, self.table, self.verdict, self.note = html(), html(), html(), html()
+        self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
+        self.of: Measured | None = None
+        self.visible, self._measuring = False, object()
+        self.starter.start.on_click(lambda _event: self.start())
+        self.starter.use.on_click(lambda _event: self.use())
+        self.work.param.watch(self._done, "result")
+        self.run.param.watch(self._follow, ["shown", "state"])
+        display.param.watch(self._redraw, ["mode", "unit", "dark"])
+
+    def view(self) -> pn.Column:
+        """What is shown."""
+        row = pn.Row(*self.starter.view(), self.level, self.lowest, **WIDE, stylesheets=[ROW])
+        return pn.Column(
+            box("Identification", text(INTRO), row, self.starter.status, self.stale, self.verdict),
+            box("Spectrum", self.legend, self.note, pn.pane.Bokeh(self.figure.figure, **WIDE)),
+            box("Model", self.table, text(ABOUT)), **WIDE, stylesheets=[":host { gap: 10px; }"])
+
+    def show(self, visible: bool) -> None:
+        """Draw what has changed meanwhile, and go on while visible."""
+        self.visible = visible
+        self._follow()
+
+    def start(self) -> None:
+        """Identify the record shown."""
+        of = self.run.shown
+        if of is None:
+            self.work.refuse("There is no record yet.")
+            return
+        try:
+            level, lowest = _read(self.level, 1e-9, 0.5), _read(self.lowest, 1e-3, 1e4)
+            self.store.limits.check_seconds(seconds(of.result.record), "identification")
+        except SettingError as error:
+            self.work.refuse(str(error))
+        else:
+            self.work.start(lambda watch, _tell: compute(of, level, lowest, watch))
+
+    def use(self) -> None:
+        """Take the model into the settings."""
+        if self.work.result is not None:
+            result, _ = self.work.result
+            try:
+                self.store.load(result.scenario(self.store.scenario))
+            except SettingError as error:
+                self.work.refuse(str(error))
+
+    def _follow(self, *_: object) -> None:
+        """Measure the record shown, once its run is over."""
+        of = self.run.shown
+        if not self.visible or of is None or self.run.state == RUNNING or of is self._measuring:
+            return
+        self._measuring = of
+        self.run.aside(partial(self._measure, of))
+
+    def _measure(self, of: Shown) -> None:
+        """In a thread of the pool."""
+        try:
+            found: Measured | str = measured(of)
+        except RecordError as error:
+            found = str(error)
+        self.run.post(lambda: self._land(of, found))
+
+    def _land(self, of: Shown, found: Measured | str) -> None:
+        if of is self._measuring:
+            self.of = None if isinstance(found, str) else found
+            self.note.object = f'<p class="failure">No spectrum: {found}</p>' if isinstance(found, str) else ""
+            self._redraw()
+
+    def _done(self, *_: object) -> None:
+        self._redraw()
+
+    def _identified(self) -> tuple[Identified, Record] | tuple[None, None]:
+        """The model, and the record that it is of."""
+        return self.work.result or (None, None)
+
+    def _redraw(self, *_: object) -> None:
+        of, shown = self.of, self.run.shown
+        if not self.visible or of is None or shown is None or self.display.column >= of.mean.shape[1]:
+            return
+        diameter, column = shown.scenario.telescope.diameter, self.display.column
+        result, record = self._identified()
+        mode = result.modes[column] if result and column < len(result.modes) else None
+        with pn.io.hold():
+            self.legend.object = legend(NAMES, self.display.dark)
+            self.figure.draw_measured(of, self.display, diameter)
+            self.figure.draw_fit(mode, fit(mode, result) if mode and result else None, self.display, diameter)
+            self.figure.restyle(self.display.dark)
+            if result and record:
+                self.verdict.object = verdict_html(result)
+                self.table.object = table_html(mode, self.display, diameter) if mode else ""
+                self.stale.visible = not same(record, of.record)
+
+
+def _number(label: str, value: float) -> pmui.TextInput:
+    return pmui.TextInput(label=label, value=f"{value:g}", size="small", width=120, margin=0)
+
+
+def _read(field: pmui.TextInput, low: float, high: float) -> float:
+    """What was typed. Raises SettingError."""
+    value = parsed(str(field.value))
+    if isinstance(value, str) or not low <= value <= high:
+        raise SettingError(f"{field.label} = {str(field.value)[:40]!r}: takes a number from {low:g} to {high:g}")
+    return float(value)

@@ -1,0 +1,77 @@
+"""What the pages are put together from: headings, texts, figures with captions, the line of something long that is under way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from html import escape
+from types import MappingProxyType
+from typing import Any
+
+import panel as pn
+import panel_material_ui as pmui
+from bokeh.plotting import figure
+
+from wfsobs.app.beside import Beside
+from wfsobs.app.controls.panel import Status
+from wfsobs.app.run import CANCELLED, DONE, RUNNING
+from wfsobs.app.style import asset, swatch
+
+WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
+
+
+def heading(title: str) -> pn.pane.HTML:
+    """The title of a box."""
+    return pn.pane.HTML(f'<h2 class="title">{escape(title)}</h2>', margin=0, stylesheets=[asset("style.css")])
+
+
+def html(content: str = "") -> pn.pane.HTML:
+    """HTML in the page's style."""
+    return pn.pane.HTML(content, **WIDE, stylesheets=[asset("style.css")])
+
+
+def text(content: str) -> pn.pane.HTML:
+    """A paragraph."""
+    return html(f'<p class="text">{escape(content)}</p>')
+
+
+def box(title: str, *content: Any) -> pn.Column:
+    """A part of a page under its title."""
+    return pn.Column(heading(title), *content, **WIDE, stylesheets=[asset("box.css")])
+
+
+def captioned(title: str, fig: figure) -> pn.Column:
+    """A figure under its caption."""
+    fig.name = title
+    caption = pn.pane.HTML(f'<div class="caption">{escape(title)}</div>', margin=(8, 0, 0, 0), stylesheets=[asset("style.css")])
+    return pn.Column(caption, pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), **WIDE)
+
+
+def legend(names: Mapping[str, str], dark: bool) -> str:
+    """Swatches of lines, name -> what it is called."""
+    marks = "".join(f'<span class="mark">{swatch(name, dark)}{escape(called)}</span>' for name, called in names.items())
+    return f'<div class="caption legend">{marks}</div>'
+
+
+class Starter:
+    """The buttons that start, cancel and use something long, and the line on how it is going."""
+
+    def __init__(self, work: Beside, start: str, label: str):
+        self.work = work
+        self.start = pmui.Button(label=start, icon="play_arrow", color="primary", size="small", margin=0)
+        self.cancel = pmui.Button(label="Stop", icon="stop", variant="outlined", size="small", margin=0, disabled=True)
+        self.use = pmui.Button(label="Use it", icon="check", variant="outlined", size="small", margin=0, disabled=True)
+        self.status = Status(label=label, sizing_mode="stretch_width", margin=(4, 0), visible=False)
+        self.cancel.on_click(lambda _event: work.cancel())
+        work.param.watch(self.refresh, ["state", "progress", "message", "result"])
+
+    def view(self) -> list[Any]:
+        """The row of buttons; the line is `status`."""
+        return [self.start, self.cancel, self.use]
+
+    def refresh(self, *_: object) -> None:
+        """What may be pressed, and how it is going."""
+        work = self.work
+        running = work.state == RUNNING
+        said = {RUNNING: f"Computing, {int(100 * work.progress)} %", CANCELLED: "Stopped", DONE: "Finished"}.get(work.state, "")
+        self.cancel.disabled, self.use.disabled = not running, running or work.result is None
+        self.status.param.update(progress=work.progress, text=said, note=work.message, visible=True)

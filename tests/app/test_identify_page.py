@@ -1,0 +1,209 @@
+"""The page of the identification: true to the core, beside the page, within limits; and what is done beside a run at all."""
+
+from __future__ import annotations
+
+import io
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app.beside import Beside
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.display import per_micrometre
+from wfsobs.app.identify_work import same, seconds
+from wfsobs.app.limits import PUBLIC, Limits
+from wfsobs.app.pages.identify import IdentifyPage
+from wfsobs.app.pages.pages import IDENTIFY
+from wfsobs.app.run import CANCELLED, DONE, FAILED, RUNNING
+from wfsobs.app.store import Store
+from wfsobs.app.upload import Loaded
+from wfsobs.formats import format_of
+from wfsobs.identify import Identified, identify
+from wfsobs.identify.process import Number
+from wfsobs.identify.report import verdict, written
+from wfsobs.loop import simulate
+from wfsobs.scenario import Scenario
+from wfsobs.telemetry import read_record, record_arrays
+from wfsobs.watch import Watch
+
+LINE = 25.0
+"""A pure line of 50 nm in tip [Hz]; the warm-up of the figures plays no part in it."""
+
+
+@pytest.fixture
+def short(short: Scenario) -> Scenario:
+    """Turbulence, noise and one line."""
+    peak = {"frequency": LINE, "damping": 0.0, "rms": [0.05, 0.0]}
+    return short.replace({"vibration.source": "peaks", "vibration.peaks": [peak]})
+
+
+@pytest.fixture
+def page(dashboard: Dashboard, loop: Any) -> IdentifyPage:
+    """The page, the record measured."""
+    dashboard.pages.current = IDENTIFY
+    page = dashboard.pages.made[IDENTIFY]
+    assert isinstance(page, IdentifyPage)
+    loop.until(lambda: page.of is not None)
+    return page
+
+
+def identified(page: IdentifyPage, loop: Any) -> Identified:
+    """What the page found, once it has."""
+    page.starter.start.param.trigger("clicks")
+    assert page.work.state == RUNNING and not page.starter.cancel.disabled
+    loop.until(lambda: page.work.state != RUNNING)
+    assert page.work.state == DONE, page.work.message
+    return page.work.result[0]
+
+
+def test_it_shows_what_the_core_finds(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> None:
+    of = dashboard.store.run.shown
+    assert of is not None and page.of is not None and not len(page.figure.total.data["x"]) and page.starter.use.disabled
+    found, expected = identified(page, loop), identify(of.result.record, of.scenario)
+    assert found.modes == expected.modes and not page.stale.visible
+    for line in verdict(expected):
+        assert line.replace("<", "&lt;") in page.verdict.object
+    (line,) = (p for p in expected.modes[0].peaks if p.pure)
+    assert line.frequency.value == pytest.approx(LINE, abs=0.1)
+    noise = Number(*(1e3 * x for x in expected.modes[0].noise))
+    for number in (line.frequency, noise, Number(*(1e3 * x for x in line.rms))):
+        assert f"<td>{written(number).replace('+-', '±')}</td>" in page.table.object
+    the_measured_spectrum_holds_the_variance(page)
+    dashboard.display.param.update(unit="mas")
+    scale = per_micrometre("mas", 8.0) ** 2
+    total = page.figure.total.data
+    np.testing.assert_allclose(total["y"], scale * expected.modes[0].spectrum.psd(np.asarray(total["x"])))
+    np.testing.assert_allclose(total["y"], np.sum(page.figure.parts.data["ys"], axis=0), rtol=1e-12)
+    the_line_stands_as_high_as_the_measured_spectrum(page)
+    dashboard.display.param.update(mode="tilt", dark=True)
+    assert not len(page.figure.spikes.data["x"]), "the line is in tip alone"
+    assert "of z, tilt [mas²/Hz]" in page.figure.figure.yaxis.axis_label
+
+
+def the_line_stands_as_high_as_the_measured_spectrum(page: IdentifyPage) -> None:
+    """Up to what falls between two bins (0.9 dB of a taper that is nearly a rectangle: at most a factor 2.5) and noise."""
+    spikes, known = page.figure.spikes.data, page.figure.measured.data
+    (at,) = np.asarray(spikes["x"])
+    near = np.abs(np.asarray(known["x"]) - at) < 1.0
+    ratio = np.asarray(known["highest"])[near].max() / np.asarray(spikes["high"])[0]
+    assert 0.35 < ratio < 1.2
+    assert np.all(np.asarray(known["highest"]) >= np.asarray(known["mean"]))
+
+
+def the_measured_spectrum_holds_the_variance(page: IdentifyPage) -> None:
+    """Parseval: the mean over all bins of the tapered z, in bins of the axis weighted with what is in each."""
+    assert page.of is not None
+    z = page.of.record.z[page.of.record.delay :, 0]
+    count = np.round(np.diff(page.of.frequency, append=500.0) * page.of.duration)  # of narrow bins; wide ones are near enough
+    total = np.sum(page.of.mean[:, 0] * np.maximum(count, 1.0)) / page.of.duration
+    assert total == pytest.approx(np.var(z), rel=0.35)  # the taper leaves out the ends of slow turbulence
+
+
+def test_use_it_is_a_change_like_every_other(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> None:
+    before = dashboard.store.scenario
+    expected = identified(page, loop).scenario(before)
+    page.starter.use.param.trigger("clicks")
+    assert dashboard.store.scenario == expected != before
+    loop.finish(dashboard.store)
+    loop.until(lambda: page.stale.visible)  # the simulation of the model is another record
+    dashboard.store.undo()
+    assert dashboard.store.scenario == before
+    loop.finish(dashboard.store)
+    loop.until(lambda: not page.stale.visible)
+    dashboard.store.change("kalman.vibration_rms", 0.2)
+    loop.finish(dashboard.store)
+    shown = dashboard.store.run.shown
+    loop.until(lambda: page.of is not None and shown is not None and page.of.record is shown.result.record)
+    assert not page.stale.visible, "an observer's setting is not the record's"
+
+
+def test_a_loaded_record_stays(page: IdentifyPage, dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    file = io.BytesIO()
+    record = simulate(short.replace({"run.seed": 9}))
+    format_of(".npz").write(file, record_arrays(replace(record, turbulence=None, vibration=None)))
+    file.seek(0)
+    dashboard.upload.loaded = Loaded(read_record(file, "night.npz"), "night.npz", "key")
+    dashboard.store.follow()
+    loop.finish(dashboard.store)
+    identified(page, loop)
+    page.starter.use.param.trigger("clicks")
+    loop.finish(dashboard.store)
+    shown = dashboard.store.run.shown
+    assert shown is not None and shown.recorded and shown.result.record is dashboard.upload.loaded.record
+    assert shown.scenario.kalman.process_noise == "matched" and not page.stale.visible
+
+
+def test_what_cannot_be_done_is_said_in_one_line(page: IdentifyPage, loop: Any) -> None:
+    for level, lowest, reason in (
+        ("2", "5", "Level = '2': takes a number from 1e-09 to 0.5"),
+        ("0.04", "soon", "Lowest peak [Hz] = 'soon': takes a number from 0.001 to 10000"),
+        ("0.04", "300", "peaks from 300 Hz: takes a frequency below a quarter of the rate, 250 Hz"),
+    ):
+        page.level.value, page.lowest.value = level, lowest
+        page.start()
+        loop.until(lambda: page.work.state != RUNNING)
+        assert (page.work.state, page.starter.status.note) == (FAILED, reason)
+        assert page.starter.use.disabled
+
+
+def test_limits_of_a_public_server(loop: Any, short: Scenario) -> None:
+    """By the estimate, and by the time that it takes after all."""
+    dashboard = Dashboard(loop.queue.put, short, limits=Limits(seconds=5.0))
+    loop.closing.append(dashboard)
+    dashboard.page()
+    dashboard.start()
+    loop.finish(dashboard.store)
+    page = IdentifyPage(dashboard.store, dashboard.display)
+    shown = dashboard.store.run.shown
+    assert shown is not None
+    dashboard.store.limits = Limits(seconds=0.1)
+    page.start()
+    assert page.work.message == "The identification would take about 0 s, at most 0.1 on this server"
+    dashboard.store.limits, page.work.most_seconds = Limits(seconds=5.0), 1e-6
+    page.start()
+    loop.until(lambda: page.work.state != RUNNING)
+    assert page.work.message == "It took more than 1e-06 s, which is what this server allows"
+    longest = replace(shown.result.record, y_lgs=np.zeros((120_000, 2)), u=np.zeros((120_000, 2)))
+    PUBLIC.check_seconds(seconds(longest), "identification")
+
+
+def test_same_records(short: Scenario) -> None:
+    record = simulate(short)
+    y = record.y_lgs.copy()
+    y[3] = np.nan
+    lost = replace(record, y_lgs=y)
+    assert same(lost, replace(lost, y_lgs=y.copy())) and same(record, record)
+    for other in (lost, replace(record, delay=3), replace(record, dt=2e-3), replace(record, y_lgs=y[:-1])):
+        assert not same(record, other)
+
+
+def test_beside_a_run_one_thing_at_a_time(make_store: Callable[..., Store], loop: Any) -> None:
+    beside, gate = Beside(make_store().run), threading.Event()
+
+    def slow(watch: Watch, tell: Any) -> str:
+        watch.step(0.5)
+        tell("half")
+        assert gate.wait(20)
+        return "late"
+
+    beside.start(slow)
+    loop.until(lambda: beside.latest == "half")
+    assert (beside.state, beside.progress) == (RUNNING, 0.5)
+    beside.cancel()
+    assert beside.state == CANCELLED
+    beside.start(lambda watch, tell: "second")
+    loop.until(lambda: beside.state == DONE)
+    gate.set()
+    assert beside.result == "second" and beside.latest is None
+
+    def broken(watch: Watch, tell: Any) -> None:
+        raise ZeroDivisionError("a bug")
+
+    beside.start(broken)
+    loop.until(lambda: beside.state == FAILED)
+    assert (beside.message, beside.result) == ("ZeroDivisionError: a bug", "second")
+    assert loop.queue.empty(), "nothing of what was cancelled lands"
