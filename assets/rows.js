@@ -33,6 +33,7 @@ export function render({model, el}) {
     const focused = el.getRootNode().activeElement?.dataset?.cell
     const top = scroll.scrollTop
     table.replaceChildren()
+    table.style.minWidth = `${64 * model.columns.length}px`
     const head = table.createTHead().insertRow()
     for (const column of model.columns) {
       const th = document.createElement("th")

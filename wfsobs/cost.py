@@ -8,6 +8,7 @@ three times as long: what counts here is whether it will be a moment or a wait.
 
 from __future__ import annotations
 
+from wfsobs.events import clock, steps_of_air
 from wfsobs.loop import TRAINING_MARGIN
 from wfsobs.observers.modes import AT_ONCE
 from wfsobs.scenario import Scenario
@@ -31,10 +32,11 @@ def part_seconds(scenario: Scenario) -> dict[str, float]:
     n, turns = scenario.n_steps, -(-len(scenario.modes) // CORES)
     online, offline = scenario.gpr_online, scenario.gpr_offline
     training = offline.depth + offline.training_size + round(TRAINING_MARGIN * scenario.sensors.lgs_rate)
+    air = steps_of_air(clock(scenario, n), n)
     return {
         "gpr-online": turns * gpr_online_seconds(n, online.training_size, online.depth),
         "gpr-offline": turns * gpr_offline_seconds(n, offline.training_size, offline.depth),
-        "rest": 2.5e-6 * len(scenario.modes) * (n + training) + frozen_flow_seconds(scenario, n + training),
+        "rest": 2.5e-6 * len(scenario.modes) * (n + training) + frozen_flow_seconds(scenario, air + training),
     }
 
 

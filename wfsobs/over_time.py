@@ -51,12 +51,24 @@ def trailing_sum(x: Array, n: int) -> Array:
     return (upto[1:] + after[:-1]).reshape(-1, columns)[:steps]
 
 
-def pooled(running: Sequence[Array]) -> Array:
-    """The running rms of several records together: root of the mean of squares, NaN left out; same shape as each."""
-    known = [~np.isnan(r) for r in running]
-    count = np.sum(known, axis=0)
-    total = np.sum([np.where(k, r, 0.0) ** 2 for k, r in zip(known, running, strict=True)], axis=0)
-    return np.sqrt(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
+@dataclass
+class Pooled:
+    """The running rms of several records of one length together: root of the mean of squares, NaN left out."""
+
+    total: Array | float = 0.0
+    count: Array | int = 0
+
+    def add(self, running: Array) -> None:
+        """One more record's, (n_steps, n_modes)."""
+        known = ~np.isnan(running)
+        self.total = self.total + np.where(known, running, 0.0) ** 2
+        self.count = self.count + known
+
+    @property
+    def rms(self) -> Array:
+        """(n_steps, n_modes), NaN where no record has any."""
+        total, count = np.asarray(self.total), np.asarray(self.count)
+        return np.sqrt(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
 
 
 @dataclass(frozen=True)

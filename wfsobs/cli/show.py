@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from wfsobs.over_time_tables import OverTime
 from wfsobs.pipeline import Result
 from wfsobs.tables import TIME, Row, score_table
 
@@ -21,6 +22,14 @@ def show(all_rows: list[Row], as_json: bool) -> None:
         click.echo(json.dumps([{k: v for k, v in row.items() if k != TIME} for row in all_rows], allow_nan=False))
     else:
         show_table(score_table(all_rows))
+
+
+def show_over_time(history: OverTime, as_json: bool) -> None:
+    """Print the error against time, as JSON or as a table."""
+    if as_json:
+        click.echo(json.dumps(history.rows, allow_nan=False))
+    else:
+        show_table(history.table())
 
 
 def show_table(table: Table) -> None:

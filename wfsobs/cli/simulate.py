@@ -8,11 +8,12 @@ import click
 
 from wfsobs import configfile
 from wfsobs.cli.options import scenario_options
-from wfsobs.cli.show import progress_bar, show, show_table, warn
+from wfsobs.cli.show import progress_bar, show, show_over_time, show_table, warn
 from wfsobs.control import tables as loop_tables
 from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.formats.psd import load_psd
 from wfsobs.loop import simulate
+from wfsobs.over_time_tables import OverTime
 from wfsobs.pipeline import observe as observe_record
 from wfsobs.settings import SettingError
 from wfsobs.tables import Row, rows
@@ -28,10 +29,12 @@ from wfsobs.watch import Watch
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 @click.option("--save", metavar="RECORD", help="Also save the record of the (one) run: .npz, .csv, .fits or .aot.fits.")
 @click.option("--vibration-psd", metavar="FILE", help="Vibration with the spectrum of a CSV or FITS file (docs/data.md).")
+@click.option("--over-time", type=click.FloatRange(0, min_open=True), metavar="SECONDS",
+              help="Print the error over the last so many seconds against time in place of the one number (docs/events.md).")
 @click.option("--psd-unit", type=click.Choice(UNITS), help="Its unit, squared per Hz, where it states none.")
 def run(
     preset: str | None, config: str | None, assignments: tuple[str, ...], seeds: int, as_json: bool, save: str | None,
-    vibration_psd: str | None, psd_unit: str | None,
+    vibration_psd: str | None, over_time: float | None, psd_unit: str | None,
 ) -> None:
     """Simulate the loop, run every observer and print the RMS table."""
     if save and seeds > 1:
@@ -41,6 +44,7 @@ def run(
         table = load_psd(vibration_psd, psd_unit, scenario.telescope.diameter)
         scenario = scenario.replace({"vibration.source": "psd", "vibration.psd": table})
     all_rows: list[Row] = []
+    history = OverTime(scenario, over_time) if over_time else None
     with progress_bar() as update:
         for i in range(seeds):
             one = scenario.replace({"run.seed": scenario.run.seed + i})
@@ -50,7 +54,12 @@ def run(
             result = observe_record(record, one, Watch(progress=lambda f, i=i: update((i + f) / seeds)), simulated=True)
             warn(result)
             all_rows += rows(result.scores, one.run.seed)
-    show(all_rows, as_json)
+            if history:
+                history.add(result, one.run.seed)
+    if history:
+        show_over_time(history, as_json)
+    else:
+        show(all_rows, as_json)
 
 
 @click.command()

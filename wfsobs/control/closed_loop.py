@@ -14,7 +14,7 @@ pseudo-open-loop terms the integrator works on z - f, and u[k] = u_int[k] - vib_
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import pi
 
 import numpy as np
@@ -27,6 +27,7 @@ from wfsobs.control.law import Law
 from wfsobs.control.margins import Margins, frequencies, margins
 from wfsobs.control.mirror import Mirror, mirror_of
 from wfsobs.control.residual import residual_variance
+from wfsobs.gaps import bridged
 from wfsobs.observers.multirate import UnstableCycle
 from wfsobs.observers.reference import online_reference
 from wfsobs.pipeline import as_stated
@@ -104,14 +105,19 @@ class ClosedLoop:
 
 
 def design(scenario: Scenario, controllers: Sequence[str] | None = None) -> Design:
-    """Make the laws of the controllers (all unless named) and judge them by theory. Raises SettingError."""
+    """Make the laws of the controllers (all unless named) and judge them by theory. Raises SettingError.
+
+    Laws are those of the scenario before its events. What they will leave is then not known by theory, nor a bound.
+    """
     scenario.validate()
-    mirror = mirror_of(scenario)
+    before, mirror = scenario.before_events, mirror_of(scenario)
     modes = range(len(scenario.modes))
-    known = is_known(scenario)
-    spectra = [true_spectra(scenario, mode) if known else None for mode in modes]
-    laws = {
-        c.id: tuple(_designed(c, scenario, mode, mirror, spectra[mode]) for mode in modes) for c in chosen(controllers)}
+    known = is_known(before)
+    spectra = [true_spectra(before, mode) if known else None for mode in modes]
+    laws = {c.id: tuple(_designed(c, before, mode, mirror, spectra[mode]) for mode in modes) for c in chosen(controllers)}
+    if scenario.events:
+        laws = {name: tuple(replace(one, predicted=None) for one in designed) for name, designed in laws.items()}
+        return Design(scenario, mirror, laws, None)
     # A fraction of a frame comes on top of the whole ones, which alone bound what can be known.
     least = tuple(bound_of(one, ahead=int(mirror.delay) - 1)["total"] for one in spectra if one)
     return Design(scenario, mirror, laws, least if known else None)
@@ -148,10 +154,10 @@ def closed_loop(record: Record, plan: Design, watch: Watch = QUIET) -> ClosedLoo
     Raises RecordError if the record has no truth, Cancelled.
     """
     total = sum(CONTROLLERS[name].weight for name in plan.laws)
-    outcomes, done = [], 0.0
+    outcomes, done, given = [], 0.0, bridged(record, plan.scenario)
     for name, weight in ((name, CONTROLLERS[name].weight) for name in plan.laws):
         inner = Watch(lambda f, at=done, w=weight: watch.progress((at + f * w) / total), watch.cancelled)
-        outcomes += each_outcome(record, plan, inner, [name])
+        outcomes += each_outcome(given, plan, inner, [name])
         done += weight
     return ClosedLoop(plan, record, tuple(outcomes))
 
@@ -159,8 +165,12 @@ def closed_loop(record: Record, plan: Design, watch: Watch = QUIET) -> ClosedLoo
 def each_outcome(
     record: Record, plan: Design, watch: Watch = QUIET, controllers: Sequence[str] | None = None
 ) -> Iterator[Outcome]:
-    """Run the controllers of a design (all unless named) and yield each one's outcome as soon as it is done."""
+    """Run the controllers of a design (all unless named) and yield each one's outcome as soon as it is done.
+
+    Where measurements are missing they work on what takes their place (`gaps`).
+    """
     disturbance = truth(record)
+    record = bridged(record, plan.scenario)
     if as_stated(record, plan.scenario) is not plan.scenario:
         raise RecordError("the record was made with another rate or exposure ratio than the controllers")
     for name, designed in plan.laws.items():
