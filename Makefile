@@ -38,9 +38,10 @@ help:  ## list the targets
 run: $(RUN)  ## serve the dashboard on localhost:5006 (another port: make run PORT=5007)
 	@$(BIN)/wfsobs serve --port $(PORT)
 
-test: setup  ## run all tests, those in a browser after the others
+test: setup  ## run all tests, then the tutorials, then those in a browser
 	@status=0; \
 	$(BIN)/python -m pytest -n auto --dist loadfile || status=1; \
+	$(BIN)/python -m pytest -n auto tests/tutorials || status=1; \
 	$(BIN)/python -m pytest -n auto --dist loadfile tests/browser || status=1; \
 	exit $$status
 

@@ -21,7 +21,7 @@ from wfsobs.scenario import Scenario
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
-PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [README, *sorted((ROOT / "docs").glob("**/*.md"))]
 SHORT = ("--set", "run.duration=2", "--set", "run.warm_up=0.5")
 
 
@@ -112,7 +112,7 @@ def test_readme_lists_the_observers() -> None:
     assert here == {(o.id, o.label, ", ".join(o.targets)) for o in OBSERVERS.values()}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", [p for p in PAGES if p.parent.name != "tutorials"], ids=lambda p: p.name)
 def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every line of a ```sh block that starts with wfsobs, in order, in one folder, on short records."""
     monkeypatch.chdir(tmp_path)
