@@ -1,4 +1,4 @@
-"""Runs the tutorials: `python docs/scripts/tutorial.py docs/tutorials/PAGE.md ...` and brings their outputs and figures up to date.
+"""Runs the tutorials: `python docs/scripts/tutorial.py docs/tutorials/PAGE.md ...` brings their outputs and figures up to date.
 
 On a page, blocks of ```python and of ```sh with `wfsobs` commands run in order, in one namespace and one folder; what one prints
 stands in the ```text block after it. Figures are saved by the page's own code and shown from `docs/tutorials`.
