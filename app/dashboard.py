@@ -17,7 +17,7 @@ from panel.util.parameters import edit_readonly
 from wfsobs.app.actions import Actions
 from wfsobs.app.controls.fields import SOON
 from wfsobs.app.controls.panel import Controls, waiting_text
-from wfsobs.app.display import CUMULATIVE, ERROR, PSD, SIGNAL, UNITS, Display
+from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, UNITS, Display
 from wfsobs.app.pages.pages import Pages
 from wfsobs.app.run import FAILED, IDLE, Post
 from wfsobs.app.store import Store
@@ -149,7 +149,7 @@ class Dashboard:
 
     def _switches(self) -> pn.FlexBox:
         return pn.FlexBox(
-            self._group("show", {"Signal": SIGNAL, "Error": ERROR}),
+            self._group("show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS}),
             self._group("spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
             self._zoom_buttons(), *self.pinning.view(), gap="12px", align_items="center", **WIDE)
 

@@ -11,7 +11,7 @@ from wfsobs.app.pin import Pin
 from wfsobs.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.parameters import unit_of
 
-SIGNAL, ERROR = "signal", "error"
+SIGNAL, ERROR, RUNNING_RMS = "signal", "error", "running rms"
 PSD, CUMULATIVE = "psd", "cumulative"
 UNITS = {"nm": "nm", "mas": "mas", "um": "µm"}
 """Unit -> how it is written."""
@@ -69,7 +69,7 @@ class Display(param.Parameterized):
     """The switches above the figures."""
 
     mode = param.Selector(default=MODES[0], objects=MODES, label="Mode")
-    show = param.Selector(default=SIGNAL, objects=[SIGNAL, ERROR], label="Show")
+    show = param.Selector(default=SIGNAL, objects=[SIGNAL, ERROR, RUNNING_RMS], label="Show")
     unit = param.Selector(default="nm", objects=list(UNITS), label="Unit")
     hidden = param.Dict({}, doc="Target -> names of its hidden lines.")
     dark = param.Boolean(False, doc="Dark mode.")
@@ -89,8 +89,13 @@ class Display(param.Parameterized):
 
     @property
     def error(self) -> bool:
-        """Whether errors are shown."""
-        return self.show == ERROR
+        """Whether errors are shown, as they are or as their running rms."""
+        return self.show != SIGNAL
+
+    @property
+    def running(self) -> bool:
+        """Whether the time traces are the running rms of the errors."""
+        return self.show == RUNNING_RMS
 
     @property
     def cumulative(self) -> bool:

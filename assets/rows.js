@@ -1,9 +1,11 @@
 // A table of numbers edited in place: rows and columns come from Python, edits go back as messages.
 
+const MOST = 6 // columns of a table
+
 export function render({model, el}) {
   const box = document.createElement("div")
   box.className = "peaks"
-  const table = document.createElement("table")
+  const noun = `${model.noun[0].toUpperCase()}${model.noun.slice(1)}`
   const note = document.createElement("div")
   note.className = "note"
   note.setAttribute("role", "alert")
@@ -14,7 +16,6 @@ export function render({model, el}) {
   add.onclick = () => model.send_msg({action: "add"})
   const scroll = document.createElement("div")
   scroll.className = "rows"
-  scroll.append(table)
   box.append(scroll, note, add)
   el.append(box)
 
@@ -24,16 +25,25 @@ export function render({model, el}) {
     input.value = value
     input.inputMode = "decimal"
     input.dataset.cell = `${row}.${column.key}`
-    input.setAttribute("aria-label", `${model.noun[0].toUpperCase()}${model.noun.slice(1)} ${row + 1}: ${column.name}`)
+    input.setAttribute("aria-label", `${noun} ${row + 1}: ${column.name}`)
     input.onchange = () => model.send_msg({action: "edit", row, key: column.key, text: input.value})
     return input
   }
 
-  const draw = () => {
-    const focused = el.getRootNode().activeElement?.dataset?.cell
-    const top = scroll.scrollTop
-    table.replaceChildren()
-    table.style.minWidth = `${64 * model.columns.length}px`
+  const remover = (i) => {
+    const remove = document.createElement("button")
+    remove.type = "button"
+    remove.className = "remove"
+    remove.textContent = "×"
+    remove.title = `Remove ${model.noun} ${i + 1}`
+    remove.setAttribute("aria-label", remove.title)
+    remove.onclick = () => model.send_msg({action: "remove", row: i})
+    return remove
+  }
+
+  // Few columns make a table, a line per item; of many, each item has a block with the settings that mean something in it.
+  const drawTable = () => {
+    const table = document.createElement("table")
     const head = table.createTHead().insertRow()
     for (const column of model.columns) {
       const th = document.createElement("th")
@@ -47,25 +57,41 @@ export function render({model, el}) {
     model.rows.forEach((row, i) => {
       const line = body.insertRow()
       model.columns.forEach((column, j) => line.insertCell().append(cell(i, column, row[j])))
-      const remove = document.createElement("button")
-      remove.type = "button"
-      remove.className = "remove"
-      remove.textContent = "×"
-      remove.title = `Remove ${model.noun} ${i + 1}`
-      remove.setAttribute("aria-label", `Remove ${model.noun} ${i + 1}`)
-      remove.onclick = () => model.send_msg({action: "remove", row: i})
-      line.insertCell().append(remove)
+      line.insertCell().append(remover(i))
     })
+    return [table]
+  }
+
+  const drawBlocks = () => model.rows.map((row, i) => {
+    const block = document.createElement("fieldset")
+    const name = document.createElement("legend")
+    name.textContent = `${noun} ${i + 1}`
+    block.append(name, remover(i))
+    model.columns.forEach((column, j) => {
+      if (row[j] === null) return
+      const label = document.createElement("label")
+      label.textContent = column.name
+      label.title = column.doc
+      label.append(cell(i, column, row[j]))
+      block.append(label)
+    })
+    return block
+  })
+
+  const draw = () => {
+    const focused = el.getRootNode().activeElement?.dataset?.cell
+    const top = scroll.scrollTop
+    scroll.replaceChildren(...(model.columns.length > MOST ? drawBlocks() : drawTable()))
     mark()
     scroll.scrollTop = top
     if (focused) {
-      table.querySelector(`[data-cell="${focused}"]`)?.focus()
+      scroll.querySelector(`[data-cell="${focused}"]`)?.focus()
     }
   }
 
   const mark = () => {
     const errors = model.errors
-    table.querySelectorAll("input, select").forEach((input) => {
+    scroll.querySelectorAll("input, select").forEach((input) => {
       const error = errors[input.dataset.cell]
       if (error) {
         input.value = error.text

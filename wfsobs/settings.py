@@ -47,6 +47,10 @@ class Group(param.Parameterized):
             raise AttributeError(f"{type(self).__name__} has no setting {name!r}")
         super().__setattr__(name, value)
 
+    def idle(self) -> tuple[str, ...]:
+        """Settings that mean nothing while the others are as they are."""
+        return ()
+
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and self.to_dict() == other.to_dict()  # type: ignore[attr-defined]
 

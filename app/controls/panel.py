@@ -45,6 +45,7 @@ class Controls:
         self.store = store
         self.fields: dict[str, Field] = {}
         self.lists: dict[str, RowEditor] = {}
+        self.parts: list[tuple[str, Any]] = []
         self.preset = pmui.Select(
             label="Preset", value=store.preset, options={_title(name): name for name in PRESETS}, size="small", **ROOM)
         self.reset = pmui.Button(
@@ -84,22 +85,35 @@ class Controls:
             return
         own = {path: RowEditor(self.store, path, p) for path, p in self.store.scenario.lists() if path.split(".")[0] == name}
         self.lists |= own
-        column[:] = [*(editor.view for editor in own.values()), *self._fields_of(name)]
+        views = [*((path, editor.view) for path, editor in own.items()), *self._fields_of(name)]
+        self.parts += views
+        self._refresh_parts()
+        column[:] = [view for _, view in views]
 
-    def _fields_of(self, name: str) -> list[Any]:
-        """The fields of a topic under the headings of its groups; none where it is a list."""
+    def _refresh_parts(self, *_: object) -> None:
+        """Hide what has no meaning for the settings as they are."""
+        with pn.io.hold():
+            for path, view in self.parts:
+                topic, *below = path.split(".")
+                if below:
+                    view.visible = below[0] not in getattr(self.store.scenario, topic).idle()
+
+    def _fields_of(self, name: str) -> list[tuple[str, Any]]:
+        """The fields of a topic under the headings of its groups, with the paths of both; none where it is a list."""
         group = getattr(self.store.scenario, name)
         if not isinstance(group, Group):
             return []
-        views, heading = [], name
-        for path, _, _ in group.walk(f"{name}."):
-            if path in FIRST or any(path.startswith(f"{listed}.") for listed in self.lists):
+        views: list[tuple[str, Any]] = []
+        heading = name
+        for setting, _, _ in group.walk(f"{name}."):
+            if setting in FIRST or any(setting.startswith(f"{listed}.") for listed in self.lists):
                 continue
-            *_, above, _setting = path.split(".")
+            *_, above, _name = setting.split(".")
             if above != heading:
                 heading = above
-                views.append(pn.pane.HTML(f"<b>{escape(str(group.settings()[above].label))}</b>", margin=(8, 0, 0, 0)))
-            views.append(self._field(path).view)
+                title = escape(str(group.settings()[above].label))
+                views.append((f"{name}.{above}", pn.pane.HTML(f"<b>{title}</b>", margin=(8, 0, 0, 0))))
+            views.append((setting, self._field(setting).view))
         return views
 
     def _field(self, path: str) -> Field:
@@ -117,6 +131,7 @@ class Controls:
         self.cancel.on_click(lambda _event: self.store.run.cancel())
         self.accordion.param.watch(self._opened, "active")
         self.store.param.watch(self._refresh_preset, ["scenario", "preset", "can_undo", "can_redo"])
+        self.store.param.watch(self._refresh_parts, "scenario")
         self.store.param.watch(self._refresh_run, ["errors", "waiting"])
         self.store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"])
 

@@ -25,7 +25,7 @@ SHORT = {
 class RowTable(JSComponent):
     """The table in the browser: texts down, messages {action, row, key, text} up."""
 
-    rows = param.List([], doc="One list of texts per item.")
+    rows = param.List([], doc="One list of texts per item, None for what means nothing in it.")
     columns = param.List([], doc="{key, name, doc, choices} of every column.")
     errors = param.Dict({}, doc="'row.key' -> {text, reason} of refused cells.")
     noun = param.String("item", doc="What an item is called.")
@@ -85,7 +85,7 @@ class RowEditor:
     def refresh(self, *_: object) -> None:
         """Show the accepted items and what was refused."""
         items = self.store.value(self.path)
-        rows = [[_cell(item, column["key"]) for column in self.table.columns] for item in items]
+        rows = [[None if c["key"] in item.idle() else _cell(item, c["key"]) for c in self.table.columns] for item in items]
         errors: dict[str, dict[str, str]] = {}
         for path, reason in self.store.errors.items():
             if f"{path}.".startswith(f"{self.path}."):

@@ -13,9 +13,11 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.run import Run
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
+from wfsobs.app.views.event_marks import EventMarks, room
 from wfsobs.app.views.plots import Faint, add_line, new_figure, restyle, send
 from wfsobs.app.work import TRUTH, Shown
 from wfsobs.observers.base import TARGETS
+from wfsobs.over_time import trailing_rms
 
 Array = NDArray[np.float64]
 
@@ -24,6 +26,9 @@ BINS = 500
 
 MARGIN = 0.25
 """What is sent beyond either side of a zoomed window, as a share of it: a pan shows something at once."""
+
+WINDOW_S = 1.0
+"""Over which the running rms of an error is taken [s]."""
 
 SETTLE_MS = 60
 """A zoom is answered when the window has not moved for this long."""
@@ -108,6 +113,7 @@ class _Trace:
         self.figure.add_layout(self.warm_up)
         self.lines = {name: add_line(self.figure, name, self.source, name) for name in self.names}
         self.faint = Faint(self.figure)
+        self.events = EventMarks(self.figure)
 
     def draw(self, shown: Shown, display: Display, first: int, last: int) -> None:
         """Send the samples first ... last - 1 of every line."""
@@ -119,14 +125,16 @@ class _Trace:
         send(self.source, data)
         warm_up = shown.scenario.run.warm_up
         self.warm_up.right = warm_up
-        self._fit(data, warm_up, self._draw_pinned(display, data["x"]))
-        what = f"error of {display.mode}" if display.error else display.mode
+        settled = warm_up + WINDOW_S * display.running
+        self._fit(data, settled, self._draw_pinned(display, data["x"]), room(shown))
+        self.events.draw(shown, display.dark)
+        what = f"{'running rms of ' if display.running else ''}{'error of ' if display.error else ''}{display.mode}"
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
 
     def _draw_pinned(self, display: Display, times: Array) -> dict[str, tuple[Array, Array]]:
         """Send the pinned run's visible lines between the first and the last of the times; what was sent."""
         kept, lines = display.compared, {}
-        if kept is not None:
+        if kept is not None and not display.running:  # what is kept of it are extremes
             first, last = np.searchsorted(kept.times, [times[0], times[-1]])
             cut = slice(first, last + 1)
             x = _thinned(kept.times[cut])
@@ -138,7 +146,7 @@ class _Trace:
         self.faint.draw(lines, display.dark)
         return lines
 
-    def _fit(self, data: dict[str, Any], warm_up: float, pinned: dict[str, tuple[Array, Array]]) -> None:
+    def _fit(self, data: dict[str, Any], warm_up: float, pinned: dict[str, tuple[Array, Array]], above: float) -> None:
         """Have the axis hold every visible line; what a filter does while it settles does not count."""
         counted = data["x"] >= warm_up
         if not counted.any():
@@ -150,7 +158,7 @@ class _Trace:
         if values.size:
             low, high = float(values.min()), float(values.max())
             pad = 0.05 * (high - low) or 1.0
-            self.figure.y_range.update(start=low - pad, end=high + pad)
+            self.figure.y_range.update(start=low - pad, end=high + pad + above * (high - low))
 
 
 def _thinned(times: Array) -> Array:
@@ -166,10 +174,17 @@ def _line(shown: Shown, name: str, target: str, display: Display, first: int, la
     nothing = np.full(last - first, np.nan)
     if values is None:
         return nothing
-    cut = values[first:last, display.column]
+    n = max(round(WINDOW_S / shown.result.record.dt), 1)
+    before = min(n - 1, first) if display.running else 0
+    cut = slice(first - before, last), slice(display.column, display.column + 1)
     if not display.error:
-        return cut
-    return nothing if truth is None or name == TRUTH else cut - truth[first:last, display.column]
+        return values[cut][:, 0]
+    if truth is None or name == TRUTH:
+        return nothing
+    error = values[cut] - truth[cut]
+    if display.running:  # where there is no estimate yet, that of a while ago is not shown in its place
+        error = np.where(np.isnan(error), np.nan, trailing_rms(error, n))
+    return error[before:, 0]
 
 
 def later(function: Any, milliseconds: int) -> None:

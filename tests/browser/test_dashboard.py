@@ -39,9 +39,9 @@ def test_first_paint(open_page: Any, tmp_path: Path) -> None:
     page = open_page()
     for observer, target in (("kf-lgs", "turbulence"), ("multirate", "turbulence"), ("gpr-offline", "vibration"),
                              ("gpr-online", "vibration")):
-        value, truth, relative, lag, seconds, factor = row(page, observer, target)
+        value, truth, relative, needs, lag, seconds, factor = row(page, observer, target)
         value, relative = value.split()[-1], relative.split()[-1]
-        assert float(factor) > 0
+        assert float(factor) > 0 and needs
         assert float(value) > 0 and float(truth) > 0
         assert float(relative) == pytest.approx(float(value) / float(truth), rel=0.02)
         assert lag and float(seconds) > 0

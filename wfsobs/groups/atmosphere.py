@@ -66,3 +66,7 @@ class Turbulence(Group):
                        doc="Outer scale of the von Karman spectrum [m].")
     layers = param.List([Layer()], item_type=Layer, bounds=(0, 40), label="Layers", doc="The layers of frozen flow.")
     psd = section(PsdTable, "PSD table", "The spectrum of turbulence as a table, for source psd.")
+
+    def idle(self) -> tuple[str, ...]:
+        """What other sources are made of; r0 and L0 set the ratio of the modes in all of them."""
+        return tuple(name for name, source in (("layers", "frozen-flow"), ("psd", "psd")) if source != self.source)

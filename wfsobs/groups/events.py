@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import param
 
 from wfsobs.parameters import Real, Whole
 from wfsobs.settings import Group
 
 PEAK, WIND, LASER, FRAMES = "peak", "wind", "laser", "frames"
+OF_KIND: Mapping[str, tuple[str, ...]] = MappingProxyType({
+    PEAK: ("peak", "frequency_shift", "strength"), WIND: ("wind_factor",), LASER: ("lasers",), FRAMES: ("sensor", "share")})
+"""Settings that a kind has of its own."""
 
 
 class Event(Group):
@@ -35,3 +41,7 @@ class Event(Group):
                    doc="For kind laser: how many LGS drop out, the last ones first; without any there is no LGS measurement.")
     sensor = param.Selector(default="lgs", objects=["lgs", "ngs"], label="Sensor", doc="For kind frames: whose frames are lost.")
     share = Real(0.1, bounds=(0.0, 1.0), step=0.01, label="Share lost", doc="For kind frames: the share of them that is lost.")
+
+    def idle(self) -> tuple[str, ...]:
+        """Those of the other kinds."""
+        return tuple(name for kind, names in OF_KIND.items() if kind != self.kind for name in names)

@@ -40,3 +40,8 @@ class Vibration(Group):
     peaks = param.List([Peak()], item_type=Peak, bounds=(0, 100), label="Peaks",
                        doc="The lines of the spectrum.")
     psd = section(PsdTable, "PSD table", "The spectrum as a table, for source psd.")
+
+    def idle(self) -> tuple[str, ...]:
+        """What other sources are made of."""
+        uses = {"peaks": ("peaks",), "ar2": ("peaks",), "psd": ("psd",), "measured": ("spectrum", "part")}.get(self.source, ())
+        return tuple(name for name in ("spectrum", "part", "peaks", "psd") if name not in uses)

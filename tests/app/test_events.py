@@ -1,0 +1,100 @@
+"""Who is thrown off by an event, in the figures; and events in the drawer."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app.controls.panel import Controls
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.pin import pin
+from wfsobs.app.store import Store
+from wfsobs.app.views.envelope import envelope
+from wfsobs.app.views.traces import BINS
+from wfsobs.groups.events import OF_KIND, Event
+from wfsobs.over_time import running_rms
+from wfsobs.scenario import Scenario
+
+EVENTS = [
+    {"kind": "wind", "start": 1.6, "duration": 0.2, "wind_factor": 2.0},
+    {"kind": "peak", "start": 1.5, "frequency_shift": -3.0, "strength": 2.0},
+    {"kind": "frames", "start": 1.7, "duration": 0.1, "share": 0.25},
+    {"kind": "laser", "start": 1.9, "duration": 0.05},
+]
+
+
+@pytest.fixture
+def short(short: Scenario) -> Scenario:
+    return short.replace({"events": EVENTS})
+
+
+def test_running_rms_and_marks(dashboard: Dashboard, loop: Any) -> None:
+    shown, trace = dashboard.store.run.shown, dashboard.traces.traces["vibration"]
+    assert shown is not None
+    dashboard.display.param.update(show="running rms", mode="tilt", unit="um")
+    for name in ("kf-lgs", "gpr-online"):
+        estimate = shown.result.estimate(name, "vibration")
+        assert estimate is not None
+        expected = running_rms(shown.result.record, estimate, 1.0)[:, 1]
+        expected[np.isnan(estimate.values[:, 1])] = np.nan
+        np.testing.assert_allclose(trace.source.data[name], envelope(expected, BINS), rtol=1e-6)
+    assert np.isnan(trace.source.data["truth"]).all()
+    assert trace.figure.yaxis.axis_label == "running rms of error of tilt [µm]"
+    dashboard.traces.x_range.update(start=1.2, end=1.4)  # sent from 1.15 s on, which needs what was before
+    at = np.asarray(trace.source.data["x"])
+    estimate = shown.result.estimate("kf-lgs", "vibration")
+    assert estimate is not None and at[0] == pytest.approx(1.15)
+    steps = np.round(at / shown.result.record.dt).astype(int)
+    np.testing.assert_allclose(
+        trace.source.data["kf-lgs"], running_rms(shown.result.record, estimate, 1.0)[steps, 1], rtol=1e-6)
+    the_marks_are_those_of_the_scenario(dashboard)
+    dashboard.display.pinned = pin(shown)  # of a pinned run, extremes are kept, of which there is no rms
+    assert trace.faint.source is None
+
+
+def the_marks_are_those_of_the_scenario(dashboard: Dashboard) -> None:
+    for trace in dashboard.traces.traces.values():
+        marks, top = trace.events, trace.figure.y_range.end  # type: ignore[attr-defined]
+        assert list(marks.jumps.data["x"]) == [1.5]
+        assert list(marks.spans.data["start"]) == [1.6, 1.7, 1.9]
+        assert list(marks.spans.data["end"]) == pytest.approx([1.8, 1.8, 1.95])
+        assert list(marks.words.data["text"]) == ["peak 0 −3 Hz × 2", "wind × 2", "25 % LGS lost", "1 LGS out"]
+        assert list(marks.words.data["y"]) == [top] * 4 and len(set(marks.words.data["below"][:3])) == 3
+        values = np.concatenate([np.asarray(trace.source.data[name]) for name in trace.names])
+        assert np.nanmax(values) < top, "the words have room of their own"
+
+
+def test_only_what_counts_is_in_the_drawer(make_store: Callable[..., Store]) -> None:
+    controls = Controls(make_store())
+    for topic in ("events", "vibration", "turbulence"):
+        controls.open_topic(topic)
+    table, store = controls.lists["events"].table, controls.store
+    keys = [column["key"] for column in table.columns]
+    for row, event in zip(table.rows, EVENTS, strict=True):
+        own = [key for key, text in zip(keys, row, strict=True) if text is not None]
+        assert own == ["kind", "start", "duration", *OF_KIND[str(event["kind"])]]
+    assert [key for names in OF_KIND.values() for key in names] == list(Event.settings())[3:]
+
+    visible = {path: view.visible for path, view in controls.parts}
+    assert visible["vibration.peaks"] and visible["vibration.cutoff"] and visible["turbulence.r0"] and visible["events"]
+    for path in ("vibration.psd", "vibration.psd.tip", "vibration.spectrum", "vibration.part", "turbulence.layers"):
+        assert not visible[path]
+    store.load(store.scenario.replace({"events": [], "vibration.source": "measured", "turbulence.source": "frozen-flow"}))
+    visible = {path: view.visible for path, view in controls.parts}
+    assert visible["vibration.spectrum"] and visible["turbulence.layers"] and not visible["vibration.peaks"]
+
+
+def test_a_kind_that_needs_a_duration_waits_for_it(make_store: Callable[..., Store]) -> None:
+    controls = Controls(make_store())
+    controls.open_topic("events")
+    editor = controls.lists["events"]
+    editor.handle({"action": "edit", "row": 1, "key": "kind", "text": "laser"})
+    (reason,) = editor.table.errors.values()
+    assert reason["reason"] == "events.1.duration = 0: takes a number above 0 s, for kind laser" and reason["text"] == "laser"
+    editor.handle({"action": "edit", "row": 1, "key": "duration", "text": "0.2"})
+    assert editor.table.errors == {} and controls.store.scenario.events[1].kind == "laser"
+    assert json.dumps(editor.table.rows)  # as it goes to the browser
