@@ -115,6 +115,8 @@ def lag(truth: Array, value: Array, dt: float) -> float | None:
     n, moving = middle.size, value - value.mean()
     sums, squares = (np.concatenate([[0.0], np.cumsum(x)]) for x in (moving, moving**2))
     power = squares[n:] - squares[:-n] - (sums[n:] - sums[:-n]) ** 2 / n
+    if not power.max() > 0:  # so small that its square is nothing
+        return None
     power = np.maximum(power, 1e-12 * power.max())
     alike = np.correlate(moving, middle - middle.mean(), "valid") / np.sqrt(power)
     inner = alike[1:-1]

@@ -44,16 +44,16 @@ class Judge:
             if isinstance(item, Failure):
                 raise RecordError(item.reason)
             out.append(item)
-        return out if self.target == PREDICTION else [e for e in out if e.target == self.target]
+        return out
 
     def errors(self, record: Record, scenario: Scenario, estimates: list[Estimate], warm_up: float) -> Errors:
         """Over the steps after the warm-up [s] that have an estimate. Raises RecordError where there is none."""
         names = [m.name for m in scenario.modes][: record.n_modes]
         if self.target == PREDICTION:
-            scores = unsupervised_scores(record, estimates, warm_up, names)
+            scores = [s for s in unsupervised_scores(record, estimates, warm_up, names) if s.observer == self.observer]
         else:
-            scores = [s for e in estimates for s in score(record, e, warm_up, names)]
-        modes = {s.mode: s.rms for s in scores if (s.observer, s.target) == (self.observer, self.target)}
+            scores = [s for e in estimates if e.target == self.target for s in score(record, e, warm_up, names)]
+        modes = {s.mode: s.rms for s in scores}
         if len(modes) < len(names) or not all(map(isfinite, modes.values())):
             raise RecordError(f"{self.observer} has nothing to be scored after {warm_up:g} s")
         return Errors(modes)

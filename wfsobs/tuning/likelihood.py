@@ -19,7 +19,7 @@ from wfsobs.observers.gpr_offline import training_targets
 from wfsobs.observers.gpr_online import kernel_of, online_targets
 from wfsobs.observers.inputs import scale_of, window_signals
 from wfsobs.observers.kernels import SquaredExponential, band, check_condition, square_from_band
-from wfsobs.record import Record, pseudo_open_loop
+from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.watch import QUIET, Watch
 
@@ -69,5 +69,7 @@ def _of_mode(observer: str, record: Record, scenario: Scenario, mode: int, watch
     else:
         targets, first = online_targets(record, scenario), record.n_steps - 1 - g.training_size
         y, u, z = record.y_lgs, record.u, record.z
+    if first < g.depth - 1 or first + g.training_size > targets.shape[0]:
+        raise RecordError("the record is too short for the training set")
     signals = window_signals(g, y, u, z, mode, record.dt, scale)
     return log_marginal_likelihood(signals, targets[:, mode], g.depth, first, g.training_size, kernel_of(g), watch)

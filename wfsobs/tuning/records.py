@@ -34,6 +34,9 @@ GAP = 1.0
 SHORTEST = 1.0
 """What is left of validation and test after the warm-up, at least [s]."""
 
+TRUTH, NEXT, REFERENCE = "the truth", "the next measurement of the LGS", "the zero-phase Butterworth reference"
+"""What an estimate is compared with."""
+
 LENGTHS = ("gpr_offline.training_size", "gpr_offline.depth")
 """Settings of which a training record is longer."""
 
@@ -42,12 +45,14 @@ LENGTHS = ("gpr_offline.training_size", "gpr_offline.depth")
 class Records:
     """validation : the record that the search sees, training record included
     test   : a scenario -> the record that it is scored on, once before and once after
-    target : what there is to compare with: "turbulence", "vibration" or PREDICTION
+    target : what the errors are those of: "turbulence", "vibration" or PREDICTION
+    against: what stands for the truth, in words
     """
 
     validation: Record
     test: Callable[[Scenario], Record]
     target: str
+    against: str = TRUTH
 
 
 def stream(scenario: Scenario, purpose: int) -> np.random.Generator:
@@ -79,22 +84,26 @@ def simulated(scenario: Scenario, space: Space, target: str, duration: float | N
 def cut(record: Record, scenario: Scenario, observer: str, target: str) -> Records:
     """The pieces of telemetry, and what stands for the truth where the record has none of the target.
 
-    An observer of turbulence and vibration together is judged by its prediction of the next z; one of vibration alone by the
-    zero-phase Butterworth reference of the piece. Raises RecordError for another, and where the record is too short.
+    An observer of turbulence and vibration together is judged by its prediction of the next z of the LGS, which has all their
+    errors; one of vibration alone by the zero-phase Butterworth reference of the piece. Raises RecordError for one that knows
+    better than the LGS, for one of turbulence alone, and where the record is too short.
     """
-    if record.truth(target) is None and set(OBSERVERS[observer].targets) == set(TARGETS):
-        target = PREDICTION
-    elif record.truth(target) is None and target != VIBRATION:
-        raise RecordError(f"{observer} estimates turbulence alone, which a record without the truth cannot judge")
+    against = TRUTH
+    if record.truth(target) is None:
+        of_both, against = set(OBSERVERS[observer].targets) == set(TARGETS), REFERENCE
+        if "y_ngs" in OBSERVERS[observer].needs or not (of_both or target == VIBRATION):
+            raise RecordError(f"{observer}: nothing to judge it by in a record without the truth")
+        if of_both:
+            target, against = PREDICTION, NEXT
     g = getattr(scenario, observer.replace("-", "_"), None)
     learns = "training" in OBSERVERS[observer].needs or getattr(g, "inputs_filter", "") == "standardised"
     cuts = _cuts(record, scenario, learns and record.training is None)
     training, validation, test = (piece(record, start, stop) for start, stop in cuts)
     known = record.training or (Training(training.y_lgs, training.u, training.open_loop_y) if learns else None)
     validation, test = (replace(r, training=known) for r in (validation, test))
-    if target == VIBRATION and record.vibration is None:
+    if against == REFERENCE:
         validation, test = (replace(r, vibration=reference(r, scenario)) for r in (validation, test))
-    return Records(validation, lambda _: test, target)
+    return Records(validation, lambda _: test, target, against)
 
 
 def _cuts(record: Record, scenario: Scenario, learns: bool) -> list[tuple[int, int]]:

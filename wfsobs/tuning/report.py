@@ -11,6 +11,7 @@ from wfsobs.configfile import annotated, changes, to_toml
 from wfsobs.scenario import Scenario
 from wfsobs.tables import label_of
 from wfsobs.tuning.judge import Errors
+from wfsobs.tuning.records import TRUTH
 from wfsobs.tuning.tuning import Stage, Tuned
 
 
@@ -19,13 +20,14 @@ def plain(tuned: Tuned) -> dict[str, Any]:
     def stage(s: Stage) -> dict[str, Any]:
         return {
             "validation_rms_um": s.validation.rms if s.validation else None, "validation_um": _modes(s.validation),
-            "test_rms_um": s.test.rms if s.test else None, "test_um": _modes(s.test),
+            "test_rms_um": s.test.rms if s.test else None, "test_um": _modes(s.test), "other_target_test_um": _modes(s.other),
             "log_marginal_likelihood": list(s.likelihood) if s.likelihood else None,
         }
 
     return {
-        "observer": tuned.observer, "target": tuned.target, "settings": changes(tuned.scenario, tuned.before.scenario),
-        "start": tuned.start, "before": stage(tuned.before), "after": stage(tuned.after),
+        "observer": tuned.observer, "target": tuned.target, "against": tuned.against,
+        "settings": changes(tuned.scenario, tuned.before.scenario), "start": tuned.start,
+        "before": stage(tuned.before), "after": stage(tuned.after),
         "evaluations": [
             {"settings": e.changes, "rms_um": e.errors.rms if e.errors else None, "reason": e.reason or None}
             for e in tuned.history
@@ -50,13 +52,22 @@ def settings_table(tuned: Tuned) -> Table:
 
 def settings(tuned: Tuned) -> list[tuple[str, str, str]]:
     """(dotted path, before, after) of every setting that was searched or set by hand."""
-    before, after = tuned.before.scenario, tuned.scenario
-    paths = [*changes(after, before), *tuned.start]
-    return [(path, _shown(before, path), _shown(after, path)) for path in dict.fromkeys(paths)]
+    changed = [path for path in changes(tuned.scenario, tuned.before.scenario) if path not in tuned.start]
+    before = {path: _before(tuned, path) for path in (*changed, *tuned.start)}
+    if tuned.scenario == tuned.before.scenario:
+        return [(path, text, text) for path, text in before.items()]
+    return [(path, text, _shown(_value(tuned.scenario, path))) for path, text in before.items()]
 
 
-def _shown(scenario: Scenario, path: str) -> str:
-    value = reduce(getattr, path.split("."), scenario)
+def _before(tuned: Tuned, path: str) -> str:
+    return _shown(tuned.start.get(path, _value(tuned.before.scenario, path)))
+
+
+def _value(scenario: Scenario, path: str) -> Any:
+    return reduce(getattr, path.split("."), scenario)
+
+
+def _shown(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
@@ -72,6 +83,8 @@ def errors_table(tuned: Tuned) -> Table:
         out.add_row(mode, *(_nm(e.modes[mode]) if e else "fails" for e in cells))
     out.add_section()
     out.add_row("rms over modes", *(_nm(e.rms) if e else "fails" for e in cells))
+    if any(s.other for s in stages):
+        out.add_row("in the other target", "", "", *(_nm(s.other.rms) if s.other else "fails" for s in stages))
     return out
 
 
@@ -81,7 +94,7 @@ def _nm(rms: float) -> str:
 
 def remarks(tuned: Tuned) -> list[str]:
     """One line on each thing that the tables do not say."""
-    out = []
+    out = [] if tuned.against == TRUTH else [f"compared with {tuned.against}, no truth being known"]
     known = [s.likelihood for s in (tuned.before, tuned.after)]
     if all(known):
         text = " -> ".join(", ".join(f"{x:.1f}" for x in values) for values in known if values)
@@ -97,12 +110,13 @@ def remarks(tuned: Tuned) -> list[str]:
 def toml(tuned: Tuned) -> str:
     """The tuned scenario as TOML, with what was changed beside its settings."""
     base = tuned.before.scenario
-    notes = {path: f"tuned, {_shown(base, path)} before" for path in changes(tuned.scenario, base)}
-    head = [f"{label_of(tuned.observer)} tuned for {tuned.target} in {len(tuned.history)} evaluations.",
-            *(f"{name} rms error: {_of(before)} nm before, {_of(after)} nm after" for name, before, after in (
+    notes = {path: f"{'tuned' if path in tuned.paths else 'with it'}, {_before(tuned, path)} before"
+             for path in changes(tuned.scenario, base)}
+    head = [f"{label_of(tuned.observer)} tuned for {tuned.target}, against {tuned.against}, in {len(tuned.history)} evaluations.",
+            *(f"{name} rms error: {_of(before)} before, {_of(after)} after" for name, before, after in (
                 ("Validation", tuned.before.validation, tuned.after.validation), ("Test", tuned.before.test, tuned.after.test)))]
     return "\n".join(f"# {line}" for line in head) + "\n\n" + annotated(to_toml(tuned.scenario), notes)
 
 
 def _of(errors: Errors | None) -> str:
-    return _nm(errors.rms) if errors else "no"
+    return f"{_nm(errors.rms)} nm" if errors else "fails"

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import Any
 
 from wfsobs.arrays import Array
+from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import as_stated
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
+from wfsobs.scores import PREDICTION
 from wfsobs.settings import SettingError
 from wfsobs.tuning.judge import Errors, Judge, target_of
 from wfsobs.tuning.likelihood import likelihood
@@ -44,12 +46,17 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Stage:
-    """An observer before or after tuning: its errors on validation and on test record, None where it fails; for a GPR, the
-    log marginal likelihood of its training targets, a number per mode."""
+    """An observer before or after tuning.
+
+    validation, test : its errors on either record, None where it fails
+    other            : on the test record, its errors in the target that it was not tuned for, if it has another
+    likelihood       : of a GPR, the log marginal likelihood of its training targets, a number per mode
+    """
 
     scenario: Scenario
     validation: Errors | None
     test: Errors | None
+    other: Errors | None
     likelihood: tuple[float, ...] | None
 
 
@@ -58,12 +65,16 @@ class Tuned:
     """What a tuning gives.
 
     target  : what the errors are those of: "turbulence", "vibration", or "next z" where there is no truth
-    start   : dotted path -> number before, of the settings that were searched; of matched ones what "matched" stands for
+    against : what stood for the truth, in words
+    paths   : the settings that were searched
+    start   : dotted path -> number before, of these and of those set by hand with them; of matched ones what that stands for
     history : every evaluation in its order, the scenario as it was first
     """
 
     observer: str
     target: str
+    against: str
+    paths: tuple[str, ...]
     start: dict[str, float]
     before: Stage
     after: Stage
@@ -113,7 +124,9 @@ def tune(
         raise RecordError(first.reason)
     before, after = (trials.stage(e) for e in (first, best))
     watch.step(1.0)
-    return Tuned(observer, records.target, searched.values(scenario), before, after, tuple(trials.history))
+    start = {path: v for path, v in {**searched.by_hand, **searched.values(scenario)}.items() if not isinstance(v, str)}
+    return Tuned(observer, records.target, records.against, tuple(a.path for a in searched.axes), start, before, after,
+                 tuple(trials.history))
 
 
 @dataclass
@@ -129,7 +142,11 @@ class _Trials:
     told: Callable[[Evaluation], None] | None
     history: list[Evaluation] = field(default_factory=list)
     known: dict[tuple[Any, ...], float] = field(default_factory=dict)
-    warm_up: float = 0.0
+    warm_up: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        record = self.records.validation
+        self.warm_up = max(self.scenario.run.warm_up, LEARNING * record.n_steps * record.dt)
 
     def at(self, point: Array) -> float:
         """The error at a point of the unit cube. Raises Spent where that takes one evaluation too many, Cancelled."""
@@ -144,7 +161,7 @@ class _Trials:
         return self.known[key]
 
     def run(self, changes: dict[str, Any]) -> Evaluation:
-        """One evaluation; the first sets where the scores begin. Raises Cancelled."""
+        """One evaluation; scores begin where the first has its estimates, if that is later. Raises Cancelled."""
         errors, reason = None, ""
         try:
             errors = self._errors(self.scenario.replace(changes))
@@ -161,7 +178,7 @@ class _Trials:
         estimates = self.judge.estimates(record, scenario, self._inner())
         begins = self.judge.begins(estimates) * record.dt
         if not self.history:
-            self.warm_up = max(self.scenario.run.warm_up, LEARNING * record.n_steps * record.dt, begins)
+            self.warm_up = max(self.warm_up, begins)
         if begins > self.warm_up:
             raise RecordError(
                 f"{self.judge.observer} has its first estimate after {begins:g} s; the scores begin at {self.warm_up:g} s")
@@ -170,13 +187,16 @@ class _Trials:
     def stage(self, evaluation: Evaluation) -> Stage:
         """The scenario of an evaluation on the test record."""
         scenario = self.scenario.replace(evaluation.changes)
-        record, errors = self.records.test(scenario), None
+        record, judge, errors, other = self.records.test(scenario), self.judge, None, None
+        others = {*OBSERVERS[judge.observer].targets} - {judge.target} if judge.target != PREDICTION else set[str]()
         try:
-            estimates = self.judge.estimates(record, scenario, self._inner())
-            errors = self.judge.errors(record, scenario, estimates, scenario.run.warm_up)
+            estimates = judge.estimates(record, scenario, self._inner())
+            errors = judge.errors(record, scenario, estimates, scenario.run.warm_up)
+            for target in others:
+                other = replace(judge, target=target).errors(record, scenario, estimates, scenario.run.warm_up)
         except ValueError:
             pass  # of the scenario as it was: the reason is in the history
-        return Stage(scenario, evaluation.errors, errors, likelihood(self.judge.observer, record, scenario, self.watch))
+        return Stage(scenario, evaluation.errors, errors, other, likelihood(judge.observer, record, scenario, self.watch))
 
     def _inner(self) -> Watch:
         """The part of the progress that one run is."""
