@@ -22,7 +22,7 @@ from wfsobs.scenario import Scenario
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("**/*.md"))]
-SHORT = ("--set", "run.duration=2", "--set", "run.warm_up=0.5")
+SHORT = ("--set", "run.duration=2", "--set", "run.warm_up=0.5", "--set", "events=[]")
 
 
 def script(name: str) -> ModuleType:

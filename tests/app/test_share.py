@@ -77,6 +77,12 @@ def test_peaks_and_layers_survive_a_link(peaks: list[dict[str, Any]], layers: li
     assert query is not None and from_query(query).scenario == scenario
 
 
+def test_events_survive_a_link() -> None:
+    scenario = PRESETS["lost-frames"]().replace({"events.2": {"kind": "wind", "start": 1.5, "wind_factor": 0.3}})
+    query = to_query(scenario, "paper")
+    assert query is not None and from_query(f"?{query}").scenario == scenario
+
+
 def test_a_link_holds_what_differs_and_can_be_read() -> None:
     scenario = PRESETS["ut4"]().replace({
         "turbulence.wind_speed": 20, "loop.closed": False, "butterworth.frequencies": [17, 20.5],
@@ -133,6 +139,7 @@ CHANGED = {
     **QUICK, "turbulence.wind_speed": 22.5, "loop.gain": 0.25, "kalman.measurement_noise": "manual",
     "multirate.model_lgs_error": False, "butterworth.frequencies": [24.3, 47.7], "vibration.source": "ar2",
     "vibration.peaks": [{"frequency": 47, "damping": 0.01, "rms": [0.02, 1e-5]}],
+    "events": [{"kind": "peak", "start": 1.0, "frequency_shift": 2.0}],
 }
 
 
