@@ -120,7 +120,7 @@ class Scenario(Group):
             if event.kind == PEAK:
                 self._validate_moving_peak(i, event)
         blown = air_time([e for e in self.events if e.kind == WIND], np.linspace(0.0, self.run.duration, 1001))[-1]
-        if blown > MOST_AIR * self.run.duration:
+        if blown > (MOST_AIR + 1e-9) * self.run.duration:
             raise SettingError(f"events: the wind carries {blown:.3g} s of turbulence past in {self.run.duration:g} s; at most "
                                f"{MOST_AIR:g} times as much as the record is long")
 
