@@ -45,7 +45,8 @@ TUNABLE: dict[str, Tunable] = {
     "kf-lgs": Tunable((*_MODEL[:2], "kalman.vibration_rms"), ("kalman.turbulence_rms", "kalman.lgs_noise")),
     "kf-multi": Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
     "kf-ngs": Tunable(("kalman.turbulence_rms", "kalman.vibration_rms"), (*_MODEL[:2], "kalman.ngs_noise")),
-    "kf-adaptive": Tunable(("adaptive.window", "adaptive.interval")),
+    # A shorter interval costs time, which no error shows.
+    "kf-adaptive": Tunable(("adaptive.window",), ("adaptive.interval", "adaptive.peaks", "adaptive.lowest")),
     "multirate": Tunable(_RATES, _MODEL),
     "multirate-optimal": Tunable(_RATES, _MODEL),
     "butterworth-ol": Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
