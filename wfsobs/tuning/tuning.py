@@ -22,8 +22,9 @@ from wfsobs.tuning.space import Space, space
 from wfsobs.watch import QUIET, Watch
 
 EVALUATIONS = 40
-LEARNING = 0.25
-"""Part of the validation record that counts for nothing, so that slow starters are compared with others on the same steps."""
+LEARNING, LATEST = 0.25, 0.5
+"""Part of the validation record that counts for nothing, so that slow starters are compared with others on the same steps; and
+part by which the scores begin at the latest."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,7 @@ class _Trials:
         record = self.records.validation
         estimates = self.judge.estimates(record, scenario, self._inner())
         begins = self.judge.begins(estimates) * record.dt
-        if not self.history:
+        if not self.history and begins <= LATEST * record.n_steps * record.dt:
             self.warm_up = max(self.warm_up, begins)
         if begins > self.warm_up:
             raise RecordError(
