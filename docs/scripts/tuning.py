@@ -50,7 +50,7 @@ def gains() -> None:
 
 def lengths() -> None:
     """Validation records of several lengths, `paper`."""
-    for seconds in (1.5, 2.5, 5.0, 10.0, 30.0):
+    for seconds in (1.5, 2.5, 5.0, 10.0):
         for observer in ("kf-lgs", "gpr-offline"):
             print(row(f"{seconds:g} s | `{observer}`", of_seeds("paper", observer, range(1, 11), validation=seconds)), flush=True)
 
