@@ -51,6 +51,7 @@ LOOKS: Mapping[str, Look] = MappingProxyType({
     "measured": Look("Measured", "#606060", "#C8C8C8"),
     "highest": Look("Highest", "#8A8A8A", "#9A9A9A"),
     "fitted": Look("Model", "#E04E00", "#FF8533", width=2.2),
+    "tried": Look("Tried", "#606060", "#C8C8C8"),
     "parts": Look("Parts", "#003DE6", "#7AA2FF", (4, 3)),
     "found": Look("Peaks", "#A1260D", "#FFB3A1"),
     "none": Look("No control", "#606060", "#C8C8C8", (6, 3)),

@@ -13,7 +13,7 @@ from wfsobs.app.display import Display
 from wfsobs.app.identify_work import Measured, compute, fit, measured, same, seconds
 from wfsobs.app.pages.identify_figure import NAMES, SpectrumFigure
 from wfsobs.app.pages.identify_table import table_html, verdict_html
-from wfsobs.app.pages.parts import WIDE, Starter, box, html, legend, text
+from wfsobs.app.pages.parts import WIDE, Starter, box, html, legend, line, text
 from wfsobs.app.run import RUNNING
 from wfsobs.app.store import Store
 from wfsobs.app.work import Shown
@@ -34,10 +34,6 @@ ABOUT = (
     "remains unexplained: Bartlett's on the cumulated ratio of the measured to the fitted spectrum, and Ljung and Box's on the "
     "innovations of the Kalman filter that the model gives. p is how likely white noise is to look less white than what is left.")
 EARLIER = "This model is of an earlier record than the one shown now."
-ROW = """
-:host { display: flex !important; flex-wrap: wrap; gap: 14px 10px; align-items: center; padding: 10px 0 4px; }
-:host > * { flex: 0 0 auto; }
-"""
 
 
 class IdentifyPage:
@@ -61,7 +57,7 @@ class IdentifyPage:
 
     def view(self) -> pn.Column:
         """What is shown."""
-        row = pn.Row(*self.starter.view(), self.level, self.lowest, **WIDE, stylesheets=[ROW])
+        row = line(self.level, self.lowest, *self.starter.view())
         return pn.Column(
             box("Identification", text(INTRO), row, self.starter.status, self.stale, self.verdict),
             box("Spectrum", self.legend, self.note, pn.pane.Bokeh(self.figure.figure, **WIDE)),

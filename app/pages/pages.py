@@ -15,11 +15,15 @@ from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.figures import Figures
 from wfsobs.app.pages.identify import IdentifyPage
 from wfsobs.app.pages.model import Model
+from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.store import Store
 
-EXPLORE, IDENTIFY, LOOP, FIGURES, MODEL = "explore", "identify", "loop", "figures", "model"
+EXPLORE, IDENTIFY, TUNE, LOOP, FIGURES, MODEL = "explore", "identify", "tune", "loop", "figures", "model"
 TITLES: Mapping[str, str] = MappingProxyType(
-    {"Explore": EXPLORE, "Identify": IDENTIFY, "Closed loop": LOOP, "Paper figures": FIGURES, "Model": MODEL})
+    {"Explore": EXPLORE, "Identify": IDENTIFY, "Tune": TUNE, "Closed loop": LOOP, "Paper figures": FIGURES, "Model": MODEL})
+
+WRAPPED = {"flexWrap": "wrap", "& .MuiToggleButton-root": {"width": "auto"}}
+"""As many lines of buttons as a narrow window takes."""
 
 
 class Page(Protocol):
@@ -40,14 +44,14 @@ class Pages(param.Parameterized):
     def __init__(self, explore: Any, store: Store, display: Display):
         super().__init__()
         self._makers: dict[str, Callable[[], Page]] = {
-            IDENTIFY: lambda: IdentifyPage(store, display),
+            IDENTIFY: lambda: IdentifyPage(store, display), TUNE: lambda: TunePage(store, display),
             LOOP: lambda: ClosedLoopPage(store.run, display), FIGURES: lambda: Figures(store.run, display),
             MODEL: lambda: Model(store, display)}
         self.made: dict[str, Page] = {}
         self.rooms = {EXPLORE: explore, **{
             name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers}}
         self.switch = pmui.RadioButtonGroup.from_param(
-            self.param.current, options=dict(TITLES), size="small", margin=0, color="primary")
+            self.param.current, options=dict(TITLES), size="small", margin=0, color="primary", sx=WRAPPED)
         self.switch.label = ""
         self.view = pn.Column(*self.rooms.values(), sizing_mode="stretch_width", margin=0)
         self.param.watch(self._turn, "current")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from html import escape
 from types import MappingProxyType
 from typing import Any
@@ -13,7 +13,7 @@ from bokeh.plotting import figure
 
 from wfsobs.app.beside import Beside
 from wfsobs.app.controls.panel import Status
-from wfsobs.app.run import CANCELLED, DONE, RUNNING
+from wfsobs.app.run import CANCELLED, DONE, IDLE, RUNNING
 from wfsobs.app.style import asset, swatch
 
 WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
@@ -39,6 +39,11 @@ def box(title: str, *content: Any) -> pn.Column:
     return pn.Column(heading(title), *content, **WIDE, stylesheets=[asset("box.css")])
 
 
+def line(*parts: Any) -> pn.FlexBox:
+    """Buttons and fields beside each other, in as many lines as they take."""
+    return pn.FlexBox(*parts, gap="14px 10px", align_items="center", styles={"padding": "10px 0 4px"}, **WIDE)
+
+
 def captioned(title: str, fig: figure) -> pn.Column:
     """A figure under its caption."""
     fig.name = title
@@ -55,14 +60,15 @@ def legend(names: Mapping[str, str], dark: bool) -> str:
 class Starter:
     """The buttons that start, cancel and use something long, and the line on how it is going."""
 
-    def __init__(self, work: Beside, start: str, label: str):
-        self.work = work
+    def __init__(self, work: Beside, start: str, label: str, detail: Callable[[], str] = str):
+        """detail : what to add to the line while the work goes on."""
+        self.work, self._detail = work, detail
         self.start = pmui.Button(label=start, icon="play_arrow", color="primary", size="small", margin=0)
         self.cancel = pmui.Button(label="Stop", icon="stop", variant="outlined", size="small", margin=0, disabled=True)
         self.use = pmui.Button(label="Use it", icon="check", variant="outlined", size="small", margin=0, disabled=True)
         self.status = Status(label=label, sizing_mode="stretch_width", margin=(4, 0), visible=False)
         self.cancel.on_click(lambda _event: work.cancel())
-        work.param.watch(self.refresh, ["state", "progress", "message", "result"])
+        work.param.watch(self.refresh, ["state", "progress", "message", "latest", "result"])
 
     def view(self) -> list[Any]:
         """The row of buttons; the line is `status`."""
@@ -74,4 +80,5 @@ class Starter:
         running = work.state == RUNNING
         said = {RUNNING: f"Computing, {int(100 * work.progress)} %", CANCELLED: "Stopped", DONE: "Finished"}.get(work.state, "")
         self.cancel.disabled, self.use.disabled = not running, running or work.result is None
-        self.status.param.update(progress=work.progress, text=said, note=work.message, visible=True)
+        self.status.param.update(
+            progress=work.progress, text=said + self._detail(), note=work.message, visible=work.state != IDLE)

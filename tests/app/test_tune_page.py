@@ -1,0 +1,136 @@
+"""The page of the tuning: true to the core, beside the page, within limits."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from math import inf
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.display import number
+from wfsobs.app.limits import Limits
+from wfsobs.app.pages.pages import TUNE
+from wfsobs.app.pages.tune import TunePage
+from wfsobs.app.pages.tune_views import unit_for
+from wfsobs.app.run import CANCELLED, DONE, FAILED, RUNNING
+from wfsobs.app.tune_work import CHOICES, best_so_far, seconds
+from wfsobs.app.upload import Loaded
+from wfsobs.configfile import changes
+from wfsobs.loop import simulate
+from wfsobs.observers import OBSERVERS
+from wfsobs.scenario import Scenario
+from wfsobs.tuning import Evaluation, Tuned, tune
+from wfsobs.tuning.judge import Errors
+
+
+@pytest.fixture
+def page(dashboard: Dashboard) -> TunePage:
+    dashboard.pages.current = TUNE
+    page = dashboard.pages.made[TUNE]
+    assert isinstance(page, TunePage)
+    page.observer.value, page.evaluations.value = "kf-lgs", "8"
+    return page
+
+
+def tuned(page: TunePage, loop: Any) -> Tuned:
+    """What the page came to, once it has."""
+    page.starter.start.param.trigger("clicks")
+    assert page.work.state == RUNNING and page.starter.use.disabled
+    loop.until(lambda: page.work.state != RUNNING)
+    assert page.work.state == DONE, page.work.message
+    return page.work.result
+
+
+def row(table: str, section: str, name: str) -> list[str]:
+    """The cells of a row of the table."""
+    pattern = rf'<tr data-section="{section}"><th scope=row>(?:<b>)?{re.escape(name)}(?:</b>)?</th>(.*?)</tr>'
+    (found,) = re.findall(pattern, table)
+    return re.findall("<td>(.*?)</td>", found)
+
+
+def test_it_shows_what_the_core_finds(page: TunePage, dashboard: Dashboard, loop: Any) -> None:
+    expected = tune(dashboard.store.scenario, "kf-lgs", evaluations=8, target="vibration")
+    found = tuned(page, loop)
+    assert found.history == expected.history and found.scenario == expected.scenario != expected.before.scenario
+    (before, after), table = (expected.before, expected.after), page.table.object
+    for section, errors in (("validation", [s.validation for s in (before, after)]), ("test", [s.test for s in (before, after)])):
+        one, other = errors
+        assert one and other
+        for name, a, b in (("tip", one.modes["tip"], other.modes["tip"]), ("rms over modes", one.rms, other.rms)):
+            cells = row(table, section, name)
+            assert cells[:2] == [number(1e3 * a, 4), number(1e3 * b, 4)]
+            assert float(cells[2].replace("−", "-")) == pytest.approx(100 * (b / a - 1), abs=0.051)
+    for path, value in changes(expected.scenario, before.scenario).items():
+        text = f"{value:.6g}" if isinstance(value, float) else str(value)
+        assert row(table, "setting", path)[1] == text
+    assert "likelihood" not in table, "it is no GPR"
+    data = page.figure.source.data
+    np.testing.assert_allclose(data["tried"], [1e3 * e.rms for e in expected.history])
+    np.testing.assert_allclose(data["best"], np.minimum.accumulate(data["tried"]))
+    using_it_leaves_the_other_settings(page, dashboard, found)
+
+
+def using_it_leaves_the_other_settings(page: TunePage, dashboard: Dashboard, found: Tuned) -> None:
+    store = dashboard.store
+    assert not page.stale.visible
+    store.change("run.seed", 5)
+    assert page.stale.visible
+    page.starter.use.param.trigger("clicks")
+    expected = found.before.scenario.replace({"run.seed": 5, **changes(found.scenario, found.before.scenario)})
+    assert store.scenario == expected
+    store.undo()
+    store.undo()
+    assert store.scenario == found.before.scenario and not page.stale.visible
+
+
+def test_a_gpr_and_its_likelihood(page: TunePage, dashboard: Dashboard, loop: Any) -> None:
+    page.observer.value, page.evaluations.value = "gpr-offline", "3"
+    assert page.target.options == ["vibration"] and "gpr_offline.noise_std" in page.searched.object
+    found = tuned(page, loop)
+    assert found.before.likelihood and found.after.likelihood
+    cells = row(page.table.object, "likelihood", "tilt")
+    assert cells == [number(found.before.likelihood[1], 4), number(found.after.likelihood[1], 4), ""]
+    dashboard.display.unit = "mas"
+    assert "test record, which it does not [mas]" in page.table.object
+    focus = Errors({"tip": 0.01, "defocus": 0.01})
+    assert unit_for(replace(found, before=replace(found.before, validation=focus)), dashboard.display) == "nm", "it has no angle"
+    assert unit_for(found, dashboard.display) == unit_for(None, dashboard.display) == "mas"
+
+
+def test_a_loaded_record_is_cut(page: TunePage, dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    record = replace(simulate(short.replace({"run.duration": 9.0, "run.seed": 4})), turbulence=None, vibration=None)
+    dashboard.upload.loaded = Loaded(record, "night.npz", "key")
+    dashboard.store.load(dashboard.store.scenario.replace({"run.duration": 9.0}))
+    loop.finish(dashboard.store)
+    found = tuned(page, loop)
+    assert found.target == "next z" and found.history == tune(dashboard.store.scenario, "kf-lgs", None, 8, record=record).history
+
+
+def test_progress_cancel_and_errors(page: TunePage, dashboard: Dashboard, loop: Any) -> None:
+    page.evaluations.value = "0"
+    page.start()
+    assert (page.work.state, page.starter.status.note) == (
+        FAILED, "Evaluations = '0': takes a whole number from 1 to 1000")
+    page.evaluations.value = "1000"
+    page.observer.value = "gpr-online"
+    page.start()
+    loop.until(lambda: page.work.latest is not None)
+    assert re.fullmatch(r"Computing, \d+ % · \d+ evaluations, best [\d.]+ nm, [\d.]+ nm before", page.starter.status.text)
+    page.starter.cancel.param.trigger("clicks")
+    assert page.work.state == CANCELLED and page.starter.use.disabled and len(page.figure.source.data["x"]) > 0
+    dashboard.store.limits = Limits(seconds=0.01)
+    page.start()
+    shown = dashboard.store.run.shown
+    assert shown is not None
+    estimate = seconds(shown, dashboard.store.scenario, "gpr-online", 1000)
+    assert page.work.message == f"The tuning would take about {estimate:.0f} s, at most 0.01 on this server" and estimate > 1.0
+
+
+def test_the_least_so_far() -> None:
+    errors = (Evaluation({}, None), *(Evaluation({}, Errors({"tip": x})) for x in (3.0, 5.0, 2.0)), Evaluation({}, None))
+    assert best_so_far(errors) == [inf, 3.0, 3.0, 2.0, 2.0]
+    assert set(OBSERVERS) - set(CHOICES.values()) == {"persistence", "zero"}, "they have nothing to tune"

@@ -1,0 +1,50 @@
+"""From the record shown to its model, and to a tuned observer, in a browser."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from playwright.sync_api import expect
+
+QUICK = "?run.duration=5&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40"
+
+
+def test_identify_and_use_it(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK)
+    page.get_by_role("button", name="Identify", exact=True).click()
+    expect(page.get_by_role("button", name="Use it")).to_be_disabled()
+    page.get_by_role("button", name="Identify the record").click()
+    expect(page.get_by_text(re.compile("tip: what is left is (NOT )?white at 1%"))).to_be_visible()
+    row = page.get_by_role("region", name="Identified in tip").locator("tr", has_text="turbulence")
+    corner = float(row.locator("td").first.inner_text().split()[0])
+    assert 0.4 < corner < 3.0, "the paper's is 1.125 Hz, of 5 s a third of an octave wide"
+    wind = page.get_by_role("textbox", name="m/s")
+    before = wind.input_value()
+    page.get_by_role("button", name="Use it").click()
+    expect(wind).not_to_have_value(before)
+    expect(page.get_by_text("This model is of an earlier record")).to_be_visible()
+    page.get_by_role("button", name="Undo", exact=True).click()
+    expect(wind).to_have_value(before)
+
+
+def test_tune_stop_and_use_it(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK)
+    page.get_by_role("button", name="Tune", exact=True).click()
+    start, evaluations = page.get_by_role("button", name="Start tuning"), page.get_by_role("textbox", name="Evaluations")
+    evaluations.fill("1000")
+    evaluations.press("Enter")
+    start.click()
+    expect(page.get_by_text(re.compile(r"Computing, \d+ % · \d+ evaluations, best"))).to_be_visible()
+    page.get_by_role("button", name="Stop").click()
+    expect(page.get_by_text("Stopped")).to_be_visible()
+    expect(page.get_by_role("button", name="Use it")).to_be_disabled()
+    page.get_by_role("combobox", name="Observer").click()
+    page.get_by_role("menuitem", name="LGS KF", exact=True).click()
+    evaluations.fill("12")
+    evaluations.press("Enter")
+    start.click()
+    table = page.get_by_role("region", name="Before and after")
+    expect(table.get_by_text("rms over modes").first).to_be_visible()
+    page.get_by_role("button", name="Use it").click()
+    expect(page.get_by_text(re.compile(r"changed: .*kalman\.vibration_rms"))).to_be_visible()
