@@ -59,7 +59,7 @@ def test_recovery_is_read_off_a_curve() -> None:
     first, last = recovery(x, dt, [10.0, 5.0, 5.0], window, 1.0)
     assert first is not None and (first.start, first.settled, first.worst) == (5.0, 1.0, 3.0)
     assert first.back == pytest.approx(2.5, abs=dt / 2)
-    assert last is not None and last.settled == pytest.approx(1.09) and last.worst == 2.0 and last.back is None
+    assert last is not None and last.settled == pytest.approx(1.09) and last.worst == last.last == 2.0 and last.back is None
     unmoved, unknown = recovery(np.where(t < 12, 1.0, np.nan), dt, [5.0, 15.0], window, 1.0)
     assert unmoved is not None and unmoved.back == 0.0 and unknown is None
 

@@ -78,6 +78,7 @@ class Recovery:
     start   : of the event [s]
     settled : rms of the error before it [um]
     worst   : highest running rms from it to the next [um]
+    last    : running rms at the end of that time [um]
     back    : time from its start until the running rms is within 10 % of what it was, and stays so until the next [s]; None
         where it never is
     """
@@ -85,6 +86,7 @@ class Recovery:
     start: float
     settled: float
     worst: float
+    last: float
     back: float | None
 
 
@@ -106,5 +108,5 @@ def recovery(running: Array, dt: float, starts: Sequence[float], window: float, 
         settled = float(np.sqrt(np.mean(quiet**2)))
         late = np.flatnonzero(known & (then > BACK * settled))
         back = 0.0 if not late.size else float((late[-1] + 1) * dt) if late[-1] + 1 < then.size else None
-        out.append(Recovery(start, settled, float(then[known].max()), back))
+        out.append(Recovery(start, settled, float(then[known].max()), float(then[known][-1]), back))
     return out

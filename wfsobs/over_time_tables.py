@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import groupby
 from math import inf
 
 import numpy as np
 from rich.table import Table
 
-from wfsobs.over_time import Pooled, recovery, running_rms
+from wfsobs.over_time import Pooled, Recovery, recovery, running_rms
 from wfsobs.pipeline import Result
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
@@ -62,28 +62,28 @@ class OverTime:
         seeds = len({r["seed"] for r in self.rows})
         return f"{text}, rms over {self.window:g} s" + (f", {seeds} seeds together" if seeds > 1 else "")
 
+    def recoveries(self) -> Iterator[tuple[str, str, str, str, Recovery | None]]:
+        """(target, mode, event, observer, what it did), of every event who is back first."""
+        events, run = self.scenario.events, self.scenario.run
+        starts = sorted({event.start for event in events})
+        names = [", ".join(dict.fromkeys(e.kind for e in events if e.start == start)) + f" at {start:g} s" for start in starts]
+        for (target, mode), group in groupby(self._series(), key=lambda s: s[:2]):
+            known = {name: recovery(x, self.scenario.dt, starts, self.window, run.warm_up) for _, _, name, x in group}
+            for i, event in enumerate(names):
+                for name in sorted(known, key=lambda name: _rank(known[name][i])):
+                    yield target, mode, event, name, known[name][i]
+
     def _recoveries(self) -> Table:
-        """One row per event and observer, who is back first at the top."""
+        """One row per event and observer."""
         table = Table(title=self._title("Error before and after every event"))
         for name in ("Target", "Mode", "Event", "Observer"):
             table.add_column(name, no_wrap=True)
-        for name in ("before, nm", "worst after, nm", "back after, s"):
+        for name in ("before, nm", "worst after, nm", "at the end, nm", "back after, s"):
             table.add_column(name, justify="right", no_wrap=True)
-        events, run = self.scenario.events, self.scenario.run
-        starts = sorted({event.start for event in events})
-        for (target, mode), group in groupby(self._series(), key=lambda s: s[:2]):
-            known = [(label_of(observer), recovery(x, self.scenario.dt, starts, self.window, run.warm_up))
-                     for _, _, observer, x in group]
-            for i, start in enumerate(starts):
-                kinds = ", ".join(dict.fromkeys(event.kind for event in events if event.start == start))
-                lines = [(name, found[i]) for name, found in known]
-                lines.sort(key=lambda line: (inf, inf) if line[1] is None else (
-                    inf if line[1].back is None else line[1].back, line[1].worst))
-                for name, r in lines:
-                    numbers = ("-", "-", "-") if r is None else (
-                        f"{r.settled * 1e3:.2f}", f"{r.worst * 1e3:.2f}", "never" if r.back is None else f"{r.back:.2f}")
-                    table.add_row(target, mode, f"{kinds} at {start:g} s", name, *numbers)
-                table.add_section()
+        for _, lines in groupby(self.recoveries(), key=lambda line: line[:3]):
+            for target, mode, event, name, r in lines:
+                table.add_row(target, mode, event, label_of(name), *recovery_texts(r))
+            table.add_section()
         return table
 
     def _times(self) -> Table:
@@ -101,6 +101,19 @@ class OverTime:
                 table.add_row(target, mode, label_of(observer), *("-" if np.isnan(v) else f"{v * 1e3:.2f}" for v in values))
             table.add_section()
         return table
+
+
+def recovery_texts(r: Recovery | None) -> tuple[str, str, str, str]:
+    """Error before, at its worst and at the end [nm], and the time to be back [s], as texts."""
+    if r is None:
+        return "-", "-", "-", "-"
+    before, worst, last = (f"{value * 1e3:.2f}" for value in (r.settled, r.worst, r.last))
+    return before, worst, last, "never" if r.back is None else f"{r.back:.2f}"
+
+
+def _rank(r: Recovery | None) -> tuple[float, float]:
+    """Who is back first comes first, then the least error."""
+    return (inf, inf) if r is None else (inf if r.back is None else r.back, r.worst)
 
 
 def _spread(n: int) -> Sequence[int]:
