@@ -14,7 +14,7 @@ from wfsobs.ar2 import Ar2, turbulence_corner
 from wfsobs.bound import bound_scores
 from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.control.tables import rows
-from wfsobs.cost import run_seconds
+from wfsobs.cost import run_bytes, run_seconds
 from wfsobs.disturbance import make_disturbance
 from wfsobs.events import moved, moved_process, read
 from wfsobs.groups.events import Event
@@ -152,6 +152,7 @@ def test_wind_that_grows_costs_what_its_turbulence_costs() -> None:
     grown = s.replace({"events": [{"kind": "wind", "start": 0.0, "wind_factor": 4.0}]})
     longer = s.replace({"run.duration": 40.0, "gpr_online.training_size": 2})
     assert run_seconds(s) < run_seconds(grown) < run_seconds(s) + run_seconds(longer)
+    assert run_bytes(grown) - run_bytes(s) == pytest.approx(2 * 140.0 * 30_000, rel=1e-3)
 
 
 # ---------------------------------------------------------------------- lasers and frames

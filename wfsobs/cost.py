@@ -73,7 +73,8 @@ def run_bytes(scenario: Scenario) -> float:
     """About how much memory a run takes at its height [bytes], both modes at once.
 
     Measured from 10 s to 300 s of record and m from 20 to 2048, where it is within a third: what is kept of every
-    step, and the windows of the larger GPR, or the waves of frozen flow that are at work.
+    step, turbulence that grown wind carries past besides, and the windows of the larger GPR, or the waves of frozen flow that are
+    at work.
 
     >>> from wfsobs.presets import paper
     >>> round(run_bytes(paper()) / 1e6), round(run_bytes(paper().replace({"run.duration": 300})) / 1e6)
@@ -84,4 +85,5 @@ def run_bytes(scenario: Scenario) -> float:
     waves = 0.0
     if scenario.turbulence.source == "frozen-flow":
         waves = 20e6 * (n_modes if scenario.sensors.kind == "shack-hartmann" else 1)
-    return n_modes * 300.0 * scenario.n_steps + max(min(n_modes, AT_ONCE) * windows, waves)
+    air = steps_of_air(clock(scenario, scenario.n_steps), scenario.n_steps) - scenario.n_steps
+    return n_modes * (300.0 * scenario.n_steps + 140.0 * air) + max(min(n_modes, AT_ONCE) * windows, waves)
