@@ -140,14 +140,19 @@ class _Work:
                 else:
                     self._add(record, item)
                 self.news = True
-                done = {of.observer for of in (*self.estimates, *self.failures)}
-                shown = self._deliver(record) if done == set(OBSERVERS) - {SLOWEST} else None
+                shown = self._deliver(record) if self._left() == {SLOWEST} else None
             if shown is not None:
                 self.report(self.fraction, shown)
                 self._let_draw()
                 if self.loaded is None:
                     self.bounds = bound_scores(self.scenario, record)
         return self._so_far(record)
+
+    def _left(self) -> set[str]:
+        """The observers that have not said all that they will."""
+        said = {(e.observer, e.target) for e in self.estimates}
+        left = {o.id for o in OBSERVERS.values() if any((o.id, target) not in said for target in o.targets)}
+        return left - {f.observer for f in self.failures}
 
     def _let_draw(self) -> None:
         """Leave the processors to the page and the browser while all but the slowest observer is drawn."""

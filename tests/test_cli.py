@@ -14,9 +14,10 @@ from wfsobs.cli import main
 from wfsobs.observers import OBSERVERS
 from wfsobs.presets import paper
 
-QUICK = ["--set", "run.duration=2", "--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=50"]
+QUICK = ["--set", "run.duration=2", "--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=50",
+         "--set", "adaptive.window=0.5"]
 KEYS = {"observer", "target", "mode", "rms_um", "truth_rms_um", "normalised_rms", "lag_s", "needs", "seed"}
-SHORT = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50}
+SHORT = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50, "adaptive.window": 0.5}
 
 
 def call(*arguments):
@@ -70,7 +71,7 @@ def test_observers_that_lack_something_are_left_out_with_a_line(tmp_path):
     assert "gpr-offline left out: the record has no training" in result.stderr
     scored = json.loads(call("observe", str(tmp_path / "bare.npz"), *QUICK, "--json").stdout)
     assert {(r["observer"], r["target"]) for r in scored} == {
-        ("kf-lgs", "next z"), ("kf-multi", "next z"), ("zero", "next z"), ("loop", "residual y")}
+        ("kf-lgs", "next z"), ("kf-multi", "next z"), ("kf-adaptive", "next z"), ("zero", "next z"), ("loop", "residual y")}
     assert "Recorded loop" in result.stdout and "error / z" in result.stdout
     with np.load(tmp_path / "e.npz") as file:
         assert "gpr-online/vibration" in file.files

@@ -21,7 +21,7 @@ def scenario(changes: dict[str, Any] | None = None) -> Scenario:
     base = PRESETS["paper"]()
     base.update({
         "run": {"duration": 0.8, "warm_up": 0.3}, "gpr_offline": {"training_size": 60, "depth": 25},
-        "gpr_online": {"training_size": 60, "depth": 25},
+        "gpr_online": {"training_size": 60, "depth": 25}, "adaptive": {"window": 0.25},
     })
     return base.replace(changes or {})
 

@@ -16,7 +16,7 @@ from wfsobs.fit import fit
 from wfsobs.groups.atmosphere import PsdTable, Telescope, Turbulence
 from wfsobs.groups.control import Control
 from wfsobs.groups.events import FRAMES, LASER, PEAK, WIND, Event
-from wfsobs.groups.observers import Butterworth, Kalman, MultiPeak, MultiRate, OfflineGpr, OnlineGpr
+from wfsobs.groups.observers import Adaptive, Butterworth, Kalman, MultiPeak, MultiRate, OfflineGpr, OnlineGpr
 from wfsobs.groups.run import Loop, Run
 from wfsobs.groups.sensors import Sensors
 from wfsobs.groups.vibration import Vibration
@@ -52,6 +52,7 @@ class Scenario(Group):
     loop = section(Loop, "Loop")
     kalman = section(Kalman, "Kalman filters")
     multipeak = section(MultiPeak, "Multi-peak Kalman filter")
+    adaptive = section(Adaptive, "Adaptive Kalman filter")
     multirate = section(MultiRate, "Multi-rate filter")
     butterworth = section(Butterworth, "Butterworth reference")
     gpr_offline = section(OfflineGpr, "Offline GPR")
@@ -79,12 +80,6 @@ class Scenario(Group):
     def before_events(self) -> Scenario:
         """The scenario as it is without its events: what observers were made for, and the training record is of."""
         return self.replace({"events": []}) if self.events else self
-
-    @property
-    def air(self) -> float:
-        """How long a piece of turbulence the wind carries past during the record, at the speed that it has without events [s]."""
-        wind = [event for event in self.events if event.kind == WIND]
-        return float(air_time(wind, np.linspace(0.0, self.run.duration, 1001))[-1]) if wind else self.run.duration
 
     def validate(self) -> None:
         """Check what no single setting can: raises SettingError naming the settings and the limit."""
@@ -125,9 +120,10 @@ class Scenario(Group):
                 raise SettingError(f"events.{i}.lasers = {event.lasers}: takes up to sensors.lgs_count = {stars}")
             if event.kind == PEAK:
                 self._validate_moving_peak(i, event)
-        if self.air > (MOST_AIR + 1e-9) * self.run.duration:
-            raise SettingError(f"events: the wind carries {self.air:.3g} s of turbulence past in {self.run.duration:g} s; at "
-                               f"most {MOST_AIR:g} times as much as the record is long")
+        blown = air_time([e for e in self.events if e.kind == WIND], np.linspace(0.0, self.run.duration, 1001))[-1]
+        if blown > (MOST_AIR + 1e-9) * self.run.duration:
+            raise SettingError(f"events: the wind carries {blown:.3g} s of turbulence past in {self.run.duration:g} s; at most "
+                               f"{MOST_AIR:g} times as much as the record is long")
 
     def _validate_moving_peak(self, i: int, event: Event) -> None:
         v, nyquist = self.vibration, self.sensors.lgs_rate / 2

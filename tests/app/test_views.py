@@ -54,7 +54,7 @@ class TestTraces:
     def test_signal(self, dashboard: Dashboard) -> None:
         shown = dashboard.store.run.shown
         data = trace(dashboard, "turbulence")
-        assert set(data) == {"x", TRUTH, "kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal"}
+        assert set(data) == {"x", TRUTH, "kf-lgs", "kf-multi", "kf-adaptive", "kf-ngs", "multirate", "multirate-optimal"}
         expected = 1e3 * envelope(shown.values("kf-lgs", "turbulence")[:, 0], BINS)
         assert np.allclose(data["kf-lgs"], expected, rtol=1e-6)
         assert data["x"][0] >= 0 and data["x"][-1] <= 2.0 and data["x"].size == data[TRUTH].size

@@ -21,7 +21,8 @@ from wfsobs.scenario import Scenario
 from wfsobs.tables import TIME, rows
 
 QUICK = ["--set", "run.duration=1.5", "--set", "run.warm_up=0.5", "--set", "gpr_online.training_size=20",
-         "--set", "gpr_offline.training_size=50", "--set", "gpr_online.depth=20", "--set", "gpr_offline.depth=20"]
+         "--set", "gpr_offline.training_size=50", "--set", "gpr_online.depth=20", "--set", "gpr_offline.depth=20",
+         "--set", "adaptive.window=0.5"]
 
 
 def call(*arguments: str) -> Result:
@@ -50,7 +51,7 @@ def test_settings_from_a_file_are_compared_with_its_preset(tmp_path: Path, parse
     config.write_text('preset = "ut4"\nloop.gain = 0.2\n', encoding="utf-8")
     assert call("export", str(tmp_path / "r.html"), "--config", str(config), *QUICK).exit_code == 0
     it = parse((tmp_path / "r.html").read_text(encoding="utf-8"))
-    assert "--preset ut4 --set loop.gain=0.2 " in it.text and "Preset ut4, 7 settings changed" in it.text
+    assert "--preset ut4 --set loop.gain=0.2 " in it.text and "Preset ut4, 8 settings changed" in it.text
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

@@ -139,7 +139,7 @@ def test_what_changed_is_listed(text: str, parse: Any) -> None:
     (table,) = [table for table in parse(text).tables if table[0][0] == "Setting"]
     assert ["Integrator gain gloop.gain", "0.3", "0.4"] in table
     assert ["Duration [s]run.duration", "10", "2"] in table
-    assert len(table) == 1 + 7
+    assert len(table) == 1 + 8
 
 
 def test_the_words_fit_the_report(report: Report, text: str, result: Result, parse: Any) -> None:

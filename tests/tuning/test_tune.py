@@ -201,7 +201,8 @@ def test_every_tunable_setting_is_read() -> None:
     gprs = {f"{gpr}.{name}": value for gpr in ("gpr_offline", "gpr_online") for name, value in (
         ("training_size", 60), ("depth", 20), ("length_scale", 20.0), ("inputs_filter", "high-pass"))}
     base = Scenario().replace(gprs | {
-        "run.duration": 0.8, "run.warm_up": 0.1, "vibration.peaks.0.damping": 0.0, "kalman.process_noise": "manual",
+        "run.duration": 3.2, "run.warm_up": 0.1, "vibration.peaks.0.damping": 0.0, "kalman.process_noise": "manual",
+        "adaptive.window": 2.5,  # and the record holds two of them, half a second apart
         "kalman.measurement_noise": "manual", "multirate.measurement_noise": "manual"})
     record = simulate(base)
 

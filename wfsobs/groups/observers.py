@@ -45,6 +45,20 @@ class MultiPeak(Group):
                       doc="Width at half maximum that lines have at least [Hz]; the filter averages over the inverse of it.")
 
 
+class Adaptive(Group):
+    """The Kalman filter of a model that is identified anew all the time."""
+
+    window = Real(4.0, bounds=(0.1, 100.0), softbounds=(0.5, 10.0), step=0.5, label="Window",
+                  doc="How much of z a model is identified from [s]: peaks closer than two over it are one, and for that long a "
+                      "peak that has moved is not what the filter knows.")
+    interval = Real(0.5, bounds=(0.01, 100.0), softbounds=(0.1, 5.0), step=0.1, label="Interval",
+                    doc="Time from one identification to the next [s].")
+    peak_count = Whole(20, bounds=(0, 60), label="Peaks at most",
+                       doc="How many vibration peaks the model of one mode has at most.")
+    lowest = Real(5.0, bounds=(0.1, 1000.0), softbounds=(1.0, 20.0), step=0.5, label="Peaks from",
+                  doc="Frequency from which peaks are looked for [Hz]; from 15 over the window at least.")
+
+
 class MultiRate(Group):
     """Noise weights of the multi-rate Kalman filter."""
 

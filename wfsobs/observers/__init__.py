@@ -6,6 +6,7 @@ from wfsobs.observers.base import BANDS, LINES, MODEL, TARGETS, TRAINING, TURBUL
 from wfsobs.observers.gpr_offline import gpr_offline
 from wfsobs.observers.gpr_online import gpr_online
 from wfsobs.observers.kalman import kf_lgs, kf_ngs
+from wfsobs.observers.kalman_adaptive import kf_adaptive
 from wfsobs.observers.kalman_multi import kf_multi
 from wfsobs.observers.multirate import multirate
 from wfsobs.observers.multirate_optimal import multirate_optimal
@@ -17,6 +18,7 @@ _NGS = ("y_ngs", "ratio")
 OBSERVERS: dict[str, Observer] = {o.id: o for o in (
     Observer("kf-lgs", "LGS KF", TARGETS, kf_lgs, given=(MODEL,)),
     Observer("kf-multi", "Multi-peak KF", TARGETS, kf_multi, given=(MODEL, LINES)),
+    Observer("kf-adaptive", "Adaptive KF", TARGETS, kf_adaptive, weight=50.0),
     Observer("kf-ngs", "NGS KF", (TURBULENCE,), kf_ngs, needs=_NGS, given=(MODEL,)),
     Observer("multirate", "Multi-rate KF", (TURBULENCE,), multirate, needs=_NGS, given=(MODEL,)),
     Observer("multirate-optimal", "Optimal multi-rate KF", TARGETS, multirate_optimal, needs=_NGS, given=(MODEL,)),
