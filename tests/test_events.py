@@ -208,6 +208,19 @@ def test_the_integrator_holds_its_command_where_a_frame_is_lost() -> None:
             assert u[k, mode] == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.parametrize("rate", [10.0, 20.0])
+def test_a_record_of_a_step_or_two_may_have_events(rate: float) -> None:
+    s = Scenario.from_dict({
+        "run": {"duration": 0.1, "warm_up": 0.0}, "sensors": {"lgs_rate": rate}, "gpr_offline": {"training_size": 2, "depth": 1},
+        "vibration": {"source": "ar2", "peaks": [{"frequency": 2.0}]}, "kalman": {"frequency": 2.0},
+        "butterworth": {"frequencies": [2.0]}, "events": [
+            {"kind": "peak", "start": 0.0, "frequency_shift": 1.0}, {"kind": "wind", "start": 0.0, "wind_factor": 3.0},
+            {"kind": "laser", "start": 0.0, "duration": 1.0, "lasers": 2}]})
+    record = simulate(s)
+    assert record.n_steps == record.missing == round(rate / 10) and record.vibration is not None
+    assert np.isfinite(record.vibration).all()
+
+
 # ---------------------------------------------------------------------- who sees it, and who is not told
 
 BROKEN = ({"kind": "laser", "start": 1.0, "duration": 0.3, "lasers": 2},
@@ -267,6 +280,7 @@ def test_a_record_with_lost_frames_can_be_identified() -> None:
     s = changed({"kind": "frames", "start": 0.0, "duration": 2.0, "share": 0.1}, **{"vibration.source": "none"})
     found = identify(simulate(s), s)
     assert [0.012 < mode.spectrum.noise < 0.017 for mode in found.modes] == [True, True]
+    assert found.scenario(s).events == []
 
 
 # ---------------------------------------------------------------------- what is refused

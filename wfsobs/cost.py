@@ -8,7 +8,6 @@ three times as long: what counts here is whether it will be a moment or a wait.
 
 from __future__ import annotations
 
-from wfsobs.events import clock, steps_of_air
 from wfsobs.loop import TRAINING_MARGIN
 from wfsobs.observers.modes import AT_ONCE
 from wfsobs.scenario import Scenario
@@ -32,12 +31,17 @@ def part_seconds(scenario: Scenario) -> dict[str, float]:
     n, turns = scenario.n_steps, -(-len(scenario.modes) // CORES)
     online, offline = scenario.gpr_online, scenario.gpr_offline
     training = offline.depth + offline.training_size + round(TRAINING_MARGIN * scenario.sensors.lgs_rate)
-    air = steps_of_air(clock(scenario, n), n)
+    air = _steps_of_air(scenario)
     return {
         "gpr-online": turns * gpr_online_seconds(n, online.training_size, online.depth),
         "gpr-offline": turns * gpr_offline_seconds(n, offline.training_size, offline.depth),
         "rest": 2.5e-6 * len(scenario.modes) * (n + training) + frozen_flow_seconds(scenario, air + training),
     }
+
+
+def _steps_of_air(scenario: Scenario) -> int:
+    """Steps of turbulence that are made, at least those of the record."""
+    return max(scenario.n_steps, round(scenario.air * scenario.sensors.lgs_rate))
 
 
 def frozen_flow_seconds(scenario: Scenario, n_steps: int) -> float:
@@ -85,5 +89,5 @@ def run_bytes(scenario: Scenario) -> float:
     waves = 0.0
     if scenario.turbulence.source == "frozen-flow":
         waves = 20e6 * (n_modes if scenario.sensors.kind == "shack-hartmann" else 1)
-    air = steps_of_air(clock(scenario, scenario.n_steps), scenario.n_steps) - scenario.n_steps
-    return n_modes * (300.0 * scenario.n_steps + 140.0 * air) + max(min(n_modes, AT_ONCE) * windows, waves)
+    kept = 300.0 * scenario.n_steps + 140.0 * (_steps_of_air(scenario) - scenario.n_steps)
+    return n_modes * kept + max(min(n_modes, AT_ONCE) * windows, waves)

@@ -23,7 +23,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.schedule import air_time, during, strength, turns
 
 GUARD = 64
-"""Periods of an AR(2) peak, by which it is continued to both sides for its analytic signal."""
+"""Periods of an AR(2) peak, by which it is continued to both sides for its analytic signal, as long as the record at most."""
 
 
 def of_peak(scenario: Scenario, number: int) -> list[Event]:
@@ -41,9 +41,9 @@ def moved(signal: Array, events: Sequence[Event], dt: float, before: int = 0) ->
 def moved_process(process: Ar2, x: Array, events: Sequence[Event]) -> Array:
     """The same of a sample x (n,) of an AR(2) process, which is not periodic: on both sides it goes on as the process is
     expected to, and fades out."""
-    guard = max(round(GUARD * 2.0 * np.pi / (process.omega * process.dt)), 2)
+    guard = min(round(GUARD * 2.0 * np.pi / (process.omega * process.dt)), x.size)
     fade = 0.5 + 0.5 * np.cos(np.pi * np.arange(1, guard + 1) / (guard + 1))
-    ahead, behind = (fade * process.expected(ends, guard) for ends in (x[-2:], x[1::-1]))
+    ahead, behind = (fade * process.expected(ends, guard) for ends in (np.resize(x[-2:], 2), np.resize(x[1::-1], 2)))
     return moved(np.concatenate([behind[::-1], x, ahead]), events, process.dt, guard)[guard:-guard]
 
 
@@ -56,7 +56,7 @@ def clock(scenario: Scenario, n_steps: int) -> Array | None:
 def steps_of_air(at: Array | None, n_steps: int) -> int:
     """How many steps of turbulence a record takes, by its clock: those of the record at least, so that a wind that falls leaves
     what was before as it was."""
-    return n_steps if at is None else max(n_steps, int(np.ceil(at[-1])) + 1)
+    return n_steps if at is None else max(n_steps, int(np.ceil(at[-1])) + 1, 2)
 
 
 def read(x: Array, at: Array | None) -> Array:

@@ -81,6 +81,12 @@ class Scenario(Group):
         """The scenario as it is without its events: what observers were made for, and the training record is of."""
         return self.replace({"events": []}) if self.events else self
 
+    @property
+    def air(self) -> float:
+        """How long a piece of turbulence the wind carries past during the record, at the speed that it has without events [s]."""
+        wind = [event for event in self.events if event.kind == WIND]
+        return float(air_time(wind, np.linspace(0.0, self.run.duration, 1001))[-1]) if wind else self.run.duration
+
     def validate(self) -> None:
         """Check what no single setting can: raises SettingError naming the settings and the limit."""
         nyquist = self.sensors.lgs_rate / 2
@@ -120,10 +126,9 @@ class Scenario(Group):
                 raise SettingError(f"events.{i}.lasers = {event.lasers}: takes up to sensors.lgs_count = {stars}")
             if event.kind == PEAK:
                 self._validate_moving_peak(i, event)
-        blown = air_time([e for e in self.events if e.kind == WIND], np.linspace(0.0, self.run.duration, 1001))[-1]
-        if blown > (MOST_AIR + 1e-9) * self.run.duration:
-            raise SettingError(f"events: the wind carries {blown:.3g} s of turbulence past in {self.run.duration:g} s; at most "
-                               f"{MOST_AIR:g} times as much as the record is long")
+        if self.air > (MOST_AIR + 1e-9) * self.run.duration:
+            raise SettingError(f"events: the wind carries {self.air:.3g} s of turbulence past in {self.run.duration:g} s; at "
+                               f"most {MOST_AIR:g} times as much as the record is long")
 
     def _validate_moving_peak(self, i: int, event: Event) -> None:
         v, nyquist = self.vibration, self.sensors.lgs_rate / 2

@@ -61,9 +61,10 @@ class Identified:
         """A scenario whose z has the spectra found: turbulence as AR(2), the peaks, the LGS noise; the Kalman filters follow it.
 
         What the modes share in a scenario (wind, damping, strength of turbulence, noise) is the mean of what was found, weighted
-        with the errors. base : where everything else comes from.
+        with the errors. base : where everything else comes from, but its events, which name peaks by their number.
         """
-        out = (base or Scenario()).replace({"telescope.radial_order": _order(len(self.modes)), "sensors.lgs_rate": 1.0 / self.dt})
+        out = (base or Scenario()).before_events.replace(
+            {"telescope.radial_order": _order(len(self.modes)), "sensors.lgs_rate": 1.0 / self.dt})
         peaks = self.peaks
         changes: dict[str, Any] = {path: number.value for path, number in self.shared(out).items()}
         changes |= {
