@@ -27,7 +27,7 @@ MOST = 1000
 Rows = list[tuple[str, str, float | str | None, float | str | None]]
 """(section, name, before, after)."""
 
-SETTING, VALIDATION, TEST, LIKELIHOOD = "setting", "validation", "test", "likelihood"
+SETTING, VALIDATION, TEST, OTHER, LIKELIHOOD = "setting", "validation", "test", "other target", "likelihood"
 
 
 def seconds(of: Shown, scenario: Scenario, observer: str, evaluations: int) -> float:
@@ -75,6 +75,9 @@ def rows(tuned: Tuned) -> Rows:
         (VALIDATION, *(s.validation for s in stages)), (TEST, *(s.test for s in stages)),
     ):
         out += [(section, name, _error(before, name), _error(after, name)) for name in (*_modes(stages), TOGETHER)]
+    if any(s.other for s in stages):
+        before, after = stages
+        out.append((OTHER, TOGETHER, _error(before.other, TOGETHER), _error(after.other, TOGETHER)))
     if any(s.likelihood for s in stages):
         values = [s.likelihood or (None,) * len(_modes(stages)) for s in stages]
         out += [(LIKELIHOOD, *row) for row in zip(_modes(stages), *values, strict=True)]

@@ -17,10 +17,16 @@ import param
 
 from wfsobs.app.display import label_of, written_unit
 from wfsobs.app.store import Store
-from wfsobs.parameters import Reals, unit_of
+from wfsobs.parameters import Reals
 
 ROOM = {"sizing_mode": "stretch_width", "margin": (4, 0)}
 NUMBER_WIDTH = 92
+
+UNNAMED = {
+    "& .MuiInputLabel-root": {"clipPath": "inset(50%)", "overflow": "hidden", "width": "1px", "height": "1px"},
+    "& legend": {"display": "none"}, "& fieldset": {"top": 0},
+}
+"""A box whose name is heard but not seen: the slider beside it has the same."""
 
 SOON = 5
 """How long a message of a slider or switch waits for the next to go with it [ms]: by default 50, a tenth of a redraw."""
@@ -165,8 +171,7 @@ class SliderField(TextField):
             size="small", **names, **ROOM)
         slider._debounce = SOON  # type: ignore[misc]
         slider.param.watch(self._released, "value_throttled")
-        unit = written_unit(unit_of(p))
-        text = self._text(label=unit or "value", width=NUMBER_WIDTH, margin=(4, 0, 4, 8), align="end")
+        text = self._text(label=names["label"], width=NUMBER_WIDTH, margin=(4, 0, 4, 8), align="end", sx=UNNAMED)
         return [slider, text]
 
     def _row(self) -> Any:

@@ -41,14 +41,14 @@ class Pages(param.Parameterized):
 
     current = param.Selector(default=EXPLORE, objects=list(TITLES.values()), label="Page")
 
-    def __init__(self, explore: Any, store: Store, display: Display):
+    def __init__(self, explore: Page, store: Store, display: Display):
         super().__init__()
         self._makers: dict[str, Callable[[], Page]] = {
             IDENTIFY: lambda: IdentifyPage(store, display), TUNE: lambda: TunePage(store, display),
             LOOP: lambda: ClosedLoopPage(store.run, display), FIGURES: lambda: Figures(store.run, display),
             MODEL: lambda: Model(store, display)}
-        self.made: dict[str, Page] = {}
-        self.rooms = {EXPLORE: explore, **{
+        self.made: dict[str, Page] = {EXPLORE: explore}
+        self.rooms = {EXPLORE: explore.view(), **{
             name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers}}
         self.switch = pmui.RadioButtonGroup.from_param(
             self.param.current, options=dict(TITLES), size="small", margin=0, color="primary", sx=WRAPPED)

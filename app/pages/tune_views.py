@@ -10,7 +10,7 @@ from bokeh.models import ColumnDataSource, DataRange1d
 
 from wfsobs.app.display import NO_ANGLE, NOTHING, UNITS, Display, number, per_micrometre
 from wfsobs.app.style import look
-from wfsobs.app.tune_work import LIKELIHOOD, SETTING, TEST, TOGETHER, VALIDATION, best_so_far, rows
+from wfsobs.app.tune_work import LIKELIHOOD, OTHER, SETTING, TEST, TOGETHER, VALIDATION, best_so_far, rows
 from wfsobs.app.views.plots import new_figure
 from wfsobs.app.views.table import change
 from wfsobs.modes import TIP_TILT
@@ -20,6 +20,7 @@ from wfsobs.tuning.report import remarks
 TITLES = {
     SETTING: "Settings", VALIDATION: "RMS error on the validation record, which the search sees [{unit}]",
     TEST: "RMS error on the test record, which it does not [{unit}]",
+    OTHER: "The same of what it was not tuned for, turbulence or vibration [{unit}]",
     LIKELIHOOD: "Log marginal likelihood of the training targets, for information",
 }
 LEGEND = {"tried": "error of what was tried", "fitted": "least so far"}
@@ -68,7 +69,7 @@ def table_html(tuned: Tuned, display: Display, diameter: float) -> str:
             title = TITLES[section].format(unit=UNITS[unit])
             body += f'<tr><th colspan=4 class="target" scope=rowgroup>{escape(title)}</th></tr>'
             last = section
-        error = section in (VALIDATION, TEST)
+        error = section in (VALIDATION, TEST, OTHER)
         cells = [_cell(x, scale if error else 1.0, 4) for x in (before, after)]
         known = error and isinstance(before, float) and isinstance(after, float)
         cells.append(change(before, after) if known else "")  # type: ignore[arg-type]

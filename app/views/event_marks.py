@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 from bokeh.models import ColumnDataSource, Text, VSpan, VStrip
 from bokeh.plotting import figure
 
 from wfsobs.app.views.plots import send
 from wfsobs.app.work import Shown
 from wfsobs.groups.events import LASER, PEAK, WIND, Event
+from wfsobs.scenario import Scenario
 
 COLOURS = {False: "#7A1FA2", True: "#E0B3FF"}
 """In light and dark mode."""
@@ -16,18 +19,20 @@ LEVELS = 3
 """Words one below the other before they start at the top again."""
 
 LINE_PX = 13
+WORD = 0.25
+"""How wide a word is at most, as a share of the record."""
 
 
-def word(event: Event) -> str:
+def word(event: Event, scenario: Scenario) -> str:
     """What an event does, in a word or two.
 
-    >>> word(Event(kind="peak", peak=2, frequency_shift=3.0)), word(Event(kind="laser", lasers=2))
-    ('peak 2 +3 Hz', '2 LGS out')
+    >>> word(Event(kind="peak", frequency_shift=3.0), Scenario()), word(Event(kind="laser", lasers=2), Scenario())
+    ('47.5 Hz peak +3 Hz', '2 LGS out')
     """
     if event.kind == PEAK:
         moves = f" {event.frequency_shift:+g} Hz" if event.frequency_shift else ""
         grows = f" × {event.strength:g}" if event.strength != 1.0 else ""
-        return f"peak {event.peak}{moves}{grows}".replace("-", "−")
+        return f"{scenario.vibration.peaks[event.peak].frequency:.3g} Hz peak{moves}{grows}".replace("-", "−")
     if event.kind == WIND:
         return f"wind × {event.wind_factor:g}"
     if event.kind == LASER:
@@ -42,7 +47,17 @@ def events_of(shown: Shown) -> list[Event]:
 
 def room(shown: Shown) -> float:
     """What the words take above the lines, as a share of the axis."""
-    return 0.1 * min(len(events_of(shown)), LEVELS)
+    return 0.1 * (1 + max(levels(shown), default=-1))
+
+
+def levels(shown: Shown) -> list[int]:
+    """How many lines below the top the word of each event stands, so that none stands in the one before."""
+    out, before = [], -math.inf
+    for event in events_of(shown):
+        near = event.start - before < WORD * shown.scenario.run.duration
+        out.append((out[-1] + 1) % LEVELS if near else 0)
+        before = event.start
+    return out
 
 
 class EventMarks:
@@ -69,8 +84,8 @@ class EventMarks:
         send(self.spans, {"start": [e.start for e in lasting], "end": [e.start + e.duration for e in lasting]})
         top = float(self.figure.y_range.end)  # type: ignore[attr-defined]
         send(self.words, {
-            "x": [e.start for e in events], "y": [top] * len(events), "text": [word(e) for e in events],
-            "below": [2 + LINE_PX * (i % LEVELS) for i in range(len(events))]})
+            "x": [e.start for e in events], "y": [top] * len(events), "text": [word(e, shown.scenario) for e in events],
+            "below": [2 + LINE_PX * level for level in levels(shown)]})
         self.restyle(dark)
 
     def restyle(self, dark: bool) -> None:

@@ -23,6 +23,7 @@ class Spectra:
 
     def __init__(self, run: Run, display: Display):
         self.run, self.display = run, display
+        self.visible, self._behind = True, False
         self.x_range = Range1d(start=0.5, end=500.0)
         self.spectra = {target: _Spectrum(target, self.x_range) for target in TARGETS}
         run.param.watch(self._redraw, "shown")
@@ -33,9 +34,16 @@ class Spectra:
         """The figure of one target."""
         return pn.pane.Bokeh(self.spectra[target].figure, sizing_mode="stretch_width", margin=0)
 
+    def show(self, visible: bool) -> None:
+        """Draw what has come meanwhile, and go on while visible."""
+        self.visible = visible
+        if visible and self._behind:
+            self._redraw()
+
     def _redraw(self, *_: object) -> None:
         shown = self.run.shown
-        if shown is None:
+        self._behind = not self.visible
+        if shown is None or self._behind:
             return
         with pn.io.hold():
             for spectrum in self.spectra.values():

@@ -41,7 +41,8 @@ class Traces:
         self.run, self.display = run, display
         self.x_range = Range1d(start=0.0, end=10.0)
         self.length = 0.0
-        self._waiting = False
+        self._waiting = self._behind = False
+        self.visible = True
         crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
         self.traces = {target: _Trace(target, self.x_range, crosshair) for target in TARGETS}
         run.param.watch(self._redraw, "shown")
@@ -54,9 +55,16 @@ class Traces:
         """The figure of one target."""
         return pn.pane.Bokeh(self.traces[target].figure, sizing_mode="stretch_width", margin=0)
 
+    def show(self, visible: bool) -> None:
+        """Draw what has come meanwhile, and go on while visible."""
+        self.visible = visible
+        if visible and self._behind:
+            self._redraw()
+
     def _redraw(self, *_: object) -> None:
         shown = self.run.shown
-        if shown is None:
+        self._behind = not self.visible
+        if shown is None or self._behind:
             return
         record = shown.result.record
         length = record.n_steps * record.dt

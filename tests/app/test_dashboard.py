@@ -56,12 +56,12 @@ def test_a_failing_run_shows_inline(loop: Any, short: Scenario) -> None:
     dashboard.page()
     dashboard.start()
     loop.finish(dashboard.store)
-    table = dashboard.table.pane.object
+    table = dashboard.explore.table.pane.object
     dashboard.store.change("loop.gain", 0.1)
     loop.finish(dashboard.store)
     assert dashboard.alert.visible and "no such luck" in dashboard.alert.object
     assert dashboard.stale.visible and faded(dashboard)
-    assert dashboard.table.pane.object == table, "the last result stands"
+    assert dashboard.explore.table.pane.object == table, "the last result stands"
     dashboard.store.change("loop.gain", 0.2)
     loop.finish(dashboard.store)
     assert not dashboard.alert.visible and not dashboard.stale.visible and not faded(dashboard)

@@ -57,7 +57,7 @@ def seen(dashboard: Dashboard) -> list[str]:
 
 class TestPages:
     def test_nothing_is_made_before_it_is_opened(self, dashboard: Dashboard) -> None:
-        assert dashboard.pages.made == {}
+        assert list(dashboard.pages.made) == [EXPLORE]
         assert seen(dashboard) == [EXPLORE]
 
     def test_turning(self, dashboard: Dashboard) -> None:
@@ -158,3 +158,16 @@ class TestModel:
     @pytest.mark.parametrize(("x", "text"), [(0.5, "0.5"), (-1.0, "−1"), (0.0, "0"), (100.0, "100"), (2e-7, "2.0000e-07")])
     def test_short(self, x: float, text: str) -> None:
         assert mathml.short(x) == text
+
+
+def test_the_first_page_rests_while_another_shows(dashboard: Dashboard, loop: Any) -> None:
+    line = dashboard.explore.traces.traces["turbulence"].source
+    spectrum = dashboard.explore.spectra.spectra["turbulence"].sources["kf-lgs"]
+    before = line.data, spectrum.data
+    opened(dashboard, MODEL)
+    dashboard.store.change("turbulence.wind_speed", 30)
+    loop.finish(dashboard.store)
+    assert line.data is before[0] and spectrum.data is before[1]
+    dashboard.pages.current = EXPLORE
+    assert not np.array_equal(np.asarray(line.data["truth"]), np.asarray(before[0]["truth"]))
+    assert not np.array_equal(np.asarray(spectrum.data["y"]), np.asarray(before[1]["y"]))

@@ -20,7 +20,7 @@ from wfsobs.scores import rms
 
 
 def press(dashboard: Dashboard) -> None:
-    dashboard.pinning.button.param.trigger("clicks")
+    dashboard.explore.pinning.button.param.trigger("clicks")
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def pinned(dashboard: Dashboard, loop: Any) -> Dashboard:
 
 
 def order(dashboard: Dashboard, target: str) -> list[str]:
-    return re.findall(rf'data-observer="([\w-]+)" data-target="{target}"', dashboard.table.pane.object)
+    return re.findall(rf'data-observer="([\w-]+)" data-target="{target}"', dashboard.explore.table.pane.object)
 
 
 class TestPin:
@@ -42,22 +42,22 @@ class TestPin:
         before = kept.score("kf-lgs", "turbulence", "tip").rms
         now = next(s for s in shown.result.scores if (s.observer, s.target, s.mode) == ("kf-lgs", "turbulence", "tip")).rms
         assert now != before
-        html = pinned.table.pane.object
+        html = pinned.explore.table.pane.object
         assert f"<td>{number(1e3 * before)}</td><td>{change(before, now)}</td>" in html
         assert "Pinned [nm]" in html and "Change [%]" in html
 
     def test_the_name_says_what_differs(self, pinned: Dashboard, loop: Any) -> None:
-        assert "Wind speed V₀ 15 → 30 m/s" in pinned.pinning.note.object and pinned.pinning.note.visible
+        assert "Wind speed V₀ 15 → 30 m/s" in pinned.explore.pinning.note.object and pinned.explore.pinning.note.visible
         pinned.store.change("turbulence.wind_speed", 15)
         loop.finish(pinned.store)
-        assert "the same settings" in pinned.pinning.note.object
+        assert "the same settings" in pinned.explore.pinning.note.object
 
     def test_faint_lines(self, pinned: Dashboard) -> None:
-        trace, kept = pinned.traces.traces["turbulence"], pinned.display.pinned
+        trace, kept = pinned.explore.traces.traces["turbulence"], pinned.display.pinned
         data = trace.faint.source.data
         assert len(data["xs"]) == len(data["colour"]) == 1 + len(observers_of("turbulence"))
         assert np.nanmax(data["ys"][0]) == pytest.approx(1e3 * np.nanmax(kept.signals[TRUTH, "turbulence"][:, 0]))
-        spectrum = pinned.spectra.spectra["vibration"].faint.source.data
+        spectrum = pinned.explore.spectra.spectra["vibration"].faint.source.data
         assert np.allclose(spectrum["ys"][0], 1e6 * kept.spectra[TRUTH, "vibration"].signal[1:, 0])
         pinned.display.show = "error"
         assert len(trace.faint.source.data["xs"]) == len(observers_of("turbulence")), "the truth has no error"
@@ -65,19 +65,19 @@ class TestPin:
         assert len(trace.faint.source.data["xs"]) == len(observers_of("turbulence")) - 1
 
     def test_a_zoom_cuts_the_pinned_lines(self, pinned: Dashboard) -> None:
-        pinned.traces.x_range.update(start=1.0, end=1.1)
-        x = np.asarray(pinned.traces.traces["vibration"].faint.source.data["xs"][0])
+        pinned.explore.traces.x_range.update(start=1.0, end=1.1)
+        x = np.asarray(pinned.explore.traces.traces["vibration"].faint.source.data["xs"][0])
         assert x[0] == pytest.approx(0.975, abs=2e-3) and x[-1] == pytest.approx(1.125, abs=3e-3)
 
     def test_unpin(self, pinned: Dashboard) -> None:
-        assert pinned.pinning.button.label == "Unpin"
+        assert pinned.explore.pinning.button.label == "Unpin"
         press(pinned)
-        assert pinned.display.pinned is None and pinned.pinning.button.label == "Pin"
-        assert "Pinned" not in pinned.table.pane.object and not pinned.pinning.note.visible
-        assert pinned.traces.traces["turbulence"].faint.source.data["xs"] == []
+        assert pinned.display.pinned is None and pinned.explore.pinning.button.label == "Pin"
+        assert "Pinned" not in pinned.explore.table.pane.object and not pinned.explore.pinning.note.visible
+        assert pinned.explore.traces.traces["turbulence"].faint.source.data["xs"] == []
 
     def test_nothing_is_drawn_before(self, dashboard: Dashboard) -> None:
-        assert all(dashboard.traces.traces[target].faint.source is None for target in TARGETS)
+        assert all(dashboard.explore.traces.traces[target].faint.source is None for target in TARGETS)
 
     def test_all_samples_of_a_short_record_are_kept(self, dashboard: Dashboard) -> None:
         shown = dashboard.store.run.shown
@@ -112,7 +112,7 @@ class TestTable:
         assert order(dashboard, "vibration") == list(rms_of)
 
     def test_marks(self, dashboard: Dashboard) -> None:
-        html = dashboard.table.pane.object
+        html = dashboard.explore.table.pane.object
         assert html.count(">best<") == 2, "one causal observer per target"
         worse = [s for s in dashboard.store.run.shown.result.scores
                  if s.mode == "tip" and s.normalised_rms is not None and s.normalised_rms > 1]
@@ -120,13 +120,13 @@ class TestTable:
 
     def test_real_time_factor(self, dashboard: Dashboard) -> None:
         score = next(s for s in dashboard.store.run.shown.result.scores if s.observer == "gpr-online" and s.mode == "tip")
-        assert f"<td>{number(1e3 * score.seconds_per_step, 2)}</td></tr>" in dashboard.table.pane.object
+        assert f"<td>{number(1e3 * score.seconds_per_step, 2)}</td></tr>" in dashboard.explore.table.pane.object
 
 
 def test_cumulative_rms(dashboard: Dashboard) -> None:
     """At the lowest frequency it is the rms of what is shown, the mean aside."""
     dashboard.display.spectrum = "cumulative"
-    shown, view = dashboard.store.run.shown, dashboard.spectra.spectra["vibration"]
+    shown, view = dashboard.store.run.shown, dashboard.explore.spectra.spectra["vibration"]
     y = np.asarray(view.sources["kf-lgs"].data["y"])
     assert np.all(np.diff(y) <= 0)
     signal = shown.values("kf-lgs", "vibration")[500:, 0]

@@ -64,6 +64,8 @@ def test_it_shows_what_the_core_finds(page: TunePage, dashboard: Dashboard, loop
             cells = row(table, section, name)
             assert cells[:2] == [number(1e3 * a, 4), number(1e3 * b, 4)]
             assert float(cells[2].replace("−", "-")) == pytest.approx(100 * (b / a - 1), abs=0.051)
+    assert before.other and after.other
+    assert row(table, "other target", "rms over modes")[:2] == [number(1e3 * s.rms, 4) for s in (before.other, after.other)]
     for path, value in changes(expected.scenario, before.scenario).items():
         text = f"{value:.6g}" if isinstance(value, float) else str(value)
         assert row(table, "setting", path)[1] == text

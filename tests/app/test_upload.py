@@ -58,15 +58,15 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     expected = observe(read_record(io.BytesIO(content), "night.csv"), scenario)
     assert [(s.observer, s.target, s.mode, s.rms) for s in shown.result.scores] == [
         (s.observer, s.target, s.mode, s.rms) for s in expected.scores]
-    table = dashboard.table.html()
+    table = dashboard.explore.table.html()
     assert "one step ahead: the record has no truth" in table and "Recorded loop, residual" in table and "error / z" in table
     assert "nan" not in table
-    line = dashboard.traces.traces["vibration"].source.data
+    line = dashboard.explore.traces.traces["vibration"].source.data
     assert np.isfinite(line["kf-lgs"]).all() and np.isnan(line["truth"]).all()
-    spectrum = dashboard.spectra.spectra["vibration"].sources["kf-lgs"].data
+    spectrum = dashboard.explore.spectra.spectra["vibration"].sources["kf-lgs"].data
     assert len(spectrum["y"]) and np.isfinite(spectrum["y"]).all()
-    assert dashboard.spectra.spectra["vibration"].peaks.data["x"] == []  # of the settings, not of the record
-    notes = {card["name"]: card["note"] for card in dashboard.strips["vibration"].items()}
+    assert dashboard.explore.spectra.spectra["vibration"].peaks.data["x"] == []  # of the settings, not of the record
+    notes = {card["name"]: card["note"] for card in dashboard.explore.strips["vibration"].items()}
     assert notes["kf-lgs"] == "no truth to compare" and notes["butterworth-ol"] in ("no result", "no truth to compare")
     dashboard.display.show = "error"  # there is none, and nothing breaks
 

@@ -22,7 +22,7 @@ from wfsobs.scores import BOUND
 
 
 def trace(dashboard: Dashboard, target: str) -> dict[str, Any]:
-    return dict(dashboard.traces.traces[target].source.data)
+    return dict(dashboard.explore.traces.traces[target].source.data)
 
 
 class TestEnvelope:
@@ -66,26 +66,26 @@ class TestTraces:
         data = trace(dashboard, "vibration")
         assert np.allclose(data["kf-lgs"], 1e3 * envelope(error[:, 0], BINS), rtol=1e-5)
         assert np.isnan(data[TRUTH]).all()
-        assert "error of tip [nm]" in dashboard.traces.traces["vibration"].figure.yaxis.axis_label
+        assert "error of tip [nm]" in dashboard.explore.traces.traces["vibration"].figure.yaxis.axis_label
 
     def test_mode_and_unit(self, dashboard: Dashboard) -> None:
         dashboard.display.param.update(mode="tilt", unit="mas")
         truth = dashboard.store.run.shown.values(TRUTH, "vibration")[:, 1]
         assert np.allclose(trace(dashboard, "vibration")[TRUTH], 103.132403 * envelope(truth, BINS), rtol=1e-6)
-        assert dashboard.traces.traces["vibration"].figure.yaxis.axis_label == "tilt [mas]"
+        assert dashboard.explore.traces.traces["vibration"].figure.yaxis.axis_label == "tilt [mas]"
 
     def test_figures_share_their_time_axis(self, dashboard: Dashboard) -> None:
-        ranges = {id(t.figure.x_range) for t in dashboard.traces.traces.values()}
+        ranges = {id(t.figure.x_range) for t in dashboard.explore.traces.traces.values()}
         assert len(ranges) == 1
-        assert (dashboard.traces.x_range.start, dashboard.traces.x_range.end) == (0.0, 2.0)
+        assert (dashboard.explore.traces.x_range.start, dashboard.explore.traces.x_range.end) == (0.0, 2.0)
 
     def test_figures_share_their_crosshair(self, dashboard: Dashboard) -> None:
         spans = [{id(tool.overlay) for tool in t.figure.tools if isinstance(tool, CrosshairTool)}
-                 for t in dashboard.traces.traces.values()]
+                 for t in dashboard.explore.traces.traces.values()]
         assert len(spans) == 2 and spans[0] == spans[1] and len(spans[0]) == 1
 
     def test_a_zoom_sends_the_samples_of_its_window(self, dashboard: Dashboard) -> None:
-        dashboard.traces.x_range.update(start=1.0, end=1.1)
+        dashboard.explore.traces.x_range.update(start=1.0, end=1.1)
         data = trace(dashboard, "vibration")
         step = np.diff(data["x"])
         assert np.allclose(step, 1e-3), "every sample of it"
@@ -95,28 +95,28 @@ class TestTraces:
         assert np.allclose(data[TRUTH], 1e3 * truth, rtol=1e-6)
 
     def test_the_window_stays_through_a_change(self, dashboard: Dashboard, loop: Any) -> None:
-        dashboard.traces.zoom(0.2)
-        window = (dashboard.traces.x_range.start, dashboard.traces.x_range.end)
+        dashboard.explore.traces.zoom(0.2)
+        window = (dashboard.explore.traces.x_range.start, dashboard.explore.traces.x_range.end)
         assert window == pytest.approx((0.9, 1.1))
         dashboard.store.change("turbulence.wind_speed", 30)
         loop.finish(dashboard.store)
-        assert (dashboard.traces.x_range.start, dashboard.traces.x_range.end) == window
+        assert (dashboard.explore.traces.x_range.start, dashboard.explore.traces.x_range.end) == window
         dashboard.store.change("run.duration", 3)
         loop.finish(dashboard.store)
-        assert (dashboard.traces.x_range.start, dashboard.traces.x_range.end) == (0.0, 3.0)
-        dashboard.traces.zoom(None)
-        assert dashboard.traces.x_range.reset_end == 3.0
+        assert (dashboard.explore.traces.x_range.start, dashboard.explore.traces.x_range.end) == (0.0, 3.0)
+        dashboard.explore.traces.zoom(None)
+        assert dashboard.explore.traces.x_range.reset_end == 3.0
 
     def test_hidden_lines(self, dashboard: Dashboard) -> None:
-        dashboard.strips["vibration"].cards.hidden = ["kf-lgs"]
-        assert not dashboard.traces.traces["vibration"].lines["kf-lgs"].visible
-        assert not dashboard.spectra.spectra["vibration"].lines["kf-lgs"].visible
-        assert dashboard.traces.traces["turbulence"].lines["kf-lgs"].visible
-        dashboard.strips["vibration"].cards.hidden = []
-        assert dashboard.traces.traces["vibration"].lines["kf-lgs"].visible
+        dashboard.explore.strips["vibration"].cards.hidden = ["kf-lgs"]
+        assert not dashboard.explore.traces.traces["vibration"].lines["kf-lgs"].visible
+        assert not dashboard.explore.spectra.spectra["vibration"].lines["kf-lgs"].visible
+        assert dashboard.explore.traces.traces["turbulence"].lines["kf-lgs"].visible
+        dashboard.explore.strips["vibration"].cards.hidden = []
+        assert dashboard.explore.traces.traces["vibration"].lines["kf-lgs"].visible
 
     def test_the_axis_leaves_out_the_warm_up(self, dashboard: Dashboard) -> None:
-        figure = dashboard.traces.traces["turbulence"].figure
+        figure = dashboard.explore.traces.traces["turbulence"].figure
         data = trace(dashboard, "turbulence")
         counted = np.concatenate([np.asarray(v)[data["x"] >= 0.5] for k, v in data.items() if k != "x"])
         assert figure.y_range.start < np.nanmin(counted) < np.nanmax(counted) < figure.y_range.end
@@ -124,7 +124,7 @@ class TestTraces:
 
 class TestSpectra:
     def test_signal_and_error(self, dashboard: Dashboard) -> None:
-        shown, view = dashboard.store.run.shown, dashboard.spectra.spectra["vibration"]
+        shown, view = dashboard.store.run.shown, dashboard.explore.spectra.spectra["vibration"]
         spectrum = shown.spectra["gpr-offline", "vibration"]
         assert np.allclose(view.sources["gpr-offline"].data["y"], 1e6 * spectrum.signal[1:, 0])
         truth = np.asarray(view.sources[TRUTH].data["y"])
@@ -134,13 +134,13 @@ class TestSpectra:
 
     def test_unit(self, dashboard: Dashboard) -> None:
         dashboard.display.unit = "um"
-        view = dashboard.spectra.spectra["vibration"]
+        view = dashboard.explore.spectra.spectra["vibration"]
         assert np.allclose(
             view.sources[TRUTH].data["y"], dashboard.store.run.shown.spectra[TRUTH, "vibration"].signal[1:, 0])
         assert "µm²/Hz" in view.figure.yaxis.axis_label
 
     def test_peaks_are_marked(self, dashboard: Dashboard, loop: Any) -> None:
-        view = dashboard.spectra.spectra["vibration"]
+        view = dashboard.explore.spectra.spectra["vibration"]
         peaks = [p.frequency for p in dashboard.store.scenario.vibration.peaks]
         assert view.peaks.data["x"] == peaks
         assert view.model.data["x"] == [dashboard.store.scenario.kalman.frequency]
@@ -152,15 +152,15 @@ class TestSpectra:
         assert view.peaks.data["x"] == []
 
     def test_axes(self, dashboard: Dashboard) -> None:
-        assert dashboard.spectra.x_range.start == pytest.approx(0.667, abs=0.01)
-        assert dashboard.spectra.x_range.end == 500.0
-        for view in dashboard.spectra.spectra.values():
+        assert dashboard.explore.spectra.x_range.start == pytest.approx(0.667, abs=0.01)
+        assert dashboard.explore.spectra.x_range.end == 500.0
+        for view in dashboard.explore.spectra.spectra.values():
             assert 0 < view.figure.y_range.start < view.figure.y_range.end
 
 
 class TestNumbers:
     def test_the_table_shows_the_scores(self, dashboard: Dashboard) -> None:
-        html = dashboard.table.pane.object
+        html = dashboard.explore.table.pane.object
         for score in dashboard.store.run.shown.result.scores:
             if score.mode == "tip":
                 assert number(1e3 * score.rms) in html
@@ -170,8 +170,8 @@ class TestNumbers:
     def test_the_table_follows_mode_and_unit(self, dashboard: Dashboard) -> None:
         dashboard.display.param.update(mode="tilt", unit="mas")
         score = next(s for s in dashboard.store.run.shown.result.scores if s.mode == "tilt")
-        assert number(score.rms * per_micrometre("mas", 8.0)) in dashboard.table.pane.object
-        assert "RMS error [mas]" in dashboard.table.pane.object
+        assert number(score.rms * per_micrometre("mas", 8.0)) in dashboard.explore.table.pane.object
+        assert "RMS error [mas]" in dashboard.explore.table.pane.object
 
     def test_a_failure_is_named(self, dashboard: Dashboard, loop: Any) -> None:
         dashboard.store.change("multirate.measurement_noise", "manual")
@@ -179,10 +179,10 @@ class TestNumbers:
         loop.finish(dashboard.store)
         failures = dashboard.store.run.shown.result.failures
         for failure in failures:
-            assert failure.observer in dashboard.table.pane.object
+            assert failure.observer in dashboard.explore.table.pane.object
 
     def test_cards(self, dashboard: Dashboard) -> None:
-        cards = {c["name"]: c for c in dashboard.strips["vibration"].cards.items}
+        cards = {c["name"]: c for c in dashboard.explore.strips["vibration"].cards.items}
         score = next(s for s in dashboard.store.run.shown.result.scores
                      if (s.observer, s.target, s.mode) == ("gpr-online", "vibration", "tip"))
         assert cards["gpr-online"]["value"] == number(1e3 * score.rms) and cards["gpr-online"]["unit"] == "nm"
@@ -193,8 +193,8 @@ class TestNumbers:
     def test_before_the_first_result(self, make_store: Any, loop: Any, short: Any) -> None:
         dashboard = Dashboard(loop.queue.put, short)
         loop.closing.append(dashboard)
-        assert all(c["value"] == "–" for c in dashboard.strips["vibration"].cards.items)
-        assert dashboard.table.pane.object.count("–") > 20
+        assert all(c["value"] == "–" for c in dashboard.explore.strips["vibration"].cards.items)
+        assert dashboard.explore.table.pane.object.count("–") > 20
 
     @pytest.mark.parametrize(("value", "text"), [
         (None, "–"), (0.0, "0"), (15.723, "15.7"), (406.4, "406"), (1234.5, "1234"), (0.0616, "0.0616"),
@@ -216,9 +216,9 @@ class TestLooks:
 
     def test_dark_mode(self, dashboard: Dashboard) -> None:
         dashboard.display.dark = True
-        line = dashboard.traces.traces["vibration"].lines["gpr-online"]
+        line = dashboard.explore.traces.traces["vibration"].lines["gpr-online"]
         assert line.glyph.line_color == LOOKS["gpr-online"].dark
-        assert LOOKS["gpr-online"].dark in dashboard.table.pane.object
+        assert LOOKS["gpr-online"].dark in dashboard.explore.table.pane.object
 
 
 def test_tilt_on_sky() -> None:
@@ -236,16 +236,16 @@ class TestHigherModes:
         assert switch.list.visible and list(switch.list.options.values()) == [m.name for m in store.scenario.modes]
         switch.list.value = "defocus"
         assert (display.mode, display.column, display.unit) == ("defocus", 2, "nm")
-        truth = dashboard.traces.traces["turbulence"].figure
-        assert "defocus" in truth.yaxis[0].axis_label and "Turbulence, defocus" in dashboard.table.pane.object
-        dashboard.pinning._pressed(None)
+        truth = dashboard.explore.traces.traces["turbulence"].figure
+        assert "defocus" in truth.yaxis[0].axis_label and "Turbulence, defocus" in dashboard.explore.table.pane.object
+        dashboard.explore.pinning._pressed(None)
         store.change("telescope.radial_order", 1)
         loop.finish(store)
         assert display.mode == "tip" and switch.buttons.visible and not switch.list.visible
         store.change("telescope.radial_order", 3)
         loop.finish(store)
         switch.list.value = "oblique trefoil"  # the pinned run has no such mode
-        assert display.compared is None and "oblique trefoil" in dashboard.table.pane.object
+        assert display.compared is None and "oblique trefoil" in dashboard.explore.table.pane.object
 
     def test_buttons_and_display_agree(self, dashboard: Dashboard) -> None:
         dashboard.modes.buttons.value = "tilt"

@@ -1,0 +1,105 @@
+"""The first page: per target a strip of cards, traces and spectra; below them the table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from html import escape
+from types import MappingProxyType
+from typing import Any
+
+import panel as pn
+import panel_material_ui as pmui
+
+from wfsobs.app.controls.fields import SOON
+from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display
+from wfsobs.app.pages.parts import WIDE, box
+from wfsobs.app.run import Run
+from wfsobs.app.style import asset
+from wfsobs.app.views.pinning import Pinning
+from wfsobs.app.views.spectra import MODEL, PEAKS, Spectra
+from wfsobs.app.views.strip import Strip
+from wfsobs.app.views.table import Table
+from wfsobs.app.views.traces import Traces
+from wfsobs.observers.base import TARGETS, VIBRATION
+
+GRID = """
+:host { display: grid !important; grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); gap: 10px; }
+@media (max-width: 1000px) { :host { grid-template-columns: minmax(0, 1fr); } }
+"""
+GAP = ":host { gap: 10px; }"
+ZOOMS: Mapping[str, float | None] = MappingProxyType({"Whole record": None, "2 s": 2.0, "0.2 s": 0.2})
+MARKS = (
+    f'<span class="mark" style="border-left:2px solid {PEAKS}">peaks</span>'
+    f'<span class="mark" style="border-left:2px dashed {MODEL}">peak in the Kalman filters</span>'
+)
+
+
+class Explore:
+    """The page; its figures rest while it is hidden."""
+
+    def __init__(self, run: Run, display: Display):
+        self.display = display
+        self.traces, self.spectra = Traces(run, display), Spectra(run, display)
+        self.strips = {target: Strip(target, run, display) for target in TARGETS}
+        self.table = Table(run, display)
+        self.pinning = Pinning(run, display)
+
+    def view(self) -> pn.Column:
+        """What is shown."""
+        body = pn.Column(
+            *(self._section(target) for target in TARGETS), box("RMS errors", self._best_first(), self.table.pane),
+            **WIDE, stylesheets=[GAP])
+        return pn.Column(self._switches(), body, **WIDE, stylesheets=[GAP])
+
+    def show(self, visible: bool) -> None:
+        """Draw what has come meanwhile, and go on while visible."""
+        for figures in (self.traces, self.spectra):
+            figures.show(visible)
+
+    def _switches(self) -> pn.FlexBox:
+        return pn.FlexBox(
+            group(self.display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS}),
+            group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
+            self._zoom_buttons(), *self.pinning.view(), gap="12px", align_items="center", **WIDE)
+
+    def _best_first(self) -> pmui.Checkbox:
+        return pmui.Checkbox.from_param(self.display.param.best_first, size="small", margin=(0, 0, 4, 0))
+
+    def _zoom_buttons(self) -> pn.Row:
+        buttons = []
+        for label, seconds in ZOOMS.items():
+            button = pmui.Button(
+                label=label, size="small", variant="text", margin=0, description=f"Time window: {label.lower()}")
+            button.on_click(lambda _event, seconds=seconds: self.traces.zoom(seconds))
+            buttons.append(button)
+        return pn.Row(*buttons, margin=0)
+
+    def _section(self, target: str) -> pn.Column:
+        """The strip and the two figures of one target."""
+        self.traces.traces[target].figure.name = f"{target.capitalize()} time trace"
+        self.spectra.spectra[target].figure.name = f"{target.capitalize()} spectrum"
+        cards = self.strips[target].cards
+        cards.param.watch(lambda event: self._hide(target, event.new), "hidden")
+        marks = MARKS if target == VIBRATION else ""
+        figures = pn.Column(
+            pn.Column(_caption("Time trace"), self.traces.pane(target), **WIDE),
+            pn.Column(_caption("Spectrum", marks), self.spectra.pane(target), **WIDE),
+            **WIDE, stylesheets=[GRID])
+        return box(target.capitalize(), cards, figures)
+
+    def _hide(self, target: str, names: list[str]) -> None:
+        self.display.hidden = {**self.display.hidden, target: list(names)}
+
+
+def group(display: Display, name: str, options: Any) -> pmui.RadioButtonGroup:
+    """The buttons of one switch of the display."""
+    widget = pmui.RadioButtonGroup.from_param(display.param[name], options=options, size="small", margin=0, variant="outlined")
+    widget.label = ""
+    widget._debounce = SOON  # type: ignore[misc]
+    return widget
+
+
+def _caption(text: str, marks: str = "") -> pn.pane.HTML:
+    return pn.pane.HTML(
+        f'<div class="caption">{escape(text)}{marks}</div>', sizing_mode="stretch_width", margin=(8, 0, 0, 0),
+        stylesheets=[asset("style.css")])
