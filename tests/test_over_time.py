@@ -93,16 +93,16 @@ def test_a_window_longer_than_the_run_is_refused() -> None:
 
 
 def test_after_a_jump_who_learns_is_back_and_who_is_fixed_is_not() -> None:
-    """A line of 30 nm jumps by 3 Hz. Who is trained on the last seconds is back within 10 % of what it had settled to once these
+    """A line of 30 nm jumps by 3 Hz. Who learns from the last seconds is back within 10 % of what it had settled to once these
     seconds, and those of the running rms, are all after the jump, and stays; filters of the old line never are.
 
     Four seeds, both modes, 3 s: 24 s of errors, whose rms is known to about 3 %.
     """
-    window, start, training, depth = 3.0, 7.0, 256, 170
+    window, start, training, depth, identified, interval = 3.0, 7.0, 256, 170, 2.0, 1.0
     s = PRESETS["peak-jump"]().replace({
         "run.duration": 15.0, "events.0.start": start, "gpr_online.training_size": training, "gpr_online.depth": depth,
-        "gpr_offline.training_size": 400})
-    adapt = {"gpr-online": (training + depth) * s.dt}
+        "gpr_offline.training_size": 400, "adaptive.window": identified, "adaptive.interval": interval})
+    adapt = {"gpr-online": (training + depth) * s.dt, "kf-adaptive": identified + interval}
     fixed = ("kf-lgs", "kf-multi", "gpr-offline")
     pools = {name: Pooled() for name in (*fixed, *adapt)}
     for seed in range(11, 15):
