@@ -80,4 +80,5 @@ def _most(path: str, value: float, most: float, unit: str = "") -> None:
 def _whole(value: float, most: float, what: str) -> None:
     if value > most:
         raise SettingError(f"The run would take about {value:.0f} {what}, at most {most:g} on this server: lower "
-                           "run.duration, sensors.lgs_rate, gpr_online.training_size or gpr_offline.training_size")
+                           "run.duration, sensors.lgs_rate, gpr_online.training_size or gpr_offline.training_size, or raise "
+                           "adaptive.interval")

@@ -20,7 +20,7 @@ from wfsobs.observers.kernels import SquaredExponential
 TINY = Sizes(
     settings={
         "run.warm_up": 0.1, "gpr_online.training_size": 30, "gpr_online.depth": 12, "gpr_offline.training_size": 60,
-        "gpr_offline.depth": 20,
+        "gpr_offline.depth": 20, "adaptive.window": 0.2,
     },
     duration=0.4, filter_duration=1.0, repeats=1, textbook_steps=6, library_steps=2, exact_steps=3,
     more_online=((40, 5),), more_steps=50, order=1, layers=2, longest_duration=0.3)
@@ -36,6 +36,7 @@ REQUIRED = {
     "offline-gpr-predict": {OURS, "gemm-stored-weights"},
     "kalman-record": {OURS, "numpy-loop"},
     "multirate-record": {OURS, "numpy-loop"},
+    "adaptive-record": {OURS},
     "frozen-flow": {OURS, "ideal-sensors"},
     "whole-run": {OURS, "without-online-gpr"},
 }
@@ -58,7 +59,7 @@ def test_rows_are_complete(rows):
         assert r["median_s"] > 0 and r["ratio_to_ours"] > 0
         assert (r["per_step_us"] is None) == (r["steps"] is None) == (r["task"] == "offline-gpr-train")
         assert (r["ready_us"] is None) == (r["task"] != "online-gpr-stream")
-        assert (r["max_error_over_std"] is None) == (r["task"] in ("frozen-flow", "whole-run"))
+        assert (r["max_error_over_std"] is None) == (r["task"] in ("adaptive-record", "frozen-flow", "whole-run"))
         assert r["variant"] != OURS or r["ratio_to_ours"] == 1.0
     assert {r["size"] for r in rows if r["peak_memory_mb"] is not None} == {
         "0.3 s, 2 modes", "0.4 s, 2 modes, 1 layer", "0.4 s, 2 modes, 2 layers"}

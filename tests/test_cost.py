@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from wfsobs.cost import frozen_flow_seconds, gpr_offline_seconds, gpr_online_seconds, part_seconds, run_seconds
+from wfsobs.cost import adaptive_seconds, frozen_flow_seconds, gpr_offline_seconds, gpr_online_seconds, part_seconds, run_seconds
 from wfsobs.presets import paper, ut4
 
 
@@ -21,7 +21,15 @@ def test_offline_gpr_near_what_was_measured(m: int, depth: int, measured: float)
     assert 0.7 < gpr_offline_seconds(10_000, m, depth) / measured < 1.8
 
 
-@pytest.mark.parametrize(("changes", "measured"), [({}, 0.410), ({"run.duration": 60}, 2.647)])
+@pytest.mark.parametrize(("changes", "measured"), [
+    ({}, 0.10), ({"run.duration": 60}, 0.74), ({"adaptive.window": 1}, 0.077), ({"adaptive.window": 8, "run.duration": 20}, 0.26),
+    ({"adaptive.interval": 0.1}, 0.38), ({"sensors.lgs_rate": 4000}, 0.15), ({"adaptive.window": 11}, 0.0),
+])
+def test_adaptive_filter_near_what_was_measured(changes: dict[str, float], measured: float) -> None:
+    assert 0.6 * measured <= adaptive_seconds(paper().replace(changes)) <= 1.6 * measured
+
+
+@pytest.mark.parametrize(("changes", "measured"), [({}, 0.62), ({"run.duration": 60}, 4.1)])
 def test_whole_runs_of_the_benchmarks_page(changes: dict[str, float], measured: float) -> None:
     assert 0.7 < run_seconds(paper().replace(changes)) / measured < 1.3
 

@@ -1,9 +1,10 @@
 """How long a run will take and how much memory, told from its settings.
 
 Measured as processor time on the machine of docs/benchmarks.md (2 virtual cores of an AMD EPYC, one BLAS thread),
-10 s to 300 s of record, m from 20 to 2048, d from 20 to 2000; there a run of the paper's takes 0.41 s, 0.38 s by this. The
-depth and the exposure ratio cost next to nothing. Modes run side by side on two cores. A busy machine takes two to
-three times as long: what counts here is whether it will be a moment or a wait.
+10 s to 300 s of record, m from 20 to 2048, d from 20 to 2000; there a run of the paper's takes 0.62 s, 0.55 s by this. The
+depth and the exposure ratio cost next to nothing. Modes run side by side on two cores, but for those of the adaptive filter,
+whose steps are too small for that. A busy machine takes two to three times as long: what counts here is whether it will be a
+moment or a wait.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ def run_seconds(scenario: Scenario) -> float:
 
     >>> from wfsobs.presets import paper
     >>> round(run_seconds(paper()), 1), round(run_seconds(paper().replace({"run.duration": 300})))
-    (0.4, 11)
+    (0.6, 20)
     """
     return sum(part_seconds(scenario).values())
 
 
 def part_seconds(scenario: Scenario) -> dict[str, float]:
-    """What `run_seconds` adds up [s]: the two GPR, and all else as "rest"."""
+    """What `run_seconds` adds up [s]: the two GPR, the adaptive filter, and all else as "rest"."""
     n, turns = scenario.n_steps, -(-len(scenario.modes) // CORES)
     online, offline = scenario.gpr_online, scenario.gpr_offline
     training = offline.depth + offline.training_size + round(TRAINING_MARGIN * scenario.sensors.lgs_rate)
@@ -35,6 +36,7 @@ def part_seconds(scenario: Scenario) -> dict[str, float]:
     return {
         "gpr-online": turns * gpr_online_seconds(n, online.training_size, online.depth),
         "gpr-offline": turns * gpr_offline_seconds(n, offline.training_size, offline.depth),
+        "kf-adaptive": len(scenario.modes) * adaptive_seconds(scenario),
         "rest": 2.5e-6 * len(scenario.modes) * (n + training) + frozen_flow_seconds(scenario, air + training),
     }
 
@@ -59,6 +61,13 @@ def frozen_flow_seconds(scenario: Scenario, n_steps: int) -> float:
     finest = max(40, s.lenslets.lgs_subapertures, s.lenslets.ngs_subapertures)
     each = 0.1 if s.kind == "zernike" else (finest / 40) ** 2
     return each * widths * beams * (2.8e-3 + 0.26e-3 * len(scenario.modes))
+
+
+def adaptive_seconds(scenario: Scenario) -> float:
+    """One mode [s]: 3.5 ms + 0.9 us per sample for every window."""
+    a, rate = scenario.adaptive, scenario.sensors.lgs_rate
+    windows = max((scenario.n_steps - round(a.window * rate)) // max(round(a.interval * rate), 1), 0)
+    return windows * (3.5e-3 + 0.9e-6 * a.window * rate)
 
 
 def gpr_online_seconds(n_steps: int, training_size: int, depth: int) -> float:

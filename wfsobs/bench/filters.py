@@ -14,6 +14,7 @@ from wfsobs.bench.sizes import Sizes
 from wfsobs.loop import simulate
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman import kalman_model, measurement_noise, modelled_processes, steady_filter
+from wfsobs.observers.kalman_adaptive import adapting
 from wfsobs.observers.multirate import multirate_filter, multirate_noise
 from wfsobs.record import pseudo_open_loop
 from wfsobs.riccati import steady_state
@@ -51,6 +52,14 @@ def kalman_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
         seconds, states = timed(lambda: external.statsmodels_kalman(
             A[:4, :4], C[:4], Q, noise**2, steady.P, pseudo_open_loop(y, u)), sizes.repeats)
         yield row(task, size, STATSMODELS, seconds, n, error=_error(states[:, PHI], exact))
+
+
+def adaptive_record(sizes: Sizes, _libraries: Collection[str]) -> Iterator[Row]:
+    """The adaptive Kalman filter, one mode over a long record: identification, Riccati equation and filter of every window."""
+    scenario = sizes.scenario(sizes.filter_duration)
+    z, a = simulate(scenario).z[:, 0], scenario.adaptive
+    seconds, _ = timed(lambda: adapting(z, scenario.dt, a, lambda _fraction: None), sizes.repeats)
+    yield row("adaptive-record", f"{len(z)} steps, {a.window:g} s every {a.interval:g} s", OURS, seconds, len(z))
 
 
 def multirate_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from threadpoolctl import threadpool_limits
 
 from wfsobs.bench import external
-from wfsobs.bench.filters import kalman_record, multirate_record
+from wfsobs.bench.filters import adaptive_record, kalman_record, multirate_record
 from wfsobs.bench.gpr import offline, online_record, online_stream
 from wfsobs.bench.measure import OURS, Row, peak_memory_mb, row, timed, with_ratios
 from wfsobs.bench.sizes import Sizes
@@ -49,7 +49,8 @@ def _length(duration: float) -> str:
 
 TASKS = (
     Task(longest_run, 1.0), Task(online_record, 5.0), Task(online_stream, 4.0), Task(offline, 3.0),
-    Task(kalman_record, 2.0), Task(multirate_record, 2.0), Task(frozen, 20.0), Task(whole_run, 3.0),
+    Task(kalman_record, 2.0), Task(multirate_record, 2.0), Task(adaptive_record, 2.0),
+    Task(frozen, 20.0), Task(whole_run, 3.0),
 )
 """In the order of the table, but for the longest run."""
 
