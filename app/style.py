@@ -45,7 +45,7 @@ LOOKS: Mapping[str, Look] = MappingProxyType({
     "ridge": Look("Ridge", "#6B6B00", "#C8C84D", (4, 2)),
     "ridge-30": Look("30-tap predictor", "#8A5A00", "#D8A44D", (2, 3)),
     "persistence": Look("Persistence", "#707070", "#A8A8A8", (1, 3)),
-    "kf-adaptive": Look("Adaptive KF", "#C2185B", "#FF8AB5", (5, 2, 1, 2)),
+    "kf-adaptive": Look("Adaptive KF", "#E0006E", "#FF7AB8", (20, 2), width=1.8),
     BOUND: Look("Bound, LGS alone", "#202020", "#E8E8E8", (1, 2)),
     "zero": Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4)),
     "measured": Look("Measured", "#606060", "#C8C8C8"),

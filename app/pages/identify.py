@@ -17,12 +17,10 @@ from wfsobs.app.pages.parts import WIDE, Starter, box, html, legend, line, text
 from wfsobs.app.run import RUNNING
 from wfsobs.app.store import Store
 from wfsobs.app.work import Shown
-from wfsobs.groups.events import PEAK
 from wfsobs.identify import Identified
 from wfsobs.identify.identification import LEVEL
 from wfsobs.identify.search import LOWEST
 from wfsobs.record import Record, RecordError
-from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 
 INTRO = (
@@ -87,7 +85,7 @@ class IdentifyPage:
         if self.work.result is not None:
             result, _ = self.work.result
             try:
-                self.store.load(result.scenario(_without_moving_peaks(self.store.scenario)))
+                self.store.load(result.scenario(self.store.scenario))
             except SettingError as error:
                 self.work.refuse(str(error))
 
@@ -136,12 +134,6 @@ class IdentifyPage:
                 self.verdict.object = verdict_html(result)
                 self.table.object = table_html(mode, self.display, diameter) if mode else ""
                 self.stale.visible = not same(record, of.record)
-
-
-def _without_moving_peaks(scenario: Scenario) -> Scenario:
-    """Events name peaks by their number, and the peaks are about to be others."""
-    kept = [event.to_dict() for event in scenario.events if event.kind != PEAK]
-    return scenario.replace({"events": kept}) if len(kept) < len(scenario.events) else scenario
 
 
 def _number(label: str, value: float) -> pmui.TextInput:

@@ -9,6 +9,9 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
+from wfsobs.app.style import observers_of
+from wfsobs.observers.base import TARGETS
+
 POINTS = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
     .filter(m => m.type === "GlyphRenderer" && m.glyph.type === "Line").map(m => m.data_source.get_length())"""
 
@@ -46,7 +49,8 @@ def test_first_paint(open_page: Any, tmp_path: Path) -> None:
         assert float(relative) == pytest.approx(float(value) / float(truth), rel=0.02)
         assert lag and float(seconds) > 0
     points = page.evaluate(POINTS)
-    assert len(points) == 2 * (6 + 8) and min(points) > 300, "every line of the four figures has points"
+    lines = sum(1 + len(observers_of(target)) for target in TARGETS)
+    assert len(points) == 2 * lines and min(points) > 300, "every line of the four figures has points"
     shot(page, tmp_path, "light")
 
 
