@@ -12,7 +12,9 @@ from wfsobs import PRESETS, Scenario, observe, simulate
 from wfsobs.tuning import Tuned, tune
 from wfsobs.tuning.likelihood import likelihood
 
-SEEDS = {"kf-lgs": range(1, 11), "gpr-offline": range(1, 11), "gpr-online": range(1, 5), "butterworth-cl": range(1, 11)}
+SEEDS, FEW = range(1, 11), range(1, 5)
+KERNEL = ["gpr_online.length_scale", "gpr_online.noise_std", "gpr_online.depth"]
+BANDWIDTH = ["butterworth.bandwidth_online", "gpr_online.noise_std"]
 RMS = Callable[[Tuned], float]
 
 
@@ -38,13 +40,13 @@ def of_seeds(preset: str, observer: str, seeds: range, names: list[str] | None =
 
 
 def gains() -> None:
-    """Presets and observers with their usual settings; then the online GPR with those of its targets."""
+    """Usual settings by preset and observer; of the online GPR kernel and depth, and the width of its bands."""
     for preset in ("paper", "strong-turbulence", "ut4"):
-        for observer, seeds in SEEDS.items():
-            print(row(f"`{preset}` | `{observer}`", of_seeds(preset, observer, seeds)), flush=True)
-    names = ["butterworth.bandwidth_online", "gpr_online.noise_std"]
+        for observer in ("kf-lgs", "gpr-offline", "butterworth-cl"):
+            print(row(f"`{preset}` | `{observer}`", of_seeds(preset, observer, SEEDS)), flush=True)
+        print(row(f"`{preset}` | `gpr-online`, kernel and depth", of_seeds(preset, "gpr-online", FEW, KERNEL)), flush=True)
     for preset in ("paper", "strong-turbulence"):
-        found = of_seeds(preset, "gpr-online", SEEDS["gpr-online"], names, evaluations=20)
+        found = of_seeds(preset, "gpr-online", FEW, BANDWIDTH, evaluations=20)
         print(row(f"`{preset}` | `gpr-online`, bandwidth and noise", found), flush=True)
 
 
@@ -52,7 +54,7 @@ def lengths() -> None:
     """Validation records of several lengths, `paper`."""
     for seconds in (1.5, 2.5, 5.0, 10.0):
         for observer in ("kf-lgs", "gpr-offline"):
-            print(row(f"{seconds:g} s | `{observer}`", of_seeds("paper", observer, range(1, 11), validation=seconds)), flush=True)
+            print(row(f"{seconds:g} s | `{observer}`", of_seeds("paper", observer, SEEDS, validation=seconds)), flush=True)
 
 
 def likeliest(scenario: Scenario) -> Scenario:

@@ -46,7 +46,7 @@ TUNABLE: dict[str, Tunable] = {
     "kf-multi": Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
     "kf-ngs": Tunable(("kalman.turbulence_rms", "kalman.vibration_rms"), (*_MODEL[:2], "kalman.ngs_noise")),
     # A shorter interval costs time, which no error shows.
-    "kf-adaptive": Tunable(("adaptive.window",), ("adaptive.interval", "adaptive.peaks", "adaptive.lowest")),
+    "kf-adaptive": Tunable(("adaptive.window",), ("adaptive.interval",)),
     "multirate": Tunable(_RATES, _MODEL),
     "multirate-optimal": Tunable(_RATES, _MODEL),
     "butterworth-ol": Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
@@ -54,8 +54,9 @@ TUNABLE: dict[str, Tunable] = {
     # The mean depends on sigma_n / sigma_SE and l only: sigma_SE stays.
     "gpr-offline": Tunable(("gpr_offline.length_scale", "gpr_offline.noise_std", "gpr_offline.depth"),
                            (*_OFFLINE, "butterworth.bandwidth_offline", "butterworth.order")),
-    "gpr-online": Tunable(("gpr_online.length_scale", "gpr_online.noise_std", "gpr_online.depth"),
-                          (*_ONLINE, "butterworth.bandwidth_online", "butterworth.order")),
+    # Its targets are what the causal band-passes make of turbulence, too.
+    "gpr-online": Tunable(("gpr_online.noise_std", "gpr_online.depth", "butterworth.bandwidth_online"),
+                          ("gpr_online.length_scale", *_ONLINE, "butterworth.order")),
     # The penalty (sigma_n l / sigma_SE)^2 is one number.
     "ridge": Tunable(("gpr_offline.noise_std", "gpr_offline.depth"),
                      ("gpr_offline.length_scale", *_OFFLINE, "butterworth.bandwidth_offline", "butterworth.order")),
@@ -69,7 +70,7 @@ TUNABLE: dict[str, Tunable] = {
 class Axis:
     """One setting that is tuned: its dotted path, its range, and whether it takes whole numbers.
 
-    A range above 0 is searched by the logarithm; 0 and 1 are its ends.
+    A range above 0 is searched by the logarithm, one of whole numbers from 0 evenly; 0 and 1 are its ends.
     """
 
     path: str
@@ -184,7 +185,7 @@ def _allowed(scenario: Scenario, path: str, value: float) -> float:
 def _axis(scenario: Scenario, path: str, start: float) -> Axis:
     p = _parameter(scenario, path)
     low, high = _limits(p.get_soft_bounds())
-    if low == 0:
+    if low == 0 and not isinstance(p, param.Integer):
         low = FROM_ZERO * high
     return Axis(path, min(low, start) if start > 0 else low, max(high, start), isinstance(p, param.Integer))
 
