@@ -12,7 +12,7 @@ from wfsobs.gaps import bridged
 from wfsobs.identify.one_mode import OneMode
 from wfsobs.identify.periodogram import fast_length
 from wfsobs.identify.result import Identified, IdentifiedMode, read_off
-from wfsobs.identify.search import LOWEST, PAD, Found, search
+from wfsobs.identify.search import LOWEST, PAD, Candidate, Found, search
 from wfsobs.identify.whiteness import Whiteness, autocorrelation_test, cumulated_test, innovations
 from wfsobs.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.pipeline import as_stated
@@ -26,6 +26,8 @@ MOST_PEAKS = 40
 """Per mode."""
 SHORTEST = 1000
 """Samples of a record at least."""
+ALONE = 0.8
+"""Share of the level for modes alone, where there are several: a line in one of them has no power to spare, one in all has."""
 JOINT = 1e-3
 """A candidate of all modes together belongs to those in which white noise would be as high with this probability."""
 
@@ -66,13 +68,14 @@ def identify(
 
 def grow(modes: Sequence[OneMode], level: float, lowest: float, watch: Watch) -> None:
     """Add peaks to the modes, one to each at a time, until no test sees any more; then polish, and look once more."""
+    look(modes, level, lowest)  # the first spectra are rough: they say what not to fit, not what is a peak
+    for mode in modes:
+        mode.refit()
     polished = False
     for sweep in range(3 * MOST_PEAKS):
         watch.step(1.0 - 1.0 / (1.0 + 0.1 * sweep))
         seen = False
-        for mode, found in zip(modes, candidates(modes, level, lowest), strict=True):
-            mode.flagged = np.logical_or.reduce([one.flagged for one in found])
-            best = max((one.best for one in found if one.best), key=lambda c: c.strength, default=None)
+        for mode, best in zip(modes, look(modes, level, lowest), strict=True):
             if best is None or mode.peaks >= MOST_PEAKS:
                 continue
             seen = True
@@ -86,14 +89,23 @@ def grow(modes: Sequence[OneMode], level: float, lowest: float, watch: Watch) ->
         polished = not seen
 
 
+def look(modes: Sequence[OneMode], level: float, lowest: float) -> list[Candidate | None]:
+    """The strongest candidate of every mode, if any; what is flagged takes no part in the next fit."""
+    out = []
+    for mode, found in zip(modes, candidates(modes, level, lowest), strict=True):
+        mode.flagged = np.logical_or.reduce([one.flagged for one in found])
+        out.append(max((one.best for one in found if one.best), key=lambda c: c.strength, default=None))
+    return out
+
+
 def candidates(modes: Sequence[OneMode], level: float, lowest: float) -> list[list[Found]]:
     """What the search finds in every mode, alone and with all the others."""
     whitened = [mode.whitened() for mode in modes]
     n, dt, several = modes[0].n, modes[0].dt, len(modes) > 1
-    share = level / 2 if several else level
-    out = [[search(fine, n, dt, 1, share / len(modes), lowest)] for fine in whitened]
+    alone = ALONE * level if several else level
+    out = [[search(fine, n, dt, 1, alone / len(modes), lowest)] for fine in whitened]
     if several:
-        together = search(sum(whitened, np.zeros_like(whitened[0])), n, dt, len(modes), share, lowest)
+        together = search(sum(whitened, np.zeros_like(whitened[0])), n, dt, len(modes), level - alone, lowest)
         for own, fine in zip(out, whitened, strict=True):
             if together.best is not None and _has_part(fine, n * dt, together.best.frequency, together.best.width):
                 own.append(together)

@@ -11,8 +11,9 @@ from scipy.signal.windows import tukey
 
 from wfsobs.arrays import Array
 
-TAPERED = 0.1
-"""Share of a record under the cosine ends of its taper: enough to keep turbulence from leaking over the noise floor."""
+TAPERED, MOST_TAPERED = 500, 0.05
+"""Samples under the cosine at either end of a record, and their share at most. Leakage of turbulence over the noise falls as f^-6
+beyond two periods of it, 4 Hz at 1 kHz, below which no noise is seen; more would cost power of lines."""
 FINE, NEAR = 200, 8
 """A cell is at most 1 / FINE of its frequency wide, and 1 / NEAR of its distance to the next resonance."""
 
@@ -20,7 +21,7 @@ FINE, NEAR = 200, 8
 @lru_cache(maxsize=4)
 def taper(n: int) -> Array:
     """Tukey's taper for n samples, its mean square 1, (n,)."""
-    h = tukey(n, TAPERED)
+    h = tukey(n, 2.0 * min(TAPERED / n, MOST_TAPERED))
     h /= np.sqrt(np.mean(h**2))
     h.flags.writeable = False
     return h
@@ -28,7 +29,7 @@ def taper(n: int) -> Array:
 
 @lru_cache(maxsize=4)
 def inflation(n: int) -> float:
-    """By what the taper raises the variance of a mean over bins, n sum h^4 / (sum h^2)^2: 1.055."""
+    """By what the taper raises the variance of a mean over bins, n sum h^4 / (sum h^2)^2: 1.009 at 60 000 samples."""
     return float(np.mean(taper(n) ** 4))
 
 

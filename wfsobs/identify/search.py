@@ -2,7 +2,7 @@
 
 The whitened periodogram I / S of the right S is exponential of mean 1. A pure line raises one of its bins, a resonance several;
 means over 1 ... 243 bins are Gamma distributed. Every frequency gets a share of the level as df / f: of two equally strong peaks
-the lower is the likelier to be one of a structure.
+the lower is the likelier to be one of a structure; most of it below STRUCTURES.
 """
 
 from __future__ import annotations
@@ -24,6 +24,10 @@ LOWEST = 5.0
 """Frequency from which peaks are looked for [Hz], unless told: below, what is left is turbulence that no AR(2) is like."""
 OVERLAP = 4
 """Means per width."""
+OF_LINES = 0.8
+"""Share of the level that lines get: one bin has to stand out of all, means of many do so by little."""
+STRUCTURES, BELOW = 100.0, 0.9
+"""Frequency up to which structures of telescopes are known to vibrate [Hz], and the share of the level spent below it."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +54,10 @@ class Found:
 def search(fine: Array, n: int, dt: float, modes: int, level: float, lowest: float = LOWEST) -> Found:
     """Candidates in a whitened periodogram, at PAD frequencies per bin, of n samples; the sum over `modes` of them.
 
-    level : probability of finding any where there is none, half of it for lines
+    level : probability of finding any where there is none, OF_LINES of it for lines
     """
     T = n * dt
-    of_lines, share = level / 2.0, level / (2.0 * len(WIDTHS))
+    of_lines, share = OF_LINES * level, (1.0 - OF_LINES) * level / len(WIDTHS)
     flagged = np.zeros((n + 1) // 2 - 1, bool)
     best: Candidate | None = None
     f = np.arange(1, len(fine) + 1) / (PAD * T)
@@ -96,7 +100,7 @@ def _limits(count: int, T: float, width: int, modes: int, share: float, n: int, 
     j = np.geomspace(1, count, 200)
     highest = count / T
     spacing = 1.0 / T if width == 1 else max(width // OVERLAP, 1) / T
-    probability = share * spacing / (np.maximum(j / T, lowest) * np.log(highest / lowest))
+    probability = share * spacing * _prior(j / T, lowest, highest)
     shape = width * modes / (1.0 if width == 1 else inflation(n))
     if width == 1:  # PAD frequencies to a bin, and the factor above: by iteration
         probability = probability * PAD
@@ -106,3 +110,11 @@ def _limits(count: int, T: float, width: int, modes: int, share: float, n: int, 
     else:
         limit = gamma.isf(probability, shape) * width * modes / shape
     return np.interp(np.log(np.arange(1, count + 1)), np.log(j), limit)
+
+
+def _prior(f: Array, lowest: float, highest: float) -> Array:
+    """Density [1/Hz] with which the level is spent from `lowest` to `highest`: as 1 / f, BELOW of it up to STRUCTURES."""
+    f = np.maximum(f, lowest)
+    if not lowest < STRUCTURES < highest:
+        return 1.0 / (f * np.log(highest / lowest))
+    return np.where(f < STRUCTURES, BELOW / np.log(STRUCTURES / lowest), (1.0 - BELOW) / np.log(highest / STRUCTURES)) / f
