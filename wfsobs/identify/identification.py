@@ -20,7 +20,7 @@ from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.watch import QUIET, Watch
 
-LEVEL = 0.04
+LEVEL = 0.05
 """Probability of any false peak in a record."""
 MOST_PEAKS = 40
 """Per mode."""
@@ -68,9 +68,10 @@ def identify(
 
 def grow(modes: Sequence[OneMode], level: float, lowest: float, watch: Watch) -> None:
     """Add peaks to the modes, one to each at a time, until no test sees any more; then polish, and look once more."""
-    look(modes, level, lowest)  # the first spectra are rough: they say what not to fit, not what is a peak
-    for mode in modes:
-        mode.refit()
+    for again in (False, True):  # the first spectra are rough: they say what not to fit, not what is a peak
+        look(modes, level, lowest)
+        for mode in modes:
+            mode.refit(reshape=again)
     polished = False
     for sweep in range(3 * MOST_PEAKS):
         watch.step(1.0 - 1.0 / (1.0 + 0.1 * sweep))
@@ -90,10 +91,10 @@ def grow(modes: Sequence[OneMode], level: float, lowest: float, watch: Watch) ->
 
 
 def look(modes: Sequence[OneMode], level: float, lowest: float) -> list[Candidate | None]:
-    """The strongest candidate of every mode, if any; what is flagged takes no part in the next fit."""
+    """The strongest candidate of every mode, if any; what is strong takes no part in the next fit."""
     out = []
     for mode, found in zip(modes, candidates(modes, level, lowest), strict=True):
-        mode.flagged = np.logical_or.reduce([one.flagged for one in found])
+        mode.strong = np.logical_or.reduce([one.strong for one in found])
         out.append(max((one.best for one in found if one.best), key=lambda c: c.strength, default=None))
     return out
 

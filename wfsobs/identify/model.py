@@ -1,35 +1,41 @@
-"""The spectrum of one mode of z: white noise, AR(2) turbulence, AR(2) resonances. Pure lines are in `lines`."""
+"""The spectrum of one mode of z: white noise, turbulence of order two or three, AR(2) resonances. Pure lines are in `lines`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 
 import numpy as np
 from scipy.special import expit, logit
 
 from wfsobs.ar2 import Ar2
+from wfsobs.ar3 import Ar3
 from wfsobs.arrays import Array
 
 STEP = 1e-4
 """Of the central differences, in the logarithm of a parameter."""
 
+RMS = 2
+"""Place of the log of the rms among the numbers of a process."""
 HIGHEST = 0.999
 """Damping of a process at most: at 1 its two poles are one."""
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """noise : rms of the white noise [um]; turbulence : or None; resonances : of structure, any number."""
+    """noise : rms of the white noise [um]; turbulence : or None; background : coloured noise, or None; resonances : any number."""
 
     noise: float
     dt: float
-    turbulence: Ar2 | None = None
+    turbulence: Ar2 | Ar3 | None = None
+    background: Ar2 | None = None
     resonances: tuple[Ar2, ...] = ()
 
     @property
-    def processes(self) -> tuple[Ar2, ...]:
-        """Turbulence, where there is any, and the resonances."""
-        return (() if self.turbulence is None else (self.turbulence,)) + self.resonances
+    def processes(self) -> tuple[Ar2 | Ar3, ...]:
+        """Turbulence and background, where there are any, and the resonances."""
+        return tuple(p for p in (self.turbulence, self.background) if p is not None) + self.resonances
 
     def psd(self, f: Array) -> Array:
         """One-sided power spectral density [um^2/Hz] at f [Hz]."""
@@ -37,30 +43,48 @@ class Spectrum:
 
     @property
     def vector(self) -> Array:
-        """log noise, then log omega, logit damping, log rms of every process, (1 + 3 processes,)."""
+        """log noise, then log omega, logit damping, log rms of every process, and the log of a third corner, (numbers,)."""
         return np.concatenate([[np.log(self.noise)], *map(_vector, self.processes)])
+
+    @property
+    def starts(self) -> list[int]:
+        """Where the numbers of every process start in `vector`, and where the last ends."""
+        return list(accumulate((3 + isinstance(p, Ar3) for p in self.processes), initial=1))
+
+    @property
+    def fixed(self) -> list[int]:
+        """Which numbers of `vector` no fit moves: the damping of the background, which is to be flat up to its corner."""
+        return [] if self.background is None else [self.starts[0 if self.turbulence is None else 1] + 1]
 
     def moved(self, vector: Array) -> Spectrum:
         """The spectrum with these numbers as its `vector`."""
-        processes = tuple(_process(v, self.dt) for v in vector[1:].reshape(-1, 3))
-        first = 0 if self.turbulence is None else 1
-        return replace(self, noise=float(np.exp(vector[0])), turbulence=processes[0] if first else None,
-                       resonances=processes[first:])
+        processes = [_process(vector[a:b], self.dt) for a, b in pairwise(self.starts)]
+        turbulence, background = (None if p is None else processes.pop(0) for p in (self.turbulence, self.background))
+        return replace(self, noise=float(np.exp(vector[0])), turbulence=turbulence, background=background,
+                       resonances=tuple(processes))
 
-    def slopes(self, f: Array) -> Array:
-        """Derivatives of the density by `vector`, (1 + 3 processes, len(f)) [um^2/Hz]."""
-        rows = [np.full_like(f, 4.0 * self.dt * self.noise**2)]
-        for p in self.processes:
+    def slopes(self, f: Array, wanted: Sequence[int]) -> Array:
+        """Derivatives of the density by the wanted numbers of `vector`, in their order, (len(wanted), len(f)) [um^2/Hz]."""
+        rows = {0: np.full_like(f, 4.0 * self.dt * self.noise**2)}
+        for start, p in zip(self.starts, self.processes, strict=False):
             at = _vector(p)
-            for i, step in enumerate((STEP * p.damping, STEP, STEP)):  # a resonance is as narrow as its damping
-                move = step * np.eye(3)[i]
-                rows.append((_process(at + move, self.dt).psd(f) - _process(at - move, self.dt).psd(f)) / (2.0 * step))
-        return np.array(rows)
+            for i in range(len(at)):
+                if start + i not in wanted:
+                    continue
+                if i == RMS:
+                    rows[start + i] = 2.0 * p.psd(f)
+                    continue
+                move = np.zeros(len(at))
+                move[i] = STEP * p.damping if i == 0 else STEP  # a resonance is as narrow as its damping
+                rows[start + i] = (_process(at + move, self.dt).psd(f) - _process(at - move, self.dt).psd(f)) / (2.0 * move[i])
+        return np.array([rows[i] for i in wanted])
 
 
-def _vector(p: Ar2) -> Array:
-    return np.array([np.log(p.omega), logit(p.damping), np.log(p.rms)])
+def _vector(p: Ar2 | Ar3) -> Array:
+    more = [np.log(p.corner)] if isinstance(p, Ar3) else []
+    return np.array([np.log(p.omega), logit(p.damping), np.log(p.rms), *more])
 
 
-def _process(v: Array, dt: float) -> Ar2:
-    return Ar2(float(np.exp(v[0])), float(np.clip(expit(v[1]), 1e-9, HIGHEST)), float(np.exp(v[2])), dt)
+def _process(v: Array, dt: float) -> Ar2 | Ar3:
+    omega, damping, rms = float(np.exp(v[0])), float(np.clip(expit(v[1]), 1e-9, HIGHEST)), float(np.exp(v[2]))
+    return Ar3(omega, damping, float(np.exp(v[3])), rms, dt) if len(v) == 4 else Ar2(omega, damping, rms, dt)

@@ -11,6 +11,7 @@ from wfsobs.ar2 import Ar2
 from wfsobs.arrays import Array
 from wfsobs.identify.lines import Line, nearest_line
 from wfsobs.identify.model import Spectrum
+from wfsobs.identify.order import of_best_order, with_background
 from wfsobs.identify.periodogram import Cells, frequencies, inflation, periodogram
 from wfsobs.identify.search import PAD, Candidate
 from wfsobs.identify.whittle import first_guess, fitted, negative_log_likelihood, standard_deviations
@@ -42,7 +43,7 @@ class OneMode:
         self.lines: list[Line] = []
         self._take_off()
         self.spectrum = first_guess(self.f, self.I, dt)
-        self.flagged = np.zeros(len(self.f), bool)
+        self.strong = np.zeros(len(self.f), bool)
         self.refused: list[Candidate] = []
 
     def _take_off(self) -> None:
@@ -63,19 +64,21 @@ class OneMode:
             ratio[np.abs(f - candidate.frequency) <= (0.5 * candidate.width + 0.5) * self.f[0]] = 1.0
         return ratio
 
-    def cells(self, spectrum: Spectrum | None = None, everything: bool = False) -> Cells:
-        """The bins for a fit: all but those that a test still flags and that no resonance of the spectrum is near."""
-        spectrum = spectrum or self.spectrum
-        keep = np.ones(len(self.f)) if everything else np.where(self.flagged, 0.0, 1.0)
-        for p in spectrum.resonances:
+    def cells(self, everything: bool = False) -> Cells:
+        """The bins for a fit: all but those that a test finds far too high and that no resonance is near."""
+        keep = np.ones(len(self.f)) if everything else np.where(self.strong, 0.0, 1.0)
+        for p in self.spectrum.resonances:
             centre, half = p.omega / (2 * pi), max(4.0 * p.damping * p.omega / (2 * pi), 20.0 * self.f[0])
             keep[np.abs(self.f - centre) < half] = 1.0
-        return Cells(self.f, self.I, keep, [p.omega / (2 * pi) for p in spectrum.resonances])
+        return Cells(self.f, self.I, keep, [p.omega / (2 * pi) for p in self.spectrum.resonances])
 
-    def refit(self, everything: bool = False) -> None:
-        """All numbers of the spectrum at once. A resonance that has become as narrow as a line is one from then on; one that has
-        become as wide as turbulence is dropped."""
-        self.spectrum = fitted(self.spectrum, self.cells(everything=everything))
+    def refit(self, reshape: bool = False) -> None:
+        """All numbers of the spectrum at once; reshape : whether order of the turbulence and background are chosen anew. A resonance
+        that has become as narrow as a line is one from then on; one that has become as wide as turbulence is dropped."""
+        cells = self.cells()
+        self.spectrum = fitted(self.spectrum, cells)
+        if reshape:
+            self.spectrum = with_background(of_best_order(self.spectrum, cells), cells)
         for p in [p for p in self.spectrum.resonances if not self._sound(p)]:
             self.spectrum = replace(self.spectrum, resonances=tuple(q for q in self.spectrum.resonances if q is not p))
             frequency = p.omega / (2 * pi)
@@ -171,7 +174,7 @@ class OneMode:
             self.left = alone - again.signal(self.n, self.dt)
             self.lines[i] = again
         self._take_off()
-        self.refit()
+        self.refit(reshape=True)
         for p in self.spectrum.resonances:
             self._split(p)
 

@@ -105,11 +105,11 @@ def read_off(mode: OneMode) -> tuple[Number, Process | None, tuple[Process, ...]
     std = mode.errors()
     noise = _scaled(Number(1.0, float(std[0])), mode.spectrum.noise)
     found = [
-        Process(_scaled(Number(1.0, float(std[1 + 3 * i])), p.omega / (2 * pi)), Number(p.damping, float(std[2 + 3 * i])),
-                _scaled(Number(1.0, float(std[3 + 3 * i])), p.rms))
-        for i, p in enumerate(mode.spectrum.processes)
+        Process(_scaled(Number(1.0, float(std[i])), p.omega / (2 * pi)), Number(p.damping, float(std[i + 1])),
+                _scaled(Number(1.0, float(std[i + 2])), p.rms))
+        for i, p in zip(mode.spectrum.starts, mode.spectrum.processes, strict=False)
     ]
-    turbulence = None if mode.spectrum.turbulence is None else found.pop(0)
+    turbulence, background = (None if p is None else found.pop(0) for p in (mode.spectrum.turbulence, mode.spectrum.background))
     for line in mode.lines:
         floor = float(mode.spectrum.psd(np.array([line.frequency]))[0])
         in_frequency, in_rms = line.standard_deviations(mode.n, mode.dt, floor)

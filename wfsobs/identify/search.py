@@ -26,6 +26,8 @@ OVERLAP = 4
 """Means per width."""
 OF_LINES = 0.8
 """Share of the level that lines get: one bin has to stand out of all, means of many do so by little."""
+SPOILS = 2.0
+"""Mean I / S from which bins would spoil the fit of a spectrum that has no peak there."""
 STRUCTURES, BELOW = 100.0, 0.9
 """Frequency up to which structures of telescopes are known to vibrate [Hz], and the share of the level spent below it."""
 
@@ -45,10 +47,12 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Found:
-    """The strongest candidate, and which bins (bins,) are above their limit at some width."""
+    """The strongest candidate; which bins (bins,) are above their limit at some width, and which of them by so much that they
+    would spoil a fit."""
 
     best: Candidate | None
     flagged: Array
+    strong: Array
 
 
 def search(fine: Array, n: int, dt: float, modes: int, level: float, lowest: float = LOWEST) -> Found:
@@ -58,14 +62,15 @@ def search(fine: Array, n: int, dt: float, modes: int, level: float, lowest: flo
     """
     T = n * dt
     of_lines, share = OF_LINES * level, (1.0 - OF_LINES) * level / len(WIDTHS)
-    flagged = np.zeros((n + 1) // 2 - 1, bool)
+    flagged, strong = np.zeros((2, (n + 1) // 2 - 1), bool)
     best: Candidate | None = None
     f = np.arange(1, len(fine) + 1) / (PAD * T)
     high = (fine > _limits(len(fine), PAD * T, 1, modes, of_lines, n, lowest)) & (f >= lowest)
     if high.any():
         at = int(np.argmax(np.where(high, fine, 0.0)))
         best = Candidate(float(f[at]), 1, float(_gain(fine[at], modes)))
-        flagged[np.clip(np.round((np.flatnonzero(high) + 1) / PAD).astype(int) - 1, 0, len(flagged) - 1)] = True
+        bins = np.clip(np.round((np.flatnonzero(high) + 1) / PAD).astype(int) - 1, 0, len(flagged) - 1)
+        flagged[bins] = strong[bins] = True
     sums = np.concatenate([[0.0], np.cumsum(fine[PAD - 1 :: PAD][: len(flagged)])])
     for width in WIDTHS:
         start = np.arange(0, len(flagged) - width, max(width // OVERLAP, 1))
@@ -75,12 +80,13 @@ def search(fine: Array, n: int, dt: float, modes: int, level: float, lowest: flo
         high = (total > limit) & (centre - width / 2.0 / T >= lowest)
         for i in np.flatnonzero(high):
             flagged[start[i] : start[i] + width] = True
+            strong[start[i] : start[i] + width] |= total[i] > SPOILS * width * modes
         if high.any():
             strengths = np.where(high, _gain(total, width * modes), 0.0) / np.sqrt(width)
             i = int(np.argmax(strengths))
             if best is None or strengths[i] > best.strength:
                 best = Candidate(float(centre[i]), width, float(strengths[i]))
-    return Found(best, flagged)
+    return Found(best, flagged, strong)
 
 
 def _gain(total: Array, count: int):

@@ -18,7 +18,7 @@ from wfsobs.identify.periodogram import Cells
 
 STEPS = 40
 """Of the minimisation, at most."""
-NOISE, TURBULENCE, RESONANCE = 3.0, (2.0, 8.0, 4.0), (0.1, 6.0, 4.0)
+NOISE, TURBULENCE, BACKGROUND, RESONANCE = 3.0, (2.0, 8.0, 4.0, 3.0), (1.5, 0.0, 4.0), (0.1, 6.0, 4.0)
 """How far the numbers of a vector may leave their start: a resonance stays at its place."""
 
 
@@ -28,40 +28,53 @@ def negative_log_likelihood(spectrum: Spectrum, cells: Cells) -> float:
     return float(cells.count @ (np.log(S) + cells.mean / S))
 
 
-def information(spectrum: Spectrum, cells: Cells) -> Array:
-    """Fisher information of `Spectrum.vector`, (p, p)."""
-    d = spectrum.slopes(cells.frequency) / spectrum.psd(cells.frequency)
+def information(spectrum: Spectrum, cells: Cells, wanted: Sequence[int] | None = None) -> Array:
+    """Fisher information of the wanted numbers of `Spectrum.vector`, all unless told, (p, p)."""
+    wanted = range(spectrum.starts[-1]) if wanted is None else wanted
+    d = spectrum.slopes(cells.frequency, wanted) / spectrum.psd(cells.frequency)
     return (d * cells.count) @ d.T
 
 
 def fitted(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = None) -> Spectrum:
-    """The spectrum of greatest likelihood near the given one; free : which numbers of its vector may move, all unless told.
+    """The spectrum of greatest likelihood near the given one; free : which numbers of its vector may move, all unless told but
+    the damping of a background.
 
     Newton's method in a trust region with the Fisher information for the second derivatives, every number in units of its own
     standard deviation at the start.
     """
     start = spectrum.vector
-    index = np.arange(len(start)) if free is None else np.array(free)
-    first = () if spectrum.turbulence is None else TURBULENCE
-    reach = np.array([NOISE, *first, *RESONANCE * len(spectrum.resonances)])[index]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information(spectrum, cells))[index], 1e-3))
+    index = [i for i in (range(len(start)) if free is None else free) if i not in spectrum.fixed]
+    first = () if spectrum.turbulence is None else TURBULENCE[: spectrum.starts[1] - 1]
+    second = () if spectrum.background is None else BACKGROUND
+    reach = np.array([NOISE, *first, *second, *RESONANCE * len(spectrum.resonances)])[index]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information(spectrum, cells, index)), 1e-3))
 
     def at(x: Array) -> Spectrum:
         vector = start.copy()
         vector[index] += np.clip(scale * x, -reach, reach)
         return spectrum.moved(vector)
 
+    last: dict[bytes, tuple[Array, Array]] = {}
+
+    def here(x: Array) -> tuple[Array, Array]:
+        """S and the derivatives of log S, which gradient and curvature both take."""
+        if x.tobytes() not in last:
+            last.clear()
+            spectrum = at(x)
+            S = spectrum.psd(cells.frequency)
+            last[x.tobytes()] = S, spectrum.slopes(cells.frequency, index) / S
+        return last[x.tobytes()]
+
     def value(x: Array) -> float:
         return negative_log_likelihood(at(x), cells)
 
     def gradient(x: Array) -> Array:
-        here = at(x)
-        S = here.psd(cells.frequency)
-        return scale * ((here.slopes(cells.frequency)[index] / S) @ (cells.count * (1.0 - cells.mean / S)))
+        S, d = here(x)
+        return scale * (d @ (cells.count * (1.0 - cells.mean / S)))
 
     def curvature(x: Array) -> Array:
-        F = information(at(x), cells)[np.ix_(index, index)] * np.outer(scale, scale)
-        return F + 1e-9 * np.eye(len(index))
+        _, d = here(x)
+        return ((d * cells.count) @ d.T) * np.outer(scale, scale) + 1e-9 * np.eye(len(index))
 
     found = minimize(value, np.zeros(len(index)), jac=gradient, hess=curvature, method="trust-exact",
                      options={"maxiter": STEPS, "gtol": 1e-2, "initial_trust_radius": 3.0, "max_trust_radius": 1e4})
@@ -70,10 +83,12 @@ def fitted(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = None) 
 
 def standard_deviations(spectrum: Spectrum, cells: Cells, inflation: float) -> Array:
     """Of the numbers of the vector, but of the damping itself in the place of its logit, (p,)."""
-    F = information(spectrum, cells) + 1e-12 * np.eye(1 + 3 * len(spectrum.processes))
-    std = np.sqrt(np.maximum(np.diag(np.linalg.inv(F)) * inflation, 0.0))
-    for i, p in enumerate(spectrum.processes):
-        std[2 + 3 * i] *= p.damping * (1.0 - p.damping)
+    std = np.zeros(spectrum.starts[-1])
+    free = [i for i in range(len(std)) if i not in spectrum.fixed]
+    covariance = np.linalg.inv(information(spectrum, cells, free) + 1e-12 * np.eye(len(free)))
+    std[free] = np.sqrt(np.maximum(np.diag(covariance) * inflation, 0.0))
+    for start, p in zip(spectrum.starts, spectrum.processes, strict=False):
+        std[start + 1] *= p.damping * (1.0 - p.damping)
     return std
 
 
