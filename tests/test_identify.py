@@ -193,9 +193,37 @@ def test_nothing_is_found_in_turbulence_and_noise_nor_turbulence_in_noise() -> N
         quiet = identify(simulate(known(30.0, **{"run.seed": seed}).replace({"vibration.source": "none"})))
         assert not quiet.peaks and all(mode.turbulence for mode in quiet.modes)
     bare = {"vibration.source": "none", "turbulence.source": "none", "sensors.lgs_low_frequency_rms": 0.0}
-    nothing = identify(simulate(known(20.0).replace(bare)))
+    nothing = identify(simulate(known(20.0, **{"run.seed": 2}).replace(bare)))
     assert not nothing.peaks and not any(mode.turbulence for mode in nothing.modes)
     assert nothing.scenario().turbulence.source == "none" and nothing.scenario().vibration.source == "none"
+
+
+def test_third_order_and_background_are_found_where_they_are() -> None:
+    """Turbulence that falls as f^-6, and coloured noise such as aliasing; a scenario holds the first."""
+    s = known().replace({"vibration.source": "none", "turbulence.source": "ar3", "turbulence.third_corner": 3.0,
+                         "sensors.lgs_low_frequency_rms": 0.0})
+    record, rng = simulate(s), np.random.default_rng(8)
+    coloured = [Ar2(2 * pi * 30.0, 0.8, 0.004, DT).sample(record.n_steps, rng) for _ in range(2)]
+    got = identify(replace(record, y_lgs=record.y_lgs + np.column_stack(coloured)))
+    assert got.white and not got.peaks
+    for m in got.modes:
+        assert m.turbulence and m.turbulence.third_corner and m.background
+        pairs = [(m.turbulence.frequency, 7.0686 / (2 * pi)), (m.turbulence.damping, 0.9), (m.turbulence.third_corner, 3.0),
+                 (m.background.frequency, 30.0), (m.background.rms, 0.004)]
+        for number, true in pairs:
+            assert abs(number.value - true) < 4.0 * number.std
+            assert number.std < 0.6 * true
+    model = got.scenario(s)
+    assert (model.turbulence.source, model.multipeak.turbulence_order) == ("ar3", 3)
+    assert model.turbulence.third_corner == pytest.approx(3.0, abs=4.0 * got.shared(s)["turbulence.third_corner"].std)
+
+
+def test_frozen_flow_leaves_white_noise_and_no_peak() -> None:
+    """In two records of the sensor without aliasing; an AR(2) alone fails all tests on them."""
+    s = PRESETS["ut4"]().replace({"vibration.source": "none", "run.duration": 30.0, "sensors.kind": "zernike"})
+    for seed in (1, 2):
+        got = identify(simulate(s.replace({"run.seed": seed})))
+        assert got.white and not got.peaks
 
 
 def test_filter_built_from_the_result_is_as_good_as_from_the_truth(found: Identified) -> None:

@@ -137,7 +137,7 @@ def test_every_number_states_its_unit_or_has_none(path: str) -> None:
     pure = {
         "damping", "fraction", "wind_factor", "radial_order", "gain", "leak", "order", "seed", "training_size", "depth",
         "lgs_count", "exposure_ratio", "lgs_subapertures", "ngs_subapertures", "fitted_order", "illumination", "obscuration",
-        "pixels", "turbulence_order", "peak", "peak_count", "strength", "lasers", "share",
+        "pixels", "turbulence_order", "peak", "peak_count", "strength", "lasers", "share", "third_corner",
     }
     is_quantity = isinstance(p, (param.Number, Reals)) and path.rsplit(".", 1)[-1] not in pure
     assert bool(unit_of(p)) == is_quantity

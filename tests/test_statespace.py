@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from wfsobs.ar2 import Ar2
-from wfsobs.statespace import disturbance_model, paper_matrices
+from wfsobs.ar3 import Ar3
+from wfsobs.statespace import disturbance_model, paper_matrices, sampled
 
 TURBULENCE, VIBRATION = Ar2(7.0686, 0.9, 0.5, 1e-3), Ar2(298.4, 0.03, 0.015, 1e-3)
 
@@ -72,3 +73,15 @@ def test_a_model_is_the_sum_of_its_processes(n_turbulence: int, n_vibration: int
     assert np.allclose(model.pairs @ model.Q @ model.pairs.T, drive, rtol=1e-9, atol=1e-12 * drive.max())
     # variance one, uncorrelated: the stationary covariance is the identity
     assert np.allclose(model.A @ model.A.T + model.Q, np.eye(len(state)), atol=1e-13)
+
+
+def test_samples_of_third_order_have_its_autocovariance_from_the_first_on() -> None:
+    """Against the integral of the density, over many short runs: at steps 0, 1, 4 and 40, with the first and with themselves."""
+    p = Ar3(200.0, 0.6, 400.0, 0.5, 1e-3)
+    runs = np.array([sampled(p, 41, np.random.default_rng(i)) for i in range(4000)])
+    f = (np.arange(100_000) + 0.5) * 5e-3  # 0 to 500 Hz
+    S = p.psd(f) * 5e-3
+    for k in (0, 1, 4, 40):
+        true = S @ np.cos(2 * np.pi * f * k * p.dt)
+        assert abs(np.mean(runs[:, 0] * runs[:, k]) - true) < 4.0 * p.rms**2 * np.sqrt(2.0 / 4000)
+        assert np.var(runs[:, k]) == pytest.approx(p.rms**2, rel=4.0 * np.sqrt(2.0 / 4000))

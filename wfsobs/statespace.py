@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.signal import lfilter, lfiltic
 
 from wfsobs.ar2 import Ar2
 from wfsobs.ar3 import Ar3
@@ -96,7 +97,20 @@ def third_order_model(p: Ar3) -> ProcessModel:
     )
 
 
-def disturbance_model(turbulence: Sequence[Ar2 | Ar3], vibration: Sequence[Ar2]) -> DisturbanceModel:
+def sampled(p: Ar3, n: int, rng: np.random.Generator) -> Array:
+    """`n` steps of a third-order process, stationary from the first, (n,)."""
+    model, denominator = third_order_model(p), np.poly(p.poles).real
+    drive = model.Q[:, 0] / np.sqrt(model.Q[0, 0])
+    x, first = rng.standard_normal(3), []
+    for v in rng.standard_normal(3):  # of variance one and uncorrelated, as the state is
+        first.append(float(x[0]))
+        x = model.A @ x + drive * v
+    gain = [drive[0]]
+    rest, _ = lfilter(gain, denominator, rng.standard_normal(max(n - 3, 0)), zi=lfiltic(gain, denominator, first[::-1]))
+    return p.rms * np.concatenate([first, rest])[:n]
+
+
+def disturbance_model(turbulence: Sequence[Ar2 | Ar3], vibration: Sequence[Ar2 | Ar3]) -> DisturbanceModel:
     """The model of all the given processes, each with its own drive (paper, eq. 1, 2 and 7)."""
     models = [third_order_model(p) if isinstance(p, Ar3) else process_model(p) for p in (*turbulence, *vibration)]
     now = np.concatenate([m.now for m in models])

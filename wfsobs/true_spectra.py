@@ -15,12 +15,13 @@ import numpy as np
 
 from wfsobs import atmosphere
 from wfsobs.ar2 import Ar2
+from wfsobs.ar3 import Ar3
 from wfsobs.arrays import Array
 from wfsobs.disturbance import peak_rms, vibration_power
 from wfsobs.flow_spectra import flow_spectra
 from wfsobs.lgs import lgs_noise_rms, lgs_weights, low_frequency_process
 from wfsobs.scenario import Scenario
-from wfsobs.turbulence import mode_power, turbulence_process
+from wfsobs.turbulence import mode_power, third_order_process, turbulence_process
 from wfsobs.wiener import Complex
 
 LONGEST = 30.0
@@ -115,8 +116,8 @@ def _decay_rates(scenario: Scenario) -> list[float]:
     return rates
 
 
-def _density(process: Ar2, n: int) -> Array:
-    """Of an AR(2) process, per sample."""
+def _density(process: Ar2 | Ar3, n: int) -> Array:
+    """Of an autoregressive process, per sample."""
     return process.psd(np.fft.rfftfreq(n, process.dt)) / (2.0 * process.dt)
 
 
@@ -135,6 +136,10 @@ def _through_lgs(scenario: Scenario, mode: int, own: Array) -> Looks:
 
 def _ar2_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
     return _through_lgs(scenario, mode, _density(turbulence_process(scenario, mode, scenario.dt), n))
+
+
+def _ar3_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
+    return _through_lgs(scenario, mode, _density(third_order_process(scenario, mode, scenario.dt), n))
 
 
 def _no_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
@@ -176,6 +181,6 @@ def widened(spectrum: Array, width: float) -> Array:
 
 
 TURBULENCE_SPECTRA: dict[str, Callable[[Scenario, int, int], Looks]] = {
-    "ar2": _ar2_turbulence, "frozen-flow": _frozen_flow, "psd": _table, "none": _no_turbulence,
+    "ar2": _ar2_turbulence, "ar3": _ar3_turbulence, "frozen-flow": _frozen_flow, "psd": _table, "none": _no_turbulence,
 }
 """How the turbulence of each source looks to `true_spectra`."""

@@ -12,12 +12,14 @@ import numpy as np
 
 from wfsobs import atmosphere
 from wfsobs.ar2 import Ar2, turbulence_corner
+from wfsobs.ar3 import Ar3
 from wfsobs.arrays import Array
 from wfsobs.frozen_flow import frozen_flow
 from wfsobs.groups.atmosphere import PsdTable
 from wfsobs.scenario import Scenario
 from wfsobs.sensors import sensor
 from wfsobs.spectrum import random_phase_signal, table_power
+from wfsobs.statespace import sampled
 from wfsobs.watch import Watch
 
 
@@ -46,6 +48,12 @@ def turbulence_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
     corner = turbulence_corner(
         atmosphere.effective_wind(scenario), scenario.telescope.diameter, scenario.modes[mode].radial_order)
     return Ar2(corner, scenario.turbulence.damping, turbulence_rms(scenario, mode), dt)
+
+
+def third_order_process(scenario: Scenario, mode: int, dt: float) -> Ar3:
+    """The turbulence of one mode with its third corner, for source ar3."""
+    p = turbulence_process(scenario, mode, dt)
+    return Ar3(p.omega, p.damping, scenario.turbulence.third_corner * p.omega, p.rms, dt)
 
 
 def turbulence_rms(scenario: Scenario, mode: int) -> float:
@@ -88,6 +96,10 @@ def _ar2(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Arr
     return turbulence_process(scenario, mode, scenario.dt).sample(n, rng)
 
 
+def _ar3(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
+    return sampled(third_order_process(scenario, mode, scenario.dt), n, rng)
+
+
 def _psd(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
     """Inverse DFT of the table, all of it up to half the rate."""
     return random_phase_signal(mode_power(scenario.turbulence.psd, scenario, mode, n), n, rng)
@@ -106,5 +118,6 @@ def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Wa
 
 
 SOURCES: dict[str, Source] = {
-    "ar2": _mode_by_mode(_ar2), "frozen-flow": _frozen_flow, "psd": _mode_by_mode(_psd), "none": _mode_by_mode(_none),
+    "ar2": _mode_by_mode(_ar2), "ar3": _mode_by_mode(_ar3), "frozen-flow": _frozen_flow, "psd": _mode_by_mode(_psd),
+    "none": _mode_by_mode(_none),
 }

@@ -47,8 +47,8 @@ def power(level: float, density: Callable[[float], float], duration: float) -> f
 
 
 def theory(duration: float) -> str:
-    """What can be had: the search as it is in one of two modes and in a single mode; all its level for lines; nothing else than lines
-    below STRUCTURES looked for, at 5 %, in two modes and in one."""
+    """What can be had: the search as it is in one of two modes and in a single mode; and one that looks for nothing but lines
+    below STRUCTURES, at 5 %, in two modes and in one."""
     below = 1.0 / np.log(STRUCTURES / LOWEST)
     levels = {"as it is": ALONE * OF_LINES * LEVEL / 2 * BELOW, "as it is, one mode": OF_LINES * LEVEL * BELOW,
               "lines alone, all at 5 %": 0.025, "lines alone, one mode, at 5 %": 0.05}
@@ -61,7 +61,8 @@ def known_peaks(duration: float, modes: int = 2, level: float = IN_ONE_BIN) -> S
     s = PRESETS["paper"]().replace({"run.duration": duration, "vibration.cutoff": 200.0})
     peaks = [(f, xi, sqrt(ABOVE_FLOOR * floor(s, f) * pi * xi * f)) for f, xi in RESONANCES]
     shapes = [Ar2(2.0 * pi * f, xi, rms, s.dt) for f, xi, rms in peaks]
-    peaks += [(f, 0.0, sqrt(level * (floor(s, f) + sum(float(p.psd(np.array([f]))[0]) for p in shapes)) / duration)) for f in LINES]
+    skirts = {f: sum(float(p.psd(np.array([f]))[0]) for p in shapes) for f in LINES}
+    peaks += [(f, 0.0, sqrt(level * (floor(s, f) + skirts[f]) / duration)) for f in LINES]
     return s.replace({"vibration.peaks": [
         {"frequency": f, "damping": xi, "rms": [rms] * modes} for f, xi, rms in sorted(peaks)]})
 

@@ -49,16 +49,20 @@ class Layer(Group):
 class Turbulence(Group):
     """Atmospheric turbulence."""
 
-    source = param.Selector(default="ar2", objects=["ar2", "frozen-flow", "psd", "none"], label="Source",
-                            doc="How turbulence is made: the AR(2) process of the paper, eq. 1; von Karman layers that the wind "
-                                "carries along, every guide star with a view of its own; inverse DFT of the PSD table; or none.")
+    source = param.Selector(
+        default="ar2", objects=["ar2", "ar3", "frozen-flow", "psd", "none"], label="Source",
+        doc="How turbulence is made: the AR(2) process of the paper, eq. 1; the same with a third corner; von Karman layers that "
+            "the wind carries along, every guide star with a view of its own; inverse DFT of the PSD table; or none.")
     wind_speed = Real(15.0, bounds=(0.1, 100.0), softbounds=(1.0, 40.0), step=0.5, label="Wind speed V₀",
                       doc="Wind speed [m/s]; sets the corner w0 = 0.6 pi (n + 1) V0 / D (paper, eq. 1d and Table 1), and "
                           "scales the wind of every layer of frozen flow.")
     damping = Real(0.9, bounds=(0.01, 1.0), step=0.01, label="Damping ξ",
                    doc="Damping factor of the AR(2) process (paper, Table 1).")
+    third_corner = Real(3.0, bounds=(1.0, 1000.0), softbounds=(1.0, 10.0), step=0.1, label="Third corner / w₀",
+                        doc="Corner beyond which the spectrum falls as f^-6 in the place of f^-4, over the corner w0, for source "
+                            "ar3; not in the paper.")
     rms = Real(0.5, bounds=(0.0, 100.0), softbounds=(0.0, 2.0), step=0.01, label="Strength, rms",
-               doc="Standard deviation of tip and of tilt [um], for source ar2; the paper gives none, r0 = 0.157 m, L0 = 25 m "
+               doc="Standard deviation of tip and of tilt [um], for ar2 and ar3; the paper gives none, r0 = 0.157 m, L0 = 25 m "
                    "on 8 m give 0.529 um. A higher order has it in the ratio that r0 and L0 give.")
     r0 = Real(0.157, bounds=(0.01, 5.0), softbounds=(0.05, 0.4), step=0.001, label="Fried parameter r₀",
               doc="r0 at 500 nm at the zenith [m], for source frozen-flow. The seeing is 0.98 x 500 nm / r0: 0.64 arcsec.")

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import gamma
 
+from wfsobs.ar3 import Ar3
 from wfsobs.arrays import Array
 from wfsobs.gaps import bridged
 from wfsobs.identify.one_mode import OneMode
 from wfsobs.identify.periodogram import fast_length
-from wfsobs.identify.result import Identified, IdentifiedMode, read_off
+from wfsobs.identify.result import Identified, read_off
 from wfsobs.identify.search import LOWEST, PAD, Candidate, Found, search
 from wfsobs.identify.whiteness import Whiteness, autocorrelation_test, cumulated_test, innovations
 from wfsobs.modes import HIGHEST_ORDER, modes_up_to
@@ -22,6 +23,8 @@ from wfsobs.watch import QUIET, Watch
 
 LEVEL = 0.05
 """Probability of any false peak in a record."""
+EVERY_SWEEP, SELDOM = 8, 4
+"""All numbers are fitted anew after every peak, of many peaks after every so many: each has been fitted alone."""
 MOST_PEAKS = 40
 """Per mode."""
 SHORTEST = 1000
@@ -61,7 +64,7 @@ def identify(
     grow(modes, level, lowest, watch)
     left = unexplained(modes, level, lowest)
     found = tuple(
-        IdentifiedMode(name, *read_off(mode), tested(mode, count)) for name, mode, count in zip(names, modes, left, strict=False))
+        read_off(name, mode, lowest, tested(mode, count)) for name, mode, count in zip(names, modes, left, strict=False))
     watch.step(1.0)
     return Identified(found, record.dt, len(z), level)
 
@@ -80,13 +83,14 @@ def grow(modes: Sequence[OneMode], level: float, lowest: float, watch: Watch) ->
             if best is None or mode.peaks >= MOST_PEAKS:
                 continue
             seen = True
-            if mode.explain(best):
+            if mode.explain(best) and (sweep < EVERY_SWEEP or sweep % SELDOM == 0):
                 mode.refit()
         if not seen:
             if polished:
                 return
+            third = any(isinstance(mode.spectrum.turbulence, Ar3) for mode in modes)
             for mode in modes:
-                mode.polish()
+                mode.polish(third)
         polished = not seen
 
 

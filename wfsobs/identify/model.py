@@ -24,13 +24,13 @@ HIGHEST = 0.999
 
 @dataclass(frozen=True)
 class Spectrum:
-    """noise : rms of the white noise [um]; turbulence : or None; background : coloured noise, or None; resonances : any number."""
+    """noise : rms of the white noise [um]; turbulence, background : coloured noise, or None each; resonances : any number."""
 
     noise: float
     dt: float
     turbulence: Ar2 | Ar3 | None = None
-    background: Ar2 | None = None
     resonances: tuple[Ar2, ...] = ()
+    background: Ar2 | None = None
 
     @property
     def processes(self) -> tuple[Ar2 | Ar3, ...]:
@@ -39,11 +39,13 @@ class Spectrum:
 
     def psd(self, f: Array) -> Array:
         """One-sided power spectral density [um^2/Hz] at f [Hz]."""
-        return 2.0 * self.dt * self.noise**2 + sum((p.psd(f) for p in self.processes), np.zeros_like(f))
+        at = _Frequencies(f, self.dt)
+        return 2.0 * self.dt * self.noise**2 + sum((at.density(p) for p in self.processes), np.zeros_like(f))
 
     @property
     def vector(self) -> Array:
-        """log noise, then log omega, logit damping, log rms of every process, and the log of a third corner, (numbers,)."""
+        """log noise, then log omega, logit damping, log rms of every process, (numbers,); a third corner lies beyond
+        omega, its number is the log of how far, over omega."""
         return np.concatenate([[np.log(self.noise)], *map(_vector, self.processes)])
 
     @property
@@ -65,6 +67,7 @@ class Spectrum:
 
     def slopes(self, f: Array, wanted: Sequence[int]) -> Array:
         """Derivatives of the density by the wanted numbers of `vector`, in their order, (len(wanted), len(f)) [um^2/Hz]."""
+        on = _Frequencies(f, self.dt)
         rows = {0: np.full_like(f, 4.0 * self.dt * self.noise**2)}
         for start, p in zip(self.starts, self.processes, strict=False):
             at = _vector(p)
@@ -72,19 +75,37 @@ class Spectrum:
                 if start + i not in wanted:
                     continue
                 if i == RMS:
-                    rows[start + i] = 2.0 * p.psd(f)
+                    rows[start + i] = 2.0 * on.density(p)
                     continue
                 move = np.zeros(len(at))
                 move[i] = STEP * p.damping if i == 0 else STEP  # a resonance is as narrow as its damping
-                rows[start + i] = (_process(at + move, self.dt).psd(f) - _process(at - move, self.dt).psd(f)) / (2.0 * move[i])
+                up, down = (on.density(_process(at + sign * move, self.dt)) for sign in (1.0, -1.0))
+                rows[start + i] = (up - down) / (2.0 * move[i])
         return np.array([rows[i] for i in wanted])
 
 
+class _Frequencies:
+    """Where the densities of many processes are taken: they share sine and cosine, which is most of the work of `Ar2.psd`."""
+
+    def __init__(self, f: Array, dt: float):
+        self.f, self.sine, self.cosine = f, np.sin(np.pi * f * dt), np.cos(np.pi * f * dt)
+
+    def density(self, p: Ar2 | Ar3) -> Array:
+        """One-sided power spectral density [um^2/Hz] of a process."""
+        if isinstance(p, Ar3):
+            return p.psd(self.f)
+        damped, half = p.damping * p.omega * p.dt, 0.5 * p.omega * np.sqrt(1.0 - p.damping**2) * p.dt
+        # |1 - exp(-damped + 2i x)|^2 = (1 - exp(-damped))^2 + 4 exp(-damped) sin^2 x at both x = pi f dt -+ half
+        a, b = self.sine * np.cos(half), self.cosine * np.sin(half)
+        flat, turning = np.expm1(-damped) ** 2, 4.0 * np.exp(-damped)
+        return 2.0 * p.dt * p.drive_variance / ((flat + turning * (a - b) ** 2) * (flat + turning * (a + b) ** 2))
+
+
 def _vector(p: Ar2 | Ar3) -> Array:
-    more = [np.log(p.corner)] if isinstance(p, Ar3) else []
+    more = [np.log(max(p.corner / p.omega - 1.0, 1e-6))] if isinstance(p, Ar3) else []
     return np.array([np.log(p.omega), logit(p.damping), np.log(p.rms), *more])
 
 
 def _process(v: Array, dt: float) -> Ar2 | Ar3:
     omega, damping, rms = float(np.exp(v[0])), float(np.clip(expit(v[1]), 1e-9, HIGHEST)), float(np.exp(v[2]))
-    return Ar3(omega, damping, float(np.exp(v[3])), rms, dt) if len(v) == 4 else Ar2(omega, damping, rms, dt)
+    return Ar3(omega, damping, omega * (1.0 + float(np.exp(v[3]))), rms, dt) if len(v) == 4 else Ar2(omega, damping, rms, dt)

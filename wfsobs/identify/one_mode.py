@@ -72,13 +72,14 @@ class OneMode:
             keep[np.abs(self.f - centre) < half] = 1.0
         return Cells(self.f, self.I, keep, [p.omega / (2 * pi) for p in self.spectrum.resonances])
 
-    def refit(self, reshape: bool = False) -> None:
-        """All numbers of the spectrum at once; reshape : whether order of the turbulence and background are chosen anew. A resonance
-        that has become as narrow as a line is one from then on; one that has become as wide as turbulence is dropped."""
+    def refit(self, reshape: bool = False, third: bool = False) -> None:
+        """All numbers of the spectrum at once; reshape : whether order of the turbulence and background are chosen anew, third :
+        third order in any case. A resonance that has become as narrow as a line is one from then on; one that has become as
+        wide as turbulence is dropped."""
         cells = self.cells()
         self.spectrum = fitted(self.spectrum, cells)
         if reshape:
-            self.spectrum = with_background(of_best_order(self.spectrum, cells), cells)
+            self.spectrum = with_background(of_best_order(self.spectrum, cells, third), cells)
         for p in [p for p in self.spectrum.resonances if not self._sound(p)]:
             self.spectrum = replace(self.spectrum, resonances=tuple(q for q in self.spectrum.resonances if q is not p))
             frequency = p.omega / (2 * pi)
@@ -166,15 +167,16 @@ class OneMode:
         assert best is not None
         return best[1]
 
-    def polish(self) -> None:
-        """Every line once more with the others taken off, and all numbers on all bins."""
+    def polish(self, third: bool = False) -> None:
+        """Every line once more with the others taken off, and all numbers on all bins; third : turbulence of third order in any
+        case, as another mode has it."""
         for i, line in enumerate(self.lines):
             alone = self.left + line.signal(self.n, self.dt)
             again = nearest_line(alone, self.dt, line.frequency, 0.25 * self.f[0])
             self.left = alone - again.signal(self.n, self.dt)
             self.lines[i] = again
         self._take_off()
-        self.refit(reshape=True)
+        self.refit(True, third)
         for p in self.spectrum.resonances:
             self._split(p)
 

@@ -24,10 +24,10 @@ REACHES = (0.02, 0.08)
 """Corners of a background, over the rate, that a fit starts from: 20 and 80 Hz at 1 kHz."""
 
 
-def of_best_order(spectrum: Spectrum, cells: Cells) -> Spectrum:
-    """A fitted spectrum with its turbulence an AR(2) or, where that is worth one number more, of third order."""
+def of_best_order(spectrum: Spectrum, cells: Cells, third: bool = False) -> Spectrum:
+    """A fitted spectrum with its turbulence an AR(2) or, where that is worth one number more or asked for, of third order."""
     t = spectrum.turbulence
-    if t is None:
+    if t is None or (third and isinstance(t, Ar3)):
         return spectrum
     if isinstance(t, Ar3):
         lower, higher = _smooth(replace(spectrum, turbulence=Ar2(t.omega, t.damping, t.rms, t.dt)), cells), spectrum
@@ -35,7 +35,7 @@ def of_best_order(spectrum: Spectrum, cells: Cells) -> Spectrum:
         starts = [replace(spectrum, turbulence=Ar3(t.omega, t.damping, k * t.omega, t.rms, t.dt)) for k in STARTS]
         lower, higher = spectrum, min((_smooth(s, cells) for s in starts), key=lambda s: negative_log_likelihood(s, cells))
     gain = negative_log_likelihood(lower, cells) - negative_log_likelihood(higher, cells)
-    return higher if gain > WORTH else lower
+    return higher if third or gain > WORTH else lower
 
 
 def with_background(spectrum: Spectrum, cells: Cells) -> Spectrum:

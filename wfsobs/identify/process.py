@@ -16,11 +16,15 @@ class Number(NamedTuple):
 
 @dataclass(frozen=True)
 class Process:
-    """Turbulence or a peak: natural frequency (omega / 2 pi) [Hz], damping (0 +- 0 for a pure line), rms [um]."""
+    """Turbulence, background or a peak: natural frequency (omega / 2 pi) [Hz], damping (0 +- 0 for a pure line), rms [um].
+
+    third_corner : of turbulence of third order, over `frequency`, or None
+    """
 
     frequency: Number
     damping: Number
     rms: Number
+    third_corner: Number | None = None
 
     @property
     def pure(self) -> bool:

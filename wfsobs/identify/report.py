@@ -7,7 +7,7 @@ from typing import Any
 from rich.table import Table
 
 from wfsobs.configfile import annotated, to_toml
-from wfsobs.identify.process import Number
+from wfsobs.identify.process import Number, Process
 from wfsobs.identify.result import Identified
 from wfsobs.identify.whiteness import LEVEL
 from wfsobs.scenario import Scenario
@@ -18,13 +18,17 @@ def plain(result: Identified) -> dict[str, Any]:
     def numbers(**named: Number) -> dict[str, float]:
         return {k: v for name, n in named.items() for k, v in ((name, n.value), (f"{name}_std", n.std))}
 
+    def of(p: Process) -> dict[str, float]:
+        return numbers(**{name: n for name, n in vars(p).items() if n is not None})
+
     return {
         "duration": result.duration, "level": result.level, "white": result.white,
         "modes": [
             {
                 "mode": m.name, **numbers(noise=m.noise),
-                "turbulence": None if m.turbulence is None else numbers(**vars(m.turbulence)),
-                "peaks": [{**numbers(**vars(p)), "pure": p.pure} for p in m.peaks],
+                "turbulence": None if m.turbulence is None else of(m.turbulence),
+                "background": None if m.background is None else of(m.background),
+                "peaks": [{**of(p), "pure": p.pure} for p in m.peaks],
                 "whiteness": {"cumulated_p": m.whiteness.cumulated, "innovations_p": m.whiteness.innovations,
                               "unexplained": m.whiteness.left, "white": m.whiteness.white},
             }
@@ -46,6 +50,11 @@ def table(result: Identified) -> Table:
         if m.turbulence is not None:
             t = m.turbulence
             out.add_row(m.name, "turbulence", written(t.frequency), written(t.damping), written(_nm(t.rms)))
+            if t.third_corner is not None:
+                third = Number(t.third_corner.value * t.frequency.value, t.third_corner.std * t.frequency.value)
+                out.add_row(m.name, "  its third corner", written(third), "", "")
+        if m.background is not None:
+            out.add_row(m.name, "background", f"up to {written(m.background.frequency)}", "", written(_nm(m.background.rms)))
         for p in m.peaks:
             out.add_row(m.name, "line" if p.pure else "resonance", written(p.frequency),
                         "0" if p.pure else written(p.damping), written(_nm(p.rms)))

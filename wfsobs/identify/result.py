@@ -8,19 +8,23 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.ar2 import turbulence_corner
+from wfsobs.ar2 import Ar2, turbulence_corner
+from wfsobs.ar3 import Ar3
+from wfsobs.arrays import Array
 from wfsobs.atmosphere import relative_rms
 from wfsobs.identify.model import Spectrum
 from wfsobs.identify.one_mode import OneMode
 from wfsobs.identify.process import Number, Peak, Process, mean, merged
 from wfsobs.identify.whiteness import Whiteness
+from wfsobs.identify.whittle import NO_NEARER
 from wfsobs.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.scenario import Scenario
 
 
 @dataclass(frozen=True)
 class IdentifiedMode:
-    """The model of one mode: noise, rms of z's white noise [um]; turbulence, or None; peaks by frequency; what the tests say.
+    """The model of one mode: noise, rms of z's white noise [um]; turbulence, or None; coloured background, or None; peaks by
+    frequency; what the tests say.
 
     spectrum : of all but the pure lines
     """
@@ -28,6 +32,7 @@ class IdentifiedMode:
     name: str
     noise: Number
     turbulence: Process | None
+    background: Process | None
     peaks: tuple[Process, ...]
     spectrum: Spectrum
     whiteness: Whiteness
@@ -58,7 +63,8 @@ class Identified:
         return merged([mode.peaks for mode in self.modes])
 
     def scenario(self, base: Scenario | None = None) -> Scenario:
-        """A scenario whose z has the spectra found: turbulence as AR(2), the peaks, the LGS noise; the Kalman filters follow it.
+        """A scenario whose z has the spectra found: turbulence, peaks, LGS noise; the Kalman filters follow it. A background,
+        a few nm where it is the aliasing of a sensor, has no place in a scenario and is left out.
 
         What the modes share in a scenario (wind, damping, strength of turbulence, noise) is the mean of what was found, weighted
         with the errors. base : where everything else comes from, but its events, which name peaks by their number.
@@ -68,7 +74,7 @@ class Identified:
         peaks = self.peaks
         changes: dict[str, Any] = {path: number.value for path, number in self.shared(out).items()}
         changes |= {
-            "turbulence.source": "ar2" if any(m.turbulence for m in self.modes) else "none",
+            "turbulence.source": self.source, "multipeak.turbulence_order": 3 if self.source == "ar3" else 2,
             "sensors.noise_from": "nm", "sensors.lgs_combination": "mean", "sensors.lgs_low_frequency_rms": 0.0,
             "sensors.tip_tilt_indetermination": False,
             "vibration.source": "peaks" if peaks else "none",
@@ -85,6 +91,12 @@ class Identified:
                         "kalman.frequency": strongest.frequency.value, "kalman.damping": strongest.damping.value}
         return out.replace(changes)
 
+    @property
+    def source(self) -> str:
+        """`turbulence.source` of the scenario."""
+        found = [m.turbulence for m in self.modes if m.turbulence]
+        return "none" if not found else "ar3" if any(t.third_corner for t in found) else "ar2"
+
     def shared(self, scenario: Scenario) -> dict[str, Number]:
         """Dotted path -> number of the settings that all modes share, and their errors; within what the settings allow."""
         modes = [*zip(self.modes, scenario.modes, strict=False)]
@@ -96,25 +108,33 @@ class Identified:
             out["turbulence.wind_speed"] = _within(mean(winds), 0.1, 100.0)
             out["turbulence.damping"] = _within(mean([t.damping for _, t, _ in seen]), 0.01, 1.0)
             strengths = [_scaled(t.rms, 1.0 / relative_rms(scenario, i)) for i, t, _ in seen]
+            if thirds := [t.third_corner for _, t, _ in seen if t.third_corner]:
+                out["turbulence.third_corner"] = _within(mean(thirds), 1.0, 1000.0)
             out["turbulence.rms"] = _within(mean(strengths), 0.0, 100.0)
         return out
 
 
-def read_off(mode: OneMode) -> tuple[Number, Process | None, tuple[Process, ...], Spectrum]:
-    """The numbers of a mode and their standard deviations: noise, turbulence, peaks; and the spectrum."""
+def read_off(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> IdentifiedMode:
+    """The numbers of a mode and their standard deviations. A resonance below the lowest frequency [Hz] that was looked at is a
+    part of the turbulence's shape, and no peak."""
     std = mode.errors()
     noise = _scaled(Number(1.0, float(std[0])), mode.spectrum.noise)
-    found = [
-        Process(_scaled(Number(1.0, float(std[i])), p.omega / (2 * pi)), Number(p.damping, float(std[i + 1])),
-                _scaled(Number(1.0, float(std[i + 2])), p.rms))
-        for i, p in zip(mode.spectrum.starts, mode.spectrum.processes, strict=False)
-    ]
+    found = [_process(p, std[start:]) for start, p in zip(mode.spectrum.starts, mode.spectrum.processes, strict=False)]
     turbulence, background = (None if p is None else found.pop(0) for p in (mode.spectrum.turbulence, mode.spectrum.background))
     for line in mode.lines:
         floor = float(mode.spectrum.psd(np.array([line.frequency]))[0])
         in_frequency, in_rms = line.standard_deviations(mode.n, mode.dt, floor)
         found.append(Process(Number(line.frequency, in_frequency), Number(0.0, 0.0), Number(line.rms, in_rms)))
-    return noise, turbulence, tuple(sorted(found, key=lambda p: p.frequency.value)), mode.spectrum
+    peaks = sorted((p for p in found if p.frequency.value >= lowest), key=lambda p: p.frequency.value)
+    return IdentifiedMode(name, noise, turbulence, background, tuple(peaks), mode.spectrum, whiteness)
+
+
+def _process(p: Ar2 | Ar3, std: Array) -> Process:
+    """With the standard deviations of its numbers, those of frequency, rms and third corner relative, the first of std."""
+    beyond = p.corner / p.omega - 1.0 if isinstance(p, Ar3) else 0.0
+    return Process(_scaled(Number(1.0, float(std[0])), p.omega / (2 * pi)), Number(p.damping, float(std[1])),
+                   _scaled(Number(1.0, float(std[2])), p.rms),
+                   Number(1.0 + beyond, max(beyond, NO_NEARER - 1.0) * float(std[3])) if isinstance(p, Ar3) else None)
 
 
 def _scaled(n: Number, factor: float) -> Number:

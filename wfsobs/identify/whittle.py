@@ -6,12 +6,14 @@ With m bins of mean I in a cell, - log L = sum m (log S + I / S). Its expected s
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
 
 from wfsobs.ar2 import Ar2
+from wfsobs.ar3 import Ar3
 from wfsobs.arrays import Array
 from wfsobs.identify.model import Spectrum
 from wfsobs.identify.periodogram import Cells
@@ -20,6 +22,8 @@ STEPS = 40
 """Of the minimisation, at most."""
 NOISE, TURBULENCE, BACKGROUND, RESONANCE = 3.0, (2.0, 8.0, 4.0, 3.0), (1.5, 0.0, 4.0), (0.1, 6.0, 4.0)
 """How far the numbers of a vector may leave their start: a resonance stays at its place."""
+NO_NEARER = 1.1
+"""Third corner, over the first two, at which its standard deviation is taken at least."""
 
 
 def negative_log_likelihood(spectrum: Spectrum, cells: Cells) -> float:
@@ -83,6 +87,9 @@ def fitted(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = None) 
 
 def standard_deviations(spectrum: Spectrum, cells: Cells, inflation: float) -> Array:
     """Of the numbers of the vector, but of the damping itself in the place of its logit, (p,)."""
+    t = spectrum.turbulence
+    if isinstance(t, Ar3):  # at its bound the corner's own number says nothing
+        spectrum = replace(spectrum, turbulence=replace(t, corner=max(t.corner, NO_NEARER * t.omega)))
     std = np.zeros(spectrum.starts[-1])
     free = [i for i in range(len(std)) if i not in spectrum.fixed]
     covariance = np.linalg.inv(information(spectrum, cells, free) + 1e-12 * np.eye(len(free)))
