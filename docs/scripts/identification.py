@@ -171,6 +171,10 @@ if __name__ == "__main__":
     print("| in tip alone, lines at 30 times the floor |", found(known_peaks(duration, 1, 30.0), seeds), "|", flush=True)
     print("| a record of tip alone |", found(known_peaks(duration, 1), seeds, 1), "|", flush=True)
     print("| in tip alone, record twice as long |", found(known_peaks(2 * duration, 1), seeds), "|\n", flush=True)
+    for name in ("ut4", "galacsi-nfm"):
+        flow = PRESETS[name]().replace({"run.duration": duration})
+        print(f"| frozen flow of {name} without vibration |", found(flow.replace(QUIET), few), "|", flush=True)
+        print(f"Filters, {name} with its vibration:", filters(flow, range(1, 6)), flush=True)
     print("Lines, at best:", theory(duration), flush=True)
     print("Filters, known peaks:", filters(known_peaks(duration), few), flush=True)
     print("Filters, peaks of the paper:", filters(resonant, few), flush=True)

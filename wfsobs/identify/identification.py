@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import gamma
@@ -12,6 +13,7 @@ from wfsobs.arrays import Array
 from wfsobs.gaps import bridged
 from wfsobs.identify.one_mode import OneMode
 from wfsobs.identify.periodogram import fast_length
+from wfsobs.identify.remarks import in_time, remarks
 from wfsobs.identify.result import Identified, read_off
 from wfsobs.identify.search import LOWEST, PAD, Candidate, Found, search
 from wfsobs.identify.whiteness import Whiteness, autocorrelation_test, cumulated_test, innovations
@@ -31,6 +33,8 @@ SHORTEST = 1000
 """Samples of a record at least."""
 ALONE = 0.8
 """Share of the level for modes alone, where there are several: a line in one of them has no power to spare, one in all has."""
+RESTING = 1e-9
+"""Rms over largest value of a measurement that is a constant with rounding errors."""
 JOINT = 1e-3
 """A candidate of all modes together belongs to those in which white noise would be as high with this probability."""
 
@@ -45,6 +49,8 @@ def identify(
     Raises RecordError for a record that is too short or does not move, Cancelled.
     """
     scenario = as_stated(record, scenario or Scenario())
+    if np.isinf(record.y_lgs).any() or np.isinf(record.u).any():
+        raise RecordError("the record has samples that are infinite")
     z = bridged(record, scenario).z[record.delay :]
     z = z[: fast_length(len(z))]
     if len(z) < SHORTEST:
@@ -55,7 +61,7 @@ def identify(
     if record.n_modes > len(names):
         raise RecordError(f"the record has {record.n_modes} modes, at most {len(names)} can be identified")
     for name, column in zip(names, z.T, strict=False):
-        if not np.ptp(column) > 0:
+        if not np.std(column) > RESTING * np.max(np.abs(column)):
             raise RecordError(f"{name}: z does not change, there is nothing to identify")
     modes = []
     for column in z.T:
@@ -86,7 +92,7 @@ def grow(modes: Sequence[OneMode], level: float, lowest: float, watch: Watch) ->
             if mode.explain(best) and (sweep < EVERY_SWEEP or sweep % SELDOM == 0):
                 mode.refit()
         if not seen:
-            if polished:
+            if polished and not sum(mode.prune() for mode in modes):
                 return
             third = any(isinstance(mode.spectrum.turbulence, Ar3) for mode in modes)
             for mode in modes:
@@ -143,4 +149,5 @@ def tested(mode: OneMode, left: int) -> Whiteness:
     """The tests of what a mode's model leaves; left : candidates that no peak explains."""
     ratio = mode.I / mode.spectrum.psd(mode.f)
     e = innovations(mode.left, mode.spectrum)
-    return Whiteness(cumulated_test(ratio, mode.n), autocorrelation_test(e, len(mode.spectrum.vector)), left)
+    result = Whiteness(cumulated_test(ratio, mode.n), autocorrelation_test(e, len(mode.spectrum.vector)), left)
+    return replace(result, remarks=tuple(in_time(e, mode.dt)) if result.white else remarks(mode.f, ratio, e, mode.dt))

@@ -16,6 +16,8 @@ from wfsobs.arrays import Array
 STEP = 1e-4
 """Of the central differences, in the logarithm of a parameter."""
 
+SLOW, FAST = 1e-3, 1.5
+"""Bounds of omega of a third-order process, over the rate: slower ones cost digits."""
 RMS = 2
 """Place of the log of the rms among the numbers of a process."""
 HIGHEST = 0.999
@@ -108,4 +110,7 @@ def _vector(p: Ar2 | Ar3) -> Array:
 
 def _process(v: Array, dt: float) -> Ar2 | Ar3:
     omega, damping, rms = float(np.exp(v[0])), float(np.clip(expit(v[1]), 1e-9, HIGHEST)), float(np.exp(v[2]))
-    return Ar3(omega, damping, omega * (1.0 + float(np.exp(v[3]))), rms, dt) if len(v) == 4 else Ar2(omega, damping, rms, dt)
+    if len(v) == 3:
+        return Ar2(omega, damping, rms, dt)
+    omega = min(max(omega, SLOW / dt), FAST / dt)
+    return Ar3(omega, damping, min(omega * (1.0 + float(np.exp(v[3]))), 2.0 * FAST / dt), rms, dt)

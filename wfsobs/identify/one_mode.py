@@ -10,7 +10,7 @@ import numpy as np
 from wfsobs.ar2 import Ar2
 from wfsobs.arrays import Array
 from wfsobs.identify.lines import Line, nearest_line
-from wfsobs.identify.model import Spectrum
+from wfsobs.identify.model import RMS, Spectrum
 from wfsobs.identify.order import of_best_order, with_background
 from wfsobs.identify.periodogram import Cells, frequencies, inflation, periodogram
 from wfsobs.identify.search import PAD, Candidate
@@ -24,6 +24,8 @@ RESOLVED = 0.2
 """Half width at half maximum of a resonance at least, in bins; what is narrower is a line."""
 WIDEST = 0.5
 """Damping of a resonance at most."""
+SURE = 2.0
+"""Standard deviations that the rms of a resonance has at least."""
 WORTH = 6.0
 """Log-likelihood that three numbers more have to gain: noise gives as much with a probability of 0.7 % (chi squared of 12)."""
 SPLIT = 8.0
@@ -197,6 +199,19 @@ class OneMode:
         if gain > SPLIT and all(map(self._sound, shape.resonances[-2:])):
             self.spectrum = shape
             self.refit()
+
+    def prune(self) -> bool:
+        """Take off the resonance whose rms is least certain, if that is below SURE of its standard deviations: a neighbour has
+        its power as well. Whether there was one."""
+        std, starts = self.errors(), self.spectrum.starts[len(self.spectrum.processes) - len(self.spectrum.resonances) :]
+        worst = max(range(len(self.spectrum.resonances)), key=lambda i: std[starts[i] + RMS], default=None)
+        if worst is None or std[starts[worst] + RMS] * SURE < 1.0:
+            return False
+        p = self.spectrum.resonances[worst]
+        self.spectrum = replace(self.spectrum, resonances=tuple(q for q in self.spectrum.resonances if q is not p))
+        self.refused.append(Candidate(p.omega / (2 * pi), max(round(p.damping * p.omega / pi / self.f[0]), WIDEST_LINE), 0.0))
+        self.refit()
+        return True
 
     def errors(self) -> Array:
         """Standard deviations of the spectrum's numbers, see `standard_deviations`."""

@@ -30,7 +30,8 @@ def plain(result: Identified) -> dict[str, Any]:
                 "background": None if m.background is None else of(m.background),
                 "peaks": [{**of(p), "pure": p.pure} for p in m.peaks],
                 "whiteness": {"cumulated_p": m.whiteness.cumulated, "innovations_p": m.whiteness.innovations,
-                              "unexplained": m.whiteness.left, "white": m.whiteness.white},
+                              "unexplained": m.whiteness.left, "white": m.whiteness.white,
+                              "remarks": list(m.whiteness.remarks)},
             }
             for m in result.modes
         ],
@@ -68,7 +69,8 @@ def verdict(result: Identified) -> list[str]:
         w = m.whiteness
         tests = f"cumulated spectrum p = {w.cumulated:.2g}, innovations p = {w.innovations:.2g}"
         rest = f"; {w.left} candidates that no peak explains" if w.left else ""
-        out.append(f"{m.name}: what is left is {'white' if w.white else 'NOT white'} at {LEVEL:.0%} ({tests}{rest})")
+        why = "".join(f"; {remark}" for remark in w.remarks)
+        out.append(f"{m.name}: what is left is {'white' if w.white else 'NOT white'} at {LEVEL:.0%} ({tests}{rest}){why}")
     return out
 
 

@@ -18,7 +18,7 @@ LEVEL = 0.01
 LAGS = 100
 """Of the autocorrelation, beside one for every number of the model."""
 MIN_NOISE = 1e-6
-"""Noise [um] that the filter assumes at least."""
+"""Noise that the filter assumes at least, over the rms of z."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,13 @@ class Whiteness:
     cumulated   : of the largest distance between the cumulated I / S and a straight line (Bartlett, with Kolmogorov's law)
     innovations : of the autocorrelation of the Kalman filter's innovations (Ljung and Box, Biometrika 65, 297, 1978)
     left        : candidates that the search still sees and no peak explains
+    remarks     : what differs, one clause each, where it is not white
     """
 
     cumulated: float
     innovations: float
     left: int
+    remarks: tuple[str, ...] = ()
 
     @property
     def white(self) -> bool:
@@ -54,7 +56,7 @@ def innovations(z: Array, spectrum: Spectrum) -> Array:
     if not spectrum.processes:
         return z[settle:]
     model = disturbance_model(list(spectrum.processes[:1]), list(spectrum.processes[1:]))
-    kalman, _ = steady_filter(model, max(spectrum.noise, MIN_NOISE), (model.C @ model.A)[None])
+    kalman, _ = steady_filter(model, max(spectrum.noise, MIN_NOISE * float(np.std(z))), (model.C @ model.A)[None])
     predicted = kalman.run(z[:, None, None])[:, 0, 0]  # C A x_hat[k], what z[k+1] should be
     return (z[1:] - predicted[:-1])[settle:]
 
