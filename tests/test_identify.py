@@ -18,9 +18,10 @@ from wfsobs.cli import main
 from wfsobs.identify import Identified, identify
 from wfsobs.identify.lines import Line, nearest_line
 from wfsobs.identify.model import Spectrum
+from wfsobs.identify.one_mode import OneMode
 from wfsobs.identify.periodogram import Cells, fast_length, frequencies, inflation, periodogram
 from wfsobs.identify.process import Number, Process, merged
-from wfsobs.identify.report import annotated, plain, written
+from wfsobs.identify.report import annotated, plain, verdict, written
 from wfsobs.identify.search import PAD, search
 from wfsobs.identify.whiteness import autocorrelation_test, cumulated_test, innovations
 from wfsobs.identify.whittle import fitted, information, negative_log_likelihood
@@ -178,6 +179,18 @@ def test_closed_loop_is_its_open_loop_twin(record: Record, found: Identified) ->
             assert abs(p.rms.value - q.rms.value) < 0.01 * p.rms.std
 
 
+def test_a_resonance_as_uncertain_as_this_is_taken_off() -> None:
+    """Two in the place of one: their powers cannot be told apart, and one is left with both."""
+    rng = np.random.default_rng(10)
+    true = Ar2(2 * pi * 30.0, 0.02, 0.02, DT)
+    mode = OneMode(true.sample(20_000, rng) + 0.014 * rng.standard_normal(20_000), DT)
+    half = replace(true, rms=true.rms / sqrt(2.0))
+    mode.spectrum = Spectrum(0.014, DT, None, (half, replace(half, omega=1.001 * half.omega)))
+    assert mode.prune() and not mode.prune()
+    (left,) = mode.spectrum.resonances
+    assert left.rms == pytest.approx(true.rms, rel=0.15)
+
+
 def test_missing_frames_change_little(record: Record, found: Identified) -> None:
     y = record.y_lgs.copy()
     y[5000:5020], y[np.random.default_rng(6).integers(0, len(y), 50)] = np.nan, np.nan
@@ -274,7 +287,26 @@ def test_peaks_that_agree_are_one() -> None:
     assert line.damping == Number(0.0, 0.0)  # tip, where it stands out more, says so
 
 
+T = np.arange(6000)[:, None] * DT
+NOISE = 0.01 * np.random.default_rng(9).standard_normal((6000, 1))
+
+
+@pytest.mark.parametrize(("z", "said"), [
+    (np.sin(2 * pi * 20.3 * T) + np.where((T > 2) & (T < 3), 0.0, NOISE), "not stationary"),  # held samples
+    (np.round(NOISE / 0.02) * 0.02, "is white"),  # counts
+    (NOISE + 3.0 * T, "NOT white"),  # drift
+    (NOISE + 5.0 * (np.arange(6000)[:, None] % 997 == 500), "further than 6 standard deviations"),  # outliers
+    (NOISE * (1.0 + (T > 3)), "not stationary"),
+])
+def test_records_that_are_none_of_the_model_are_survived_and_told(z: np.ndarray, said: str) -> None:
+    got = identify(Record(z, np.zeros_like(z), DT))
+    assert said in verdict(got)[0]
+    json.dumps(plain(got), allow_nan=False)
+    got.scenario().validate()
+
+
 @pytest.mark.parametrize(("change", "said"), [
+    ({"y_lgs": np.where(np.arange(4000)[:, None] == 7, np.inf, np.ones((4000, 2))), "u": np.zeros((4000, 2))}, "infinite"),
     ({"y_lgs": np.zeros((900, 2)), "u": np.zeros((900, 2))}, "900 samples, to identify it takes"),
     ({"y_lgs": np.zeros((4000, 2)), "u": np.zeros((4000, 2))}, "tip: z does not change"),
     ({"y_lgs": np.ones((4000, 2)), "u": np.zeros((4000, 2)), "dt": 0.1}, "peaks from 5 Hz: .* 2.5 Hz"),

@@ -20,6 +20,7 @@ from wfsobs.identify.whiteness import Whiteness, autocorrelation_test, cumulated
 from wfsobs.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.pipeline import as_stated
 from wfsobs.record import Record, RecordError
+from wfsobs.riccati import RiccatiError
 from wfsobs.scenario import Scenario
 from wfsobs.watch import QUIET, Watch
 
@@ -148,6 +149,10 @@ def unexplained(modes: Sequence[OneMode], level: float, lowest: float) -> list[i
 def tested(mode: OneMode, left: int) -> Whiteness:
     """The tests of what a mode's model leaves; left : candidates that no peak explains."""
     ratio = mode.I / mode.spectrum.psd(mode.f)
-    e = innovations(mode.left, mode.spectrum)
-    result = Whiteness(cumulated_test(ratio, mode.n), autocorrelation_test(e, len(mode.spectrum.vector)), left)
+    cumulated = cumulated_test(ratio, mode.n)
+    try:
+        e = innovations(mode.left, mode.spectrum)
+    except RiccatiError as error:  # of what is no noise at all
+        return Whiteness(cumulated, 0.0, left, (str(error),))
+    result = Whiteness(cumulated, autocorrelation_test(e, len(mode.spectrum.vector)), left)
     return replace(result, remarks=tuple(in_time(e, mode.dt)) if result.white else remarks(mode.f, ratio, e, mode.dt))

@@ -16,8 +16,8 @@ from wfsobs.arrays import Array
 STEP = 1e-4
 """Of the central differences, in the logarithm of a parameter."""
 
-SLOW, FAST = 1e-3, 1.5
-"""Bounds of omega of a third-order process, over the rate: slower ones cost digits."""
+SLOW, FAST, LEAST = 1e-3, 1.5, 0.02
+"""Bounds of omega of turbulence of third order, over the rate, and of its damping: beyond them it loses digits."""
 RMS = 2
 """Place of the log of the rms among the numbers of a process."""
 HIGHEST = 0.999
@@ -113,4 +113,4 @@ def _process(v: Array, dt: float) -> Ar2 | Ar3:
     if len(v) == 3:
         return Ar2(omega, damping, rms, dt)
     omega = min(max(omega, SLOW / dt), FAST / dt)
-    return Ar3(omega, damping, min(omega * (1.0 + float(np.exp(v[3]))), 2.0 * FAST / dt), rms, dt)
+    return Ar3(omega, max(damping, LEAST), min(omega * (1.0 + float(np.exp(v[3]))), 2.0 * FAST / dt), rms, dt)

@@ -61,4 +61,5 @@ def _beyond_turbulence(spectrum: Spectrum) -> bool:
 
 def _smooth(spectrum: Spectrum, cells: Cells) -> Spectrum:
     """All that is smooth fitted, resonances left as they are."""
+    spectrum = spectrum.moved(spectrum.vector)  # within the bounds of its numbers
     return fitted(spectrum, cells, range(spectrum.starts[len(spectrum.processes) - len(spectrum.resonances)]))

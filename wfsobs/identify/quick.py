@@ -15,6 +15,7 @@ import numpy as np
 from scipy.special import logit
 
 from wfsobs.ar2 import Ar2
+from wfsobs.ar3 import Ar3
 from wfsobs.arrays import Array
 from wfsobs.identify.densities import densities
 from wfsobs.identify.model import Spectrum
@@ -179,5 +180,5 @@ class _Fit:
         self.x = np.concatenate([self.x[: self.first], self.resonances[gain > WORTH].ravel()])
 
 
-def _numbers(p: Ar2) -> Array:
+def _numbers(p: Ar2 | Ar3) -> Array:
     return np.array([log(p.omega), logit(min(p.damping, 0.99)), log(max(p.rms, 1e-12))])

@@ -20,6 +20,9 @@ from wfsobs.identify.whittle import NO_NEARER
 from wfsobs.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.scenario import Scenario
 
+LARGEST = 100.0
+"""Rms [um] that a scenario's settings allow."""
+
 
 @dataclass(frozen=True)
 class IdentifiedMode:
@@ -79,7 +82,8 @@ class Identified:
             "sensors.tip_tilt_indetermination": False,
             "vibration.source": "peaks" if peaks else "none",
             "vibration.peaks": [
-                {"frequency": p.frequency.value, "damping": p.damping.value, "rms": [r.value if r else 0.0 for r in p.rms]}
+                {"frequency": p.frequency.value, "damping": p.damping.value,
+                 "rms": [min(r.value, LARGEST) if r else 0.0 for r in p.rms]}
                 for p in peaks
             ],
             "kalman.process_noise": "matched", "kalman.measurement_noise": "matched",
@@ -100,7 +104,8 @@ class Identified:
     def shared(self, scenario: Scenario) -> dict[str, Number]:
         """Dotted path -> number of the settings that all modes share, and their errors; within what the settings allow."""
         modes = [*zip(self.modes, scenario.modes, strict=False)]
-        out = {"sensors.lgs_noise": mean([_scaled(m.noise, sqrt(scenario.sensors.lgs_count)) for m in self.modes])}
+        noises = [_scaled(m.noise, sqrt(scenario.sensors.lgs_count)) for m in self.modes]
+        out = {"sensors.lgs_noise": _within(mean(noises), 0.0, 10.0)}
         seen = [(i, m.turbulence, mode.radial_order) for i, (m, mode) in enumerate(modes) if m.turbulence]
         if seen:
             corner = [2 * pi / turbulence_corner(1.0, scenario.telescope.diameter, order) for _, _, order in seen]
@@ -110,7 +115,7 @@ class Identified:
             strengths = [_scaled(t.rms, 1.0 / relative_rms(scenario, i)) for i, t, _ in seen]
             if thirds := [t.third_corner for _, t, _ in seen if t.third_corner]:
                 out["turbulence.third_corner"] = _within(mean(thirds), 1.0, 1000.0)
-            out["turbulence.rms"] = _within(mean(strengths), 0.0, 100.0)
+            out["turbulence.rms"] = _within(mean(strengths), 0.0, LARGEST)
         return out
 
 
