@@ -32,6 +32,13 @@ class Group(param.Parameterized):
     exist are refused on every way in.
     """
 
+    def __init_subclass__(cls) -> None:
+        """A declaration is that of the class: without this param copies it for every object whose value is set."""
+        super().__init_subclass__()
+        for p in vars(cls).values():
+            if isinstance(p, param.Parameter):
+                p.per_instance = False
+
     def __init__(self, **values: Any):
         for name, p in self.settings().items():
             if name in values:

@@ -29,7 +29,7 @@ def scenario(inputs: str = "u-y") -> Scenario:
         "run": {"duration": 0.7, "warm_up": 0.2},
         "gpr_offline": {"training_size": 60, "depth": 25, "inputs": inputs},
         "gpr_online": {"training_size": 60, "depth": 25, "inputs": inputs},
-        "adaptive": {"window": 0.2, "interval": 0.12},  # which holds 18 periods of a peak
+        "adaptive": {"window": 0.2, "interval": 0.25},  # which holds 18 periods of a peak
         "vibration": {"source": "ar2", "peaks": [{"frequency": 90.0, "damping": 0.01, "rms": [0.1, 0.1]}]},
     })
     return s
