@@ -11,7 +11,7 @@ from wfsobs.arrays import Array
 from wfsobs.gaps import bridged
 from wfsobs.identify import Identified, identify
 from wfsobs.identify.periodogram import fast_length, frequencies, periodogram, taper
-from wfsobs.identify.process import Number, Process
+from wfsobs.identify.process import Number
 from wfsobs.identify.result import IdentifiedMode
 from wfsobs.record import Record, RecordError
 from wfsobs.watch import Watch
@@ -40,7 +40,7 @@ class Measured:
 class Fit:
     """The model of one mode on a grid of frequencies [Hz] that has every resonance in it: densities [um^2/Hz].
 
-    parts : noise, turbulence where there is any, and the resonances, each by itself
+    parts : noise, turbulence and background where there are any, and the resonances, each by itself
     lines : per pure line, frequency, density under it, and how high the periodogram stands at it
     """
 
@@ -82,12 +82,20 @@ def fit(mode: IdentifiedMode, result: Identified) -> Fit:
     return Fit(f, s.psd(f), parts, tuple(lines))
 
 
-def rows(mode: IdentifiedMode) -> list[tuple[str, Process | None, Number]]:
-    """(what it is, its process or None for noise, rms [um]) of everything in a mode, peaks by frequency."""
-    out: list[tuple[str, Process | None, Number]] = [("white noise", None, mode.noise)]
-    if mode.turbulence is not None:
-        out.append(("turbulence", mode.turbulence, mode.turbulence.rms))
-    return out + [("line" if p.pure else "resonance", p, p.rms) for p in mode.peaks]
+Row = tuple[str, Number | None, Number | None, Number | None]
+"""What it is, its frequency [Hz], its damping, its rms [um]."""
+
+
+def rows(mode: IdentifiedMode) -> list[Row]:
+    """Everything in a mode, peaks by frequency."""
+    out: list[Row] = [("white noise", None, None, mode.noise)]
+    if (t := mode.turbulence) is not None:
+        out.append(("turbulence", t.frequency, t.damping, t.rms))
+        if (third := t.third_corner) is not None:
+            out.append(("its third corner", Number(*(x * t.frequency.value for x in third)), None, None))
+    if (b := mode.background) is not None:
+        out.append(("background, up to", b.frequency, None, b.rms))
+    return out + [("line" if p.pure else "resonance", p.frequency, p.damping, p.rms) for p in mode.peaks]
 
 
 def seconds(record: Record) -> float:

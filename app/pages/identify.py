@@ -24,7 +24,7 @@ from wfsobs.record import Record, RecordError
 from wfsobs.settings import SettingError
 
 INTRO = (
-    "From the pseudo-open-loop measurement z of the record shown, simulated or loaded: white noise, turbulence as AR(2), then "
+    "From the pseudo-open-loop measurement z of the record shown, simulated or loaded: white noise, turbulence, then "
     "vibration peaks one at a time until nothing is left that the tests see. “Use it” takes the model into the settings; a "
     "loaded record stays, and the observers then run on it with this model.")
 ABOUT = (

@@ -24,10 +24,9 @@ def table_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
     }
     head = "".join(f'<th scope=col title="{why}">{name}</th>' for name, why in columns.items())
     body = ""
-    for what, process, rms in rows(mode):
-        cells = ["", ""] if process is None else [
-            spoken(process.frequency), "0" if process.pure else spoken(process.damping)]
-        cells.append(spoken(Number(rms.value * scale, rms.std * scale)))
+    for what, frequency, damping, rms in rows(mode):
+        scaled = None if rms is None else Number(rms.value * scale, rms.std * scale)
+        cells = ["" if n is None else spoken(n) for n in (frequency, damping, scaled)]
         body += f"<tr><th scope=row>{what}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
     return (f'<div class="scroll" tabindex=0 role=region aria-label="Identified in {mode.name}">'
             f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')
@@ -36,10 +35,10 @@ def table_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
 def spoken(number: Number) -> str:
     """A number and its standard deviation.
 
-    >>> spoken(Number(47.43812, 0.0264))
-    '47.438 ± 0.026'
+    >>> spoken(Number(47.43812, 0.0264)), spoken(Number(0.0, 0.0))
+    ('47.438 ± 0.026', '0')
     """
-    return written(number).replace("+-", "±").replace("-", "−")
+    return "0" if number == (0.0, 0.0) else written(number).replace("+-", "±").replace("-", "−")
 
 
 def verdict_html(result: Identified) -> str:

@@ -73,4 +73,5 @@ class Turbulence(Group):
 
     def idle(self) -> tuple[str, ...]:
         """What other sources are made of; r0 and L0 set the ratio of the modes in all of them."""
-        return tuple(name for name, source in (("layers", "frozen-flow"), ("psd", "psd")) if source != self.source)
+        of_one = {"third_corner": "ar3", "layers": "frozen-flow", "psd": "psd"}
+        return tuple(name for name, source in of_one.items() if source != self.source)
