@@ -119,7 +119,7 @@ class _Work:
         self.started = self.told = self.delivered = perf_counter()
         self.news = False  # since the last delivery
         self.fraction = 0.0
-        self.lock = threading.Lock()
+        self.lock, self.telling = threading.Lock(), threading.Lock()
         self.record: Record | None = None
 
     def run(self) -> Shown:
@@ -172,16 +172,17 @@ class _Work:
 
     def _progress(self, fraction: float) -> None:
         """Called from any thread of the observers."""
-        with self.lock:
-            now = perf_counter()
-            if now - self.told < INTERVAL or self.record is None:
-                return
-            self.told = now
-            self.fraction = fraction = max(self.fraction, fraction)  # modes at work in parallel overtake each other
-            shown = None
-            if self.news and now - self.delivered >= DELIVERY_INTERVAL:
-                shown = self._deliver(self.record)
-        self.report(fraction, shown)
+        with self.telling:  # one after the other, or a report could arrive before one that it was made after
+            with self.lock:
+                now = perf_counter()
+                if now - self.told < INTERVAL or self.record is None:
+                    return
+                self.told = now
+                self.fraction = fraction = max(self.fraction, fraction)  # modes at work in parallel overtake each other
+                shown = None
+                if self.news and now - self.delivered >= DELIVERY_INTERVAL:
+                    shown = self._deliver(self.record)
+            self.report(fraction, shown)
 
     def _grow(self, observer: str, target: str, values: Array) -> None:
         with self.lock:

@@ -22,7 +22,9 @@ from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
 from wfsobs.settings import Group, SettingError
 
-QUICK = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50}
+QUICK = {
+    "run.duration": 1.0, "run.warm_up": 0.5, "gpr_online.training_size": 20, "gpr_offline.training_size": 50,
+    "adaptive.window": 0.4}
 LEAVES = [(path, p) for path, _, p in Scenario().walk() if not path.startswith("vibration.peaks")]
 
 
@@ -139,7 +141,7 @@ CHANGED = {
     **QUICK, "turbulence.wind_speed": 22.5, "loop.gain": 0.25, "kalman.measurement_noise": "manual",
     "multirate.model_lgs_error": False, "butterworth.frequencies": [24.3, 47.7], "vibration.source": "ar2",
     "vibration.peaks": [{"frequency": 47, "damping": 0.01, "rms": [0.02, 1e-5]}],
-    "events": [{"kind": "peak", "start": 1.0, "frequency_shift": 2.0}],
+    "events": [{"kind": "peak", "start": 0.7, "frequency_shift": 2.0}],
 }
 
 
