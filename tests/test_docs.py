@@ -22,7 +22,8 @@ from wfsobs.scenario import Scenario
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("**/*.md"))]
-SHORT = ("--set", "run.duration=2", "--set", "run.warm_up=0.5", "--set", "events=[]")
+SHORT = ("--set", "run.duration=2", "--set", "run.warm_up=0.5", "--set", "events=[]", "--set", "gpr_online.training_size=50",
+         "--set", "gpr_offline.training_size=50")
 
 
 def script(name: str) -> ModuleType:
