@@ -27,7 +27,7 @@ from wfsobs.tables import label_of
 
 SETTINGS = {
     "run.duration": 2.0, "run.warm_up": 0.5, "gpr_online.training_size": 20, "gpr_offline.training_size": 50,
-    "gpr_online.depth": 20, "gpr_offline.depth": 20,
+    "gpr_online.depth": 20, "gpr_offline.depth": 20, "adaptive.window": 0.5,
 }
 SHORT = [word for path, value in SETTINGS.items() for word in ("--set", f"{path}={value}")]
 SPEEDS, GAINS = (5, 15), (0.2, 0.3)
@@ -130,7 +130,8 @@ def test_every_state_shows_the_numbers_of_its_run(open_report: Any) -> None:
                 assert cells[0].startswith(label_of(row["observer"]))
                 error, truth = number(row["rms_um"] * scale), number(row["truth_rms_um"] * scale)
                 assert cells[1:4] == [error, truth, number(row["normalised_rms"])]
-                assert cells[4] == ("–" if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−"))
+                lag = "–" if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−")
+                assert cells[4:6] == [row["needs"], lag]
                 assert cards.get(key, f"{error} {written}") == f"{error} {written}"
             assert set(cards) - {f"{target}/{TRUTH}" for target in TARGETS} <= set(table)
             assert page.locator("#table .unit").first.text_content() == written

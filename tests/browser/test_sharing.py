@@ -14,7 +14,7 @@ from playwright.sync_api import Download, Page, expect
 
 from wfsobs.app.style import look, observers_of
 
-SHORT = "run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40"
+SHORT = "run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5"
 
 
 @pytest.fixture
