@@ -1,7 +1,7 @@
 """The work of one run, done in a thread: what it delivers, and how often.
 
 Nothing here knows of Panel. `compute` runs the core and hands over what is done so far: the quick observers where the
-others keep one waiting, all but the slowest as soon as they are done, then parts of that one as they come.
+others keep one waiting, all but those that learn during the run as soon as they are done, then those, in parts where they come in parts.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ DELIVERY_INTERVAL = 0.4
 DRAWING = 0.15
 """What the page takes to draw a delivery [s]."""
 
-SLOWEST = max(OBSERVERS.values(), key=lambda o: o.weight).id
+LEARNING = frozenset(o.id for o in OBSERVERS.values() if o.weight >= 50.0)
+"""The observers that learn during the run: the others do not wait for them."""
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,7 @@ class _Work:
             stated.validate()
         self.record = record
         self._add_truth(record)
+        handed_over = False  # the quick ones
         for item in each_estimate(record, stated, self.watch, on_partial=self._grow):
             with self.lock:
                 if isinstance(item, Failure):
@@ -140,8 +142,10 @@ class _Work:
                 else:
                     self._add(record, item)
                 self.news = True
-                shown = self._deliver(record) if self._left() == {SLOWEST} else None
+                quick = not handed_over and self._left() <= LEARNING
+                shown = self._deliver(record) if quick else None
             if shown is not None:
+                handed_over = True
                 self.report(self.fraction, shown)
                 self._let_draw()
                 if self.loaded is None:
@@ -155,7 +159,7 @@ class _Work:
         return left - {f.observer for f in self.failures}
 
     def _let_draw(self) -> None:
-        """Leave the processors to the page and the browser while all but the slowest observer is drawn."""
+        """Leave the processors to the page and the browser while all but the slow observers are drawn."""
         until = perf_counter() + DRAWING
         while perf_counter() < until:
             self.watch.check()

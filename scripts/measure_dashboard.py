@@ -3,7 +3,8 @@
     python scripts/measure_dashboard.py [-n 10]
 
 Starts a server and a headless Chromium ($CHROMIUM, else chromium). A time ends with the second frame after the
-last change, when the browser has painted it: of all traces, spectra and rows but the online GPR's, and of everything.
+last change, when the browser has painted it: of all traces, spectra and rows but those of the observers that learn during
+the run, and of everything.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ def main() -> None:
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors, {n} releases")
     for name, opened in (("first page", cold), ("second page", warm)):
         print(f"{name:32s} {opened['most'] / 1e3:6.2f} s, complete after {opened['all'] / 1e3:.2f} s")
-    for name, key in (("release to all but online GPR", "most"), ("release to everything", "all")):
+    for name, key in (("release to all but who learns", "most"), ("release to everything", "all")):
         seconds = [t[key] / 1e3 for t in times]
         print(f"{name:32s} {statistics.median(seconds):6.2f} s median, {max(seconds):.2f} s worst")
 

@@ -42,6 +42,8 @@ WORTH = 4.0
 """Log-likelihood that a peak has to be worth to be kept."""
 CLIPPED = 4.0
 """I / S from which a bin says no more of the background: it is of a peak."""
+STARTS = 2
+"""Corners of turbulence that the first guess tries: higher ones end where these do."""
 STEPS, ENOUGH = 6, 0.2
 """Of Newton's method, at a time at most; the gain of log-likelihood by one below which there is none more."""
 REACH = 1.0
@@ -56,7 +58,7 @@ def quick_spectrum(z: Array, dt: float, most: int, lowest: float = LOWEST, befor
     if np.ptp(z) == 0:
         return Spectrum(float(np.finfo(float).tiny), dt)
     z = z - z.mean()
-    fit = _Fit(z, dt, first_guess(frequencies(len(z), dt), periodogram(z, dt), dt)
+    fit = _Fit(z, dt, first_guess(frequencies(len(z), dt), periodogram(z, dt), dt, STARTS)
                if before is None or before.turbulence is None else before)
     fit.background()
     for again in (False, True):

@@ -99,9 +99,9 @@ def standard_deviations(spectrum: Spectrum, cells: Cells, inflation: float) -> A
     return std
 
 
-def first_guess(f: Array, I: Array, dt: float) -> Spectrum:  # noqa: E741
+def first_guess(f: Array, I: Array, dt: float, starts: int = 4) -> Spectrum:  # noqa: E741
     """Noise and turbulence from the medians of the periodogram over bands, which lines and narrow resonances leave as they are;
-    without turbulence where white noise alone is as likely."""
+    without turbulence where white noise alone is as likely. starts : corners tried, of four, the lowest first."""
     edges = np.unique(np.concatenate([[0], np.geomspace(3, len(f), 60).astype(int)]))
     bands = [slice(a, b) for a, b in pairwise(edges)]
     at = np.array([f[b].mean() for b in bands])
@@ -115,7 +115,7 @@ def first_guess(f: Array, I: Array, dt: float) -> Spectrum:  # noqa: E741
     alone = Spectrum(noise, dt)
     rms = float(np.sqrt(max(np.sum(I) * f[0] - noise**2, 1e-4 * noise**2)))
     found = []
-    for corner in np.geomspace(max(3 * f[0], 0.1), 0.02 / dt, 4):
+    for corner in np.geomspace(max(3 * f[0], 0.1), 0.02 / dt, 4)[:starts]:
         shape = Spectrum(noise, dt, Ar2(2.0 * np.pi * corner, 0.7, rms, dt))
         fit = least_squares(misfit, shape.vector, args=(shape,), loss="soft_l1", max_nfev=60,
                             bounds=(shape.vector - 12.0, shape.vector + 12.0))

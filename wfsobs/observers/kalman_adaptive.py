@@ -17,8 +17,7 @@ from wfsobs.identify.model import Spectrum
 from wfsobs.identify.quick import SHORTEST, quick_spectrum
 from wfsobs.lifted import PeriodicFilter
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman import MIN_NOISE, steady_filter
-from wfsobs.observers.modes import over_modes
+from wfsobs.observers.kalman import MIN_NOISE, by_target, steady_filter
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.statespace import disturbance_model
@@ -39,17 +38,13 @@ def kf_adaptive(record: Record, scenario: Scenario, watch: Watch) -> dict[str, A
     if record.n_steps < needed:
         raise RecordError(f"the record has {record.n_steps} steps; adaptive.window = {a.window:g} s needs {needed}")
     z = record.z[record.delay :]  # what the mirror did before the record is not known
-    done = np.zeros(record.n_modes)
+    columns = []
+    for mode in range(record.n_modes):  # one after the other: steps as short as these leave a second thread no room
+        def tell(fraction: float, mode: int = mode) -> None:
+            watch.step((mode + fraction) / record.n_modes)
 
-    def one(mode: int, watch: Watch) -> Array:
-        def tell(fraction: float) -> None:
-            done[mode] = fraction
-            watch.step(float(done.mean()))
-
-        return np.vstack([np.full((record.delay, 2), np.nan), adapting(z[:, mode], record.dt, a, tell)])
-
-    values = over_modes(record.n_modes, one, watch)
-    return {target: values[:, i :: len(TARGETS)] for i, target in enumerate(TARGETS)}
+        columns.append(np.vstack([np.full((record.delay, len(TARGETS)), np.nan), adapting(z[:, mode], record.dt, a, tell)]))
+    return by_target(columns)
 
 
 def adapting(z: Array, dt: float, settings: Adaptive, tell: Callable[[float], None]) -> Array:
