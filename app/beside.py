@@ -64,7 +64,8 @@ class Beside(param.Parameterized):
             def there() -> None:
                 if not cancel.is_set():
                     self.param.update(**news)
-            self.run.post(there)
+            if not cancel.is_set():
+                self.run.post(there)
 
         def progress(fraction: float) -> None:
             nonlocal told

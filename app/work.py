@@ -1,7 +1,8 @@
 """The work of one run, done in a thread: what it delivers, and how often.
 
 Nothing here knows of Panel. `compute` runs the core and hands over what is done so far: the quick observers where the
-others keep one waiting, all but those that learn during the run as soon as they are done, then those, in parts where they come in parts.
+others keep one waiting, all but those that learn during the run as soon as they are done, then those, in parts where they
+come in parts.
 """
 
 from __future__ import annotations

@@ -59,7 +59,8 @@ def test_deliveries_are_held_back(short: Scenario, monkeypatch: pytest.MonkeyPat
     compute(short, lambda: False, lambda fraction, shown: told.append(shown))
     (shown,) = told
     assert shown is not None
-    assert {name for name, _ in keys(shown)} == set(OBSERVERS) - {"gpr-online", "kf-adaptive"}, "all but those that learn during the run, at once"
+    here = {name for name, _ in keys(shown)}
+    assert here == set(OBSERVERS) - {"gpr-online", "kf-adaptive"}, "all but those that learn during the run, at once"
 
 
 def test_spectra_are_of_what_is_scored(reports: Any) -> None:
