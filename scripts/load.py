@@ -151,7 +151,7 @@ async def session(base: str, changes: int, rng: random.Random, door: asyncio.Loc
         visitor = await Visitor(base).open(query_of(SHORT))
     await visitor.until(lambda: visitor.status.startswith("Done"))
     await visitor.ask("SERVER-INFO-REQ", {})  # all that was sent with it has arrived
-    box = visitor.find("TextInput", label="m/s")
+    box = visitor.find("TextInput", label="Wind speed V₀ [m/s]")
     seen: list[Seen] = []
     seconds: list[float] = []
     speeds = rng.sample([5.25 + 0.5 * i for i in range(SETTINGS)], changes)
