@@ -40,7 +40,7 @@ run: $(RUN)  ## serve the dashboard on localhost:5006 (another port: make run PO
 
 test: setup  ## run all tests, then the tutorials, then those in a browser
 	@status=0; \
-	$(BIN)/python -m pytest -n auto --dist loadfile || status=1; \
+	$(BIN)/python -m pytest -n auto --dist worksteal || status=1; \
 	$(BIN)/python -m pytest -n auto tests/tutorials || status=1; \
 	$(BIN)/python -m pytest -n auto --dist loadfile tests/browser || status=1; \
 	exit $$status
