@@ -38,7 +38,7 @@ REQUIRED = {
     "multirate-record": {OURS, "numpy-loop"},
     "adaptive-record": {OURS},
     "frozen-flow": {OURS, "ideal-sensors"},
-    "whole-run": {OURS, "without-online-gpr"},
+    "whole-run": {OURS, "without-online-gpr", "without-learning"},
 }
 
 

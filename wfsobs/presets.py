@@ -133,7 +133,8 @@ def galacsi_nfm() -> Scenario:
 def galacsi_wfm() -> Scenario:
     """MUSE's wide field on UT4: as galacsi-nfm, the four LGS at 64".
 
-    The radius is that of Stroebele et al., "GALACSI system design and analysis", Proc. SPIE 8447 (2012).
+    The radius is that of Stroebele et al., "GALACSI system design and analysis", Proc. SPIE 8447 (2012); MUSE-PSFR (Fusco et al.,
+    A&A 635, A208, 2020; musevlt/muse-psfr) takes 63".
     """
     s = galacsi_nfm()
     s.update({"sensors": {"lgs_radius": 64.0}})

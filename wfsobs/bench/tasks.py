@@ -38,9 +38,10 @@ def whole_run(sizes: Sizes, _libraries: Collection[str]) -> Iterator[Row]:
     scenario, size = sizes.scenario(sizes.duration), _length(sizes.duration)
     seconds, _ = timed(lambda: run(scenario), sizes.repeats)
     yield row("whole-run", size, OURS, seconds, scenario.n_steps)
-    quick = [name for name in OBSERVERS if name != "gpr-online"]
-    seconds, _ = timed(lambda: run(scenario, observers=quick), sizes.repeats)
-    yield row("whole-run", size, "without-online-gpr", seconds, scenario.n_steps)
+    for variant, left_out in (("without-online-gpr", ("gpr-online",)), ("without-learning", ("gpr-online", "kf-adaptive"))):
+        quick = [name for name in OBSERVERS if name not in left_out]
+        seconds, _ = timed(lambda quick=quick: run(scenario, observers=quick), sizes.repeats)
+        yield row("whole-run", size, variant, seconds, scenario.n_steps)
 
 
 def _length(duration: float) -> str:
