@@ -11,7 +11,6 @@ from wfsobs.arrays import Array
 from wfsobs.gaps import bridged
 from wfsobs.identify import Identified, identify
 from wfsobs.identify.periodogram import fast_length, frequencies, periodogram, taper
-from wfsobs.identify.process import Number
 from wfsobs.identify.result import IdentifiedMode
 from wfsobs.record import Record, RecordError
 from wfsobs.watch import Watch
@@ -80,22 +79,6 @@ def fit(mode: IdentifiedMode, result: Identified) -> Fit:
         floor = float(s.psd(np.array([line.frequency.value]))[0])
         lines.append((line.frequency.value, floor, floor + gain * line.rms.value**2))
     return Fit(f, s.psd(f), parts, tuple(lines))
-
-
-Row = tuple[str, Number | None, Number | None, Number | None]
-"""What it is, its frequency [Hz], its damping, its rms [um]."""
-
-
-def rows(mode: IdentifiedMode) -> list[Row]:
-    """Everything in a mode, peaks by frequency."""
-    out: list[Row] = [("white noise", None, None, mode.noise)]
-    if (t := mode.turbulence) is not None:
-        out.append(("turbulence", t.frequency, t.damping, t.rms))
-        if (third := t.third_corner) is not None:
-            out.append(("its third corner", Number(*(x * t.frequency.value for x in third)), None, None))
-    if (b := mode.background) is not None:
-        out.append(("background, up to", b.frequency, None, b.rms))
-    return out + [("line" if p.pure else "resonance", p.frequency, p.damping, p.rms) for p in mode.peaks]
 
 
 def seconds(record: Record) -> float:

@@ -94,18 +94,20 @@ def test_a_window_longer_than_the_run_is_refused() -> None:
 
 def test_after_a_jump_who_learns_is_back_and_who_is_fixed_is_not() -> None:
     """A line of 30 nm jumps by 3 Hz. Who learns from the last seconds is back within 10 % of what it had settled to once these
-    seconds, and those of the running rms, are all after the jump, and stays; filters of the old line never are.
+    seconds, and those of the running rms, are all after the jump, and stays; filters of the old line never are. The online GPR
+    learns so soon that it may not be seen to leave.
 
-    Four seeds, both modes, 3 s: 24 s of errors, whose rms is known to about 3 %.
+    Four seeds, both modes, 3 s: 24 s of errors, whose rms is known to about 3 %; in the six groups of four seeds up to 24 the
+    adaptive filter's is later at most 1.04 times what it was, the online GPR's 1.07.
     """
-    window, start, training, depth, identified, interval = 3.0, 7.0, 256, 170, 2.0, 1.0
+    window, start, training, depth = 3.0, 7.0, 256, 170
     s = PRESETS["peak-jump"]().replace({
-        "run.duration": 15.0, "events.0.start": start, "gpr_online.training_size": training, "gpr_online.depth": depth,
-        "gpr_offline.training_size": 400, "adaptive.window": identified, "adaptive.interval": interval})
-    adapt = {"gpr-online": (training + depth) * s.dt, "kf-adaptive": identified + interval}
+        "run.duration": 18.0, "events.0.start": start, "gpr_online.training_size": training, "gpr_online.depth": depth,
+        "gpr_offline.training_size": 400})
+    adapt = {"gpr-online": (training + depth) * s.dt, "kf-adaptive": s.adaptive.window + s.adaptive.interval}
     fixed = ("kf-lgs", "kf-multi", "gpr-offline")
     pools = {name: Pooled() for name in (*fixed, *adapt)}
-    for seed in range(11, 15):
+    for seed in range(1, 5):
         result = run(s.replace({"run.seed": seed}), observers=list(pools))
         for name, pool in pools.items():
             estimate = result.estimate(name, VIBRATION)
@@ -116,7 +118,7 @@ def test_after_a_jump_who_learns_is_back_and_who_is_fixed_is_not() -> None:
         [found] = recovery(both, s.dt, [start], window, s.run.warm_up)
         assert found is not None and found.settled < 0.01, name
         if name in adapt:
-            assert found.worst > 1.1 * found.settled and found.back is not None
-            assert window < found.back <= adapt[name] + window + 0.1, name
+            assert found.back is not None and found.back <= adapt[name] + window + 0.1, name
+            assert name == "gpr-online" or found.worst > 1.5 * found.settled
         else:
             assert found.back is None and found.last > 2 * found.settled, name

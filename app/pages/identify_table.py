@@ -5,10 +5,9 @@ from __future__ import annotations
 from html import escape
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.identify_work import rows
 from wfsobs.identify import Identified
 from wfsobs.identify.process import Number
-from wfsobs.identify.report import verdict, written
+from wfsobs.identify.report import rows, verdict, written
 from wfsobs.identify.result import IdentifiedMode
 
 WHITE = '<span class="tag best">white</span> '
@@ -35,10 +34,10 @@ def table_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
 def spoken(number: Number) -> str:
     """A number and its standard deviation.
 
-    >>> spoken(Number(47.43812, 0.0264)), spoken(Number(0.0, 0.0))
-    ('47.438 ± 0.026', '0')
+    >>> spoken(Number(47.43812, 0.0264))
+    '47.438 ± 0.026'
     """
-    return "0" if number == (0.0, 0.0) else written(number).replace("+-", "±").replace("-", "−")
+    return written(number).replace("+-", "±").replace("-", "−")
 
 
 def verdict_html(result: Identified) -> str:

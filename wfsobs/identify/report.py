@@ -8,9 +8,12 @@ from rich.table import Table
 
 from wfsobs.configfile import annotated, to_toml
 from wfsobs.identify.process import Number, Process
-from wfsobs.identify.result import Identified
+from wfsobs.identify.result import Identified, IdentifiedMode
 from wfsobs.identify.whiteness import LEVEL
 from wfsobs.scenario import Scenario
+
+Row = tuple[str, Number | None, Number | None, Number | None]
+"""What it is, its frequency [Hz], its damping, its rms [um]."""
 
 
 def plain(result: Identified) -> dict[str, Any]:
@@ -47,19 +50,22 @@ def table(result: Identified) -> Table:
         out.add_column(name, justify="right", no_wrap=True)
     for m in result.modes:
         out.add_section()
-        out.add_row(m.name, "white noise", "", "", written(_nm(m.noise)))
-        if m.turbulence is not None:
-            t = m.turbulence
-            out.add_row(m.name, "turbulence", written(t.frequency), written(t.damping), written(_nm(t.rms)))
-            if t.third_corner is not None:
-                third = Number(t.third_corner.value * t.frequency.value, t.third_corner.std * t.frequency.value)
-                out.add_row(m.name, "  its third corner", written(third), "", "")
-        if m.background is not None:
-            out.add_row(m.name, "background", f"up to {written(m.background.frequency)}", "", written(_nm(m.background.rms)))
-        for p in m.peaks:
-            out.add_row(m.name, "line" if p.pure else "resonance", written(p.frequency),
-                        "0" if p.pure else written(p.damping), written(_nm(p.rms)))
+        for what, frequency, damping, rms in rows(m):
+            numbers = (frequency, damping, None if rms is None else _nm(rms))
+            out.add_row(m.name, what, *("" if n is None else written(n) for n in numbers))
     return out
+
+
+def rows(mode: IdentifiedMode) -> list[Row]:
+    """Everything in a mode, peaks by frequency."""
+    out: list[Row] = [("white noise", None, None, mode.noise)]
+    if (t := mode.turbulence) is not None:
+        out.append(("turbulence", t.frequency, t.damping, t.rms))
+        if (third := t.third_corner) is not None:
+            out.append(("its third corner", Number(*(x * t.frequency.value for x in third)), None, None))
+    if (b := mode.background) is not None:
+        out.append(("background, up to", b.frequency, None, b.rms))
+    return out + [("line" if p.pure else "resonance", p.frequency, p.damping, p.rms) for p in mode.peaks]
 
 
 def verdict(result: Identified) -> list[str]:
@@ -79,11 +85,13 @@ def _nm(n: Number) -> Number:
 
 
 def written(n: Number) -> str:
-    """A number to two digits of its standard deviation.
+    """A number to two digits of its standard deviation; the damping of a pure line, which is not estimated, as 0.
 
-    >>> written(Number(47.43812, 0.0264)), written(Number(502.3, 25.1))
-    ('47.438 +- 0.026', '502 +- 25')
+    >>> written(Number(47.43812, 0.0264)), written(Number(502.3, 25.1)), written(Number(0.0, 0.0))
+    ('47.438 +- 0.026', '502 +- 25', '0')
     """
+    if n == (0.0, 0.0):
+        return "0"
     digits = max(0, 1 - int(f"{n.std:e}".split("e")[1])) if n.std > 0 else 4
     return f"{n.value:.{digits}f} +- {n.std:.{digits}f}"
 

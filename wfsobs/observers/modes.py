@@ -18,8 +18,7 @@ AT_ONCE = max(os.cpu_count() or 1, 2)
 
 
 def over_modes(n_modes: int, work: Callable[[int, Watch], Array], watch: Watch) -> Array:
-    """Columns work(mode, watch) of every mode, as many at a time as there are processors, (n_steps, n_modes); or several
-    columns of every mode, one mode after the other.
+    """Columns work(mode, watch) of every mode, as many at a time as there are processors, (n_steps, n_modes).
 
     If one fails, or the wait for them is interrupted, the others are told to stop by the watch they were given.
     """
