@@ -194,6 +194,52 @@ def test_a_group_is_not_a_value(value: Any) -> None:
         Scenario().set("telescope", value)
 
 
+# ---------------------------------------------------------------------- numbers of NumPy
+
+
+def of_numpy(p: param.Parameter) -> list[Any]:
+    """The default of a setting in every NumPy type that holds it."""
+    value: Any = p.default
+    if isinstance(p, Reals):
+        return [[np.float64(v) for v in value], tuple(np.float64(v) for v in value)]
+    if isinstance(p, param.Boolean):
+        return [np.bool_(value)]
+    if isinstance(p, param.Integer):
+        return [np.int64(value), np.int32(value)]
+    if isinstance(p, param.Number):
+        return [np.float64(value)]
+    return [np.str_(value)]
+
+
+def types_in(value: Any) -> set[type]:
+    if isinstance(value, dict):
+        return set().union(*map(types_in, value.values()))
+    return set().union(*map(types_in, value)) if isinstance(value, list) else {type(value)}
+
+
+@pytest.mark.parametrize("path", ALL)
+def test_numbers_of_numpy_become_plain_on_every_way_in(path: str) -> None:
+    p = next(p for found, _, p in full().walk() if found == path)
+    for value in of_numpy(p):
+        by_path, by_attribute = full(), full()
+        by_path.set(path, value)
+        owner = next(owner for at, owner, _ in by_attribute.walk() if at == path)
+        setattr(owner, path.split(".")[-1], value)
+        for scenario in (by_path, by_attribute, full().replace({path: value})):
+            assert scenario == full()
+            assert types_in(scenario.to_dict()) <= {float, int, bool, str}
+
+
+def test_numbers_of_numpy_in_peaks_and_events() -> None:
+    peak = {"frequency": np.float64(45), "damping": np.float32(0.5), "rms": [np.float64(0.01), np.float64(0.02)]}
+    event = {"kind": np.str_("peak"), "start": np.float64(1), "peak": np.int64(0)}
+    scenario = Scenario().replace({"vibration.peaks": [peak], "events": [event]})
+    assert scenario == Scenario().replace({
+        "vibration.peaks": [{"frequency": 45.0, "damping": 0.5, "rms": [0.01, 0.02]}], "events": [{"start": 1.0}]})
+    assert types_in(scenario.to_dict()) <= {float, int, bool, str}
+    assert types_in(Peak(frequency=np.float64(45), rms=[np.float64(1)]).to_dict()) == {float}
+
+
 # ---------------------------------------------------------------------- plain values
 
 
@@ -335,8 +381,7 @@ def test_refused_dictionaries_change_nothing_by_path() -> None:
     assert scenario == Scenario()
 
 
-def test_numbers_of_numpy() -> None:
-    """Scalars of numpy are taken where they are exact and Python's own otherwise; arrays are not lists."""
+def test_arrays_of_numpy_are_not_lists() -> None:
     scenario = Scenario()
     scenario.set("telescope.diameter", np.float64(3.5))
     assert scenario.telescope.diameter == 3.5

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Self, TypeVar, cast
 
+import numpy as np
 import param
 
 from wfsobs.parameters import allowed
@@ -52,7 +53,7 @@ class Group(param.Parameterized):
     def __setattr__(self, name: str, value: Any) -> None:
         if not name.startswith("_") and name != "name" and name not in type(self).param:
             raise AttributeError(f"{type(self).__name__} has no setting {name!r}")
-        super().__setattr__(name, value)
+        super().__setattr__(name, _native(value))
 
     def idle(self) -> tuple[str, ...]:
         """Settings that mean nothing while the others are as they are."""
@@ -173,6 +174,13 @@ class Group(param.Parameterized):
 def section(kind: type[G], label: str, doc: str = "") -> G:
     """A setting that is a group of its own; each tree gets a fresh one."""
     return cast(G, param.ClassSelector(class_=kind, label=label, doc=doc))
+
+
+def _native(value: Any) -> Any:
+    """Scalars of NumPy, alone or in a list, as Python's own: what is written of a setting is read again without NumPy."""
+    if isinstance(value, np.generic):
+        return value.item()
+    return [_native(v) for v in value] if isinstance(value, (list, tuple)) else value
 
 
 def _plain(value: Any) -> Any:

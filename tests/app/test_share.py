@@ -18,6 +18,8 @@ from wfsobs.app.share import LONGEST, changes, from_file, from_query, to_command
 from wfsobs.cli import main
 from wfsobs.groups.atmosphere import Layer
 from wfsobs.groups.vibration import Peak
+from wfsobs.identify import identify
+from wfsobs.loop import simulate
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
 from wfsobs.settings import Group, SettingError
@@ -161,6 +163,22 @@ def test_the_python_makes_the_very_scenario(capsys: pytest.CaptureFixture[str]) 
     exec(to_python(scenario, "ut4"), made)
     assert made["scenario"] == scenario
     assert len(capsys.readouterr().out.splitlines()) == len(made["result"].scores)
+
+
+def test_settings_from_an_identification_are_written_in_plain_numbers(capsys: pytest.CaptureFixture[str]) -> None:
+    """They come out of arrays: NumPy's repr is read by no link, file or script."""
+    simulated = PRESETS["paper"]().replace({**QUICK, "run.duration": 3.0})
+    found = identify(simulate(simulated), simulated).scenario(simulated)
+    assert found.vibration.peaks
+    query = to_query(found, "paper")
+    assert query is not None
+    for text in (query, to_command(found, "paper"), to_python(found, "paper"), to_file(found, "paper")):
+        assert "np." not in text and "float64" not in text
+    link = from_query(query)
+    assert (link.scenario, link.rejected) == (found, ())
+    made: dict[str, Any] = {}
+    exec(to_python(found, "paper"), made)
+    assert made["scenario"] == found and capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("text", "reason"), [
