@@ -95,4 +95,4 @@ def same(one: Record, other: Record) -> bool:
 
 def compute(of: Shown, level: float, lowest: float, watch: Watch) -> tuple[Identified, Record]:
     """The model of the record shown, and that record. Raises RecordError, Cancelled."""
-    return identify(of.result.record, of.result.scenario, level, lowest, watch), of.result.record
+    return identify(of.result.record, level=level, lowest=lowest, watch=watch), of.result.record

@@ -63,7 +63,7 @@ def identified(page: IdentifyPage, loop: Any) -> Identified:
 def test_it_shows_what_the_core_finds(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> None:
     of = dashboard.store.run.shown
     assert of is not None and page.of is not None and not len(page.figure.total.data["x"]) and page.starter.use.disabled
-    found, expected = identified(page, loop), identify(of.result.record, of.scenario)
+    found, expected = identified(page, loop), identify(of.result.record)
     assert found.modes == expected.modes and not page.stale.visible
     for line in verdict(expected):
         assert line.replace("<", "&lt;") in page.verdict.object

@@ -67,7 +67,7 @@ def identify(
     if out:
         check_writable(out)
     with progress_bar("sweeps") as update:
-        result = identify_record(record, scenario, level, lowest, Watch(progress=update))
+        result = identify_record(record, level=level, lowest=lowest, watch=Watch(progress=update))
     if out:
         text = identified.toml(result, result.scenario(as_stated(record, scenario)))
         write_whole(out, lambda file: file.write(text.encode()))

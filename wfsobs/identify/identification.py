@@ -10,18 +10,16 @@ from scipy.stats import gamma
 
 from wfsobs.ar3 import Ar3
 from wfsobs.arrays import Array
-from wfsobs.gaps import bridged
+from wfsobs.gaps import held
 from wfsobs.identify.one_mode import OneMode
-from wfsobs.identify.periodogram import fast_length
+from wfsobs.identify.periodogram import fast_length, periodogram
 from wfsobs.identify.remarks import in_time, remarks
 from wfsobs.identify.result import Identified, read_off
 from wfsobs.identify.search import LOWEST, PAD, Candidate, Found, search
 from wfsobs.identify.whiteness import Whiteness, autocorrelation_test, cumulated_test, innovations
 from wfsobs.modes import HIGHEST_ORDER, modes_up_to
-from wfsobs.pipeline import as_stated
-from wfsobs.record import Record, RecordError
+from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.riccati import RiccatiError
-from wfsobs.scenario import Scenario
 from wfsobs.watch import QUIET, Watch
 
 LEVEL = 0.05
@@ -34,25 +32,23 @@ SHORTEST = 1000
 """Samples of a record at least."""
 ALONE = 0.8
 """Share of the level for modes alone, where there are several: a line in one of them has no power to spare, one in all has."""
+LEAST = 0.5
+"""Share of the samples that are measured at least."""
 RESTING = 1e-9
 """Rms over largest value of a measurement that is a constant with rounding errors."""
 JOINT = 1e-3
 """A candidate of all modes together belongs to those in which white noise would be as high with this probability."""
 
 
-def identify(
-    record: Record, scenario: Scenario | None = None, level: float = LEVEL, lowest: float = LOWEST, watch: Watch = QUIET
-) -> Identified:
-    """The model of every mode of a record, from its pseudo-open-loop measurement z.
+def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, watch: Watch = QUIET) -> Identified:
+    """The model of every mode of a record, from its pseudo-open-loop measurement z; lost samples are told from measured ones.
 
-    scenario : what bridges lost samples
-    level    : probability of finding any peak where there is none;  lowest : frequency from which peaks are looked for [Hz]
-    Raises RecordError for a record that is too short or does not move, Cancelled.
+    level : probability of finding any peak where there is none;  lowest : frequency from which peaks are looked for [Hz]
+    Raises RecordError for a record that is too short, lacks too much or does not move, Cancelled.
     """
-    scenario = as_stated(record, scenario or Scenario())
     if np.isinf(record.y_lgs).any() or np.isinf(record.u).any():
         raise RecordError("the record has samples that are infinite")
-    z = bridged(record, scenario).z[record.delay :]
+    z = pseudo_open_loop(record.y_lgs, held(record.u), record.delay)[record.delay :]
     z = z[: fast_length(len(z))]
     if len(z) < SHORTEST:
         raise RecordError(f"the record has {record.n_steps} samples, to identify it takes {SHORTEST + record.delay} or more")
@@ -62,7 +58,10 @@ def identify(
     if record.n_modes > len(names):
         raise RecordError(f"the record has {record.n_modes} modes, at most {len(names)} can be identified")
     for name, column in zip(names, z.T, strict=False):
-        if not np.std(column) > RESTING * np.max(np.abs(column)):
+        if (count := np.count_nonzero(np.isfinite(column))) < max(SHORTEST, LEAST * len(z)):
+            raise RecordError(
+                f"{name}: {count} of {len(z)} samples are measured, to identify it takes {SHORTEST}, and {LEAST:.0%}")
+        if not np.nanstd(column) > RESTING * np.nanmax(np.abs(column)):
             raise RecordError(f"{name}: z does not change, there is nothing to identify")
     modes = []
     for column in z.T:
@@ -148,10 +147,10 @@ def unexplained(modes: Sequence[OneMode], level: float, lowest: float) -> list[i
 
 def tested(mode: OneMode, left: int) -> Whiteness:
     """The tests of what a mode's model leaves; left : candidates that no peak explains."""
-    ratio = mode.I / mode.spectrum.psd(mode.f)
+    ratio = periodogram(mode.complete, mode.dt) / mode.spectrum.psd(mode.f)
     cumulated = cumulated_test(ratio, mode.n)
     try:
-        e = innovations(mode.left, mode.spectrum)
+        e = innovations(mode.complete, mode.spectrum)
     except RiccatiError as error:  # of what is no noise at all
         return Whiteness(cumulated, 0.0, left, (str(error),))
     result = Whiteness(cumulated, autocorrelation_test(e, len(mode.spectrum.vector)), left)

@@ -10,6 +10,7 @@ import numpy as np
 from wfsobs.ar2 import Ar2
 from wfsobs.arrays import Array
 from wfsobs.identify.lines import Line, nearest_line
+from wfsobs.identify.missing import Missing
 from wfsobs.identify.model import RMS, Spectrum
 from wfsobs.identify.order import of_best_order, with_background
 from wfsobs.identify.periodogram import Cells, frequencies, inflation, periodogram
@@ -31,26 +32,51 @@ WORTH = 6.0
 SPLIT = 8.0
 """The same for two resonances in the place of one, which every wide one is tried for."""
 
+SETTLED = 0.01
+"""Of the error of a fill that repeated filling and fitting leaves: each leaves the share that is missing, about."""
+
 
 class OneMode:
-    """z (n,) of one mode, mean taken off, and what has been found in it.
+    """z (n,) of one mode, mean taken off, and what has been found in it; NaN is a missing sample.
 
-    spectrum, lines : the model;  left : z without the lines;  I : periodogram of that;  refused : candidates that no
-        peak explains
+    spectrum, lines : the model;  left : z without the lines, filled as the model expects;  I : expected periodogram of that
+        if it were complete;  share : of every bin that is measured, see `missing`;  refused : candidates that no peak explains
     """
 
-    def __init__(self, z: Array, dt: float):
-        self.z, self.dt, self.n = z - z.mean(), dt, len(z)
+    def __init__(self, z: Array, dt: float, rng: np.random.Generator | None = None):
+        self.measured, self.dt, self.n = z - np.nanmean(z), dt, len(z)
+        self.missing = Missing(np.isnan(z), dt, rng or np.random.default_rng(0))
         self.f = frequencies(self.n, dt)
+        self.share, self.unknown, self.lost = np.ones(len(self.f)), np.zeros((0, self.n)), np.zeros(len(self.f))
+        self.z = self.missing.interpolated(self.measured)
         self.lines: list[Line] = []
         self._take_off()
         self.spectrum = first_guess(self.f, self.I, dt)
         self.strong = np.zeros(len(self.f), bool)
         self.refused: list[Candidate] = []
+        self._fill()
+
+    def _fill(self) -> None:
+        """Fill z as the model expects it now."""
+        if self.missing.any:
+            S, lines = self.spectrum.psd(self.f), self._signal()
+            self.unknown = self.missing.unknown(S)
+            self.share = self.missing.measured(S, self.unknown)
+            self.lost = (1.0 - self.share) * S
+            self.z = self.missing.filled(self.measured - lines, S) + lines
+            self._take_off()
+
+    def _signal(self) -> Array:
+        return sum((line.signal(self.n, self.dt) for line in self.lines), np.zeros(self.n))
 
     def _take_off(self) -> None:
-        self.left = self.z - sum((line.signal(self.n, self.dt) for line in self.lines), np.zeros(self.n))
-        self.I = periodogram(self.left, self.dt)
+        self.left = self.z - self._signal()
+        self.I = periodogram(self.left, self.dt) + self.lost
+
+    @property
+    def complete(self) -> Array:
+        """`left` with a sample of what is unknown in its gaps, (n,): as likely as the record that would have been."""
+        return self.left + self.unknown[0] if self.missing.any else self.left
 
     @property
     def peaks(self) -> int:
@@ -60,7 +86,7 @@ class OneMode:
     def whitened(self) -> Array:
         """I / S at PAD frequencies per bin, 1 at what has been refused."""
         f = frequencies(self.n, self.dt, PAD)
-        S = np.exp(np.interp(f, self.f, np.log(self.spectrum.psd(self.f))))
+        S = np.exp(np.interp(f, self.f, np.log(self.spectrum.psd(self.f) * self.share)))
         ratio = periodogram(self.left, self.dt, PAD) / S
         for candidate in self.refused:
             ratio[np.abs(f - candidate.frequency) <= (0.5 * candidate.width + 0.5) * self.f[0]] = 1.0
@@ -72,7 +98,7 @@ class OneMode:
         for p in self.spectrum.resonances:
             centre, half = p.omega / (2 * pi), max(4.0 * p.damping * p.omega / (2 * pi), 20.0 * self.f[0])
             keep[np.abs(self.f - centre) < half] = 1.0
-        return Cells(self.f, self.I, keep, [p.omega / (2 * pi) for p in self.spectrum.resonances])
+        return Cells(self.f, self.I, keep, [p.omega / (2 * pi) for p in self.spectrum.resonances], self.share)
 
     def refit(self, reshape: bool = False, third: bool = False) -> None:
         """All numbers of the spectrum at once; reshape : whether order of the turbulence and background are chosen anew, third :
@@ -89,6 +115,7 @@ class OneMode:
                 self.lines = [*self.lines, nearest_line(self.left, self.dt, frequency, 0.75 * self.f[0])]
             self.refused.append(Candidate(frequency, WIDEST_LINE, 0.0))  # or it would come back
             self._take_off()
+        self._fill()
 
     def _sound(self, p: Ar2) -> bool:
         """Whether a resonance is wide enough to be told from a line, and narrow enough to be told from turbulence."""
@@ -172,15 +199,19 @@ class OneMode:
     def polish(self, third: bool = False) -> None:
         """Every line once more with the others taken off, and all numbers on all bins; third : turbulence of third order in any
         case, as another mode has it."""
+        for again in range(self.missing.rounds(SETTLED)):
+            self._polish_lines()
+            self.refit(not again, third)
+        for p in self.spectrum.resonances:
+            self._split(p)
+
+    def _polish_lines(self) -> None:
         for i, line in enumerate(self.lines):
             alone = self.left + line.signal(self.n, self.dt)
             again = nearest_line(alone, self.dt, line.frequency, 0.25 * self.f[0])
             self.left = alone - again.signal(self.n, self.dt)
             self.lines[i] = again
         self._take_off()
-        self.refit(True, third)
-        for p in self.spectrum.resonances:
-            self._split(p)
 
     def _split(self, p: Ar2) -> None:
         """Two resonances in the place of one that is several bins wide, where they are worth it: neighbours look like one."""

@@ -54,12 +54,15 @@ def fast_length(n: int) -> int:
 
 
 class Cells:
-    """Bins gathered where the spectrum is smooth: frequency [Hz], mean of the periodogram and number of bins, each (cells,).
+    """Bins gathered where the spectrum is smooth: frequency [Hz], mean of the periodogram, number of bins and share of them that
+    is measured, each (cells,).
 
-    resonances : frequencies [Hz] near which cells stay narrow; keep : (bins,) which bins count
+    resonances : frequencies [Hz] near which cells stay narrow; keep : (bins,) which bins count; share : (bins,) of each that is
+    measured (`missing`), all of it unless told
     """
 
-    def __init__(self, f: Array, I: Array, keep: Array, resonances: Iterable[float] = ()):  # noqa: E741
+    def __init__(self, f: Array, I: Array, keep: Array, resonances: Iterable[float] = (),  # noqa: E741
+                 share: Array | float = 1.0):
         j = np.arange(1.0, len(f) + 1.0)
         size = np.maximum(j / FINE, 1.0)
         for centre in resonances:
@@ -70,3 +73,4 @@ class Cells:
         self.count = count[used]
         self.frequency = np.bincount(cell, keep * f)[used] / self.count
         self.mean = np.bincount(cell, keep * I)[used] / self.count
+        self.share = np.bincount(cell, keep * share)[used] / self.count

@@ -127,7 +127,7 @@ def read_off(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> I
     found = [_process(p, std[start:]) for start, p in zip(mode.spectrum.starts, mode.spectrum.processes, strict=False)]
     turbulence, background = (None if p is None else found.pop(0) for p in (mode.spectrum.turbulence, mode.spectrum.background))
     for line in mode.lines:
-        floor = float(mode.spectrum.psd(np.array([line.frequency]))[0])
+        floor = float(mode.spectrum.psd(np.array([line.frequency]))[0]) / float(np.interp(line.frequency, mode.f, mode.share))
         in_frequency, in_rms = line.standard_deviations(mode.n, mode.dt, floor)
         found.append(Process(Number(line.frequency, in_frequency), Number(0.0, 0.0), Number(line.rms, in_rms)))
     peaks = sorted((p for p in found if p.frequency.value >= lowest), key=lambda p: p.frequency.value)

@@ -33,10 +33,16 @@ def negative_log_likelihood(spectrum: Spectrum, cells: Cells) -> float:
 
 
 def information(spectrum: Spectrum, cells: Cells, wanted: Sequence[int] | None = None) -> Array:
-    """Fisher information of the wanted numbers of `Spectrum.vector`, all unless told, (p, p)."""
+    """Fisher information of the wanted numbers of `Spectrum.vector`, all unless told, (p, p).
+
+    Where samples are missing, with g the share of a bin that is measured, it is sum g^2 d d' + v v' / sum g (1 - g) with
+    v = sum g (1 - g) d: random gaps carry what a bin loses to all others alike, where noise finds it again and a peak does not.
+    """
     wanted = range(spectrum.starts[-1]) if wanted is None else wanted
     d = spectrum.slopes(cells.frequency, wanted) / spectrum.psd(cells.frequency)
-    return (d * cells.count) @ d.T
+    carried = cells.count * cells.share * (1.0 - cells.share)
+    v = d @ carried
+    return (d * (cells.count * cells.share**2)) @ d.T + np.outer(v, v) / max(carried.sum(), 1e-300)
 
 
 def fitted(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = None) -> Spectrum:
