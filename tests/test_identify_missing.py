@@ -110,7 +110,7 @@ def test_information_is_that_of_what_is_measured(share: float) -> None:
 
 def test_intervals_hold_where_a_third_is_lost() -> None:
     """Of 12 records the 95 % intervals hold the truth in so many that fewer have a probability of 1e-4, as have more false peaks
-    at a level of 5 %. Samples that are filled and taken for measurements give 13.0 nm of 14, five errors off, and peaks by chance."""
+    at a level of 5 %. Samples that are filled and taken for measurements give 13.0 nm of 14, five errors off."""
     inside, false, count = [], 0, 12
     for seed in range(count):
         (mode,) = identify(record(0.3, np.random.default_rng(seed), 4000)).modes
