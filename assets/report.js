@@ -177,7 +177,7 @@ function drawSweep(figure, target) {
 
 function rowOf(index, target, name) {
   const rows = states[index].rows.filter((r) => r.target === target && r.mode === shown.mode)
-  return name === "truth" ? rows[0] : rows.find((r) => r.observer === name)
+  return name === "truth" ? rows.find((r) => !r.apart) : rows.find((r) => r.observer === name)
 }
 
 function paint(figure) {
@@ -229,12 +229,17 @@ function card(target, name) {
   const look = data.looks[name]
   const row = rowOf(shown.state, target, name)
   const value = row && (name === "truth" ? row.truth_rms_um : row.rms_um)
-  const relative = row && row.normalised_rms !== null ? `${row.normalised_rms.toFixed(2)} × truth` : ""
+  const relative = row && row.normalised_rms !== null ? `${row.normalised_rms.toFixed(2)} × truth${own(row)}` : ""
   return {
     name, label: look.label, colour: look[dark ? "dark" : "light"], dash: look.dash,
     value: row ? number(value * data.states[shown.state].scale[shown.unit]) : "–",
     unit: row ? data.units[shown.unit] : "", note: row ? (name === "truth" ? "rms" : relative) : name === "truth" ? "" : "no result",
   }
+}
+
+// What is said of an observer that was scored on samples of its own.
+function own(row) {
+  return row.apart ? `, ${row.start_s.toFixed(2)} to ${row.stop_s.toFixed(2)} s only` : ""
 }
 
 function drawTable() {

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from wfsobs.ar2 import Ar2
 from wfsobs.observers.base import Estimate
 from wfsobs.record import Record
-from wfsobs.scores import cumulative_rms, lag, rms, score, scored_samples, welch_psd
+from wfsobs.scores import cumulative_rms, lag, rms, scored_samples, supervised_scores, unsupervised_scores, welch_psd
 
 NAMES = ["tip", "tilt"]
 
@@ -37,7 +37,7 @@ def test_scores_of_a_known_error(seed: int, log_scale: float, warm_up: float, un
     values[700:705, 1] = np.nan
     wild = truth.copy()
     wild[:start] = 1e9  # whatever the warm-up holds
-    found = score(record(vibration=wild), Estimate("x", "vibration", values, 2e-6), warm_up, NAMES)
+    found = supervised_scores(record(vibration=wild), [Estimate("x", "vibration", values, 2e-6)], warm_up, NAMES)
     assert [s.mode for s in found] == NAMES
     for mode, s in enumerate(found):
         known = [k for k in range(1000) if k >= start and not np.isnan(values[k, mode])]
@@ -46,13 +46,14 @@ def test_scores_of_a_known_error(seed: int, log_scale: float, warm_up: float, un
         assert s.rms == pytest.approx(error, rel=1e-12) and s.truth_rms == pytest.approx(size, rel=1e-12)
         assert s.normalised_rms == pytest.approx(error / size, rel=1e-12)
         assert (s.observer, s.target, s.seconds_per_step) == ("x", "vibration", 2e-6)
+        assert (s.start, s.stop, s.apart) == (pytest.approx(1e-3 * known[0]), pytest.approx(1e-3 * (known[-1] + 1)), False)
         assert s.lag == pytest.approx(0.0, abs=1e-4)  # white noise at 0.3: the peak of the correlation is at zero
 
 
 def test_no_truth_no_score_and_zero_truth_no_ratio() -> None:
     estimate = Estimate("x", "vibration", np.ones((1000, 2)), 0.0)
-    assert score(record(turbulence=np.ones((1000, 2))), estimate, 0.0, NAMES) == []
-    found = score(record(vibration=np.zeros((1000, 2))), estimate, 0.0, NAMES)
+    assert supervised_scores(record(turbulence=np.ones((1000, 2))), [estimate], 0.0, NAMES) == []
+    found = supervised_scores(record(vibration=np.zeros((1000, 2))), [estimate], 0.0, NAMES)
     assert [(s.rms, s.truth_rms, s.normalised_rms, s.lag) for s in found] == [(1.0, 0.0, None, None)] * 2
 
 
@@ -60,14 +61,14 @@ def test_nothing_left_to_score_gives_no_row() -> None:
     values = np.full((1000, 2), np.nan)
     values[:100, 0] = 1.0
     values[:, 1] = 0.0
-    found = score(record(vibration=np.ones((1000, 2))), Estimate("x", "vibration", values, 0.0), 0.5, NAMES)
-    assert [s.mode for s in found] == ["tilt"]
-    assert score(record(vibration=np.ones((1000, 2))), Estimate("x", "vibration", values, 0.0), 5.0, NAMES) == []
+    ones, estimates = record(vibration=np.ones((1000, 2))), [Estimate("x", "vibration", values, 0.0)]
+    assert [s.mode for s in supervised_scores(ones, estimates, 0.5, NAMES)] == ["tilt"]
+    assert supervised_scores(ones, estimates, 5.0, NAMES) == []
 
 
 def test_an_answer_of_zero_scores_one() -> None:
     truth = np.random.default_rng(0).standard_normal((1000, 2))
-    found = score(record(vibration=truth), Estimate("zero", "vibration", np.zeros((1000, 2)), 0.0), 0.1, NAMES)
+    found = supervised_scores(record(vibration=truth), [Estimate("zero", "vibration", np.zeros((1000, 2)), 0.0)], 0.1, NAMES)
     assert [s.normalised_rms for s in found] == [1.0, 1.0] and [s.lag for s in found] == [None, None]
 
 
@@ -75,6 +76,50 @@ def test_scored_samples_are_pairs() -> None:
     truth, value = np.arange(10.0), np.array([0, 1, np.nan, 3, 4, np.nan, 6, 7, 8, 9.0])
     one, other = scored_samples(record(n=10), truth, value, 0.002)
     assert one.tolist() == other.tolist() == [3, 4, 6, 7, 8, 9]
+
+
+def late(name: str, error: np.ndarray, start: int, target: str = "vibration") -> Estimate:
+    """An estimate that is off by `error` of a truth of zero, from some step on."""
+    return Estimate(name, target, np.where(np.arange(error.size) < start, np.nan, error)[:, None] * np.ones(2), 0.0)
+
+
+def test_a_table_is_scored_on_the_samples_that_all_have() -> None:
+    """Calm at the end, so that whoever starts late looks better than it is; one last sample and one gap less."""
+    rough = np.where(np.arange(1000) < 500, 3.0, 1.0)
+    gap = np.where(np.arange(1000) == 700, np.nan, 1.0)
+    estimates = [late("all", rough, 0), late("late", 1.1 * rough, 500), late("gap", gap * rough, 0)]
+    found = supervised_scores(record(vibration=np.zeros((1000, 2))), estimates, 0.1, NAMES)
+    got = {s.observer: s for s in found if s.mode == "tilt"}
+    assert got["all"].rms == pytest.approx(1.0) and got["late"].rms == pytest.approx(1.1)
+    assert {(s.start, s.stop, s.apart) for s in found} == {(0.5, 1.0, False)}
+    last = late("last", np.where(np.arange(1000) < 999, 1.0, np.nan), 0)
+    assert {s.stop for s in supervised_scores(record(vibration=np.zeros((1000, 2))), [*estimates, last], 0.1, NAMES)} == {0.999}
+
+
+@pytest.mark.parametrize(("start", "apart"), [(549, False), (550, False), (551, True), (990, True)])
+def test_who_leaves_less_than_half_stands_apart(start: int, apart: bool) -> None:
+    """Of the 900 samples after the warm-up; the others keep theirs."""
+    rough = np.where(np.arange(1000) < start, 3.0, 1.0)
+    estimates = [late("late", rough, start), late("one", rough, 0), late("two", rough, 50)]
+    found = {s.observer: s for s in supervised_scores(record(vibration=np.zeros((1000, 2))), estimates, 0.1, NAMES)}
+    assert found["late"].rms == pytest.approx(1.0) and found["late"].start == pytest.approx(1e-3 * start)
+    assert [found[name].apart for name in ("late", "one", "two")] == [apart, False, False]
+    for name in ("one", "two"):
+        assert found[name].start == pytest.approx(0.1 if apart else 1e-3 * start)
+        whole = np.sqrt((9.0 * (start - 100) + 1000 - start) / 900)
+        assert found[name].rms == pytest.approx(whole if apart else 1.0)
+
+
+def test_predictions_and_the_residual_are_scored_on_common_samples_too() -> None:
+    rough = np.where(np.arange(1000) < 500, 3.0, 1.0)
+    y = np.outer(rough, [1.0, 1.0])
+    without_truth = Record(y, np.zeros((1000, 2)), 1e-3)
+    estimates = [late(name, np.zeros(1000), start, target)
+                 for name, start in (("all", 0), ("late", 499), ("apart", 900)) for target in ("turbulence", "vibration")]
+    found = {s.observer: s for s in unsupervised_scores(without_truth, estimates, 0.1, NAMES) if s.mode == "tip"}
+    assert {name: (s.start, s.apart) for name, s in found.items()} == {
+        "all": (0.5, False), "late": (0.5, False), "apart": (pytest.approx(0.901), True), "loop": (0.5, False)}
+    assert all(s.rms == s.truth_rms == pytest.approx(1.0) for s in found.values())
 
 
 # ---------------------------------------------------------------------- lag

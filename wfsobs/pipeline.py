@@ -14,7 +14,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Observer
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.scores import Score, score, unsupervised_scores
+from wfsobs.scores import Score, supervised_scores, unsupervised_scores
 from wfsobs.settings import SettingError
 from wfsobs.watch import QUIET, Watch
 
@@ -85,12 +85,11 @@ def collect(
     order = {name: i for i, name in enumerate(OBSERVERS)}
     names = [m.name for m in scenario.modes][: record.n_modes]
     ordered = sorted(estimates, key=lambda e: (order[e.observer], e.target))
-    scores: list[Score] = []
-    for estimate in ordered:
-        watch.check()
-        scores += score(record, estimate, scenario.run.warm_up, names)
-    if record.turbulence is None and record.vibration is None:
-        scores = unsupervised_scores(record, ordered, scenario.run.warm_up, names)
+    watch.check()
+    known = record.turbulence is not None or record.vibration is not None
+    scores = (supervised_scores if known else unsupervised_scores)(record, ordered, scenario.run.warm_up, names)
+    if known:
+        scores.sort(key=lambda s: (order[s.observer], s.target))
     return Result(scenario, record, tuple(ordered), (*scores, *bounds), tuple(sorted(failures, key=lambda f: order[f.observer])))
 
 

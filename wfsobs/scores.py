@@ -1,4 +1,4 @@
-"""How good an estimate is: error, lag, spectra, all after the warm-up and where both signals exist."""
+"""How good estimates are: error, lag, spectra, all after the warm-up; errors that are compared, on common samples."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ LOOP, BOUND = "loop", "bound"
 MAX_LAG = 0.025
 """Lags beyond this [s] are not looked for."""
 
+SHARE = 0.5
+"""Of the samples after the warm-up, those that the observers of a table must have in common; who leaves fewer stands apart."""
+
 
 @dataclass(frozen=True)
 class Score:
@@ -28,6 +31,8 @@ class Score:
 
     rms, truth_rms [um]; normalised_rms = rms / truth_rms, None where the truth is zero; lag [s], positive if the
     estimate is late, None where it is constant; seconds_per_step: computing time [s] per step and mode.
+    start, stop : the stretch [s] that was scored, None for a mean over all records
+    apart : whether the stretch is the observer's own, not that of the other rows, so that it cannot be compared with them
     """
 
     observer: str
@@ -38,54 +43,104 @@ class Score:
     normalised_rms: float | None
     lag: float | None
     seconds_per_step: float
+    start: float | None = None
+    stop: float | None = None
+    apart: bool = False
 
 
-def score(record: Record, estimate: Estimate, warm_up: float, mode_names: list[str]) -> list[Score]:
-    """One Score per mode; none where the record has no truth for the target or no sample is left."""
-    truth = record.truth(estimate.target)
-    if truth is None:
+def common_samples(known: Sequence[Array]) -> list[tuple[Array, bool]]:
+    """What is scored of every estimate, and whether it stands apart, from the samples that each of them has, (n,) bool.
+
+    From the one with most samples on, everyone takes part whose own leave SHARE of those in common. All of these are scored on
+    the samples that they have in common, every other one on its own, apart.
+    """
+    if not known:
         return []
+    order = sorted(range(len(known)), key=lambda i: -known[i].sum())
+    shared, apart = known[order[0]], set()
+    for i in order[1:]:
+        both = shared & known[i]
+        if both.sum() >= SHARE * known[order[0]].sum():
+            shared = both
+        else:
+            apart.add(i)
+    return [(known[i] if i in apart else shared, i in apart) for i in range(len(known))]
+
+
+def supervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:
+    """One Score per estimate and mode, those of a target and mode on common samples; none where the record has no truth for the
+    target or no sample is left."""
     out = []
-    for mode, name in enumerate(mode_names):
-        true, value = scored_samples(record, truth[:, mode], estimate.values[:, mode], warm_up)
-        if true.size == 0:
+    for target in TARGETS:
+        truth, of = record.truth(target), [e for e in estimates if e.target == target]
+        if truth is None:
             continue
-        error, scale = rms(value - true), rms(true)
-        out.append(Score(
-            estimate.observer, estimate.target, name, error, scale, error / scale if scale > 0 else None,
-            lag(true, value, record.dt), estimate.seconds_per_step,
-        ))
+        for mode, name in enumerate(mode_names):
+            true = truth[:, mode]
+            counts = _after(record, warm_up) & ~np.isnan(true)
+            scored = common_samples([counts & ~np.isnan(e.values[:, mode]) for e in of])
+            for e, (samples, apart) in zip(of, scored, strict=True):
+                if not samples.any():
+                    continue
+                t, value = true[samples], e.values[samples, mode]
+                out.append(Score(
+                    e.observer, target, name, rms(value - t), rms(t), _ratio(value - t, t), lag(t, value, record.dt),
+                    e.seconds_per_step, *_stretch(samples, record.dt), apart))
     return out
 
 
 def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:
-    """What can be said without truth, in the place of `score`; truth_rms is the rms of z throughout.
+    """What can be said without truth, on common samples as well; truth_rms is the rms of z throughout.
 
     - PREDICTION: rms of z[k+1] - phi_hat[k], one step ahead, since z[k+1] = phi_dist[k] + noise and phi_hat[k] knows y up to
       k. The noise of the measurement stays in. Only an observer that estimates both turbulence and vibration says what
       z will be; the others cannot be scored so. Samples that were missing do not count.
     - RESIDUAL: rms of y_lgs, what the recorded loop left.
     """
-    start = round(warm_up / record.dt)
-    z, out = record.z, []
+    out: list[Score] = []
     whole: dict[str, list[Estimate]] = {}
     for estimate in estimates:
         whole.setdefault(estimate.observer, []).append(estimate)
+    both = {observer: parts for observer, parts in whole.items() if {e.target for e in parts} == set(TARGETS)}
+    counts = _after(record, warm_up + record.dt)
     for mode, name in enumerate(mode_names):
-        measured = z[start + 1 :, mode]
-        scale = rms(measured[~np.isnan(measured)])
-        if not scale > 0:
+        z, left = record.z[:, mode], record.y_lgs[:, mode]
+        measured = counts & ~np.isnan(z)
+        if not rms(z[measured]) > 0:
             continue
-        for observer, parts in whole.items():
-            error = measured - sum(e.values[start:-1, mode] for e in parts)
-            known = error[~np.isnan(error)]
-            if {e.target for e in parts} == set(TARGETS) and known.size:
-                seconds = max(e.seconds_per_step for e in parts)
-                out.append(Score(observer, PREDICTION, name, rms(known), scale, rms(known) / scale, None, seconds))
-        left = record.y_lgs[start + 1 :, mode]
-        left = rms(left[~np.isnan(left)])
-        out.append(Score(LOOP, RESIDUAL, name, left, scale, left / scale, None, 0.0))
+        errors = [z - _later(sum(e.values[:, mode] for e in parts)) for parts in both.values()]  # type: ignore[arg-type]
+        scored = common_samples([measured & ~np.isnan(error) for error in errors])
+        for (observer, parts), error, (samples, apart) in zip(both.items(), errors, scored, strict=True):
+            if samples.any():
+                out.append(Score(
+                    observer, PREDICTION, name, rms(error[samples]), rms(z[samples]), _ratio(error[samples], z[samples]), None,
+                    max(e.seconds_per_step for e in parts), *_stretch(samples, record.dt), apart))
+        samples = next((s for s, apart in scored if not apart and s.any()), measured) & ~np.isnan(left)
+        if samples.any():
+            out.append(Score(LOOP, RESIDUAL, name, rms(left[samples]), rms(z[samples]), _ratio(left[samples], z[samples]), None,
+                             0.0, *_stretch(samples, record.dt)))
     return out
+
+
+def _after(record: Record, warm_up: float) -> Array:
+    """Which steps are after the warm-up [s]."""
+    return np.arange(record.n_steps) >= round(warm_up / record.dt)
+
+
+def _later(x: Array) -> Array:
+    """One step later, NaN first."""
+    return np.concatenate([[np.nan], x[:-1]])
+
+
+def _stretch(samples: Array, dt: float) -> tuple[float, float]:
+    """From the first of the samples to the end of the last [s]."""
+    return float(np.argmax(samples) * dt), float((samples.size - np.argmax(samples[::-1])) * dt)
+
+
+def _ratio(error: Array, signal: Array) -> float | None:
+    """The rms of an error over that of the signal, None where that is zero."""
+    scale = rms(signal)
+    return rms(error) / scale if scale > 0 else None
 
 
 def scored_samples(record: Record, truth: Array, value: Array, warm_up: float) -> tuple[Array, Array]:
@@ -141,7 +196,7 @@ def welch_psd(x: Array, dt: float, resolution: float = 0.5) -> tuple[Array, Arra
 def spectra(record: Record, target: str, values: Array, warm_up: float) -> tuple[Array, Array, Array] | None:
     """(frequency [Hz], density of the values, density of their error against the truth [um^2/Hz], a column per mode).
 
-    Over the samples that count for the scores; None where there are too few. Without a truth the error is zero.
+    Over every sample after the warm-up [s] that has an estimate; None where there are too few. Without a truth the error is zero.
     """
     truth = record.truth(target)
     truth = values if truth is None else truth

@@ -27,7 +27,8 @@ def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
     return [
         {
             "observer": s.observer, "target": s.target, "mode": s.mode, "rms_um": s.rms, "truth_rms_um": s.truth_rms,
-            "normalised_rms": s.normalised_rms, "lag_s": s.lag, "needs": needs_of(s.observer), "seed": seed,
+            "normalised_rms": s.normalised_rms, "lag_s": s.lag, "start_s": s.start, "stop_s": s.stop, "apart": s.apart,
+            "needs": needs_of(s.observer), "seed": seed,
             TIME: None if s.observer in NOT_OBSERVERS else s.seconds_per_step * 1e6,
         }
         for s in scores
@@ -36,11 +37,11 @@ def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
 
 def score_table(rows: Sequence[Row]) -> Table:
     """The RMS table, of errors or, without truth, of predictions; over several seeds the medians, with the spread (smallest
-    to largest) of the error."""
+    to largest) of the error. Its caption says which samples were scored."""
     several = len({r["seed"] for r in rows}) > 1
     unknown = any(r["target"] == RESIDUAL for r in rows)
     title, base = ("One-step prediction error of z, and residual,", "z") if unknown else ("RMS error", "truth")
-    table = Table(title=f"{title} after warm-up" + (", median over seeds" if several else ""))
+    table = Table(title=f"{title} after warm-up" + (", median over seeds" if several else ""), caption=_caption(rows))
     for name in ("Target", "Mode", "Observer", "Needs"):
         table.add_column(name, no_wrap=True)
     for name in ("error, nm", *(("spread, nm",) if several else ()), f"{base}, nm", f"error / {base}", "lag, ms", "us / step"):
@@ -53,7 +54,7 @@ def score_table(rows: Sequence[Row]) -> Table:
             table.add_section()
         last = (target, mode)
         table.add_row(
-            target, mode, label_of(observer) + (" (looks ahead)" if looks_ahead(observer) else ""),
+            target, mode, label_of(observer) + (" (looks ahead)" if looks_ahead(observer) else "") + _own(same),
             needs_of(observer), f"{median(errors):.2f}",
             *((f"{min(errors):.2f} - {max(errors):.2f}",) if several else ()),
             f"{median(r['truth_rms_um'] for r in same) * 1e3:.2f}", _number(same, "normalised_rms", 1.0, 3),
@@ -74,9 +75,42 @@ def needs_of(observer: str) -> str:
     return OBSERVERS[observer].told
 
 
-def competes(observer: str) -> bool:
-    """Whether a row can be the best: not the bound, nor what looks ahead."""
-    return observer not in NOT_OBSERVERS and OBSERVERS[observer].causal
+def competes(observer: str, apart: bool) -> bool:
+    """Whether a row can be the best: not the bound, nor what looks ahead or was scored on samples of its own."""
+    return observer not in NOT_OBSERVERS and not looks_ahead(observer) and not apart
+
+
+def stretch_of(rows: Iterable[Row]) -> str:
+    """What was scored of rows that can be compared, from the earliest to the latest, nothing where there are none.
+
+    >>> stretch_of([{"start_s": 4.001, "stop_s": 9.999, "apart": False}, {"start_s": None, "stop_s": None, "apart": False}])
+    '4.00 to 10.00 s'
+    """
+    return _span([r for r in rows if not r["apart"]])
+
+
+def own_stretch(row: Row) -> str:
+    """What was scored of a row that stands apart, nothing of any other."""
+    return f"{_span([row])} only" if row["apart"] else ""
+
+
+def _span(rows: Sequence[Row]) -> str:
+    known = [(r["start_s"], r["stop_s"]) for r in rows if r["start_s"] is not None]
+    return f"{min(start for start, _ in known):.2f} to {max(stop for _, stop in known):.2f} s" if known else ""
+
+
+def _own(same: Sequence[Row]) -> str:
+    """What is said of an observer that stands apart, for some seeds or all."""
+    return f" ({own_stretch(own[0])})" if (own := [r for r in same if r["apart"]]) else ""
+
+
+def _caption(rows: Sequence[Row]) -> str:
+    """What was scored, target by target where they differ."""
+    found = {target: stretch_of(r for r in rows if r["target"] == target) for target in dict.fromkeys(r["target"] for r in rows)}
+    spans = {span for span in found.values() if span}
+    if len(spans) > 1:
+        return "Scored: " + "; ".join(f"{target} {span}" for target, span in found.items() if span)
+    return f"Scored: {spans.pop()}" if spans else ""
 
 
 def looks_ahead(observer: str) -> bool:
@@ -90,11 +124,11 @@ def _number(same: Sequence[Row], key: str, scale: float, digits: int) -> str:
 
 
 def _order(rows: Sequence[Row]):
-    """Turbulence before vibration, modes as they come, best observer first."""
+    """Turbulence before vibration, modes as they come, best observer first, those that stand apart last."""
     modes = list(dict.fromkeys(r["mode"] for r in rows))
 
     def key(group: tuple[str, str, str]) -> tuple:
-        errors = [r["rms_um"] for r in rows if (r["target"], r["mode"], r["observer"]) == group]
-        return group[0], modes.index(group[1]), median(errors)
+        same = [r for r in rows if (r["target"], r["mode"], r["observer"]) == group]
+        return group[0], modes.index(group[1]), any(r["apart"] for r in same), median(r["rms_um"] for r in same)
 
     return key

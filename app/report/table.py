@@ -8,11 +8,11 @@ from itertools import groupby
 
 from wfsobs.app.display import NOTHING, number, per_micrometre
 from wfsobs.app.report.data import State
-from wfsobs.tables import TIME, Row, competes, label_of, looks_ahead
+from wfsobs.tables import TIME, Row, competes, label_of, looks_ahead, own_stretch, stretch_of
 
 COLUMNS = {
     "Observer": "and its line in the figures",
-    'RMS error [<span class="unit">nm</span>]': "of the estimate, after the warm-up",
+    'RMS error [<span class="unit">nm</span>]': "of the estimate, after the warm-up, on samples that all have",
     'RMS truth [<span class="unit">nm</span>]': "the error of answering zero",
     "error / truth": "above 1 is worse than answering zero",
     "Needs": "what has to be given beside measurements",
@@ -41,26 +41,27 @@ def _group(row: Row) -> tuple[str, str]:
 
 
 def _order(rows: list[Row]):
-    """Targets and modes as they come, best first."""
+    """Targets and modes as they come, best first, those that stand apart last."""
     groups = list(dict.fromkeys(map(_group, rows)))
-    return lambda row: (groups.index(_group(row)), row["rms_um"])
+    return lambda row: (groups.index(_group(row)), row["apart"], row["rms_um"])
 
 
 def _body(state: State, rows: list[Row]) -> str:
     target, mode = _group(rows[0])
-    best = min((row["rms_um"] for row in rows if competes(row["observer"])), default=math.inf)
-    title = f'<tr><th colspan={len(COLUMNS)} class="target" scope=rowgroup>{target.capitalize()}, {escape(mode)}</th></tr>'
+    best = min((row["rms_um"] for row in rows if competes(row["observer"], row["apart"])), default=math.inf)
+    name = ", ".join((target.capitalize(), escape(mode), *filter(None, [stretch_of(rows)])))
+    title = f'<tr><th colspan={len(COLUMNS)} class="target" scope=rowgroup>{name}</th></tr>'
     return (
         f'<tbody data-target="{target}" data-mode="{escape(mode)}">{title}'
-        f'{"".join(_row(state, row, row["rms_um"] == best) for row in rows)}</tbody>')
+        f'{"".join(_row(state, row, row["rms_um"] == best and competes(row["observer"], row["apart"])) for row in rows)}</tbody>')
 
 
 def _row(state: State, row: Row, best: bool) -> str:
     name, time = row["observer"], row[TIME]
-    label = escape(label_of(name)) + (" <sup>looks ahead</sup>" if looks_ahead(name) else "")
+    label = escape(label_of(name)) + (" <sup>looks ahead</sup>" if looks_ahead(name) else "") + apart(own_stretch(row))
     lag = NOTHING if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−")
     cells = [
-        f"<td>{BEST if best and competes(name) else ''}{length(row['rms_um'])}</td>",
+        f"<td>{BEST if best else ''}{length(row['rms_um'])}</td>",
         f"<td>{length(row['truth_rms_um'])}</td>",
         f"<td>{ABOVE if (row['normalised_rms'] or 0.0) > 1.0 else ''}{number(row['normalised_rms'])}</td>",
         f"<td class=words>{row['needs']}</td>",
@@ -68,6 +69,11 @@ def _row(state: State, row: Row, best: bool) -> str:
         f"<td>{number(time)}</td>", f"<td>{number(None if time is None else 1e-6 * time / state.grid.dt, 2)}</td>",
     ]
     return f'<tr data-observer="{name}"><th scope=row>{swatch(name)}{label}</th>{"".join(cells)}</tr>'
+
+
+def apart(stretch: str) -> str:
+    """What is beside the name of an observer that was scored on samples of its own."""
+    return f" <sup>{stretch}</sup>" if stretch else ""
 
 
 def length(um: float) -> str:

@@ -12,6 +12,7 @@ from wfsobs.app.run import RUNNING, Run
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, Shown
+from wfsobs.tables import own_stretch, rows
 
 
 class Cards(JSComponent):
@@ -50,11 +51,12 @@ class Strip:
             waiting = self.run.state == RUNNING
             return self._card(name, None, "computing …" if waiting else "no result")
         relative = f"{score.normalised_rms:.2f} × truth" if score.normalised_rms is not None else ""
-        return self._card(name, self._scaled(score.rms, shown), relative)
+        own = own_stretch(rows([score], None)[0])
+        return self._card(name, self._scaled(score.rms, shown), ", ".join(filter(None, [relative, own])))
 
     def _truth(self, shown: Shown | None) -> dict[str, Any]:
         of = (self.target, self.display.mode)
-        scores = [s for s in shown.result.scores if (s.target, s.mode) == of] if shown else []
+        scores = [s for s in shown.result.scores if (s.target, s.mode) == of and not s.apart] if shown else []
         if shown is None or not scores:
             return self._card(TRUTH, None, "")
         return self._card(TRUTH, self._scaled(scores[0].truth_rms, shown), "rms")

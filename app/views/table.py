@@ -13,7 +13,16 @@ from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import Shown
 from wfsobs.observers.base import TARGETS
 from wfsobs.scores import BOUND, LOOP, RESIDUAL, Score
-from wfsobs.tables import NOT_OBSERVERS, competes, label_of, looks_ahead, needs_of
+from wfsobs.tables import (
+    NOT_OBSERVERS,
+    competes,
+    label_of,
+    looks_ahead,
+    needs_of,
+    own_stretch,
+    rows,
+    stretch_of,
+)
 
 BEST = '<span class="tag best">best</span> '
 ABOVE = '<span class="tag above">above truth</span> '
@@ -21,8 +30,7 @@ ABOVE = '<span class="tag above">above truth</span> '
 
 def find(shown: Shown, observer: str, target: str, mode: str) -> Score | None:
     """The score of one observer, target and mode, or None."""
-    rows = shown.result.scores
-    return next((s for s in rows if (s.observer, s.target, s.mode) == (observer, target, mode)), None)
+    return next((s for s in shown.result.scores if (s.observer, s.target, s.mode) == (observer, target, mode)), None)
 
 
 class Table:
@@ -53,7 +61,8 @@ class Table:
         } if self.display.pinned else {}
         base = "z" if self._without_truth() else "truth"
         return {
-            "Observer": "and its line in the figures", f"RMS error [{unit}]": "of the estimate, after the warm-up", **pinned,
+            "Observer": "and its line in the figures",
+            f"RMS error [{unit}]": "of the estimate, after the warm-up, on samples that all have", **pinned,
             f"RMS {base} [{unit}]": "the error of answering zero", f"error / {base}": "above 1 is worse than answering zero",
             "Needs": "what has to be given beside measurements",
             "Lag [ms]": "how late the estimate is", "Time per step [µs]": "computing time per step and mode",
@@ -68,12 +77,12 @@ class Table:
 
     def _measured(self, columns: int) -> str:
         """The rows of a record without truth: predictions of the next measurement, and what the recorded loop left."""
-        rows = self._without_truth()
+        scores = self._without_truth()
         if self.display.best_first:
-            rows.sort(key=lambda s: (s.target == RESIDUAL, s.rms))
+            scores.sort(key=lambda s: (s.target == RESIDUAL, s.apart, s.rms))
         shown, pinned = self.run.shown, [NOTHING] * (2 if self.display.pinned else 0)
         out = []
-        for score in rows:
+        for score in scores:
             assert shown is not None
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             loop = score.observer == LOOP
@@ -81,11 +90,11 @@ class Table:
                      needs_of(score.observer), NOTHING,
                      *_times(score, shown.result.record.dt)]
             label = "Recorded loop, residual" if loop else (
-                f"{swatch(score.observer, self.display.dark)}{escape(label_of(score.observer))}")
+                f"{swatch(score.observer, self.display.dark)}{escape(label_of(score.observer))}{_own(score)}")
             values = "".join(f"<td>{c}</td>" for c in cells)
             head = f"<th scope=row>{label}</th>"
             out.append(f'<tr data-observer="{score.observer}" data-target="{score.target}">{head}{values}</tr>')
-        title = f"Next measurement z, {self.display.mode}, one step ahead: the record has no truth"
+        title = f"Next measurement z, {self.display.mode}{_scored(scores)}, one step ahead: the record has no truth"
         head = f'<tr><th colspan={columns} class="target" scope=rowgroup>{title}</th></tr>'
         return f"<tbody>{head}{''.join(out)}</tbody>" if out else ""
 
@@ -95,21 +104,21 @@ class Table:
         scores = {
             name: find(shown, name, target, self.display.mode) if shown else None
             for name in (*observers_of(target, hidden=True), BOUND)}
-        best = min((s.rms for n, s in scores.items() if s and competes(n)), default=None)
+        best = min((s.rms for n, s in scores.items() if s and competes(n, s.apart)), default=None)
         order = list(scores.items())
         if self.display.best_first:
-            order.sort(key=lambda item: item[1].rms if item[1] else math.inf)
-        rows = "".join(self._row(name, target, score, best) for name, score in order)
-        title = f"{target.capitalize()}, {self.display.mode}"
-        return f'<tbody><tr><th colspan={columns} class="target" scope=rowgroup>{title}</th></tr>{rows}</tbody>'
+            order.sort(key=lambda item: (item[1].apart, item[1].rms) if item[1] else (True, math.inf))
+        body = "".join(self._row(name, target, score, best) for name, score in order)
+        title = f"{target.capitalize()}, {self.display.mode}{_scored([s for s in scores.values() if s])}"
+        return f'<tbody><tr><th colspan={columns} class="target" scope=rowgroup>{title}</th></tr>{body}</tbody>'
 
     def _row(self, name: str, target: str, score: Score | None, best: float | None) -> str:
-        label = escape(label_of(name)) + (" <sup>looks ahead</sup>" if looks_ahead(name) else "")
+        label = escape(label_of(name)) + (" <sup>looks ahead</sup>" if looks_ahead(name) else "") + _own(score)
         shown, pinned = self.run.shown, self._pinned(name, target, score)
         cells = [NOTHING, *pinned, *[NOTHING] * 2, needs_of(name), *[NOTHING] * 3]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
-            is_best = score.rms == best and competes(name)
+            is_best = score.rms == best and competes(name, score.apart)
             cells = [
                 (BEST if is_best else "") + number(score.rms * scale), *pinned,
                 number(score.truth_rms * scale),
@@ -137,6 +146,17 @@ class Table:
         shown = self.run.shown
         failures = shown.result.failures if shown else ()
         return "".join(f'<p class="failure">{escape(f.reason)}</p>' for f in failures)
+
+
+def _scored(scores: list[Score]) -> str:
+    """What was scored of rows that can be compared, for the end of a heading."""
+    stretch = stretch_of(rows(scores, None))
+    return f", {stretch}" if stretch else ""
+
+
+def _own(score: Score | None) -> str:
+    """What is beside the name of an observer that was scored on samples of its own."""
+    return f" <sup>{own_stretch(rows([score], None)[0])}</sup>" if score and score.apart else ""
 
 
 def _times(score: Score, dt: float) -> list[str]:

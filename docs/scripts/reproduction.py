@@ -241,7 +241,8 @@ def lgs_model() -> None:
 
 def ut4() -> None:
     """Frozen flow and the ERIS spectrum of UT4, its lines alone and with its floor."""
-    runs = [errors({}, None, preset) for preset in ("ut4", "ut4-floor")]
+    names = dict.fromkeys((*TURBULENCE, *PRINTED, "kf-multi", "ridge-30", "zero"))
+    runs = [errors({}, tuple(names), preset) for preset in ("ut4", "ut4-floor")]
     for target, names in (("turbulence", (*TURBULENCE, "kf-multi")),
                           ("vibration", (*PRINTED, "multirate-optimal", "kf-multi", "ridge-30"))):
         rows = [(OBSERVERS[name].label if name in OBSERVERS else "Truth", *(

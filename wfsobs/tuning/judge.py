@@ -12,7 +12,7 @@ from wfsobs.observers.base import TARGETS, VIBRATION, Estimate
 from wfsobs.pipeline import Failure, each_estimate
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.scores import PREDICTION, score, unsupervised_scores
+from wfsobs.scores import PREDICTION, supervised_scores, unsupervised_scores
 from wfsobs.settings import SettingError
 from wfsobs.watch import Watch
 
@@ -52,7 +52,7 @@ class Judge:
         if self.target == PREDICTION:
             scores = [s for s in unsupervised_scores(record, estimates, warm_up, names) if s.observer == self.observer]
         else:
-            scores = [s for e in estimates if e.target == self.target for s in score(record, e, warm_up, names)]
+            scores = supervised_scores(record, [e for e in estimates if e.target == self.target], warm_up, names)
         modes = {s.mode: s.rms for s in scores}
         if len(modes) < len(names) or not all(map(isfinite, modes.values())):
             raise RecordError(f"{self.observer} has nothing to be scored after {warm_up:g} s")
