@@ -13,6 +13,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.tuning import Evaluation, Stage, Tuned, tune
 from wfsobs.tuning.judge import Errors
+from wfsobs.tuning.records import MEASURES, TRUTH, judged_by
 from wfsobs.tuning.report import settings
 from wfsobs.tuning.space import TUNABLE
 from wfsobs.watch import Watch
@@ -37,6 +38,11 @@ def seconds(of: Shown, scenario: Scenario, observer: str, evaluations: int) -> f
     record, share = of.result.record, 0.5 if of.recorded else 1.0
     simulation = 0.0 if of.recorded else 3.0 * part_seconds(scenario)["rest"]
     return (evaluations + 2) * each * share * record.n_steps * record.n_modes + simulation
+
+
+def measure(of: Shown, observer: str, target: str) -> str:
+    """What a tuning makes small, in words. Raises RecordError where a record that was loaded has nothing to judge by."""
+    return MEASURES[judged_by(of.result.record, observer, target)[1] if of.recorded else TRUTH]
 
 
 def compute(

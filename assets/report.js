@@ -227,13 +227,18 @@ function cards(target) {
 
 function card(target, name) {
   const look = data.looks[name]
-  const row = rowOf(shown.state, target, name)
-  const value = row && (name === "truth" ? row.truth_rms_um : row.rms_um)
-  const relative = row && row.normalised_rms !== null ? `${row.normalised_rms.toFixed(2)} × truth${own(row)}` : ""
+  const known = rowOf(shown.state, target, name)
+  const drawn = `signal/${target}/${name}/${shown.mode}` in data.states[shown.state].lines
+  const loop = name === "truth" && !known && rowOf(shown.state, "residual y", "loop")  // where there is no truth
+  const row = known || loop || (drawn && rowOf(shown.state, "next z", name))
+  const value = row && (name === "truth" && !loop ? row.truth_rms_um : row.rms_um)
+  const base = loop ? "z, residual" : known ? "truth" : "z, next z"
+  const relative = row && row.normalised_rms !== null ? `${row.normalised_rms.toFixed(2)} × ${base}${own(row)}` : ""
+  const missing = name === "truth" ? "" : drawn ? "no truth to compare" : "no result"
   return {
-    name, label: look.label, colour: look[dark ? "dark" : "light"], dash: look.dash,
+    name, label: loop ? "Recorded loop" : look.label, colour: loop ? "transparent" : look[dark ? "dark" : "light"], dash: look.dash,
     value: row ? number(value * data.states[shown.state].scale[shown.unit]) : "–",
-    unit: row ? data.units[shown.unit] : "", note: row ? (name === "truth" ? "rms" : relative) : name === "truth" ? "" : "no result",
+    unit: row ? data.units[shown.unit] : "", note: row ? (known && name === "truth" ? "rms" : relative) : missing,
   }
 }
 

@@ -14,19 +14,22 @@ from wfsobs.app.pages.parts import WIDE, Starter, box, html, legend, line, text
 from wfsobs.app.pages.tune_views import LEGEND, HistoryFigure, table_html, unit_for
 from wfsobs.app.run import RUNNING
 from wfsobs.app.store import Store
-from wfsobs.app.tune_work import CHOICES, MOST, best_so_far, compute, seconds
+from wfsobs.app.tune_work import CHOICES, MOST, best_so_far, compute, measure, seconds
 from wfsobs.configfile import changes
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION
+from wfsobs.record import RecordError
 from wfsobs.settings import SettingError
 from wfsobs.tuning import Evaluation, Tuned
+from wfsobs.tuning.records import MEASURES, TRUTH
 from wfsobs.tuning.space import TUNABLE
 from wfsobs.tuning.tuning import EVALUATIONS
 
 INTRO = (
     "Searches the settings of one observer for the least RMS error on a validation record, which is neither the training nor the "
     "test record, and scores the settings before and after on the test record, which the search never sees. From settings the "
-    "records are simulated; a loaded record is cut into pieces. “Use it” takes the tuned settings into the drawer.")
+    "records are simulated; a loaded record is cut into pieces, and without truth the least is sought of the one-step prediction "
+    "error of z, or of the distance to a Butterworth reference. “Use it” takes the tuned settings into the drawer.")
 EARLIER = "The settings of the drawer have changed since: this was tuned for others."
 START = "gpr-online"
 
@@ -43,6 +46,7 @@ class TunePage:
         self.target = pmui.Select(label="Error of", options=[], size="small", width=130, margin=0)
         self.evaluations = pmui.TextInput(label="Evaluations", value=str(EVALUATIONS), size="small", width=110, margin=0)
         self.figure = HistoryFigure()
+        self.measure = MEASURES[TRUTH]
         self.searched, self.legend, self.table = html(), html(), html()
         self.history = box("History", self.legend, pn.pane.Bokeh(self.figure.figure, **WIDE))
         self.outcome = box("Before and after", self.table)
@@ -78,7 +82,8 @@ class TunePage:
         try:
             evaluations = _whole(self.evaluations, MOST)
             self.store.limits.check_seconds(seconds(of, scenario, observer, evaluations), "tuning")
-        except SettingError as error:
+            self.measure = measure(of, observer, target)
+        except (SettingError, RecordError) as error:
             self.work.refuse(str(error))
         else:
             self.work.start(lambda watch, tell: compute(of, scenario, observer, target, evaluations, watch, tell))
@@ -127,7 +132,7 @@ class TunePage:
         tuned, (unit, diameter) = self._tuned(), self._scale()
         with pn.io.hold():
             self.legend.object = legend(LEGEND, self.display.dark)
-            self.figure.draw(self._history(), unit, diameter)
+            self.figure.draw(self._history(), self.measure, unit, diameter)
             self.figure.restyle(self.display.dark)
             self.history.visible, self.outcome.visible = bool(self._history()), tuned is not None
             if tuned is not None:

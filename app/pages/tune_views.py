@@ -15,19 +15,23 @@ from wfsobs.app.views.plots import new_figure
 from wfsobs.app.views.table import change
 from wfsobs.modes import TIP_TILT
 from wfsobs.tuning import Evaluation, Tuned
+from wfsobs.tuning.records import MEASURES, NEXT, REFERENCE, TRUTH
 from wfsobs.tuning.report import remarks
 
 TITLES = {
-    SETTING: "Settings", VALIDATION: "RMS error on the validation record, which the search sees [{unit}]",
-    TEST: "RMS error on the test record, which it does not [{unit}]",
+    SETTING: "Settings", VALIDATION: "{measure} on the validation record, which the search sees [{unit}]",
+    TEST: "{measure} on the test record, which it does not [{unit}]",
     OTHER: "The same of what it was not tuned for, turbulence or vibration [{unit}]",
     LIKELIHOOD: "Log marginal likelihood of the training targets, for information",
 }
-LEGEND = {"tried": "error of what was tried", "fitted": "least so far"}
+LEGEND = {"tried": "what was tried", "fitted": "least so far"}
+
+AXES = {MEASURES[TRUTH]: "rms error", MEASURES[NEXT]: "prediction error", MEASURES[REFERENCE]: "rms distance"}
+"""What a tuning makes small, short enough for an axis."""
 
 
 class HistoryFigure:
-    """The error on the validation record of every evaluation, and the least so far."""
+    """The error, or what takes its place, on the validation record of every evaluation, and the least so far."""
 
     def __init__(self) -> None:
         self.figure = new_figure(x_range=DataRange1d(range_padding=0.02), y_range=DataRange1d())
@@ -37,14 +41,14 @@ class HistoryFigure:
         self._tried = self.figure.scatter("x", "tried", source=self.source, size=6, fill_alpha=0.7)
         self._best = self.figure.step("x", "best", source=self.source, mode="after", line_width=2.0)
 
-    def draw(self, history: Sequence[Evaluation], unit: str, diameter: float) -> None:
+    def draw(self, history: Sequence[Evaluation], measure: str, unit: str, diameter: float) -> None:
         """Send the evaluations so far; what failed has no point."""
         scale = per_micrometre(unit, diameter)
         tried, best = (scale * np.array(y, dtype=float) for y in ([e.rms for e in history], best_so_far(history)))
         self.source.data = {
             "x": np.arange(1, len(history) + 1), "tried": np.where(np.isfinite(tried), tried, np.nan),
             "best": np.where(np.isfinite(best), best, np.nan)}
-        self.figure.yaxis.axis_label = f"rms error, validation [{UNITS[unit]}]"
+        self.figure.yaxis.axis_label = f"{AXES[measure]}, validation [{UNITS[unit]}]"
 
     def restyle(self, dark: bool) -> None:
         """The colours of the mode."""
@@ -66,7 +70,7 @@ def table_html(tuned: Tuned, display: Display, diameter: float) -> str:
     scale, body, last = per_micrometre(unit, diameter), "", ""
     for section, name, before, after in rows(tuned):
         if section != last:
-            title = TITLES[section].format(unit=UNITS[unit])
+            title = TITLES[section].format(measure=tuned.measure, unit=UNITS[unit])
             body += f'<tr><th colspan=4 class="target" scope=rowgroup>{escape(title)}</th></tr>'
             last = section
         error = section in (VALIDATION, TEST, OTHER)

@@ -8,6 +8,7 @@ from itertools import groupby
 
 from wfsobs.app.display import NOTHING, number, per_micrometre
 from wfsobs.app.report.data import State
+from wfsobs.scores import RESIDUAL
 from wfsobs.tables import TIME, Row, competes, label_of, looks_ahead, own_stretch, stretch_of
 
 COLUMNS = {
@@ -22,12 +23,17 @@ COLUMNS = {
 }
 """Heading -> explanation."""
 
+WITHOUT_TRUTH = {name.replace("truth", "z"): why for name, why in COLUMNS.items()} | {
+    'RMS error [<span class="unit">nm</span>]': "of z one step ahead, on samples that all have, or what the loop left"}
+"""The same where there is no truth."""
+
 BEST, ABOVE = '<span class="tag best">best</span> ', '<span class="tag above">above truth</span> '
 
 
 def state_table(state: State, name: str) -> str:
     """Every score of a state of some name, one body per target and mode, best first, and what is missing."""
-    head = "".join(f'<th scope=col title="{why}">{name}</th>' for name, why in COLUMNS.items())
+    columns = WITHOUT_TRUTH if any(row["target"] == RESIDUAL for row in state.rows) else COLUMNS
+    head = "".join(f'<th scope=col title="{why}">{name}</th>' for name, why in columns.items())
     groups = [list(rows) for _, rows in groupby(sorted(state.rows, key=_order(state.rows)), _group)]
     bodies = "".join(_body(state, rows) for rows in groups)
     why = "".join(f'<p class="failure">{escape(reason)}</p>' for reason in state.reasons)

@@ -15,7 +15,7 @@ from wfsobs.app.report.data import Report, State, window_of
 from wfsobs.bench.measure import machine
 from wfsobs.configfile import changes, pristine, to_toml, written
 from wfsobs.scenario import Scenario
-from wfsobs.scores import BOUND
+from wfsobs.scores import BOUND, RESIDUAL
 
 LONGEST = 8000
 """Characters of a command line; settings that need more go by file."""
@@ -101,8 +101,12 @@ def meaning_section(report: Report) -> str:
     base = report.base
     points = [
         f"<b>RMS error</b>: root mean square of estimate minus truth, after a warm-up of {base.run.warm_up:g} s, over the steps "
-        "for which the observer gives an estimate; the GPR give none before their windows are full. One record of one seed: "
-        "another seed gives other numbers (<code>wfsobs run --seeds 20</code> shows how much).",
+        "for which every observer of the target and mode gives an estimate; a row with a stretch beside its name has "
+        "its own, and is not compared with the others. One record of one seed: another "
+        "seed gives other numbers (<code>wfsobs run --seeds 20</code> shows how much).",
+        "<b>No truth</b>: in place of the error of an estimate there is that of its prediction of the next measurement z, noise "
+        "included, of whoever estimates both turbulence and vibration; and the residual, what the recorded loop left of z. "
+        "Both are divided by the rms of z." if _truthless(report) else "",
         "<b>error / truth</b> (normalised error): that error over the rms of the truth in the same steps. At 1 an observer does "
         "no better than answering zero, which is the row <b>Zero</b>, a baseline and not an observer; above 1 it does harm.",
         "<b>Looks ahead</b>: the open-loop Butterworth runs forward and backward over measurements with the mirror at rest. It "
@@ -121,6 +125,10 @@ def meaning_section(report: Report) -> str:
         points.append("Variations of the same seed and length share their random numbers, so that differences come from the "
                       "settings and not from chance.")
     return f"<ul>{''.join(f'<li>{point}</li>' for point in points if point)}</ul>"
+
+
+def _truthless(report: Report) -> bool:
+    return any(row["target"] == RESIDUAL for state in report.states for row in state.rows)
 
 
 def _bounded(report: Report) -> bool:

@@ -1,4 +1,4 @@
-"""The strip above a target's figures: a card per observer with its RMS error, which is the legend as well."""
+"""The strip above a target's figures: a card per observer with its number, which is the legend as well."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from wfsobs.app.run import RUNNING, Run
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, Shown
-from wfsobs.tables import own_stretch, rows
+from wfsobs.scores import LOOP, PREDICTION, RESIDUAL, Score
+from wfsobs.tables import NOT_OBSERVERS, own_stretch, rows
 
 
 class Cards(JSComponent):
@@ -47,19 +48,32 @@ class Strip:
         score = find(shown, name, self.target, self.display.mode) if shown else None
         if shown is None or score is None:
             if shown is not None and shown.result.estimate(name, self.target) is not None:
-                return self._card(name, None, "no truth to compare")
+                return self._without_truth(name, shown)
             waiting = self.run.state == RUNNING
             return self._card(name, None, "computing …" if waiting else "no result")
-        relative = f"{score.normalised_rms:.2f} × truth" if score.normalised_rms is not None else ""
+        return self._scored(name, score, shown, "truth")
+
+    def _scored(self, name: str, score: Score, shown: Shown, base: str) -> dict[str, Any]:
+        relative = f"{score.normalised_rms:.2f} × {base}" if score.normalised_rms is not None else ""
         own = own_stretch(rows([score], None)[0])
         return self._card(name, self._scaled(score.rms, shown), ", ".join(filter(None, [relative, own])))
+
+    def _without_truth(self, name: str, shown: Shown) -> dict[str, Any]:
+        """How well the next measurement is predicted, by whoever says what it will be."""
+        score = find(shown, name, PREDICTION, self.display.mode)
+        return self._scored(name, score, shown, "z, next z") if score else self._card(name, None, "no truth to compare")
 
     def _truth(self, shown: Shown | None) -> dict[str, Any]:
         of = (self.target, self.display.mode)
         scores = [s for s in shown.result.scores if (s.target, s.mode) == of and not s.apart] if shown else []
         if shown is None or not scores:
-            return self._card(TRUTH, None, "")
+            left = find(shown, LOOP, RESIDUAL, self.display.mode) if shown else None
+            return self._loop(left, shown) if shown and left else self._card(TRUTH, None, "")
         return self._card(TRUTH, self._scaled(scores[0].truth_rms, shown), "rms")
+
+    def _loop(self, left: Score, shown: Shown) -> dict[str, Any]:
+        """What the recorded loop left, in the place of the truth, which has no line either."""
+        return self._scored(TRUTH, left, shown, "z, residual") | {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
 
     def _scaled(self, value: float, shown: Shown) -> float:
         return value * per_micrometre(self.display.unit, shown.scenario.telescope.diameter)

@@ -80,15 +80,16 @@ class Table:
         scores = self._without_truth()
         if self.display.best_first:
             scores.sort(key=lambda s: (s.target == RESIDUAL, s.apart, s.rms))
-        shown, pinned = self.run.shown, [NOTHING] * (2 if self.display.pinned else 0)
-        out = []
+        best = min((s.rms for s in scores if competes(s.observer, s.apart)), default=None)
+        shown, out = self.run.shown, []
         for score in scores:
             assert shown is not None
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             loop = score.observer == LOOP
-            cells = [number(score.rms * scale), *pinned, number(score.truth_rms * scale), number(score.normalised_rms),
-                     needs_of(score.observer), NOTHING,
-                     *_times(score, shown.result.record.dt)]
+            is_best = score.rms == best and competes(score.observer, score.apart)
+            cells = [(BEST if is_best else "") + number(score.rms * scale),
+                     *self._pinned(score.observer, score.target, score), number(score.truth_rms * scale),
+                     number(score.normalised_rms), needs_of(score.observer), NOTHING, *_times(score, shown.result.record.dt)]
             label = "Recorded loop, residual" if loop else (
                 f"{swatch(score.observer, self.display.dark)}{escape(label_of(score.observer))}{_own(score)}")
             values = "".join(f"<td>{c}</td>" for c in cells)

@@ -109,6 +109,8 @@ def test_a_loaded_record_is_cut(page: TunePage, dashboard: Dashboard, loop: Any,
     dashboard.store.load(dashboard.store.scenario.replace({"run.duration": 9.0}))
     loop.finish(dashboard.store)
     found = tuned(page, loop)
+    assert "RMS one-step prediction error of z on the validation record" in page.table.object
+    assert page.figure.figure.yaxis.axis_label == "prediction error, validation [nm]" and "RMS error" not in page.table.object
     assert found.target == "next z" and found.history == tune(dashboard.store.scenario, "kf-lgs", None, 8, record=record).history
 
 

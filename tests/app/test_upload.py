@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -12,8 +13,10 @@ import pytest
 
 from wfsobs.app import picker as module
 from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.display import number
 from wfsobs.app.limits import Limits
 from wfsobs.app.picker import LARGEST
+from wfsobs.app.pin import pin
 from wfsobs.app.service import Service
 from wfsobs.app.upload import SILENT
 from wfsobs.formats import format_of
@@ -66,8 +69,18 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     spectrum = dashboard.explore.spectra.spectra["vibration"].sources["kf-lgs"].data
     assert len(spectrum["y"]) and np.isfinite(spectrum["y"]).all()
     assert dashboard.explore.spectra.spectra["vibration"].peaks.data["x"] == []  # of the settings, not of the record
-    notes = {card["name"]: card["note"] for card in dashboard.explore.strips["vibration"].items()}
-    assert notes["kf-lgs"] == "no truth to compare" and notes["butterworth-ol"] in ("no result", "no truth to compare")
+    cards = dashboard.explore.strips["vibration"].items()
+    notes, values = ({card["name"]: card[key] for card in cards} for key in ("note", "value"))
+    found = {s.observer: number(1e3 * s.rms) for s in expected.scores if s.mode == "tip"}
+    assert cards[0]["label"] == "Recorded loop" and notes["truth"].endswith("× z, residual") and values["truth"] == found["loop"]
+    assert values["kf-lgs"] == found["kf-lgs"] and values["gpr-online"] == "–"
+    dashboard.display.pinned = pin(shown)
+    pinned = dashboard.explore.table.html()
+    rows = re.findall(r"<tr data-observer.*?</tr>", pinned)
+    assert len(rows) == len(found) and all("<td>+0.0</td>" in row for row in rows)
+    assert pinned.count("tag best") == 1
+    assert re.fullmatch(r"\d\.\d\d × z, next z", notes["kf-lgs"]) and notes["gpr-online"] == "no truth to compare"
+    assert notes["butterworth-ol"] in ("no result", "no truth to compare")
     dashboard.display.show = "error"  # there is none, and nothing breaks
 
     dashboard.upload.handle({"action": "simulate"})

@@ -37,6 +37,10 @@ SHORTEST = 1.0
 TRUTH, NEXT, REFERENCE = "the truth", "the next measurement of the LGS", "the zero-phase Butterworth reference"
 """What an estimate is compared with."""
 
+MEASURES = {TRUTH: "RMS error", NEXT: "RMS one-step prediction error of z",
+            REFERENCE: "RMS distance to the zero-phase Butterworth reference"}
+"""What the numbers of a tuning are, by what an estimate is compared with."""
+
 LENGTHS = ("gpr_offline.training_size", "gpr_offline.depth")
 """Settings of which a training record is longer."""
 
@@ -81,20 +85,25 @@ def simulated(scenario: Scenario, space: Space, target: str, duration: float | N
     return Records(replace(validation, training=record_of(largest).training), record_of, target)
 
 
-def cut(record: Record, scenario: Scenario, observer: str, target: str) -> Records:
-    """The pieces of telemetry, and what stands for the truth where the record has none of the target.
+def judged_by(record: Record, observer: str, target: str) -> tuple[str, str]:
+    """What the errors on a record are those of, and what stands for the truth where the record has none of the target.
 
     An observer of turbulence and vibration together is judged by its prediction of the next z of the LGS, which has all their
     errors; one of vibration alone by the zero-phase Butterworth reference of the piece. Raises RecordError for one that knows
-    better than the LGS, for one of turbulence alone, and where the record is too short.
+    better than the LGS, and for one of turbulence alone.
     """
-    against = TRUTH
-    if record.truth(target) is None:
-        of_both, against = set(OBSERVERS[observer].targets) == set(TARGETS), REFERENCE
-        if "y_ngs" in OBSERVERS[observer].needs or not (of_both or target == VIBRATION):
-            raise RecordError(f"{observer}: nothing to judge it by in a record without the truth")
-        if of_both:
-            target, against = PREDICTION, NEXT
+    if record.truth(target) is not None:
+        return target, TRUTH
+    of_both = set(OBSERVERS[observer].targets) == set(TARGETS)
+    if "y_ngs" in OBSERVERS[observer].needs or not (of_both or target == VIBRATION):
+        raise RecordError(f"{observer}: nothing to judge it by in a record without the truth")
+    return (PREDICTION, NEXT) if of_both else (target, REFERENCE)
+
+
+def cut(record: Record, scenario: Scenario, observer: str, target: str) -> Records:
+    """The pieces of telemetry, and what they are judged by. Raises RecordError where there is nothing to judge by, and where the
+    record is too short."""
+    target, against = judged_by(record, observer, target)
     g = getattr(scenario, observer.replace("-", "_"), None)
     learns = "training" in OBSERVERS[observer].needs or getattr(g, "inputs_filter", "") == "standardised"
     cuts = _cuts(record, scenario, learns and record.training is None)

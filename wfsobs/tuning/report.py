@@ -9,6 +9,7 @@ from rich.table import Table
 
 from wfsobs.configfile import annotated, changes, to_toml
 from wfsobs.scenario import Scenario
+from wfsobs.scores import PREDICTION
 from wfsobs.tables import label_of
 from wfsobs.tuning.judge import Errors
 from wfsobs.tuning.records import TRUTH
@@ -72,8 +73,8 @@ def _shown(value: Any) -> str:
 
 
 def errors_table(tuned: Tuned) -> Table:
-    """Errors on validation and test record, mode by mode and together, and the log marginal likelihoods."""
-    out = Table(title=f"RMS error in {tuned.target}, nm")
+    """Errors, or what takes their place, on validation and test record, mode by mode and together."""
+    out = Table(title=f"{tuned.measure}{'' if tuned.target == PREDICTION else f' in {tuned.target}'}, nm")
     out.add_column("", no_wrap=True)
     for name in ("validation, before", "after", "test, before", "after"):
         out.add_column(name, justify="right", no_wrap=True)
@@ -113,8 +114,8 @@ def toml(tuned: Tuned) -> str:
     notes = {path: f"{'tuned' if path in tuned.paths else 'with it'}, {_before(tuned, path)} before"
              for path in changes(tuned.scenario, base)}
     head = [f"{label_of(tuned.observer)} tuned for {tuned.target}, against {tuned.against}, in {len(tuned.history)} evaluations.",
-            *(f"{name} rms error: {_of(before)} before, {_of(after)} after" for name, before, after in (
-                ("Validation", tuned.before.validation, tuned.after.validation), ("Test", tuned.before.test, tuned.after.test)))]
+            *(f"{tuned.measure}, {name}: {_of(before)} before, {_of(after)} after" for name, before, after in (
+                ("validation", tuned.before.validation, tuned.after.validation), ("test", tuned.before.test, tuned.after.test)))]
     return "\n".join(f"# {line}" for line in head) + "\n\n" + annotated(to_toml(tuned.scenario), notes)
 
 

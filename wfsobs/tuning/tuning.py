@@ -16,7 +16,7 @@ from wfsobs.scores import PREDICTION
 from wfsobs.settings import SettingError
 from wfsobs.tuning.judge import Errors, Judge, target_of
 from wfsobs.tuning.likelihood import likelihood
-from wfsobs.tuning.records import DESIGN, Records, cut, simulated, stream
+from wfsobs.tuning.records import DESIGN, MEASURES, Records, cut, simulated, stream
 from wfsobs.tuning.search import Spent, search
 from wfsobs.tuning.space import Space, space
 from wfsobs.watch import QUIET, Watch
@@ -85,6 +85,11 @@ class Tuned:
     def scenario(self) -> Scenario:
         """The scenario with the tuned settings: the one before where nothing was better."""
         return self.after.scenario
+
+    @property
+    def measure(self) -> str:
+        """What the numbers are, in words."""
+        return MEASURES[self.against]
 
     @property
     def best(self) -> Evaluation:
