@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import reduce
@@ -20,7 +19,7 @@ import param
 
 from wfsobs import configfile
 from wfsobs.app.controls.fields import parsed
-from wfsobs.configfile import from_toml, pristine, to_toml
+from wfsobs.configfile import from_toml, parse_toml, pristine, to_toml
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError, holds_groups, settings_of
@@ -208,10 +207,8 @@ def from_file(text: str) -> Link:
     """The settings of a TOML file; preset "" where it names none. Raises SettingError with one line."""
     try:
         scenario = from_toml(text, where="file")
-        preset = tomllib.loads(text).get("preset", "")
+        preset = parse_toml(text).get("preset", "")
         scenario.validate()
     except SettingError as error:
         raise SettingError(str(error).partition("\n")[0]) from None
-    except (ValueError, RecursionError):
-        raise SettingError("file: not TOML that can be read") from None
     return Link(scenario, preset)

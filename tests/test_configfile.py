@@ -9,6 +9,7 @@ from wfsobs.groups.vibration import Peak
 from wfsobs.presets import PRESETS, paper
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
+from wfsobs.variations import parse_variation
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -60,6 +61,42 @@ def test_bad_files_give_one_line(text, message):
     with pytest.raises(SettingError, match=message) as caught:
         configfile.from_toml(text, where="f.toml")
     assert "\n" not in str(caught.value)
+
+
+DEEP = 100_000  # far more than any interpreter's stack
+
+
+@pytest.mark.parametrize("value", ["[" * DEEP + "]" * DEEP, "{a = " * 3000 + "1" + "}" * 3000, "[" * 20 + "]" * 20])
+def test_what_is_nested_deep_is_refused_in_one_line(tmp_path, value):
+    """By every reader: a file, the preset that it names, an assignment, a variation."""
+    file = tmp_path / "deep.toml"
+    file.write_text(f"butterworth.frequencies = {value}")
+    for where, read in {
+        f"{file}: ": lambda: configfile.scenario_from(None, file, ()),
+        f"{file}:  ": lambda: configfile.preset_name(None, file),
+        "--set butterworth.frequencies: ": lambda: configfile.parse_assignment(f"butterworth.frequencies={value}"),
+        "--vary butterworth.frequencies: ": lambda: parse_variation(f"butterworth.frequencies={value}"),
+    }.items():
+        with pytest.raises(SettingError) as caught:
+            read()
+        assert str(caught.value) == f"{where.rstrip()} tables or lists nested more than 8 deep"
+
+
+@pytest.mark.parametrize("text", [
+    f"butterworth.frequencies = [{'9' * 5000}]", f"turbulence.wind_speed.{'a.' * DEEP}a = 1", f"{'a . ' * DEEP}a = 1",
+    "[" + '"a".' * DEEP + "a]\nb = 1", f"a = {{{'1.' * DEEP}a = 1}}", f"a = {'b' * DEEP}"])
+def test_other_monsters_are_refused_in_one_line(text):
+    with pytest.raises(SettingError, match=r"^TOML: .{10,200}$"):
+        configfile.from_toml(text)
+
+
+def test_a_value_nested_deep_is_no_setting():
+    value = 1.0
+    for _ in range(DEEP):
+        value = [value]
+    for path in ("turbulence.wind_speed", "butterworth.frequencies", "vibration.source", "vibration.peaks"):
+        with pytest.raises(SettingError, match=rf"^{path}(\.0)? = \[.{{1,100}}: takes "):
+            Scenario().replace({path: value})
 
 
 def test_unreadable_files_give_one_line(tmp_path):

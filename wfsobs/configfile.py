@@ -18,6 +18,40 @@ from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 
 
+DEEPEST = 8
+"""Tables and lists inside one another that a text may have; settings have four."""
+
+LONG_NAME = re.compile(rf"(?<![\w\"'-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){{{DEEPEST + 1}}}")
+"""Refused before it is parsed, which takes the cube of its length."""
+
+
+class NotToml(SettingError):
+    """A text that is not TOML."""
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The tables of a TOML text, from a file, a command line or a link.
+
+    Raises NotToml, and SettingError where values are nested more than DEEPEST deep.
+    """
+    too_deep = SettingError(f"tables or lists nested more than {DEEPEST} deep")
+    if LONG_NAME.search(text):
+        raise too_deep
+    try:
+        values = tomllib.loads(text)
+    except RecursionError:
+        raise too_deep from None
+    except ValueError as error:  # TOMLDecodeError, and whole numbers of thousands of digits
+        raise NotToml(f"not TOML: {error}") from None
+    level: list[Any] = [values]
+    for _ in range(DEEPEST + 1):  # level by level: a recursion would end where the parser's did
+        level = [child for node in level if isinstance(node, (dict, list))
+                 for child in (node.values() if isinstance(node, dict) else node)]
+    if level:
+        raise too_deep
+    return values
+
+
 def to_toml(scenario: Scenario) -> str:
     """Every setting as TOML, peaks as [[vibration.peaks]] tables; `from_toml` gives back the very same scenario."""
     return tomli_w.dumps(scenario.to_dict())
@@ -45,10 +79,7 @@ def from_toml(text: str, base: Scenario | None = None, where: str = "TOML") -> S
     whole. Raises SettingError, its line starting with `where`.
     """
     try:
-        values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise SettingError(f"{where}: not TOML: {error}") from None
-    try:
+        values = parse_toml(text)
         name = values.pop("preset", None)
         scenario = base.copy() if base is not None else preset(name) if name is not None else Scenario()
         scenario.update(values)
@@ -91,7 +122,10 @@ def preset_name(chosen: str | None, config: str | Path | None, default: str = "p
     """The preset that the arguments of `scenario_from` start from. Raises SettingError where the file cannot be read."""
     if chosen is not None or config is None:
         return chosen or default
-    return tomllib.loads(_text(config)).get("preset", default)
+    try:
+        return parse_toml(_text(config)).get("preset", default)
+    except SettingError as error:
+        raise SettingError(f"{config}: {error}") from None
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:
@@ -106,9 +140,11 @@ def parse_assignment(text: str) -> tuple[str, Any]:
     if not equals or not path.strip():
         raise SettingError(f"--set {text}: takes name=value, such as turbulence.wind_speed=20")
     try:
-        parsed = tomllib.loads(f"value = {value.strip()}")
-    except tomllib.TOMLDecodeError:
+        parsed = parse_toml(f"value = {value.strip()}")
+    except NotToml:
         return path.strip(), value.strip()
+    except SettingError as error:
+        raise SettingError(f"--set {path.strip()}: {error}") from None
     return path.strip(), parsed["value"] if set(parsed) == {"value"} else value.strip()
 
 

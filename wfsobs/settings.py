@@ -6,6 +6,7 @@ files and shareable links all go through the functions here.
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Iterator, Mapping
 from typing import Any, Self, TypeVar, cast
 
@@ -100,7 +101,7 @@ class Group(param.Parameterized):
         current = getattr(self, name)
         if isinstance(current, Group) and not isinstance(value, Group):
             if not isinstance(value, Mapping):
-                raise SettingError(f"{path} = {value!r}: this is a group of settings, not a value")
+                raise SettingError(f"{path} = {_short(value)}: this is a group of settings, not a value")
             current.update(value, f"{path}.")
             return
         if isinstance(p, param.List) and holds_groups(p):
@@ -109,7 +110,7 @@ class Group(param.Parameterized):
             value = value.copy()
         try:
             setattr(self, name, value)
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, RecursionError) as error:  # the last of param's words for a value nested very deep
             raise SettingError(f"{path} = {_short(value)}: {allowed(p)}") from error
 
     def difference(self, base: Group) -> Plain:
@@ -249,6 +250,11 @@ def _put(node: Any, keys: list[str], value: Any, path: str) -> bool:
     return grown
 
 
+_WORDS = reprlib.Repr()  # stops at a depth, where `repr` would end in a RecursionError
+_WORDS.maxlist = _WORDS.maxtuple = _WORDS.maxdict = 40
+_WORDS.maxstring = _WORDS.maxother = _WORDS.maxlong = 400
+
+
 def _short(value: Any) -> str:
-    text = repr(value)
+    text = _WORDS.repr(value)
     return text if len(text) <= 80 else text[:77] + "..."

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import prod
 from typing import Any
 
-from wfsobs.configfile import written
+from wfsobs.configfile import NotToml, parse_toml, written
 from wfsobs.scenario import Scenario
 from wfsobs.settings import Plain, SettingError
 
@@ -43,9 +42,11 @@ def parse_variation(text: str) -> Variation:
     if not (path and equals and listed):
         raise SettingError(f"--vary {text}: takes name=value,value, such as turbulence.wind_speed=5,10,15")
     try:
-        parsed = tomllib.loads(f"values = [{listed}]")
-    except tomllib.TOMLDecodeError:
+        parsed = parse_toml(f"values = [{listed}]")
+    except NotToml:
         parsed = {}
+    except SettingError as error:
+        raise SettingError(f"--vary {path}: {error}") from None
     values = parsed["values"] if set(parsed) == {"values"} else [_word(part.strip()) for part in listed.split(",")]
     for i, value in enumerate(values):
         if value in values[:i]:
@@ -86,8 +87,8 @@ def _check_number(variations: Sequence[Variation]) -> None:
 def _word(text: str) -> Any:
     """One value in TOML's syntax, or the bare word."""
     try:
-        parsed = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+        parsed = parse_toml(f"value = {text}")
+    except NotToml:
         return text
     return parsed["value"] if set(parsed) == {"value"} else text
 

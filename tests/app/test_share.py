@@ -183,7 +183,7 @@ def test_settings_from_an_identification_are_written_in_plain_numbers(capsys: py
 
 @pytest.mark.parametrize(("text", "reason"), [
     ("a =", "not TOML"), ("loop.gain = 9", "loop.gain = 9"), ("nonsense = 1", "no such setting"),
-    ("run.warm_up = 20", "run.warm_up = 20"), (f"run.seed = {'9' * 5000}", "not TOML"), (f"a = {'[' * 5000}", "not TOML"),
+    ("run.warm_up = 20", "run.warm_up = 20"), (f"run.seed = {'9' * 5000}", "not TOML"), (f"a = {'[' * 5000}", "nested more than 8 deep"),
     ("preset = [1]", "preset = [1]"), ('preset = "../x"', "preset = '../x'"), ("\0", "not TOML"),
 ])
 def test_a_bad_file_says_why_in_one_line(text: str, reason: str) -> None:
@@ -195,3 +195,10 @@ def test_a_bad_file_says_why_in_one_line(text: str, reason: str) -> None:
 def test_a_file_without_a_preset_leaves_that_open() -> None:
     link = from_file("loop.gain = 0.2")
     assert link.preset == "" and link.scenario == Scenario().replace({"loop.gain": 0.2})
+
+
+@pytest.mark.parametrize("path", ["turbulence.wind_speed", "vibration.peaks", "butterworth.frequencies", "vibration"])
+def test_a_name_of_a_thousand_parts_is_a_line(path: str) -> None:
+    link = from_query(f"?{path}{'.a' * 3000}=1&turbulence.wind_speed=20")
+    assert len(link.rejected) == 1 and link.rejected[0].startswith(path) and len(link.rejected[0]) <= 200
+    assert link.scenario == PRESETS["paper"]().replace({"turbulence.wind_speed": 20.0})
