@@ -35,7 +35,7 @@ def scenario(request: pytest.FixtureRequest) -> Scenario:
 
 @pytest.fixture(scope="module")
 def told(scenario: Scenario) -> Description:
-    return describe(scenario)
+    return describe(scenario, 0)
 
 
 def follows(values: Array, poles: Array) -> bool:
@@ -79,7 +79,7 @@ def test_matrices_are_those_of_the_processes(scenario: Scenario, told: Descripti
 
 
 def test_gpr() -> None:
-    told = describe(Scenario())
+    told = describe(Scenario(), 0)
     assert told.gprs["gpr-offline"].ridge == pytest.approx(15.21)
     assert told.gprs["gpr-online"].ridge == pytest.approx(1.0)
     assert told.gprs["gpr-offline"].window == pytest.approx(0.407)
@@ -89,7 +89,7 @@ def test_gpr() -> None:
 def test_an_unstable_cycle_says_why() -> None:
     s = PRESETS["paper"]().replace({
         "multirate.measurement_noise": "manual", "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001})
-    told = describe(s)
+    told = describe(s, 0)
     assert "unstable" in told.filters["multirate"].reason and told.filters["multirate"].radius is None
     assert told.filters["kf-lgs"].reason == "" and told.filters["multirate-optimal"].radius is not None
 

@@ -62,7 +62,7 @@ def test_the_kalman_filter_predicts_through_a_gap() -> None:
     estimates = {(e.observer, e.target): e.values for e in each_estimate(record, s, observers=["kf-lgs"])}
     for mode in range(2):
         model = kalman_model(s, mode, record.dt)
-        L = steady_state(model.A, model.C, model.Q, np.array(measurement_noise(s)[0] ** 2)).L[:, 0]
+        L = steady_state(model.A, model.C, model.Q, np.array(measurement_noise(s, mode)[0] ** 2)).L[:, 0]
         rows, x, want = model.output_rows(TARGETS), np.zeros(len(model.A)), []
         for z in record.z[:, mode]:
             if not np.isnan(z):

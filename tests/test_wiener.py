@@ -31,7 +31,7 @@ MATCHED = Scenario().replace({
 def riccati_errors(scenario: Scenario) -> tuple[dict[str, float], dict[str, float]]:
     """Target -> rms error of phi[k] and of phi[k + 1] given z[k], from the Riccati covariance of the true model."""
     model = kalman_model(scenario, 0, scenario.dt)
-    steady = steady_state(model.A, model.C, model.Q, np.array(measurement_noise(scenario)[0] ** 2))
+    steady = steady_state(model.A, model.C, model.Q, np.array(measurement_noise(scenario, 0)[0] ** 2))
     rows = model.outputs | {"total": sum(model.outputs.values())}
     filtered = {name: float(np.sqrt(row @ steady.filtered @ row)) for name, row in rows.items()}
     return filtered, {name: float(np.sqrt(row @ steady.P @ row)) for name, row in rows.items()}

@@ -17,7 +17,6 @@ from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 
-
 DEEPEST = 8
 """Tables and lists inside one another that a text may have; settings have four."""
 

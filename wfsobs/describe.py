@@ -78,7 +78,7 @@ class Description:
     sensors: dict[str, SensorFacts]
 
 
-def describe(scenario: Scenario, mode: int = 0) -> Description:
+def describe(scenario: Scenario, mode: int) -> Description:
     """The numbers of a scenario's observers for one mode; a filter that cannot be has its reason in place of numbers."""
     dt, ratio = scenario.dt, scenario.sensors.exposure_ratio
     turbulence, vibration = modelled_processes(scenario, mode, dt)

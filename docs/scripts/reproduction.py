@@ -147,7 +147,7 @@ def all_peaks() -> None:
             turbulence, _ = modelled_processes(scenario, mode, record.dt)
             peaks = [Ar2(2.0 * np.pi * p.frequency, p.damping, p.rms[mode], record.dt)
                      for p in scenario.vibration.peaks if p.rms[mode] > 0]
-            kalman, _ = steady_filter(disturbance_model([turbulence], peaks), measurement_noise(scenario)[0])
+            kalman, _ = steady_filter(disturbance_model([turbulence], peaks), measurement_noise(scenario, mode)[0])
             columns.append(kalman.run(record.z[:, None, mode, None])[:, :, 0])
         start = round(scenario.run.warm_up / record.dt)
         error = (by_target(columns)["vibration"] - record.vibration)[start:]

@@ -127,7 +127,7 @@ class TestFigures:
 class TestModel:
     def test_the_numbers_are_there(self, dashboard: Dashboard) -> None:
         page = opened(dashboard, MODEL)
-        told = describe(dashboard.store.scenario)
+        told = describe(dashboard.store.scenario, 0)
         text = words(page.pane.object)
         for number in (told.turbulence.a1, -told.turbulence.a2):
             assert mathml.short(number, 7) in text
@@ -141,18 +141,18 @@ class TestModel:
     def test_it_follows_settings_and_mode(self, dashboard: Dashboard) -> None:
         page = opened(dashboard, MODEL)
         dashboard.store.change("turbulence.wind_speed", 30)
-        assert mathml.short(describe(dashboard.store.scenario).turbulence.a1, 7) in words(page.pane.object)
+        assert mathml.short(describe(dashboard.store.scenario, 0).turbulence.a1, 7) in words(page.pane.object)
         dashboard.display.mode = "tilt"
         assert "mode tilt" in words(page.pane.object)
 
     def test_an_unstable_cycle_says_why(self) -> None:
         told = describe(Scenario().replace({
             "kalman.process_noise": "manual", "kalman.vibration_rms": 0.06, "multirate.measurement_noise": "manual",
-            "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001}))
+            "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001}), 0)
         assert "is unstable" in words(model.html(told, dark=False))
 
     def test_nothing_is_fetched(self) -> None:
-        html = model.html(describe(Scenario()), dark=True)
+        html = model.html(describe(Scenario(), 0), dark=True)
         assert "http" not in html and "src=" not in html
 
     @pytest.mark.parametrize(("x", "text"), [(0.5, "0.5"), (-1.0, "−1"), (0.0, "0"), (100.0, "100"), (2e-7, "2.0000e-07")])

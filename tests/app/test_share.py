@@ -183,7 +183,8 @@ def test_settings_from_an_identification_are_written_in_plain_numbers(capsys: py
 
 @pytest.mark.parametrize(("text", "reason"), [
     ("a =", "not TOML"), ("loop.gain = 9", "loop.gain = 9"), ("nonsense = 1", "no such setting"),
-    ("run.warm_up = 20", "run.warm_up = 20"), (f"run.seed = {'9' * 5000}", "not TOML"), (f"a = {'[' * 5000}", "nested more than 8 deep"),
+    ("run.warm_up = 20", "run.warm_up = 20"), (f"run.seed = {'9' * 5000}", "not TOML"),
+    (f"a = {'[' * 5000}", "nested more than 8 deep"),
     ("preset = [1]", "preset = [1]"), ('preset = "../x"', "preset = '../x'"), ("\0", "not TOML"),
 ])
 def test_a_bad_file_says_why_in_one_line(text: str, reason: str) -> None:

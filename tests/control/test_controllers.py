@@ -78,7 +78,7 @@ def test_the_two_frame_loop_leaves_what_theory_says() -> None:
 def test_lqg_leaves_what_its_covariance_predicts() -> None:
     """The Riccati covariance of the prediction, the closed loop's spectra and the simulation are the same number."""
     model = kalman_model(MATCHED, 0, MATCHED.dt)
-    steady = steady_state(model.A, model.C, model.Q, np.array(measurement_noise(MATCHED)[0] ** 2))
+    steady = steady_state(model.A, model.C, model.Q, np.array(measurement_noise(MATCHED, 0)[0] ** 2))
     row = np.sum(list(model.outputs.values()), axis=0)
     covariance = float(np.sqrt(row @ steady.P @ row))
     for delay in (1.0, 2.0, 3.0):
@@ -133,7 +133,7 @@ def test_lqg_in_a_simulated_loop_commands_the_same() -> None:
     A, B, C = paper_matrices(turbulence, vibration)
     Q = np.zeros((6, 6))
     Q[0, 0], Q[2, 2] = turbulence.drive_variance, vibration.drive_variance
-    L = steady_state(A[:4, :4], C[:4], Q[:4, :4], np.array(measurement_noise(MATCHED)[0] ** 2)).L[:, 0]
+    L = steady_state(A[:4, :4], C[:4], Q[:4, :4], np.array(measurement_noise(MATCHED, 0)[0] ** 2)).L[:, 0]
     z, x = 0.5 * np.random.default_rng(5).standard_normal(500), np.zeros(6)
 
     def law(_k: int, y: float, _u: Array) -> float:

@@ -197,7 +197,7 @@ def test_error_of_the_matched_filter_is_what_the_riccati_equation_says() -> None
         one = []
         for mode in range(2):
             model = kalman_model(s, mode, record.dt)
-            _, steady = steady_filter(model, measurement_noise(s)[0])
+            _, steady = steady_filter(model, measurement_noise(s, mode)[0])
             for target in ("turbulence", "vibration"):
                 truth = record.truth(target)
                 assert truth is not None
@@ -216,7 +216,7 @@ def test_innovations_of_the_matched_filter_are_white() -> None:
         "run": {"duration": 30.0}, "gpr_offline": {"training_size": 2, "depth": 1},
     })
     record = simulate(s)
-    model, noise = kalman_model(s, 0, record.dt), measurement_noise(s)[0]
+    model, noise = kalman_model(s, 0, record.dt), measurement_noise(s, 0)[0]
     kalman, steady = steady_filter(model, noise, np.eye(4))
     filtered = kalman.run(record.z[:, None, 0, None])[:, :, 0]
     innovation = (record.z[1:, 0] - filtered[:-1] @ model.A.T @ model.C)[1000:]
@@ -235,7 +235,7 @@ def test_model_floors() -> None:
     """A line of damping 0 and a sensor without noise still have a filter: 1e-4 and 1e-6 um."""
     s = scenario({"kalman.damping": 0.0, "sensors.lgs_noise": 0.0, "sensors.ngs_noise": 0.0})
     assert modelled_processes(s, 0, 1e-3)[1].damping == 1e-4
-    assert measurement_noise(s) == (1e-6, 1e-6)
+    assert measurement_noise(s, 0) == (1e-6, 1e-6)
     record = simulate(s)
     assert all(np.isfinite(v).all() for v in kf_lgs(record, s, QUIET).values())
     assert all(np.isfinite(v[5:]).all() for v in kf_ngs(record, s, QUIET).values())

@@ -73,7 +73,7 @@ def test_every_step_is_the_textbook_recursion(changes: dict[str, Any]) -> None:
     record = simulate(s)
     matched = (s.sensors.lgs_noise / np.sqrt(2), s.sensors.ngs_noise)
     noise = (0.03, 0.01) if "multirate.lgs_noise" in changes else matched
-    assert multirate_noise(s) == pytest.approx(noise)
+    assert multirate_noise(s, 0) == pytest.approx(noise)
     got = multirate(record, s, QUIET)
     assert list(got) == ["turbulence"] and got["turbulence"].shape == record.y_lgs.shape
     for mode in range(2):
@@ -83,7 +83,7 @@ def test_every_step_is_the_textbook_recursion(changes: dict[str, Any]) -> None:
 
 
 def test_the_paper_weighs_ngs_over_lgs() -> None:
-    lgs, ngs = multirate_noise(scenario())
+    lgs, ngs = multirate_noise(scenario(), 0)
     assert ngs < lgs
 
 
@@ -177,7 +177,7 @@ def test_the_optimal_filter_is_the_time_varying_one_once_that_has_settled(ratio:
     })
     record = simulate(s)
     got = multirate_optimal(record, s, QUIET)
-    wanted = time_varying(record, s, 0, *multirate_noise(s), with_error)
+    wanted = time_varying(record, s, 0, *multirate_noise(s, 0), with_error)
     for i, target in enumerate(("turbulence", "vibration")):
         # the start (covariance 0 instead of the steady one) is forgotten after 2.5 s of a loop with 20 ms memory and,
         # with the slow error, 0.1 s: exp(-25)
@@ -188,7 +188,7 @@ def test_the_optimal_filter_is_the_time_varying_one_once_that_has_settled(ratio:
 def test_with_a_frame_at_every_step_both_multirate_filters_are_the_two_sensor_filter() -> None:
     s = scenario({"sensors.exposure_ratio": 1, "multirate.model_lgs_error": False})
     record = simulate(s)
-    lgs, ngs = multirate_noise(s)
+    lgs, ngs = multirate_noise(s, 0)
     one, other = multirate(record, s, QUIET)["turbulence"], multirate_optimal(record, s, QUIET)["turbulence"]
     # step 0 has no frame; the two differ in the gain there, forgotten after 0.5 s
     assert np.abs(one - other)[500:].max() < 1e-8 * one.std()

@@ -110,7 +110,7 @@ def test_a_predicted_state_is_corrected_with_the_filter_gain(case: tuple[Scenari
     what is built; with K the error of turbulence grows."""
     s, record = case
     model = kalman_model(s, 0, record.dt)
-    lgs, ngs = multirate_noise(s)
+    lgs, ngs = multirate_noise(s, 0)
     C = np.vstack([model.C, model.C])
     one = steady_state(model.A, model.C, model.Q, np.array(lgs**2))
     both = steady_state(model.A, C, model.Q, np.diag([lgs**2, ngs**2]))
@@ -137,7 +137,7 @@ def test_a_predicted_state_is_corrected_with_the_filter_gain(case: tuple[Scenari
 
 def test_ngs_weighs_more_than_lgs() -> None:
     """r_NGS < r_LGS (section 2.2.1)."""
-    lgs, ngs = multirate_noise(paper())
+    lgs, ngs = multirate_noise(paper(), 0)
     assert ngs < lgs
 
 

@@ -21,6 +21,7 @@ from wfsobs.pipeline import observe, run
 from wfsobs.presets import PRESETS
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
+from wfsobs.sensors import noise_covariance
 from wfsobs.settings import SettingError
 from wfsobs.tuning import Evaluation, tune
 from wfsobs.tuning.records import NEXT, REFERENCE, TRUTH, cut, piece, simulated, stream
@@ -102,7 +103,7 @@ def test_a_filter_of_wrong_numbers_is_tuned_to_the_error_of_the_right_one() -> N
     best = float(np.sqrt(np.mean([s.rms**2 for s in run(right, observers=["kf-lgs"]).scores if s.observer == "kf-lgs"
                                   and s.target == "vibration"])))
     model = kalman_model(right, 0, right.dt)
-    _, steady = steady_filter(model, measurement_noise(right)[0])
+    _, steady = steady_filter(model, measurement_noise(right, 0)[0])
     row = model.outputs["vibration"]
     # The error is that of 2 x 19 s of a signal with a bandwidth of a few Hz: about 100 independent squares, 7 % in rms
     assert best == pytest.approx(np.sqrt(row @ steady.filtered @ row), rel=0.2)
@@ -232,3 +233,16 @@ def test_command_line(tmp_path: Path) -> None:
                   ["--observer", "kf-lgs", "--setting", "x.y"], ["--observer", "multirate", "--target", "vibration"]):
         result = call(*wrong)
         assert result.exit_code == 2 and len(result.stderr.splitlines()) == 1, result.output
+
+
+def test_a_noise_set_by_hand_starts_from_that_of_all_modes() -> None:
+    """Tuned it is one number for modes whose noise differs: their root mean square, from the sensors' own covariances."""
+    s = linear(**{"turbulence.source": "frozen-flow", "telescope.radial_order": 2, "sensors.kind": "shack-hartmann",
+                  "sensors.noise_from": "photons"})
+    for observer, switch, group in (("kf-multi", "kalman", "kalman"), ("multirate", "multirate", "multirate")):
+        by_hand = space(s, observer, [f"{group}.lgs_noise"]).by_hand
+        assert by_hand[f"{switch}.measurement_noise"] == "manual"
+        for kind, stars in (("lgs", s.sensors.lgs_count), ("ngs", 1)):
+            variances = np.diagonal(noise_covariance(s, kind)) / stars  # type: ignore[arg-type]
+            assert variances.max() > 1.4 * variances.min()  # else any of them would do
+            assert by_hand[f"{group}.{kind}_noise"] == pytest.approx(np.sqrt(variances.mean()), rel=1e-5)  # six digits are kept

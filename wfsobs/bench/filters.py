@@ -34,7 +34,7 @@ def kalman_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
     record = simulate(scenario)
     y, u, n = record.y_lgs[:, 0], record.u[:, 0], record.n_steps
     task, size = "kalman-record", f"{n} steps, 6 states"
-    noise = measurement_noise(scenario)[0]
+    noise = measurement_noise(scenario, 0)[0]
     ours, _ = steady_filter(kalman_model(scenario, 0, record.dt), noise)
     A, B, C, Q = paper_model(scenario, record.dt)
     steady = steady_state(A[:4, :4], C[:4], Q, np.array(noise**2))
@@ -69,7 +69,7 @@ def multirate_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
     assert record.ratio is not None
     y, u, z_ngs, n = record.y_lgs[:, 0], record.u[:, 0], record.z_ngs[:, 0], record.n_steps
     task, size = "multirate-record", f"{n} steps, 6 states"
-    lgs, ngs = multirate_noise(scenario)
+    lgs, ngs = multirate_noise(scenario, 0)
     ours = multirate_filter(kalman_model(scenario, 0, record.dt), record.ratio, lgs, ngs)
     A, B, C, Q = paper_model(scenario, record.dt)
     C_ngs = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 0.0])  # of z_ngs, from which the mirror's part has been taken

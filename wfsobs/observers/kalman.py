@@ -48,7 +48,7 @@ def kalman_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
     return disturbance_model([turbulence], [vibration])
 
 
-def measurement_noise(scenario: Scenario, mode: int = 0) -> tuple[float, float]:
+def measurement_noise(scenario: Scenario, mode: int) -> tuple[float, float]:
     """Standard deviation of the modelled noise [um] of the LGS together and of an NGS frame in one mode."""
     k = scenario.kalman
     if k.measurement_noise == "manual":

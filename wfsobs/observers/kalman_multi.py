@@ -38,18 +38,18 @@ def modelled_turbulence(scenario: Scenario, mode: int, dt: float) -> Ar2 | Ar3:
     process, _ = modelled_processes(scenario, mode, dt)
     if scenario.multipeak.turbulence_order == 2 or process.rms == 0:
         return process
-    noise = measurement_noise(scenario)[0]
+    noise, _ = measurement_noise(scenario, mode)
     start = Ar3(process.omega, process.damping, 5.0 * process.omega, process.rms, dt)
     return fitted_ar3(seen_turbulence(scenario, mode), noise**2, start)
 
 
 def kf_multi(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
     """The filter on the LGS measurement, at every fast step."""
-    z, noise = record.z, measurement_noise(scenario)[0]
+    z = record.z
     columns = []
     for mode in range(record.n_modes):
         watch.step(mode / record.n_modes)
-        kalman, _ = steady_filter(multi_model(scenario, mode, record.dt), noise)
+        kalman, _ = steady_filter(multi_model(scenario, mode, record.dt), measurement_noise(scenario, mode)[0])
         columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
     return by_target(columns)
 
@@ -58,5 +58,5 @@ def predicted_rms(scenario: Scenario, mode: int) -> float:
     """What the filter believes its error of the next phi_dist to be, rms [um]."""
     model = multi_model(scenario, mode, scenario.dt)
     row = np.sum(list(model.outputs.values()), axis=0)
-    _, steady = steady_filter(model, measurement_noise(scenario)[0])
+    _, steady = steady_filter(model, measurement_noise(scenario, mode)[0])
     return sqrt(float(row @ steady.P @ row))

@@ -31,7 +31,7 @@ class UnstableCycle(SettingError):
     """Two gains, each stable, that make an unstable cycle."""
 
 
-def multirate_noise(scenario: Scenario, mode: int = 0) -> tuple[float, float]:
+def multirate_noise(scenario: Scenario, mode: int) -> tuple[float, float]:
     """Square roots of r_LGS and r_NGS [um] in one mode."""
     m = scenario.multirate
     return (m.lgs_noise, m.ngs_noise) if m.measurement_noise == "manual" else measurement_noise(scenario, mode)

@@ -197,9 +197,16 @@ def _process(scenario: Scenario) -> tuple[float, float]:
     return turbulence_process(scenario, 0, scenario.dt).rms / relative_rms(scenario, 0), float(np.sqrt(variance))
 
 
+def _noise(scenario: Scenario) -> tuple[float, float]:
+    """Noise of LGS and NGS that "matched" gives, rms over the modes [um]: set by hand it is one number for all of them."""
+    each = np.array([measurement_noise(scenario, mode) for mode in range(len(scenario.modes))])
+    lgs, ngs = np.sqrt(np.mean(each**2, axis=0)).tolist()
+    return lgs, ngs
+
+
 BY_HAND: dict[str, tuple[tuple[str, str], Callable[[Scenario], tuple[float, float]]]] = {
     "kalman.process_noise": (("kalman.turbulence_rms", "kalman.vibration_rms"), _process),
-    "kalman.measurement_noise": (("kalman.lgs_noise", "kalman.ngs_noise"), measurement_noise),
-    "multirate.measurement_noise": (_RATES, measurement_noise),  # type: ignore[dict-item]
+    "kalman.measurement_noise": (("kalman.lgs_noise", "kalman.ngs_noise"), _noise),
+    "multirate.measurement_noise": (_RATES, _noise),
 }
 """Settings that say "matched", the two numbers that count instead once they say "manual", and what those are until then."""
