@@ -10,12 +10,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.special import expit, logit
 
 from wfsobs.arrays import Array
+from wfsobs.whittle import negative_log_likelihood, whittle_fit
 
 SLOWEST = 3e-3
 """Least corner of a fitted process, over the sampling rate: slower ones cost digits, and a filter nothing."""
+TOLERANCE = 1e-3
+"""Distance of a fit from its minimum, in standard deviations of its parameters."""
+STEPS = 100
+"""Of a fit, at most."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +40,24 @@ class Ar3:
     @property
     def poles(self) -> NDArray[np.complex128]:
         """The three poles."""
-        pair = complex(-self.damping, np.sqrt(1.0 - self.damping**2)) * self.omega * self.dt
-        return np.exp([pair, pair.conjugate(), -self.corner * self.dt])
+        return np.exp(-self.decays)
+
+    @property
+    def decays(self) -> NDArray[np.complex128]:
+        """a_i of the three poles exp(-a_i)."""
+        pair = complex(self.damping, np.sqrt(1.0 - self.damping**2)) * self.omega * self.dt
+        return np.array([pair, pair.conjugate(), self.corner * self.dt])
+
+    @property
+    def unit_drive_variance(self) -> float:
+        """Variance of the drive that gives the process the variance 1.
+
+        The product of 1 - p_i p_j over i <= j, divided by 1 + e_2 - e_1 e_3 - e_3^2 with e_i the elementary symmetric polynomials
+        of the poles: one over the sum of squares of the impulse response. Grouped so that nothing cancels when it is slow.
+        """
+        a, total = self.decays, self.decays.sum()
+        pairs = np.prod(-np.expm1(-(a[:, None] + a))[np.triu_indices(3)])
+        return float((pairs / (-np.expm1(-2.0 * total) - (np.exp(a - total) * np.expm1(-2.0 * a)).sum())).real)
 
     @property
     def reflections(self) -> Array:
@@ -50,36 +71,50 @@ class Ar3:
 
     def psd(self, frequency: Array) -> Array:
         """One-sided power spectral density [unit^2/Hz] at `frequency` [Hz]."""
-        turn = np.exp(-2j * np.pi * np.asarray(frequency) * self.dt)
-        distance = np.abs(np.prod([1.0 - pole * turn for pole in self.poles], axis=0))
-        drive = self.rms**2 * np.prod(1.0 - self.reflections**2)
-        return 2.0 * self.dt * drive / distance**2
+        turn = 2j * np.pi * np.asarray(frequency) * self.dt
+        distance = np.abs(np.prod([np.expm1(-a - turn) for a in self.decays], axis=0))
+        return 2.0 * self.dt * self.rms**2 * self.unit_drive_variance / distance**2
+
+    def log_slopes(self, frequency: Array) -> Array:
+        """Derivatives of the logarithm of `psd` by log omega, logit damping, log corner and log rms, (4, n)."""
+        a, xi = self.decays, self.damping
+        turn = 2j * np.pi * np.asarray(frequency) * self.dt
+        pairs = 1.0 / np.expm1(a[:, None] + a)
+        drive = pairs.sum(axis=1) + np.diag(pairs) + 1.0
+        drive -= (np.cosh(a.sum()) + np.cosh(a)) / (np.sinh(a.sum()) + np.sinh(a).sum())
+        by_decay = drive[:, None] - 2.0 / np.expm1(a[:, None] + turn)
+        damped = self.omega * self.dt * complex(xi * (1.0 - xi), -(xi**2) * np.sqrt((1.0 - xi) / (1.0 + xi)))
+        moves = np.array([[a[0], a[1], 0.0], [damped, damped.conjugate(), 0.0], [0.0, 0.0, a[2]]])
+        return np.vstack([(moves @ by_decay).real, np.full(by_decay.shape[1], 2.0)])
 
 
 def fitted_ar3(spectrum: Array, noise: float, start: Ar3) -> Ar3:
     """The process whose spectrum, with white noise of variance `noise`, is nearest to a given one, with the same noise.
 
     spectrum : per sample, on the frequencies of `wiener`, (n // 2 + 1,). Nearest is what makes the innovations of the
-    filter built on it whitest and smallest: the mean of log S + S_true / S is least (Whittle, Ark. Mat. 2, 423, 1953). The
-    frequencies are thinned out to so many per octave, each standing for those about it.
+    filter built on it whitest and smallest: the mean of log S + S_true / S is least (`whittle`). The frequencies are thinned out
+    to so many per octave, each standing for those about it. Two minima are possible, the pair below the real pole or above it:
+    the fit starts from `start` and from the same with the two exchanged, and the lower minimum counts.
     """
-    n = 2 * (spectrum.size - 1)
+    n, dt = 2 * (spectrum.size - 1), start.dt
     edges = np.unique(np.concatenate([[1], np.geomspace(1, n // 2 + 1, 400).astype(int)]))
-    bins, weight = edges[:-1], np.diff(edges)
-    frequency = (bins + 0.5 * (weight - 1)) / (n * start.dt)
-    measured = np.add.reduceat(spectrum[: edges[-1]], bins) / weight + noise
+    bins, count = edges[:-1], np.diff(edges)
+    frequency = (bins + 0.5 * (count - 1)) / (n * dt)
+    mean = np.add.reduceat(spectrum[: edges[-1]], bins) / count + noise
 
     def process(x: Array) -> Ar3:
-        return Ar3(float(np.exp(x[0])), float(1.0 / (1.0 + np.exp(-x[1]))), float(np.exp(x[2])), float(np.exp(x[3])), start.dt)
+        return Ar3(float(np.exp(x[0])), float(expit(x[1])), float(np.exp(x[2])), float(np.exp(x[3])), dt)
 
-    def distance(x: Array) -> float:
-        model = process(x).psd(frequency) / (2.0 * start.dt) + noise
-        return float(weight @ (np.log(model) + measured / model) / weight.sum())
+    def density(x: Array) -> Array:
+        return process(x).psd(frequency) / (2.0 * dt) + noise
 
-    logit = np.log(start.damping / max(1.0 - start.damping, 1e-3))
-    first = np.array([np.log(start.omega), logit, np.log(start.corner), np.log(start.rms)])
-    bounds = [(np.log(SLOWEST / start.dt), np.log(1.0 / start.dt)), (-4.0, 6.0),
-              (np.log(SLOWEST / start.dt), np.log(3.0 / start.dt)),
-              (np.log(1e-6), np.log(1e3))]
-    found = minimize(distance, first, method="L-BFGS-B", bounds=bounds)
-    return process(found.x)
+    def log_slopes(x: Array, S: Array) -> Array:
+        return process(x).log_slopes(frequency) * (1.0 - noise / S)
+
+    slowest = np.log(SLOWEST / dt)
+    bounds = np.array([(slowest, np.log(1.0 / dt)), (-4.0, 6.0), (slowest, np.log(3.0 / dt)), (np.log(1e-6), np.log(1e3))])
+    found = []
+    for omega, corner in ((start.omega, start.corner), (start.corner, start.omega)):
+        first = np.array([np.log(omega), logit(min(start.damping, 0.999)), np.log(corner), np.log(start.rms)])
+        found.append(whittle_fit(density, log_slopes, first, bounds, mean, count, TOLERANCE, STEPS))
+    return process(min(found, key=lambda x: negative_log_likelihood(density(x), mean, count)))

@@ -1,7 +1,4 @@
-"""Fits of a spectrum to a periodogram: the likelihood of Whittle (Ark. Mat. 2, 423, 1953), its minimum, its information.
-
-With m bins of mean I in a cell, - log L = sum m (log S + I / S). Its expected second derivatives are sum m (d log S)(d log S)'.
-"""
+"""Fits of a `Spectrum` to a periodogram by Whittle's likelihood (`wfsobs.whittle`), their standard deviations, first guesses."""
 
 from __future__ import annotations
 
@@ -10,8 +7,9 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import least_squares
 
+from wfsobs import whittle
 from wfsobs.ar2 import Ar2
 from wfsobs.ar3 import Ar3
 from wfsobs.arrays import Array
@@ -19,7 +17,9 @@ from wfsobs.identify.model import Spectrum
 from wfsobs.identify.periodogram import Cells
 
 STEPS = 40
-"""Of the minimisation, at most."""
+"""Of a fit, at most."""
+TOLERANCE = 1e-2
+"""Distance of a fit from its minimum, in standard deviations of its numbers."""
 NOISE, TURBULENCE, BACKGROUND, RESONANCE = 3.0, (2.0, 8.0, 4.0, 3.0), (1.5, 0.0, 4.0), (0.1, 6.0, 4.0)
 """How far the numbers of a vector may leave their start: a resonance stays at its place."""
 NO_NEARER = 1.1
@@ -28,8 +28,7 @@ NO_NEARER = 1.1
 
 def negative_log_likelihood(spectrum: Spectrum, cells: Cells) -> float:
     """- log L, less a constant."""
-    S = spectrum.psd(cells.frequency)
-    return float(cells.count @ (np.log(S) + cells.mean / S))
+    return whittle.negative_log_likelihood(spectrum.psd(cells.frequency), cells.mean, cells.count)
 
 
 def information(spectrum: Spectrum, cells: Cells, wanted: Sequence[int] | None = None) -> Array:
@@ -47,48 +46,26 @@ def information(spectrum: Spectrum, cells: Cells, wanted: Sequence[int] | None =
 
 def fitted(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = None) -> Spectrum:
     """The spectrum of greatest likelihood near the given one; free : which numbers of its vector may move, all unless told but
-    the damping of a background.
-
-    Newton's method in a trust region with the Fisher information for the second derivatives, every number in units of its own
-    standard deviation at the start.
-    """
+    the damping of a background."""
     start = spectrum.vector
     index = [i for i in (range(len(start)) if free is None else free) if i not in spectrum.fixed]
     first = () if spectrum.turbulence is None else TURBULENCE[: spectrum.starts[1] - 1]
     second = () if spectrum.background is None else BACKGROUND
     reach = np.array([NOISE, *first, *second, *RESONANCE * len(spectrum.resonances)])[index]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information(spectrum, cells, index)), 1e-3))
 
-    def at(x: Array) -> Spectrum:
+    def moved(x: Array) -> Spectrum:
         vector = start.copy()
-        vector[index] += np.clip(scale * x, -reach, reach)
+        vector[index] = x
         return spectrum.moved(vector)
 
-    last: dict[bytes, tuple[Array, Array]] = {}
+    def density(x: Array) -> Array:
+        return moved(x).psd(cells.frequency)
 
-    def here(x: Array) -> tuple[Array, Array]:
-        """S and the derivatives of log S, which gradient and curvature both take."""
-        if x.tobytes() not in last:
-            last.clear()
-            spectrum = at(x)
-            S = spectrum.psd(cells.frequency)
-            last[x.tobytes()] = S, spectrum.slopes(cells.frequency, index) / S
-        return last[x.tobytes()]
+    def log_slopes(x: Array, S: Array) -> Array:
+        return moved(x).slopes(cells.frequency, index) / S
 
-    def value(x: Array) -> float:
-        return negative_log_likelihood(at(x), cells)
-
-    def gradient(x: Array) -> Array:
-        S, d = here(x)
-        return scale * (d @ (cells.count * (1.0 - cells.mean / S)))
-
-    def curvature(x: Array) -> Array:
-        _, d = here(x)
-        return ((d * cells.count) @ d.T) * np.outer(scale, scale) + 1e-9 * np.eye(len(index))
-
-    found = minimize(value, np.zeros(len(index)), jac=gradient, hess=curvature, method="trust-exact",
-                     options={"maxiter": STEPS, "gtol": 1e-2, "initial_trust_radius": 3.0, "max_trust_radius": 1e4})
-    return at(found.x)
+    bounds = np.transpose([start[index] - reach, start[index] + reach])
+    return moved(whittle.whittle_fit(density, log_slopes, start[index], bounds, cells.mean, cells.count, TOLERANCE, STEPS))
 
 
 def standard_deviations(spectrum: Spectrum, cells: Cells, inflation: float) -> Array:
