@@ -18,14 +18,15 @@ from wfsobs.app.limits import Limits
 from wfsobs.app.logs import event
 from wfsobs.app.queue import Queue, give_back
 from wfsobs.app.run import Tell
-from wfsobs.app.work import Loaded, Report, Shown, compute
+from wfsobs.app.sources import Source
+from wfsobs.app.work import Report, Shown, compute
 from wfsobs.cost import run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 from wfsobs.watch import Cancelled
 
 Work = Callable[..., Shown]
-"""(scenario, cancelled, report), and the record where one is loaded -> results."""
+"""(scenario, cancelled, report), and the source of the record where that is not the scenario -> results."""
 
 POLL = 0.1
 """How often somebody who waits looks whether they still want to [s]."""
@@ -164,10 +165,10 @@ class Service:
         return key_of(scenario) in self.cache
 
     def join(
-        self, owner: int, scenario: Scenario, cancelled: Callable[[], bool], tell: Tell, loaded: Loaded | None = None
+        self, owner: int, scenario: Scenario, cancelled: Callable[[], bool], tell: Tell, source: Source | None = None
     ) -> Shown | tuple[Flight, Callable[[], None]]:
         """The results; or the run that will bring them, in the line from now on if it was not, and how to leave it."""
-        key, ticket = key_of(scenario, loaded.key if loaded else ""), object()
+        key, ticket = key_of(scenario, source.key if source else ""), object()
         with self._lock:
             shown = self.cache.get(key)
             flight = self._flights.get(key)
@@ -177,15 +178,15 @@ class Service:
                 return shown
             if flight is None or not joined:
                 flight = self._flights[key] = Flight(
-                    next(self._run_numbers), scenario, partial(self._compute, key, scenario, loaded), lambda: self.closing)
+                    next(self._run_numbers), scenario, partial(self._compute, key, scenario, source), lambda: self.closing)
                 flight.join(ticket, owner, cancelled, tell)
                 self.queue.put(flight)
         return flight, partial(self._leave, key, flight, ticket)
 
     def _compute(
-        self, key: str, scenario: Scenario, loaded: Loaded | None, cancelled: Callable[[], bool], report: Report
+        self, key: str, scenario: Scenario, source: Source | None, cancelled: Callable[[], bool], report: Report
     ) -> Shown:
-        return self.cache.put(key, self._work(scenario, cancelled, report, *([loaded] if loaded else [])))
+        return self.cache.put(key, self._work(scenario, cancelled, report, *([source] if source else [])))
 
     def _leave(self, key: str, flight: Flight, ticket: object) -> None:
         with self._lock:
@@ -209,13 +210,13 @@ class Visit:
         self._since, self._open = monotonic(), True
 
     def compute(
-        self, scenario: Scenario, cancelled: Callable[[], bool], tell: Tell, loaded: Loaded | None = None
+        self, scenario: Scenario, cancelled: Callable[[], bool], tell: Tell, source: Source | None = None
     ) -> Shown:
         """The results of a scenario, kept or computed, whoever asked first. Raises SettingError, Cancelled."""
         self.service.limits.check(scenario)
-        if loaded is not None:
-            self.service.limits.check_steps(loaded.record.n_steps)
-        joined = self.service.join(self.number, scenario, cancelled, tell, loaded)
+        if source is not None:
+            source.check(self.service.limits)
+        joined = self.service.join(self.number, scenario, cancelled, tell, source)
         if isinstance(joined, Shown):
             return joined
         flight, leave = joined

@@ -19,9 +19,9 @@ import panel_material_ui as pmui
 from bokeh.models import ColumnDataSource
 
 from wfsobs.app.picker import Parcel, Picker, too_large
+from wfsobs.app.sources import Loaded
 from wfsobs.app.store import Store
 from wfsobs.app.views.plots import new_figure, send
-from wfsobs.app.work import Loaded
 from wfsobs.intake import Stated
 from wfsobs.modes import TIP_TILT
 from wfsobs.pipeline import as_stated
@@ -37,10 +37,9 @@ COLOURS = ("#0B4F6C", "#FF6600")
 
 
 class Upload:
-    """The record of a session, and how it comes in. `loaded` is None while results are simulated."""
+    """How the record of a session comes in."""
 
     def __init__(self) -> None:
-        self.loaded: Loaded | None = None
         self.picker = Picker(sizing_mode="stretch_width", margin=0)
         self.picker.on_message = self.handle
         self.unit = self._select("Unit", [SILENT, *UNITS])
@@ -66,27 +65,31 @@ class Upload:
             widget.param.watch(lambda _event: self.look(), "value")
 
     def over(self, work: Callable[..., Any]) -> Callable[..., Any]:
-        """The work of a run, on the loaded record where there is one."""
+        """The work of a run, on what takes the place of the simulation where something does."""
         def with_record(scenario: Scenario, cancelled: Callable[[], bool], tell: Any) -> Any:
-            loaded = self.loaded
-            return work(scenario, cancelled, tell, *([loaded] if loaded else []))
+            source = self.store.source
+            return work(scenario, cancelled, tell, *([source] if source else []))
         return with_record
 
     def unless(self, held: Callable[[Scenario], bool]) -> Callable[[Scenario], bool]:
         """Whether the results of a scenario are there already, which is not known of a record."""
-        return lambda scenario: self.loaded is None and held(scenario)
+        return lambda scenario: self.store.source is None and held(scenario)
 
     def attach(self, store: Store) -> None:
         """The store whose runs are to be on the record, and whose aperture turns angles into wavefronts."""
         self.store = store
         self._diameter = store.scenario.telescope.diameter
         store.param.watch(self._follow, "scenario")
+        store.param.watch(self._entitle, "source")
 
     def _follow(self, _event: object) -> None:
         diameter = self.store.scenario.telescope.diameter
         if diameter != self._diameter:
             self._diameter = diameter
             self.look()
+
+    def _entitle(self, _event: object) -> None:
+        self.picker.loaded = self.store.source.title if self.store.source else ""
 
     # ------------------------------------------------------------------ the file
 
@@ -190,36 +193,29 @@ class Upload:
         if not isinstance(found, Preview):
             return
         record = found.record
-        key = hashlib.sha256(self._content + repr((self.stated(), self.store.scenario.telescope.diameter)).encode()).hexdigest()
-        before = self.loaded
+        stated, digest = self.stated(), hashlib.sha256(self._content).hexdigest()
+        key = hashlib.sha256(repr((digest, stated, self.store.scenario.telescope.diameter)).encode()).hexdigest()
         try:
-            scenario = fitting(record, self.store.scenario)
-            self.loaded, same = Loaded(record, found.name, key), scenario == self.store.scenario
-            self.store.load(scenario)
+            self.store.run_on(
+                Loaded(record, found.name, key, found.lines()[0], stated, digest), fitting(record, self.store.scenario))
         except SettingError as error:
-            self.loaded = before
             self._say(f"{found.name}: {error}")
-            return
-        if same:  # other settings have started it
-            self.store.follow()
-        self.discard()
-        self.picker.loaded = f"{found.name}: {found.lines()[0]}"
+        else:
+            self.discard()
 
     def _vibrate(self, found: SpectrumPreview) -> None:
         """Take a spectrum as that of the vibration."""
         try:
-            self.store.load(self.store.scenario.replace({"vibration.source": "psd", "vibration.psd": found.table}))
+            self.store.replace({"vibration.source": "psd", "vibration.psd": found.table})
         except SettingError as error:
             self._say(f"{found.name}: {str(error)[:300]}")
         else:
             self.discard(f"The vibration has the spectrum of {found.name}.")
 
     def simulate(self) -> None:
-        """Go back to the simulation."""
-        if self.loaded is not None:
-            self.loaded = None
-            self.picker.loaded = ""
-            self.store.follow()
+        """Go back to the simulation; to the settings of one that was kept."""
+        if (source := self.store.source) is not None:
+            self.store.run_on(None, source.simulation or self.store.scenario)
 
     def discard(self, why: str = "") -> None:
         """Forget the file that is being looked at."""

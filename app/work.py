@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from wfsobs.app.sources import Source
 from wfsobs.bound import bound_scores
 from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
@@ -60,14 +61,24 @@ class Shown:
 
     partial : values so far, NaN where there are none yet, of observers still at work
     spectra : of the truth and of every finished estimate
-    recorded : whether on a record that was loaded, not simulated
+    source : what they are of where that is not the simulation of the settings
     """
 
     result: Result
     partial: Mapping[Key, Array] = field(default_factory=dict)
     spectra: Mapping[Key, Spectrum] = field(default_factory=dict)
     seconds: float = 0.0
-    recorded: bool = False
+    source: Source | None = None
+
+    @property
+    def recorded(self) -> bool:
+        """Whether the record stays whatever the settings."""
+        return self.source is not None
+
+    @property
+    def simulation(self) -> Scenario | None:
+        """What the record was simulated from; None where it was loaded."""
+        return self.scenario if self.source is None else self.source.simulation
 
     @property
     def scenario(self) -> Scenario:
@@ -82,15 +93,6 @@ class Shown:
         return estimate.values if estimate else self.partial.get((observer, target))
 
 
-@dataclass(frozen=True)
-class Loaded:
-    """A record that takes the place of the simulation; its key names its content and what was said of it."""
-
-    record: Record
-    name: str
-    key: str
-
-
 Report = Callable[[float, Shown | None], None]
 """Told the fraction done, and what is done where that has grown."""
 
@@ -101,17 +103,18 @@ def one_blas_thread() -> None:
 
 
 def compute(
-    scenario: Scenario, cancelled: Callable[[], bool], report: Report, loaded: Loaded | None = None
+    scenario: Scenario, cancelled: Callable[[], bool], report: Report, source: Source | None = None
 ) -> Shown:
-    """Run everything on a scenario, or the observers on a record. Raises SettingError, Cancelled."""
-    return _Work(scenario, cancelled, report, loaded).run()
+    """Run everything on a scenario, or the observers on another record. Raises SettingError, Cancelled."""
+    return _Work(scenario, cancelled, report, source).run()
 
 
 class _Work:
     def __init__(
-        self, scenario: Scenario, cancelled: Callable[[], bool], report: Report, loaded: Loaded | None = None
+        self, scenario: Scenario, cancelled: Callable[[], bool], report: Report, source: Source | None = None
     ):
-        self.scenario, self.report, self.loaded = scenario, report, loaded
+        self.scenario, self.report, self.source = scenario, report, source
+        self.simulation = scenario if source is None else source.simulation
         self.watch = Watch(progress=self._progress, cancelled=cancelled)
         self.estimates: list[Estimate] = []
         self.failures: list[Failure] = []
@@ -127,10 +130,10 @@ class _Work:
     def run(self) -> Shown:
         self.watch.step(0.0)
         stated = self.scenario
-        if self.loaded is None:
+        if self.source is None:
             record = simulate(stated, watch=self.watch)
         else:
-            record = self.loaded.record
+            record = self.source.make(self.watch)
             stated = as_stated(record, stated)
             stated.validate()
         self.record = record
@@ -149,8 +152,8 @@ class _Work:
                 handed_over = True
                 self.report(self.fraction, shown)
                 self._let_draw()
-                if self.loaded is None:
-                    self.bounds = bound_scores(self.scenario, record)
+                if self.simulation is not None:
+                    self.bounds = bound_scores(self.simulation, record)
         return self._so_far(record)
 
     def _left(self) -> set[str]:
@@ -173,7 +176,7 @@ class _Work:
     def _so_far(self, record: Record) -> Shown:
         result = collect(self.scenario, record, self.estimates, self.failures, bounds=self.bounds)
         partial = {key: values.copy() for key, values in self.growing.items()}
-        return Shown(result, partial, dict(self.spectra), perf_counter() - self.started, self.loaded is not None)
+        return Shown(result, partial, dict(self.spectra), perf_counter() - self.started, self.source)
 
     def _progress(self, fraction: float) -> None:
         """Called from any thread of the observers."""

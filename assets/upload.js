@@ -36,7 +36,7 @@ export function render({model, el}) {
   bar.append(input, open, loaded, back, said)
   el.append(bar)
   const draw = () => {
-    loaded.textContent = model.loaded ? `Record ${model.loaded}` : ""
+    loaded.textContent = model.loaded
     back.hidden = !model.loaded
     said.textContent = model.said
   }

@@ -15,23 +15,29 @@ from wfsobs.app.pages.identify_figure import NAMES, SpectrumFigure
 from wfsobs.app.pages.identify_table import table_html, verdict_html
 from wfsobs.app.pages.parts import WIDE, Starter, box, html, legend, line, text
 from wfsobs.app.run import RUNNING
+from wfsobs.app.sources import Kept, Source
 from wfsobs.app.store import Store
 from wfsobs.app.work import Shown
 from wfsobs.identify import Identified
 from wfsobs.identify.identification import LEVEL
 from wfsobs.identify.search import LOWEST
 from wfsobs.record import Record, RecordError
+from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 
 INTRO = (
     "From the pseudo-open-loop measurement z of the record shown, simulated or loaded: white noise, turbulence, then "
-    "vibration peaks one at a time until nothing is left that the tests see. “Use it” takes the model into the settings; a "
-    "loaded record stays, and the observers then run on it with this model.")
+    "vibration peaks one at a time until nothing is left that the tests see. “Filters only” keeps the record and tells the "
+    "filters this model. “As a new simulation” replaces the record by a simulation of this model, which the filters then know "
+    "exactly.")
 ABOUT = (
     "± is one standard deviation. What is left is called white where, in a mode, two tests of level 1 % pass and no candidate "
     "remains unexplained: Bartlett's on the cumulated ratio of the measured to the fitted spectrum, and Ljung and Box's on the "
     "innovations of the Kalman filter that the model gives. p is how likely white noise is to look less white than what is left.")
 EARLIER = "This model is of an earlier record than the one shown now."
+REPLACED = (
+    "The record that this model was identified from is replaced by a simulation of the model. Errors are now those of filters "
+    "that know the simulated spectra, and cannot be compared with errors on the record before. Undo brings it back.")
 
 
 class IdentifyPage:
@@ -40,15 +46,19 @@ class IdentifyPage:
     def __init__(self, store: Store, display: Display):
         self.store, self.run, self.display = store, store.run, display
         self.work = Beside(store.run, store.limits.seconds)
-        self.starter = Starter(self.work, "Identify the record", "Progress of the identification")
+        self.starter = Starter(self.work, "Identify the record", "Progress of the identification",
+            uses=("Filters only", "As a new simulation"))
         self.level, self.lowest = _number("Level", LEVEL), _number("Lowest peak [Hz]", LOWEST)
         self.figure = SpectrumFigure()
         self.legend, self.table, self.verdict, self.note = html(), html(), html(), html()
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
         self.of: Measured | None = None
+        self._made: Scenario | None = None
         self.visible, self._measuring = False, object()
         self.starter.start.on_click(lambda _event: self.start())
-        self.starter.use.on_click(lambda _event: self.use())
+        filters, simulation = self.starter.uses
+        filters.on_click(lambda _event: self.tell_filters())
+        simulation.on_click(lambda _event: self.simulate())
         self.work.param.watch(self._done, "result")
         self.run.param.watch(self._follow, ["shown", "state"])
         display.param.watch(self._redraw, ["mode", "unit", "dark"])
@@ -80,14 +90,24 @@ class IdentifyPage:
         else:
             self.work.start(lambda watch, _tell: compute(of, level, lowest, watch))
 
-    def use(self) -> None:
-        """Take the model into the settings."""
-        if self.work.result is not None:
-            result, _ = self.work.result
+    def tell_filters(self) -> None:
+        """Take the model into the settings, for the filters alone: the record stays, be it loaded or simulated."""
+        self._take(self.store.source or Kept(self.store.scenario))
+
+    def simulate(self) -> None:
+        """Take the model into the settings, and simulate it in place of the record."""
+        self._take(None)
+
+    def _take(self, source: Source | None) -> None:
+        result, _ = self._identified()
+        if result is not None:
             try:
-                self.store.load(result.scenario(self.store.scenario))
+                self.store.run_on(source, result.scenario(self.store.scenario))
             except SettingError as error:
                 self.work.refuse(str(error))
+            else:
+                self._made = self.store.scenario if source is None else None
+                self._redraw()
 
     def _follow(self, *_: object) -> None:
         """Measure the record shown, once its run is over."""
@@ -133,7 +153,8 @@ class IdentifyPage:
             if result and record:
                 self.verdict.object = verdict_html(result)
                 self.table.object = table_html(mode, self.display, diameter) if mode else ""
-                self.stale.visible = not same(record, of.record)
+                replaced = self.store.source is None and self._made == self.store.scenario
+                self.stale.param.update(object=REPLACED if replaced else EARLIER, visible=not same(record, of.record))
 
 
 def _number(label: str, value: float) -> pmui.TextInput:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from types import MappingProxyType
 from typing import Any
@@ -60,25 +60,29 @@ def legend(names: Mapping[str, str], dark: bool) -> str:
 class Starter:
     """The buttons that start, cancel and use something long, and the line on how it is going."""
 
-    def __init__(self, work: Beside, start: str, label: str, detail: Callable[[], str] = str):
-        """detail : what to add to the line while the work goes on."""
+    def __init__(self, work: Beside, start: str, label: str, detail: Callable[[], str] = str,
+                 uses: Sequence[str] = ("Use it",)):
+        """detail : what to add to the line while the work goes on;  uses : what can be done with the result."""
         self.work, self._detail = work, detail
         self.start = pmui.Button(label=start, icon="play_arrow", color="primary", size="small", margin=0)
         self.cancel = pmui.Button(label="Stop", icon="stop", variant="outlined", size="small", margin=0, disabled=True)
-        self.use = pmui.Button(label="Use it", icon="check", variant="outlined", size="small", margin=0, disabled=True)
+        self.uses = [
+            pmui.Button(label=use, icon="check", variant="outlined", size="small", margin=0, disabled=True) for use in uses]
         self.status = Status(label=label, sizing_mode="stretch_width", margin=(4, 0), visible=False)
         self.cancel.on_click(lambda _event: work.cancel())
         work.param.watch(self.refresh, ["state", "progress", "message", "latest", "result"])
 
     def view(self) -> list[Any]:
         """The row of buttons; the line is `status`."""
-        return [self.start, self.cancel, self.use]
+        return [self.start, self.cancel, *self.uses]
 
     def refresh(self, *_: object) -> None:
         """What may be pressed, and how it is going."""
         work = self.work
         running = work.state == RUNNING
         said = {RUNNING: f"Computing, {int(100 * work.progress)} %", CANCELLED: "Stopped", DONE: "Finished"}.get(work.state, "")
-        self.cancel.disabled, self.use.disabled = not running, running or work.result is None
+        self.cancel.disabled = not running
+        for use in self.uses:
+            use.disabled = running or work.result is None
         self.status.param.update(
             progress=work.progress, text=said + self._detail(), note=work.message, visible=work.state != IDLE)

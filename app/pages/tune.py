@@ -54,7 +54,7 @@ class TunePage:
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
         self.visible = False
         self.starter.start.on_click(lambda _event: self.start())
-        self.starter.use.on_click(lambda _event: self.use())
+        self.starter.uses[0].on_click(lambda _event: self.use())
         self.observer.param.watch(self._choose, "value")
         self.work.param.watch(self._redraw, ["latest", "result"])
         store.param.watch(self._compare, "scenario")
@@ -93,7 +93,7 @@ class TunePage:
         tuned = self._tuned()
         if tuned is not None:
             try:
-                self.store.load(self.store.scenario.replace(changes(tuned.scenario, tuned.before.scenario)))
+                self.store.replace(changes(tuned.scenario, tuned.before.scenario))
             except SettingError as error:
                 self.work.refuse(str(error))
 

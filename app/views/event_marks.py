@@ -41,8 +41,8 @@ def word(event: Event, scenario: Scenario) -> str:
 
 
 def events_of(shown: Shown) -> list[Event]:
-    """By their start; a record that was loaded has none of the settings' events."""
-    return [] if shown.recorded else sorted(shown.scenario.events, key=lambda e: e.start)
+    """By their start, of the simulation; a record that was loaded has none."""
+    return [] if shown.simulation is None else sorted(shown.simulation.events, key=lambda e: e.start)
 
 
 def room(shown: Shown) -> float:

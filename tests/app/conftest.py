@@ -13,8 +13,9 @@ import pytest
 from wfsobs.app.cache import frozen, key_of
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.run import RUNNING
+from wfsobs.app.sources import Source
 from wfsobs.app.store import Store
-from wfsobs.app.work import Loaded, Report, Shown, compute
+from wfsobs.app.work import Report, Shown, compute
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
 
@@ -74,14 +75,14 @@ KEPT: dict[str, Shown] = {}
 
 
 def compute_once(
-    scenario: Scenario, cancelled: Callable[[], bool], report: Report, loaded: Loaded | None = None
+    scenario: Scenario, cancelled: Callable[[], bool], report: Report, source: Source | None = None
 ) -> Shown:
     """`compute`, and for the scenario that every dashboard starts with what it gave the first time."""
     key = key_of(scenario)
-    if loaded is None and key in KEPT:
+    if source is None and key in KEPT:
         return KEPT[key]
-    shown = compute(scenario, cancelled, report, loaded)
-    if loaded is None and key == FIRST:
+    shown = compute(scenario, cancelled, report, source)
+    if source is None and key == FIRST:
         KEPT[key] = frozen(shown)
     return shown
 

@@ -16,17 +16,19 @@ from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import per_micrometre
 from wfsobs.app.identify_work import same, seconds
 from wfsobs.app.limits import PUBLIC, Limits
-from wfsobs.app.pages.identify import IdentifyPage
+from wfsobs.app.pages.identify import EARLIER, IdentifyPage
 from wfsobs.app.pages.pages import IDENTIFY
 from wfsobs.app.run import CANCELLED, DONE, FAILED, RUNNING
+from wfsobs.app.sources import Kept, Loaded
 from wfsobs.app.store import Store
-from wfsobs.app.upload import Loaded
 from wfsobs.formats import format_of
 from wfsobs.identify import Identified, identify
 from wfsobs.identify.process import Number
 from wfsobs.identify.report import verdict, written
 from wfsobs.loop import simulate
+from wfsobs.pipeline import observe
 from wfsobs.scenario import Scenario
+from wfsobs.scores import BOUND
 from wfsobs.telemetry import read_record, record_arrays
 from wfsobs.watch import Watch
 
@@ -62,7 +64,7 @@ def identified(page: IdentifyPage, loop: Any) -> Identified:
 
 def test_it_shows_what_the_core_finds(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> None:
     of = dashboard.store.run.shown
-    assert of is not None and page.of is not None and not len(page.figure.total.data["x"]) and page.starter.use.disabled
+    assert of is not None and page.of is not None and not len(page.figure.total.data["x"]) and page.starter.uses[0].disabled
     found, expected = identified(page, loop), identify(of.result.record)
     assert found.modes == expected.modes and not page.stale.visible
     for line in verdict(expected):
@@ -103,13 +105,60 @@ def the_measured_spectrum_holds_the_variance(page: IdentifyPage) -> None:
     assert total == pytest.approx(np.var(z), rel=0.35)  # the taper leaves out the ends of slow turbulence
 
 
-def test_use_it_is_a_change_like_every_other(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> None:
+def rms(dashboard: Dashboard) -> dict[tuple[str, str, str], float]:
+    shown = dashboard.store.run.shown
+    assert shown is not None
+    return {(s.observer, s.target, s.mode): s.rms for s in shown.result.scores}
+
+
+def test_filters_only(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> None:
+    """The record, its truth and its bound stay, and the observers run on it as they do on the same record from a file."""
+    store, before = dashboard.store, dashboard.store.run.shown
+    assert before is not None
+    told = identified(page, loop).scenario(store.scenario)
+    page.starter.uses[0].param.trigger("clicks")
+    assert store.scenario == told != before.scenario
+    assert dashboard.upload.picker.loaded.startswith("The simulation with 1 peak is kept")
+    loop.finish(store)
+    shown = store.run.shown
+    assert shown is not None and shown.recorded and not store.stale and not page.stale.visible
+    for name in ("y_lgs", "u", "turbulence", "vibration"):
+        np.testing.assert_array_equal(getattr(shown.result.record, name), getattr(before.result.record, name))
+    expected = {(s.observer, s.target, s.mode): s.rms for s in observe(before.result.record, told).scores}
+    bounds = {key: value for key, value in rms(dashboard).items() if key[0] == BOUND}
+    assert rms(dashboard) == expected | bounds
+    assert bounds and bounds == {(s.observer, s.target, s.mode): s.rms for s in before.result.scores if s.observer == BOUND}
+    store.change("kalman.ngs_between_frames", "propagate")  # other settings of the filters leave the record alone, too
+    loop.finish(store)
+    np.testing.assert_array_equal(store.run.shown.result.record.y_lgs, before.result.record.y_lgs)
+    store.undo()
+    store.undo()
+    assert (store.scenario, store.source) == (before.scenario, None) and dashboard.upload.picker.loaded == ""
+    store.redo()
+    assert store.scenario == told and isinstance(store.source, Kept), "and not the simulation of the model"
+    dashboard.upload.handle({"action": "simulate"})
+    assert (store.scenario, store.source) == (before.scenario, None), "back to the simulation is back to its settings"
+    page.starter.uses[0].param.trigger("clicks")
+    store.choose("ut4")
+    assert store.source is None, "a preset is a start"
+
+
+def test_as_a_new_simulation(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> None:
     before = dashboard.store.scenario
     expected = identified(page, loop).scenario(before)
-    page.starter.use.param.trigger("clicks")
-    assert dashboard.store.scenario == expected != before
+    page.starter.uses[0].param.trigger("clicks")
+    page.starter.uses[1].param.trigger("clicks")
+    assert dashboard.store.scenario == expected != before and dashboard.store.source is None
     loop.finish(dashboard.store)
     loop.until(lambda: page.stale.visible)  # the simulation of the model is another record
+    assert "is replaced by a simulation of the model" in page.stale.object
+    dashboard.store.change("run.seed", 99)
+    loop.finish(dashboard.store)
+    loop.until(lambda: page.stale.object == EARLIER)
+    dashboard.store.undo()
+    dashboard.store.undo()
+    loop.finish(dashboard.store)
+    assert isinstance(dashboard.store.source, Kept)
     dashboard.store.undo()
     assert dashboard.store.scenario == before
     loop.finish(dashboard.store)
@@ -126,14 +175,13 @@ def test_a_loaded_record_stays(page: IdentifyPage, dashboard: Dashboard, loop: A
     record = simulate(short.replace({"run.seed": 9}))
     format_of(".npz").write(file, record_arrays(replace(record, turbulence=None, vibration=None)))
     file.seek(0)
-    dashboard.upload.loaded = Loaded(read_record(file, "night.npz"), "night.npz", "key")
-    dashboard.store.follow()
+    dashboard.store.run_on(Loaded(loaded := read_record(file, "night.npz"), "night.npz", "key"), dashboard.store.scenario)
     loop.finish(dashboard.store)
     identified(page, loop)
-    page.starter.use.param.trigger("clicks")
+    page.starter.uses[0].param.trigger("clicks")
     loop.finish(dashboard.store)
     shown = dashboard.store.run.shown
-    assert shown is not None and shown.recorded and shown.result.record is dashboard.upload.loaded.record
+    assert shown is not None and shown.recorded and shown.result.record is loaded
     assert shown.scenario.kalman.process_noise == "matched" and not page.stale.visible
 
 
@@ -147,7 +195,7 @@ def test_what_cannot_be_done_is_said_in_one_line(page: IdentifyPage, loop: Any) 
         page.start()
         loop.until(lambda: page.work.state != RUNNING)
         assert (page.work.state, page.starter.status.note) == (FAILED, reason)
-        assert page.starter.use.disabled
+        assert page.starter.uses[0].disabled
 
 
 def test_limits_of_a_public_server(loop: Any, short: Scenario) -> None:

@@ -168,7 +168,7 @@ def test_the_python_makes_the_very_scenario(capsys: pytest.CaptureFixture[str]) 
 def test_settings_from_an_identification_are_written_in_plain_numbers(capsys: pytest.CaptureFixture[str]) -> None:
     """They come out of arrays: NumPy's repr is read by no link, file or script."""
     simulated = PRESETS["paper"]().replace({**QUICK, "run.duration": 3.0})
-    found = identify(simulate(simulated), simulated).scenario(simulated)
+    found = identify(simulate(simulated)).scenario(simulated)
     assert found.vibration.peaks
     query = to_query(found, "paper")
     assert query is not None

@@ -17,8 +17,8 @@ from wfsobs.app.pages.pages import TUNE
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.pages.tune_views import unit_for
 from wfsobs.app.run import CANCELLED, DONE, FAILED, RUNNING
+from wfsobs.app.sources import Loaded
 from wfsobs.app.tune_work import CHOICES, best_so_far, seconds
-from wfsobs.app.upload import Loaded
 from wfsobs.configfile import changes
 from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
@@ -39,7 +39,7 @@ def page(dashboard: Dashboard) -> TunePage:
 def tuned(page: TunePage, loop: Any) -> Tuned:
     """What the page came to, once it has."""
     page.starter.start.param.trigger("clicks")
-    assert page.work.state == RUNNING and page.starter.use.disabled
+    assert page.work.state == RUNNING and page.starter.uses[0].disabled
     loop.until(lambda: page.work.state != RUNNING)
     assert page.work.state == DONE, page.work.message
     return page.work.result
@@ -81,7 +81,7 @@ def using_it_leaves_the_other_settings(page: TunePage, dashboard: Dashboard, fou
     assert not page.stale.visible
     store.change("run.seed", 5)
     assert page.stale.visible
-    page.starter.use.param.trigger("clicks")
+    page.starter.uses[0].param.trigger("clicks")
     expected = found.before.scenario.replace({"run.seed": 5, **changes(found.scenario, found.before.scenario)})
     assert store.scenario == expected
     store.undo()
@@ -105,8 +105,7 @@ def test_a_gpr_and_its_likelihood(page: TunePage, dashboard: Dashboard, loop: An
 
 def test_a_loaded_record_is_cut(page: TunePage, dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     record = replace(simulate(short.replace({"run.duration": 9.0, "run.seed": 4})), turbulence=None, vibration=None)
-    dashboard.upload.loaded = Loaded(record, "night.npz", "key")
-    dashboard.store.load(dashboard.store.scenario.replace({"run.duration": 9.0}))
+    dashboard.store.run_on(Loaded(record, "night.npz", "key"), dashboard.store.scenario.replace({"run.duration": 9.0}))
     loop.finish(dashboard.store)
     found = tuned(page, loop)
     assert "RMS one-step prediction error of z on the validation record" in page.table.object
@@ -125,7 +124,7 @@ def test_progress_cancel_and_errors(page: TunePage, dashboard: Dashboard, loop: 
     loop.until(lambda: page.work.latest is not None)
     assert re.fullmatch(r"Computing, \d+ % · \d+ evaluations, best [\d.]+ nm, [\d.]+ nm before", page.starter.status.text)
     page.starter.cancel.param.trigger("clicks")
-    assert page.work.state == CANCELLED and page.starter.use.disabled and len(page.figure.source.data["x"]) > 0
+    assert page.work.state == CANCELLED and page.starter.uses[0].disabled and len(page.figure.source.data["x"]) > 0
     dashboard.store.limits = Limits(seconds=0.01)
     page.start()
     shown = dashboard.store.run.shown

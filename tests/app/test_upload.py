@@ -138,7 +138,7 @@ def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     dashboard.upload.confirm()
     loop.finish(dashboard.store)
     vibration = dashboard.store.scenario.vibration
-    assert vibration.source == "psd" and dashboard.upload.loaded is None
+    assert vibration.source == "psd" and dashboard.store.source is None
     assert vibration.psd.tip == pytest.approx([0.0, 1e-5, 1e-5, 0.0], rel=1e-12)
     assert dashboard.store.run.shown.result.record.vibration.std(axis=0) == pytest.approx([np.sqrt(1.1e-5), 0.0], rel=0.02)
     previewed(dashboard, loop, b"seeing,airmass\n1,2\n", "log.csv")
@@ -155,7 +155,7 @@ def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
         assert dashboard.upload.picker.said.startswith(line)
         assert "<b>.exe" not in dashboard.upload.text.object
         dashboard.upload.confirm()
-        assert dashboard.upload.loaded is None and dashboard.store.run.shown is before
+        assert dashboard.store.source is None and dashboard.store.run.shown is before
 
 
 def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:

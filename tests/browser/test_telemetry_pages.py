@@ -13,7 +13,7 @@ QUICK = "?run.duration=5&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline
 def test_identify_and_use_it(open_page: Any, server: Any) -> None:
     page = open_page(url=server.url + QUICK)
     page.get_by_role("button", name="Identify", exact=True).click()
-    expect(page.get_by_role("button", name="Use it")).to_be_disabled()
+    expect(page.get_by_role("button", name="Filters only")).to_be_disabled()
     page.get_by_role("button", name="Identify the record").click()
     expect(page.get_by_text(re.compile("tip: what is left is (NOT )?white at 1%"))).to_be_visible()
     row = page.get_by_role("region", name="Identified in tip").locator("tr", has_text="turbulence")
@@ -21,10 +21,15 @@ def test_identify_and_use_it(open_page: Any, server: Any) -> None:
     assert 0.4 < corner < 3.0, "the paper's is 1.125 Hz, of 5 s a third of an octave wide"
     wind = page.get_by_role("textbox", name="m/s")
     before = wind.input_value()
-    page.get_by_role("button", name="Use it").click()
+    page.get_by_role("button", name="Filters only").click()
     expect(wind).not_to_have_value(before)
-    expect(page.get_by_text("This model is of an earlier record")).to_be_visible()
+    expect(page.get_by_text("The simulation with 15 peaks is kept; the settings")).to_be_visible()
+    page.get_by_role("button", name="As a new simulation").click()
+    expect(page.get_by_text(re.compile("is replaced by a simulation of the model"))).to_be_visible()
+    expect(page.get_by_text("is kept; the settings")).to_have_count(0)
     page.get_by_role("button", name="Undo", exact=True).click()
+    expect(page.get_by_text("is kept; the settings")).to_be_visible()
+    page.get_by_role("button", name="Back to the simulation").click()
     expect(wind).to_have_value(before)
 
 
