@@ -12,21 +12,24 @@ from panel.custom import JSComponent
 from panel.util.parameters import edit_readonly
 
 from wfsobs.app.actions import Actions
+from wfsobs.app.connection import Connection
+from wfsobs.app.controls.names import named
 from wfsobs.app.controls.panel import Controls, waiting_text
-from wfsobs.app.display import UNITS, Display
-from wfsobs.app.pages.explore import Explore, group
+from wfsobs.app.display import Display
+from wfsobs.app.pages.explore import Explore
 from wfsobs.app.pages.pages import Pages
 from wfsobs.app.pages.parts import WIDE
 from wfsobs.app.run import FAILED, IDLE, Post
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, theme
 from wfsobs.app.upload import Upload
-from wfsobs.app.views.modes import ModeSwitch
+from wfsobs.app.views.modes import ModeSwitch, UnitSwitch
 from wfsobs.app.work import compute
 from wfsobs.scenario import Scenario
 
 ACTIONS = """
-:host { display: flex !important; flex-wrap: wrap; gap: 8px; }
+:host { display: flex !important; flex-wrap: wrap; gap: 8px; padding-bottom: 16px; }
+@media (max-width: 700px) { :host { row-gap: 24px; } }
 :host > * { flex: 0 1 auto; width: auto !important; }
 """
 STALE = "These results are not those of the settings."
@@ -36,9 +39,11 @@ PHONE_PX = 600
 
 
 class Frame(JSComponent):
-    """Tells the width of the window, and fades the results above it while they are stale."""
+    """Tells the width of the window and the theme that is wanted, and fades the results above it while they are stale."""
 
     width_px = param.Integer(0, doc="Width when the page opened [px].")
+    wants_dark = param.Boolean(False, doc="Whether the visitor's system has a dark theme, unless one was chosen here.")
+    dark = param.Boolean(False, doc="Whether the page is dark; where it is not as wanted, the visitor has chosen so.")
     stale = param.Boolean(False, doc="Whether to fade the results.")
 
     _esm = asset("frame.js")
@@ -63,8 +68,9 @@ class Dashboard:
         self.display = Display()
         self.controls = Controls(self.store)
         self.actions = Actions(self.store)
-        self.modes = ModeSwitch(self.store.run, self.display)
+        self.modes, self.units = ModeSwitch(self.store.run, self.display), UnitSwitch(self.display)
         self.explore = Explore(self.store.run, self.display)
+        self.connection = Connection(self.controls.take, width=0, height=0, margin=0)
         self.frame = Frame(width=0, height=0, margin=0)
         self.alert = pmui.Alert(
             object="", severity="error", visible=False, **WIDE)
@@ -81,13 +87,15 @@ class Dashboard:
             title="wfsobs", sidebar=[self.controls.view()], sidebar_width=340, theme_config=theme(), favicon=None,
             main=[_title(), pn.Column(
                 self._top(), self._row_of_actions(), self.upload.room, self.alert, self.stale, self.pages.view, self.frame,
+                self.connection,
                 sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
         )
         self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")
         with edit_readonly(page):
             # Tied to what all sessions do, each change walks all models of the page, and the page outlives its session.
             page.busy = Idle().param.busy
-        page.param.watch(lambda event: self.display.param.update(dark=event.new), "dark_theme")
+        page.param.watch(self._themed, "dark_theme")
+        self.frame.param.watch(lambda event: page.param.update(dark_theme=event.new), "wants_dark")
         return page
 
     def start(self) -> None:
@@ -100,11 +108,13 @@ class Dashboard:
         self.actions.close()
         self.store.close()
 
+    def _themed(self, event: param.parameterized.Event) -> None:
+        self.display.dark = self.frame.dark = event.new
+
     def _top(self) -> pn.FlexBox:
         """The pages, and what holds on all of them."""
         return pn.FlexBox(
-            self.pages.switch, *self.modes.view(),
-            group(self.display, "unit", {written: unit for unit, written in UNITS.items()}),
+            self.pages.switch, *self.modes.view(), *self.units.view(),
             gap="12px", align_items="center", **WIDE)
 
     def _row_of_actions(self) -> pn.Row:
@@ -113,7 +123,7 @@ class Dashboard:
     def _refresh(self, *_: object) -> None:
         run = self.store.run
         failed = run.state == FAILED
-        self.alert.param.update(object=run.message, visible=failed)
+        self.alert.param.update(object=named(run.message), visible=failed)
         texts = [STALE] if self.store.stale else []
         if self.store.waiting:
             texts.append(f"{waiting_text(self.store.waiting)}.")

@@ -8,7 +8,7 @@ import re
 import param
 
 from wfsobs.app.pin import Pin
-from wfsobs.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.modes import HIGHEST_ORDER, TIP_TILT, Mode, modes_up_to
 from wfsobs.parameters import unit_of
 
 SIGNAL, ERROR, RUNNING_RMS = "signal", "error", "running rms"
@@ -65,6 +65,15 @@ def label_of(p: param.Parameter) -> str:
     return f"{p.label} [{unit}]" if unit else str(p.label)
 
 
+def short_name(mode: Mode) -> str:
+    """A mode's name where there is little room: a long one is Z and Noll's index.
+
+    >>> [short_name(mode) for mode in modes_up_to(2)]
+    ['tip', 'tilt', 'defocus', 'Z5', 'Z6']
+    """
+    return mode.name if len(mode.name) <= len("defocus") else f"Z{mode.noll}"
+
+
 class Display(param.Parameterized):
     """The switches above the figures."""
 
@@ -81,6 +90,16 @@ class Display(param.Parameterized):
     def column(self) -> int:
         """The column of the mode in every array."""
         return MODES.index(self.mode)
+
+    @property
+    def mode_label(self) -> str:
+        """The mode as axes write it."""
+        return short_name(modes_up_to(HIGHEST_ORDER)[self.column])
+
+    @property
+    def units(self) -> list[str]:
+        """Those that the mode can be in: only tip and tilt are angles."""
+        return [unit for unit in UNITS if unit not in NO_ANGLE or self.mode in [m.name for m in TIP_TILT]]
 
     @property
     def compared(self) -> Pin | None:

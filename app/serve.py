@@ -34,6 +34,9 @@ CACHE_MB = 256
 MESSAGE_BYTES = 6_000_000
 """The largest message that is read from a browser; a scenario file comes as one."""
 
+TOKEN = 30 * 86_400
+"""For how long a page may come back to its session, where that is still there [s]."""
+
 TURN = 0.001
 """How long the interpreter stays with one thread while another waits [s]: the page's own has short things to do."""
 
@@ -153,6 +156,7 @@ def make_server(options: Options, service: Service) -> Server:
         websocket_max_message_size=MESSAGE_BYTES, use_xheaders=bool(options.origins),
         # A session is reached by a name that this server has signed, and keeps nothing of who the visitor is.
         sign_sessions=True, secret_key=generate_secret_key(), include_headers=[], include_cookies=[],
+        session_token_expiration=TOKEN,  # a page that was open for days may come back as well
         unused_session_lifetime_milliseconds=round(1000 * options.lifetime),
         check_unused_sessions_milliseconds=round(1000 * options.lifetime),
         extra_patterns=[("/liveness", Liveness, {"service": service})],

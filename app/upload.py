@@ -24,6 +24,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.views.plots import new_figure, send
 from wfsobs.intake import Stated
 from wfsobs.modes import TIP_TILT
+from wfsobs.parameters import hint
 from wfsobs.pipeline import as_stated
 from wfsobs.preview import Preview, SpectrumPreview, preview_any, safe_name
 from wfsobs.record import RecordError
@@ -134,7 +135,7 @@ class Upload:
             except ValueError:
                 value = -1
             if not least <= value < 1e6:
-                raise RecordError(f"{field.label}: takes a number from {least:g}, not {text[:40]!r}")
+                raise RecordError(f"{field.label}: takes a number from {least:g}, not {text[:40]!r}{hint(text)}")
             return value
         unit = None if self.unit.value == SILENT else self.unit.value
         return Stated(unit, self.sign.value or None, number(self.delay, int, 1), number(self.rate, float, 1e-3))

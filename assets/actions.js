@@ -1,6 +1,8 @@
 // The row of actions: menus to share and to save, opening a scenario, and what there is to say about it. It also keeps the
 // address in step with the settings, and hears the keys for undo and redo.
 
+const SAID_MS = 6_000 // for which something that was done is told
+
 function tag(name, parent, properties = {}, attributes = {}) {
   const it = Object.assign(document.createElement(name), properties)
   for (const [key, value] of Object.entries(attributes)) it.setAttribute(key, value)
@@ -131,7 +133,7 @@ function opener(bar, model) {
 }
 
 function reporter(bar, model) {
-  const button = tag("button", bar, {type: "button"})
+  const button = tag("button", bar, {type: "button", className: "report"})
   const draw = () => {
     button.textContent = model.reporting ? "Making the report …" : "Report"
     button.setAttribute("aria-disabled", !model.ready || model.reporting)
@@ -157,7 +159,9 @@ function noteBox(el, model) {
   draw()
 }
 
-export function render({model, el}) {
+const drawn = new WeakSet() // documents; one may be drawn anew after a connection was lost
+
+export function render({model, view, el}) {
   const bar = tag("div", el, {className: "bar"})
   const here = () => location.origin + location.pathname + (model.query ? `?${model.query}` : "")
   const copyLink = () => model.linked ? copy(here(), "link") : model.send_msg({action: "unlinked"})
@@ -178,15 +182,22 @@ export function render({model, el}) {
   ])
   reporter(bar, model)
   opener(bar, model)
-  const said = tag("span", bar, {className: "said"}, {role: "status"})
+  const said = tag("span", bar, {className: "said below"}, {role: "status"})
   const copy = textBox(el, model)
   noteBox(el, model)
   keys(model)
 
-  const speak = () => { said.textContent = model.said }
+  let over
+  const speak = () => {
+    said.textContent = model.said
+    clearTimeout(over)
+    if (model.said && !model.said.endsWith("…")) over = setTimeout(() => { model.said = "" }, SAID_MS)
+  }
   const address = () => history.replaceState(history.state, "", here() + location.hash)
   model.on("said", speak)
   model.on("query", address)
+  if (drawn.has(view.model.document)) address()
+  drawn.add(view.model.document)
   model.on("msg:custom", (event) => {
     const {name, kind, content} = event.data ?? event
     save(name, new Blob([Uint8Array.from(atob(content), (c) => c.charCodeAt(0))], {type: kind}))

@@ -2,6 +2,7 @@
 
 const KINDS = ["svg", "png"]
 const ROW = 18, SWATCH = 26, GAP = 16, MARGIN = 8
+const PNG_SCALE = 3 // 400 px on the page make 1200
 const FONT = "12px Helvetica, Arial, sans-serif"
 
 function figures() {
@@ -15,10 +16,8 @@ function figures() {
 
 // The figure as a blob, its legend above it. labels: name of a line -> what it is called.
 async function exported(view, kind, labels) {
-  const blob = await view.export(kind).to_blob()
-  const lines = drawn(view, labels)
-  if (lines.length === 0) return blob
-  return kind === "svg" ? await svgWith(view, lines, blob) : await pngWith(view, lines, blob)
+  const drawing = await svgWith(view, drawn(view, labels), await view.export("svg").to_blob())
+  return kind === "svg" ? drawing : await pngOf(drawing)
 }
 
 const plain = (property) => property?.value !== undefined ? property.value : property
@@ -55,7 +54,7 @@ async function svgWith(view, lines, blob) {
   const page = new DOMParser().parseFromString(await blob.text(), "image/svg+xml")
   const svg = page.documentElement
   const width = Number(svg.getAttribute("width")), height = Number(svg.getAttribute("height"))
-  const [places, extra] = placed(lines, width)
+  const [places, extra] = lines.length ? placed(lines, width) : [[], 0]
   const [paper, ink] = inks(view)
   const make = (name, attributes, text = "") => {
     const it = page.createElementNS("http://www.w3.org/2000/svg", name)
@@ -75,28 +74,17 @@ async function svgWith(view, lines, blob) {
   return new Blob([new XMLSerializer().serializeToString(page)], {type: "image/svg+xml"})
 }
 
-async function pngWith(view, lines, blob) {
-  const image = await createImageBitmap(blob)
-  const scale = image.width / view.el.getBoundingClientRect().width
-  const [places, extra] = placed(lines, image.width / scale)
-  const [paper, ink] = inks(view)
-  const canvas = Object.assign(document.createElement("canvas"), {
-    width: image.width, height: image.height + Math.round(extra * scale)})
-  const pen = canvas.getContext("2d")
-  pen.fillStyle = paper
-  pen.fillRect(0, 0, canvas.width, canvas.height)
-  pen.drawImage(image, 0, Math.round(extra * scale))
-  pen.scale(scale, scale)
-  Object.assign(pen, {font: FONT, fillStyle: ink})
-  for (const {label, colour, width, dash, x, y} of places) {
-    pen.fillText(label, x + SWATCH + 6, y + 4)
-    Object.assign(pen, {strokeStyle: colour, lineWidth: width})
-    pen.setLineDash(dash)
-    pen.beginPath()
-    pen.moveTo(x, y)
-    pen.lineTo(x + SWATCH, y)
-    pen.stroke()
+// The drawing at several times its size on the page.
+async function pngOf(blob) {
+  const url = URL.createObjectURL(blob)
+  try {
+    const image = new Image()
+    image.src = url
+    await image.decode()
+    const canvas = Object.assign(document.createElement("canvas"), {width: PNG_SCALE * image.width, height: PNG_SCALE * image.height})
+    canvas.getContext("2d").drawImage(image, 0, 0, canvas.width, canvas.height)
+    return await new Promise((done) => canvas.toBlob(done, "image/png"))
+  } finally {
+    URL.revokeObjectURL(url)
   }
-  return await new Promise((done) => canvas.toBlob(done, "image/png"))
 }
-

@@ -15,7 +15,7 @@ export function render({model, el}) {
   const draw = () => {
     bar.value = model.progress
     line.textContent = model.text
-    note.textContent = model.note
+    note.textContent = note.title = model.note
   }
   for (const name of ["progress", "text", "note"]) {
     model.on(name, draw)

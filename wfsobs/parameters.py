@@ -84,6 +84,18 @@ def allowed(p: param.Parameter) -> str:
     return f"takes a {getattr(p, 'class_', object).__name__.lower()}"
 
 
+def hint(value: object) -> str:
+    """What to do about a text that is a number but for its comma, alone or in a list; nothing about any other value.
+
+    >>> hint("15,5"), hint([1.0, "0,5"]), hint("fast"), hint(15.5)
+    ('; use a point: 15.5', '; use a point: 0.5', '', '')
+    """
+    if isinstance(value, list):
+        return next((said for v in value if isinstance(v, str) and (said := hint(v))), "")
+    decimal = isinstance(value, str) and re.fullmatch(r"\s*[-+−]?\d*,\d+\s*", value)
+    return f"; use a point: {value.strip().replace(',', '.')}" if decimal else ""
+
+
 def unit_of(p: param.Parameter) -> str:
     """The unit a setting is in: what stands in [brackets] in its documentation, or nothing."""
     match = re.search(r"(?<=\s)\[([^\]]+)\]", p.doc or "")

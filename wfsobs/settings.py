@@ -13,7 +13,7 @@ from typing import Any, Self, TypeVar, cast
 import numpy as np
 import param
 
-from wfsobs.parameters import allowed
+from wfsobs.parameters import allowed, hint
 
 Plain = dict[str, Any]
 """A tree as plain values: nested dictionaries, lists, numbers, strings and booleans."""
@@ -111,7 +111,7 @@ class Group(param.Parameterized):
         try:
             setattr(self, name, value)
         except (ValueError, TypeError, RecursionError) as error:  # the last of param's words for a value nested very deep
-            raise SettingError(f"{path} = {_short(value)}: {allowed(p)}") from error
+            raise SettingError(f"{path} = {_short(value)}: {allowed(p)}{hint(value)}") from error
 
     def difference(self, base: Group) -> Plain:
         """The settings in which this tree differs from `base`, as a partial dictionary."""

@@ -15,6 +15,7 @@ import panel as pn
 import panel_material_ui as pmui
 import param
 
+from wfsobs.app.controls.names import named
 from wfsobs.app.display import label_of, written_unit
 from wfsobs.app.store import Store
 from wfsobs.parameters import Reals
@@ -27,6 +28,9 @@ UNNAMED = {
     "& legend": {"display": "none"}, "& fieldset": {"top": 0},
 }
 """A box whose name is heard but not seen: the slider beside it has the same."""
+
+TAG = "setting:"
+"""Stands before the path of its setting in the tag of a widget: the browser knows by it what was changed."""
 
 SOON = 5
 """How long a message of a slider or switch waits for the next to go with it [ms]: by default 50, a tenth of a redraw."""
@@ -64,7 +68,7 @@ class Field:
         if not reason:
             self.show(self.store.value(self.path))
         if reason or len(self.view) > 1:
-            note = [pn.pane.HTML(error_html(reason), margin=(0, 0, 6, 0))] if reason else []
+            note = [pn.pane.HTML(error_html(named(reason)), margin=(0, 0, 6, 0))] if reason else []
             self.view[1:] = note
         for widget in self.widgets:
             if "error_state" in widget.param:
@@ -73,6 +77,10 @@ class Field:
     def show(self, value: Any) -> None:
         """Put a value into the widgets."""
         raise NotImplementedError
+
+    def enter(self, value: Any) -> None:
+        """Do as if a value had been typed or chosen. Raises ValueError where that cannot be."""
+        self.widgets[-1].value = value
 
     def _widgets(self) -> list[Any]:
         raise NotImplementedError
@@ -84,7 +92,8 @@ class Field:
         self.store.change(self.path, event.new)
 
     def _names(self) -> dict[str, Any]:
-        return {"label": label_of(self.parameter), "description": written_unit(self.parameter.doc or "")}
+        return {
+            "label": label_of(self.parameter), "description": written_unit(self.parameter.doc or ""), "tags": [TAG + self.path]}
 
 
 class ChoiceField(Field):
@@ -133,6 +142,10 @@ class TextField(Field):
         written = self.written(value)
         self.widgets[-1].param.update(value=written, value_input=written)
 
+    def enter(self, value: Any) -> None:
+        """Type a text, or the number that the slider stands at."""
+        super().enter(value if isinstance(value, str) else number_text(float(value)))
+
     def written(self, value: Any) -> str:
         """The value as text."""
         return number_text(value)
@@ -171,7 +184,8 @@ class SliderField(TextField):
             size="small", **names, **ROOM)
         slider._debounce = SOON  # type: ignore[misc]
         slider.param.watch(self._released, "value_throttled")
-        text = self._text(label=names["label"], width=NUMBER_WIDTH, margin=(4, 0, 4, 8), align="end", sx=UNNAMED)
+        text = self._text(
+            label=names["label"], tags=[TAG + self.path], width=NUMBER_WIDTH, margin=(4, 0, 4, 8), align="end", sx=UNNAMED)
         return [slider, text]
 
     def _row(self) -> Any:

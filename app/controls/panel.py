@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from html import escape
 from typing import Any
 
@@ -10,7 +11,8 @@ import panel_material_ui as pmui
 import param
 from panel.custom import JSComponent
 
-from wfsobs.app.controls.fields import ROOM, Field, make_field
+from wfsobs.app.controls.fields import ROOM, TAG, Field, make_field
+from wfsobs.app.controls.names import name_of
 from wfsobs.app.controls.rows import RowEditor
 from wfsobs.app.run import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.store import Store
@@ -24,6 +26,20 @@ FIRST = ("turbulence.wind_speed", "sensors.exposure_ratio")
 
 TOPICS = ("vibration", "gpr_offline", "gpr_online")
 """Topics that come first; the others follow as declared."""
+
+
+PRESET = "preset"
+"""What the box of presets is called where the others are called by the paths of their settings."""
+
+
+NO_CHANGES = "Nothing changed"
+TWO_LINES = """
+.MuiFormHelperText-root {
+  height: 2lh; overflow: hidden; overflow-wrap: anywhere;
+  display: -webkit-box; -webkit-line-clamp: 2; -webkit-box-orient: vertical;
+}
+"""
+"""What is below must not move under the pointer with every change."""
 
 
 class Status(JSComponent):
@@ -47,7 +63,8 @@ class Controls:
         self.lists: dict[str, RowEditor] = {}
         self.parts: list[tuple[str, Any]] = []
         self.preset = pmui.Select(
-            label="Preset", value=store.preset, options={_title(name): name for name in PRESETS}, size="small", **ROOM)
+            label="Preset", tags=[TAG + PRESET], value=store.preset, options={_title(name): name for name in PRESETS},
+            helper_text=NO_CHANGES, size="small", stylesheets=[TWO_LINES], **ROOM)
         self.reset = pmui.Button(
             label="Reset", icon="restart_alt", variant="text", size="small", margin=(4, 0))
         self.undo, self.redo = (
@@ -89,6 +106,22 @@ class Controls:
         self.parts += views
         self._refresh_parts()
         column[:] = [view for _, view in views]
+
+    def take(self, change: dict[str, Any]) -> None:
+        """Make a change of the visitor's that did not arrive: {setting, value} of a box, {setting, message} of a table.
+
+        One that makes no sense, or none any more, is left.
+        """
+        path, value, message = (change.get(key) for key in ("setting", "value", "message"))
+        with contextlib.suppress(ValueError, TypeError, KeyError, IndexError):
+            if path == PRESET:
+                self.preset.value = value
+            elif isinstance(path, str) and path.split(".")[0] in self.rooms:
+                self.open_topic(path.split(".")[0])
+                if path in self.fields:
+                    self.fields[path].enter(value)
+                elif path in self.lists and isinstance(message, dict):
+                    self.lists[path].handle(message)
 
     def _refresh_parts(self, *_: object) -> None:
         """Hide what has no meaning for the settings as they are."""
@@ -147,7 +180,7 @@ class Controls:
     def _refresh_preset(self, *_: object) -> None:
         changed = self.store.changed()
         self.preset.value = self.store.preset
-        self.preset.helper_text = f"{len(changed)} changed: {', '.join(changed)}" if changed else ""
+        self.preset.helper_text = f"{len(changed)} changed: {', '.join(changed)}" if changed else NO_CHANGES
         self.reset.disabled = not changed
         self.undo.disabled, self.redo.disabled = not self.store.can_undo, not self.store.can_redo
 
@@ -171,7 +204,7 @@ def status_of(store: Store) -> tuple[str, str]:
     }.get(run.state, "")
     if store.waiting:
         text = waiting_text(store.waiting)
-    note = f"Not accepted: {', '.join(store.errors)}" if store.errors else ""
+    note = f"Not accepted: {', '.join(map(name_of, store.errors))}" if store.errors else ""
     return text, note
 
 

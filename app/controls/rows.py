@@ -8,18 +8,13 @@ import panel as pn
 import param
 from panel.custom import JSComponent
 
-from wfsobs.app.controls.fields import number_text, parsed, written_unit
+from wfsobs.app.controls.fields import TAG, number_text, parsed, written_unit
+from wfsobs.app.controls.names import column_of, named
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset
 from wfsobs.modes import TIP_TILT
 from wfsobs.parameters import Reals, unit_of
 from wfsobs.settings import Group
-
-SHORT = {
-    "frequency": "f", "damping": "ξ", "height": "h", "fraction": "share", "wind_factor": "V / V₀", "wind_direction": "wind to",
-    "frequency_shift": "shift",
-}
-"""Setting -> its name above a narrow column; any other has its own."""
 
 
 class RowTable(JSComponent):
@@ -50,7 +45,8 @@ class RowEditor:
         self._kind: type[Group] = p.item_type  # type: ignore[assignment]
         self._texts: dict[str, str] = {}
         self.table = RowTable(
-            columns=_columns(self._kind), noun=self._kind.__name__.lower(), sizing_mode="stretch_width", margin=(0, 0, 8, 0))
+            columns=_columns(self._kind), noun=self._kind.__name__.lower(), tags=[TAG + path],
+            sizing_mode="stretch_width", margin=(0, 0, 8, 0))
         self.table.on_edit = self.handle
         self.view = pn.Column(self.table, sizing_mode="stretch_width", margin=0)
         self.refresh()
@@ -89,7 +85,7 @@ class RowEditor:
         errors: dict[str, dict[str, str]] = {}
         for path, reason in self.store.errors.items():
             if f"{path}.".startswith(f"{self.path}."):
-                errors[path.removeprefix(f"{self.path}.")] = {"text": self._texts.get(path, ""), "reason": reason}
+                errors[path.removeprefix(f"{self.path}.")] = {"text": self._texts.get(path, ""), "reason": named(reason)}
         self.table.param.update(rows=rows, errors=errors)
 
     def _plain(self) -> list[dict[str, Any]]:
@@ -103,13 +99,13 @@ def _columns(kind: type[Group]) -> list[dict[str, Any]]:
     """One column per number or word, one for tip and one for tilt per list of numbers, named from the settings."""
     out = []
     for setting, p in kind.settings().items():
-        named = [(setting, SHORT.get(setting, setting))]
+        keys = [setting]
         if isinstance(p, Reals):
-            named = [(f"{setting}.{i}", mode.name) for i, mode in enumerate(TIP_TILT)]
+            keys = [f"{setting}.{i}" for i, _ in enumerate(TIP_TILT)]
         unit = written_unit(unit_of(p))
         choices = list(p.objects) if isinstance(p, param.Selector) else []
         out += [{"key": key, "name": f"{name} [{unit}]" if unit else name, "doc": p.doc or "", "choices": choices}
-                for key, name in named]
+                for key in keys for name in [column_of(key)]]
     return out
 
 

@@ -71,6 +71,7 @@ class ClosedLoopPage:
         """Compute what has changed meanwhile, and go on while visible."""
         self.visible = visible
         self._follow()
+        self._redraw()  # mode or unit may have changed
 
     def _follow(self, *_: object) -> None:
         """Start the loop of the results shown, once their run is over; stop where the page is hidden."""

@@ -21,6 +21,7 @@ from wfsobs.app.work import Shown
 from wfsobs.identify import Identified
 from wfsobs.identify.identification import LEVEL
 from wfsobs.identify.search import LOWEST
+from wfsobs.parameters import hint
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
@@ -75,6 +76,7 @@ class IdentifyPage:
         """Draw what has changed meanwhile, and go on while visible."""
         self.visible = visible
         self._follow()
+        self._redraw()  # mode, unit or theme may have changed
 
     def start(self) -> None:
         """Identify the record shown."""
@@ -165,5 +167,6 @@ def _read(field: pmui.TextInput, low: float, high: float) -> float:
     """What was typed. Raises SettingError."""
     value = parsed(str(field.value))
     if isinstance(value, str) or not low <= value <= high:
-        raise SettingError(f"{field.label} = {str(field.value)[:40]!r}: takes a number from {low:g} to {high:g}")
+        raise SettingError(
+            f"{field.label} = {str(field.value)[:40]!r}: takes a number from {low:g} to {high:g}{hint(str(field.value))}")
     return float(value)

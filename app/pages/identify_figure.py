@@ -55,7 +55,7 @@ class SpectrumFigure:
             self.figure.y_range.update(start=low, end=high, reset_start=low, reset_end=high)
         ends = float(of.frequency[0]), float(of.frequency[-1])
         self.figure.x_range.update(start=ends[0], end=ends[1], reset_start=ends[0], reset_end=ends[1])
-        self.figure.yaxis.axis_label = f"PSD of z, {display.mode} [{display.unit_label}²/Hz]"
+        self.figure.yaxis.axis_label = f"PSD of z, {display.mode_label} [{display.unit_label}²/Hz]"
 
     def draw_fit(self, mode: IdentifiedMode | None, of: Fit | None, display: Display, diameter: float) -> None:
         """Send the model of the mode shown, or nothing."""

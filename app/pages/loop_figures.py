@@ -64,7 +64,7 @@ class Trace(Lines):
             source.data = {"x": [], "y": []} if residual is None else {
                 "x": times, "y": (scale * envelope(residual[first:last, display.column], BINS)).astype(np.float32)}
         self.figure.x_range.update(start=first * dt, end=last * dt, reset_start=first * dt, reset_end=last * dt)
-        self.figure.yaxis.axis_label = f"residual {display.mode} [{display.unit_label}]"
+        self.figure.yaxis.axis_label = f"residual {display.mode_label} [{display.unit_label}]"
 
     def fit(self, hidden: list[str]) -> None:
         """Have the axis hold every visible line."""
@@ -93,7 +93,7 @@ class Spectrum(Lines):
                 self.figure.x_range.update(start=float(frequency[1]), end=float(frequency[-1]))
         top = 3.0 * self.highest() or 1.0
         self.figure.y_range.update(start=top * 10.0**-DECADES, end=top)
-        self.figure.yaxis.axis_label = f"PSD of residual, {display.mode} [{display.unit_label}²/Hz]"
+        self.figure.yaxis.axis_label = f"PSD of residual, {display.mode_label} [{display.unit_label}²/Hz]"
 
 
 class Response(Lines):

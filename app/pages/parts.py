@@ -12,6 +12,7 @@ import panel_material_ui as pmui
 from bokeh.plotting import figure
 
 from wfsobs.app.beside import Beside
+from wfsobs.app.controls.names import named
 from wfsobs.app.controls.panel import Status
 from wfsobs.app.run import CANCELLED, DONE, IDLE, RUNNING
 from wfsobs.app.style import asset, swatch
@@ -85,4 +86,4 @@ class Starter:
         for use in self.uses:
             use.disabled = running or work.result is None
         self.status.param.update(
-            progress=work.progress, text=said + self._detail(), note=work.message, visible=work.state != IDLE)
+            progress=work.progress, text=said + self._detail(), note=named(work.message), visible=work.state != IDLE)

@@ -18,6 +18,7 @@ from wfsobs.app.tune_work import CHOICES, MOST, best_so_far, compute, measure, s
 from wfsobs.configfile import changes
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION
+from wfsobs.parameters import hint
 from wfsobs.record import RecordError
 from wfsobs.settings import SettingError
 from wfsobs.tuning import Evaluation, Tuned
@@ -149,5 +150,6 @@ def _whole(field: pmui.TextInput, most: int) -> int:
     """What was typed. Raises SettingError."""
     value = parsed(str(field.value))
     if not isinstance(value, int) or not 1 <= value <= most:
-        raise SettingError(f"{field.label} = {str(field.value)[:40]!r}: takes a whole number from 1 to {most}")
+        raise SettingError(
+            f"{field.label} = {str(field.value)[:40]!r}: takes a whole number from 1 to {most}{hint(str(field.value))}")
     return value

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import panel as pn
 import panel_material_ui as pmui
 
-from wfsobs.app.display import NO_ANGLE, Display
+from wfsobs.app.controls.fields import SOON
+from wfsobs.app.display import UNITS, Display, short_name
 from wfsobs.app.run import Run
-from wfsobs.modes import TIP_TILT
+from wfsobs.modes import TIP_TILT, Mode
 
 
 class ModeSwitch:
@@ -17,7 +19,7 @@ class ModeSwitch:
 
     def __init__(self, run: Run, display: Display):
         self.run, self.display = run, display
-        options = {mode.name.capitalize(): mode.name for mode in TIP_TILT}
+        options = {_title(mode): mode.name for mode in TIP_TILT}
         self.buttons = pmui.RadioButtonGroup(options=options, value=display.mode, size="small", margin=0, variant="outlined")
         self.list = pmui.Select(
             label="Mode", options=options, value=display.mode, size="small", margin=0, width=190, visible=False)
@@ -43,7 +45,7 @@ class ModeSwitch:
         modes = shown.scenario.modes[: shown.result.record.n_modes]
         if self.display.mode not in [mode.name for mode in modes]:
             self.display.mode = modes[0].name
-        options = {mode.name[0].upper() + mode.name[1:]: mode.name for mode in modes}
+        options = {_title(mode): mode.name for mode in modes}
         if list(self.list.options) != list(options):
             self.list.param.update(options=options, value=self.display.mode)
             self.list.visible = len(modes) > len(TIP_TILT)
@@ -52,9 +54,49 @@ class ModeSwitch:
     def _follow(self, *_: object) -> None:
         """Show the mode in the widgets; what is no tilt of the wavefront has no angle."""
         mode = self.display.mode
-        if self.display.unit in NO_ANGLE and mode not in [m.name for m in TIP_TILT]:
+        if self.display.unit not in self.display.units:
             self.display.unit = "nm"
         if mode in self.list.options.values():
             self.list.value = mode
         if mode in self.buttons.options.values():
             self.buttons.value = mode
+
+
+class UnitSwitch:
+    """Chooses among the units of the mode shown, and says why one is missing. Made after the switch between modes."""
+
+    def __init__(self, display: Display):
+        self.display = display
+        self.buttons = pmui.RadioButtonGroup(
+            options=self._options(), value=display.unit, size="small", margin=0, variant="outlined")
+        self.buttons._debounce = SOON  # type: ignore[misc]
+        self.note = pn.pane.HTML(NO_MAS, visible=False, margin=0)
+        self.buttons.param.watch(self._chosen, "value")
+        display.param.watch(self._follow, ["mode", "unit"])
+
+    def view(self) -> list[object]:
+        """The buttons and the note."""
+        return [self.buttons, self.note]
+
+    def _options(self) -> dict[str, str]:
+        return {UNITS[unit]: unit for unit in self.display.units}
+
+    def _chosen(self, event: object) -> None:
+        value = event.new  # type: ignore[attr-defined]
+        if value in self.display.units:
+            self.display.unit = value
+
+    def _follow(self, *_: object) -> None:
+        options = self._options()
+        if options != self.buttons.options or self.buttons.value != self.display.unit:
+            self.buttons.param.update(options=options, value=self.display.unit)
+        self.note.visible = len(options) < len(UNITS)
+
+
+NO_MAS = '<span style="font-size:12px;opacity:0.75">mas: tip and tilt only</span>'
+
+
+def _title(mode: Mode) -> str:
+    """A mode's name in a list, with the one that axes have."""
+    short = short_name(mode)
+    return mode.name[0].upper() + mode.name[1:] + (f" ({short})" if short != mode.name else "")

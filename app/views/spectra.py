@@ -101,7 +101,7 @@ class _Spectrum:
         of = " of error" if display.error else ""
         what, unit = (
             (f"cumulative rms{of}", display.unit_label) if display.cumulative else (f"PSD{of}", f"{display.unit_label}²/Hz"))
-        self.figure.yaxis.axis_label = f"{what}, {display.mode} [{unit}]"
+        self.figure.yaxis.axis_label = f"{what}, {display.mode_label} [{unit}]"
         if self.target == VIBRATION:
             self._draw_marks(shown)
 

@@ -136,7 +136,7 @@ class _Trace:
         settled = warm_up + WINDOW_S * display.running
         self._fit(data, settled, self._draw_pinned(display, data["x"]), room(shown))
         self.events.draw(shown, display.dark)
-        what = f"{'running rms of ' if display.running else ''}{'error of ' if display.error else ''}{display.mode}"
+        what = f"{'running rms of ' if display.running else ''}{'error of ' if display.error else ''}{display.mode_label}"
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
 
     def _draw_pinned(self, display: Display, times: Array) -> dict[str, tuple[Array, Array]]:

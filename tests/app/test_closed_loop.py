@@ -121,6 +121,13 @@ def test_it_follows_the_settings_while_it_is_seen(page: ClosedLoopPage, dashboar
     assert "unstable</span>" not in page.table.object
 
 
+def test_it_comes_back_as_the_switches_are_by_then(page: ClosedLoopPage, dashboard: Dashboard) -> None:
+    dashboard.pages.current = EXPLORE
+    dashboard.display.param.update(mode="tilt", unit="mas")
+    opened(dashboard)
+    assert page.whole.figure.yaxis.axis_label == "residual tilt [mas]"
+
+
 def test_more_modes_than_tip_and_tilt(page: ClosedLoopPage, dashboard: Dashboard, loop: Any) -> None:
     dashboard.store.change("telescope.radial_order", 2)
     loop.finish(dashboard.store)

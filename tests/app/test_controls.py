@@ -9,6 +9,7 @@ import param
 import pytest
 
 from wfsobs.app.controls.fields import SliderField, label_of, parsed, written_unit
+from wfsobs.app.controls.names import name_of
 from wfsobs.app.controls.panel import FIRST, Controls, status_of
 from wfsobs.app.work import Shown
 from wfsobs.pipeline import Result
@@ -142,10 +143,11 @@ def test_a_typed_value_runs(controls: Controls, loop: Any, path: str, text: str,
 
 
 @pytest.mark.parametrize(("path", "text", "says"), [
-    ("turbulence.wind_speed", "200", "0.1 to 100 m/s"), ("turbulence.wind_speed", "fast", "a number"),
+    ("turbulence.wind_speed", "200", "Wind speed V₀ = 200: takes a number from 0.1 to 100 m/s"),
+    ("turbulence.wind_speed", "15,5", "use a point: 15.5"), ("turbulence.wind_speed", "fast", "a number"),
     ("turbulence.wind_speed", "", "a number"), ("run.seed", "1.5", "a whole number"),
     ("gpr_online.length_scale", "nan", "0.1"), ("butterworth.frequencies", "20, x", "a list of"),
-    ("kalman.frequency", "900", "half the LGS rate"), ("run.warm_up", "3", "run.duration"),
+    ("kalman.frequency", "900", "half the LGS rate"), ("run.warm_up", "3", "Duration"),
 ])
 def test_a_bad_value_shows_beside_its_setting(controls: Controls, path: str, text: str, says: str) -> None:
     shown, scenario = controls.store.run.shown, controls.store.scenario
@@ -154,7 +156,7 @@ def test_a_bad_value_shows_beside_its_setting(controls: Controls, path: str, tex
     assert says in error_of(controls, path)
     assert field.widgets[-1].error_state and field.widgets[-1].value == text, "what was typed stays, to be corrected"
     assert controls.store.run.shown is shown and controls.store.scenario is scenario
-    assert status_of(controls.store)[1] == f"Not accepted: {path}" == controls.status.note
+    assert status_of(controls.store)[1] == f"Not accepted: {name_of(path)}" == controls.status.note
 
 
 def test_correcting_a_bad_value_clears_the_message(controls: Controls, loop: Any) -> None:
@@ -204,7 +206,7 @@ def test_every_widget_follows_the_store(controls: Controls, loop: Any) -> None:
 def test_choosing_a_preset(controls: Controls) -> None:
     controls.preset.value = "ut4"
     assert controls.store.scenario == PRESETS["ut4"]() and controls.store.run.state == "running"
-    assert controls.reset.disabled and controls.preset.helper_text == ""
+    assert controls.reset.disabled and controls.preset.helper_text == "Nothing changed"
     controls.store.change("loop.gain", 0.1)
     assert "loop.gain" in controls.preset.helper_text and not controls.reset.disabled
     controls.reset.clicks += 1
@@ -256,8 +258,9 @@ class TestPeaks:
         assert controls.store.run.shown.scenario == controls.store.scenario
 
     @pytest.mark.parametrize(("key", "text", "says"), [
-        ("frequency", "-3", "from 0.01"), ("frequency", "600", "half the LGS rate"), ("damping", "two", "a number"),
-        ("rms.1", "-1", "from 0 to 100"),
+        ("frequency", "-3", "from 0.01"), ("frequency", "600", "half the LGS rate"),
+        ("damping", "two", "Peak 3: ξ = 'two': takes a number"),
+        ("rms.1", "-1", "Peak 3: rms = [0.0025, -1]: takes"), ("rms.1", "0,5", "use a point: 0.5"),
     ])
     def test_bad_cell(self, controls: Controls, key: str, text: str, says: str) -> None:
         shown, rows = controls.store.run.shown, controls.lists[PATH].table.rows
@@ -280,3 +283,24 @@ def test_parsed() -> None:
     assert parsed("3") == 3 and isinstance(parsed("3"), int)
     assert parsed("−1.5e-3") == -0.0015
     assert parsed("three") == "three"
+
+
+def test_what_did_not_arrive_is_done_again(controls: Controls, loop: Any) -> None:
+    """As a browser sends it that was cut off; a topic that nobody has opened, and nonsense, among it."""
+    controls.take({"setting": "turbulence.wind_speed", "value": "22"})
+    controls.take({"setting": "turbulence.wind_speed", "value": 200.0})
+    controls.take({"setting": "loop.gain", "value": 0.4})
+    controls.take({"setting": PATH, "message": {"action": "edit", "row": 0, "key": "frequency", "text": "6.5"}})
+    for nonsense in (
+        {}, {"setting": 3}, {"setting": "run.x", "value": 1}, {"setting": "preset", "value": "x"},
+        {"setting": PATH, "message": 1},
+        {"setting": PATH, "message": {"action": "remove", "row": 99}}, {"setting": "run.duration", "value": None},
+    ):
+        controls.take(nonsense)
+    store = controls.store
+    assert [store.value(path) for path in ("turbulence.wind_speed", "loop.gain", f"{PATH}.0.frequency")] == [22.0, 0.4, 6.5]
+    assert set(store.errors) == {"turbulence.wind_speed"}
+    assert field_of(controls, "turbulence.wind_speed").widgets[-1].value == "200"
+    controls.take({"setting": "preset", "value": "ut4"})
+    assert store.preset == "ut4" and store.errors == {}
+    store.run.cancel()

@@ -17,10 +17,11 @@ from wfsobs.app.display import per_micrometre
 from wfsobs.app.identify_work import same, seconds
 from wfsobs.app.limits import PUBLIC, Limits
 from wfsobs.app.pages.identify import EARLIER, IdentifyPage
-from wfsobs.app.pages.pages import IDENTIFY
+from wfsobs.app.pages.pages import EXPLORE, IDENTIFY
 from wfsobs.app.run import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.sources import Kept, Loaded
 from wfsobs.app.store import Store
+from wfsobs.app.style import LOOKS
 from wfsobs.formats import format_of
 from wfsobs.identify import Identified, identify
 from wfsobs.identify.process import Number
@@ -217,6 +218,16 @@ def test_limits_of_a_public_server(loop: Any, short: Scenario) -> None:
     assert page.work.message == "It took more than 1e-06 s, which is what this server allows"
     longest = replace(shown.result.record, y_lgs=np.zeros((120_000, 2)), u=np.zeros((120_000, 2)))
     PUBLIC.check_seconds(seconds(longest), "identification")
+
+
+def test_it_comes_back_as_the_switches_are_by_then(page: IdentifyPage, dashboard: Dashboard) -> None:
+    """Theme, mode and unit may be changed while another page is shown."""
+    dashboard.pages.current = EXPLORE
+    dashboard.display.param.update(dark=True, mode="tilt", unit="mas")
+    dashboard.pages.current = IDENTIFY
+    line = page.figure.figure.renderers[1]
+    assert line.glyph.line_color == LOOKS["measured"].dark and LOOKS["measured"].dark in page.legend.object
+    assert page.figure.figure.yaxis.axis_label == "PSD of z, tilt [mas²/Hz]"
 
 
 def test_same_records(short: Scenario) -> None:

@@ -238,6 +238,15 @@ class TestHigherModes:
         assert (display.mode, display.column, display.unit) == ("defocus", 2, "nm")
         truth = dashboard.explore.traces.traces["turbulence"].figure
         assert "defocus" in truth.yaxis[0].axis_label and "Turbulence, defocus" in dashboard.explore.table.pane.object
+        units = dashboard.units
+        assert list(units.buttons.options.values()) == ["nm", "um"] and units.note.visible and units.buttons.value == "nm"
+        display.mode = "oblique astigmatism"
+        assert truth.yaxis[0].axis_label == "Z5 [nm]" and "Oblique astigmatism (Z5)" in switch.list.options
+        display.mode = "tilt"
+        assert "mas" in units.buttons.options.values() and not units.note.visible
+        units.buttons.value = "mas"
+        assert display.unit == "mas"
+        switch.list.value = "defocus"
         dashboard.explore.pinning._pressed(None)
         store.change("telescope.radial_order", 1)
         loop.finish(store)

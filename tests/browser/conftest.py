@@ -33,13 +33,15 @@ expect.set_options(timeout=30_000)  # a busy machine is no fault
 
 
 class Server:
-    """A server on a free port of this machine, its output in a file."""
+    """A server on a port of this machine, a free one unless told, its output in a file."""
 
-    def __init__(self, command: list[str], log: Path, path: str):
+    def __init__(self, command: list[str], log: Path, path: str, port: int = 0):
         self.log = log
-        with socket.socket() as s:
-            s.bind(("127.0.0.1", 0))
-            port = s.getsockname()[1]
+        if not port:
+            with socket.socket() as s:
+                s.bind(("127.0.0.1", 0))
+                port = s.getsockname()[1]
+        self.port = port
         self.url = f"http://localhost:{port}{path}"
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
         with log.open("w") as out:
@@ -113,8 +115,8 @@ def open_page(server: Server, browser: Browser) -> Iterator[Any]:
     start = len(server.log.read_text())
     opened: list[tuple[Page, Watched]] = []
 
-    def open_it(width: int = 1400, height: int = 1000, url: str = "", wait: bool = True) -> Page:
-        page = browser.new_page(viewport={"width": width, "height": height})
+    def open_it(width: int = 1400, height: int = 1000, url: str = "", wait: bool = True, **options: Any) -> Page:
+        page = browser.new_page(viewport={"width": width, "height": height}, **options)
         page.set_default_timeout(60_000)
         opened.append((page, Watched(page)))
         page.goto(url or server.url)
@@ -135,7 +137,23 @@ DONE = """() => [...(window.Bokeh?.index?.roots?.[0]?.model.document._all_models
 """Asked of the models: on a phone the line that says so may be in a drawer that has not been opened."""
 
 
+DRAWN = """() => {
+  const parse = (text) => new DOMParser().parseFromString(text, "text/html").body
+  const table = (root) => {
+    for (const it of root.querySelectorAll("*")) {
+      if (it.matches("table.rms") && it.querySelector("[data-observer], .target")) return it
+      const below = it.shadowRoot && table(it.shadowRoot)
+      if (below) return below
+    }
+  }
+  const models = [...Bokeh.index.roots[0].model.document._all_models.values()]
+  const said = models.map((m) => m.text).find((text) => typeof text === "string" && /table class=.{1,6}rms/.test(text))
+  return said && table(document)?.textContent === table(parse(parse(said).textContent))?.textContent
+}"""
+"""Whether the table stands on the page as its model has it: on a busy machine that takes a while."""
+
+
 def finished(page: Page) -> None:
-    """Wait until the run is over."""
+    """Wait until the run is over and its results are drawn."""
     page.wait_for_function(DONE, polling=100)
-    page.wait_for_timeout(300)
+    page.wait_for_function(DRAWN, polling=100)

@@ -26,5 +26,4 @@ def test_controllers_side_by_side(open_page: Any, server: Any) -> None:
     card.click()
     expect(card).to_have_attribute("aria-pressed", "false")
     page.set_viewport_size({"width": 390, "height": 844})
-    page.wait_for_timeout(300)
-    assert page.evaluate("() => document.documentElement.scrollWidth") <= 390
+    page.wait_for_function("() => document.documentElement.scrollWidth <= 390")

@@ -65,7 +65,7 @@ def test_the_model(open_page: Any) -> None:
 
 def test_by_keyboard_on_a_phone(open_page: Any) -> None:
     page = open_page(390, 844)
-    page.wait_for_timeout(600)
+    expect(page.get_by_role("button", name="Open drawer")).to_be_visible()
     button = page.get_by_role("button", name="Model", exact=True)
     button.focus()
     page.keyboard.press("Enter")

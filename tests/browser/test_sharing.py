@@ -117,7 +117,7 @@ def test_data_and_figures(open_short: Any, tmp_path: Path) -> None:
         labels = {look(line).label for line in ("truth", *observers_of(target))}
         assert labels <= {it.text for it in root.iter("{http://www.w3.org/2000/svg}text")}, "the legend"
         png = saved(page, f"{name} as PNG", tmp_path).read_bytes()
-        assert png.startswith(b"\x89PNG") and int.from_bytes(png[20:24]) == int(float(root.get("height", 0))) > 240
+        assert png.startswith(b"\x89PNG") and int.from_bytes(png[20:24]) == 3 * int(float(root.get("height", 0))) > 720
 
 
 def test_a_scenario_out_and_in_again(open_short: Any, tmp_path: Path) -> None:

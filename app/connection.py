@@ -1,0 +1,40 @@
+"""The connection to the browser: answers its questions whether anybody is there, and takes what it kept while nobody was."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+from uuid import uuid4
+
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.style import asset
+
+MOST = 1000
+"""Changes that are taken at once."""
+
+
+class Connection(JSComponent):
+    """The banner in the browser: questions {ask} and unsent changes {changes} up, the last question heard down."""
+
+    session = param.String("", doc="A name of the session, to tell it from one made anew.")
+    heard = param.Integer(0, doc="Number of the last question that has arrived, and all before it.")
+
+    _esm = asset("connection.js")
+    _stylesheets = [asset("connection.css")]  # noqa: RUF012
+
+    def __init__(self, take: Callable[[dict[str, Any]], None], **params: Any):
+        """take : makes a change again that did not arrive"""
+        self._take = take
+        super().__init__(session=uuid4().hex, **params)
+
+    def _handle_msg(self, data: Any) -> None:
+        if not isinstance(data, dict):
+            return
+        if isinstance(data.get("ask"), int):
+            self.heard = data["ask"]
+        changes = data.get("changes")
+        for change in changes[:MOST] if isinstance(changes, list) else []:
+            if isinstance(change, dict):
+                self._take(change)

@@ -1,0 +1,241 @@
+// Watches the connection to the server: says at once when it is lost, takes it up again where the server still has the session,
+// and keeps what was changed meanwhile. One for the document, which outlives what is drawn of it.
+
+const TICK = 250 // [ms]; only those count in which this page gets to work, so that a busy computer is no lost connection
+const PATIENCE = 8 // with a question to the server [ticks]
+const GIVEN_UP = 40 // after which another way to the server is tried [ticks]
+const PERIOD = 12 // between questions where nothing is changed [ticks]
+const TIMEOUT = 3_000 // of a question beside the connection [ms]
+const LONGEST = 10_000 // between two attempts to connect [ms]
+const UNSENT = "wfsobs-unsent"
+const TAG = "setting:"
+const TYPED = ["value", "value_input", "value_throttled"]
+
+const SAID = {
+  connected: "Connected again.",
+  offline: "This computer is offline. Results are as they were; what you change is kept for later.",
+  silent: "The server does not answer. Results are as they were; what you change is kept for later.",
+  lost: "The connection to the server is lost: connecting again … Results are as they were; what you change is kept for later.",
+  gone: "The server does not have this session any more.",
+}
+
+// Whether the server answers at all: a file of its own, not from a cache.
+async function reachable() {
+  const file = [...document.scripts].find((script) => script.src.includes("static/"))?.src ?? location.href
+  try {
+    return (await fetch(file, {method: "HEAD", cache: "no-store", signal: AbortSignal.timeout(TIMEOUT)})).ok
+  } catch {
+    return false
+  }
+}
+
+// The socket that something is sent by.
+function socketOf(act) {
+  const send = WebSocket.prototype.send
+  let socket = null
+  WebSocket.prototype.send = function (...args) {
+    socket = this
+    return send.apply(this, args)
+  }
+  try {
+    act()
+  } finally {
+    WebSocket.prototype.send = send
+  }
+  return socket
+}
+
+// The path of the setting that a component, or what holds its data, stands for; or nothing.
+function settingOf(model) {
+  const of = model?.data ? model : [...model?.document?._all_models.values() ?? []].find((it) => it.data === model)
+  return of?.tags.find((tag) => tag.startsWith?.(TAG))?.slice(TAG.length)
+}
+
+class Link {
+  constructor(doc) {
+    Object.assign(this, {doc, state: "connected", asked: 0, unsent: [], socket: null, connection: null, refused: 0, wait: 0, ticks: 0})
+    doc.on_change((event) => this.changed(event))
+    doc.on_event("connection_lost", (_, event) => this.lost(event.connection.deref()))
+    window.addEventListener("offline", () => { this.turn("offline"); this.ask() })
+    window.addEventListener("online", () => this.connection ? this.retry() : this.ask())
+    document.addEventListener("visibilitychange", () => this.ask())
+    setInterval(() => this.tick(), TICK)
+  }
+
+  // What is drawn of the document is there, for the first time or anew.
+  attach(model, draw) {
+    const again = this.model !== undefined
+    Object.assign(this, {model, draw, session: model.session})
+    model.on("heard", () => this.answered(model.heard))
+    if (!again) this.restore()
+    this.connection = null
+    this.wait = this.refused = 0
+    this.due = true
+    this.deliver()
+    this.turn("connected")
+  }
+
+  turn(state) {
+    const before = this.state
+    this.state = state
+    this.draw(state === "connected" && before === "connected" ? "" : SAID[state], state)
+  }
+
+  // ---------------------------------------------------------------- questions and answers
+
+  ask() {
+    if (this.connection || !this.ready) return
+    if (this.asked === this.model.heard) this.ticks = 0
+    this.asked += 1
+    this.socket = socketOf(() => this.model.send_msg({ask: this.asked}))
+  }
+
+  // The connection stands, as far as one knows.
+  tick() {
+    if (this.connection || document.hidden) return
+    this.deliver()
+    this.ticks += 1
+    const waiting = this.asked > this.model.heard
+    if (!waiting && (this.unsent.length || this.ticks >= PERIOD)) this.ask()
+    if (waiting && this.ticks === PATIENCE) this.turn(navigator.onLine ? "silent" : "offline")
+    if (waiting && this.ticks % GIVEN_UP === 0) this.another()
+  }
+
+  answered(number) {
+    this.ticks = 0
+    this.unsent = this.unsent.filter((it) => it.number > number)
+    this.keep()
+    if (["offline", "silent"].includes(this.state)) this.turn("connected")
+  }
+
+  // Where the server is there but this way to it is not.
+  async another() {
+    const {asked, socket} = this
+    if (await reachable() && this.model.heard < asked && socket === this.socket) socket?.close()
+  }
+
+  // ---------------------------------------------------------------- lost, and found again
+
+  lost(connection) {
+    if (this.connection) return
+    this.connection = connection
+    const link = this
+    connection._repull_session_doc = async function (resolve, reject) {
+      try {
+        const {doc_json, buffers} = await this._pull_doc_json()
+        if (!JSON.stringify(doc_json).includes(link.session)) throw new Error("another session")
+        const {document} = this.session
+        document.constructor.from_json(doc_json, [], buffers).destructively_move(document)
+        document._new_models.clear() // the server has them
+        resolve(this.session)
+      } catch (error) {
+        if (error.message === "another session") link.end()
+        reject(error)
+      }
+    }
+    this.turn(navigator.onLine ? "lost" : "offline")
+    this.retry()
+  }
+
+  async retry() {
+    clearTimeout(this.retrying)
+    try {
+      await this.connection.connect()
+    } catch {
+      if (this.state === "gone") return
+      this.refused = await reachable() ? this.refused + 1 : 0
+      if (this.refused > 2) return this.end()
+      this.turn(navigator.onLine ? "lost" : "offline")
+      this.wait = Math.min(2 * this.wait + 500, LONGEST)
+      this.retrying = setTimeout(() => this.retry(), this.wait)
+    }
+  }
+
+  end() {
+    this.turn("gone")
+    this.connection.close()
+  }
+
+  async again() {
+    if (!await reachable()) return this.draw(SAID.gone + " It does not answer yet.", "gone")
+    this.keep()
+    location.reload()
+  }
+
+  // ---------------------------------------------------------------- what was changed and may not have arrived
+
+  changed(event) {
+    if (!event.sync) return
+    const number = this.asked + 1
+    if (event.kind === "ModelChanged" && TYPED.includes(event.attr)) {
+      const {id} = event.model, setting = settingOf(event.model)
+      this.unsent = this.unsent.filter((it) => (setting ? it.setting !== setting : it.id !== id) || it.message)
+      this.note({number, id, setting, attr: event.attr, value: event.value})
+    } else if (event.kind === "MessageSent") {
+      const {origin, data} = event.msg_data ?? {}, setting = data?.action && settingOf(origin)
+      if (setting) this.note({number, id: origin.id, setting, message: data})
+    }
+  }
+
+  note(it) {
+    this.unsent.push(it)
+    this.keep()
+    queueMicrotask(() => this.ask())
+  }
+
+  // Once the page is drawn for the first time: what the server changes before then is not seen.
+  deliver() {
+    this.ready ||= this.doc.is_idle
+    if (!this.ready || !this.due) return
+    this.due = false
+    this.send(this.unsent.filter((it) => it.number > this.model.heard))
+  }
+
+  send(changes) {
+    this.unsent = changes.map((it) => ({...it, number: this.asked + 1}))
+    const settings = changes.filter((it) => it.setting)
+    if (settings.length) this.model.send_msg({changes: settings})
+    for (const {id, attr, value} of changes.filter((it) => !it.setting)) {
+      const model = this.doc.get_model_by_id(id)
+      if (model) model[attr] = value
+    }
+    this.ask()
+  }
+
+  keep() {
+    try {
+      if (this.unsent.length) sessionStorage.setItem(UNSENT, JSON.stringify([location.search, this.unsent]))
+      else sessionStorage.removeItem(UNSENT)
+    } catch { /* a browser that keeps nothing */ }
+  }
+
+  restore() {
+    try {
+      const [search, unsent] = JSON.parse(sessionStorage.getItem(UNSENT)) ?? []
+      if (search === location.search) this.unsent = unsent.map((it) => ({...it, id: "", number: 1}))
+    } catch { /* nothing kept */ }
+  }
+}
+
+export function render({model, view, el}) {
+  const doc = view.model.document
+  const box = document.createElement("div")
+  Object.assign(box, {className: "banner", popover: "manual"})
+  box.setAttribute("role", "alert")
+  const text = document.createElement("span")
+  const button = Object.assign(document.createElement("button"), {type: "button", textContent: "Start again with these settings"})
+  button.onclick = () => doc.wfsobs.again()
+  box.append(text, button)
+  el.append(box)
+  let hiding
+  const draw = (said, state) => {
+    clearTimeout(hiding)
+    box.dataset.state = state
+    text.textContent = said
+    button.hidden = state !== "gone"
+    box.togglePopover(said !== "")
+    if (state === "connected") hiding = setTimeout(() => box.hidePopover(), 3_000)
+  }
+  doc.wfsobs ??= new Link(doc)
+  doc.wfsobs.attach(model, draw)
+}

@@ -1,0 +1,169 @@
+"""The network goes, the server goes, and what a visitor has done meanwhile does not."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+QUICK = (
+    "?run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5")
+
+
+class Cable:
+    """What lies between browser and server, and can be cut."""
+
+    def __init__(self) -> None:
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self.listener.getsockname()[1]
+        self.to, self.whole = 0, True
+        self.ends: list[socket.socket] = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near, _ = self.listener.accept()
+            except OSError:
+                return
+            try:
+                if not self.whole:
+                    raise OSError
+                far = socket.create_connection(("127.0.0.1", self.to))
+            except OSError:
+                near.close()
+                continue
+            self.ends += [near, far]
+            for one, other in ((near, far), (far, near)):
+                threading.Thread(target=self._carry, args=(one, other), daemon=True).start()
+
+    def _carry(self, one: socket.socket, other: socket.socket) -> None:
+        try:
+            while part := one.recv(65536):
+                other.sendall(part)
+        except OSError:
+            pass
+        for end in (one, other):
+            end.close()
+
+    def cut(self) -> None:
+        self.whole = False
+        for end in self.ends:
+            try:
+                end.shutdown(socket.SHUT_RDWR)
+            except OSError:
+                continue
+        self.ends = []
+
+    def mend(self) -> None:
+        self.whole = True
+
+
+@pytest.fixture
+def cable() -> Iterator[Cable]:
+    cable = Cable()
+    yield cable
+    cable.listener.close()
+    cable.cut()
+
+
+@pytest.fixture
+def serve(make_server: Any, cable: Cable, tmp_path: Any) -> Iterator[Any]:
+    """A function that starts the server, or starts it again where it was."""
+    started: list[Any] = []
+
+    def start(name: str = "log") -> Any:
+        command = ["-m", "wfsobs", "serve", "--local", "--port", "{port}", "--origin", f"localhost:{cable.port}"]
+        started.append(make_server(command, tmp_path / name, "/", port=cable.to))
+        cable.to = started[-1].port
+        return started[-1]
+
+    yield start
+    started[-1].close()
+    assert started[-1].errors(0) == []
+
+
+@pytest.fixture
+def page(browser: Browser, cable: Cable, serve: Any) -> Iterator[Page]:
+    """The page at the end of the cable, its first run over."""
+    context = browser.new_context(viewport={"width": 1400, "height": 1000})
+    page = context.new_page()
+    page.set_default_timeout(60_000)
+    page.server = serve()  # type: ignore[attr-defined]
+    page.goto(f"http://localhost:{cable.port}/{QUICK}")
+    done(page)
+    yield page
+    context.close()
+
+
+def done(page: Page) -> None:
+    page.locator("[role=status]", has_text="Done in").first.wait_for(state="attached", timeout=120_000)
+
+
+def speed(page: Page, text: str) -> None:
+    box = page.get_by_role("textbox", name="m/s")
+    box.fill(text)
+    box.press("Enter")
+
+
+def peak(page: Page) -> Any:
+    return page.locator('input[data-cell="0.frequency"]')
+
+
+def banner(page: Page, text: str) -> Any:
+    return page.get_by_role("alert").filter(has_text=text)
+
+
+def test_offline_for_a_while(page: Page) -> None:
+    page.context.set_offline(True)
+    expect(banner(page, "This computer is offline")).to_be_visible(timeout=2000)
+    speed(page, "22")
+    page.context.set_offline(False)
+    expect(banner(page, "Connected again")).to_be_visible()
+    page.wait_for_function("() => location.search.includes('turbulence.wind_speed=22')")
+    expect(page.get_by_role("alert").filter(has_text="Connected again")).to_be_hidden()
+    done(page)
+
+
+def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> None:
+    page.get_by_role("button", name="Pin this run to compare others with it").click()
+    expect(page.get_by_text("Pinned, faint in the figures")).to_be_visible()
+    cable.cut()
+    expect(banner(page, "connection to the server is lost")).to_be_visible(timeout=2000)
+    speed(page, "22")
+    peak(page).fill("6.5")
+    peak(page).press("Enter")
+    page.get_by_role("button", name="+ Add peak").click()
+    peaks = page.locator('input[data-cell$=".frequency"]').count()
+    cable.mend()
+    expect(banner(page, "Connected again")).to_be_visible()
+    page.wait_for_function("() => location.search.includes('turbulence.wind_speed=22')")
+    page.wait_for_function("() => location.search.includes('vibration.peaks=6.5,')")
+    expect(page.locator('input[data-cell$=".frequency"]')).to_have_count(peaks + 1)
+    expect(page.get_by_text("Wind speed V₀ 15 → 22 m/s")).to_be_visible(), "the same session: its pinned run is there"
+    done(page)
+
+
+def test_a_server_that_was_started_again(page: Page, cable: Cable, serve: Any) -> None:
+    speed(page, "22")
+    page.wait_for_function("() => location.search.includes('turbulence.wind_speed=22')")
+    page.server.process.kill()  # type: ignore[attr-defined]
+    page.server.process.wait(20)  # type: ignore[attr-defined]
+    expect(banner(page, "connection to the server is lost")).to_be_visible(timeout=2000)
+    speed(page, "200")
+    peak(page).fill("7.5")
+    peak(page).press("Enter")
+    serve("again")
+    again = page.get_by_role("button", name="Start again with these settings")
+    expect(again).to_be_visible(timeout=60_000)
+    again.click()
+    expect(peak(page)).to_have_value("7.5", timeout=60_000)
+    expect(banner(page, "Wind speed V₀ = 200: takes a number from 0.1 to 100 m/s").first).to_be_visible()
+    expect(page.get_by_role("textbox", name="m/s")).to_have_value("200")
+    page.wait_for_function("() => location.search.includes('turbulence.wind_speed=22')")
+    page.wait_for_function("() => location.search.includes('vibration.peaks=7.5,')")
+    done(page)

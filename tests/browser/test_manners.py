@@ -1,0 +1,70 @@
+"""What is not to bother anyone: things that move under the pointer, words that stay, a theme that nobody asked for."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from playwright.sync_api import Locator, Page, expect
+
+QUICK = (
+    "?run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5")
+
+
+def place(it: Locator) -> tuple[float, float]:
+    box = it.bounding_box()
+    assert box is not None
+    return round(box["x"]), round(box["y"])
+
+
+def becomes(page: Page, expected: bool) -> None:
+    """Wait for the theme."""
+    sign = "<" if expected else ">="
+    page.wait_for_function(
+        f"() => getComputedStyle(document.body).backgroundColor.match(/\\d+/g).slice(0, 3).reduce((a, b) => +a + +b) {sign} 300")
+
+
+def test_nothing_moves_under_the_pointer(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK)
+    load, source = page.get_by_role("button", name="Load data"), page.get_by_role("combobox", name="Source").first
+    run, box = page.get_by_role("button", name="Run", exact=True).first, page.get_by_role("textbox", name="m/s")
+    before = [place(it) for it in (load, run, box, source)]
+    page.evaluate("() => { navigator.clipboard.writeText = () => Promise.resolve() }")
+    page.get_by_role("button", name="Share", exact=True).click()
+    page.get_by_role("menuitem", name="Copy link", exact=True).click()
+    expect(page.get_by_text("Copied the link.")).to_be_visible()
+    assert place(load) == before[0]
+    box.fill("22")
+    box.press("Enter")
+    page.locator('input[data-cell="0.frequency"]').fill("7")
+    page.locator('input[data-cell="0.frequency"]').press("Enter")
+    expect(page.get_by_text(re.compile(r"\d changed: .*vibration.peaks"))).to_be_visible()
+    assert [place(it) for it in (load, run, box, source)] == before
+    expect(page.get_by_text("Copied the link.")).to_have_count(0)
+
+
+def test_a_comma_gets_a_hint(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK)
+    box = page.get_by_role("textbox", name="m/s")
+    box.fill("15,5")
+    box.press("Enter")
+    expect(page.get_by_role("alert").filter(has_text="use a point: 15.5").first).to_be_visible()
+
+
+def test_the_theme_of_the_system_unless_another_is_chosen(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK, color_scheme="dark")
+    becomes(page, True)
+    page.emulate_media(color_scheme="light")
+    becomes(page, False)
+    page.get_by_role("button", name=re.compile("theme", re.I)).click()
+    becomes(page, True)
+    page.reload()
+    becomes(page, True)
+    page.emulate_media(color_scheme="dark")
+    page.get_by_role("button", name=re.compile("theme", re.I)).click()
+    becomes(page, False)
+    page.emulate_media(color_scheme="light")
+    page.emulate_media(color_scheme="dark")
+    page.reload()
+    expect(page.get_by_role("textbox", name="m/s")).to_be_visible()
+    becomes(page, False)
