@@ -65,7 +65,7 @@ class Options:
     limits: Limits = NONE
     runs: int = 0
     cache_mb: int = CACHE_MB
-    lifetime: float = 15.0
+    lifetime: float = 60.0
     log_level: str = "info"
     log_requests: bool = False
 
@@ -158,7 +158,7 @@ def make_server(options: Options, service: Service) -> Server:
         sign_sessions=True, secret_key=generate_secret_key(), include_headers=[], include_cookies=[],
         session_token_expiration=TOKEN,  # a page that was open for days may come back as well
         unused_session_lifetime_milliseconds=round(1000 * options.lifetime),
-        check_unused_sessions_milliseconds=round(1000 * options.lifetime),
+        check_unused_sessions_milliseconds=round(250 * options.lifetime),
         extra_patterns=[("/liveness", Liveness, {"service": service})],
     )
     router = server._tornado.wildcard_router

@@ -56,7 +56,10 @@ class Link {
     Object.assign(this, {doc, state: "connected", asked: 0, unsent: [], socket: null, connection: null, refused: 0, wait: 0, ticks: 0})
     doc.on_change((event) => this.changed(event))
     doc.on_event("connection_lost", (_, event) => this.lost(event.connection.deref()))
-    window.addEventListener("offline", () => { this.turn("offline"); this.ask() })
+    window.addEventListener("offline", () => {
+      if (this.state !== "gone") this.turn("offline")
+      this.ask()
+    })
     window.addEventListener("online", () => this.connection ? this.retry() : this.ask())
     document.addEventListener("visibilitychange", () => this.ask())
     setInterval(() => this.tick(), TICK)
@@ -139,6 +142,8 @@ class Link {
 
   async retry() {
     clearTimeout(this.retrying)
+    if (this.trying) return
+    this.trying = true
     try {
       await this.connection.connect()
     } catch {
@@ -148,6 +153,8 @@ class Link {
       this.turn(navigator.onLine ? "lost" : "offline")
       this.wait = Math.min(2 * this.wait + 500, LONGEST)
       this.retrying = setTimeout(() => this.retry(), this.wait)
+    } finally {
+      this.trying = false
     }
   }
 

@@ -92,8 +92,9 @@ def hint(value: object) -> str:
     """
     if isinstance(value, list):
         return next((said for v in value if isinstance(v, str) and (said := hint(v))), "")
-    decimal = isinstance(value, str) and re.fullmatch(r"\s*[-+−]?\d*,\d+\s*", value)
-    return f"; use a point: {value.strip().replace(',', '.')}" if decimal else ""
+    if isinstance(value, str) and re.fullmatch(r"\s*[-+−]?\d*,\d+\s*", value):
+        return f"; use a point: {value.strip().replace(',', '.')}"
+    return ""
 
 
 def unit_of(p: param.Parameter) -> str:

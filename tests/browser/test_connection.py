@@ -144,7 +144,7 @@ def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> 
     page.wait_for_function("() => location.search.includes('turbulence.wind_speed=22')")
     page.wait_for_function("() => location.search.includes('vibration.peaks=6.5,')")
     expect(page.locator('input[data-cell$=".frequency"]')).to_have_count(peaks + 1)
-    expect(page.get_by_text("Wind speed V₀ 15 → 22 m/s")).to_be_visible(), "the same session: its pinned run is there"
+    expect(page.get_by_text("Wind speed V₀ 15 → 22 m/s")).to_be_visible()  # the same session: its pinned run is there
     done(page)
 
 
