@@ -159,7 +159,7 @@ function noteBox(el, model) {
   draw()
 }
 
-const drawn = new WeakSet() // documents; one may be drawn anew after a connection was lost
+const known = new WeakSet() // documents; one may be drawn anew after a connection was lost
 
 export function render({model, view, el}) {
   const bar = tag("div", el, {className: "bar"})
@@ -196,8 +196,8 @@ export function render({model, view, el}) {
   const address = () => history.replaceState(history.state, "", here() + location.hash)
   model.on("said", speak)
   model.on("query", address)
-  if (drawn.has(view.model.document)) address()
-  drawn.add(view.model.document)
+  if (known.has(view.model.document)) address()
+  known.add(view.model.document)
   model.on("msg:custom", (event) => {
     const {name, kind, content} = event.data ?? event
     save(name, new Blob([Uint8Array.from(atob(content), (c) => c.charCodeAt(0))], {type: kind}))
