@@ -40,10 +40,19 @@ def noise_covariance(scenario: Scenario, kind: Kind) -> Array:
     """
     s = scenario.sensors
     if s.noise_from == "nm":
-        return np.diag(np.full(len(scenario.modes), (s.lgs_noise if kind == "lgs" else s.ngs_noise) ** 2))
+        return np.diag(_stated_noise(scenario, kind) ** 2)
     photons, fwhm = (s.spots.lgs_photons, s.spots.lgs_fwhm) if kind == "lgs" else (s.spots.ngs_photons, s.spots.ngs_fwhm)
     spots = Spots(photons, s.spots.read_noise, fwhm, s.spots.pixel_scale, s.spots.pixels)
     return shack_hartmann(scenario, kind).noise_covariance(spots)
+
+
+def _stated_noise(scenario: Scenario, kind: Kind) -> Array:
+    """Rms [um] per mode, of noise from nm, (n_modes,)."""
+    s = scenario.sensors
+    if kind == "ngs":
+        return np.full(len(scenario.modes), s.ngs_noise)
+    own = s.lgs_noise_per_mode[: len(scenario.modes)]
+    return np.array(own + [s.lgs_noise] * (len(scenario.modes) - len(own)))
 
 
 def noise_rms(scenario: Scenario, kind: Kind) -> Array:
@@ -57,7 +66,7 @@ def white_noise(scenario: Scenario, kind: Kind, n_steps: int, rng: np.random.Gen
     n_modes = len(scenario.modes)
     normal = np.hstack([rng.standard_normal((n_steps, 2)), rng.standard_normal((n_steps, n_modes - 2))])
     if scenario.sensors.noise_from == "nm":
-        return normal * (scenario.sensors.lgs_noise if kind == "lgs" else scenario.sensors.ngs_noise)
+        return normal * _stated_noise(scenario, kind)
     return normal @ np.linalg.cholesky(noise_covariance(scenario, kind)).T
 
 

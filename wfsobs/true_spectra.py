@@ -21,7 +21,7 @@ from wfsobs.disturbance import peak_rms, vibration_power
 from wfsobs.flow_spectra import flow_spectra
 from wfsobs.lgs import lgs_noise_rms, lgs_weights, low_frequency_process
 from wfsobs.scenario import Scenario
-from wfsobs.turbulence import mode_power, third_order_process, turbulence_process
+from wfsobs.turbulence import mode_power, processes, third_order_process, turbulence_process
 from wfsobs.wiener import Complex
 
 LONGEST = 30.0
@@ -104,7 +104,10 @@ def _wanted_frequencies(scenario: Scenario) -> int:
 def _decay_rates(scenario: Scenario) -> list[float]:
     """How fast the correlations of the disturbances decay [1/s], xi w, with the margin that smooth spectra leave."""
     v, least = scenario.vibration, pi * line_width(scenario)
-    rates = [2.0, turbulence_process(scenario, 0, scenario.dt).omega * scenario.turbulence.damping / SMOOTH]
+    smooth = [turbulence_process(scenario, 0, scenario.dt)]
+    if scenario.turbulence.source == "processes":
+        smooth = [p for mode in range(len(scenario.modes)) for p in processes(scenario, mode, scenario.dt)]
+    rates = [2.0, *(p.omega * p.damping / SMOOTH for p in smooth)]
     if v.source in ("psd", "measured"):
         rates.append(least)
     elif v.source != "none":
@@ -140,6 +143,11 @@ def _ar2_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
 
 def _ar3_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
     return _through_lgs(scenario, mode, _density(third_order_process(scenario, mode, scenario.dt), n))
+
+
+def _sum_of_processes(scenario: Scenario, mode: int, n: int) -> Looks:
+    own = [_density(p, n) for p in processes(scenario, mode, scenario.dt)]
+    return _through_lgs(scenario, mode, sum(own, np.zeros(n // 2 + 1)))
 
 
 def _no_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
@@ -181,6 +189,7 @@ def widened(spectrum: Array, width: float) -> Array:
 
 
 TURBULENCE_SPECTRA: dict[str, Callable[[Scenario, int, int], Looks]] = {
-    "ar2": _ar2_turbulence, "ar3": _ar3_turbulence, "frozen-flow": _frozen_flow, "psd": _table, "none": _no_turbulence,
+    "ar2": _ar2_turbulence, "ar3": _ar3_turbulence, "processes": _sum_of_processes,
+    "frozen-flow": _frozen_flow, "psd": _table, "none": _no_turbulence,
 }
 """How the turbulence of each source looks to `true_spectra`."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import hypot, pi
 
 import numpy as np
 
@@ -44,10 +45,25 @@ ModeSource = Callable[[Scenario, int, int, np.random.Generator], Array]
 
 def turbulence_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
     """The AR(2) turbulence of one mode (paper, eq. 1), sampled every `dt` [s], rms in [um]; where turbulence is made
-    another way, the AR(2) process of its variance and effective wind."""
+    another way, the AR(2) process of its variance and effective wind, or of its strongest process."""
+    rms = turbulence_rms(scenario, mode)
+    if found := processes(scenario, mode, dt) if scenario.turbulence.source == "processes" else []:
+        strongest = max(found, key=lambda p: p.rms)
+        return Ar2(strongest.omega, strongest.damping, rms, dt)
     corner = turbulence_corner(
         atmosphere.effective_wind(scenario), scenario.telescope.diameter, scenario.modes[mode].radial_order)
-    return Ar2(corner, scenario.turbulence.damping, turbulence_rms(scenario, mode), dt)
+    return Ar2(corner, scenario.turbulence.damping, rms, dt)
+
+
+def processes(scenario: Scenario, mode: int, dt: float) -> list[Ar2 | Ar3]:
+    """The coloured noises whose sum the turbulence of one mode is, for source processes."""
+    out: list[Ar2 | Ar3] = []
+    for p in scenario.turbulence.processes:
+        omega, rms = 2.0 * pi * p.frequency, p.rms[mode] if mode < len(p.rms) else 0.0
+        if rms > 0:
+            third = p.third_corner * omega
+            out.append(Ar3(omega, p.damping, third, rms, dt) if third else Ar2(omega, p.damping, rms, dt))
+    return out
 
 
 def third_order_process(scenario: Scenario, mode: int, dt: float) -> Ar3:
@@ -61,6 +77,8 @@ def turbulence_rms(scenario: Scenario, mode: int) -> float:
     t = scenario.turbulence
     if t.source == "none":
         return 0.0
+    if t.source == "processes":
+        return hypot(*(p.rms for p in processes(scenario, mode, scenario.dt)))
     if t.source == "psd":
         return float(np.sqrt(mode_power(t.psd, scenario, mode, scenario.n_steps)[1:].sum()))
     if t.source == "frozen-flow":
@@ -100,6 +118,13 @@ def _ar3(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Arr
     return sampled(third_order_process(scenario, mode, scenario.dt), n, rng)
 
 
+def _processes(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
+    found = processes(scenario, mode, scenario.dt)
+    parts = [sampled(p, n, own) if isinstance(p, Ar3) else p.sample(n, own)
+             for p, own in zip(found, rng.spawn(len(found)), strict=True)]
+    return np.sum(parts, axis=0) if parts else np.zeros(n)
+
+
 def _psd(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
     """Inverse DFT of the table, all of it up to half the rate."""
     return random_phase_signal(mode_power(scenario.turbulence.psd, scenario, mode, n), n, rng)
@@ -118,6 +143,6 @@ def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Wa
 
 
 SOURCES: dict[str, Source] = {
-    "ar2": _mode_by_mode(_ar2), "ar3": _mode_by_mode(_ar3), "frozen-flow": _frozen_flow, "psd": _mode_by_mode(_psd),
-    "none": _mode_by_mode(_none),
+    "ar2": _mode_by_mode(_ar2), "ar3": _mode_by_mode(_ar3), "processes": _mode_by_mode(_processes),
+    "frozen-flow": _frozen_flow, "psd": _mode_by_mode(_psd), "none": _mode_by_mode(_none),
 }

@@ -46,13 +46,27 @@ class Layer(Group):
                           doc="Direction that the wind blows to [deg], from the axis of tip to that of tilt.")
 
 
+class Process(Group):
+    """One coloured noise in the turbulence of some modes."""
+
+    frequency = Real(1.1, bounds=(1e-9, 1e6), softbounds=(0.1, 10.0), step=0.1, label="Corner",
+                     doc="Corner of the AR(2) process, its omega over 2 pi [Hz].")
+    damping = Real(0.9, bounds=(1e-6, 1.0), softbounds=(0.1, 1.0), step=0.01, label="Damping ξ",
+                   doc="Damping factor of the process.")
+    third_corner = Real(0.0, bounds=(0.0, 1e6), softbounds=(0.0, 10.0), step=0.1, label="Third corner / first",
+                        doc="Corner beyond which the spectrum falls as f^-6 in the place of f^-4, over the frequency; 0 is none.")
+    rms = Reals([0.5, 0.5], item_bounds=(0.0, 1e6), bounds=(1, 64), label="Strength per mode, rms",
+                doc="Standard deviation of the process [um], one number per mode: tip, tilt; modes beyond the list have none.")
+
+
 class Turbulence(Group):
     """Atmospheric turbulence."""
 
     source = param.Selector(
-        default="ar2", objects=["ar2", "ar3", "frozen-flow", "psd", "none"], label="Source",
-        doc="How turbulence is made: the AR(2) process of the paper, eq. 1; the same with a third corner; von Karman layers that "
-            "the wind carries along, every guide star with a view of its own; inverse DFT of the PSD table; or none.")
+        default="ar2", objects=["ar2", "ar3", "processes", "frozen-flow", "psd", "none"], label="Source",
+        doc="How turbulence is made: the AR(2) process of the paper, eq. 1; the same with a third corner; a sum of such in "
+            "every mode; von Karman layers that the wind carries along, every guide star with a view of its own; "
+            "inverse DFT of the PSD table; or none.")
     wind_speed = Real(15.0, bounds=(0.1, 100.0), softbounds=(1.0, 40.0), step=0.5, label="Wind speed V₀",
                       doc="Wind speed [m/s]; sets the corner w0 = 0.6 pi (n + 1) V0 / D (paper, eq. 1d and Table 1), and "
                           "scales the wind of every layer of frozen flow.")
@@ -69,9 +83,11 @@ class Turbulence(Group):
     outer_scale = Real(25.0, bounds=(1.0, 1e6), softbounds=(5.0, 100.0), step=1.0, label="Outer scale L₀",
                        doc="Outer scale of the von Karman spectrum [m].")
     layers = param.List([Layer()], item_type=Layer, bounds=(0, 40), label="Layers", doc="The layers of frozen flow.")
+    processes = param.List([], item_type=Process, bounds=(0, 500), label="Processes",
+                           doc="Whose sum the turbulence of a mode is, for source processes.")
     psd = section(PsdTable, "PSD table", "The spectrum of turbulence as a table, for source psd.")
 
     def idle(self) -> tuple[str, ...]:
         """What other sources are made of; r0 and L0 set the ratio of the modes in all of them."""
-        of_one = {"third_corner": "ar3", "layers": "frozen-flow", "psd": "psd"}
+        of_one = {"third_corner": "ar3", "processes": "processes", "layers": "frozen-flow", "psd": "psd"}
         return tuple(name for name, source in of_one.items() if source != self.source)

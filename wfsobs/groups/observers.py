@@ -12,7 +12,11 @@ from wfsobs.settings import Group
 class Kalman(Group):
     """The model inside the Kalman filters: AR(2) turbulence plus one vibration peak."""
 
-    frequency = Real(PAPER_PEAK_HZ, bounds=(0.01, 5000.0), softbounds=(5.0, 80.0), step=0.1, label="Model frequency f_f",
+    peak = param.Selector(
+        default="manual", objects=["manual", "matched"], label="Vibration peak",
+        doc="manual: the frequency and damping below in every mode; matched: those of the strongest line that the scenario's "
+            "vibration has in each, the ones below where it has none.")
+    frequency = Real(PAPER_PEAK_HZ, bounds=(0.01, 50_000.0), softbounds=(5.0, 80.0), step=0.1, label="Model frequency f_f",
                      doc="Natural frequency of the modelled vibration [Hz] (paper, Table 2).")
     damping = Real(0.03, bounds=(0.0, 1.0), softbounds=(0.0, 0.1), step=0.001, label="Model damping ξ_f",
                    doc="Damping of the modelled vibration (paper, Table 2); the model never goes below 1e-4.")
@@ -78,7 +82,7 @@ class MultiRate(Group):
 class Butterworth(Group):
     """The sum of band-passes that isolates vibration, as reference and as GPR target."""
 
-    frequencies = Reals([17.1, 24.3, 34.1, 47.7, 54.3, 61.5], item_bounds=(0.01, 5000.0), bounds=(1, 100),
+    frequencies = Reals([17.1, 24.3, 34.1, 47.7, 54.3, 61.5], item_bounds=(0.01, 50_000.0), bounds=(1, 100),
                         label="Centre frequencies", doc="Centres of the band-passes [Hz] (paper, Table 4).")
     bandwidth_offline = Real(3.0, bounds=(0.01, 1000.0), softbounds=(0.5, 10.0), step=0.1, label="Bandwidth, open loop",
                              doc="Width of each band on open-loop data [Hz] (paper, Table 4).")

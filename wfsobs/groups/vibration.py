@@ -15,11 +15,11 @@ PAPER_PEAK_HZ = 47.4969
 class Peak(Group):
     """One line of the vibration spectrum: a damped resonance, or a pure line at damping 0."""
 
-    frequency = Real(PAPER_PEAK_HZ, bounds=(0.01, 5000.0), softbounds=(5.0, 80.0), step=0.1, label="Frequency f",
+    frequency = Real(PAPER_PEAK_HZ, bounds=(0.01, 50_000.0), softbounds=(5.0, 80.0), step=0.1, label="Frequency f",
                      doc="Natural frequency [Hz]. The paper's dominant one is 47.4969 Hz (Table 2).")
     damping = Real(0.03, bounds=(0.0, 1.0), softbounds=(0.0, 0.1), step=0.001, label="Damping ξ",
                    doc="Damping ratio; 0 is a pure line. The paper has 0.03 (Table 2).")
-    rms = Reals([0.01, 0.01], item_bounds=(0.0, 100.0), bounds=(1, 64), label="Strength per mode, rms",
+    rms = Reals([0.01, 0.01], item_bounds=(0.0, 1e6), bounds=(1, 64), label="Strength per mode, rms",
                 doc="Standard deviation of the line [um], one number per mode: tip, tilt; modes beyond "
                     "the list have none.")
 
@@ -35,9 +35,9 @@ class Vibration(Group):
     part = param.Selector(default="lines", objects=["lines", "all"], label="Part of the spectrum",
                           doc="For source measured: the lines that stand above its synthetic floor 4e4 / f^2 nm^2/Hz, from "
                               "7.5 Hz up, or all of it.")
-    cutoff = Real(80.0, bounds=(0.1, 5000.0), softbounds=(10.0, 200.0), label="Cut-off f_c",
+    cutoff = Real(80.0, bounds=(0.1, 50_000.0), softbounds=(10.0, 200.0), label="Cut-off f_c",
                   doc="Nothing above this frequency in an inverse DFT [Hz] (paper, section 2.4).")
-    peaks = param.List([Peak()], item_type=Peak, bounds=(0, 100), label="Peaks",
+    peaks = param.List([Peak()], item_type=Peak, bounds=(0, 2000), label="Peaks",
                        doc="The lines of the spectrum.")
     psd = section(PsdTable, "PSD table", "The spectrum as a table, for source psd.")
 

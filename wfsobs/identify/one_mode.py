@@ -118,8 +118,10 @@ class OneMode:
         self._fill()
 
     def _sound(self, p: Ar2) -> bool:
-        """Whether a resonance is wide enough to be told from a line, and narrow enough to be told from turbulence."""
-        return RESOLVED * self.f[0] < p.damping * p.omega / (2 * pi) and p.damping < WIDEST and p.omega > 4.0 * pi * self.f[0]
+        """Whether a resonance is wide enough to be told from a line, narrow enough to be told from turbulence, and below half the
+        rate."""
+        frequency = p.omega / (2 * pi)
+        return RESOLVED * self.f[0] < p.damping * frequency and p.damping < WIDEST and 2.0 * self.f[0] < frequency < self.f[-1]
 
     def explain(self, candidate: Candidate) -> bool:
         """Add the line or the resonance that explains the candidate best, or where there are lines beside it make one

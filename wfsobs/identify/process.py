@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot, sqrt
+from math import hypot, log, sqrt
 from typing import NamedTuple
 
 
@@ -42,7 +42,9 @@ class Peak:
 
 
 AGREE = 3.0
-"""Standard deviations of their difference within which two frequencies are the same."""
+"""Standard deviations of their difference within which two numbers are the same."""
+UNSURE = 0.02, 0.5
+"""Standard deviation of a frequency and of a damping, over the number, from which it agrees with none: it could be any."""
 
 
 def mean(numbers: list[Number]) -> Number:
@@ -52,28 +54,44 @@ def mean(numbers: list[Number]) -> Number:
 
 
 def merged(modes: list[tuple[Process, ...]]) -> list[Peak]:
-    """The peaks of all modes by frequency; those of several modes that agree in frequency are one.
-
-    Whether that is a pure line is what the mode says in which it stands out most.
-    """
+    """The peaks of all modes by frequency; those of several modes that agree in kind, frequency and damping are one."""
     groups: list[dict[int, Process]] = []
     for i, peaks in enumerate(modes):
         for peak in peaks:
-            near = [g for g in groups if i not in g and _apart(g, peak) <= AGREE]
+            near = [g for g in groups if i not in g and _agree(list(g.values()), peak)]
             if near:
-                min(near, key=lambda g: _apart(g, peak))[i] = peak
+                min(near, key=lambda g: _apart([p.frequency for p in g.values()], peak.frequency))[i] = peak
             else:
                 groups.append({i: peak})
     out = []
     for group in groups:
-        clearest = max(group.values(), key=lambda p: p.rms.value / p.rms.std)
-        damping = Number(0.0, 0.0) if clearest.pure else mean([p.damping for p in group.values() if not p.pure])
+        pure = next(iter(group.values())).pure
+        damping = Number(0.0, 0.0) if pure else mean([p.damping for p in group.values()])
         out.append(Peak(mean([p.frequency for p in group.values()]), damping,
                         tuple(group[i].rms if i in group else None for i in range(len(modes)))))
     return sorted(out, key=lambda p: p.frequency.value)
 
 
-def _apart(group: dict[int, Process], peak: Process) -> float:
-    """Distance in frequency over its standard deviation."""
-    at = mean([p.frequency for p in group.values()])
-    return abs(at.value - peak.frequency.value) / hypot(at.std, peak.frequency.std)
+def _agree(group: list[Process], peak: Process) -> bool:
+    """Whether a peak may be the one that a group is."""
+    if group[0].pure != peak.pure or not all(map(_sure, (*group, peak))):
+        return False
+    apart = [_apart([p.frequency for p in group], peak.frequency)]
+    if not peak.pure:
+        apart.append(_apart([_logarithm(p.damping) for p in group], _logarithm(peak.damping)))
+    return max(apart) <= AGREE
+
+
+def _sure(p: Process) -> bool:
+    frequency, damping = UNSURE
+    return p.frequency.std < frequency * p.frequency.value and (p.pure or p.damping.std < damping * p.damping.value)
+
+
+def _logarithm(n: Number) -> Number:
+    return Number(log(n.value), n.std / n.value)
+
+
+def _apart(group: list[Number], number: Number) -> float:
+    """Distance over its standard deviation."""
+    at = mean(group)
+    return abs(at.value - number.value) / hypot(at.std, number.std)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import Any
 
 from rich.table import Table
@@ -98,10 +99,31 @@ def written(n: Number) -> str:
 
 def toml(result: Identified, scenario: Scenario) -> str:
     """The scenario of the result as TOML, a standard deviation beside every number that was found."""
+    count = sqrt(scenario.sensors.lgs_count)
     notes = {path: f"+- {number.std:.2g}" for path, number in result.shared(scenario).items()}
-    for i, p in enumerate(result.peaks):
-        notes |= {f"vibration.peaks.{i}.frequency": f"+- {p.frequency.std:.2g}",
-                  f"vibration.peaks.{i}.damping": f"+- {p.damping.std:.2g}" if p.damping.std else "a pure line",
-                  f"vibration.peaks.{i}.rms": "+- " + ", ".join(f"{r.std:.2g}" if r else "not seen" for r in p.rms)}
+    notes["sensors.lgs_noise_per_mode"] = "+- " + ", ".join(f"{count * m.noise.std:.2g}" for m in result.modes)
+    smooth = [(m.name, what, p) for m in result.modes for what, p in _smooth(m)]
+    for i, (mode, what, p) in enumerate(smooth):
+        notes |= _notes(f"turbulence.processes.{i}", p, f"{mode}, {what}, ")
+    for i, (mode, p) in enumerate(result.all_peaks):
+        notes |= _notes(f"vibration.peaks.{i}", p, f"{mode}, ")
     head = [f"Identified from {result.duration:.1f} s; +- is one standard deviation.", *verdict(result)]
     return "\n".join(f"# {line}" for line in head) + "\n\n" + annotated(to_toml(scenario), notes)
+
+
+def _smooth(mode: IdentifiedMode) -> list[tuple[str, Process | None]]:
+    """What a mode has in `turbulence.processes`, in its order; a resonance too low for a peak has no numbers here."""
+    named = [("turbulence", mode.turbulence), ("background", mode.background)]
+    found: list[tuple[str, Process | None]] = [(what, p) for what, p in named if p is not None]
+    return found + [("below the lowest peak", None)] * (len(mode.prior.turbulence) - len(found))
+
+
+def _notes(path: str, p: Process | None, whose: str) -> dict[str, str]:
+    """Comments of the settings of one process or peak."""
+    if p is None:
+        return {f"{path}.frequency": whose.removesuffix(", ")}
+    numbers = {"frequency": p.frequency, "damping": p.damping, "rms": p.rms, "third_corner": p.third_corner}
+    notes = {f"{path}.{name}": f"+- {n.std:.2g}" for name, n in numbers.items() if n is not None and n.std}
+    if p.pure:
+        notes[f"{path}.damping"] = "a pure line"
+    return notes | {f"{path}.frequency": f"{whose}+- {p.frequency.std:.2g}"}

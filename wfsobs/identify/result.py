@@ -15,13 +15,15 @@ from wfsobs.atmosphere import relative_rms
 from wfsobs.identify.model import Spectrum
 from wfsobs.identify.one_mode import OneMode
 from wfsobs.identify.process import Number, Peak, Process, mean, merged
+from wfsobs.identify.settings import fitting, told
 from wfsobs.identify.whiteness import Whiteness
 from wfsobs.identify.whittle import NO_NEARER
 from wfsobs.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.prior import Line, Prior
 from wfsobs.scenario import Scenario
 
 LARGEST = 100.0
-"""Rms [um] that a scenario's settings allow."""
+"""Strength of turbulence [um] that a scenario's settings allow."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class IdentifiedMode:
     """The model of one mode: noise, rms of z's white noise [um]; turbulence, or None; coloured background, or None; peaks by
     frequency; what the tests say.
 
-    spectrum : of all but the pure lines
+    spectrum : of all but the pure lines;  prior : what an observer is told of the mode
     """
 
     name: str
@@ -38,6 +40,7 @@ class IdentifiedMode:
     background: Process | None
     peaks: tuple[Process, ...]
     spectrum: Spectrum
+    prior: Prior
     whiteness: Whiteness
 
 
@@ -62,44 +65,30 @@ class Identified:
 
     @property
     def peaks(self) -> list[Peak]:
-        """The peaks of all modes together."""
+        """The peaks of all modes together, those that agree as one."""
         return merged([mode.peaks for mode in self.modes])
 
-    def scenario(self, base: Scenario | None = None) -> Scenario:
-        """A scenario whose z has the spectra found: turbulence, peaks, LGS noise; the Kalman filters follow it. A background,
-        a few nm where it is the aliasing of a sensor, has no place in a scenario and is left out.
+    @property
+    def all_peaks(self) -> list[tuple[str, Process]]:
+        """Name of the mode and peak, of every peak of every mode, in the order that `scenario` has them."""
+        found = [(p.frequency.value, p.damping.value, p.rms.value, i, p) for i, mode in enumerate(self.modes) for p in mode.peaks]
+        return [(self.modes[i].name, p) for *_, i, p in sorted(found, key=lambda each: each[:4])]
 
-        What the modes share in a scenario (wind, damping, strength of turbulence, noise) is the mean of what was found, weighted
-        with the errors. base : where everything else comes from, but its events, which name peaks by their number.
+    def scenario(self, base: Scenario | None = None) -> Scenario:
+        """A scenario whose z has the spectra found, every mode with its own noise, turbulence and peaks; the Kalman filters
+        follow it. A background counts as turbulence.
+
+        base : where everything else comes from, but its events, which name peaks by their number, and bands that the rate has no
+            room for. Wind, damping and strength of turbulence become the means over the modes, for who goes on from there.
         """
         out = (base or Scenario()).before_events.replace(
             {"telescope.radial_order": _order(len(self.modes)), "sensors.lgs_rate": 1.0 / self.dt})
-        peaks = self.peaks
         changes: dict[str, Any] = {path: number.value for path, number in self.shared(out).items()}
-        changes |= {
-            "turbulence.source": self.source, "multipeak.turbulence_order": 3 if self.source == "ar3" else 2,
+        return out.replace(changes | fitting(out, 0.5 / self.dt) | told([mode.prior for mode in self.modes], out) | {
             "sensors.noise_from": "nm", "sensors.lgs_combination": "mean", "sensors.lgs_low_frequency_rms": 0.0,
             "sensors.tip_tilt_indetermination": False,
-            "vibration.source": "peaks" if peaks else "none",
-            "vibration.peaks": [
-                {"frequency": p.frequency.value, "damping": p.damping.value,
-                 "rms": [min(r.value, LARGEST) if r else 0.0 for r in p.rms]}
-                for p in peaks
-            ],
-            "kalman.process_noise": "matched", "kalman.measurement_noise": "matched",
-        }
-        if peaks:
-            highest = max(p.frequency.value for p in peaks)
-            strongest = max(peaks, key=lambda p: sum(r.value**2 for r in p.rms if r))
-            changes |= {"vibration.cutoff": max(out.vibration.cutoff, 1.2 * highest),
-                        "kalman.frequency": strongest.frequency.value, "kalman.damping": strongest.damping.value}
-        return out.replace(changes)
-
-    @property
-    def source(self) -> str:
-        """`turbulence.source` of the scenario."""
-        found = [m.turbulence for m in self.modes if m.turbulence]
-        return "none" if not found else "ar3" if any(t.third_corner for t in found) else "ar2"
+            "kalman.process_noise": "matched", "kalman.measurement_noise": "matched", "kalman.peak": "matched",
+        })
 
     def shared(self, scenario: Scenario) -> dict[str, Number]:
         """Dotted path -> number of the settings that all modes share, and their errors; within what the settings allow."""
@@ -121,7 +110,7 @@ class Identified:
 
 def read_off(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> IdentifiedMode:
     """The numbers of a mode and their standard deviations. A resonance below the lowest frequency [Hz] that was looked at is a
-    part of the turbulence's shape, and no peak."""
+    part of the turbulence's shape, and no peak; an observer is told of it as such."""
     std = mode.errors()
     noise = _scaled(Number(1.0, float(std[0])), mode.spectrum.noise)
     found = [_process(p, std[start:]) for start, p in zip(mode.spectrum.starts, mode.spectrum.processes, strict=False)]
@@ -131,7 +120,11 @@ def read_off(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> I
         in_frequency, in_rms = line.standard_deviations(mode.n, mode.dt, floor)
         found.append(Process(Number(line.frequency, in_frequency), Number(0.0, 0.0), Number(line.rms, in_rms)))
     peaks = sorted((p for p in found if p.frequency.value >= lowest), key=lambda p: p.frequency.value)
-    return IdentifiedMode(name, noise, turbulence, background, tuple(peaks), mode.spectrum, whiteness)
+    s = mode.spectrum
+    below = [p for p in s.resonances if p.omega / (2 * pi) < lowest]
+    prior = Prior(s.noise, s.dt, tuple(p for p in (s.turbulence, s.background, *below) if p is not None),
+                  tuple(Line(p.frequency.value, p.damping.value, p.rms.value) for p in peaks))
+    return IdentifiedMode(name, noise, turbulence, background, tuple(peaks), s, prior, whiteness)
 
 
 def _process(p: Ar2 | Ar3, std: Array) -> Process:

@@ -15,7 +15,7 @@ import numpy as np
 from wfsobs.ar2 import Ar2
 from wfsobs.arrays import Array
 from wfsobs.atmosphere import relative_rms
-from wfsobs.disturbance import vibration_variance
+from wfsobs.disturbance import vibration_lines, vibration_variance
 from wfsobs.lgs import lgs_noise_rms
 from wfsobs.lifted import PeriodicFilter
 from wfsobs.observers.base import TARGETS
@@ -39,7 +39,17 @@ def modelled_processes(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2, A
     if manual:
         turbulence = replace(turbulence, rms=k.turbulence_rms * relative_rms(scenario, mode))
     vibration_rms = k.vibration_rms if manual and tip_tilt else float(np.sqrt(vibration_variance(scenario, mode)))
-    return turbulence, Ar2(2.0 * np.pi * k.frequency, max(k.damping, MIN_MODEL_DAMPING), vibration_rms, dt)
+    frequency, damping = modelled_peak(scenario, mode)
+    return turbulence, Ar2(2.0 * np.pi * frequency, max(damping, MIN_MODEL_DAMPING), vibration_rms, dt)
+
+
+def modelled_peak(scenario: Scenario, mode: int) -> tuple[float, float]:
+    """Natural frequency [Hz] and damping of the one peak of the model."""
+    k, lines = scenario.kalman, vibration_lines(scenario, mode)
+    if k.peak == "manual" or not lines:
+        return k.frequency, k.damping
+    frequency, damping, _ = max(lines, key=lambda line: line[2])
+    return frequency, damping
 
 
 def kalman_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:

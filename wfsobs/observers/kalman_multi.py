@@ -5,7 +5,8 @@ The filter is that of `kalman`, its model one AR(2) per line of the vibration an
 
 from __future__ import annotations
 
-from math import pi, sqrt
+from dataclasses import replace
+from math import sqrt
 
 import numpy as np
 
@@ -14,23 +15,37 @@ from wfsobs.ar3 import Ar3, fitted_ar3
 from wfsobs.arrays import Array
 from wfsobs.disturbance import vibration_lines
 from wfsobs.observers.kalman import by_target, measurement_noise, modelled_processes, steady_filter
+from wfsobs.prior import Line, Prior
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.statespace import DisturbanceModel, disturbance_model
+from wfsobs.statespace import DisturbanceModel
 from wfsobs.true_spectra import seen_turbulence
+from wfsobs.turbulence import processes, turbulence_rms
 from wfsobs.watch import Watch
 
 
-def multi_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
-    """Turbulence and all the lines of one mode. Raises ValueError where the vibration names no lines."""
+def prior(scenario: Scenario, mode: int, dt: float) -> Prior:
+    """Noise, turbulence and all the lines of one mode. Raises ValueError where the vibration names no lines."""
     if scenario.vibration.source == "psd":
         raise ValueError("vibration.source = psd is a table, not lines that a model could have")
-    least = pi * scenario.multipeak.line_width  # as xi w
-    lines = []
-    for frequency, damping, rms in vibration_lines(scenario, mode):
-        omega = 2.0 * pi * frequency
-        lines.append(Ar2(omega, min(max(damping, least / omega), 1.0), rms, dt))
-    return disturbance_model([modelled_turbulence(scenario, mode, dt)], lines)
+    return Prior(measurement_noise(scenario, mode)[0], dt, _turbulence(scenario, mode, dt),
+                 tuple(Line(*line) for line in vibration_lines(scenario, mode)))
+
+
+def multi_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
+    """The state-space model of that. Raises ValueError where the vibration names no lines."""
+    return prior(scenario, mode, dt).model(scenario.multipeak.line_width)
+
+
+def _turbulence(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2 | Ar3, ...]:
+    """A scenario's own processes, in the strength that the model has; else one process."""
+    found = processes(scenario, mode, dt) if scenario.turbulence.source == "processes" else []
+    if not found:
+        return (modelled_turbulence(scenario, mode, dt),)
+    if scenario.kalman.process_noise == "matched":
+        return tuple(found)
+    factor = modelled_processes(scenario, mode, dt)[0].rms / turbulence_rms(scenario, mode)
+    return tuple(replace(p, rms=factor * p.rms) for p in found)
 
 
 def modelled_turbulence(scenario: Scenario, mode: int, dt: float) -> Ar2 | Ar3:
@@ -49,7 +64,8 @@ def kf_multi(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Arra
     columns = []
     for mode in range(record.n_modes):
         watch.step(mode / record.n_modes)
-        kalman, _ = steady_filter(multi_model(scenario, mode, record.dt), measurement_noise(scenario, mode)[0])
+        told = prior(scenario, mode, record.dt)
+        kalman, _ = steady_filter(told.model(scenario.multipeak.line_width), told.noise)
         columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
     return by_target(columns)
 

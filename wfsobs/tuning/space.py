@@ -17,7 +17,7 @@ from wfsobs.arrays import Array
 from wfsobs.atmosphere import relative_rms
 from wfsobs.disturbance import vibration_variance
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman import measurement_noise
+from wfsobs.observers.kalman import measurement_noise, modelled_peak
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 from wfsobs.turbulence import turbulence_process
@@ -205,6 +205,7 @@ def _noise(scenario: Scenario) -> tuple[float, float]:
 
 
 BY_HAND: dict[str, tuple[tuple[str, str], Callable[[Scenario], tuple[float, float]]]] = {
+    "kalman.peak": (("kalman.frequency", "kalman.damping"), lambda scenario: modelled_peak(scenario, 0)),
     "kalman.process_noise": (("kalman.turbulence_rms", "kalman.vibration_rms"), _process),
     "kalman.measurement_noise": (("kalman.lgs_noise", "kalman.ngs_noise"), _noise),
     "multirate.measurement_noise": (_RATES, _noise),

@@ -1,0 +1,189 @@
+"""What an identification writes is settings that load and run, and that predict as what was found does."""
+
+from __future__ import annotations
+
+from math import pi
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from wfsobs import configfile
+from wfsobs.ar2 import Ar2
+from wfsobs.ar3 import Ar3
+from wfsobs.arrays import Array
+from wfsobs.bound import bound
+from wfsobs.cli import main
+from wfsobs.control.lqg import LQG
+from wfsobs.control.mirror import Mirror
+from wfsobs.identify import Identified, identify
+from wfsobs.identify.process import Number, Process, merged
+from wfsobs.identify.report import toml
+from wfsobs.observers.kalman import modelled_peak, steady_filter
+from wfsobs.observers.kalman_multi import prior
+from wfsobs.pipeline import observe, run
+from wfsobs.presets import PRESETS
+from wfsobs.prior import Prior
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.statespace import sampled
+from wfsobs.telemetry import save_record
+from wfsobs.turbulence import turbulence_rms
+
+DT = 1e-3
+QUICK = ("kf-lgs", "kf-multi", "butterworth-cl")
+
+
+def drawn(processes: list[Ar2 | Ar3], noise: float, n: int, rng: np.random.Generator) -> Array:
+    parts = [sampled(p, n, rng) if isinstance(p, Ar3) else p.sample(n, rng) for p in processes]
+    return np.sum(parts, axis=0) + noise * rng.standard_normal(n)
+
+
+def recorded(*columns: Array, dt: float = DT) -> Record:
+    y = np.column_stack(columns)
+    return Record(y, np.zeros_like(y), dt)
+
+
+def hump_and_line(seed: int, n: int = 40_000) -> Record:
+    """A hump on tip, a line at the same frequency and turbulence of another corner and noise on tilt, coloured noise besides."""
+    rng = np.random.default_rng(seed)
+    tip: list[Ar2 | Ar3] = [Ar2(7.0, 0.9, 0.5, DT), Ar2(2 * pi * 30.0, 0.091, 0.05, DT)]
+    tilt: list[Ar2 | Ar3] = [
+        Ar3(3.0, 0.9, 12.0, 0.3, DT), Ar2(2 * pi * 30.0, 0.0011, 0.05, DT), Ar2(2 * pi * 120.0, 0.8, 0.01, DT)]
+    return recorded(drawn(tip, 0.014, n, rng), drawn(tilt, 0.02, n, rng))
+
+
+@pytest.fixture(scope="module")
+def found() -> Identified:
+    return identify(hump_and_line(1))
+
+
+@pytest.fixture(scope="module")
+def saved(found: Identified) -> Scenario:
+    base = PRESETS["paper"]()
+    return configfile.from_toml(toml(found, found.scenario(base)))
+
+
+def numbers(p: Prior) -> list[float]:
+    """All of a model, processes in their order."""
+    smooth = [x for q in p.turbulence for x in (q.omega, q.damping, q.rms, q.corner if isinstance(q, Ar3) else 0.0)]
+    return [p.noise, *smooth, *(x for line in p.lines for x in line)]
+
+
+def test_the_file_tells_the_filters_what_was_found(found: Identified, saved: Scenario) -> None:
+    for i, mode in enumerate(found.modes):
+        # A product and a quotient each: a few units in the last place.
+        assert numbers(prior(saved, i, DT)) == pytest.approx(numbers(mode.prior), rel=1e-14)
+    assert [len(m.prior.turbulence) for m in found.modes] == [1, 2]  # the second has a background
+
+
+def test_the_file_predicts_a_new_record_as_what_was_found_does(found: Identified, saved: Scenario) -> None:
+    test = hump_and_line(2, 10_000)
+    result = observe(test, saved, observers=["kf-multi"])
+    for i, mode in enumerate(found.modes):
+        model = mode.prior.model(saved.multipeak.line_width)
+        kalman, _ = steady_filter(model, mode.prior.noise, np.sum(list(model.outputs.values()), axis=0)[None])
+        expected = kalman.run(test.z[:, None, i, None])[:, 0, 0]
+        values = sum(e.values[:, i] for e in result.estimates)
+        assert np.max(np.abs(values - expected)) < 1e-10 * np.std(expected)  # rounding through the Riccati equation
+
+
+def test_a_filter_of_one_peak_has_that_of_its_mode(found: Identified, saved: Scenario) -> None:
+    for i, mode in enumerate(found.modes):
+        strongest = max(mode.peaks, key=lambda p: p.rms.value)
+        assert modelled_peak(saved, i) == (strongest.frequency.value, strongest.damping.value)
+    assert modelled_peak(saved, 0)[1] > 30.0 * modelled_peak(saved, 1)[1]
+    by_hand = saved.replace({"kalman.peak": "manual", "kalman.frequency": 12.0, "kalman.damping": 0.2})
+    assert modelled_peak(by_hand, 0) == modelled_peak(by_hand, 1) == (12.0, 0.2)
+
+
+def test_every_mode_has_its_own_in_a_simulation_and_in_the_bound(found: Identified, saved: Scenario) -> None:
+    """A record made from the file is like the one that was identified, and no filter of its own model beats the bound."""
+    assert [turbulence_rms(saved, i) for i in (0, 1)] == pytest.approx(
+        [np.sqrt(sum(p.rms**2 for p in m.prior.turbulence)) for m in found.modes], rel=1e-12)
+    assert saved.sensors.lgs_noise_per_mode == pytest.approx([np.sqrt(2.0) * m.noise.value for m in found.modes], rel=1e-12)
+    for i, mode in enumerate(found.modes):
+        model = mode.prior.model(saved.multipeak.line_width)
+        row = np.sum(list(model.outputs.values()), axis=0)
+        _, steady = steady_filter(model, mode.prior.noise)
+        own = np.sqrt(row @ (steady.P - steady.L @ model.C[None] @ steady.P) @ row)
+        made = saved.replace({"vibration.source": "ar2"})
+        assert own == pytest.approx(bound(made, i)["total"], rel=2e-3)  # the same model on a grid of frequencies
+
+
+@pytest.mark.parametrize("name", ["lqg-kf-multi", "lqg-kf-lgs"])
+def test_a_controller_takes_the_model_of_its_mode(saved: Scenario, name: str) -> None:
+    """Tip as if it were alone, and not as tilt."""
+    laws = [LQG[name](saved, mode, Mirror(2.0)) for mode in (0, 1)]
+    z = np.random.default_rng(3).standard_normal((200, 1, 1))
+    tip, tilt = (law.run(z[:, :, 0]) for law in laws)
+    assert np.std(tip - tilt) > 0.1 * np.std(tip)
+
+
+def peak(f: float, xi: float, std: float = 0.01, xi_std: float | None = None) -> Process:
+    return Process(Number(f, std), Number(xi, 0.1 * xi if xi_std is None else xi_std), Number(0.01, 0.001))
+
+
+@pytest.mark.parametrize(("tip", "tilt", "one"), [
+    (peak(30.0, 0.02), peak(30.02, 0.022), True),
+    (peak(30.0, 0.02), peak(30.2, 0.02), False),  # ten standard deviations apart
+    (peak(30.0, 0.091), peak(30.0, 0.0011), False),  # of another width
+    (peak(30.0, 0.0), peak(30.0, 0.002), False),  # of another kind
+    (peak(30.0, 0.0), peak(30.01, 0.0), True),
+    (peak(300.0, 0.3, 200.0), peak(30.0, 0.3), False),  # could be anywhere
+    (peak(30.0, 0.3), peak(300.0, 0.3, 200.0), False),
+    (peak(30.0, 0.02, 0.01, 0.05), peak(30.0, 0.02), False),  # could be of any width
+])
+def test_peaks_are_one_that_agree_in_all_that_is_known_of_them(tip: Process, tilt: Process, one: bool) -> None:
+    assert len(merged([(tip,), (tilt,)])) == (1 if one else 2)
+
+
+Modes = list[list[tuple[float, float, float]]]
+RATES = st.sampled_from([100.0, 137.5, 250.0, 500.0, 1000.0, 2000.0, 5000.0])
+PLACES = st.floats(0.03, 1.1)  # of half the rate
+WIDTH = st.sampled_from([0.0, 1e-3, 0.02, 0.1, 0.4])
+PEAKS = st.lists(st.tuples(PLACES, WIDTH, st.floats(0.1, 30.0)), max_size=3)
+
+
+def made(rate: float, modes: Modes, scale: float, turbulent: bool, seed: int) -> Record:
+    """Noise of rms `scale` [um], turbulence with a corner of a thousandth of the rate, and peaks (frequency over half the rate,
+    damping, rms over that of the noise)."""
+    n, dt, rng = 2000, 1.0 / rate, np.random.default_rng(seed)
+    columns = []
+    for peaks in modes:
+        z = rng.standard_normal(n)
+        if turbulent:
+            z += Ar2(2e-3 * pi * rate, 0.9, 30.0, dt).sample(n, rng)
+        for place, damping, rms in peaks:
+            z += Ar2(pi * place * rate, max(damping, 1e-5), rms, dt).sample(n, rng)
+        columns.append(scale * z)
+    return recorded(*columns, dt=dt)
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@given(
+    rate=RATES, modes=st.lists(PEAKS, min_size=1, max_size=2), scale=st.sampled_from([1e-3, 0.02, 50.0]),
+    turbulent=st.booleans(), seed=st.integers(0, 2**16), name=st.sampled_from(["paper", "ut4", "peak-jump"]),
+)
+@example(rate=1000.0, modes=[[(0.97, 0.4, 30.0)]], scale=0.02, turbulent=True, seed=1, name="paper")  # a hump near half the rate
+@example(rate=100.0, modes=[[], []], scale=0.02, turbulent=True, seed=1, name="paper")  # bands beyond half the rate
+@example(rate=25.0, modes=[[], []], scale=0.02, turbulent=True, seed=1, name="paper")  # all of them
+def test_whatever_is_written_loads_and_runs(
+    tmp_path: Path, rate: float, modes: Modes, scale: float, turbulent: bool, seed: int, name: str
+) -> None:
+    """On a simulation and on the record that it is from, from presets of several kinds."""
+    record, base = made(rate, modes, scale, turbulent, seed), PRESETS[name]()
+    file, telemetry = tmp_path / "found.toml", tmp_path / "r.npz"
+    save_record(telemetry, record)
+    command = ["identify", str(telemetry), "--preset", name, "--lowest", str(min(5.0, 0.1 * rate)), "--out", str(file)]
+    done = CliRunner().invoke(main, command)
+    assert done.exit_code == 0, done.output
+    short = configfile.scenario_from(None, file, ("run.duration=3", "run.warm_up=0.5"))
+    assert short.replace({"run.duration": base.run.duration, "run.warm_up": base.run.warm_up}) == configfile.load(file)
+    for result in (observe(record, short, observers=QUICK), run(short, observers=QUICK)):
+        assert not result.failures
+        assert {e.observer for e in result.estimates} == set(QUICK)
+        assert all(np.isfinite(e.values).all() for e in result.estimates)
