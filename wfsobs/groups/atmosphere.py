@@ -83,7 +83,7 @@ class Turbulence(Group):
     outer_scale = Real(25.0, bounds=(1.0, 1e6), softbounds=(5.0, 100.0), step=1.0, label="Outer scale L₀",
                        doc="Outer scale of the von Karman spectrum [m].")
     layers = param.List([Layer()], item_type=Layer, bounds=(0, 40), label="Layers", doc="The layers of frozen flow.")
-    processes = param.List([], item_type=Process, bounds=(0, 500), label="Processes",
+    processes = param.List([Process()], item_type=Process, bounds=(0, 500), label="Processes",
                            doc="Whose sum the turbulence of a mode is, for source processes.")
     psd = section(PsdTable, "PSD table", "The spectrum of turbulence as a table, for source psd.")
 
