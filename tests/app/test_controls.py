@@ -76,7 +76,7 @@ def test_every_setting_has_one_field(controls: Controls) -> None:
     lists = [path for path, _ in controls.store.scenario.lists()]
     settings = [path for path, _, _ in controls.store.scenario.walk() if not any(path.startswith(f"{at}.") for at in lists)]
     assert sorted(controls.fields) == sorted(settings)
-    assert sorted(controls.lists) == sorted(lists) == ["events", "turbulence.layers", PATH]
+    assert sorted(controls.lists) == sorted(lists) == ["events", "turbulence.layers", "turbulence.processes", PATH]
     for path in lists:
         assert len(controls.lists[path].table.rows) == len(controls.store.value(path))
 

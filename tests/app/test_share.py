@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import wfsobs
 from wfsobs.app.share import LONGEST, changes, from_file, from_query, to_command, to_file, to_python, to_query
 from wfsobs.cli import main
-from wfsobs.groups.atmosphere import Layer
+from wfsobs.groups.atmosphere import Layer, Process
 from wfsobs.groups.vibration import Peak
 from wfsobs.identify import identify
 from wfsobs.loop import simulate
@@ -74,9 +74,14 @@ def test_every_setting_survives_a_link_and_a_file(path: str, p: Any, data: st.Da
 
 
 @settings(max_examples=20, deadline=None, derandomize=True)
-@given(peaks=items(Peak), layers=items(Layer))
-def test_peaks_and_layers_survive_a_link(peaks: list[dict[str, Any]], layers: list[dict[str, Any]]) -> None:
-    scenario = Scenario().replace({"vibration.peaks": peaks, "turbulence.layers": layers, "sensors.lgs_rate": 20_000.0})
+@given(peaks=items(Peak), layers=items(Layer), processes=items(Process))
+def test_lists_of_groups_survive_a_link(
+    peaks: list[dict[str, Any]], layers: list[dict[str, Any]], processes: list[dict[str, Any]]
+) -> None:
+    scenario = Scenario().replace({
+        "vibration.peaks": peaks, "turbulence.layers": layers, "turbulence.processes": processes, "sensors.lgs_rate": 100_000.0})
+    if not usable(scenario):
+        return
     query = to_query(scenario, "ut4")
     assert query is not None and from_query(query).scenario == scenario
 

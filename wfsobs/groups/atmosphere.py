@@ -55,7 +55,7 @@ class Process(Group):
                    doc="Damping factor of the process.")
     third_corner = Real(0.0, bounds=(0.0, 1e6), softbounds=(0.0, 10.0), step=0.1, label="Third corner / first",
                         doc="Corner beyond which the spectrum falls as f^-6 in the place of f^-4, over the frequency; 0 is none.")
-    rms = Reals([0.5, 0.5], item_bounds=(0.0, 1e6), bounds=(1, 64), label="Strength per mode, rms",
+    rms = Reals([0.5, 0.5], item_bounds=(0.0, 1e4), bounds=(1, 64), label="Strength per mode, rms",
                 doc="Standard deviation of the process [um], one number per mode: tip, tilt; modes beyond the list have none.")
 
 

@@ -32,7 +32,7 @@ class Sensors(Group):
     lgs_noise = Real(0.02, bounds=(0.0, 10.0), softbounds=(0.0, 0.2), step=0.001, label="LGS noise",
                      doc="White measurement noise of each LGS and mode, rms [um], for noise from nm; not given in the paper.")
     lgs_noise_per_mode = Reals(
-        [], item_bounds=(0.0, 1e6), bounds=(0, 64), label="LGS noise per mode",
+        [], item_bounds=(0.0, 1e4), bounds=(0, 64), label="LGS noise per mode",
         doc="The same where modes differ, rms [um]: a number per mode, modes beyond the list have the one above.")
     ngs_noise = Real(0.01, bounds=(0.0, 10.0), softbounds=(0.0, 0.2), step=0.001, label="NGS noise",
                      doc="White measurement noise of an NGS frame and mode, rms [um], for noise from nm; not given in the "

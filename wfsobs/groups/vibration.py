@@ -19,7 +19,7 @@ class Peak(Group):
                      doc="Natural frequency [Hz]. The paper's dominant one is 47.4969 Hz (Table 2).")
     damping = Real(0.03, bounds=(0.0, 1.0), softbounds=(0.0, 0.1), step=0.001, label="Damping ξ",
                    doc="Damping ratio; 0 is a pure line. The paper has 0.03 (Table 2).")
-    rms = Reals([0.01, 0.01], item_bounds=(0.0, 1e6), bounds=(1, 64), label="Strength per mode, rms",
+    rms = Reals([0.01, 0.01], item_bounds=(0.0, 1e4), bounds=(1, 64), label="Strength per mode, rms",
                 doc="Standard deviation of the line [um], one number per mode: tip, tilt; modes beyond "
                     "the list have none.")
 

@@ -11,7 +11,7 @@ from wfsobs.ar3 import Ar3
 from wfsobs.prior import Prior
 from wfsobs.scenario import Scenario
 
-HIGHEST, LARGEST, LEAST = 50_000.0, 1e6, 1e-6
+HIGHEST, LARGEST, LEAST = 50_000.0, 1e4, 1e-6
 """Highest frequency of a peak [Hz], largest rms [um] and least damping of a process that a scenario's settings allow."""
 WIDTHS = ("bandwidth_offline", "bandwidth_online")
 
