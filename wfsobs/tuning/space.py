@@ -15,9 +15,9 @@ import param
 
 from wfsobs.arrays import Array
 from wfsobs.atmosphere import relative_rms
-from wfsobs.disturbance import vibration_variance
+from wfsobs.disturbance import vibration_lines, vibration_variance
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman import measurement_noise, modelled_peak
+from wfsobs.observers.kalman import measurement_noise
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 from wfsobs.turbulence import turbulence_process
@@ -197,6 +197,14 @@ def _process(scenario: Scenario) -> tuple[float, float]:
     return turbulence_process(scenario, 0, scenario.dt).rms / relative_rms(scenario, 0), float(np.sqrt(variance))
 
 
+def _peak(scenario: Scenario) -> tuple[float, float]:
+    """Frequency and damping of the line that is the strongest of all modes: set by hand it is one for all of them."""
+    lines = [line for mode in range(len(scenario.modes)) for line in vibration_lines(scenario, mode)]
+    default = (scenario.kalman.frequency, scenario.kalman.damping, 0.0)
+    frequency, damping, _ = max(lines, key=lambda line: line[2], default=default)
+    return frequency, damping
+
+
 def _noise(scenario: Scenario) -> tuple[float, float]:
     """Noise of LGS and NGS that "matched" gives, rms over the modes [um]: set by hand it is one number for all of them."""
     each = np.array([measurement_noise(scenario, mode) for mode in range(len(scenario.modes))])
@@ -205,7 +213,7 @@ def _noise(scenario: Scenario) -> tuple[float, float]:
 
 
 BY_HAND: dict[str, tuple[tuple[str, str], Callable[[Scenario], tuple[float, float]]]] = {
-    "kalman.peak": (("kalman.frequency", "kalman.damping"), lambda scenario: modelled_peak(scenario, 0)),
+    "kalman.peak": (("kalman.frequency", "kalman.damping"), _peak),
     "kalman.process_noise": (("kalman.turbulence_rms", "kalman.vibration_rms"), _process),
     "kalman.measurement_noise": (("kalman.lgs_noise", "kalman.ngs_noise"), _noise),
     "multirate.measurement_noise": (_RATES, _noise),
