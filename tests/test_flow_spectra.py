@@ -58,6 +58,16 @@ def test_simulated_records_have_these_spectra() -> None:
         assert ratio == pytest.approx(1.0, abs=0.15), name
 
 
+def test_a_step_is_the_mean_of_the_steps_of_a_faster_sensor() -> None:
+    """The mean of four steps of a quarter of the length has the transfer function of four phasors."""
+    f = np.linspace(1.0, 500.0, 200)
+    slow, fast = (flow_spectra(FLOW.replace({"sensors.lgs_rate": rate}), 0, f) for rate in (1000.0, 4000.0))
+    mean = np.abs(np.exp(-2j * np.pi * np.multiply.outer(f, np.arange(4)) / 4000.0).mean(axis=1)) ** 2
+    for name in ("own", "seen", "shared"):
+        # both are interpolated between frequencies 5 % apart, which cuts (0.05 x 2 pi / 2)^2 / 8 = 0.003 off their bend at most
+        assert np.abs(getattr(slow, name)) == pytest.approx(mean * np.abs(getattr(fast, name)), rel=3e-3, abs=0)
+
+
 def test_true_spectra_carry_them() -> None:
     spectra = true_spectra(FLOW, 0)
     assert np.sqrt(circle_mean(spectra.signal["turbulence"])) == pytest.approx(turbulence_rms(FLOW, 0), rel=5e-3)

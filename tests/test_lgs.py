@@ -44,6 +44,19 @@ def test_error_and_noise_are_those_of_samples(changes: dict[str, Any]) -> None:
         assert error_of_samples(s) == pytest.approx(wanted, rel=0.15)
 
 
+@pytest.mark.parametrize("combination", [{}, BEST])
+def test_the_error_process_has_the_variance_of_the_error(combination: dict[str, Any]) -> None:
+    """Four stars whose errors of 30 nm are independent leave half of that in their mean; the rest by the covariances."""
+    several = {"sensors.lgs_count": 4, "turbulence.source": "ar2", "sensors.lgs_low_frequency_rms": 0.03}
+    for changes in (several, BESIDE):
+        s = scenario(changes, combination)
+        for mode in range(len(s.modes)):
+            wanted = np.sqrt(lgs_error_variance(s, mode))
+            assert lgs_error_process(s, mode, 1e-3).rms == pytest.approx(wanted, rel=1e-9)
+    if not combination:
+        assert lgs_error_process(scenario(several), 0, 1e-3).rms == pytest.approx(0.015, rel=1e-12)
+
+
 def test_no_weights_do_better() -> None:
     """What the combination gets wrong has nothing in common with what any star measures in any mode: there is nothing left
     to gain (the principle of orthogonality), to rounding."""
