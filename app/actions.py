@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import logging
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -12,14 +11,14 @@ import param
 from panel.custom import JSComponent
 
 from wfsobs.app.downloads import TooLarge, data_csv, data_npz
-from wfsobs.app.report.maker import FAILED, Maker, ReportError
+from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.report.maker import LIMIT, ReportError, make
 from wfsobs.app.share import FILE, Link, from_file, from_query, to_command, to_file, to_python, to_query
 from wfsobs.app.store import Store
 from wfsobs.app.style import LOOKS, asset
 from wfsobs.app.work import Shown
 from wfsobs.settings import SettingError
-
-log = logging.getLogger(__name__)
 
 LARGEST = 2_000_000
 """Of a scenario file that is opened [bytes]."""
@@ -65,9 +64,10 @@ class Actions:
         self.toolbar = Toolbar(
             labels={name: it.label for name, it in LOOKS.items()}, sizing_mode="stretch_width", margin=0)
         self.toolbar.on_action = self.handle
-        self.maker = Maker()
+        self._tasks: dict[str, BackgroundTask] = {}
+        self._under_way: dict[str, tuple[str, Callable[[Any], None]]] = {}
         store.param.watch(self._refresh, ["scenario", "preset"])
-        store.run.param.watch(self._refresh_ready, "shown")
+        store.run.param.watch(self._refresh_ready, "result")
         self._refresh()
 
     def handle(self, msg: dict[str, Any]) -> None:
@@ -96,28 +96,16 @@ class Actions:
         if not isinstance(text, str) or len(text) > LARGEST:
             self._note(f"{name[:80]}: larger than {LARGEST // 1_000_000} MB, not a scenario")
             return
-        run = self.store.run
-
-        def work() -> None:
-            try:
-                link = from_file(text)
-            except SettingError as error:
-                run.post(partial(self._refuse, name, error))
-            else:
-                run.post(partial(self._take, name, link))
-
-        run.aside(work)
+        job = Job("upload", lambda _watch, _tell: from_file(text), refusal=SettingError)
+        self._start("open", name[:80], job, partial(self._take, name))
 
     def _take(self, name: str, link: Link) -> None:
         try:
             self.store.load(link.scenario, link.preset or None)
         except SettingError as error:
-            self._refuse(name, error)
+            self._note(f"{name[:80]}: {_reason(str(error))}")
         else:
             self.toolbar.param.update(notes=[], said=f"Opened {name[:80]}.")
-
-    def _refuse(self, name: str, error: SettingError) -> None:
-        self._note(f"{name[:80]}: {str(error).removeprefix('file: ')[:300]}")
 
     def save_scenario(self) -> None:
         """Send the settings as TOML."""
@@ -125,50 +113,40 @@ class Actions:
         self.toolbar.save(FILE, "application/toml", text.encode())
 
     def save_data(self, name: str, kind: str, make: Callable[[Shown], bytes]) -> None:
-        """Make a file of the results shown, in a thread, and send it."""
-        shown, run = self.store.run.shown, self.store.run
+        """Make a file of the results shown, beside the page, and send it."""
+        shown = self.store.run.result
         if shown is None:
             self._note("There are no results to save yet.")
             return
-
-        def work() -> None:
-            try:
-                content = make(shown)
-            except TooLarge as error:
-                run.post(partial(self._note, f"{name}: {error}"))
-            else:
-                run.post(partial(self.toolbar.save, name, kind, content))
-
-        run.aside(work)
+        job = Job("save", lambda _watch, _tell: make(shown), refusal=TooLarge)
+        self._start(name, name, job, partial(self.toolbar.save, name, kind))
 
     def make_report(self) -> None:
         """Make the report of the results shown, beside everything else, and send it; one at a time."""
-        shown, run, preset = self.store.run.shown, self.store.run, self.store.preset
+        shown, preset = self.store.run.result, self.store.preset
         if shown is None or self.toolbar.reporting:
             return
-        self.toolbar.param.update(reporting=True, said="", notes=[])
+        job = Job("report", partial(make, shown, preset), time_limit=LIMIT, wait_limit=LIMIT, refusal=ReportError)
+        self._start("report", "Report", job, partial(self.toolbar.save, REPORT, "text/html"))
 
-        def work() -> None:
-            try:
-                content = self.maker.make(shown, preset)
-            except ReportError as error:
-                run.post(partial(self._reported, f"Report: {error}"))
-            except Exception:
-                log.exception("the report could not be made")
-                run.post(partial(self._reported, f"Report: {FAILED}"))
-            else:
-                run.post(partial(self._reported, "", content))
+    def _start(self, which: str, name: str, job: Job, then: Callable[[Any], None]) -> None:
+        """Have a job done, one of each at a time, say under a name how it goes, and then do something with its result."""
+        self._under_way[which] = name, then
+        if which not in self._tasks:
+            task = self._tasks[which] = BackgroundTask(self.store.session)
+            task.param.watch(lambda *_: self._follow(which), ["state", "place"])
+        self._tasks[which].start(job)
 
-        run.aside(work)
-
-    def _reported(self, line: str, content: bytes = b"") -> None:
-        self.toolbar.param.update(reporting=False, notes=[line] if line else [])
-        if content:
-            self.toolbar.save(REPORT, "text/html", content)
-
-    def close(self) -> None:
-        """The session has ended."""
-        self.maker.close()
+    def _follow(self, which: str) -> None:
+        task, (name, then) = self._tasks[which], self._under_way[which]
+        if which == "report":
+            self.toolbar.reporting = task.state == RUNNING
+        if task.state == FAILED:
+            self._note(f"{name}: {_reason(task.message)}")
+        else:
+            self.toolbar.param.update(notes=[], said=f"{name}: {task.line()}" if task.place else "")
+        if task.state == DONE:
+            then(task.result)
 
     def _note(self, line: str) -> None:
         self.toolbar.param.update(notes=[line], said="")
@@ -181,4 +159,8 @@ class Actions:
             python=to_python(scenario, preset))
 
     def _refresh_ready(self, *_: object) -> None:
-        self.toolbar.ready = self.store.run.shown is not None
+        self.toolbar.ready = self.store.run.result is not None
+
+
+def _reason(text: str) -> str:
+    return text.removeprefix("file: ")[:300]

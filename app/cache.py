@@ -6,11 +6,12 @@ import dataclasses
 import hashlib
 import json
 import threading
-from collections import OrderedDict
 from collections.abc import Hashable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from wfsobs.scenario import Scenario
@@ -67,31 +68,20 @@ class Cache(Generic[T]):
     """
 
     def __init__(self, most_bytes: int):
-        self.most_bytes = most_bytes
-        self._kept: OrderedDict[Hashable, tuple[T, int]] = OrderedDict()
-        self._bytes = 0
+        self._kept: LRUCache[Hashable, T] = LRUCache(most_bytes, size_of)
         self._lock = threading.Lock()
 
     def get(self, key: Hashable) -> T | None:
         """What is kept under a key, or None."""
         with self._lock:
-            if key not in self._kept:
-                return None
-            self._kept.move_to_end(key)
-            return self._kept[key][0]
+            return self._kept.get(key)
 
     def put(self, key: Hashable, value: T) -> T:
         """Keep a value, in place of the least wanted ones; gives it back, its arrays read-only."""
-        size = size_of(frozen(value))
-        with self._lock:
-            _, before = self._kept.pop(key, (None, 0))
-            self._bytes -= before
-            if size <= self.most_bytes:
-                self._kept[key] = value, size
-                self._bytes += size
-            while self._bytes > self.most_bytes:
-                _, (_, gone) = self._kept.popitem(last=False)
-                self._bytes -= gone
+        frozen(value)
+        with self._lock, suppress(ValueError):  # larger than all that is kept
+            self._kept.pop(key, None)
+            self._kept[key] = value
         return value
 
     def __contains__(self, key: Hashable) -> bool:
@@ -106,4 +96,4 @@ class Cache(Generic[T]):
     def bytes(self) -> int:
         """Of arrays that are kept."""
         with self._lock:
-            return self._bytes
+            return int(self._kept.currsize)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
@@ -16,15 +15,16 @@ from wfsobs.app.connection import Connection
 from wfsobs.app.controls.names import named
 from wfsobs.app.controls.panel import Controls, waiting_text
 from wfsobs.app.display import Display
+from wfsobs.app.jobs.job import FAILED
+from wfsobs.app.jobs.task import IDLE
 from wfsobs.app.pages.explore import Explore
 from wfsobs.app.pages.pages import Pages
 from wfsobs.app.pages.parts import WIDE
-from wfsobs.app.run import FAILED, IDLE, Post
+from wfsobs.app.service import Post, Session
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, theme
 from wfsobs.app.upload import Upload
 from wfsobs.app.views.modes import ModeSwitch, UnitSwitch
-from wfsobs.app.work import compute
 from wfsobs.scenario import Scenario
 
 ACTIONS = """
@@ -58,13 +58,10 @@ class Idle(param.Parameterized):
 class Dashboard:
     """One session: its store, its controls and its views."""
 
-    def __init__(self, post: Post, scenario: Scenario | None = None, work: Any = compute, **store: Any):
+    def __init__(self, post: Post, session: Session, scenario: Scenario | None = None):
         self._post = post
-        self.upload = Upload()
-        if "held" in store:
-            store["held"] = self.upload.unless(store["held"])
-        self.store = Store(post, scenario, self.upload.over(work), **store)
-        self.upload.attach(self.store)
+        self.store = Store(post, session, scenario)
+        self.upload = Upload(self.store)
         self.display = Display()
         self.controls = Controls(self.store)
         self.actions = Actions(self.store)
@@ -105,7 +102,6 @@ class Dashboard:
 
     def close(self) -> None:
         """The session has ended."""
-        self.actions.close()
         self.store.close()
 
     def _themed(self, event: param.parameterized.Event) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wfsobs.app.jobs.job import Tell
 from wfsobs.app.work import Shown
 from wfsobs.arrays import Array
 from wfsobs.gaps import bridged
@@ -49,7 +50,7 @@ class Fit:
     lines: tuple[tuple[float, float, float], ...]
 
 
-def measured(of: Shown) -> Measured:
+def measured(of: Shown, _watch: Watch, _tell: Tell) -> Measured:
     """The spectrum of the record shown, with the taper that identification uses. Raises RecordError."""
     record = of.result.record
     z = bridged(record, of.result.scenario).z[record.delay :]
@@ -93,6 +94,6 @@ def same(one: Record, other: Record) -> bool:
         and np.array_equal(one.y_lgs, other.y_lgs, equal_nan=True) and np.array_equal(one.u, other.u, equal_nan=True))
 
 
-def compute(of: Shown, level: float, lowest: float, watch: Watch) -> tuple[Identified, Record]:
+def compute(of: Shown, level: float, lowest: float, watch: Watch, _tell: Tell) -> tuple[Identified, Record]:
     """The model of the record shown, and that record. Raises RecordError, Cancelled."""
     return identify(of.result.record, level=level, lowest=lowest, watch=watch), of.result.record

@@ -1,14 +1,12 @@
-"""The closed loop of the results shown, computed in a thread beside the run: quick controllers first, each as it is done."""
+"""The closed loop of the results shown: quick controllers first, each as it is done."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
-from wfsobs.app.run import Run
+from wfsobs.app.jobs.job import Tell
 from wfsobs.app.work import Shown
 from wfsobs.arrays import Array
 from wfsobs.control.closed_loop import ClosedLoop, design, each_outcome
@@ -17,7 +15,7 @@ from wfsobs.control.curves import Curves, curves
 from wfsobs.control.tables import Row, rows
 from wfsobs.scenario import Scenario
 from wfsobs.scores import welch_psd
-from wfsobs.watch import Cancelled, Watch
+from wfsobs.watch import Watch
 
 PATIENCE = 60.0
 """A controller that would take longer is left out here [s]; `wfsobs loop` runs it."""
@@ -43,40 +41,9 @@ class LoopShown:
         return next((o.residual for o in self.result.outcomes if o.controller == controller), None)
 
 
-class LoopRun:
-    """The one closed loop of a session. What it gives lands on the session's thread, unless superseded."""
-
-    def __init__(self, run: Run, land: Callable[[LoopShown | None, str], None]):
-        """Land is called with the results so far, or None and why there are none."""
-        self._run, self._land = run, land
-        self._cancel = threading.Event()
-
-    def start(self, of: Shown) -> None:
-        """Compute for a record that is shown, in place of whatever is being computed."""
-        self.stop()
-        self._cancel = cancel = threading.Event()
-        self._run.aside(partial(self._work, of, cancel))
-
-    def stop(self) -> None:
-        """Nothing more lands."""
-        self._cancel.set()
-
-    def _work(self, of: Shown, cancel: threading.Event) -> None:
-        """In a thread of the pool."""
-        def land(shown: LoopShown | None, reason: str = "") -> None:
-            self._run.post(lambda: None if cancel.is_set() else self._land(shown, reason))
-
-        try:
-            compute(of, Watch(cancelled=lambda: cancel.is_set() or self._run.closed), land)
-        except Cancelled:
-            pass
-        except ValueError as error:  # settings or a record that no loop can be made of
-            land(None, str(error))
-
-
-def compute(of: Shown, watch: Watch, land: Callable[[LoopShown], None]) -> None:
-    """Run every controller on the record shown; hand over what is done once the quick ones are, and after each of the others."""
-    record = of.result.record
+def compute(of: Shown, watch: Watch, tell: Tell) -> LoopShown | None:
+    """Run every controller on the record shown; tell what is done once the quick ones are, and after each of the others."""
+    record, shown = of.result.record, None
     plan = design(of.scenario, [name for name in CONTROLLERS if seconds(name, of.scenario) <= PATIENCE])
     linear = {
         name: tuple(curves(d.law, plan.mirror, record.dt) for d in laws if d.law)
@@ -92,7 +59,15 @@ def compute(of: Shown, watch: Watch, land: Callable[[LoopShown], None]) -> None:
             spectra[outcome.controller] = welch_psd(outcome.residual[start:], record.dt)
         if outcome.controller not in quick[:-1]:
             result = ClosedLoop(plan, record, tuple(outcomes))
-            land(LoopShown(result, tuple(rows(result, None)), dict(spectra), linear, outcome.controller == names[-1]))
+            shown = LoopShown(result, tuple(rows(result, None)), dict(spectra), linear, outcome.controller == names[-1])
+            if not shown.done:
+                tell(result=shown)
+    return shown
+
+
+def cost(scenario: Scenario) -> float:
+    """About how long all that are not left out take at most [s]."""
+    return sum(s for s in (seconds(name, scenario) for name in CONTROLLERS) if s <= PATIENCE)
 
 
 def seconds(controller: str, scenario: Scenario) -> float:

@@ -50,7 +50,7 @@ class Options:
 
     origins    : HOST or HOST:PORT that browsers reach the server by, where it is not the address: behind a proxy
     prefix     : path of the page, where a proxy serves other things beside it
-    runs       : at once; 0 for as many as there are processors
+    runs       : jobs at once, of every kind; 0 for as many as there are processors
     lifetime   : of the settings of a page that is not connected any more, or has never been [s]
     cache_mb   : results kept [MB]
     log_level  : debug, info, warning or error
@@ -100,7 +100,7 @@ def serve(options: Options) -> None:
     loop.start()
     server.stop(wait=False)
     ended = service.close()
-    event("stopped", sessions=service.visits)
+    event("stopped", sessions=service.sessions)
     gc.freeze()  # what is left need not be looked through once more
     if not ended:  # a computation that does not listen must not keep the process
         logging.shutdown()
@@ -131,7 +131,7 @@ def shared() -> Service:
 
 def _end(service: Service, then: Any, number: int, frame: Any) -> None:
     """Have the runs stop on a signal, and leave the rest to whoever was to hear of it."""
-    service.closing = True
+    service.queue.closing = True
     if callable(then):
         then(number, frame)
     else:
@@ -141,11 +141,11 @@ def _end(service: Service, then: Any, number: int, frame: Any) -> None:
 def new_page(service: Service) -> Any:
     """The page of a new session."""
     try:
-        visit = service.enter()
+        session = service.enter()
     except Full as error:
         return pn.pane.HTML(full_html(str(error)), margin=40)
-    pn.state.on_session_destroyed(lambda _context: visit.leave())
-    return page(lambda post: Dashboard(post, work=visit.compute, limits=service.limits, held=service.held))
+    pn.state.on_session_destroyed(lambda _context: session.leave())
+    return page(lambda post: Dashboard(post, session))
 
 
 def make_server(options: Options, service: Service) -> Server:
@@ -218,7 +218,7 @@ class Liveness(RequestHandler):
     def get(self) -> None:
         """Answer in JSON."""
         queue = self.service.queue
-        self.write({"ok": True, "sessions": self.service.visits, "running": queue.running, "waiting": queue.length})
+        self.write({"ok": True, "sessions": self.service.sessions, "running": queue.running, "waiting": queue.length})
 
 
 def full_html(line: str) -> str:

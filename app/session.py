@@ -16,12 +16,12 @@ from urllib.parse import quote, urlencode
 import panel as pn
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.run import Post
+from wfsobs.app.service import Post
 
 log = logging.getLogger(__name__)
 
 
-def page(build: Callable[[Post], Dashboard] = Dashboard) -> Any:
+def page(build: Callable[[Post], Dashboard]) -> Any:
     """The page of a new session; a page that says what went wrong where it cannot be built."""
     try:
         dashboard = build(post_to_session())

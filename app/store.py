@@ -5,15 +5,14 @@ A `Scenario` in the store is replaced, never changed in place, so whoever holds 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import param
 
-from wfsobs.app.limits import NONE, Limits
-from wfsobs.app.run import Compute, Post, Run
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.service import Post, Session
 from wfsobs.app.sources import Kept, Loaded, Source, same
-from wfsobs.app.work import compute
 from wfsobs.configfile import pristine
 from wfsobs.cost import run_seconds
 from wfsobs.presets import PRESETS
@@ -42,28 +41,28 @@ class Store(param.Parameterized):
     can_undo = param.Boolean(False, doc="Whether there is a change to undo.")
     can_redo = param.Boolean(False, doc="Whether there is an undone change to make again.")
 
-    def __init__(
-        self, post: Post, scenario: Scenario | None = None, work: Compute = compute,
-        limits: Limits = NONE, held: Callable[[Scenario], bool] = lambda _: False,
-    ):
-        """Limits are those on what a scenario may ask for; held says whether its results are there already."""
+    def __init__(self, post: Post, session: Session, scenario: Scenario | None = None):
         super().__init__(scenario=scenario or PRESETS[next(iter(PRESETS))]())
-        self.limits, self._held = limits, held
+        self.session, self.limits = session, session.service.limits
+        session.post = post
         self._refused: dict[str, Any] = {}
         self._past: list[Step] = []
         self._future: list[Step] = []
-        self.run = Run(post, work)
-        self.run.param.watch(self._compare, "shown")
+        self.run = BackgroundTask(session)
+        self.run.param.watch(self._compare, "result")
 
     def start(self) -> None:
         """Run the settings as they stand."""
         self.waiting = 0.0
-        self.run.start(self.scenario)
+        try:
+            self.run.start(self.session.service.run(self.scenario, self.source))
+        except SettingError as error:
+            self.run.refuse(str(error))
 
     def follow(self) -> None:
         """Run the settings as they stand, unless that takes long: then stop, and wait to be asked."""
         seconds = run_seconds(self.scenario)
-        if seconds <= AT_ONCE or self._held(self.scenario):
+        if seconds <= AT_ONCE or self.session.service.held(self.scenario, self.source):
             self.start()
         else:
             self.run.cancel()
@@ -139,7 +138,7 @@ class Store(param.Parameterized):
 
     def close(self) -> None:
         """The session has ended."""
-        self.run.close()
+        self.session.leave()
 
     @property
     def _step(self) -> Step:
@@ -169,7 +168,7 @@ class Store(param.Parameterized):
         self._compare()
 
     def _compare(self, *_: object) -> None:
-        shown = self.run.shown
+        shown = self.run.result
         self.stale = shown is not None and (shown.scenario != self.scenario or not same(shown.source, self.source))
 
 

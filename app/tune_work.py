@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from time import monotonic
 from types import MappingProxyType
 
-from wfsobs.app.beside import Tell
-from wfsobs.app.work import INTERVAL, Shown
+from wfsobs.app.jobs.job import INTERVAL, Tell
+from wfsobs.app.work import Shown
 from wfsobs.cost import part_seconds
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
@@ -60,7 +60,7 @@ def compute(
         history.append(evaluation)
         if monotonic() - last >= INTERVAL:
             last = monotonic()
-            tell(tuple(history))
+            tell(latest=tuple(history))
 
     record = of.result.record if of.recorded else None
     return tune(scenario, observer, None, evaluations, watch, record, target=target, told=told)

@@ -8,8 +8,6 @@ is confirmed. Reading is done beside the page, in a thread.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
-from functools import partial
 from html import escape
 from typing import Any
 
@@ -18,6 +16,8 @@ import panel as pn
 import panel_material_ui as pmui
 from bokeh.models import ColumnDataSource
 
+from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job, Tell
+from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.picker import Parcel, Picker, too_large
 from wfsobs.app.sources import Loaded
 from wfsobs.app.store import Store
@@ -31,6 +31,7 @@ from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
 from wfsobs.units import UNITS
+from wfsobs.watch import Watch
 
 SILENT = "as the file says"
 NOTHING = np.empty(0)
@@ -38,9 +39,10 @@ COLOURS = ("#0B4F6C", "#FF6600")
 
 
 class Upload:
-    """How the record of a session comes in."""
+    """How a record comes into a session's store, whose aperture turns angles into wavefronts."""
 
-    def __init__(self) -> None:
+    def __init__(self, store: Store) -> None:
+        self.store = store
         self.picker = Picker(sizing_mode="stretch_width", margin=0)
         self.picker.on_message = self.handle
         self.unit = self._select("Unit", [SILENT, *UNITS])
@@ -59,26 +61,12 @@ class Upload:
         self._parcel: Parcel | None = None
         self._name, self._content = "", b""
         self._preview: Preview | SpectrumPreview | None = None
-        self._asked = 0
+        self.reading = BackgroundTask(store.session)
+        self.reading.param.watch(self._read, ["state", "place", "message"])
         self.use.on_click(lambda _event: self.confirm())
         self.drop.on_click(lambda _event: self.discard())
         for widget in (self.unit, self.sign, self.delay, self.rate):
             widget.param.watch(lambda _event: self.look(), "value")
-
-    def over(self, work: Callable[..., Any]) -> Callable[..., Any]:
-        """The work of a run, on what takes the place of the simulation where something does."""
-        def with_record(scenario: Scenario, cancelled: Callable[[], bool], tell: Any) -> Any:
-            source = self.store.source
-            return work(scenario, cancelled, tell, *([source] if source else []))
-        return with_record
-
-    def unless(self, held: Callable[[Scenario], bool]) -> Callable[[Scenario], bool]:
-        """Whether the results of a scenario are there already, which is not known of a record."""
-        return lambda scenario: self.store.source is None and held(scenario)
-
-    def attach(self, store: Store) -> None:
-        """The store whose runs are to be on the record, and whose aperture turns angles into wavefronts."""
-        self.store = store
         self._diameter = store.scenario.telescope.diameter
         store.param.watch(self._follow, "scenario")
         store.param.watch(self._entitle, "source")
@@ -144,30 +132,32 @@ class Upload:
         """Read the file, beside the page, as what the fields say."""
         if not self._content:
             return
-        self._asked += 1
-        asked, content, name = self._asked, self._content, self._name
+        content, name = self._content, self._name
         scenario = self.store.scenario.replace({"telescope.radial_order": 6})  # as many modes as there may be
         try:
             stated = self.stated()
         except RecordError as error:
-            self._land(asked, error)
+            self.reading.refuse(str(error))
             return
-        self.picker.said = f"Reading {name} …"
 
-        def read() -> None:
+        def read(_watch: Watch, _tell: Tell) -> Preview | SpectrumPreview:
             try:
-                found: Preview | SpectrumPreview | RecordError = preview_any(content, name, scenario, stated)
-            except RecordError as error:
-                found = error
+                return preview_any(content, name, scenario, stated)
+            except RecordError:
+                raise
             except Exception:  # whatever a stranger's file may do
-                found = RecordError(f"{name}: cannot be read")
-            self.store.run.post(partial(self._land, asked, found))
+                raise RecordError(f"{name}: cannot be read") from None
 
-        self.store.run.aside(read)
+        self.reading.start(Job("upload", read))
 
-    def _land(self, asked: int, found: Preview | SpectrumPreview | RecordError) -> None:
-        if asked != self._asked:
-            return
+    def _read(self, *_: object) -> None:
+        task = self.reading
+        if task.state == RUNNING:
+            self._say(task.line() if task.place else f"Reading {self._name} …")
+        elif self._content and task.state != CANCELLED:
+            self._show(RecordError(task.message) if task.state == FAILED else task.result)
+
+    def _show(self, found: Preview | SpectrumPreview | RecordError) -> None:
         self._preview = None if isinstance(found, RecordError) else found
         spectrum = isinstance(found, SpectrumPreview)
         self.use.label = "Use this spectrum" if spectrum else "Use this record"
@@ -220,8 +210,8 @@ class Upload:
 
     def discard(self, why: str = "") -> None:
         """Forget the file that is being looked at."""
-        self._asked += 1
         self._content, self._parcel, self._preview = b"", None, None
+        self.reading.cancel()
         self.room.visible = False
         self._say(why)
 

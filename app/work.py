@@ -8,7 +8,7 @@ come in parts.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from time import perf_counter, sleep
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from wfsobs.app.jobs.job import INTERVAL, Tell
 from wfsobs.app.sources import Source
 from wfsobs.bound import bound_scores
 from wfsobs.loop import simulate
@@ -32,9 +33,6 @@ Key = tuple[str, str]
 """(observer or TRUTH, target)."""
 
 TRUTH = "truth"
-
-INTERVAL = 0.15
-"""Least time between two reports of progress [s]."""
 
 DELIVERY_INTERVAL = 0.4
 """Least time between two deliveries [s], each of which has the page drawn anew."""
@@ -93,8 +91,6 @@ class Shown:
         return estimate.values if estimate else self.partial.get((observer, target))
 
 
-Report = Callable[[float, Shown | None], None]
-"""Told the fraction done, and what is done where that has grown."""
 
 
 def one_blas_thread() -> None:
@@ -102,20 +98,18 @@ def one_blas_thread() -> None:
     threadpool_limits(limits=1, user_api="blas")
 
 
-def compute(
-    scenario: Scenario, cancelled: Callable[[], bool], report: Report, source: Source | None = None
-) -> Shown:
-    """Run everything on a scenario, or the observers on another record. Raises SettingError, Cancelled."""
-    return _Work(scenario, cancelled, report, source).run()
+def compute(scenario: Scenario, watch: Watch, tell: Tell, source: Source | None = None) -> Shown:
+    """Run everything on a scenario, or the observers on another record; tells the results that there are. Raises
+    SettingError, Cancelled."""
+    return _Work(scenario, watch, tell, source).run()
 
 
 class _Work:
-    def __init__(
-        self, scenario: Scenario, cancelled: Callable[[], bool], report: Report, source: Source | None = None
-    ):
-        self.scenario, self.report, self.source = scenario, report, source
+    def __init__(self, scenario: Scenario, watch: Watch, tell: Tell, source: Source | None):
+        self.scenario, self.tell, self.source = scenario, tell, source
         self.simulation = scenario if source is None else source.simulation
-        self.watch = Watch(progress=self._progress, cancelled=cancelled)
+        self.report = watch.progress
+        self.watch = Watch(progress=self._progress, cancelled=watch.cancelled)
         self.estimates: list[Estimate] = []
         self.failures: list[Failure] = []
         self.bounds: list[Score] = []
@@ -150,7 +144,8 @@ class _Work:
                 shown = self._deliver(record) if quick else None
             if shown is not None:
                 handed_over = True
-                self.report(self.fraction, shown)
+                self.report(self.fraction)
+                self.tell(result=shown)
                 self._let_draw()
                 if self.simulation is not None:
                     self.bounds = bound_scores(self.simulation, record)
@@ -190,7 +185,9 @@ class _Work:
                 shown = None
                 if self.news and now - self.delivered >= DELIVERY_INTERVAL:
                     shown = self._deliver(self.record)
-            self.report(fraction, shown)
+            self.report(fraction)
+            if shown is not None:
+                self.tell(result=shown)
 
     def _grow(self, observer: str, target: str, values: Array) -> None:
         with self.lock:

@@ -14,7 +14,7 @@ from panel.custom import JSComponent
 from wfsobs.app.controls.fields import ROOM, TAG, Field, make_field
 from wfsobs.app.controls.names import name_of
 from wfsobs.app.controls.rows import RowEditor
-from wfsobs.app.run import CANCELLED, DONE, FAILED, RUNNING
+from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset
 from wfsobs.presets import PRESETS
@@ -195,9 +195,9 @@ class Controls:
 def status_of(store: Store) -> tuple[str, str]:
     """A line on the run, and one on what was refused."""
     run = store.run
-    seconds = f" in {run.shown.seconds:.2f} s" if run.shown and run.state == DONE else ""
+    seconds = f" in {run.result.seconds:.2f} s" if run.result and run.state == DONE else ""
     text = {
-        RUNNING: f"Waiting: position {run.place}" if run.place else f"Running, {int(100 * run.progress)} %",
+        RUNNING: run.line(),
         DONE: f"Done{seconds}",
         CANCELLED: "Cancelled",
         FAILED: "The run failed",

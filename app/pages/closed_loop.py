@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
 from html import escape
 from typing import Any
 
 import panel as pn
 
 from wfsobs.app.display import NOTHING, Display, number, per_micrometre
-from wfsobs.app.loop_work import LoopRun, LoopShown, seconds
+from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.loop_work import LoopShown, compute, cost, seconds
 from wfsobs.app.pages.loop_figures import Nyquist, Response, Spectrum, Trace
 from wfsobs.app.pages.loop_table import margins_html, table_html
 from wfsobs.app.pages.parts import WIDE, box, captioned, html, text
-from wfsobs.app.run import RUNNING, Run
 from wfsobs.app.style import look
 from wfsobs.app.views.strip import Cards
 from wfsobs.control.controllers import CONTROLLERS
@@ -36,17 +38,18 @@ ABOUT = (
 class ClosedLoopPage:
     """The page; computed anew when the results change, while it is visible."""
 
-    def __init__(self, run: Run, display: Display):
+    def __init__(self, run: BackgroundTask, display: Display):
         self.run, self.display = run, display
-        self.work = LoopRun(run, self._land)
-        self.shown: LoopShown | None = None
+        self.work = BackgroundTask(run.session)
         self.visible, self._of = False, object()
         self.note, self.table, self.margins = html(), html(), html()
         self.cards = Cards(items=[], hidden=[], sizing_mode="stretch_width", margin=0)
         self.whole, self.zoomed = Trace("whole record"), Trace("zoomed")
         self.spectrum, self.response, self.nyquist = Spectrum(), Response(), Nyquist()
         self._drawn = (self.whole, self.zoomed, self.spectrum, self.response, self.nyquist)
-        run.param.watch(self._follow, ["shown", "state"])
+        self.work.param.watch(self._say, ["state", "place", "message"])
+        self.work.param.watch(self._redraw, "result")
+        run.param.watch(self._follow, ["result", "state"])
         display.param.watch(self._redraw, ["mode", "unit"])
         display.param.watch(self._restyle, "dark")
         self.cards.param.watch(self._restyle, "hidden")
@@ -75,24 +78,27 @@ class ClosedLoopPage:
 
     def _follow(self, *_: object) -> None:
         """Start the loop of the results shown, once their run is over; stop where the page is hidden."""
-        of = self.run.shown
+        of = self.run.result
         if not self.visible:
-            self.work.stop()
-            if self.shown is None or not self.shown.done:
+            self.work.cancel()
+            if self.work.state == CANCELLED:
                 self._of = object()
             return
         if of is None or self.run.state == RUNNING or of is self._of:
             return
         self._of = of
-        self.note.object = '<p class="text" role="status">computing …</p>'
-        self.work.start(of)
+        self.work.start(Job("loop", partial(compute, of), cost=cost(of.scenario)))
 
-    def _land(self, shown: LoopShown | None, reason: str) -> None:
-        self.shown = shown
-        with pn.io.hold():
-            said = "" if shown and shown.done else "computing …" if shown else f"No closed loop: {reason}"
-            self.note.object = f'<p class="text" role="status">{escape(said)}</p>' if said else ""
-            self._redraw()
+    @property
+    def shown(self) -> LoopShown | None:
+        """What the loop has given so far, or the one before."""
+        return self.work.result
+
+    def _say(self, *_: object) -> None:
+        work = self.work
+        doing = work.line() if work.place else "computing …"
+        said = {RUNNING: doing, FAILED: f"No closed loop: {work.message}"}.get(work.state, "")
+        self.note.object = f'<p class="text" role="status">{escape(said)}</p>' if said else ""
 
     def _redraw(self, *_: object) -> None:
         shown = self.shown

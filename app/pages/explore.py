@@ -12,8 +12,8 @@ import panel_material_ui as pmui
 
 from wfsobs.app.controls.fields import SOON
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display
+from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.parts import WIDE, box
-from wfsobs.app.run import Run
 from wfsobs.app.style import asset
 from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.spectra import MODEL, PEAKS, Spectra
@@ -37,7 +37,7 @@ MARKS = (
 class Explore:
     """The page; its figures rest while it is hidden."""
 
-    def __init__(self, run: Run, display: Display):
+    def __init__(self, run: BackgroundTask, display: Display):
         self.display = display
         self.traces, self.spectra = Traces(run, display), Spectra(run, display)
         self.strips = {target: Strip(target, run, display) for target in TARGETS}

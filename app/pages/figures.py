@@ -11,7 +11,7 @@ from bokeh.models import BoxAnnotation, ColumnDataSource, DataRange1d, GlyphRend
 from bokeh.plotting import figure
 
 from wfsobs.app.display import Display, number, per_micrometre
-from wfsobs.app.run import Run
+from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import asset, look, swatch
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.plots import new_figure
@@ -71,11 +71,11 @@ FIGURES = (
 class Figures:
     """The page; redrawn with the results and the unit while it is visible."""
 
-    def __init__(self, run: Run, display: Display):
+    def __init__(self, run: BackgroundTask, display: Display):
         self.run, self.display = run, display
         self.visible = False
         self.sheets = [_Sheet(it) for it in FIGURES]
-        run.param.watch(self._refresh, "shown")
+        run.param.watch(self._refresh, "result")
         display.param.watch(self._refresh, ["unit", "dark"])
 
     def view(self) -> pn.Column:
@@ -92,7 +92,7 @@ class Figures:
             self._refresh()
 
     def _refresh(self, *_: object) -> None:
-        shown = self.run.shown
+        shown = self.run.result
         if self.visible and shown is not None:
             with pn.io.hold():
                 for sheet in self.sheets:

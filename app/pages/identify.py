@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from functools import partial
+from html import escape
 
 import panel as pn
 import panel_material_ui as pmui
 
-from wfsobs.app.beside import Beside
 from wfsobs.app.controls.fields import parsed
 from wfsobs.app.display import Display
 from wfsobs.app.identify_work import Measured, compute, fit, measured, same, seconds
+from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
+from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.identify_figure import NAMES, SpectrumFigure
 from wfsobs.app.pages.identify_table import table_html, verdict_html
 from wfsobs.app.pages.parts import WIDE, Starter, box, html, legend, line, text
-from wfsobs.app.run import RUNNING
 from wfsobs.app.sources import Kept, Source
 from wfsobs.app.store import Store
-from wfsobs.app.work import Shown
 from wfsobs.identify import Identified
 from wfsobs.identify.identification import LEVEL
 from wfsobs.identify.search import LOWEST
@@ -46,7 +46,7 @@ class IdentifyPage:
 
     def __init__(self, store: Store, display: Display):
         self.store, self.run, self.display = store, store.run, display
-        self.work = Beside(store.run, store.limits.seconds)
+        self.work = BackgroundTask(store.session)
         self.starter = Starter(self.work, "Identify the record", "Progress of the identification",
             uses=("Filters only", "As a new simulation"))
         self.level, self.lowest = _number("Level", LEVEL), _number("Lowest peak [Hz]", LOWEST)
@@ -54,14 +54,16 @@ class IdentifyPage:
         self.legend, self.table, self.verdict, self.note = html(), html(), html(), html()
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
         self.of: Measured | None = None
+        self.measuring = BackgroundTask(store.session)
         self._made: Scenario | None = None
-        self.visible, self._measuring = False, object()
+        self.visible, self._measured = False, object()
         self.starter.start.on_click(lambda _event: self.start())
         filters, simulation = self.starter.uses
         filters.on_click(lambda _event: self.tell_filters())
         simulation.on_click(lambda _event: self.simulate())
-        self.work.param.watch(self._done, "result")
-        self.run.param.watch(self._follow, ["shown", "state"])
+        self.work.param.watch(self._redraw, "result")
+        self.measuring.param.watch(self._land, ["state", "place"])
+        self.run.param.watch(self._follow, ["result", "state"])
         display.param.watch(self._redraw, ["mode", "unit", "dark"])
 
     def view(self) -> pn.Column:
@@ -80,17 +82,19 @@ class IdentifyPage:
 
     def start(self) -> None:
         """Identify the record shown."""
-        of = self.run.shown
+        of = self.run.result
         if of is None:
             self.work.refuse("There is no record yet.")
             return
         try:
             level, lowest = _read(self.level, 1e-9, 0.5), _read(self.lowest, 1e-3, 1e4)
-            self.store.limits.check_seconds(seconds(of.result.record), "identification")
+            cost = seconds(of.result.record)
+            self.store.limits.check_seconds(cost, "identification")
         except SettingError as error:
             self.work.refuse(str(error))
         else:
-            self.work.start(lambda watch, _tell: compute(of, level, lowest, watch))
+            work = partial(compute, of, level, lowest)
+            self.work.start(Job("identify", work, cost=cost, time_limit=self.store.limits.seconds))
 
     def tell_filters(self) -> None:
         """Take the model into the settings, for the filters alone: the record stays, be it loaded or simulated."""
@@ -113,35 +117,27 @@ class IdentifyPage:
 
     def _follow(self, *_: object) -> None:
         """Measure the record shown, once its run is over."""
-        of = self.run.shown
-        if not self.visible or of is None or self.run.state == RUNNING or of is self._measuring:
+        of = self.run.result
+        if not self.visible or of is None or self.run.state == RUNNING or of is self._measured:
             return
-        self._measuring = of
-        self.run.aside(partial(self._measure, of))
+        self._measured = of
+        self.measuring.start(Job("identify", partial(measured, of), refusal=RecordError))
 
-    def _measure(self, of: Shown) -> None:
-        """In a thread of the pool."""
-        try:
-            found: Measured | str = measured(of)
-        except RecordError as error:
-            found = str(error)
-        self.run.post(lambda: self._land(of, found))
-
-    def _land(self, of: Shown, found: Measured | str) -> None:
-        if of is self._measuring:
-            self.of = None if isinstance(found, str) else found
-            self.note.object = f'<p class="failure">No spectrum: {found}</p>' if isinstance(found, str) else ""
+    def _land(self, *_: object) -> None:
+        task = self.measuring
+        if task.state in (DONE, FAILED):
+            self.of = task.result if task.state == DONE else None
+        said = f'<p class="failure">No spectrum: {escape(task.message)}</p>' if task.state == FAILED else ""
+        self.note.object = f'<p class="text">{task.line()}</p>' if task.place else said
+        if task.state != RUNNING:
             self._redraw()
-
-    def _done(self, *_: object) -> None:
-        self._redraw()
 
     def _identified(self) -> tuple[Identified, Record] | tuple[None, None]:
         """The model, and the record that it is of."""
         return self.work.result or (None, None)
 
     def _redraw(self, *_: object) -> None:
-        of, shown = self.of, self.run.shown
+        of, shown = self.of, self.run.result
         if not self.visible or of is None or shown is None or self.display.column >= of.mean.shape[1]:
             return
         diameter, column = shown.scenario.telescope.diameter, self.display.column

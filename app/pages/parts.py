@@ -11,10 +11,10 @@ import panel as pn
 import panel_material_ui as pmui
 from bokeh.plotting import figure
 
-from wfsobs.app.beside import Beside
 from wfsobs.app.controls.names import named
 from wfsobs.app.controls.panel import Status
-from wfsobs.app.run import CANCELLED, DONE, IDLE, RUNNING
+from wfsobs.app.jobs.job import CANCELLED, DONE, RUNNING
+from wfsobs.app.jobs.task import IDLE, BackgroundTask
 from wfsobs.app.style import asset, swatch
 
 WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
@@ -61,7 +61,7 @@ def legend(names: Mapping[str, str], dark: bool) -> str:
 class Starter:
     """The buttons that start, cancel and use something long, and the line on how it is going."""
 
-    def __init__(self, work: Beside, start: str, label: str, detail: Callable[[], str] = str,
+    def __init__(self, work: BackgroundTask, start: str, label: str, detail: Callable[[], str] = str,
                  uses: Sequence[str] = ("Use it",)):
         """detail : what to add to the line while the work goes on;  uses : what can be done with the result."""
         self.work, self._detail = work, detail
@@ -71,7 +71,7 @@ class Starter:
             pmui.Button(label=use, icon="check", variant="outlined", size="small", margin=0, disabled=True) for use in uses]
         self.status = Status(label=label, sizing_mode="stretch_width", margin=(4, 0), visible=False)
         self.cancel.on_click(lambda _event: work.cancel())
-        work.param.watch(self.refresh, ["state", "progress", "message", "latest", "result"])
+        work.param.watch(self.refresh, ["state", "progress", "place", "message", "latest", "result"])
 
     def view(self) -> list[Any]:
         """The row of buttons; the line is `status`."""
@@ -81,7 +81,7 @@ class Starter:
         """What may be pressed, and how it is going."""
         work = self.work
         running = work.state == RUNNING
-        said = {RUNNING: f"Computing, {int(100 * work.progress)} %", CANCELLED: "Stopped", DONE: "Finished"}.get(work.state, "")
+        said = {RUNNING: work.line("Computing"), CANCELLED: "Stopped", DONE: "Finished"}.get(work.state, "")
         self.cancel.disabled = not running
         for use in self.uses:
             use.disabled = running or work.result is None

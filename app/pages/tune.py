@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
 
-from wfsobs.app.beside import Beside
 from wfsobs.app.controls.fields import parsed
 from wfsobs.app.display import UNITS, Display, number, per_micrometre
+from wfsobs.app.jobs.job import RUNNING, SWEEP, Job
+from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.parts import WIDE, Starter, box, html, legend, line, text
 from wfsobs.app.pages.tune_views import LEGEND, HistoryFigure, table_html, unit_for
-from wfsobs.app.run import RUNNING
 from wfsobs.app.store import Store
 from wfsobs.app.tune_work import CHOICES, MOST, best_so_far, compute, measure, seconds
 from wfsobs.configfile import changes
@@ -40,7 +41,7 @@ class TunePage:
 
     def __init__(self, store: Store, display: Display):
         self.store, self.run, self.display = store, store.run, display
-        self.work = Beside(store.run, store.limits.seconds)
+        self.work = BackgroundTask(store.session)
         self.starter = Starter(self.work, "Start tuning", "Progress of the tuning", self._so_far)
         self.observer = pmui.Select(
             label="Observer", options=dict(CHOICES), value=START, size="small", width=190, margin=0)
@@ -76,18 +77,20 @@ class TunePage:
 
     def start(self) -> None:
         """Tune the chosen observer."""
-        of, observer, target, scenario = self.run.shown, self.observer.value, self.target.value, self.store.scenario
+        of, observer, target, scenario = self.run.result, self.observer.value, self.target.value, self.store.scenario
         if of is None:
             self.work.refuse("There is no record yet.")
             return
         try:
             evaluations = _whole(self.evaluations, MOST)
-            self.store.limits.check_seconds(seconds(of, scenario, observer, evaluations), "tuning")
+            cost = seconds(of, scenario, observer, evaluations)
+            self.store.limits.check_seconds(cost, "tuning")
             self.measure = measure(of, observer, target)
         except (SettingError, RecordError) as error:
             self.work.refuse(str(error))
         else:
-            self.work.start(lambda watch, tell: compute(of, scenario, observer, target, evaluations, watch, tell))
+            work = partial(compute, of, scenario, observer, target, evaluations)
+            self.work.start(Job("tune", work, cost=cost, priority=SWEEP, time_limit=self.store.limits.seconds))
 
     def use(self) -> None:
         """Take what was tuned into the settings, and leave the others as they are by now."""

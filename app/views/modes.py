@@ -7,7 +7,7 @@ import panel_material_ui as pmui
 
 from wfsobs.app.controls.fields import SOON
 from wfsobs.app.display import UNITS, Display, short_name
-from wfsobs.app.run import Run
+from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.modes import TIP_TILT, Mode
 
 
@@ -17,7 +17,7 @@ class ModeSwitch:
     Made before the views, so that they are never asked for a mode that a run does not have.
     """
 
-    def __init__(self, run: Run, display: Display):
+    def __init__(self, run: BackgroundTask, display: Display):
         self.run, self.display = run, display
         options = {_title(mode): mode.name for mode in TIP_TILT}
         self.buttons = pmui.RadioButtonGroup(options=options, value=display.mode, size="small", margin=0, variant="outlined")
@@ -25,7 +25,7 @@ class ModeSwitch:
             label="Mode", options=options, value=display.mode, size="small", margin=0, width=190, visible=False)
         for widget in (self.buttons, self.list):
             widget.param.watch(self._chosen, "value")
-        run.param.watch(self._fit, "shown")
+        run.param.watch(self._fit, "result")
         display.param.watch(self._follow, ["mode", "unit"])
 
     def view(self) -> list[object]:
@@ -39,7 +39,7 @@ class ModeSwitch:
 
     def _fit(self, *_: object) -> None:
         """Offer the modes of the run shown."""
-        shown = self.run.shown
+        shown = self.run.result
         if shown is None:
             return
         modes = shown.scenario.modes[: shown.result.record.n_modes]

@@ -8,8 +8,8 @@ import panel as pn
 import panel_material_ui as pmui
 
 from wfsobs.app.display import Display
+from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pin import name_of, pin
-from wfsobs.app.run import Run
 from wfsobs.app.style import asset
 
 PIN, UNPIN = "Pin this run to compare others with it", "Unpin the run compared with"
@@ -18,14 +18,14 @@ PIN, UNPIN = "Pin this run to compare others with it", "Unpin the run compared w
 class Pinning:
     """Pin and unpin, one button; in step with the run shown."""
 
-    def __init__(self, run: Run, display: Display):
+    def __init__(self, run: BackgroundTask, display: Display):
         self.run, self.display = run, display
         self.button = pmui.Button(
             label="Pin", icon="push_pin", size="small", variant="outlined", margin=0, disabled=True,
             description=PIN)
         self.note = pn.pane.HTML("", margin=0, visible=False, stylesheets=[asset("style.css")])
         self.button.on_click(self._pressed)
-        run.param.watch(self._refresh, "shown")
+        run.param.watch(self._refresh, "result")
         display.param.watch(self._refresh, "pinned")
 
     def view(self) -> list[object]:
@@ -35,11 +35,11 @@ class Pinning:
     def _pressed(self, _event: object) -> None:
         if self.display.pinned is not None:
             self.display.pinned = None
-        elif self.run.shown is not None:
-            self.display.pinned = pin(self.run.shown)
+        elif self.run.result is not None:
+            self.display.pinned = pin(self.run.result)
 
     def _refresh(self, *_: object) -> None:
-        kept, shown = self.display.pinned, self.run.shown
+        kept, shown = self.display.pinned, self.run.result
         if (self.button.label == "Unpin") != (kept is not None):
             self.button.param.update(
                 label="Pin" if kept is None else "Unpin", description=PIN if kept is None else UNPIN)

@@ -7,7 +7,7 @@ import panel as pn
 from bokeh.models import ColumnDataSource, HoverTool, Range1d, VSpan
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.run import Run
+from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, Faint, add_line, marked_peaks, new_figure, restyle, send
 from wfsobs.app.work import TRUTH, Array, Shown, Spectrum
@@ -21,12 +21,12 @@ DECADES = 8
 class Spectra:
     """The figures, redrawn when the results or the switches change."""
 
-    def __init__(self, run: Run, display: Display):
+    def __init__(self, run: BackgroundTask, display: Display):
         self.run, self.display = run, display
         self.visible, self._behind = True, False
         self.x_range = Range1d(start=0.5, end=500.0)
         self.spectra = {target: _Spectrum(target, self.x_range) for target in TARGETS}
-        run.param.watch(self._redraw, "shown")
+        run.param.watch(self._redraw, "result")
         display.param.watch(self._redraw, ["mode", "show", "unit", "spectrum", "pinned"])
         display.param.watch(self._restyle, ["dark", "hidden"])
 
@@ -41,7 +41,7 @@ class Spectra:
             self._redraw()
 
     def _redraw(self, *_: object) -> None:
-        shown = self.run.shown
+        shown = self.run.result
         self._behind = not self.visible
         if shown is None or self._behind:
             return

@@ -8,7 +8,8 @@ import param
 from panel.custom import JSComponent
 
 from wfsobs.app.display import NOTHING, Display, number, per_micrometre
-from wfsobs.app.run import RUNNING, Run
+from wfsobs.app.jobs.job import RUNNING
+from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, Shown
@@ -29,10 +30,10 @@ class Cards(JSComponent):
 class Strip:
     """The cards of one target, in step with the results and the switches."""
 
-    def __init__(self, target: str, run: Run, display: Display):
+    def __init__(self, target: str, run: BackgroundTask, display: Display):
         self.target, self.run, self.display = target, run, display
         self.cards = Cards(items=self.items(), sizing_mode="stretch_width", margin=0)
-        run.param.watch(self._refresh, ["shown", "state"])
+        run.param.watch(self._refresh, ["result", "state"])
         display.param.watch(self._refresh, ["mode", "unit", "dark"])
 
     def _refresh(self, *_: object) -> None:
@@ -40,7 +41,7 @@ class Strip:
 
     def items(self) -> list[dict[str, Any]]:
         """What the cards say."""
-        shown = self.run.shown
+        shown = self.run.result
         observers = [self._observer(name, shown) for name in observers_of(self.target)]
         return [self._truth(shown), *observers]
 

@@ -8,7 +8,7 @@ from html import escape
 import panel as pn
 
 from wfsobs.app.display import NOTHING, Display, number, per_micrometre
-from wfsobs.app.run import Run
+from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import Shown
 from wfsobs.observers.base import TARGETS
@@ -36,10 +36,10 @@ def find(shown: Shown, observer: str, target: str, mode: str) -> Score | None:
 class Table:
     """Every score of the mode shown, one row per observer and target."""
 
-    def __init__(self, run: Run, display: Display):
+    def __init__(self, run: BackgroundTask, display: Display):
         self.run, self.display = run, display
         self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
-        run.param.watch(self._refresh, "shown")
+        run.param.watch(self._refresh, "result")
         display.param.watch(self._refresh, ["mode", "unit", "dark", "best_first", "pinned"])
 
     def _refresh(self, *_: object) -> None:
@@ -71,7 +71,7 @@ class Table:
 
     def _without_truth(self) -> list[Score]:
         """The scores of a record without truth, of the mode shown."""
-        shown = self.run.shown
+        shown = self.run.result
         scores = [s for s in shown.result.scores if s.mode == self.display.mode] if shown else []
         return scores if any(s.target == RESIDUAL for s in scores) else []
 
@@ -81,7 +81,7 @@ class Table:
         if self.display.best_first:
             scores.sort(key=lambda s: (s.target == RESIDUAL, s.apart, s.rms))
         best = min((s.rms for s in scores if competes(s.observer, s.apart)), default=None)
-        shown, out = self.run.shown, []
+        shown, out = self.run.result, []
         for score in scores:
             assert shown is not None
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
@@ -101,7 +101,7 @@ class Table:
 
     def _target(self, target: str, columns: int) -> str:
         """The rows of a target, best first if asked for, those without a score last."""
-        shown = self.run.shown
+        shown = self.run.result
         scores = {
             name: find(shown, name, target, self.display.mode) if shown else None
             for name in (*observers_of(target, hidden=True), BOUND)}
@@ -115,7 +115,7 @@ class Table:
 
     def _row(self, name: str, target: str, score: Score | None, best: float | None) -> str:
         label = escape(label_of(name)) + (" <sup>looks ahead</sup>" if looks_ahead(name) else "") + _own(score)
-        shown, pinned = self.run.shown, self._pinned(name, target, score)
+        shown, pinned = self.run.result, self._pinned(name, target, score)
         cells = [NOTHING, *pinned, *[NOTHING] * 2, needs_of(name), *[NOTHING] * 3]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
@@ -144,7 +144,7 @@ class Table:
         return [number(before.rms * scale), change(before.rms, score.rms if score else None)]
 
     def _notes(self) -> str:
-        shown = self.run.shown
+        shown = self.run.result
         failures = shown.result.failures if shown else ()
         return "".join(f'<p class="failure">{escape(f.reason)}</p>' for f in failures)
 

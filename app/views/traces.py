@@ -10,7 +10,7 @@ from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, Range1d
 from numpy.typing import NDArray
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.run import Run
+from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.event_marks import EventMarks, room
@@ -37,7 +37,7 @@ SETTLE_MS = 60
 class Traces:
     """The figures, redrawn when the results, the switches or the window change."""
 
-    def __init__(self, run: Run, display: Display):
+    def __init__(self, run: BackgroundTask, display: Display):
         self.run, self.display = run, display
         self.x_range = Range1d(start=0.0, end=10.0)
         self.length = 0.0
@@ -45,7 +45,7 @@ class Traces:
         self.visible = True
         crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
         self.traces = {target: _Trace(target, self.x_range, crosshair) for target in TARGETS}
-        run.param.watch(self._redraw, "shown")
+        run.param.watch(self._redraw, "result")
         display.param.watch(self._redraw, ["mode", "show", "unit", "pinned"])
         display.param.watch(self._restyle, ["dark", "hidden"])
         for end in ("start", "end"):
@@ -62,7 +62,7 @@ class Traces:
             self._redraw()
 
     def _redraw(self, *_: object) -> None:
-        shown = self.run.shown
+        shown = self.run.result
         self._behind = not self.visible
         if shown is None or self._behind:
             return

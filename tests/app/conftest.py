@@ -12,12 +12,15 @@ import pytest
 
 from wfsobs.app.cache import frozen, key_of
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.run import RUNNING
+from wfsobs.app.jobs.job import RUNNING, Tell
+from wfsobs.app.limits import NONE, Limits
+from wfsobs.app.service import Service, Session
 from wfsobs.app.sources import Source
 from wfsobs.app.store import Store
-from wfsobs.app.work import Report, Shown, compute
+from wfsobs.app.work import Shown, compute
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
+from wfsobs.watch import Watch
 
 SHORT = {
     "run.duration": 2.0, "run.warm_up": 0.5, "gpr_offline.training_size": 40, "gpr_offline.depth": 20,
@@ -61,9 +64,23 @@ def short() -> Scenario:
 
 
 @pytest.fixture
-def make_store(loop: Loop, short: Scenario) -> Callable[..., Store]:
+def enter() -> Iterator[Callable[..., Session]]:
+    """A session of a server of its own, which keeps no results."""
+    services: list[Service] = []
+
+    def enter(work: Any = compute, limits: Limits = NONE, workers: int = 2) -> Session:
+        services.append(Service(limits, workers, 0, work))
+        return services[-1].enter()
+
+    yield enter
+    for service in services:
+        service.close(20.0)
+
+
+@pytest.fixture
+def make_store(loop: Loop, short: Scenario, enter: Callable[..., Session]) -> Callable[..., Store]:
     def make(work: Any = compute) -> Store:
-        store = Store(loop.queue.put, short, work)
+        store = Store(loop.queue.put, enter(work), short)
         loop.closing.append(store)
         return store
     return make
@@ -74,23 +91,21 @@ KEPT: dict[str, Shown] = {}
 """Results by the scenario's key, their arrays read-only."""
 
 
-def compute_once(
-    scenario: Scenario, cancelled: Callable[[], bool], report: Report, source: Source | None = None
-) -> Shown:
+def compute_once(scenario: Scenario, watch: Watch, tell: Tell, source: Source | None = None) -> Shown:
     """`compute`, and for the scenario that every dashboard starts with what it gave the first time."""
     key = key_of(scenario)
     if source is None and key in KEPT:
         return KEPT[key]
-    shown = compute(scenario, cancelled, report, source)
+    shown = compute(scenario, watch, tell, source)
     if source is None and key == FIRST:
         KEPT[key] = frozen(shown)
     return shown
 
 
 @pytest.fixture
-def dashboard(loop: Loop, short: Scenario) -> Dashboard:
+def dashboard(loop: Loop, short: Scenario, enter: Callable[..., Session]) -> Dashboard:
     """A dashboard whose first run is done."""
-    dashboard = Dashboard(loop.queue.put, short, compute_once)
+    dashboard = Dashboard(loop.queue.put, enter(compute_once), short)
     loop.closing.append(dashboard)
     dashboard.page()
     dashboard.start()

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from wfsobs.app import actions as module
 from wfsobs.app import downloads
 from wfsobs.app.actions import LARGEST, Actions
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.downloads import TooLarge, data_csv, data_npz
-from wfsobs.app.report.maker import FAILED, ReportError
+from wfsobs.app.report.maker import ReportError
 from wfsobs.app.share import to_query
 from wfsobs.app.work import Shown, compute
 from wfsobs.cli import main
@@ -24,6 +25,7 @@ from wfsobs.configfile import from_toml
 from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
 from wfsobs.telemetry import load_record, read_record
+from wfsobs.watch import QUIET
 
 WIND = "turbulence.wind_speed"
 
@@ -42,7 +44,7 @@ def shown() -> Shown:
     scenario = PRESETS["paper"]().replace({
         "run.duration": 1.0, "run.warm_up": 0.2, "gpr_offline.training_size": 40, "gpr_offline.depth": 20,
         "gpr_online.training_size": 40, "gpr_online.depth": 20})
-    return compute(scenario, lambda: False, lambda fraction, shown: None)
+    return compute(scenario, QUIET, lambda **_: None)
 
 
 def test_texts_follow_the_settings(actions: Actions) -> None:
@@ -112,15 +114,15 @@ def test_data_is_made_aside_and_sent(actions: Actions, loop: Any, action: str, m
     loop.until(lambda: actions.sent)  # type: ignore[attr-defined]
     (file,) = actions.sent  # type: ignore[attr-defined]
     content = base64.b64decode(file["content"])
-    assert file["name"] == f"wfsobs.{action}" and len(content) == len(make(actions.store.run.shown))
+    assert file["name"] == f"wfsobs.{action}" and len(content) == len(make(actions.store.run.result))
 
 
 def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
     actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[tuple[Any, str]] = []
-    monkeypatch.setattr(actions.maker, "make", lambda shown, preset: asked.append((shown, preset)) or b"<!doctype html>")
-    shown = actions.store.run.shown
+    monkeypatch.setattr(module, "make", lambda shown, preset, *_: asked.append((shown, preset)) or b"<!doctype html>")
+    shown = actions.store.run.result
     actions.handle({"action": "report"})
     assert actions.toolbar.reporting
     actions.handle({"action": "report"})
@@ -130,14 +132,15 @@ def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
     assert shown is not None and asked == [(shown, "paper")]
 
 
-@pytest.mark.parametrize(("error", "line"), [(ReportError("stopped"), "Report: stopped"), (KeyError("x"), f"Report: {FAILED}")])
+@pytest.mark.parametrize(("error", "line"), [
+    (ReportError("no room"), "Report: no room"), (KeyError("x"), "Report: KeyError: 'x'")])
 def test_a_report_that_fails_is_one_line(
     actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch, error: Exception, line: str,
 ) -> None:
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(actions.maker, "make", fail)
+    monkeypatch.setattr(module, "make", fail)
     actions.handle({"action": "report"})
     loop.until(lambda: actions.toolbar.notes)
     assert actions.toolbar.notes == [line] and not actions.toolbar.reporting
@@ -147,7 +150,7 @@ def test_a_report_that_fails_is_one_line(
 def test_too_much_data_is_refused_with_a_line(actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(downloads, "MOST", 1000)
     with pytest.raises(TooLarge):
-        data_csv(actions.store.run.shown)  # type: ignore[arg-type]
+        data_csv(actions.store.run.result)  # type: ignore[arg-type]
     actions.handle({"action": "npz"})
     loop.until(lambda: actions.toolbar.notes)
     assert "wfsobs run --save" in actions.toolbar.notes[0]
@@ -206,8 +209,8 @@ def test_npz_is_a_record_and_its_estimates(shown: Shown, tmp_path: Path) -> None
             np.testing.assert_allclose(again[name], file[name], rtol=1e-9, atol=1e-12)
 
 
-def test_the_page_tells_of_a_long_run(loop: Any, short: Scenario) -> None:
-    dashboard = Dashboard(loop.queue.put, short)
+def test_the_page_tells_of_a_long_run(loop: Any, short: Scenario, enter: Any) -> None:
+    dashboard = Dashboard(loop.queue.put, enter(), short)
     loop.closing.append(dashboard)
     dashboard.actions.open_link("?run.duration=300")
     dashboard.page()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import OrderedDict
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -14,24 +14,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.app.cache import Cache, arrays_in, key_of, size_of
+from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Tell
 from wfsobs.app.limits import NONE
-from wfsobs.app.service import Service, Visit
-from wfsobs.app.work import Report, Shown, Spectrum, compute
+from wfsobs.app.service import Service
+from wfsobs.app.work import Shown, Spectrum, compute
 from wfsobs.pipeline import Result
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
-from wfsobs.watch import Cancelled
+from wfsobs.watch import QUIET, Watch
 
 WAIT = 20.0
-
-
-def never() -> bool:
-    return False
-
-
-def silent(fraction: float, shown: Shown | None, place: int = 0) -> None:
-    return None
 
 
 def answer(scenario: Scenario) -> Shown:
@@ -40,50 +33,50 @@ def answer(scenario: Scenario) -> Shown:
 
 
 class Gated:
-    """Work that waits to be let go, and listens to `cancelled` when it is."""
+    """Work that waits to be let go, and looks whether it is wanted when it is."""
 
     def __init__(self) -> None:
-        self.entered, self.gate, self.left = threading.Semaphore(0), threading.Event(), threading.Semaphore(0)
-        self.calls: list[tuple[Scenario, Callable[[], bool], Report]] = []
+        self.entered, self.gate = threading.Semaphore(0), threading.Event()
+        self.calls: list[tuple[Scenario, Watch, Tell]] = []
 
-    def __call__(self, scenario: Scenario, cancelled: Callable[[], bool], report: Report) -> Shown:
-        self.calls.append((scenario, cancelled, report))
+    def __call__(self, scenario: Scenario, watch: Watch, tell: Tell, _loaded: object) -> Shown:
+        self.calls.append((scenario, watch, tell))
         self.entered.release()
-        try:
-            assert self.gate.wait(WAIT)
-            if cancelled():
-                raise Cancelled
-            return answer(scenario)
-        finally:
-            self.left.release()
+        assert self.gate.wait(WAIT)
+        watch.check()
+        return answer(scenario)
 
 
-class Bench:
-    """A service with some visits, each call of them in a thread."""
+class Asked:
+    """Somebody who has asked for the results of a scenario, and what they heard."""
 
-    def __init__(self, work: Any, workers: int = 2, most_bytes: int = 10**8):
-        self.service = Service(NONE, workers, most_bytes, work)
-        self.pool = ThreadPoolExecutor(16)
+    def __init__(self, service: Service, scenario: Scenario):
+        self.heard: list[dict[str, Any]] = []
+        self.over = threading.Event()
+        self.leave = service.enter().submit(service.run(scenario), self.hear)
 
-    def visit(self) -> Visit:
-        return self.service.enter()
+    def hear(self, news: Any) -> None:
+        self.heard.append(dict(news))
+        if news.get("state", RUNNING) != RUNNING:
+            self.over.set()
 
-    def ask(self, visit: Visit, scenario: Scenario, cancelled: Any = never, tell: Any = silent) -> Future[Shown]:
-        return self.pool.submit(visit.compute, scenario, cancelled, tell)
+    def end(self) -> dict[str, Any]:
+        """The last that they hear."""
+        assert self.over.wait(WAIT)
+        return self.heard[-1]
 
 
 @pytest.fixture
-def make_bench() -> Any:
-    made: list[Bench] = []
+def make_service() -> Iterator[Callable[..., Service]]:
+    made: list[Service] = []
 
-    def make(*args: Any, **kwargs: Any) -> Bench:
-        made.append(Bench(*args, **kwargs))
+    def make(work: Any, workers: int = 2) -> Service:
+        made.append(Service(NONE, workers, 10**8, work))
         return made[-1]
 
     yield make
-    for bench in made:
-        assert bench.service.close(WAIT), "a thread did not stop"
-        bench.pool.shutdown()
+    for service in made:
+        assert service.close(WAIT), "a thread did not stop"
 
 
 # ---------------------------------------------------------------------- what is kept
@@ -141,7 +134,7 @@ def test_size_is_of_the_memory_held() -> None:
 
 
 def test_every_array_of_a_run_is_found(short: Scenario) -> None:
-    shown = compute(short, never, silent)
+    shown = compute(short, QUIET, lambda **_: None)
     found = {id(array) for array in arrays_in(shown)}
     record = shown.result.record
     own = [record.y_lgs, record.u, record.y_ngs, record.turbulence, record.vibration, record.open_loop_y,
@@ -160,130 +153,102 @@ def test_other_settings_have_another_key(changes: dict[str, Any]) -> None:
 
 # ---------------------------------------------------------------------- one run for all who want it
 
-def test_the_same_settings_are_computed_once_at_the_same_time(make_bench: Any, short: Scenario) -> None:
+def test_the_same_settings_are_computed_once_at_the_same_time(make_service: Any, short: Scenario) -> None:
     work = Gated()
-    bench = make_bench(work)
-    asked = [bench.ask(bench.visit(), short.copy()) for _ in range(8)]
+    service = make_service(work)
+    asked = [Asked(service, short.copy()) for _ in range(8)]
     assert work.entered.acquire(timeout=WAIT)
     work.gate.set()
-    results = [future.result(WAIT) for future in asked]
+    results = [one.end()["result"] for one in asked]
     assert len(work.calls) == 1 and len({id(shown) for shown in results}) == 1
-    assert bench.ask(bench.visit(), short).result(WAIT) is results[0] and len(work.calls) == 1, "and kept"
-    assert bench.service.held(short)
+    assert Asked(service, short).end()["result"] is results[0] and len(work.calls) == 1, "and kept"
+    assert service.held(short)
 
 
-def test_other_settings_are_not_mixed_up(make_bench: Any, short: Scenario) -> None:
-    bench = make_bench(lambda scenario, cancelled, report: answer(scenario))
+def test_other_settings_are_not_mixed_up(make_service: Any, short: Scenario) -> None:
+    service = make_service(lambda scenario, *_: answer(scenario))
     scenarios = [short.replace({"run.seed": seed % 5}) for seed in range(40)]
-    asked = [bench.ask(bench.visit(), scenario) for scenario in scenarios]
-    assert [future.result(WAIT).scenario for future in asked] == scenarios
+    asked = [Asked(service, scenario) for scenario in scenarios]
+    assert [one.end()["result"].scenario for one in asked] == scenarios
 
 
-def test_followers_hear_of_progress_those_who_come_late_too(make_bench: Any, short: Scenario) -> None:
+def test_who_joins_hears_of_progress_those_who_come_late_too(make_service: Any, short: Scenario) -> None:
     work = Gated()
-    bench = make_bench(work)
-    heard: list[list[tuple[float, Shown | None]]] = [[], []]
-    come = threading.Event()
-
-    def hears(who: int) -> Any:
-        def tell(fraction: float, shown: Shown | None, place: int = 0) -> None:
-            heard[who].append((fraction, shown))
-            come.set()
-        return tell
-
-    first = bench.ask(bench.visit(), short, tell=hears(0))
+    service = make_service(work)
+    first = Asked(service, short)
     assert work.entered.acquire(timeout=WAIT)
     part = answer(short)
-    _, _, report = work.calls[0]
-    report(0.3, part)
-    report(0.4, None)
-    come.clear()
-    second = bench.ask(bench.visit(), short, tell=hears(1))
-    assert come.wait(WAIT)
-    report(0.6, None)
+    _, watch, tell = work.calls[0]
+    watch.progress(0.3)
+    watch.progress(0.4)
+    assert [news["progress"] for news in first.heard if "progress" in news] == [0.3], "not more often than a page can show"
+    tell(result=part)
+    second = Asked(service, short)
+    assert second.heard == [{"progress": 0.3, "result": part}]
+    tell(progress=0.6)
+    assert second.heard[-1] == first.heard[-1] == {"progress": 0.6}
     work.gate.set()
-    assert first.result(WAIT) is second.result(WAIT)
-    assert (0.3, part) in heard[0]
-    assert heard[1][0] == (0.4, part) and heard[1][-1] == (0.6, None)
+    assert first.end()["result"] is second.end()["result"] is not part
 
 
-def test_one_who_leaves_does_not_stop_it_for_others(make_bench: Any, short: Scenario) -> None:
+def test_one_who_leaves_does_not_stop_it_for_others(make_service: Any, short: Scenario) -> None:
     work = Gated()
-    bench = make_bench(work)
-    gone = threading.Event()
-    leader = bench.ask(bench.visit(), short, cancelled=gone.is_set)
+    service = make_service(work)
+    leader = Asked(service, short)
     assert work.entered.acquire(timeout=WAIT)
-    joined = threading.Event()
-    _, given_up, report = work.calls[0]
-    report(0.1, None)
-    follower = bench.ask(bench.visit(), short, tell=lambda *_: joined.set())
-    assert joined.wait(WAIT)
-    gone.set()
-    with pytest.raises(Cancelled):
-        leader.result(WAIT)
-    assert not given_up()
+    follower = Asked(service, short)
+    leader.leave()
+    assert not work.calls[0][1].cancelled()
     work.gate.set()
-    assert follower.result(WAIT).scenario == short and len(work.calls) == 1
+    assert follower.end()["result"].scenario == short and len(work.calls) == 1
+    assert not leader.over.is_set(), "who has left hears nothing more"
 
 
-def test_what_nobody_wants_stops_at_once_and_starts_anew_for_the_next(make_bench: Any, short: Scenario) -> None:
+def test_what_nobody_wants_stops_at_once_and_starts_anew_for_the_next(make_service: Any, short: Scenario) -> None:
     work = Gated()
-    bench = make_bench(work)
-    gone = threading.Event()
-    leader = bench.ask(bench.visit(), short, cancelled=gone.is_set)
+    service = make_service(work)
+    leader = Asked(service, short)
     assert work.entered.acquire(timeout=WAIT)
-    gone.set()
-    _, given_up, _ = work.calls[0]
-    assert given_up(), "the run knows before anybody has left"
-    after = bench.ask(bench.visit(), short)
-    with pytest.raises(Cancelled):
-        leader.result(WAIT)
+    leader.leave()
+    assert work.calls[0][1].cancelled()
+    after = Asked(service, short)
     work.gate.set()
-    assert after.result(WAIT).scenario == short
-    assert len(work.calls) == 2
+    assert after.end()["result"].scenario == short and len(work.calls) == 2
 
 
-def test_a_failure_reaches_all_and_is_not_kept(make_bench: Any, short: Scenario) -> None:
+def test_a_failure_reaches_all_and_is_not_kept(make_service: Any, short: Scenario) -> None:
     gate, entered = threading.Event(), threading.Event()
     errors: list[Exception] = [SettingError("loop.gain: not today")]
 
-    def fails(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
+    def fails(scenario: Scenario, *_: object) -> Shown:
         entered.set()
         assert gate.wait(WAIT)
         if errors:
             raise errors.pop()
         return answer(scenario)
 
-    bench = make_bench(fails)
-    joined = threading.Event()
-    first = bench.ask(bench.visit(), short)
+    service = make_service(fails)
+    first = Asked(service, short)
     assert entered.wait(WAIT)
-    bench.service._flights[key_of(short)]._report(0.5, None)
-    second = bench.ask(bench.visit(), short, tell=lambda *_: joined.set())
-    assert joined.wait(WAIT)
+    second = Asked(service, short)
     gate.set()
-    for future in (first, second):
-        with pytest.raises(SettingError, match="not today"):
-            future.result(WAIT)
-    assert not bench.service.held(short)
-    assert bench.ask(bench.visit(), short).result(WAIT).scenario == short
+    for one in (first, second):
+        assert one.end() == {"state": FAILED, "message": "loop.gain: not today"}
+    assert not service.held(short)
+    assert Asked(service, short).end()["result"].scenario == short
 
 
-def test_closing_the_service_ends_every_wait(make_bench: Any, short: Scenario) -> None:
-    stopped = threading.Event()
+def test_closing_the_service_ends_every_wait(make_service: Any, short: Scenario) -> None:
+    entered = threading.Event()
 
-    def works(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
-        while not cancelled():
-            stopped.wait(0.001)
-        stopped.set()
-        raise Cancelled
+    def works(scenario: Scenario, watch: Watch, *_: object) -> Shown:
+        entered.set()
+        while True:
+            watch.check()
+            time.sleep(0.001)
 
-    bench = make_bench(works, workers=1)
-    asked = [bench.ask(bench.visit(), short.replace({"run.seed": seed})) for seed in range(3)]
-    while bench.service.queue.length < 2:
-        stopped.wait(0.001)
-    assert bench.service.close(WAIT)
-    assert stopped.is_set()
-    for future in asked:
-        with pytest.raises(Cancelled):
-            future.result(WAIT)
+    service = make_service(works, workers=1)
+    asked = [Asked(service, short.replace({"run.seed": seed})) for seed in range(3)]
+    assert entered.wait(WAIT) and service.queue.length == 2
+    assert service.close(WAIT)
+    assert [one.end() for one in (*asked, Asked(service, short))] == 4 * [{"state": CANCELLED}]

@@ -30,7 +30,7 @@ def opened(dashboard: Dashboard) -> ClosedLoopPage:
 
 def done(page: ClosedLoopPage, loop: Any) -> ClosedLoopPage:
     """The page once all controllers have run on the results shown."""
-    of = page.run.shown
+    of = page.run.result
     assert of is not None
     loop.until(lambda: page.shown is not None and page.shown.done and page.shown.result.scenario is of.scenario)
     return page
@@ -47,7 +47,7 @@ def page(dashboard: Dashboard, loop: Any) -> ClosedLoopPage:
 
 
 def test_it_says_what_the_command_says(page: ClosedLoopPage, dashboard: Dashboard) -> None:
-    of = dashboard.store.run.shown
+    of = dashboard.store.run.result
     assert of is not None and page.shown is not None
     expected = rows(closed_loop(of.result.record, design(of.scenario)), None)
     assert list(page.shown.rows) == expected
@@ -90,7 +90,7 @@ def test_marks_hiding_colours_and_reasons(page: ClosedLoopPage, dashboard: Dashb
     assert top(page) < before and not len(page.nyquist.marks.data["x"])
     dashboard.display.dark = True
     assert page.whole.lines["integrator"].glyph.line_color == LOOKS["integrator"].dark
-    page._land(None, "the record has no truth")
+    page.work.refuse("the record has no truth")
     assert "No closed loop: the record has no truth" in page.note.object
 
 
@@ -148,4 +148,4 @@ def test_what_would_take_minutes_is_left_out(
     (card,) = [c for c in page.cards.items if c["name"] == "integrator+gpr-online"]
     assert card["note"].startswith("left out") and "integrator+gpr-online" not in page.table.object
     dashboard.close()
-    assert page.run.closed, "a session that ends takes its loop with it"
+    assert page.run.session.closed, "a session that ends takes its loop with it"

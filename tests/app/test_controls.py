@@ -20,7 +20,7 @@ from wfsobs.scenario import Scenario
 PATH = "vibration.peaks"
 
 
-def nothing(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
+def nothing(scenario: Scenario, *_: object) -> Shown:
     """An empty result, at once."""
     record = Record(y_lgs=np.zeros((8, 2)), u=np.zeros((8, 2)), dt=1e-3)
     return Shown(Result(scenario, record, (), ()))
@@ -101,14 +101,14 @@ def test_topics_are_filled_when_opened(controls: Controls) -> None:
 
 
 def test_a_slider_that_is_let_go_runs(controls: Controls, loop: Any) -> None:
-    before = controls.store.run.shown
+    before = controls.store.run.result
     field = field_of(controls, "turbulence.wind_speed")
     release(field.widgets[0], 22.0)
     assert controls.store.scenario.turbulence.wind_speed == 22.0
     assert field.widgets[1].value == "22", "the typed number follows"
     loop.finish(controls.store)
-    assert controls.store.run.shown is not before
-    assert controls.store.run.shown.scenario.turbulence.wind_speed == 22.0
+    assert controls.store.run.result is not before
+    assert controls.store.run.result.scenario.turbulence.wind_speed == 22.0
 
 
 def test_a_slider_under_way_does_not_run(controls: Controls) -> None:
@@ -139,7 +139,7 @@ def test_a_typed_value_runs(controls: Controls, loop: Any, path: str, text: str,
     field_of(controls, path).widgets[-1].value = text
     assert controls.store.value(path) == value and error_of(controls, path) == ""
     loop.finish(controls.store)
-    assert controls.store.run.shown.scenario == controls.store.scenario
+    assert controls.store.run.result.scenario == controls.store.scenario
 
 
 @pytest.mark.parametrize(("path", "text", "says"), [
@@ -150,12 +150,12 @@ def test_a_typed_value_runs(controls: Controls, loop: Any, path: str, text: str,
     ("kalman.frequency", "900", "half the LGS rate"), ("run.warm_up", "3", "Duration"),
 ])
 def test_a_bad_value_shows_beside_its_setting(controls: Controls, path: str, text: str, says: str) -> None:
-    shown, scenario = controls.store.run.shown, controls.store.scenario
+    shown, scenario = controls.store.run.result, controls.store.scenario
     field = field_of(controls, path)
     field.widgets[-1].value = text
     assert says in error_of(controls, path)
     assert field.widgets[-1].error_state and field.widgets[-1].value == text, "what was typed stays, to be corrected"
-    assert controls.store.run.shown is shown and controls.store.scenario is scenario
+    assert controls.store.run.result is shown and controls.store.scenario is scenario
     assert status_of(controls.store)[1] == f"Not accepted: {name_of(path)}" == controls.status.note
 
 
@@ -186,7 +186,7 @@ def test_choices_and_switches_run(controls: Controls, loop: Any) -> None:
     assert controls.store.scenario.kalman.process_noise == "matched"
     assert controls.store.scenario.loop.closed is False
     loop.finish(controls.store)
-    assert controls.store.run.shown.scenario.loop.closed is False
+    assert controls.store.run.result.scenario.loop.closed is False
 
 
 def test_every_widget_follows_the_store(controls: Controls, loop: Any) -> None:
@@ -249,13 +249,13 @@ class TestPeaks:
         ("frequency", "33.3", 33.3), ("damping", "0", 0.0), ("rms.0", "0.02", 0.02), ("rms.1", "2e-3", 0.002),
     ])
     def test_edit_in_place(self, controls: Controls, loop: Any, key: str, text: str, expected: float) -> None:
-        before = controls.store.run.shown
+        before = controls.store.run.result
         controls.lists[PATH].table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
         assert controls.store.value(f"{PATH}.2.{key}") == expected
         assert controls.lists[PATH].table.errors == {}
         loop.finish(controls.store)
-        assert controls.store.run.shown is not before
-        assert controls.store.run.shown.scenario == controls.store.scenario
+        assert controls.store.run.result is not before
+        assert controls.store.run.result.scenario == controls.store.scenario
 
     @pytest.mark.parametrize(("key", "text", "says"), [
         ("frequency", "-3", "from 0.01"), ("frequency", "600", "half the LGS rate"),
@@ -263,14 +263,14 @@ class TestPeaks:
         ("rms.1", "-1", "Peak 3: rms = [0.0025, -1]: takes"), ("rms.1", "0,5", "use a point: 0.5"),
     ])
     def test_bad_cell(self, controls: Controls, key: str, text: str, says: str) -> None:
-        shown, rows = controls.store.run.shown, controls.lists[PATH].table.rows
+        shown, rows = controls.store.run.result, controls.lists[PATH].table.rows
         controls.lists[PATH].table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
         error = controls.lists[PATH].table.errors[f"2.{key}"]
         assert error["text"] == text and says in error["reason"]
-        assert controls.store.run.shown is shown and controls.lists[PATH].table.rows == rows
+        assert controls.store.run.result is shown and controls.lists[PATH].table.rows == rows
         good = {"frequency": rows[2][0], "damping": rows[2][1], "rms.1": rows[2][3]}[key]
         controls.lists[PATH].table._handle_msg({"action": "edit", "row": 2, "key": key, "text": good})
-        assert controls.lists[PATH].table.errors == {} and controls.store.run.shown is shown
+        assert controls.lists[PATH].table.errors == {} and controls.store.run.result is shown
 
     def test_removing_a_bad_row_removes_its_error(self, controls: Controls, loop: Any) -> None:
         controls.lists[PATH].table._handle_msg({"action": "edit", "row": 0, "key": "damping", "text": "7"})

@@ -29,7 +29,7 @@ def test_error_page(caplog: pytest.LogCaptureFixture) -> None:
     assert "no> room" in caplog.text
 
 
-def test_a_page_that_cannot_be_assembled(monkeypatch: pytest.MonkeyPatch, loop: Any, short: Scenario) -> None:
+def test_a_page_that_cannot_be_assembled(monkeypatch: pytest.MonkeyPatch, loop: Any, short: Scenario, enter: Any) -> None:
     def broken(self: Dashboard) -> Any:
         raise ValueError("no page")
 
@@ -37,7 +37,7 @@ def test_a_page_that_cannot_be_assembled(monkeypatch: pytest.MonkeyPatch, loop: 
     made: list[Dashboard] = []
 
     def build(post: Any) -> Dashboard:
-        made.append(Dashboard(loop.queue.put, short))
+        made.append(Dashboard(loop.queue.put, enter(), short))
         return made[0]
 
     assert "ValueError: no page" in page(build)[0].object
@@ -45,13 +45,13 @@ def test_a_page_that_cannot_be_assembled(monkeypatch: pytest.MonkeyPatch, loop: 
     made[0].close()
 
 
-def test_a_failing_run_shows_inline(loop: Any, short: Scenario) -> None:
-    def work(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
+def test_a_failing_run_shows_inline(loop: Any, short: Scenario, enter: Any) -> None:
+    def work(scenario: Scenario, *how: Any) -> Shown:
         if scenario.loop.gain == 0.1:
             raise RuntimeError("no such luck")
-        return compute(scenario, cancelled, report)
+        return compute(scenario, *how)
 
-    dashboard = Dashboard(loop.queue.put, short, work)
+    dashboard = Dashboard(loop.queue.put, enter(work), short)
     loop.closing.append(dashboard)
     dashboard.page()
     dashboard.start()
@@ -67,15 +67,15 @@ def test_a_failing_run_shows_inline(loop: Any, short: Scenario) -> None:
     assert not dashboard.alert.visible and not dashboard.stale.visible and not faded(dashboard)
 
 
-def test_results_are_marked_stale_until_new_ones_land(loop: Any, short: Scenario) -> None:
+def test_results_are_marked_stale_until_new_ones_land(loop: Any, short: Scenario, enter: Any) -> None:
     gate = threading.Event()
 
-    def work(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
+    def work(scenario: Scenario, *how: Any) -> Shown:
         if scenario.loop.gain == 0.1:
             assert gate.wait(20)
-        return compute(scenario, cancelled, report)
+        return compute(scenario, *how)
 
-    dashboard = Dashboard(loop.queue.put, short, work)
+    dashboard = Dashboard(loop.queue.put, enter(work), short)
     loop.closing.append(dashboard)
     dashboard.page()
     dashboard.start()
@@ -111,8 +111,8 @@ def test_importing_the_package_imports_no_panel() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_a_session_that_has_ended_leaves_nothing_behind(short: Scenario) -> None:
-    dashboard = Dashboard(lambda function: function(), short)
+def test_a_session_that_has_ended_leaves_nothing_behind(short: Scenario, enter: Any) -> None:
+    dashboard = Dashboard(lambda function: function(), enter(), short)
     page = dashboard.page()
     dashboard.close()
     gone = weakref.ref(dashboard), weakref.ref(page)

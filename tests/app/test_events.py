@@ -33,7 +33,7 @@ def short(short: Scenario) -> Scenario:
 
 
 def test_running_rms_and_marks(dashboard: Dashboard, loop: Any) -> None:
-    shown, trace = dashboard.store.run.shown, dashboard.explore.traces.traces["vibration"]
+    shown, trace = dashboard.store.run.result, dashboard.explore.traces.traces["vibration"]
     assert shown is not None
     dashboard.display.param.update(show="running rms", mode="tilt", unit="um")
     for name in ("kf-lgs", "gpr-online"):

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
 from wfsobs.app.controls.panel import Controls
-from wfsobs.app.run import DONE
+from wfsobs.app.jobs.job import DONE
 from wfsobs.app.store import STEPS_BACK, Store
-from wfsobs.app.work import Report, Shown
+from wfsobs.app.work import Shown
 from wfsobs.cost import run_seconds
 from wfsobs.pipeline import Result
 from wfsobs.presets import PRESETS
@@ -22,7 +21,7 @@ WIND = "turbulence.wind_speed"
 LONG = {"run.duration": 300}
 
 
-def nothing(scenario: Scenario, cancelled: Callable[[], bool], report: Report) -> Shown:
+def nothing(scenario: Scenario, *_: object) -> Shown:
     """An empty result, at once."""
     return Shown(Result(scenario, Record(y_lgs=np.zeros((8, 2)), u=np.zeros((8, 2)), dt=1e-3), (), ()))
 
@@ -53,7 +52,7 @@ def test_undo_and_redo(store: Store, loop: Any) -> None:
     store.redo()
     assert (wind(store), store.scenario.loop.gain) == (20.0, 0.2) and not store.can_redo
     loop.finish(store)
-    assert store.run.shown is not None and store.run.shown.scenario == store.scenario, "what is undone or redone runs"
+    assert store.run.result is not None and store.run.result.scenario == store.scenario, "what is undone or redone runs"
 
 
 def test_a_change_after_undo_leaves_nothing_to_redo(store: Store) -> None:
@@ -135,4 +134,4 @@ def test_going_back_to_a_short_run_starts_it(store: Store, loop: Any) -> None:
     store.undo()
     assert store.waiting == 0.0
     loop.finish(store)
-    assert store.run.shown is not None and not store.stale
+    assert store.run.result is not None and not store.stale

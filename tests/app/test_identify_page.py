@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import io
-import threading
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from wfsobs.app.beside import Beside
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import per_micrometre
 from wfsobs.app.identify_work import same, seconds
+from wfsobs.app.jobs.job import DONE, FAILED, RUNNING
 from wfsobs.app.limits import PUBLIC, Limits
+from wfsobs.app.pages import identify as module
 from wfsobs.app.pages.identify import EARLIER, IdentifyPage
 from wfsobs.app.pages.pages import EXPLORE, IDENTIFY
-from wfsobs.app.run import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.sources import Kept, Loaded
-from wfsobs.app.store import Store
 from wfsobs.app.style import LOOKS
 from wfsobs.formats import format_of
 from wfsobs.identify import Identified, identify
@@ -31,7 +28,6 @@ from wfsobs.pipeline import observe
 from wfsobs.scenario import Scenario
 from wfsobs.scores import BOUND
 from wfsobs.telemetry import read_record, record_arrays
-from wfsobs.watch import Watch
 
 LINE = 25.0
 """A pure line of 50 nm in tip [Hz]; the warm-up of the figures plays no part in it."""
@@ -64,7 +60,7 @@ def identified(page: IdentifyPage, loop: Any) -> Identified:
 
 
 def test_it_shows_what_the_core_finds(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> None:
-    of = dashboard.store.run.shown
+    of = dashboard.store.run.result
     assert of is not None and page.of is not None and not len(page.figure.total.data["x"]) and page.starter.uses[0].disabled
     found, expected = identified(page, loop), identify(of.result.record)
     assert found.modes == expected.modes and not page.stale.visible
@@ -107,21 +103,21 @@ def the_measured_spectrum_holds_the_variance(page: IdentifyPage) -> None:
 
 
 def rms(dashboard: Dashboard) -> dict[tuple[str, str, str], float]:
-    shown = dashboard.store.run.shown
+    shown = dashboard.store.run.result
     assert shown is not None
     return {(s.observer, s.target, s.mode): s.rms for s in shown.result.scores}
 
 
 def test_filters_only(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> None:
     """The record, its truth and its bound stay, and the observers run on it as they do on the same record from a file."""
-    store, before = dashboard.store, dashboard.store.run.shown
+    store, before = dashboard.store, dashboard.store.run.result
     assert before is not None
     told = identified(page, loop).scenario(store.scenario)
     page.starter.uses[0].param.trigger("clicks")
     assert store.scenario == told != before.scenario
     assert dashboard.upload.picker.loaded.startswith("The simulation with 1 peak is kept")
     loop.finish(store)
-    shown = store.run.shown
+    shown = store.run.result
     assert shown is not None and shown.recorded and not store.stale and not page.stale.visible
     for name in ("y_lgs", "u", "turbulence", "vibration"):
         np.testing.assert_array_equal(getattr(shown.result.record, name), getattr(before.result.record, name))
@@ -131,7 +127,7 @@ def test_filters_only(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> No
     assert bounds and bounds == {(s.observer, s.target, s.mode): s.rms for s in before.result.scores if s.observer == BOUND}
     store.change("kalman.ngs_between_frames", "propagate")  # other settings of the filters leave the record alone, too
     loop.finish(store)
-    np.testing.assert_array_equal(store.run.shown.result.record.y_lgs, before.result.record.y_lgs)
+    np.testing.assert_array_equal(store.run.result.result.record.y_lgs, before.result.record.y_lgs)
     store.undo()
     store.undo()
     assert (store.scenario, store.source) == (before.scenario, None) and dashboard.upload.picker.loaded == ""
@@ -166,7 +162,7 @@ def test_as_a_new_simulation(page: IdentifyPage, dashboard: Dashboard, loop: Any
     loop.until(lambda: not page.stale.visible)
     dashboard.store.change("kalman.vibration_rms", 0.2)
     loop.finish(dashboard.store)
-    shown = dashboard.store.run.shown
+    shown = dashboard.store.run.result
     loop.until(lambda: page.of is not None and shown is not None and page.of.record is shown.result.record)
     assert not page.stale.visible, "an observer's setting is not the record's"
 
@@ -181,7 +177,7 @@ def test_a_loaded_record_stays(page: IdentifyPage, dashboard: Dashboard, loop: A
     identified(page, loop)
     page.starter.uses[0].param.trigger("clicks")
     loop.finish(dashboard.store)
-    shown = dashboard.store.run.shown
+    shown = dashboard.store.run.result
     assert shown is not None and shown.recorded and shown.result.record is loaded
     assert shown.scenario.kalman.process_noise == "matched" and not page.stale.visible
 
@@ -199,20 +195,21 @@ def test_what_cannot_be_done_is_said_in_one_line(page: IdentifyPage, loop: Any) 
         assert page.starter.uses[0].disabled
 
 
-def test_limits_of_a_public_server(loop: Any, short: Scenario) -> None:
+def test_limits_of_a_public_server(loop: Any, short: Scenario, enter: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the estimate, and by the time that it takes after all."""
-    dashboard = Dashboard(loop.queue.put, short, limits=Limits(seconds=5.0))
+    dashboard = Dashboard(loop.queue.put, enter(limits=Limits(seconds=5.0)), short)
     loop.closing.append(dashboard)
     dashboard.page()
     dashboard.start()
     loop.finish(dashboard.store)
     page = IdentifyPage(dashboard.store, dashboard.display)
-    shown = dashboard.store.run.shown
+    shown = dashboard.store.run.result
     assert shown is not None
     dashboard.store.limits = Limits(seconds=0.1)
     page.start()
     assert page.work.message == "The identification would take about 0 s, at most 0.1 on this server"
-    dashboard.store.limits, page.work.most_seconds = Limits(seconds=5.0), 1e-6
+    monkeypatch.setattr(module, "seconds", lambda record: 0.0)
+    dashboard.store.limits = Limits(seconds=1e-6)
     page.start()
     loop.until(lambda: page.work.state != RUNNING)
     assert page.work.message == "It took more than 1e-06 s, which is what this server allows"
@@ -238,31 +235,3 @@ def test_same_records(short: Scenario) -> None:
     assert same(lost, replace(lost, y_lgs=y.copy())) and same(record, record)
     for other in (lost, replace(record, delay=3), replace(record, dt=2e-3), replace(record, y_lgs=y[:-1])):
         assert not same(record, other)
-
-
-def test_beside_a_run_one_thing_at_a_time(make_store: Callable[..., Store], loop: Any) -> None:
-    beside, gate = Beside(make_store().run), threading.Event()
-
-    def slow(watch: Watch, tell: Any) -> str:
-        watch.step(0.5)
-        tell("half")
-        assert gate.wait(20)
-        return "late"
-
-    beside.start(slow)
-    loop.until(lambda: beside.latest == "half")
-    assert (beside.state, beside.progress) == (RUNNING, 0.5)
-    beside.cancel()
-    assert beside.state == CANCELLED
-    beside.start(lambda watch, tell: "second")
-    loop.until(lambda: beside.state == DONE)
-    gate.set()
-    assert beside.result == "second" and beside.latest is None
-
-    def broken(watch: Watch, tell: Any) -> None:
-        raise ZeroDivisionError("a bug")
-
-    beside.start(broken)
-    loop.until(lambda: beside.state == FAILED)
-    assert (beside.message, beside.result) == ("ZeroDivisionError: a bug", "second")
-    assert loop.queue.empty(), "nothing of what was cancelled lands"

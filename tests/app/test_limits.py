@@ -84,8 +84,8 @@ def test_a_loaded_record_is_bounded() -> None:
 # ---------------------------------------------------------------------- every way in
 
 @pytest.fixture
-def store(loop: Any, short: Scenario) -> Store:
-    store = Store(loop.queue.put, short, limits=Limits(duration=30))
+def store(loop: Any, short: Scenario, enter: Any) -> Store:
+    store = Store(loop.queue.put, enter(limits=Limits(duration=30)), short)
     loop.closing.append(store)
     return store
 
@@ -98,8 +98,8 @@ def test_a_field_says_it_and_the_settings_stand(store: Store) -> None:
         store.load(paper().replace({"run.duration": 40}))
 
 
-def test_a_link_and_a_file_say_it(loop: Any, short: Scenario) -> None:
-    dashboard = Dashboard(loop.queue.put, short, limits=Limits(duration=30))
+def test_a_link_and_a_file_say_it(loop: Any, short: Scenario, enter: Any) -> None:
+    dashboard = Dashboard(loop.queue.put, enter(limits=Limits(duration=30)), short)
     loop.closing.append(dashboard)
     actions = dashboard.actions
     actions.open_link("?run.duration=31&turbulence.wind_speed=20")
@@ -123,7 +123,7 @@ def test_a_service_refuses_what_has_passed_by_the_page(short: Scenario) -> None:
     service = Service(Limits(duration=1.0), 1, 0, never)
     try:
         with pytest.raises(SettingError, match="at most 1 s"):
-            service.enter().compute(short, lambda: False, lambda *_: None)
+            service.run(short)
     finally:
         assert service.close(20)
 
@@ -140,7 +140,7 @@ def test_no_more_sessions_than_may_be(caplog: Any) -> None:
             service.enter()
         first.leave()
         first.leave()
-        assert service.visits == 1, "one who leaves twice has left once"
+        assert service.sessions == 1, "one who leaves twice has left once"
         service.enter()
     finally:
         assert service.close(20)

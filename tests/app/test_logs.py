@@ -5,11 +5,14 @@ from __future__ import annotations
 import io
 import logging
 import re
+import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
+from wfsobs.app.jobs.job import Job
 from wfsobs.app.limits import NONE
 from wfsobs.app.logs import event, to_stream
 from wfsobs.app.service import Service
@@ -44,20 +47,24 @@ def test_an_event_is_a_line_of_fields(written: io.StringIO) -> None:
 
 
 def test_a_run_from_beginning_to_end(written: io.StringIO, short: Scenario) -> None:
-    def fails(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
+    def fails(*_: Any) -> Shown:
         raise RuntimeError("no such luck")
 
-    service = Service(NONE, 1, 0, fails)
-    visit = service.enter()
-    with pytest.raises(RuntimeError):
-        visit.compute(short, lambda: False, lambda *_: None)
-    visit.leave()
+    service, over = Service(NONE, 1, 0, fails), threading.Event()
+    session = service.enter()
+    session.submit(service.run(short), lambda news: over.set() if "message" in news else None)
+    session.submit(Job("identify", lambda *_: None, cost=1.5), lambda _news: None)
+    assert over.wait(20)
+    while service.queue.running + service.queue.length:
+        time.sleep(0.001)
+    session.leave()
     assert service.close(20)
-    said = [LINE.sub("", line) for line in written.getvalue().splitlines()]
+    said = [LINE.sub("", line) for line in written.getvalue().splitlines() if LINE.match(line) and " failed" not in line]
     shapes = [re.sub(r"=[\d.a-f]+\b", "=#", line) for line in said]
     assert shapes == [
         "session-start session=# sessions=#", "result session=# key=# cache=miss",
         "run-start run=# session=# wait=# estimate=#", "run-end run=# state=failed seconds=#",
+        "identify-start identify=# session=# wait=# estimate=#", "identify-end identify=# state=done seconds=#",
         "session-end session=# seconds=# sessions=#"]
     assert " ERROR run-end" in written.getvalue()
 

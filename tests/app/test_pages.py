@@ -94,7 +94,7 @@ class TestFigures:
                 assert y.size > 50 and np.isfinite(y).mean() > 0.9 and len(source.data["x"]) == y.size
 
     def test_values(self, figures: Figures, dashboard: Dashboard) -> None:
-        shown = dashboard.store.run.shown
+        shown = dashboard.store.run.result
         turbulence = figures.sheets[2]
         tilt = np.asarray(turbulence.plots[1].sources["multirate"].data["y"])
         assert np.nanmax(tilt) == pytest.approx(1e3 * shown.values("multirate", "turbulence")[500:, 1].max(), rel=1e-6)

@@ -38,7 +38,7 @@ def order(dashboard: Dashboard, target: str) -> list[str]:
 
 class TestPin:
     def test_the_table_shows_the_change(self, pinned: Dashboard) -> None:
-        kept, shown = pinned.display.pinned, pinned.store.run.shown
+        kept, shown = pinned.display.pinned, pinned.store.run.result
         before = kept.score("kf-lgs", "turbulence", "tip").rms
         now = next(s for s in shown.result.scores if (s.observer, s.target, s.mode) == ("kf-lgs", "turbulence", "tip")).rms
         assert now != before
@@ -80,7 +80,7 @@ class TestPin:
         assert all(dashboard.explore.traces.traces[target].faint.source is None for target in TARGETS)
 
     def test_all_samples_of_a_short_record_are_kept(self, dashboard: Dashboard) -> None:
-        shown = dashboard.store.run.shown
+        shown = dashboard.store.run.result
         kept = pin(shown)
         values = shown.values("kf-lgs", "vibration")
         assert np.allclose(kept.signals["kf-lgs", "vibration"], values, atol=1e-6)
@@ -105,7 +105,7 @@ class TestWords:
 
 class TestTable:
     def test_best_first(self, dashboard: Dashboard) -> None:
-        rms_of = {s.observer: s.rms for s in dashboard.store.run.shown.result.scores
+        rms_of = {s.observer: s.rms for s in dashboard.store.run.result.result.scores
                   if (s.target, s.mode) == ("vibration", "tip")}
         assert order(dashboard, "vibration") == sorted(rms_of, key=lambda name: rms_of[name])
         dashboard.display.best_first = False
@@ -114,19 +114,19 @@ class TestTable:
     def test_marks(self, dashboard: Dashboard) -> None:
         html = dashboard.explore.table.pane.object
         assert html.count(">best<") == 2, "one causal observer per target"
-        worse = [s for s in dashboard.store.run.shown.result.scores
+        worse = [s for s in dashboard.store.run.result.result.scores
                  if s.mode == "tip" and s.normalised_rms is not None and s.normalised_rms > 1]
         assert html.count(">above truth<") == len(worse) > 0
 
     def test_real_time_factor(self, dashboard: Dashboard) -> None:
-        score = next(s for s in dashboard.store.run.shown.result.scores if s.observer == "gpr-online" and s.mode == "tip")
+        score = next(s for s in dashboard.store.run.result.result.scores if s.observer == "gpr-online" and s.mode == "tip")
         assert f"<td>{number(1e3 * score.seconds_per_step, 2)}</td></tr>" in dashboard.explore.table.pane.object
 
 
 def test_cumulative_rms(dashboard: Dashboard) -> None:
     """At the lowest frequency it is the rms of what is shown, the mean aside."""
     dashboard.display.spectrum = "cumulative"
-    shown, view = dashboard.store.run.shown, dashboard.explore.spectra.spectra["vibration"]
+    shown, view = dashboard.store.run.result, dashboard.explore.spectra.spectra["vibration"]
     y = np.asarray(view.sources["kf-lgs"].data["y"])
     assert np.all(np.diff(y) <= 0)
     signal = shown.values("kf-lgs", "vibration")[500:, 0]

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from wfsobs import pipeline
-from wfsobs.app.run import CANCELLED, DONE, FAILED, RUNNING
+from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING, Tell
 from wfsobs.app.store import Store
-from wfsobs.app.work import Report, Shown
+from wfsobs.app.work import Shown
 from wfsobs.presets import PRESETS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.settings import SettingError
-from wfsobs.watch import Cancelled
+from wfsobs.watch import Cancelled, Watch
 
 
 def answer(scenario: Scenario) -> Shown:
@@ -25,7 +24,7 @@ def answer(scenario: Scenario) -> Shown:
     return Shown(pipeline.Result(scenario, record, (), ()))
 
 
-def instant(scenario: Scenario, cancelled: Callable[[], bool], report: Report) -> Shown:
+def instant(scenario: Scenario, *_: object) -> Shown:
     return answer(scenario)
 
 
@@ -35,7 +34,7 @@ class Gated:
     def __init__(self) -> None:
         self.gates: dict[float, threading.Event] = {}
         self.told_to_stop: dict[float, bool] = {}
-        self.reporting: dict[float, Report] = {}
+        self.telling: dict[float, Tell] = {}
         self.entered: dict[float, threading.Event] = {}
         self.left: dict[float, threading.Event] = {}
 
@@ -43,12 +42,12 @@ class Gated:
         for speed in speeds:
             self.gates[speed], self.entered[speed], self.left[speed] = (threading.Event() for _ in range(3))
 
-    def __call__(self, scenario: Scenario, cancelled: Callable[[], bool], report: Report) -> Shown:
+    def __call__(self, scenario: Scenario, watch: Watch, tell: Tell, _loaded: object) -> Shown:
         speed = scenario.turbulence.wind_speed
-        self.reporting[speed] = report
+        self.telling[speed] = tell
         self.entered[speed].set()
         assert self.gates[speed].wait(20)
-        self.told_to_stop[speed] = cancelled()
+        self.told_to_stop[speed] = watch.cancelled()
         try:
             return answer(scenario)
         finally:
@@ -62,7 +61,7 @@ def test_a_run_gives_what_the_core_gives(make_store: Any, loop: Any, short: Scen
     loop.finish(store)
     assert store.run.state == DONE and store.run.progress == 1.0
     expected = pipeline.run(short)
-    got = {(s.observer, s.target, s.mode): s.rms for s in store.run.shown.result.scores}
+    got = {(s.observer, s.target, s.mode): s.rms for s in store.run.result.result.scores}
     assert got == {(s.observer, s.target, s.mode): s.rms for s in expected.scores}
 
 
@@ -70,13 +69,13 @@ def test_a_change_runs_again(make_store: Any, loop: Any, short: Scenario) -> Non
     store = make_store()
     store.start()
     loop.finish(store)
-    first = store.run.shown
+    first = store.run.result
     assert store.change("turbulence.wind_speed", 25)
     assert store.stale and store.run.state == RUNNING
     loop.finish(store)
     assert not store.stale
-    assert store.run.shown.scenario.turbulence.wind_speed == 25.0
-    assert store.run.shown.result.scores != first.result.scores
+    assert store.run.result.scenario.turbulence.wind_speed == 25.0
+    assert store.run.result.result.scores != first.result.scores
     assert short.turbulence.wind_speed == 15.0, "a scenario that was handed over is a snapshot"
 
 
@@ -90,10 +89,10 @@ def test_a_bad_value_leaves_the_last_result_standing(make_store: Any, loop: Any)
     store = make_store(instant)
     store.start()
     loop.finish(store)
-    scenario, shown = store.scenario, store.run.shown
+    scenario, shown = store.scenario, store.run.result
     assert not store.change("turbulence.wind_speed", 200)
     assert store.errors == {"turbulence.wind_speed": "turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s"}
-    assert store.scenario is scenario and store.run.shown is shown
+    assert store.scenario is scenario and store.run.result is shown
     assert store.run.state == DONE and not store.stale
 
 
@@ -157,14 +156,14 @@ def test_a_superseded_run_never_lands(make_store: Any, loop: Any) -> None:
     assert work.entered[20.0].wait(20)
     work.gates[20.0].set()
     loop.finish(store)
-    assert store.run.shown.scenario.turbulence.wind_speed == 20.0
+    assert store.run.result.scenario.turbulence.wind_speed == 20.0
 
-    work.reporting[15.0](0.5, answer(PRESETS["paper"]()))
+    work.telling[15.0](progress=0.5, result=answer(PRESETS["paper"]()))
     work.gates[15.0].set()
     assert work.left[15.0].wait(20)
-    store.run._pool.shutdown(wait=True)
+    assert store.session.service.close(20)
     assert loop.queue.empty(), "nothing of it is even posted"
-    assert store.run.shown.scenario.turbulence.wind_speed == 20.0 and store.run.progress == 1.0
+    assert store.run.result.scenario.turbulence.wind_speed == 20.0 and store.run.progress == 1.0
     assert work.told_to_stop == {20.0: False, 15.0: True}
 
 
@@ -174,20 +173,20 @@ def test_what_was_posted_before_a_run_was_superseded_does_not_land_after(make_st
     store = make_store(work)
     store.start()
     assert work.entered[15.0].wait(20)
-    work.reporting[15.0](0.5, answer(store.scenario))
+    work.telling[15.0](progress=0.5, result=answer(store.scenario))
     store.change("turbulence.wind_speed", 20)
     loop.land()
-    assert store.run.shown is None and store.run.progress == 0.0
+    assert store.run.result is None and store.run.progress == 0.0
     for gate in work.gates.values():
         gate.set()
     loop.finish(store)
-    assert store.run.shown.scenario.turbulence.wind_speed == 20.0
+    assert store.run.result.scenario.turbulence.wind_speed == 20.0
 
 
 def test_many_changes_in_a_row_show_only_the_last(make_store: Any, loop: Any) -> None:
     store = make_store()
     speeds: list[float] = []
-    store.run.param.watch(lambda event: speeds.append(event.new.scenario.turbulence.wind_speed), "shown")
+    store.run.param.watch(lambda event: speeds.append(event.new.scenario.turbulence.wind_speed), "result")
     for speed in (10, 12, 14, 16, 18):
         store.change("turbulence.wind_speed", speed)
     loop.finish(store)
@@ -201,15 +200,15 @@ def test_cancel_stops_and_keeps_what_was_shown(make_store: Any, loop: Any) -> No
     store.start()
     assert work.entered[15.0].wait(20)
     part = answer(store.scenario)
-    work.reporting[15.0](0.3, part)
-    loop.until(lambda: store.run.shown is part)
+    work.telling[15.0](progress=0.3, result=part)
+    loop.until(lambda: store.run.result is part)
     store.run.cancel()
     assert store.run.state == CANCELLED and store.run.progress == 0.3
     work.gates[15.0].set()
     assert work.left[15.0].wait(20)
-    store.run._pool.shutdown(wait=True)
+    assert store.session.service.close(20)
     assert work.told_to_stop == {15.0: True}
-    assert loop.queue.empty() and store.run.state == CANCELLED and store.run.shown is part
+    assert loop.queue.empty() and store.run.state == CANCELLED and store.run.result is part
 
 
 def test_cancelling_before_anything_has_landed_leaves_the_results_stale(make_store: Any, loop: Any) -> None:
@@ -221,12 +220,12 @@ def test_cancelling_before_anything_has_landed_leaves_the_results_stale(make_sto
     loop.finish(store)
     store.change("turbulence.wind_speed", 20)
     store.run.cancel()
-    assert store.stale and store.run.shown.scenario.turbulence.wind_speed == 15.0
+    assert store.stale and store.run.result.scenario.turbulence.wind_speed == 15.0
     work.gates[20.0].set()
 
 
 def test_cancelled_work_that_reports_it_itself(make_store: Any, loop: Any) -> None:
-    def stops(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
+    def stops(*_: object) -> Shown:
         raise Cancelled
 
     store = make_store(stops)
@@ -236,7 +235,7 @@ def test_cancelled_work_that_reports_it_itself(make_store: Any, loop: Any) -> No
 
 
 def test_a_failing_run_says_why_and_leaves_the_last_result_standing(make_store: Any, loop: Any, caplog: Any) -> None:
-    def fails(scenario: Scenario, cancelled: Any, report: Any) -> Shown:
+    def fails(scenario: Scenario, *_: object) -> Shown:
         if scenario.loop.gain == 0.1:
             raise RuntimeError("no such luck")
         if scenario.loop.gain == 0.2:
@@ -246,7 +245,7 @@ def test_a_failing_run_says_why_and_leaves_the_last_result_standing(make_store: 
     store = make_store(fails)
     store.start()
     loop.finish(store)
-    shown = store.run.shown
+    shown = store.run.result
     store.change("loop.gain", 0.1)
     loop.finish(store)
     assert (store.run.state, store.run.message) == (FAILED, "RuntimeError: no such luck")
@@ -254,7 +253,7 @@ def test_a_failing_run_says_why_and_leaves_the_last_result_standing(make_store: 
     store.change("loop.gain", 0.2)
     loop.finish(store)
     assert store.run.message == "loop.gain = 0.2: not today"
-    assert store.run.shown is shown and store.stale
+    assert store.run.result is shown and store.stale
     store.change("loop.gain", 0.3)
     loop.finish(store)
     assert store.run.state == DONE and store.run.message == "" and not store.stale

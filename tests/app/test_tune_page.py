@@ -12,11 +12,11 @@ import pytest
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import number
+from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.limits import Limits
 from wfsobs.app.pages.pages import TUNE
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.pages.tune_views import unit_for
-from wfsobs.app.run import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.sources import Loaded
 from wfsobs.app.tune_work import CHOICES, best_so_far, seconds
 from wfsobs.configfile import changes
@@ -127,7 +127,7 @@ def test_progress_cancel_and_errors(page: TunePage, dashboard: Dashboard, loop: 
     assert page.work.state == CANCELLED and page.starter.uses[0].disabled and len(page.figure.source.data["x"]) > 0
     dashboard.store.limits = Limits(seconds=0.01)
     page.start()
-    shown = dashboard.store.run.shown
+    shown = dashboard.store.run.result
     assert shown is not None
     estimate = seconds(shown, dashboard.store.scenario, "gpr-online", 1000)
     assert page.work.message == f"The tuning would take about {estimate:.0f} s, at most 0.01 on this server" and estimate > 1.0

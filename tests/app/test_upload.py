@@ -47,13 +47,13 @@ def previewed(dashboard: Dashboard, loop: Any, content: bytes, name: str = "nigh
 
 def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     content = file_of(short)
-    before = dashboard.store.run.shown
+    before = dashboard.store.run.result
     previewed(dashboard, loop, content)
     assert "750 steps at 500 Hz, 1.5 s, 0 missing" in dashboard.upload.text.object and dashboard.upload.room.visible
-    assert dashboard.store.run.shown is before  # nothing runs before it is confirmed
+    assert dashboard.store.run.result is before  # nothing runs before it is confirmed
     dashboard.upload.confirm()
     loop.finish(dashboard.store)
-    shown = dashboard.store.run.shown
+    shown = dashboard.store.run.result
     assert dashboard.store.run.state == "done", dashboard.store.run.message
     scenario = dashboard.store.scenario
     assert (scenario.sensors.lgs_rate, scenario.run.duration, scenario.run.warm_up) == (500.0, 1.5, pytest.approx(0.3))
@@ -85,17 +85,17 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
 
     dashboard.upload.handle({"action": "simulate"})
     loop.finish(dashboard.store)
-    assert dashboard.store.run.shown.result.record.turbulence is not None and dashboard.upload.picker.loaded == ""
+    assert dashboard.store.run.result.result.record.turbulence is not None and dashboard.upload.picker.loaded == ""
 
 
 def test_settings_change_what_runs_on_the_record(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     previewed(dashboard, loop, file_of(short))
     dashboard.upload.confirm()
     loop.finish(dashboard.store)
-    first = dashboard.store.run.shown.result
+    first = dashboard.store.run.result.result
     dashboard.store.change("kalman.vibration_rms", 0.2)
     loop.finish(dashboard.store)
-    second = dashboard.store.run.shown.result
+    second = dashboard.store.run.result.result
     np.testing.assert_array_equal(first.record.y_lgs, second.record.y_lgs)
     assert first.scores[0].rms != second.scores[0].rms
 
@@ -140,13 +140,13 @@ def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     vibration = dashboard.store.scenario.vibration
     assert vibration.source == "psd" and dashboard.store.source is None
     assert vibration.psd.tip == pytest.approx([0.0, 1e-5, 1e-5, 0.0], rel=1e-12)
-    assert dashboard.store.run.shown.result.record.vibration.std(axis=0) == pytest.approx([np.sqrt(1.1e-5), 0.0], rel=0.02)
+    assert dashboard.store.run.result.result.record.vibration.std(axis=0) == pytest.approx([np.sqrt(1.1e-5), 0.0], rel=0.02)
     previewed(dashboard, loop, b"seeing,airmass\n1,2\n", "log.csv")
     assert dashboard.upload.picker.said.startswith("log.csv: has no y_lgs")
 
 
 def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
-    before = dashboard.store.run.shown
+    before = dashboard.store.run.result
     for content, name, line in (
         (b"hello", "a.npz", "a.npz: not an .npz file"), (b"", "a.csv", "a.csv: is empty"),
         (b"# nothing", "a.csv", "a.csv: holds no table"), (b"x", "<b>.exe", "_b_.exe: its name ends in none of"),
@@ -155,7 +155,7 @@ def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
         assert dashboard.upload.picker.said.startswith(line)
         assert "<b>.exe" not in dashboard.upload.text.object
         dashboard.upload.confirm()
-        assert dashboard.store.source is None and dashboard.store.run.shown is before
+        assert dashboard.store.source is None and dashboard.store.run.result is before
 
 
 def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -179,20 +179,19 @@ def test_on_a_server_with_limits(loop: Any, short: Scenario) -> None:
     try:
         boards = []
         for seed in (1, 2):
-            visit = service.enter()
-            board = Dashboard(loop.queue.put, short, work=visit.compute, limits=service.limits, held=service.held)
+            board = Dashboard(loop.queue.put, service.enter(), short)
             loop.closing.append(board)
             record = simulate(short.replace({"run.seed": seed}))
             previewed(board, loop, file_of(short, y_lgs=record.y_lgs[:750]), "same.csv")
             board.upload.confirm()
             loop.finish(board.store)
-            boards.append(board.store.run.shown.result)
+            boards.append(board.store.run.result.result)
         assert not np.array_equal(boards[0].record.y_lgs, boards[1].record.y_lgs)
         assert boards[0].scores[0].rms != boards[1].scores[0].rms
         long = simulate(short.replace({"run.duration": 2.5}))
         previewed(board, loop, file_of(short, **{k: getattr(long, k) for k in ("y_lgs", "u", "y_ngs", "open_loop_y")}))
         board.upload.confirm()
         assert "run.duration = 5: at most 2 s on this server" in board.upload.picker.said
-        np.testing.assert_array_equal(board.store.run.shown.result.record.y_lgs, boards[1].record.y_lgs)
+        np.testing.assert_array_equal(board.store.run.result.result.record.y_lgs, boards[1].record.y_lgs)
     finally:
         service.close()

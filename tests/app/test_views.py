@@ -52,7 +52,7 @@ class TestEnvelope:
 
 class TestTraces:
     def test_signal(self, dashboard: Dashboard) -> None:
-        shown = dashboard.store.run.shown
+        shown = dashboard.store.run.result
         data = trace(dashboard, "turbulence")
         assert set(data) == {"x", TRUTH, "kf-lgs", "kf-multi", "kf-adaptive", "kf-ngs", "multirate", "multirate-optimal"}
         expected = 1e3 * envelope(shown.values("kf-lgs", "turbulence")[:, 0], BINS)
@@ -61,7 +61,7 @@ class TestTraces:
 
     def test_error(self, dashboard: Dashboard) -> None:
         dashboard.display.show = "error"
-        shown = dashboard.store.run.shown
+        shown = dashboard.store.run.result
         error = shown.values("kf-lgs", "vibration") - shown.values(TRUTH, "vibration")
         data = trace(dashboard, "vibration")
         assert np.allclose(data["kf-lgs"], 1e3 * envelope(error[:, 0], BINS), rtol=1e-5)
@@ -70,7 +70,7 @@ class TestTraces:
 
     def test_mode_and_unit(self, dashboard: Dashboard) -> None:
         dashboard.display.param.update(mode="tilt", unit="mas")
-        truth = dashboard.store.run.shown.values(TRUTH, "vibration")[:, 1]
+        truth = dashboard.store.run.result.values(TRUTH, "vibration")[:, 1]
         assert np.allclose(trace(dashboard, "vibration")[TRUTH], 103.132403 * envelope(truth, BINS), rtol=1e-6)
         assert dashboard.explore.traces.traces["vibration"].figure.yaxis.axis_label == "tilt [mas]"
 
@@ -91,7 +91,7 @@ class TestTraces:
         assert np.allclose(step, 1e-3), "every sample of it"
         assert data["x"][0] == pytest.approx(0.975, abs=2e-3) and data["x"][-1] == pytest.approx(1.125, abs=3e-3)
         first = round(data["x"][0] / 1e-3)
-        truth = dashboard.store.run.shown.values(TRUTH, "vibration")[first : first + data["x"].size, 0]
+        truth = dashboard.store.run.result.values(TRUTH, "vibration")[first : first + data["x"].size, 0]
         assert np.allclose(data[TRUTH], 1e3 * truth, rtol=1e-6)
 
     def test_the_window_stays_through_a_change(self, dashboard: Dashboard, loop: Any) -> None:
@@ -124,7 +124,7 @@ class TestTraces:
 
 class TestSpectra:
     def test_signal_and_error(self, dashboard: Dashboard) -> None:
-        shown, view = dashboard.store.run.shown, dashboard.explore.spectra.spectra["vibration"]
+        shown, view = dashboard.store.run.result, dashboard.explore.spectra.spectra["vibration"]
         spectrum = shown.spectra["gpr-offline", "vibration"]
         assert np.allclose(view.sources["gpr-offline"].data["y"], 1e6 * spectrum.signal[1:, 0])
         truth = np.asarray(view.sources[TRUTH].data["y"])
@@ -136,7 +136,7 @@ class TestSpectra:
         dashboard.display.unit = "um"
         view = dashboard.explore.spectra.spectra["vibration"]
         assert np.allclose(
-            view.sources[TRUTH].data["y"], dashboard.store.run.shown.spectra[TRUTH, "vibration"].signal[1:, 0])
+            view.sources[TRUTH].data["y"], dashboard.store.run.result.spectra[TRUTH, "vibration"].signal[1:, 0])
         assert "µm²/Hz" in view.figure.yaxis.axis_label
 
     def test_peaks_are_marked(self, dashboard: Dashboard, loop: Any) -> None:
@@ -161,7 +161,7 @@ class TestSpectra:
 class TestNumbers:
     def test_the_table_shows_the_scores(self, dashboard: Dashboard) -> None:
         html = dashboard.explore.table.pane.object
-        for score in dashboard.store.run.shown.result.scores:
+        for score in dashboard.store.run.result.result.scores:
             if score.mode == "tip":
                 assert number(1e3 * score.rms) in html
         assert html.count("<tr data-observer") == 2 + sum(len(o.targets) for o in OBSERVERS.values()), "and the bounds"
@@ -169,7 +169,7 @@ class TestNumbers:
 
     def test_the_table_follows_mode_and_unit(self, dashboard: Dashboard) -> None:
         dashboard.display.param.update(mode="tilt", unit="mas")
-        score = next(s for s in dashboard.store.run.shown.result.scores if s.mode == "tilt")
+        score = next(s for s in dashboard.store.run.result.result.scores if s.mode == "tilt")
         assert number(score.rms * per_micrometre("mas", 8.0)) in dashboard.explore.table.pane.object
         assert "RMS error [mas]" in dashboard.explore.table.pane.object
 
@@ -177,21 +177,21 @@ class TestNumbers:
         dashboard.store.change("multirate.measurement_noise", "manual")
         dashboard.store.change("multirate.ngs_noise", 0.5)
         loop.finish(dashboard.store)
-        failures = dashboard.store.run.shown.result.failures
+        failures = dashboard.store.run.result.result.failures
         for failure in failures:
             assert failure.observer in dashboard.explore.table.pane.object
 
     def test_cards(self, dashboard: Dashboard) -> None:
         cards = {c["name"]: c for c in dashboard.explore.strips["vibration"].cards.items}
-        score = next(s for s in dashboard.store.run.shown.result.scores
+        score = next(s for s in dashboard.store.run.result.result.scores
                      if (s.observer, s.target, s.mode) == ("gpr-online", "vibration", "tip"))
         assert cards["gpr-online"]["value"] == number(1e3 * score.rms) and cards["gpr-online"]["unit"] == "nm"
         assert cards["gpr-online"]["colour"] == "#004B00"
         assert cards[TRUTH]["value"] == number(1e3 * score.truth_rms)
         assert "zero" not in cards
 
-    def test_before_the_first_result(self, make_store: Any, loop: Any, short: Any) -> None:
-        dashboard = Dashboard(loop.queue.put, short)
+    def test_before_the_first_result(self, enter: Any, loop: Any, short: Any) -> None:
+        dashboard = Dashboard(loop.queue.put, enter(), short)
         loop.closing.append(dashboard)
         assert all(c["value"] == "–" for c in dashboard.explore.strips["vibration"].cards.items)
         assert dashboard.explore.table.pane.object.count("–") > 20
@@ -265,6 +265,6 @@ class TestHigherModes:
     def test_csv_names_every_mode(self, dashboard: Dashboard, loop: Any) -> None:
         dashboard.store.change("telescope.radial_order", 2)
         loop.finish(dashboard.store)
-        shown = dashboard.store.run.shown
+        shown = dashboard.store.run.result
         head = next(line for line in data_csv(shown).decode().splitlines() if line.startswith("time_s"))
         assert all(f"truth/turbulence/{mode.name}_um" in head for mode in dashboard.store.scenario.modes)

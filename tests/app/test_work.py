@@ -13,7 +13,7 @@ from wfsobs.app.work import TRUTH, Shown, compute
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.scores import scored_samples, welch_psd
-from wfsobs.watch import Cancelled
+from wfsobs.watch import QUIET, Cancelled, Watch
 
 
 def keys(shown: Shown) -> set[tuple[str, str]]:
@@ -26,7 +26,7 @@ def reports(monkeypatch: pytest.MonkeyPatch, short: Scenario) -> list[tuple[floa
     monkeypatch.setattr(work, "INTERVAL", 0.0)
     monkeypatch.setattr(work, "DELIVERY_INTERVAL", 0.0)
     out: list[tuple[float, Shown | None]] = []
-    final = compute(short, lambda: False, lambda fraction, shown: out.append((fraction, shown)))
+    final = compute(short, Watch(lambda fraction: out.append((fraction, None))), lambda result: out.append((out[-1][0], result)))
     return [*out, (1.0, final)]
 
 
@@ -56,7 +56,7 @@ def test_progress_rises_to_one(reports: Any) -> None:
 def test_deliveries_are_held_back(short: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(work, "INTERVAL", 1000.0)
     told: list[Shown | None] = []
-    compute(short, lambda: False, lambda fraction, shown: told.append(shown))
+    compute(short, QUIET, lambda result: told.append(result))
     (shown,) = told
     assert shown is not None
     here = {name for name, _ in keys(shown)}
@@ -78,10 +78,10 @@ def test_spectra_are_of_what_is_scored(reports: Any) -> None:
 
 def test_a_run_that_is_not_wanted_stops(short: Scenario) -> None:
     with pytest.raises(Cancelled):
-        compute(short, lambda: True, lambda fraction, shown: None)
+        compute(short, Watch(cancelled=lambda: True), lambda **_: None)
 
 
 def test_a_record_too_short_for_an_observer_says_so(short: Scenario) -> None:
     scenario = short.replace({"run.duration": 0.2, "run.warm_up": 0.19, "gpr_online.training_size": 400})
-    shown = compute(scenario, lambda: False, lambda fraction, part: None)
+    shown = compute(scenario, QUIET, lambda **_: None)
     assert ("gpr-online", "vibration") not in shown.spectra

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,12 @@ from click.testing import CliRunner, Result
 
 from wfsobs import pipeline
 from wfsobs.app.report import maker
-from wfsobs.app.report.maker import Maker, ReportError
+from wfsobs.app.report.maker import ReportError
 from wfsobs.app.work import Shown
 from wfsobs.cli import main
 from wfsobs.scenario import Scenario
 from wfsobs.tables import TIME, rows
+from wfsobs.watch import QUIET, Cancelled, Watch
 
 QUICK = ["--set", "run.duration=1.5", "--set", "run.warm_up=0.5", "--set", "gpr_online.training_size=20",
          "--set", "gpr_offline.training_size=50", "--set", "gpr_online.depth=20", "--set", "gpr_offline.depth=20",
@@ -97,41 +98,31 @@ def test_a_run_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: pyt
 
 
 def test_the_dashboards_report_has_the_numbers_given_to_it(result: Any, parse: Any) -> None:
-    it = parse(Maker().make(Shown(result), "paper").decode())
+    it = parse(maker.make(Shown(result), "paper", QUIET).decode())
     assert it.data("rows")[0]["rows"] == rows(result.scores, result.scenario.run.seed)
     assert "wfsobs export report.html --preset paper --set" in it.text
 
 
-def test_closing_stops_what_is_being_made(result: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    it, said = Maker(), []
-    thread = threading.Thread(target=lambda: said.append(failure(it, result)))
-    thread.start()
-    while it._process is None:
-        time.sleep(0.005)
-    process = it._process
-    it.close()
-    thread.join(20)
-    assert said == ["stopped"] and process.returncode is not None
-    assert failure(it, result) == "stopped", "nor is anything begun after"
+def test_what_nobody_wants_any_more_is_stopped(result: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[Any] = []
 
+    class Noted(subprocess.Popen):
+        def __init__(self, *given: Any, **how: Any):
+            super().__init__(*given, **how)
+            begun.append(self)
 
-def test_a_report_takes_its_time_or_is_given_up(result: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(maker, "LIMIT", 0.05)
-    assert failure(Maker(), result) == "it took longer than 0.05 s"
-    with maker._room:
-        assert "busy" in failure(Maker(), result)
+    monkeypatch.setattr(maker.subprocess, "Popen", Noted)
+    with pytest.raises(Cancelled):
+        maker.make(Shown(result), "paper", Watch(cancelled=lambda: bool(begun)))
+    (process,) = begun
+    assert process.returncode == -signal.SIGKILL
 
 
 def test_a_process_that_fails_is_one_line(result: Any, monkeypatch: pytest.MonkeyPatch, caplog: Any) -> None:
     monkeypatch.setattr(maker, "packed", lambda report: b"nonsense")
-    assert failure(Maker(), result) == "it could not be made; the server's log has the details"
+    with pytest.raises(ReportError, match="it could not be made; the server's log has the details"):
+        maker.make(Shown(result), "paper", QUIET)
     assert "Traceback" in caplog.text
-
-
-def failure(it: Maker, result: Any) -> str:
-    with pytest.raises(ReportError) as caught:
-        it.make(Shown(result), "paper")
-    return str(caught.value)
 
 
 def test_a_failure_of_an_observer_is_in_the_report(short: Scenario, tmp_path: Path, parse: Any) -> None:

@@ -1,0 +1,195 @@
+"""The line of jobs before the processors: so many at once, of every kind, and each told its place."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import logging
+import math
+import os
+import sys
+import threading
+from collections.abc import Callable, Hashable
+from functools import partial
+from time import monotonic
+from typing import Any
+
+from wfsobs.app.cache import Cache
+from wfsobs.app.jobs.job import CANCELLED, CLICK, DONE, FAILED, Job, Listener
+from wfsobs.app.logs import event
+
+log = logging.getLogger(__name__)
+
+PATIENCE = 60.0
+"""A sweep that has waited longer goes like a click [s], so that its turn comes."""
+
+
+class JobQueue:
+    """Threads of their own, as many as jobs may be done at once, and the results kept of jobs that have a key.
+
+    Clicks go before sweeps, then turns are taken: the first job of every owner before the second of anybody, whoever comes
+    later beginning with the turn that is being done, and within a turn first come first served. What is wanted twice is done
+    once.
+    """
+
+    def __init__(self, workers: int, cache: Cache[Any]):
+        self.cache = cache
+        self.closing = False
+        self._waiting: list[Job] = []
+        self._running: list[Job] = []
+        self._shared: dict[str, Job] = {}
+        self._turn = 0  # the latest that has begun
+        self._changed = threading.Condition()
+        self._timers: dict[Job, threading.Timer] = {}
+        self._threads = [
+            threading.Thread(target=self._work, name=f"wfsobs-work-{i}", daemon=True) for i in range(workers)]
+        for thread in self._threads:
+            thread.start()
+
+    def submit(
+        self, job: Job, owner: Hashable, listener: Listener, before: Callable[[], None] = lambda: None
+    ) -> Callable[[], None]:
+        """Have a job done when its turn comes, or tell the listener what there is of the same; how to take it back.
+
+        before : takes back what this replaces; that would end the same job if it were done any sooner
+        """
+        with self._changed:
+            found = self.cache.get(job.key) if job.key else None
+            shared = self._shared.get(job.key) if found is None else None
+            joined = shared is not None and shared.join(owner, listener)
+            if job.key:
+                how = "hit" if found is not None else "joined" if joined else "miss"
+                event("result", session=owner, key=job.key[:12], cache=how)
+            before()
+            if found is not None:
+                listener({"state": DONE, "progress": 1.0, "result": found})
+                return lambda: None
+            if shared is not None and joined:
+                job = shared
+            else:
+                job.join(owner, listener)
+                self._put(job)
+        return partial(self._leave, job, listener)
+
+    def _put(self, job: Job) -> None:
+        if self.closing:
+            job.tell(state=CANCELLED)
+            return
+        if job.key:
+            self._shared[job.key] = job
+        if job.wait_limit < math.inf:
+            self._timers[job] = threading.Timer(job.wait_limit, self._overdue, (job,))
+            self._timers[job].daemon = True
+            self._timers[job].start()
+        owner = job.owner
+        job.turn = max([self._turn, *(other.turn + 1 for other in (*self._running, *self._waiting) if other.owner == owner)])
+        self._waiting.append(job)
+        self._changed.notify_all()
+        self._tell_places()
+
+    def _leave(self, job: Job, listener: Listener) -> None:
+        if job.leave(listener):
+            with self._changed:
+                self._take_out(job)
+
+    def _overdue(self, job: Job) -> None:
+        with self._changed:
+            if self._take_out(job):
+                job.tell(state=FAILED, message=f"the server is busy: no turn within {job.wait_limit:g} s, try again")
+
+    def _take_out(self, job: Job) -> bool:
+        """Out of the line and of what is shared; whether it was in the line."""
+        if self._shared.get(job.key) is job:
+            del self._shared[job.key]
+        if job not in self._waiting:
+            return False
+        self._waiting.remove(job)
+        if job in self._timers:
+            self._timers.pop(job).cancel()
+        self._tell_places()
+        return True
+
+    @property
+    def workers(self) -> int:
+        """Jobs that may be done at once."""
+        return len(self._threads)
+
+    @property
+    def length(self) -> int:
+        """How many wait."""
+        with self._changed:
+            return len(self._waiting)
+
+    @property
+    def running(self) -> int:
+        """How many are being done."""
+        with self._changed:
+            return len(self._running)
+
+    def close(self, timeout: float) -> bool:
+        """Start nothing any more, and wait [s] for what is being done; whether all of that has ended."""
+        with self._changed:
+            self.closing = True
+            for job in [*self._waiting]:
+                self._take_out(job)
+                job.tell(state=CANCELLED)
+            self._changed.notify_all()
+        end = monotonic() + timeout
+        for thread in self._threads:
+            thread.join(max(end - monotonic(), 0.0))
+        return not any(thread.is_alive() for thread in self._threads)
+
+    def _work(self) -> None:
+        step_back()
+        while (job := self._next()) is not None:
+            try:
+                job.run(lambda: self.closing, self.cache.put)
+            except Exception:  # a bug, but the thread is for all
+                log.exception("a job failed")
+            finally:
+                with self._changed:
+                    self._running.remove(job)
+                    self._take_out(job)
+                del job
+                give_back()
+
+    def _next(self) -> Job | None:
+        """The first in the line; None when there will be no more."""
+        with self._changed:
+            while not self.closing:
+                if self._waiting:
+                    job = self._line()[0]
+                    self._waiting.remove(job)
+                    if job in self._timers:
+                        self._timers.pop(job).cancel()
+                    self._running.append(job)
+                    self._turn = max(self._turn, job.turn)
+                    job.moved(0)
+                    self._tell_places()
+                    return job
+                self._changed.wait()
+            return None
+
+    def _line(self) -> list[Job]:
+        """Who waits, in the order of their turns."""
+        late = monotonic() - PATIENCE
+        return sorted(self._waiting, key=lambda job: (CLICK if job.since < late else job.priority, job.turn))
+
+    def _tell_places(self) -> None:
+        """A thread that is free takes the next at once."""
+        if len(self._running) >= len(self._threads):
+            for place, job in enumerate(self._line(), 1):
+                job.moved(place)
+
+
+def give_back() -> None:
+    """Return free memory to the system: glibc keeps what was freed in another thread than the page's."""
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):  # another C library
+            ctypes.CDLL(None).malloc_trim(0)
+
+
+def step_back() -> None:
+    """Let the page's own thread, and a browser on the same machine, go first. On Linux priority is the thread's own."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
