@@ -97,7 +97,7 @@ def bench(full: bool, as_json: bool) -> None:
               help="Longest run, as estimated.")
 @click.option("--max-memory", type=click.FloatRange(0, min_open=True), metavar="MB", help="Memory of a run, as estimated.")
 @click.option("--max-sessions", type=click.IntRange(1), metavar="N", help="Open pages.")
-@click.option("--runs", type=click.IntRange(1), metavar="N", help="Jobs of all kinds at once, as many as there are processors unless told.")
+@click.option("--runs", type=click.IntRange(1), metavar="N", help="Jobs at once, as many as processors unless told.")
 @click.option("--cache-mb", type=click.IntRange(0), default=256, show_default=True, metavar="MB", help="Results kept.")
 @click.option("--lifetime", type=click.FloatRange(0.1), default=60.0, show_default=True, metavar="S",
               help="How long the settings are kept of a page that has lost its connection.")
