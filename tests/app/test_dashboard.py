@@ -103,6 +103,16 @@ def test_a_narrow_window_closes_the_drawer(dashboard: Dashboard, loop: Any) -> N
     loop.until(lambda: page.sidebar_open)
 
 
+def test_the_theme_that_the_system_wants(dashboard: Dashboard, loop: Any) -> None:
+    page, frame = dashboard.page(), dashboard.frame
+    frame.wants_dark = True
+    assert not page.dark_theme, "not before the page has been drawn"
+    loop.until(lambda: page.dark_theme)
+    assert dashboard.display.dark and frame.dark
+    page.dark_theme = False  # as the button does
+    assert not dashboard.display.dark and not frame.dark and frame.wants_dark
+
+
 def test_importing_the_package_imports_no_panel() -> None:
     import subprocess
     import sys

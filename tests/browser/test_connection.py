@@ -120,7 +120,7 @@ def banner(page: Page, text: str) -> Any:
 
 def test_offline_for_a_while(page: Page) -> None:
     page.context.set_offline(True)
-    expect(banner(page, "This computer is offline")).to_be_visible(timeout=2000)
+    expect(banner(page, "This computer is offline")).to_be_visible()
     speed(page, "22")
     page.context.set_offline(False)
     expect(banner(page, "Connected again")).to_be_visible()
@@ -133,7 +133,7 @@ def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> 
     page.get_by_role("button", name="Pin this run to compare others with it").click()
     expect(page.get_by_text("Pinned, faint in the figures")).to_be_visible()
     cable.cut()
-    expect(banner(page, "connection to the server is lost")).to_be_visible(timeout=2000)
+    expect(banner(page, "connection to the server is lost")).to_be_visible()
     speed(page, "22")
     peak(page).fill("6.5")
     peak(page).press("Enter")
@@ -153,7 +153,7 @@ def test_a_server_that_was_started_again(page: Page, cable: Cable, serve: Any) -
     page.wait_for_function("() => location.search.includes('turbulence.wind_speed=22')")
     page.server.process.kill()  # type: ignore[attr-defined]
     page.server.process.wait(20)  # type: ignore[attr-defined]
-    expect(banner(page, "connection to the server is lost")).to_be_visible(timeout=2000)
+    expect(banner(page, "connection to the server is lost")).to_be_visible()
     speed(page, "200")
     peak(page).fill("7.5")
     peak(page).press("Enter")
