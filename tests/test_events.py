@@ -278,7 +278,7 @@ def test_records_with_events_are_files_like_others(broken: tuple[Scenario, Recor
 
 def test_a_record_with_lost_frames_can_be_identified() -> None:
     s = changed({"kind": "frames", "start": 0.0, "duration": 2.0, "share": 0.1}, **{"vibration.source": "none"})
-    found = identify(simulate(s), s)
+    found = identify(simulate(s))
     assert [0.012 < mode.spectrum.noise < 0.017 for mode in found.modes] == [True, True]
     assert found.scenario(s).events == []
 
