@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -68,6 +69,21 @@ def test_two_visitors_wait_in_line(visit: Callable[..., Page]) -> None:
     status(second, "Waiting: position 1")
     first.get_by_role("button", name="Cancel", exact=True).click()
     status(first, "Cancelled")
+    status(second, "Running")
+
+
+def test_every_kind_of_work_is_in_that_line_and_a_click_goes_first(visit: Callable[..., Page], tmp_path: Path) -> None:
+    first, second = visit(LONG + "4"), visit(LONG + "5")
+    start(first)
+    status(first, "Running")
+    start(second)
+    status(second, "Waiting: position 1")
+    (tmp_path / "log.csv").write_text("seeing,airmass\n1,2\n", encoding="utf-8")
+    second.get_by_label("Record file").set_input_files(tmp_path / "log.csv")
+    expect(second.get_by_text("Waiting: position 1")).to_be_visible()  # the reading of the file
+    status(second, "Waiting: position 2")
+    first.get_by_role("button", name="Cancel", exact=True).click()
+    expect(second.get_by_text("log.csv: has no y_lgs").first).to_be_visible()
     status(second, "Running")
 
 
