@@ -101,7 +101,7 @@ def page(browser: Browser, cable: Cable, serve: Any) -> Iterator[Page]:
 
 
 def done(page: Page) -> None:
-    page.locator("[role=status]", has_text="Done in").first.wait_for(state="attached", timeout=120_000)
+    page.locator("[role=status]", has_text="Done in").first.wait_for(state="attached", timeout=240_000)
 
 
 def speed(page: Page, text: str) -> None:
@@ -159,9 +159,9 @@ def test_a_server_that_was_started_again(page: Page, cable: Cable, serve: Any) -
     peak(page).press("Enter")
     serve("again")
     again = page.get_by_role("button", name="Start again with these settings")
-    expect(again).to_be_visible(timeout=60_000)
+    expect(again).to_be_visible(timeout=120_000)
     again.click()
-    expect(peak(page)).to_have_value("7.5", timeout=60_000)
+    expect(peak(page)).to_have_value("7.5", timeout=240_000)
     expect(banner(page, "Wind speed V₀ = 200: takes a number from 0.1 to 100 m/s").first).to_be_visible()
     expect(page.get_by_role("textbox", name="m/s")).to_have_value("200")
     page.wait_for_function("() => location.search.includes('turbulence.wind_speed=22')")

@@ -59,6 +59,7 @@ def test_the_theme_of_the_system_unless_another_is_chosen(open_page: Any, server
     page.get_by_role("button", name=re.compile("theme", re.I)).click()
     becomes(page, True)
     page.reload()
+    page.locator("[role=status]", has_text="Done in").first.wait_for(state="attached", timeout=240_000)
     becomes(page, True)
     page.emulate_media(color_scheme="dark")
     page.get_by_role("button", name=re.compile("theme", re.I)).click()
