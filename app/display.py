@@ -17,6 +17,7 @@ UNITS = {"nm": "nm", "mas": "mas", "um": "µm"}
 """Unit -> how it is written."""
 
 NOTHING = "–"
+IN_MOST = "where the error of an optimal observer lies in 95 % of records"
 
 NO_ANGLE = ("mas",)
 """Units that only tip and tilt can be in."""

@@ -46,7 +46,7 @@ LOOKS: Mapping[str, Look] = MappingProxyType({
     "ridge-30": Look("30-tap predictor", "#8A5A00", "#D8A44D", (2, 3)),
     "persistence": Look("Persistence", "#707070", "#A8A8A8", (1, 3)),
     "kf-adaptive": Look("Adaptive KF", "#E0006E", "#FF7AB8", (20, 2), width=1.8),
-    BOUND: Look("Bound, LGS alone", "#202020", "#E8E8E8", (1, 2)),
+    BOUND: Look("Bound, mean of the LGS", "#202020", "#E8E8E8", (1, 2)),
     "zero": Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4)),
     "measured": Look("Measured", "#606060", "#C8C8C8"),
     "highest": Look("Highest", "#8A8A8A", "#9A9A9A"),

@@ -18,14 +18,14 @@ from threadpoolctl import threadpool_limits
 
 from wfsobs.app.jobs.job import INTERVAL, Tell
 from wfsobs.app.sources import Source
-from wfsobs.bound import bound_scores
+from wfsobs.bound import Bound, bounds
 from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.pipeline import Failure, Result, as_stated, collect, each_estimate
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.scores import Score, spectra
+from wfsobs.scores import spectra
 from wfsobs.watch import Watch
 
 Array = NDArray[np.float64]
@@ -112,7 +112,7 @@ class _Work:
         self.watch = Watch(progress=self._progress, cancelled=watch.cancelled)
         self.estimates: list[Estimate] = []
         self.failures: list[Failure] = []
-        self.bounds: list[Score] = []
+        self.bounds: list[Bound] = []
         self.growing: dict[Key, Array] = {}  # written to by the observers' threads
         self.spectra: dict[Key, Spectrum] = {}
         self.started = self.told = self.delivered = perf_counter()
@@ -148,7 +148,7 @@ class _Work:
                 self.tell(result=shown)
                 self._let_draw()
                 if self.simulation is not None:
-                    self.bounds = bound_scores(self.simulation, record)
+                    self.bounds = bounds(self.simulation, record)
         return self._so_far(record)
 
     def _left(self) -> set[str]:
@@ -169,7 +169,7 @@ class _Work:
         return self._so_far(record)
 
     def _so_far(self, record: Record) -> Shown:
-        result = collect(self.scenario, record, self.estimates, self.failures, bounds=self.bounds)
+        result = collect(self.scenario, record, self.estimates, self.failures, least=self.bounds)
         partial = {key: values.copy() for key, values in self.growing.items()}
         return Shown(result, partial, dict(self.spectra), perf_counter() - self.started, self.source)
 

@@ -17,7 +17,7 @@ from wfsobs.presets import paper
 QUICK = ["--set", "run.duration=2", "--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=50",
          "--set", "adaptive.window=0.5"]
 KEYS = {"observer", "target", "mode", "rms_um", "truth_rms_um", "normalised_rms", "lag_s",
-        "start_s", "stop_s", "apart", "needs", "seed"}
+        "start_s", "stop_s", "apart", "needs", "interval_um", "seed"}
 SHORT = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50, "adaptive.window": 0.5}
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import periodogram
 
 from wfsobs.disturbance import Disturbance, make_disturbance, vibration_variance
 from wfsobs.scenario import Scenario
@@ -39,7 +40,8 @@ def powers(x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("n", [N, N - 1, 997])
 def test_damped_peaks_have_the_spectrum_of_the_scenario(n: int) -> None:
-    s = scenario({"vibration.peaks": [p.to_dict() for p in scenario().vibration.peaks[:2]], "run.duration": n / 1000})
+    s = scenario({"vibration.peaks": [p.to_dict() for p in scenario().vibration.peaks[:2]], "run.duration": n / 1000,
+                  "vibration.synthesis": "random-phase"})
     x = make_disturbance(s, n, np.random.default_rng(1)).vibration
     f = np.fft.rfftfreq(n, 1e-3)
     df = f[1]
@@ -72,15 +74,47 @@ def test_variance_is_that_of_the_peaks_below_the_cutoff() -> None:
 @pytest.mark.parametrize("source", ["peaks", "psd"])
 def test_nothing_above_the_cutoff(cutoff: float, source: str) -> None:
     table = {"frequency": [0.0, 500.0], "tip": [1e-5, 1e-5], "tilt": [2e-5, 0.0]}
-    x = made({"vibration.cutoff": cutoff, "vibration.source": source, "vibration.psd": table}).vibration
+    base = {"vibration.cutoff": cutoff, "vibration.synthesis": "random-phase"}
+    x = made(base | {"vibration.source": source, "vibration.psd": table}).vibration
     f = np.fft.rfftfreq(N, 1e-3)
     above = powers(x)[f > cutoff + 1.0]
     below = powers(x)[(f > 1) & (f < cutoff)]
     if source == "peaks":  # pure lines lie between bins: their leakage is not cut, the noise floor of the rest is
         damped = [p.to_dict() for p in scenario().vibration.peaks[:2]]
-        x = made({"vibration.cutoff": cutoff, "vibration.peaks": damped}).vibration
+        x = made(base | {"vibration.peaks": damped}).vibration
         above, below = powers(x)[f > cutoff], powers(x)[(f > 1) & (f < cutoff)]
     assert above.max() < 1e-30 and below.min() > 1e-12
+
+
+def test_a_gaussian_record_has_the_covariance_of_its_spectrum_and_does_not_repeat() -> None:
+    """Over records: at every lag that of the resonance, at the last one too, where an inverse DFT of the record's own length has
+    all but its variance."""
+    n, seeds, rms, f0, xi = 500, 400, 0.05, 30.0, 0.01
+    s = scenario({"vibration.peaks": [{"frequency": f0, "damping": xi, "rms": [rms, rms]}], "vibration.cutoff": 499.0,
+                  "run.duration": n / 1000})
+    x = np.hstack([make_disturbance(s, n, np.random.default_rng(seed)).vibration for seed in range(seeds)])
+    for lag in (0, 1, 17, 100, n - 1):
+        # A resonance driven by white noise: exp(-a t) (cos b t + a / b sin b t), a = xi w, b = w sqrt(1 - xi^2).
+        t, a = lag / 1000, xi * 2 * np.pi * f0
+        b = a / xi * np.sqrt(1 - xi**2)
+        wanted = rms**2 * np.exp(-a * t) * (np.cos(b * t) + a / b * np.sin(b * t))
+        products = x[0] * x[lag]
+        # 800 records of two modes: four standard errors of their mean.
+        assert products.mean() == pytest.approx(wanted, abs=4 * products.std() / np.sqrt(products.size)), lag
+    repeated = np.hstack([
+        make_disturbance(s.replace({"vibration.synthesis": "random-phase"}), n, np.random.default_rng(seed)).vibration
+        for seed in range(20)])
+    assert np.mean(repeated[0] * repeated[-1]) > 0.9 * rms**2
+
+
+@pytest.mark.parametrize("source", ["peaks", "psd"])
+def test_a_gaussian_record_ends_at_the_cutoff(source: str) -> None:
+    table = {"frequency": [0.0, 500.0], "tip": [1e-5, 1e-5], "tilt": [2e-5, 0.0]}
+    damped = [p.to_dict() for p in scenario().vibration.peaks[:2]]
+    x = made({"vibration.cutoff": 50.0, "vibration.source": source, "vibration.psd": table, "vibration.peaks": damped}).vibration
+    f, power = periodogram(x, 1000.0, window="blackmanharris", axis=0)
+    # The window's side lobes are 92 dB below a line, its main lobe 4 bins of 0.25 Hz wide on either side.
+    assert power[f > 51.25].max() < 1e-8 * power.max() and power[(f > 5) & (f < 49)].min() > 1e-9 * power.max()
 
 
 def test_pure_lines_keep_their_own_frequency_and_rms() -> None:
@@ -118,7 +152,7 @@ def test_a_psd_table_gives_its_variance(step: float, seconds: float) -> None:
     rng = np.random.default_rng(0)
     tip, tilt = 1e-6 * rng.exponential(size=(2, f.size))
     s = scenario({
-        "vibration.source": "psd", "run.duration": seconds,
+        "vibration.source": "psd", "vibration.synthesis": "random-phase", "run.duration": seconds,
         "vibration.psd": {"frequency": f.tolist(), "tip": tip.tolist(), "tilt": tilt.tolist()},
     })
     x = make_disturbance(s, s.n_steps, np.random.default_rng(3)).vibration

@@ -11,7 +11,7 @@ import pytest
 
 from wfsobs import PRESETS, Scenario, SettingError, observe, simulate
 from wfsobs.ar2 import Ar2, turbulence_corner
-from wfsobs.bound import bound_scores
+from wfsobs.bound import bounds
 from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.control.tables import rows
 from wfsobs.cost import run_bytes, run_seconds
@@ -264,7 +264,7 @@ def test_the_loop_runs_with_the_laws_of_before(broken: tuple[Scenario, Record]) 
 
 def test_there_is_no_bound_where_spectra_change(broken: tuple[Scenario, Record]) -> None:
     s, record = broken
-    assert bound_scores(s, record) == [] and bound_scores(s.replace({"events": []}), record)
+    assert bounds(s, record) == [] and bounds(s.replace({"events": []}), record)
 
 
 def test_records_with_events_are_files_like_others(broken: tuple[Scenario, Record], tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import csd, welch
 
-from wfsobs.bound import bound, bound_scores
+from wfsobs.bound import bound, bounds
 from wfsobs.flow_spectra import flow_spectra
 from wfsobs.lgs import lgs_error_variance
 from wfsobs.loop import simulate
@@ -93,7 +93,7 @@ def test_on_frozen_flow_a_third_order_model_is_within_a_tenth_of_the_bound() -> 
 
 def test_too_slow_a_flow_has_no_bound_rather_than_a_wrong_one() -> None:
     slow = FLOW.replace({"turbulence.wind_speed": 0.2})
-    assert not is_known(slow) and bound_scores(slow, simulate(slow)) == []
+    assert not is_known(slow) and bounds(slow, simulate(slow)) == []
     assert is_known(FLOW) and n_frequencies(FLOW.replace({"turbulence.wind_speed": 1.0})) == 2**20
     # In slower air all is easier: at 2 m/s as little of the cone effect is left as at 1.
     assert bound(FLOW.replace({"turbulence.wind_speed": 1.0}), 0)["total"] == pytest.approx(

@@ -63,7 +63,8 @@ def test_the_vibration_has_the_spectrum(part: str, seconds: float):
     """Its variance, and the share of it in each 2 Hz, whatever the record's own grid. A bin of the record that straddles
     a border (1 / seconds wide) may lie on either side, hence bands whose borders lie between lines at 10 s and more."""
     s = Scenario().replace({
-        "vibration.source": "measured", "vibration.part": part, "vibration.cutoff": 100.0, "run.duration": seconds,
+        "vibration.source": "measured", "vibration.synthesis": "random-phase", "vibration.part": part, "vibration.cutoff": 100.0,
+        "run.duration": seconds,
         "turbulence.source": "none"})
     x = make_disturbance(s, s.n_steps, np.random.default_rng(5)).vibration
     power = np.abs(np.fft.rfft(x, axis=0)) ** 2 * 2.0 / len(x) ** 2

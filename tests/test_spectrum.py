@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from wfsobs.spectrum import bin_edges, bin_frequencies, random_phase_signal, resonance_power, table_power
+from wfsobs.spectrum import bin_edges, bin_frequencies, gaussian_signal, random_phase_signal, resonance_power, table_power
 
 EXAMPLES = settings(max_examples=25, deadline=None, derandomize=True)
 EPS = np.finfo(float).eps
@@ -101,6 +101,17 @@ def test_phases_are_uniform_and_new_each_time() -> None:
         assert kstest(phases / (2 * np.pi) + 0.5, "uniform").pvalue > 1e-4
     neighbours = np.mean(np.exp(1j * np.angle(first[1:] * first[:-1].conj())))
     assert abs(neighbours) < 4.0 / np.sqrt(n / 2)  # mean of 10000 unit vectors
+
+
+def test_gaussian_amplitudes_are_independent_normal_numbers() -> None:
+    n = 20_001
+    power = np.linspace(1.0, 3.0, n // 2 + 1)
+    bins = 2.0 * np.fft.rfft(gaussian_signal(power, n, np.random.default_rng(1)))[1:] / (n * np.sqrt(power[1:]))
+    parts = (bins.real, bins.imag)
+    for part in parts:
+        assert kstest(part, "norm").pvalue > 1e-4  # a false alarm once in 10000 seeds
+        assert abs(np.corrcoef(part[1:], part[:-1])[0, 1]) < 4.0 / np.sqrt(n / 2)
+    assert abs(np.corrcoef(*parts)[0, 1]) < 4.0 / np.sqrt(n / 2)
 
 
 @pytest.mark.parametrize("size", [0, 5, 7])

@@ -74,7 +74,7 @@ def test_the_bound_of_the_two_frame_loop() -> None:
     assert bound(MATCHED, 0, ahead=1) == pytest.approx(riccati_errors(MATCHED)[1], rel=1e-7)
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(
     wind=st.floats(2.0, 60.0), rms=st.floats(0.05, 2.0), frequency=st.floats(5.0, 80.0), damping=st.floats(0.005, 0.5),
     vibration=st.floats(0.002, 0.2), noise=st.floats(0.002, 0.2), duration=st.floats(1.0, 3.0),

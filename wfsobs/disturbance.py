@@ -6,7 +6,7 @@ setting knows it by; turbulence has a module of its own.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,12 +19,13 @@ from wfsobs.groups.vibration import Peak
 from wfsobs.measured import measured_spectrum
 from wfsobs.scenario import Scenario
 from wfsobs.schedule import strength, turns
-from wfsobs.spectrum import bin_edges, bin_frequencies, random_phase_signal, resonance_power, table_power
+from wfsobs.spectrum import bin_edges, bin_frequencies, gaussian_signal, random_phase_signal, resonance_power, table_power
+from wfsobs.synthesis import damping_at_least, line_width, period_steps, widened
 from wfsobs.turbulence import SOURCES, ModeSource, columns, mode_power
 from wfsobs.watch import QUIET, Watch
 
-MIN_AR2_DAMPING = 1e-6
-"""A pure line has no stationary AR(2) process; this damping stands for it."""
+RANDOM_PHASE = "random-phase"
+"""The synthesis of the paper: the inverse DFT has the record's own length."""
 
 
 @dataclass(frozen=True)
@@ -71,18 +72,19 @@ def vibration_variance(scenario: Scenario, mode: int) -> float:
         return 0.0
     if v.source == "ar2":
         return float(sum(peak_rms(peak.rms, mode) ** 2 for peak in v.peaks))
-    return float(vibration_power(scenario, mode, scenario.n_steps).sum())
+    _, n, width = _synthesis(scenario, scenario.n_steps)
+    return float(_bin_power(scenario, mode, n, width).sum() + sum(variance for _, variance in pure_lines(scenario, mode)))
 
 
 def vibration_power(scenario: Scenario, mode: int, n: int) -> Array:
-    """Variance [um^2] of the vibration in each DFT bin of `n` steps, pure lines in the bin that they lie in, (n // 2 + 1,)."""
-    if scenario.vibration.source == "none":
-        return np.zeros(n // 2 + 1)
-    power = _bin_power(scenario, mode, n)
-    for peak in scenario.vibration.peaks:
-        if _is_pure_line(scenario, peak):
-            power[min(round(peak.frequency * n * scenario.dt), n // 2)] += peak_rms(peak.rms, mode) ** 2
-    return power
+    """Variance [um^2] of the vibration in each DFT bin of `n` steps, an even number, (n // 2 + 1,), but for its pure lines."""
+    return _bin_power(scenario, mode, n, line_width(scenario))
+
+
+def pure_lines(scenario: Scenario, mode: int) -> list[tuple[float, float]]:
+    """(frequency [Hz], variance [um^2]) of the lines of no width that the vibration of a mode has."""
+    pure = [peak for peak in scenario.vibration.peaks if _is_pure_line(scenario, peak)]
+    return [(peak.frequency, peak_rms(peak.rms, mode) ** 2) for peak in pure if peak_rms(peak.rms, mode) > 0]
 
 
 def vibration_lines(scenario: Scenario, mode: int) -> list[tuple[float, float, float]]:
@@ -105,19 +107,27 @@ def _ar2_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generat
     """Each peak as an AR(2) process (paper, eq. 2)."""
     out = np.zeros(n)
     for i, (peak, stream) in enumerate(zip(scenario.vibration.peaks, rng.spawn(len(scenario.vibration.peaks)), strict=True)):
-        damping = max(peak.damping, MIN_AR2_DAMPING)
+        damping = damping_at_least(line_width(scenario), peak.frequency, peak.damping)
         process = Ar2(2.0 * np.pi * peak.frequency, damping, peak_rms(peak.rms, mode), scenario.dt)
         x, changes = process.sample(n, stream), events.of_peak(scenario, i)
         out += events.moved_process(process, x, changes) if changes else x
     return out
 
 
+def _synthesis(scenario: Scenario, n: int) -> tuple[Callable[[Array, int, np.random.Generator], Array], int, float]:
+    """(how the bins of a DFT become a signal, the steps of that DFT for a record of `n`, the least width of a line [Hz])."""
+    if scenario.vibration.synthesis == RANDOM_PHASE:
+        return random_phase_signal, n, 0.0
+    return gaussian_signal, period_steps(scenario, n), line_width(scenario)
+
+
 def _dft_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
     """Inverse DFT of the spectrum below the cut-off, plus the pure lines at their own frequencies, and the peaks that have
-    events, each with random phases of its own so that it can be moved."""
-    phases, *peak_streams = rng.spawn(1 + len(scenario.vibration.peaks))
+    events, each with random numbers of its own so that it can be moved."""
+    bins, *peak_streams = rng.spawn(1 + len(scenario.vibration.peaks))
     moving = {event.peak for event in scenario.events if event.kind == PEAK}
-    out = random_phase_signal(_bin_power(scenario, mode, n, without=moving), n, phases)
+    signal, period, width = _synthesis(scenario, n)
+    out = signal(_bin_power(scenario, mode, period, width, without=moving), period, bins)[:n]
     t = np.arange(n) * scenario.dt
     for i, (peak, stream) in enumerate(zip(scenario.vibration.peaks, peak_streams, strict=True)):
         changes = events.of_peak(scenario, i)
@@ -125,8 +135,8 @@ def _dft_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generat
             amplitude = np.sqrt(2.0) * peak_rms(peak.rms, mode) * strength(changes, t)
             out += amplitude * np.cos(2.0 * np.pi * (peak.frequency * t + turns(changes, t) + stream.random()))
         elif i in moving:
-            power = _below_cutoff(scenario, _resonance(peak, mode, n, scenario.dt), n)
-            out += events.moved(random_phase_signal(power, n, stream), changes, scenario.dt)
+            power = _below_cutoff(scenario, _resonance(scenario, peak, mode, period, width), period)
+            out += events.moved(signal(power, period, stream), changes, scenario.dt)[:n]
     return out
 
 
@@ -135,27 +145,37 @@ def _is_pure_line(scenario: Scenario, peak: Peak) -> bool:
     return v.source == "peaks" and peak.damping == 0 and peak.frequency <= v.cutoff
 
 
-def _bin_power(scenario: Scenario, mode: int, n: int, without: Collection[int] = ()) -> Array:
+def _bin_power(scenario: Scenario, mode: int, n: int, width: float, without: Collection[int] = ()) -> Array:
     """Variance [um^2] in each DFT bin: that of the damped peaks, but for those `without`, of the PSD table or of the
-    measured spectrum, up to the cut-off."""
+    measured spectrum, up to the cut-off; nothing narrower than `width` [Hz]."""
     v, dt = scenario.vibration, scenario.dt
     power = np.zeros(n // 2 + 1)
+    if v.source == "peaks":
+        for i, peak in enumerate(v.peaks):
+            if peak.damping > 0 and i not in without:
+                power = power + _resonance(scenario, peak, mode, n, width)
+        return _below_cutoff(scenario, power, n)
     if v.source == "psd":
         power = mode_power(v.psd, scenario, mode, n)
     elif v.source == "measured":
         spectrum = measured_spectrum(v.spectrum)
         if mode < spectrum.density.shape[1]:
             power = table_power(spectrum.frequency, spectrum.part(v.part)[:, mode], n, dt)
-    else:
-        for i, peak in enumerate(v.peaks):
-            if peak.damping > 0 and i not in without:
-                power = power + _resonance(peak, mode, n, dt)
-    return _below_cutoff(scenario, power, n)
+    power = _below_cutoff(scenario, power, n)
+    if width > 0:
+        power = widened(power, width * dt)
+        power[bin_frequencies(n, dt) > v.cutoff] = 0.0
+    return power
 
 
-def _resonance(peak: Peak, mode: int, n: int, dt: float) -> Array:
-    """Variance [um^2] of one damped peak in each DFT bin."""
-    return peak_rms(peak.rms, mode) ** 2 * resonance_power(peak.frequency, peak.damping, bin_edges(n, dt))
+def _resonance(scenario: Scenario, peak: Peak, mode: int, n: int, width: float) -> Array:
+    """Variance [um^2] of one damped peak in each DFT bin, those above the cut-off left out."""
+    edges = bin_edges(n, scenario.dt)
+    used = min(int(np.searchsorted(edges, scenario.vibration.cutoff)) + 2, edges.size)
+    damping = damping_at_least(width, peak.frequency, peak.damping)
+    power = np.zeros(edges.size - 1)
+    power[: used - 1] = peak_rms(peak.rms, mode) ** 2 * resonance_power(peak.frequency, damping, edges[:used])
+    return power
 
 
 def _below_cutoff(scenario: Scenario, power: Array, n: int) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from time import perf_counter
 
 from wfsobs.arrays import Array
-from wfsobs.bound import bound_scores
+from wfsobs.bound import Bound, bound_scores, bounds
 from wfsobs.gaps import bridged
 from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
@@ -63,8 +63,8 @@ def observe(
     failures: list[Failure] = []
     for item in each_estimate(record, scenario, watch, observers):
         (failures if isinstance(item, Failure) else estimates).append(item)  # type: ignore[arg-type]
-    bounds = bound_scores(scenario, record) if simulated else []
-    return collect(scenario, record, estimates, failures, watch, bounds)
+    least = bounds(scenario, record) if simulated else []
+    return collect(scenario, record, estimates, failures, watch, least)
 
 
 def as_stated(record: Record, scenario: Scenario) -> Scenario:
@@ -79,7 +79,7 @@ def as_stated(record: Record, scenario: Scenario) -> Scenario:
 
 def collect(
     scenario: Scenario, record: Record, estimates: Sequence[Estimate], failures: Sequence[Failure], watch: Watch = QUIET,
-    bounds: Sequence[Score] = (),
+    least: Sequence[Bound] = (),
 ) -> Result:
     """A Result with its scores, everything in the order of the registry, the bounds last. Raises Cancelled."""
     order = {name: i for i, name in enumerate(OBSERVERS)}
@@ -90,7 +90,8 @@ def collect(
     scores = (supervised_scores if known else unsupervised_scores)(record, ordered, scenario.run.warm_up, names)
     if known:
         scores.sort(key=lambda s: (order[s.observer], s.target))
-    return Result(scenario, record, tuple(ordered), (*scores, *bounds), tuple(sorted(failures, key=lambda f: order[f.observer])))
+    scores += bound_scores(least, record, scores, scenario.run.warm_up)
+    return Result(scenario, record, tuple(ordered), tuple(scores), tuple(sorted(failures, key=lambda f: order[f.observer])))
 
 
 def each_estimate(

@@ -47,10 +47,18 @@ MUSE_LAYERS = (
 )
 
 
+def _system() -> Scenario:
+    """The paper's system, its records made as those of the other presets are."""
+    s = paper()
+    s.update({"vibration": {"synthesis": "gaussian"}})
+    return s
+
+
 def paper() -> Scenario:
     """The paper's system, with every number that it publishes.
 
-    What it leaves open, and what is taken here:
+    Records are made as the paper makes them, by an inverse DFT of their own length with random phases (`vibration.synthesis`);
+    no other preset does. What it leaves open, and what is taken here:
 
     - vibration: the peaks of the MAVIS spectrum of UT4, 15.5 nm rms on tip (above);
     - turbulence 0.5 um rms per mode, the size of r0 = 0.157 m, L0 = 25 m on 8 m (0.529 um);
@@ -64,7 +72,7 @@ def paper() -> Scenario:
     """
     s = Scenario()
     s.update({
-        "vibration": {"peaks": [
+        "vibration": {"synthesis": "random-phase", "peaks": [
             {"frequency": f, "damping": xi, "rms": [tip, tilt]} for f, xi, tip, tilt in MAVIS_PEAKS
         ]},
         "kalman": {"process_noise": "manual", "turbulence_rms": 0.5, "vibration_rms": 0.06},
@@ -105,7 +113,7 @@ def strong_turbulence() -> Scenario:
     `gpr_offline.inputs_filter` = high-pass the offline one comes back; the online one does not, since what the causal
     Butterworth bank gives it as targets has turbulence in it, too (docs/reproduction.md).
     """
-    s = paper()
+    s = _system()
     s.update({"turbulence": {"rms": 2.0}, "kalman": {"process_noise": "matched"}})
     return s
 
@@ -160,7 +168,7 @@ def peak_jump() -> Scenario:
     - one Butterworth band from 40 to 60 Hz, of equal phase at the old frequency and the new one: the online GPR learns from that
       band, and what jumps out of it is lost to it (docs/events.md).
     """
-    s = paper()
+    s = _system()
     s.update({
         "vibration": {"peaks": [
             {"frequency": 17.25, "damping": 0.013, "rms": [0.003, 0.003]},
@@ -197,7 +205,7 @@ def laser_dropout() -> Scenario:
 
     With one LGS its noise and its slow error are no longer halved; without any there are NGS frames alone.
     """
-    s = paper()
+    s = _system()
     s.update({
         "kalman": {"process_noise": "matched"}, "run": {"duration": 20.0}, "events": [
             {"kind": "laser", "start": 6.0, "duration": 4.0, "lasers": 1},
@@ -208,7 +216,7 @@ def laser_dropout() -> Scenario:
 
 def lost_frames() -> Scenario:
     """The paper's system; it loses half the LGS frames for 5 s, later half the NGS frames."""
-    s = paper()
+    s = _system()
     s.update({
         "kalman": {"process_noise": "matched"}, "run": {"duration": 20.0}, "events": [
             {"kind": "frames", "start": 5.0, "duration": 5.0, "sensor": "lgs", "share": 0.5},

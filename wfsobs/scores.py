@@ -33,6 +33,7 @@ class Score:
     estimate is late, None where it is constant; seconds_per_step: computing time [s] per step and mode.
     start, stop : the stretch [s] that was scored, None for a mean over all records
     apart : whether the stretch is the observer's own, not that of the other rows, so that it cannot be compared with them
+    interval [um]: of the bound, where the rms of an optimal observer lies in 95 % of records.
     """
 
     observer: str
@@ -46,6 +47,7 @@ class Score:
     start: float | None = None
     stop: float | None = None
     apart: bool = False
+    interval: tuple[float, float] | None = None
 
 
 def common_samples(known: Sequence[Array]) -> list[tuple[Array, bool]]:

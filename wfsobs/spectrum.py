@@ -1,4 +1,4 @@
-"""Spectra and signals: damped lines, tables, and the inverse DFT with random phases (paper, Algorithm 4).
+"""Spectra and signals: damped lines, tables, and the inverse DFT with Gaussian amplitudes or random phases (paper, Algorithm 4).
 
 All spectra are one-sided power spectral densities: their integral over positive frequencies is the
 variance.
@@ -7,7 +7,7 @@ variance.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from wfsobs.arrays import Array
 
@@ -66,11 +66,32 @@ def random_phase_signal(power: ArrayLike, n: int, rng: np.random.Generator) -> A
     Algorithm 4, which prints S itself as amplitude and drops the imaginary unit). The bins at zero
     and at Nyquist stay empty: a phase means nothing there.
     """
+    power = _one_per_bin(power, n)
+    phases = 2.0 * np.pi * rng.random(power.size)
+    return _of_bins(np.sqrt(2.0 * power), np.exp(1j * phases), n)
+
+
+def gaussian_signal(power: ArrayLike, n: int, rng: np.random.Generator) -> Array:
+    """One period of `n` samples of the stationary Gaussian process with the variance `power` [unit^2] in each DFT bin, (n,).
+
+    Cosine and sine of a bin have independent normal amplitudes (Shinozuka and Deodatis, Appl. Mech. Rev. 44, 1991). The
+    process is periodic; a piece of it that is short beside the period is not.
+    """
+    power = _one_per_bin(power, n)
+    a, b = rng.standard_normal((2, power.size))
+    return _of_bins(np.sqrt(power), a + 1j * b, n)
+
+
+def _one_per_bin(power: ArrayLike, n: int) -> Array:
     power = np.asarray(power, dtype=float)
     if power.shape != (n // 2 + 1,):
         raise ValueError(f"power must have one entry per DFT bin, {n // 2 + 1}, not {power.shape}")
-    phases = 2.0 * np.pi * rng.random(power.size)
-    bins = 0.5 * n * np.sqrt(2.0 * power) * np.exp(1j * phases)
+    return power
+
+
+def _of_bins(amplitude: Array, turn: NDArray[np.complex128], n: int) -> Array:
+    """The signal of `n` samples whose bins have these amplitudes and factors, zero and Nyquist left out."""
+    bins = 0.5 * n * amplitude * turn
     bins[0] = 0.0
     if n % 2 == 0:
         bins[-1] = 0.0

@@ -18,7 +18,7 @@ TIME = "time_per_step_us"
 """Computing time per step and mode [us]: in the table, but not part of the result, which the seed fixes."""
 
 
-NOT_OBSERVERS = {LOOP: "Recorded loop", BOUND: "Bound, LGS alone"}
+NOT_OBSERVERS = {LOOP: "Recorded loop", BOUND: "Bound, mean of the LGS"}
 """Labels of rows that stand among the observers' and are none."""
 
 
@@ -28,7 +28,7 @@ def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
         {
             "observer": s.observer, "target": s.target, "mode": s.mode, "rms_um": s.rms, "truth_rms_um": s.truth_rms,
             "normalised_rms": s.normalised_rms, "lag_s": s.lag, "start_s": s.start, "stop_s": s.stop, "apart": s.apart,
-            "needs": needs_of(s.observer), "seed": seed,
+            "needs": needs_of(s.observer), "interval_um": None if s.interval is None else list(s.interval), "seed": seed,
             TIME: None if s.observer in NOT_OBSERVERS else s.seconds_per_step * 1e6,
         }
         for s in scores
@@ -37,14 +37,17 @@ def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
 
 def score_table(rows: Sequence[Row]) -> Table:
     """The RMS table, of errors or, without truth, of predictions; over several seeds the medians, with the spread (smallest
-    to largest) of the error. Its caption says which samples were scored."""
+    to largest) of the error. The bound has the interval in which an optimal observer's error lies in 95 % of records. Its
+    caption says which samples were scored."""
     several = len({r["seed"] for r in rows}) > 1
     unknown = any(r["target"] == RESIDUAL for r in rows)
     title, base = ("One-step prediction error of z, and residual,", "z") if unknown else ("RMS error", "truth")
     table = Table(title=f"{title} after warm-up" + (", median over seeds" if several else ""), caption=_caption(rows))
     for name in ("Target", "Mode", "Observer", "Needs"):
         table.add_column(name, no_wrap=True)
-    for name in ("error, nm", *(("spread, nm",) if several else ()), f"{base}, nm", f"error / {base}", "lag, ms", "us / step"):
+    bounded = ("95 %, nm",) if any(r["interval_um"] for r in rows) else ()
+    spread = ("spread, nm",) if several else ()
+    for name in ("error, nm", *spread, *bounded, f"{base}, nm", f"error / {base}", "lag, ms", "us / step"):
         table.add_column(name, justify="right", no_wrap=True)
     last = None
     for target, mode, observer in sorted({(r["target"], r["mode"], r["observer"]) for r in rows}, key=_order(rows)):
@@ -57,10 +60,16 @@ def score_table(rows: Sequence[Row]) -> Table:
             target, mode, label_of(observer) + (" (looks ahead)" if looks_ahead(observer) else "") + _own(same),
             needs_of(observer), f"{median(errors):.2f}",
             *((f"{min(errors):.2f} - {max(errors):.2f}",) if several else ()),
+            *((interval_text(same[0]["interval_um"], 1e3),) if bounded else ()),
             f"{median(r['truth_rms_um'] for r in same) * 1e3:.2f}", _number(same, "normalised_rms", 1.0, 3),
             _number(same, "lag_s", 1e3, 2), _number(same, TIME, 1.0, 2),
         )
     return table
+
+
+def interval_text(interval: Sequence[float] | None, scale: float) -> str:
+    """Where the rms of an optimal observer lies in 95 % of records, "low - high"; "-" for rows that have none."""
+    return "-" if interval is None else f"{interval[0] * scale:.2f} - {interval[1] * scale:.2f}"
 
 
 def label_of(observer: str) -> str:

@@ -1,8 +1,8 @@
 """The spectra that a scenario really has, mode by mode, from its settings alone.
 
-How wide lines are decides how well they can be told ahead: a pure line, after long enough, without any error. So the width
-is stated: lines of no width of their own (pure lines, tables) and those narrower are taken to be `line_width` wide at half
-maximum, a sixteenth of what a record could show; narrower still, and the bound would be that of a longer record.
+How wide lines are decides how well they can be told ahead. Damped ones have the width that they have in the record
+(`synthesis`); pure lines are told ahead without error after long enough (`TrueSpectra.without_lines`). What a controller
+leaves of those is asked of lines `line_width` wide at half maximum.
 """
 
 from __future__ import annotations
@@ -17,18 +17,13 @@ from wfsobs import atmosphere
 from wfsobs.ar2 import Ar2
 from wfsobs.ar3 import Ar3
 from wfsobs.arrays import Array
-from wfsobs.disturbance import peak_rms, vibration_power
+from wfsobs.disturbance import peak_rms, pure_lines, vibration_power
 from wfsobs.flow_spectra import flow_spectra
 from wfsobs.lgs import lgs_noise_rms, lgs_weights, low_frequency_process
 from wfsobs.scenario import Scenario
-from wfsobs.turbulence import mode_power, processes, third_order_process, turbulence_process
+from wfsobs.synthesis import damping_at_least, line_width, widened
+from wfsobs.turbulence import processes, table_variance, third_order_process, turbulence_process
 from wfsobs.wiener import Complex
-
-LONGEST = 30.0
-"""Longest record whose resolution counts [s]."""
-
-SHARPER = 16
-"""Lines over the width that a record can show."""
 
 DECAYED = 2.5
 """How far correlations have decayed after half the DFT, as an exponent; a line that turns round by then is nothing new."""
@@ -49,11 +44,16 @@ class TrueSpectra:
 
     measured : S_z of the pseudo-open-loop LGS measurement, noise and all
     signal   : target -> S_s;  shared : target -> spectrum between s[k] and what z[k + 1] has of it
+    lines    : of the pure lines in the vibration, `line_width` wide; gain : what the measurement has of them
+    pure     : (frequency [cycles per step], variance [um^2]) of each
     """
 
     measured: Array
     signal: dict[str, Array]
     shared: dict[str, Complex | Array]
+    lines: Array | None = None
+    gain: float = 1.0
+    pure: tuple[tuple[float, float], ...] = ()
 
     @property
     def total(self) -> tuple[Array, Complex | Array]:
@@ -61,26 +61,42 @@ class TrueSpectra:
         return sum(self.signal.values(), np.zeros(1)), sum(self.shared.values(), np.zeros(1))
 
 
+    @property
+    def without_lines(self) -> TrueSpectra:
+        """What is left to be estimated once the pure lines are known."""
+        if self.lines is None:
+            return self
+        return TrueSpectra(
+            self.measured - self.gain**2 * self.lines,
+            self.signal | {"vibration": self.signal["vibration"] - self.lines},
+            self.shared | {"vibration": self.shared["vibration"] - self.gain * self.lines})
+
+
+    def line_covariance(self, n: int) -> Array:
+        """Autocovariance of the pure lines at the lags 0 to n - 1, (n,)."""
+        lag = np.arange(n)
+        return sum((variance * np.cos(2.0 * pi * f * lag) for f, variance in self.pure), np.zeros(n))
+
+
 def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
     """The spectra of one mode, from the settings alone."""
     n = n_frequencies(scenario)
     turbulence, seen, shared = TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n)
     vibration, gain = _vibration(scenario, mode, n), lgs_weights(scenario)[mode, :, mode].sum()
+    lines = _pure_lines(scenario, mode, n)
+    if lines is not None:
+        vibration = vibration + lines
     return TrueSpectra(
         measured=seen + gain**2 * vibration + max(lgs_noise_rms(scenario, mode), FLOOR) ** 2,
         signal={"turbulence": turbulence, "vibration": vibration},
         shared={"turbulence": shared, "vibration": gain * vibration},
+        lines=lines, gain=float(gain), pure=tuple((f * scenario.dt, variance) for f, variance in pure_lines(scenario, mode)),
     )
 
 
 def seen_turbulence(scenario: Scenario, mode: int) -> Array:
     """S of what the LGS together see of the turbulence, on the frequencies of `true_spectra`."""
     return TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n_frequencies(scenario))[1]
-
-
-def line_width(scenario: Scenario) -> float:
-    """The least width of a line at half maximum [Hz]."""
-    return 1.0 / (SHARPER * min(max(scenario.run.duration, 1.0), LONGEST))
 
 
 def n_frequencies(scenario: Scenario) -> int:
@@ -155,9 +171,7 @@ def _no_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
 
 
 def _table(scenario: Scenario, mode: int, n: int) -> Looks:
-    own = 0.5 * n * mode_power(scenario.turbulence.psd, scenario, mode, n)
-    own[0] = 0.0
-    return _through_lgs(scenario, mode, widened(own, line_width(scenario) * scenario.dt))
+    return _through_lgs(scenario, mode, 0.5 * n * table_variance(scenario, mode, n))
 
 
 def _frozen_flow(scenario: Scenario, mode: int, n: int) -> Looks:
@@ -172,20 +186,18 @@ def _vibration(scenario: Scenario, mode: int, n: int) -> Array:
         out = np.zeros(n // 2 + 1)
         for peak in v.peaks:
             omega = 2.0 * pi * peak.frequency
-            damping = min(max(peak.damping, pi * line_width(scenario) / omega), 1.0)
+            damping = damping_at_least(line_width(scenario), peak.frequency, peak.damping)
             out += _density(Ar2(omega, damping, peak_rms(peak.rms, mode), dt), n)
         return out
-    spectrum = 0.5 * n * vibration_power(scenario, mode, n)
-    if v.source == "peaks" and all(peak.damping > 0 for peak in v.peaks):
-        return spectrum
-    return widened(spectrum, line_width(scenario) * dt)
+    return 0.5 * n * vibration_power(scenario, mode, n)
 
 
-def widened(spectrum: Array, width: float) -> Array:
-    """A spectrum whose lines are `width` wider [cycles per sample]: correlations decay as exp(-pi width |lag|)."""
-    n = 2 * (spectrum.size - 1)
-    lag = np.minimum(np.arange(n), n - np.arange(n))
-    return np.maximum(np.fft.rfft(np.fft.irfft(spectrum, n) * np.exp(-pi * width * lag)).real, 0.0)
+def _pure_lines(scenario: Scenario, mode: int, n: int) -> Array | None:
+    """The spectrum of the pure lines; None where there is none."""
+    power = np.zeros(n // 2 + 1)
+    for frequency, variance in pure_lines(scenario, mode):
+        power[min(round(frequency * n * scenario.dt), n // 2)] += variance
+    return widened(0.5 * n * power, line_width(scenario) * scenario.dt) if power.any() else None
 
 
 TURBULENCE_SPECTRA: dict[str, Callable[[Scenario, int, int], Looks]] = {

@@ -19,8 +19,9 @@ from wfsobs.frozen_flow import frozen_flow
 from wfsobs.groups.atmosphere import PsdTable
 from wfsobs.scenario import Scenario
 from wfsobs.sensors import sensor
-from wfsobs.spectrum import random_phase_signal, table_power
+from wfsobs.spectrum import gaussian_signal, table_power
 from wfsobs.statespace import sampled
+from wfsobs.synthesis import line_width, period_steps, widened
 from wfsobs.watch import Watch
 
 
@@ -80,7 +81,7 @@ def turbulence_rms(scenario: Scenario, mode: int) -> float:
     if t.source == "processes":
         return hypot(*(p.rms for p in processes(scenario, mode, scenario.dt)))
     if t.source == "psd":
-        return float(np.sqrt(mode_power(t.psd, scenario, mode, scenario.n_steps)[1:].sum()))
+        return float(np.sqrt(table_variance(scenario, mode, period_steps(scenario, scenario.n_steps)).sum()))
     if t.source == "frozen-flow":
         return float(np.sqrt(atmosphere.frozen_flow_variance(scenario, mode)))
     return t.rms * atmosphere.relative_rms(scenario, mode)
@@ -90,6 +91,13 @@ def mode_power(table: PsdTable, scenario: Scenario, mode: int, n: int) -> Array:
     """Variance [um^2] that a table gives one mode in each DFT bin of `n` steps; modes that it does not hold have none."""
     density = getattr(table, scenario.modes[mode].name, None)
     return np.zeros(n // 2 + 1) if density is None else table_power(table.frequency, density, n, scenario.dt)
+
+
+def table_variance(scenario: Scenario, mode: int, n: int) -> Array:
+    """Variance [um^2] of the turbulence of source psd in each DFT bin of `n` steps, an even number."""
+    power = mode_power(scenario.turbulence.psd, scenario, mode, n)
+    power[0] = 0.0
+    return widened(power, line_width(scenario) * scenario.dt)
 
 
 def columns(source: ModeSource, scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch) -> Array:
@@ -126,8 +134,9 @@ def _processes(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) 
 
 
 def _psd(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
-    """Inverse DFT of the table, all of it up to half the rate."""
-    return random_phase_signal(mode_power(scenario.turbulence.psd, scenario, mode, n), n, rng)
+    """A Gaussian process with the spectrum of the table, all of it up to half the rate."""
+    period = period_steps(scenario, n)
+    return gaussian_signal(table_variance(scenario, mode, period), period, rng)[:n]
 
 
 def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Watch) -> Turbulence:

@@ -53,14 +53,52 @@ def factorise(spectrum: Array) -> Whitener:
     return Whitener(spectrum, np.exp(np.fft.rfft(causal)), float(np.exp(cepstrum[0])))
 
 
-def causal_error(target: Array, cross: Complex, whitener: Whitener) -> float:
-    """Variance of the least error of s[k] from z[k], z[k-1], ...
+def error_spectrum(target: Array, cross: Complex, whitener: Whitener) -> Array:
+    """The spectrum of the least error of s[k] from z[k], z[k-1], ..., (n // 2 + 1,).
 
     target : S_s; cross : S_sz, the transform over n of E s[k] z[k-n]; both (n // 2 + 1,)
     """
     g = np.fft.irfft(cross / whitener.H.conj(), whitener.n)
-    anticausal = float(np.sum(g[whitener.n // 2 :] ** 2)) / whitener.innovation_variance
-    return circle_mean(np.maximum(target - np.abs(cross) ** 2 / whitener.spectrum, 0.0)) + anticausal
+    g[: whitener.n // 2] = 0.0
+    anticausal = np.abs(np.fft.rfft(g)) ** 2 / whitener.innovation_variance
+    return np.maximum(target - np.abs(cross) ** 2 / whitener.spectrum, 0.0) + anticausal
+
+
+def causal_error(target: Array, cross: Complex, whitener: Whitener) -> float:
+    """Variance of that error."""
+    return circle_mean(error_spectrum(target, cross, whitener))
+
+
+def explained(measured: Array, cross: Array) -> Array:
+    """What n = 1, 2, ... measurements z[k], ..., z[k-n+1] explain of the variance of targets s[k], (n_targets, n).
+
+    measured : autocovariance of z at the lags 0 ... n - 1, (n,); cross : E s[k] z[k-j], j = 0 ... n - 1, (n_targets, n)
+
+    Levinson's recursion: the errors of predicting each earlier measurement from the later ones are orthogonal.
+    """
+    n = measured.size
+    backwards = np.ascontiguousarray(cross[:, ::-1])
+    predictor, error = np.zeros(n), float(measured[0])
+    predictor[0] = 1.0
+    out = np.empty_like(backwards)
+    for k in range(n):
+        if k:
+            reflection = float(predictor[:k] @ measured[k:0:-1]) / error
+            predictor[1 : k + 1] -= reflection * predictor[k - 1 :: -1] if k > 1 else reflection
+            error *= 1.0 - reflection**2
+        out[:, k] = (backwards[:, n - 1 - k :] @ predictor[: k + 1]) ** 2 / error
+    return np.cumsum(out, axis=1)
+
+
+def freedom(covariance: Array, n_steps: int) -> float:
+    """Degrees of freedom of the mean square of `n_steps` samples of a Gaussian process with the autocovariance r at the lags
+    0, 1, ...: those of the chi-square distribution with its mean and variance (Satterthwaite, Biometrics Bulletin 2, 1946).
+
+    The mean square has the variance (2 / N) sum (1 - |k| / N) r[k]^2.
+    """
+    r = covariance[:n_steps]
+    weight = 1.0 - np.arange(r.size) / n_steps
+    return float(n_steps * r[0] ** 2 / (2.0 * np.sum(weight * r**2) - r[0] ** 2))
 
 
 def circle_mean(spectrum: Array) -> float:

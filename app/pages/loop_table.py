@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 
 from wfsobs.app.display import NOTHING, Display, number, per_micrometre
@@ -9,7 +10,7 @@ from wfsobs.app.loop_work import LoopShown
 from wfsobs.app.style import LOOKS, swatch
 from wfsobs.app.views.table import BEST
 from wfsobs.bound import BOUND
-from wfsobs.control.tables import Row, label
+from wfsobs.control.tables import LIMITED, NOT_APPLICABLE, Row, label
 
 UNSTABLE = '<span class="tag above">unstable</span>'
 
@@ -34,9 +35,19 @@ def table_html(shown: LoopShown, display: Display) -> str:
     best = next((r["controller"] for r in rows if r["controller"] != BOUND and r["residual_rms_nm"] is not None), None)
     scale = 1e-3 * per_micrometre(display.unit, shown.result.scenario.telescope.diameter)
     body = "".join(_row(r, display, scale, r["controller"] == best) for r in rows)
-    notes = {r["note"]: label(r["controller"]) for r in reversed(rows) if r["note"]}
+    notes = {r["note"]: label(r["controller"]) for r in reversed(rows) if r["note"] and not r["limited"]}
     failures = "".join(f'<p class="failure">{escape(name)}: {escape(note)}</p>' for note, name in notes.items())
-    return _table("Controllers", columns, body) + failures
+    return _table("Controllers", columns, body) + limits_note(rows) + failures
+
+
+def limits_note(rows: Sequence[Row]) -> str:
+    """Why some of the rows have no theory and no margins; nothing where no limit of the mirror acts."""
+    return f"<p>{NOT_APPLICABLE}: {LIMITED}</p>" if any(r["limited"] for r in rows) else ""
+
+
+def unlimited(row: Row, value: str) -> str:
+    """What is shown of the linear loop: not applicable where a limit of the mirror acts."""
+    return f'<span title="{LIMITED}">{NOT_APPLICABLE}</span>' if row["limited"] else value
 
 
 def _row(row: Row, display: Display, scale: float, best: bool) -> str:
@@ -45,7 +56,7 @@ def _row(row: Row, display: Display, scale: float, best: bool) -> str:
 
     residual = UNSTABLE if row["stable"] is False else scaled("residual_rms_nm")
     cells = [
-        (BEST if best else "") + residual, scaled("predicted_rms_nm"),
+        (BEST if best else "") + residual, unlimited(row, scaled("predicted_rms_nm")),
         NOTHING if row["strehl"] is None else f"{row['strehl']:.4f}", number(row["gain"]),
         NOTHING if row["limited"] is None else number(100.0 * row["limited"], 2), escape(row["needs"]),
     ]

@@ -8,13 +8,13 @@ from itertools import groupby
 from wfsobs.app.display import NOTHING, number
 from wfsobs.app.report.data import Report, State
 from wfsobs.app.report.text import state_name
-from wfsobs.control.tables import label
+from wfsobs.control.tables import LIMITED, NOT_APPLICABLE, label
 from wfsobs.tables import Row
 
 INTRO = (
     "The same disturbance and noise under every controller, with the delay and the limits of the mirror that the settings under "
     "<code>control</code> say. Strehl counts the simulated modes alone; theory is by the true spectra, for an endless record. "
-    "Multi-rate loops have no frequency response, and so no margins.")
+    "Multi-rate loops have no frequency response, and so no margins. " + f"{NOT_APPLICABLE}: {LIMITED}.")
 
 
 def loop_section(report: Report) -> str:
@@ -29,7 +29,7 @@ def loop_section(report: Report) -> str:
 def _table(state: State, name: str) -> str:
     columns = (
         "Controller", "Residual [nm]", "Residual [mas]", f"Strehl at {state.scenario.control.wavelength:g} µm", "Theory [nm]",
-        "Gain", "Gain margin [dB]", "Phase margin [°]", "Delay margin [ms]", "Needs")
+        "Gain", "Gain margin [dB]", "Phase margin [°]", "Delay margin [ms]", "At a limit [%]", "Needs")
     head = "".join(f"<th scope=col>{column}</th>" for column in columns)
     bodies = "".join(_body(mode, list(rows), len(columns)) for mode, rows in groupby(
         sorted(state.loop, key=_order(state)), key=lambda row: row["mode"]))
@@ -53,6 +53,8 @@ def _row(row: Row) -> str:
     residual = '<span class="tag above">unstable</span>' if row["stable"] is False else number(row["residual_rms_nm"])
     strehl = NOTHING if row["strehl"] is None else f"{row['strehl']:.4f}"
     keys = ("predicted_rms_nm", "gain", "gain_margin_db", "phase_margin_deg", "delay_margin_ms")
-    cells = [residual, number(row["residual_rms_mas"]), strehl, *(number(row[key]) for key in keys), escape(row["needs"])]
+    known = {key: NOT_APPLICABLE if row["limited"] and key != "gain" else number(row[key]) for key in keys}
+    limited = NOTHING if row["limited"] is None else number(100.0 * row["limited"], 2)
+    cells = [residual, number(row["residual_rms_mas"]), strehl, *known.values(), limited, escape(row["needs"])]
     values = "".join(f"<td>{cell}</td>" for cell in cells)
     return f'<tr data-controller="{row["controller"]}"><th scope=row>{escape(label(row["controller"]))}</th>{values}</tr>'

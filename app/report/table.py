@@ -6,7 +6,7 @@ import math
 from html import escape
 from itertools import groupby
 
-from wfsobs.app.display import NOTHING, number, per_micrometre
+from wfsobs.app.display import IN_MOST, NOTHING, number, per_micrometre
 from wfsobs.app.report.data import State
 from wfsobs.scores import RESIDUAL
 from wfsobs.tables import TIME, Row, competes, label_of, looks_ahead, own_stretch, stretch_of
@@ -67,7 +67,7 @@ def _row(state: State, row: Row, best: bool) -> str:
     label = escape(label_of(name)) + (" <sup>looks ahead</sup>" if looks_ahead(name) else "") + apart(own_stretch(row))
     lag = NOTHING if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−")
     cells = [
-        f"<td>{BEST if best else ''}{length(row['rms_um'])}</td>",
+        f"<td>{BEST if best else ''}{length(row['rms_um'])}{_interval(row['interval_um'])}</td>",
         f"<td>{length(row['truth_rms_um'])}</td>",
         f"<td>{ABOVE if (row['normalised_rms'] or 0.0) > 1.0 else ''}{number(row['normalised_rms'])}</td>",
         f"<td class=words>{row['needs']}</td>",
@@ -80,6 +80,13 @@ def _row(state: State, row: Row, best: bool) -> str:
 def apart(stretch: str) -> str:
     """What is beside the name of an observer that was scored on samples of its own."""
     return f" <sup>{stretch}</sup>" if stretch else ""
+
+
+def _interval(interval: list[float] | None) -> str:
+    if interval is None:
+        return ""
+    low, high = map(length, interval)
+    return f' <span class="range" title="{IN_MOST}">{low} – {high}</span>'
 
 
 def length(um: float) -> str:

@@ -112,8 +112,9 @@ def meaning_section(report: Report) -> str:
         "<b>Looks ahead</b>: the open-loop Butterworth runs forward and backward over measurements with the mirror at rest. It "
         "uses later samples, so no controller can have it, and it is never marked best. All others are causal: an estimate at "
         "a step uses nothing measured after it.",
-        "<b>Bound, LGS alone</b>: the least error that any causal observer of the LGS could have with the true spectra of the "
-        "scenario, the mean over all records; no observer, and never marked best." if _bounded(report) else "",
+        "<b>Bound, mean of the LGS</b>: the least error that any causal observer of the mean of the LGS could have with the true "
+        "spectra of the scenario, after an endless record; no observer, and never marked best. Beside it where the error of an "
+        "optimal observer that starts with the record lies in 95 % of records." if _bounded(report) else "",
         "<b>Lag</b>: the delay at which an estimate is most like the truth; positive is late. Of signals with a strong line it "
         "can be negative without any look ahead.",
         "<b>Time per step</b>: measured once on the machine named below, per mode; the one column that is not reproducible.",

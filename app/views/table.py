@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from html import escape
 
 import panel as pn
 
-from wfsobs.app.display import NOTHING, Display, number, per_micrometre
+from wfsobs.app.display import IN_MOST, NOTHING, Display, number, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import Shown
@@ -121,7 +122,7 @@ class Table:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             is_best = score.rms == best and competes(name, score.apart)
             cells = [
-                (BEST if is_best else "") + number(score.rms * scale), *pinned,
+                (BEST if is_best else "") + number(score.rms * scale) + interval_html(score.interval, scale), *pinned,
                 number(score.truth_rms * scale),
                 (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
                 needs_of(name),
@@ -158,6 +159,14 @@ def _scored(scores: list[Score]) -> str:
 def _own(score: Score | None) -> str:
     """What is beside the name of an observer that was scored on samples of its own."""
     return f" <sup>{own_stretch(rows([score], None)[0])}</sup>" if score and score.apart else ""
+
+
+def interval_html(interval: Sequence[float] | None, scale: float) -> str:
+    """The interval of a bound, behind it."""
+    if interval is None:
+        return ""
+    low, high = (number(x * scale) for x in interval)
+    return f' <span class="range" title="{IN_MOST}">{low} – {high}</span>'
 
 
 def _times(score: Score, dt: float) -> list[str]:

@@ -13,7 +13,7 @@ from wfsobs.bound import BOUND
 from wfsobs.cli import main
 from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.tables import label
+from wfsobs.control.tables import LIMITED, NOT_APPLICABLE, label
 from wfsobs.loop import simulate
 
 QUICK = ["--set", "run.duration=2", "--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=50"]
@@ -73,6 +73,27 @@ def test_the_table_names_every_controller_and_what_it_needs() -> None:
     assert "true spectra, training data" not in call(*QUICK, "--set", "control.integrator=manual").stdout
     spread = call(*QUICK, "--controller", "none", "--seeds", "2").stdout
     assert "spread, nm" in spread and "median over seeds" in spread
+
+
+def test_where_a_limit_acts_there_is_neither_theory_nor_margins() -> None:
+    """A stroke far below the turbulence of 500 nm; one that is never reached changes nothing but the settings."""
+    one = [*QUICK, "--controller", "integrator"]
+    said = [json.loads(call(*one, "--set", f"control.stroke={stroke}", "--json").stdout) for stroke in (0, 100, 0.1)]
+    free, far, near = ([r for r in rows if r["controller"] == "integrator"] for rows in said)
+    assert free == far
+    of_linear = ("predicted_rms_nm", "gain_margin_db", "phase_margin_deg", "delay_margin_ms")
+    for row, limited in zip(free, near, strict=True):
+        assert row["limited"] == 0.0 and row["note"] == "" and all(row[key] is not None for key in of_linear)
+        assert limited["limited"] > 0.3 and limited["note"] == LIMITED and limited["gain"] == row["gain"]
+        assert all(limited[key] is None for key in of_linear)
+        assert limited["residual_rms_nm"] > row["residual_rms_nm"]
+    table = call(*one, "--set", "control.stroke=0.1").stdout
+    cells = [[c.strip() for c in line.strip("│").split("│")] for line in table.splitlines() if label("integrator") in line]
+    for row, printed in zip(near, sorted(cells, key=lambda c: c[0]), strict=True):  # tilt, tip
+        assert printed.count(NOT_APPLICABLE) == 3
+        assert printed[-1] in {f"{100 * r['limited']:.2f}" for r in near} and row["gain"]
+    assert "limit of the mirror acts" in " ".join(table.split())
+    assert NOT_APPLICABLE not in call(*one).stdout
 
 
 def test_higher_modes_have_no_angle() -> None:

@@ -7,12 +7,13 @@ from datetime import UTC, datetime
 
 import pytest
 
+from wfsobs.app.display import number
 from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.packing import packed, unpacked
 from wfsobs.app.report.page import page
 from wfsobs.bound import BOUND
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.tables import label
+from wfsobs.control.tables import LIMITED, NOT_APPLICABLE, label
 from wfsobs.pipeline import Result
 from wfsobs.scenario import Scenario
 
@@ -46,6 +47,17 @@ def test_an_unstable_loop_says_so(result: Result) -> None:
     changed = replace(result, scenario=result.scenario.replace({"control.integrator": "manual", "control.gain": 1.5}))
     text = page(Report("paper", changed.scenario, (), (state_of(changed),)), MADE)
     assert text.count("unstable</span>") == 2
+
+
+def test_a_limited_loop_has_its_share_and_no_theory(result: Result, report: Report) -> None:
+    changed = replace(result, scenario=result.scenario.replace({"control.stroke": 0.05}))
+    state = state_of(changed)
+    text = page(Report("paper", changed.scenario, (), (state,)), MADE)
+    section = text[text.index("<h2>Closed loop</h2>") : text.index("<h2>Scenario</h2>")]
+    limited = [row for row in state.loop if row["limited"]]
+    assert limited and not any(row["limited"] for row in report.states[0].loop)
+    assert section.count(f"<td>{NOT_APPLICABLE}</td>") == 4 * len(limited) and LIMITED in section
+    assert all(f"<td>{number(100.0 * row['limited'], 2)}</td>" in section for row in limited)
 
 
 def test_a_record_without_a_truth_has_no_such_section(result: Result, short: Scenario) -> None:

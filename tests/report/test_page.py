@@ -85,8 +85,11 @@ def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any)
         for row in state.rows:
             name = label_of(row["observer"]) + (" looks ahead" if looks_ahead(row["observer"]) else "")
             lag = "–" if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−")
+            spread = "" if row["interval_um"] is None else " " + " – ".join(number(1e3 * x) for x in row["interval_um"])
+            assert (spread == "") == (row["observer"] != "bound")
             want[f"{row['target'].capitalize()}, {row['mode']}", name] = [
-                number(1e3 * row["rms_um"]), number(1e3 * row["truth_rms_um"]), number(row["normalised_rms"]), row["needs"], lag,
+                number(1e3 * row["rms_um"]) + spread, number(1e3 * row["truth_rms_um"]), number(row["normalised_rms"]),
+                row["needs"], lag,
                 number(row[TIME]), "–" if row[TIME] is None else number(row[TIME] / 1000.0, 2)]
         plain = {key: [re.sub(r"^(best|above truth) ", "", cell) for cell in cells] for key, cells in got.items()}
         assert plain == want

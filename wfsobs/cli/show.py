@@ -35,7 +35,7 @@ def show_over_time(history: OverTime, as_json: bool) -> None:
 def show_table(table: Table) -> None:
     """Print a table as wide as the terminal, or where there is none as wide as a page."""
     console = Console()
-    (console if console.is_terminal else Console(width=160)).print(table)
+    (console if console.is_terminal else Console(width=180)).print(table)
 
 
 def warn(result: Result) -> None:

@@ -20,7 +20,7 @@ from math import pi
 import numpy as np
 
 from wfsobs.arrays import Array
-from wfsobs.bound import bound_of
+from wfsobs.bound import least_errors
 from wfsobs.control.controllers import CONTROLLERS, Controller
 from wfsobs.control.integrator import limited_integrator
 from wfsobs.control.law import Law
@@ -62,7 +62,7 @@ class Design:
     """All controllers of a scenario, before any random number.
 
     laws  : controller -> one per mode
-    bound : per mode, rms [um] of the least residual of any causal controller of the LGS alone; None where the spectrum of
+    bound : per mode, rms [um] of the least residual of any causal controller of the mean of the LGS; None where the spectrum of
         the turbulence is not known
     """
 
@@ -119,7 +119,7 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None) -> Desi
         laws = {name: tuple(replace(one, predicted=None) for one in designed) for name, designed in laws.items()}
         return Design(scenario, mirror, laws, None)
     # A fraction of a frame comes on top of the whole ones, which alone bound what can be known.
-    least = tuple(bound_of(one, ahead=int(mirror.delay) - 1)["total"] for one in spectra if one)
+    least = tuple(least_errors(one, ahead=int(mirror.delay) - 1)["total"].rms for one in spectra if one)
     return Design(scenario, mirror, laws, least if known else None)
 
 

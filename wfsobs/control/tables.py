@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import degrees, log10
 from statistics import median
 from typing import Any
@@ -16,6 +17,11 @@ from wfsobs.scores import BOUND
 from wfsobs.tables import NOT_OBSERVERS, Row
 from wfsobs.units import micrometres_per
 
+LIMITED = "theory and margins are not applicable: a limit of the mirror acts, and the loop is no longer linear"
+"""Why a row has neither."""
+
+NOT_APPLICABLE = "n/a"
+
 
 def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
     """One plain dictionary per controller and mode, the bound last: the keys of `wfsobs loop --json`.
@@ -24,7 +30,8 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
         not run (`note` says why); strehl is that of all modes together
     residual_rms_mas : of tip and tilt alone;  predicted_rms_nm : by theory;  gain : of an integrator, optimised or set
     gain_margin_db, phase_margin_deg, delay_margin_ms : null where a loop has no frequency response or no such limit
-    limited : share of the steps in which a limit of the mirror changed the command
+    limited : share of the steps in which a limit of the mirror changed the command. Where it is above 0 the loop is not the
+        linear one that theory and margins are of: these are null, and `note` says why
     """
     plan, warm_up = result.design, result.scenario.run.warm_up
     modes = result.scenario.modes
@@ -46,6 +53,9 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
     for outcome in result.outcomes:
         left = residual_rms(outcome, result.record, warm_up)
         for mode, designed in enumerate(plan.laws[outcome.controller]):
+            limited = outcome.limited[mode] if outcome.limited else None
+            if limited:
+                designed = replace(designed, predicted=None, margins=None)
             m = designed.margins
             out.append(row(
                 outcome.controller, CONTROLLERS[outcome.controller].needed(result.scenario), mode, outcome.stable[mode], left,
@@ -54,8 +64,7 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
                 gain_margin_db=20 * log10(m.gain) if m and m.gain else None,
                 phase_margin_deg=degrees(m.phase) if m and m.phase is not None else None,
                 delay_margin_ms=m.delay * 1e3 if m and m.delay is not None else None,
-                limited=outcome.limited[mode] if outcome.limited else None,
-                note=outcome.note,
+                limited=limited, note=outcome.note or (LIMITED if limited else ""),
             ))
     if plan.bound is not None:
         out += [row(BOUND, SPECTRA, mode, True, plan.bound) for mode in range(len(modes))]
@@ -74,7 +83,7 @@ def table(rows: Sequence[Row]) -> Table:
     for name in ("Mode", "Controller", "Needs"):
         out.add_column(name, no_wrap=True)
     spread = ("spread, nm",) if several else ()
-    for name in ("rms, nm", *spread, "mas", "Strehl", "theory, nm", "gain", "margins", "delay, ms"):
+    for name in ("rms, nm", *spread, "mas", "Strehl", "theory, nm", "gain", "margins", "delay, ms", "at limit, %"):
         out.add_column(name, justify="right", no_wrap=True)
     last = None
     for mode, controller in sorted({(r["mode"], r["controller"]) for r in rows}, key=_order(rows)):
@@ -90,10 +99,24 @@ def table(rows: Sequence[Row]) -> Table:
         out.add_row(
             mode, label(controller), same[0]["needs"], shown,
             *((f"{min(left):.2f} - {max(left):.2f}" if left else "-",) if several else ()),
-            _number(same, "residual_rms_mas", 3), _number(same, "strehl", 4), _number(same, "predicted_rms_nm", 2),
-            _number(same, "gain", 3), _margins(same[0]), _number(same, "delay_margin_ms", 2),
+            _number(same, "residual_rms_mas", 3), _number(same, "strehl", 4), linear(same, _number(same, "predicted_rms_nm", 2)),
+            _number(same, "gain", 3), linear(same, _margins(same[0])), linear(same, _number(same, "delay_margin_ms", 2)),
+            _share(same),
         )
+    if any(r["limited"] for r in rows):
+        out.caption = f"{NOT_APPLICABLE}: {LIMITED}"
     return out
+
+
+def linear(same: Sequence[Row], value: str) -> str:
+    """What is shown of the linear loop: not applicable where a limit of the mirror acts in any of the rows."""
+    return NOT_APPLICABLE if any(r["limited"] for r in same) else value
+
+
+def _share(same: Sequence[Row]) -> str:
+    """Share of the limited steps in per cent, the median over seeds."""
+    shares = [100.0 * r["limited"] for r in same if r["limited"] is not None]
+    return f"{median(shares):.2f}" if shares else "-"
 
 
 def _margins(row: Row) -> str:

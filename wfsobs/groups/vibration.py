@@ -30,6 +30,11 @@ class Vibration(Group):
     source = param.Selector(default="peaks", objects=["peaks", "psd", "measured", "ar2", "none"], label="Source",
                             doc="How vibration is made: inverse DFT of the peak list (paper, Algorithm 4), of the PSD table or "
                                 "of a measured spectrum, each peak as an AR(2) process (paper, eq. 2), or none.")
+    synthesis = param.Selector(
+        default="gaussian", objects=["gaussian", "random-phase"], label="Synthesis",
+        doc="How an inverse DFT makes a record. gaussian: a piece of a stationary Gaussian process, cut from a period many times "
+            "as long; random-phase: fixed amplitudes and random phases, as long as the record and periodic with it (paper, "
+            "Algorithm 4).")
     spectrum = param.Selector(default="eris-ut4", objects=["eris-ut4"], label="Measured spectrum",
                               doc="For source measured: eris-ut4, measured at VLT UT4 with ERIS (astro-tiptop/TIPTOP, MIT).")
     part = param.Selector(default="lines", objects=["lines", "all"], label="Part of the spectrum",
@@ -43,5 +48,6 @@ class Vibration(Group):
 
     def idle(self) -> tuple[str, ...]:
         """What other sources are made of."""
-        uses = {"peaks": ("peaks",), "ar2": ("peaks",), "psd": ("psd",), "measured": ("spectrum", "part")}.get(self.source, ())
-        return tuple(name for name in ("spectrum", "part", "peaks", "psd") if name not in uses)
+        uses = {"peaks": ("synthesis", "peaks"), "ar2": ("peaks",), "psd": ("synthesis", "psd"),
+                "measured": ("synthesis", "spectrum", "part")}.get(self.source, ())
+        return tuple(name for name in ("synthesis", "spectrum", "part", "peaks", "psd") if name not in uses)
