@@ -49,6 +49,12 @@ class Frame(JSComponent):
     _esm = asset("frame.js")
 
 
+class Keyboard(JSComponent):
+    """What the keyboard needs, and a first stop that leads to what is after it."""
+
+    _esm = asset("keyboard.js")
+
+
 class Idle(param.Parameterized):
     """Never busy."""
 
@@ -69,6 +75,7 @@ class Dashboard:
         self.explore = Explore(self.store.run, self.display)
         self.connection = Connection(self.controls.take, width=0, height=0, margin=0)
         self.frame = Frame(width=0, height=0, margin=0)
+        self.keyboard = Keyboard(width=0, height=0, margin=0, styles={"position": "absolute"})
         self.alert = pmui.Alert(
             object="", severity="error", visible=False, **WIDE)
         self.stale = pmui.Alert(
@@ -83,8 +90,8 @@ class Dashboard:
         page = pmui.Page(
             title="wfsobs", sidebar=[self.controls.view()], sidebar_width=340, theme_config=theme(), favicon=None,
             main=[_title(), pn.Column(
-                self._top(), self._row_of_actions(), self.upload.room, self.alert, self.stale, self.pages.view, self.frame,
-                self.connection,
+                self._top(), self._row_of_actions(), self.upload.room, self.alert, self.stale, self.keyboard,
+                self.pages.view, self.frame, self.connection,
                 sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
         )
         self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")

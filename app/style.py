@@ -68,6 +68,9 @@ LOOKS: Mapping[str, Look] = MappingProxyType({
 HIDDEN = ("ridge", "ridge-30", "persistence", "zero")
 """Observers in the table only: their lines would be the axis, or hide the others."""
 
+HEARD = ".MuiFormLabel-root { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); }"
+"""Style of a switch whose name is heard but not seen."""
+
 PRIMARY = "#0B4F6C"
 
 _COMPONENTS = {

@@ -233,18 +233,18 @@ function card(target, name) {
   const row = known || loop || (drawn && rowOf(shown.state, "next z", name))
   const value = row && (name === "truth" && !loop ? row.truth_rms_um : row.rms_um)
   const base = loop ? "z, residual" : known ? "truth" : "z, next z"
-  const relative = row && row.normalised_rms !== null ? `${row.normalised_rms.toFixed(2)} × ${base}${own(row)}` : ""
-  const missing = name === "truth" ? "" : drawn ? "no truth to compare" : "no result"
+  const relative = row && row.normalised_rms !== null ? `${row.normalised_rms.toFixed(2)} × ${base}` : ""
+  const missing = name === "truth" ? "" : drawn ? "no truth" : "no result"
   return {
     name, label: loop ? "Recorded loop" : look.label, colour: loop ? "transparent" : look[dark ? "dark" : "light"], dash: look.dash,
     value: row ? number(value * data.states[shown.state].scale[shown.unit]) : "–",
-    unit: row ? data.units[shown.unit] : "", note: row ? (known && name === "truth" ? "rms" : relative) : missing,
+    unit: row ? data.units[shown.unit] : "", note: row ? (known && name === "truth" ? "rms" : own(row) || relative) : missing,
   }
 }
 
 // What is said of an observer that was scored on samples of its own.
 function own(row) {
-  return row.apart ? `, ${row.start_s.toFixed(2)} to ${row.stop_s.toFixed(2)} s only` : ""
+  return row.apart ? `${row.start_s.toFixed(2)} to ${row.stop_s.toFixed(2)} s only` : ""
 }
 
 function drawTable() {

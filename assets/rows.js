@@ -9,11 +9,15 @@ export function render({model, el}) {
   const note = document.createElement("div")
   note.className = "note"
   note.setAttribute("role", "alert")
+  let next = "" // where the focus goes when the rows have changed
   const add = document.createElement("button")
   add.type = "button"
   add.className = "add"
   add.textContent = `+ Add ${model.noun}`
-  add.onclick = () => model.send_msg({action: "add"})
+  add.onclick = () => {
+    next = `[data-cell^="${model.rows.length}."]`
+    model.send_msg({action: "add"})
+  }
   const scroll = document.createElement("div")
   scroll.className = "rows"
   box.append(scroll, note, add)
@@ -26,6 +30,7 @@ export function render({model, el}) {
     input.inputMode = "decimal"
     input.dataset.cell = `${row}.${column.key}`
     input.setAttribute("aria-label", `${noun} ${row + 1}: ${column.name}`)
+    input.title = column.doc
     input.onchange = () => model.send_msg({action: "edit", row, key: column.key, text: input.value})
     return input
   }
@@ -37,7 +42,11 @@ export function render({model, el}) {
     remove.textContent = "×"
     remove.title = `Remove ${model.noun} ${i + 1}`
     remove.setAttribute("aria-label", remove.title)
-    remove.onclick = () => model.send_msg({action: "remove", row: i})
+    remove.dataset.remove = i
+    remove.onclick = () => {
+      next = `[data-remove="${Math.min(i, model.rows.length - 2)}"]`
+      model.send_msg({action: "remove", row: i})
+    }
     return remove
   }
 
@@ -84,10 +93,32 @@ export function render({model, el}) {
     scroll.replaceChildren(...(model.columns.length > MOST ? drawBlocks() : drawTable()))
     mark()
     scroll.scrollTop = top
-    if (focused) {
+    if (next) {
+      (scroll.querySelector(next) ?? add).focus()
+    } else if (focused) {
       scroll.querySelector(`[data-cell="${focused}"]`)?.focus()
     }
+    next = ""
+    rove()
   }
+
+  // The lines of a table are one stop each for the arrows, and one together for the Tab key: that with the focus, or the first.
+  const lines = () => [...scroll.querySelectorAll("tbody tr")]
+  const rove = (line = lines().find((it) => it.contains(el.getRootNode().activeElement)) ?? lines()[0]) => {
+    for (const it of lines()) {
+      it.querySelectorAll("input, select, button").forEach((part) => { part.tabIndex = it === line ? 0 : -1 })
+    }
+  }
+  scroll.addEventListener("focusin", (event) => {
+    if (event.target.closest("tr")) rove(event.target.closest("tr"))
+  })
+  scroll.addEventListener("keydown", (event) => {
+    const line = event.target.closest("tbody tr")
+    const to = {ArrowDown: line?.nextElementSibling, ArrowUp: line?.previousElementSibling}[event.key]
+    if (!to || event.target.tagName === "SELECT") return
+    event.preventDefault()
+    to.cells[event.target.closest("td").cellIndex].firstElementChild.focus()
+  })
 
   const mark = () => {
     const errors = model.errors

@@ -14,8 +14,9 @@ from wfsobs.app.controls.fields import SOON
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.parts import WIDE, box
-from wfsobs.app.style import asset
+from wfsobs.app.style import HEARD, asset
 from wfsobs.app.views.pinning import Pinning
+from wfsobs.app.views.plots import call
 from wfsobs.app.views.spectra import MODEL, PEAKS, Spectra
 from wfsobs.app.views.strip import Strip
 from wfsobs.app.views.table import Table
@@ -76,8 +77,8 @@ class Explore:
 
     def _section(self, target: str) -> pn.Column:
         """The strip and the two figures of one target."""
-        self.traces.traces[target].figure.name = f"{target.capitalize()} time trace"
-        self.spectra.spectra[target].figure.name = f"{target.capitalize()} spectrum"
+        call(self.traces.traces[target].figure, f"{target.capitalize()} time trace")
+        call(self.spectra.spectra[target].figure, f"{target.capitalize()} spectrum")
         cards = self.strips[target].cards
         cards.param.watch(lambda event: self._hide(target, event.new), "hidden")
         marks = MARKS if target == VIBRATION else ""
@@ -93,8 +94,8 @@ class Explore:
 
 def group(display: Display, name: str, options: Any) -> pmui.RadioButtonGroup:
     """The buttons of one switch of the display."""
-    widget = pmui.RadioButtonGroup.from_param(display.param[name], options=options, size="small", margin=0, variant="outlined")
-    widget.label = ""
+    widget = pmui.RadioButtonGroup.from_param(
+        display.param[name], options=options, size="small", margin=0, variant="outlined", stylesheets=[HEARD])
     widget._debounce = SOON  # type: ignore[misc]
     return widget
 

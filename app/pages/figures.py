@@ -14,7 +14,7 @@ from wfsobs.app.display import Display, number, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import asset, look, swatch
 from wfsobs.app.views.envelope import envelope, envelope_times
-from wfsobs.app.views.plots import new_figure
+from wfsobs.app.views.plots import call, new_figure
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, Shown
 from wfsobs.modes import TIP_TILT
@@ -149,7 +149,7 @@ class _Drawn:
         else:
             self.figure = new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=DataRange1d())
         self.figure.xaxis.axis_label = "frequency [Hz]" if plot.what == SPECTRUM else "time [s]"
-        self.figure.name = f"{of.title}, {TIP_TILT[plot.column].name}, {plot.what}"
+        call(self.figure, f"{of.title}, {TIP_TILT[plot.column].name}, {plot.what}")
         self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
         self.lines: dict[str, GlyphRenderer] = {
             name: self.figure.line(

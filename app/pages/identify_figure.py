@@ -8,7 +8,7 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.identify_work import Fit, Measured
 from wfsobs.app.style import look
-from wfsobs.app.views.plots import new_figure
+from wfsobs.app.views.plots import call, new_figure
 from wfsobs.identify.result import IdentifiedMode
 
 HEIGHT = 400
@@ -25,7 +25,8 @@ class SpectrumFigure:
     def __init__(self) -> None:
         self.figure = new_figure(
             x_range=Range1d(start=0.1, end=500.0), y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log")
-        self.figure.update(height=HEIGHT, name="Spectrum of z and its model")
+        self.figure.height = HEIGHT
+        call(self.figure, "Spectrum of z and its model")
         self.figure.xaxis.axis_label = "frequency [Hz]"
         self.measured = ColumnDataSource({"x": [], "mean": [], "highest": []})
         self.total = ColumnDataSource({"x": [], "y": []})

@@ -17,6 +17,7 @@ from wfsobs.app.pages.identify import IdentifyPage
 from wfsobs.app.pages.model import Model
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.store import Store
+from wfsobs.app.style import HEARD
 
 EXPLORE, IDENTIFY, TUNE, LOOP, FIGURES, MODEL = "explore", "identify", "tune", "loop", "figures", "model"
 TITLES: Mapping[str, str] = MappingProxyType(
@@ -51,8 +52,7 @@ class Pages(param.Parameterized):
         self.rooms = {EXPLORE: explore.view(), **{
             name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers}}
         self.switch = pmui.RadioButtonGroup.from_param(
-            self.param.current, options=dict(TITLES), size="small", margin=0, color="primary", sx=WRAPPED)
-        self.switch.label = ""
+            self.param.current, options=dict(TITLES), size="small", margin=0, color="primary", sx=WRAPPED, stylesheets=[HEARD])
         self.view = pn.Column(*self.rooms.values(), sizing_mode="stretch_width", margin=0)
         self.param.watch(self._turn, "current")
 

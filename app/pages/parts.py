@@ -16,6 +16,7 @@ from wfsobs.app.controls.panel import Status
 from wfsobs.app.jobs.job import CANCELLED, DONE, RUNNING
 from wfsobs.app.jobs.task import IDLE, BackgroundTask
 from wfsobs.app.style import asset, swatch
+from wfsobs.app.views.plots import call
 
 WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
 
@@ -47,7 +48,7 @@ def line(*parts: Any) -> pn.FlexBox:
 
 def captioned(title: str, fig: figure) -> pn.Column:
     """A figure under its caption."""
-    fig.name = title
+    call(fig, title)
     caption = pn.pane.HTML(f'<div class="caption">{escape(title)}</div>', margin=(8, 0, 0, 0), stylesheets=[asset("style.css")])
     return pn.Column(caption, pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), **WIDE)
 

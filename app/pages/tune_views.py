@@ -11,7 +11,7 @@ from bokeh.models import ColumnDataSource, DataRange1d
 from wfsobs.app.display import NO_ANGLE, NOTHING, UNITS, Display, number, per_micrometre
 from wfsobs.app.style import look
 from wfsobs.app.tune_work import LIKELIHOOD, OTHER, SETTING, TEST, TOGETHER, VALIDATION, best_so_far, rows
-from wfsobs.app.views.plots import new_figure
+from wfsobs.app.views.plots import call, new_figure
 from wfsobs.app.views.table import change
 from wfsobs.modes import TIP_TILT
 from wfsobs.tuning import Evaluation, Tuned
@@ -35,7 +35,7 @@ class HistoryFigure:
 
     def __init__(self) -> None:
         self.figure = new_figure(x_range=DataRange1d(range_padding=0.02), y_range=DataRange1d())
-        self.figure.update(name="History of the tuning")
+        call(self.figure, "History of the tuning")
         self.figure.xaxis.axis_label = "evaluation"
         self.source = ColumnDataSource({"x": [], "tried": [], "best": []})
         self._tried = self.figure.scatter("x", "tried", source=self.source, size=6, fill_alpha=0.7)

@@ -8,6 +8,7 @@ import panel_material_ui as pmui
 from wfsobs.app.controls.fields import SOON
 from wfsobs.app.display import UNITS, Display, short_name
 from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.style import HEARD
 from wfsobs.modes import TIP_TILT, Mode
 
 
@@ -20,7 +21,8 @@ class ModeSwitch:
     def __init__(self, run: BackgroundTask, display: Display):
         self.run, self.display = run, display
         options = {_title(mode): mode.name for mode in TIP_TILT}
-        self.buttons = pmui.RadioButtonGroup(options=options, value=display.mode, size="small", margin=0, variant="outlined")
+        self.buttons = pmui.RadioButtonGroup(
+            label="Mode", options=options, value=display.mode, size="small", margin=0, variant="outlined", stylesheets=[HEARD])
         self.list = pmui.Select(
             label="Mode", options=options, value=display.mode, size="small", margin=0, width=190, visible=False)
         for widget in (self.buttons, self.list):
@@ -68,7 +70,8 @@ class UnitSwitch:
     def __init__(self, display: Display):
         self.display = display
         self.buttons = pmui.RadioButtonGroup(
-            options=self._options(), value=display.unit, size="small", margin=0, variant="outlined")
+            label="Unit", options=self._options(), value=display.unit, size="small", margin=0, variant="outlined",
+            stylesheets=[HEARD])
         self.buttons._debounce = SOON  # type: ignore[misc]
         self.note = pn.pane.HTML(NO_MAS, visible=False, margin=0)
         self.buttons.param.watch(self._chosen, "value")

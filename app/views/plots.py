@@ -34,6 +34,11 @@ def new_figure(**options: Any) -> figure:
     return fig
 
 
+def call(fig: figure, name: str) -> None:
+    """Name a figure, for its file and for those who hear the page."""
+    fig.update(name=name, html_attributes={"role": "figure", "aria-label": name})
+
+
 def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> GlyphRenderer:
     """A line in the look of an observer or of the truth."""
     it = look(name)

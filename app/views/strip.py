@@ -56,13 +56,12 @@ class Strip:
 
     def _scored(self, name: str, score: Score, shown: Shown, base: str) -> dict[str, Any]:
         relative = f"{score.normalised_rms:.2f} × {base}" if score.normalised_rms is not None else ""
-        own = own_stretch(rows([score], None)[0])
-        return self._card(name, self._scaled(score.rms, shown), ", ".join(filter(None, [relative, own])))
+        return self._card(name, self._scaled(score.rms, shown), own_stretch(rows([score], None)[0]) or relative)
 
     def _without_truth(self, name: str, shown: Shown) -> dict[str, Any]:
         """How well the next measurement is predicted, by whoever says what it will be."""
         score = find(shown, name, PREDICTION, self.display.mode)
-        return self._scored(name, score, shown, "z, next z") if score else self._card(name, None, "no truth to compare")
+        return self._scored(name, score, shown, "z, next z") if score else self._card(name, None, "no truth")
 
     def _truth(self, shown: Shown | None) -> dict[str, Any]:
         of = (self.target, self.display.mode)

@@ -129,7 +129,7 @@ def test_every_stop_of_the_tab_key_has_a_name_and_shows(open_page: Any) -> None:
 
 def test_the_keyboard_does_it_all(open_page: Any) -> None:
     page = open_page()
-    assert "drawer" in focused(page)["name"], "the drawer's button comes first"
+    assert focused(page)["name"] == "Skip to figures" and "drawer" in focused(page)["name"]
     page.keyboard.press("Enter")
     opener = page.get_by_role("button", name="Open drawer")
     expect(opener).to_be_visible()
@@ -155,6 +155,116 @@ def test_the_keyboard_does_it_all(open_page: Any) -> None:
         page.keyboard.press(key)
         expect(card).to_have_attribute("aria-pressed", pressed)
         assert "multi-rate" in page.evaluate(FOCUSED)["name"], "the focus stays"
+
+
+ACTIVE = """() => {
+  let e = document.activeElement
+  while (e?.shadowRoot?.activeElement) e = e.shadowRoot.activeElement
+  const name = e.getAttribute("aria-label") ?? e.textContent
+  return {name, role: e.getAttribute("role"), selected: e.getAttribute("aria-selected")}
+}"""
+
+
+def press(page: Page, key: str) -> dict[str, Any]:
+    page.keyboard.press(key)
+    return page.evaluate(ACTIVE)
+
+
+def until(page: Page, name: str, key: str = "Tab", most: int = 60) -> int:
+    """Go on with a key until the focus is on something of that name; how many stops that took."""
+    for count in range(1, most + 1):
+        if name in press(page, key)["name"]:
+            return count
+    raise AssertionError(f"no {name!r} in {most} stops")
+
+
+def chosen(page: Page) -> Any:
+    """The item that has the focus, once the list is open."""
+    page.wait_for_function(f"() => ({ACTIVE})().selected === 'true'")
+    return page.evaluate(ACTIVE)
+
+
+@pytest.mark.parametrize("key", ["Enter", "Space", "ArrowDown", "ArrowUp"])
+def test_a_list_opens_and_chooses_by_keyboard(open_page: Any, key: str) -> None:
+    page = open_page(wait=key == "Enter")
+    preset = page.get_by_role("combobox", name="Preset")
+    expect(preset).to_have_text("Paper")
+    until(page, "Paper")
+    press(page, key)
+    assert chosen(page) == {"name": "Paper", "role": "option", "selected": "true"}
+    options = page.get_by_role("listbox").get_by_role("option")
+    expect(options.first).to_have_attribute("aria-selected", "true")
+    assert options.evaluate_all("them => them.filter(it => it.getAttribute('aria-selected') === 'true').length") == 1
+    assert press(page, "ArrowDown")["name"] == "Strong turbulence"
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("listbox")).to_have_count(0)
+    expect(preset).to_have_attribute("aria-expanded", "false")
+    expect(preset).to_be_focused()
+    expect(preset).to_have_text("Paper")
+    if key == "Enter":
+        press(page, key)
+        chosen(page)
+        press(page, "ArrowDown")
+        press(page, "Enter")
+        expect(preset).to_have_text("Strong turbulence")
+        expect(preset).to_be_focused()
+
+
+def test_the_lists_of_other_pages_open_by_keyboard(open_page: Any) -> None:
+    page = open_page()
+    until(page, "peaks")  # where the vibration comes from
+    press(page, "Enter")
+    assert chosen(page)["name"] == "peaks"
+    press(page, "Escape")
+    expect(page.get_by_role("listbox")).to_have_count(0)
+    until(page, "Explore")
+    until(page, "Tune", "ArrowRight", 3)
+    press(page, "Enter")
+    until(page, "Online GPR")
+    press(page, "Enter")
+    assert chosen(page)["name"] == "Online GPR"
+
+
+def test_the_figures_are_not_far(open_page: Any) -> None:
+    page = open_page()
+    assert press(page, "Tab")["name"] == "Skip to figures"
+    expect(page.get_by_role("button", name="Skip to figures")).to_be_in_viewport()
+    press(page, "Enter")
+    assert until(page, "Truth", most=10), "a card of the first strip"
+    assert until(page, "Turbulence time trace", most=10), "a figure has a name"
+    for name in ("Page", "Mode", "Unit", "Show", "Spectrum"):
+        expect(page.get_by_role("group", name=name, exact=True)).to_be_visible()
+    for name in ("Turbulence time trace", "Turbulence spectrum", "Vibration time trace", "Vibration spectrum"):
+        expect(page.get_by_role("figure", name=name, exact=True)).to_be_visible()
+    page = open_page()
+    assert until(page, "Truth", most=60) < 60, "and by the Tab key alone, past the drawer"
+
+
+def test_a_table_is_one_stop_and_keeps_the_focus(open_page: Any) -> None:
+    page = open_page()
+    until(page, "Peak 1: f")
+    assert press(page, "ArrowDown")["name"] == "Peak 2: f [Hz]"
+    tip = page.get_by_role("tooltip").filter(has_text="Natural frequency")
+    expect(tip).to_be_visible()
+    press(page, "Escape")
+    expect(tip).to_be_hidden()
+    assert until(page, "Remove peak 2", most=5)
+    value = page.locator('input[data-cell="2.frequency"]').input_value()
+    press(page, "Enter")
+    expect(page.locator('input[data-cell="1.frequency"]')).to_have_value(value)
+    assert page.evaluate(ACTIVE)["name"] == "Remove peak 2", "the next one"
+    assert until(page, "Add peak", most=1)
+    press(page, "Enter")
+    page.wait_for_function(f"() => ({ACTIVE})().name === 'Peak 15: f [Hz]'")
+
+
+def test_a_tip_comes_with_the_focus(open_page: Any) -> None:
+    page = open_page()
+    until(page, "Wind speed")
+    tip = page.get_by_role("tooltip").filter(has_text=re.compile("wind", re.I))
+    expect(tip.first).to_be_visible()
+    press(page, "Tab")
+    expect(tip.first).to_be_hidden()
 
 
 @pytest.mark.parametrize("width", [390, 820])

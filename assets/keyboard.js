@@ -1,0 +1,120 @@
+// What the keyboard needs beyond what the widgets do themselves: a way past the drawer, lists that open, items that say which of
+// them is chosen, tips where the focus is.
+
+export function render({model, el}) {
+  const stop = new AbortController()
+  const on = (type, heard) => document.addEventListener(type, heard, {signal: stop.signal, capture: true})
+  const skip = skipLink(() => el.getRootNode().host.nextElementSibling)
+  model.on("remove", () => { stop.abort(); skip.remove() })
+  const tips = tipsAt(el)
+  for (const type of ["keydown", "keyup"]) on(type, openList)
+  on("click", (event) => markItems(event.composedPath()[0]))
+  // What moves the focus within one shadow root is not heard of out here: so every key is followed.
+  let last = null
+  on("pointerdown", tips.hide)
+  on("keydown", (event) => setTimeout(() => {
+    const at = focused()
+    name(at)
+    if (at !== last || event.key === "Escape") tips.hide()
+    if (at !== last) tips.show(at)
+    last = at
+  }))
+}
+
+// Names for what Bokeh and panel-material-ui leave without: a plot that has the focus, and a fieldset whose group within has one.
+function name(at) {
+  at.closest("fieldset.MuiFormControl-root")?.setAttribute("role", "presentation")
+  if (!at.matches(".bk-events")) return
+  at.style.outline = "2px solid #2b8ab3"  // it has none to show that it has the focus
+  at.addEventListener("blur", () => { at.style.outline = "" }, {once: true})
+  at.setAttribute("role", "group")
+  at.setAttribute("aria-label", at.getRootNode().host.getRootNode().host.getAttribute("aria-label"))
+}
+
+function focused() {
+  let it = document.activeElement
+  while (it.shadowRoot?.activeElement) it = it.shadowRoot.activeElement
+  return it
+}
+
+// The first stop of the page, seen while it has the focus.
+function skipLink(results) {
+  const room = document.createElement("nav")
+  room.setAttribute("aria-label", "Skip")
+  const link = document.createElement("button")
+  link.type = "button"
+  link.textContent = "Skip to figures"
+  const put = (top) => Object.assign(link.style, {
+    position: "fixed", left: "8px", top, zIndex: 10000, padding: "10px 14px", border: "0", borderRadius: "4px",
+    background: "#fff", color: "#0b4f6c", font: "14px sans-serif", outline: "3px solid #0b4f6c"})
+  put("-60px")
+  link.onfocus = () => put("8px")
+  link.onblur = () => put("-60px")
+  link.onclick = () => {
+    const to = results()
+    to.tabIndex = -1
+    to.style.outline = "none"
+    to.focus()
+    to.scrollIntoView()
+  }
+  room.append(link)
+  document.body.prepend(room)
+  return room
+}
+
+const LIST = "[role=combobox][aria-haspopup=listbox]"
+
+// A list of panel-material-ui 0.16 opens by click alone: what opens it by keyboard calls a function that it has not been given.
+// The space bar opens it when it comes up, or it would choose the first item by that.
+function openList(event) {
+  const box = event.composedPath()[0]
+  if (!["Enter", " ", "ArrowDown", "ArrowUp"].includes(event.key) || !box.matches?.(LIST)) return
+  if (box.getAttribute("aria-expanded") === "true" || box.getAttribute("aria-disabled") === "true") return
+  event.preventDefault()
+  if ((event.key === " ") === (event.type === "keyup")) box.click()
+}
+
+// Nor do its items say that they are those of a list, and which one is chosen; that one has the focus first.
+function markItems(at, tries = 60) {
+  const box = at.closest?.(LIST)
+  if (!box || !tries) return
+  const items = [...box.getRootNode().querySelectorAll("ul[role=listbox] > li")]
+  for (const item of items) {
+    const chosen = item.textContent === box.textContent
+    item.setAttribute("role", "option")
+    item.setAttribute("aria-selected", chosen)
+    if (chosen) item.focus()
+  }
+  const there = items.includes(box.getRootNode().activeElement)
+  if (!there) requestAnimationFrame(() => markItems(box, tries - 1))  // the list is on its way
+}
+
+const MARK = "label > svg.MuiSvgIcon-root, .MuiFormControlLabel-label > svg.MuiSvgIcon-root"
+
+// The tip of whatever has the focus: that of the mark beside a field's name, or its title.
+function tipsAt(el) {
+  const own = document.createElement("div")
+  own.setAttribute("role", "tooltip")
+  own.popover = "manual"
+  Object.assign(own.style, {
+    position: "fixed", margin: "0", padding: "4px 8px", border: "0", borderRadius: "4px", maxWidth: "300px",
+    background: "#616161", color: "#fff", font: "11px/1.4 sans-serif"})
+  el.append(own)
+  let mark = null
+  const hide = () => {
+    mark?.dispatchEvent(new MouseEvent("mouseout", {bubbles: true}))
+    mark = null
+    if (own.matches(":popover-open")) own.hidePopover()
+  }
+  const show = (at) => {
+    mark = at.getRootNode().querySelector?.(MARK) ?? null
+    mark?.dispatchEvent(new MouseEvent("mouseover", {bubbles: true}))
+    if (mark || !at.title) return
+    own.textContent = at.title
+    own.showPopover()
+    const box = at.getBoundingClientRect()
+    own.style.top = `${Math.min(box.bottom + 4, window.innerHeight - own.offsetHeight - 4)}px`
+    own.style.left = `${Math.min(box.left, window.innerWidth - own.offsetWidth - 8)}px`
+  }
+  return {hide, show}
+}
