@@ -75,7 +75,7 @@ function openList(event) {
 }
 
 // Nor do its items say that they are those of a list, and which one is chosen; that one has the focus first.
-function markItems(at, tries = 60) {
+function markItems(at, tries = 600) {
   const box = at.closest?.(LIST)
   if (!box || !tries) return
   const items = [...box.getRootNode().querySelectorAll("ul[role=listbox] > li")]

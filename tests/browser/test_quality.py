@@ -213,7 +213,11 @@ def test_the_lists_of_other_pages_open_by_keyboard(open_page: Any) -> None:
     until(page, "Explore")
     until(page, "Tune", "ArrowRight", 3)
     press(page, "Enter")
+    observer = page.get_by_role("combobox", name="Observer")
+    expect(observer).to_be_visible()
+    until(page, "Load data")
     until(page, "Online GPR")
+    expect(observer).to_be_focused()
     press(page, "Enter")
     assert chosen(page)["name"] == "Online GPR"
 
