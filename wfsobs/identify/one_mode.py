@@ -10,6 +10,7 @@ import numpy as np
 from wfsobs.ar2 import Ar2
 from wfsobs.arrays import Array
 from wfsobs.identify.lines import Line, nearest_line
+from wfsobs.identify.misfit import margin
 from wfsobs.identify.missing import Missing
 from wfsobs.identify.model import RMS, Spectrum
 from wfsobs.identify.order import of_best_order, with_background
@@ -84,9 +85,10 @@ class OneMode:
         return len(self.lines) + len(self.spectrum.resonances)
 
     def whitened(self) -> Array:
-        """I / S at PAD frequencies per bin, 1 at what has been refused."""
+        """I / S at PAD frequencies per bin, 1 at what has been refused; S as high as it may be (`misfit`)."""
         f = frequencies(self.n, self.dt, PAD)
-        S = np.exp(np.interp(f, self.f, np.log(self.spectrum.psd(self.f) * self.share)))
+        S = self.spectrum.psd(self.f)
+        S = np.exp(np.interp(f, self.f, np.log(S * self.share * margin(self.I / S))))
         ratio = periodogram(self.left, self.dt, PAD) / S
         for candidate in self.refused:
             ratio[np.abs(f - candidate.frequency) <= (0.5 * candidate.width + 0.5) * self.f[0]] = 1.0
