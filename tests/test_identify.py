@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from scipy.stats import kstest
+from scipy.stats import binom, gamma, kstest
 
 from wfsobs import configfile
 from wfsobs.ar2 import Ar2
 from wfsobs.cli import main
-from wfsobs.identify import Identified, identify
+from wfsobs.identify import Identified, identify, misfit
 from wfsobs.identify.lines import Line, nearest_line
+from wfsobs.identify.misfit import margin
 from wfsobs.identify.model import Spectrum
 from wfsobs.identify.one_mode import OneMode
 from wfsobs.identify.periodogram import Cells, fast_length, frequencies, inflation, periodogram
@@ -31,6 +32,7 @@ from wfsobs.presets import PRESETS
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.telemetry import save_record
+from wfsobs.true_spectra import true_spectra
 from wfsobs.watch import Cancelled, Watch
 
 DT = 1e-3
@@ -237,6 +239,35 @@ def test_frozen_flow_leaves_white_noise_and_no_peak() -> None:
     for seed in (1, 2):
         got = identify(simulate(s.replace({"run.seed": seed})))
         assert got.white and not got.peaks
+
+
+def test_a_right_spectrum_has_no_margin_and_one_with_lobes_that_of_its_lobes() -> None:
+    """I / S of a record of 60 s at 1 kHz is exponential; lobes of 2 Hz, a factor 2.2 up and down, from 3 to 12 Hz."""
+    rng, f = np.random.default_rng(11), frequencies(60_000, DT)
+    lobes = np.where((f > 3.0) & (f < 12.0), np.exp(0.8 * np.sin(pi * f)), 1.0)
+    right = [margin(rng.exponential(size=len(f))) for _ in range(40)]
+    wrong = np.array([margin(rng.exponential(lobes)) for _ in range(40)])
+    assert sum(x.max() > 1.0 for x in right) <= 10  # a tenth of a percent at any of some hundred frequencies, most alike
+    inside = wrong[:, (f > 5.0) & (f < 9.0)]
+    assert np.exp(0.6) < np.median(inside) < np.exp(1.2)  # what noise dips by is in it
+    assert np.mean(wrong[:, f > 30.0] > 1.0) < 0.01
+    dips = gamma(misfit.WIDTH, scale=1.0 / misfit.WIDTH)
+    worth, worth_squared = (dips.expect(lambda r: (misfit.WIDTH * (r - 1.0 - np.log(r))) ** k, ub=1.0) for k in (1, 2))  # noqa: B023
+    assert (worth, worth_squared - worth**2) == pytest.approx((misfit.MEAN, misfit.VARIANCE), abs=1e-4)  # four digits are given
+
+
+@pytest.mark.parametrize("name", ["ut4", "galacsi-nfm"])
+def test_lobes_of_frozen_flow_are_no_peaks(name: str) -> None:
+    """Records drawn from the closed form of their spectrum, of many layers a peak in 17 of 25 and more where lobes count; with a
+    margin not more than the level allows."""
+    s, found = PRESETS[name]().replace({"vibration.source": "none", "run.duration": 60.0}), 0
+    S = [true_spectra(s, mode).measured for mode in (0, 1)]
+    n = 2 * (len(S[0]) - 1)
+    for seed in range(1001, 1005):
+        rng = np.random.default_rng(seed)
+        z = np.column_stack([np.fft.irfft(np.sqrt(x) * np.fft.rfft(rng.standard_normal(n)), n)[:60_000] for x in S])
+        found += bool(identify(Record(z, np.zeros_like(z), DT)).peaks)
+    assert found <= binom.isf(0.01, 4, 0.05)
 
 
 def test_filter_built_from_the_result_is_as_good_as_from_the_truth(found: Identified) -> None:

@@ -1,4 +1,7 @@
-"""The figures of docs/identification.md: what is found and what is not, over seeds. `identification.py [seeds] [duration]`."""
+"""The figures of docs/identification.md, over seeds: `identification.py [seeds] [duration] [parts]`.
+
+parts : which of search, flow, filters, coverage, all unless told. Every seed that went wrong is printed.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,7 @@ from wfsobs.identify import Identified, identify
 from wfsobs.identify.identification import ALONE, LEVEL
 from wfsobs.identify.search import BELOW, LOWEST, OF_LINES, STRUCTURES
 from wfsobs.lgs import lgs_error_process, lgs_noise_rms
+from wfsobs.true_spectra import true_spectra
 from wfsobs.turbulence import turbulence_process
 
 QUIET: dict[str, Any] = {"vibration.source": "none"}
@@ -87,7 +91,7 @@ def found(scenario: Scenario, seeds: range, modes: int = 2) -> str:
     """Share of lines and resonances found in the first modes of a record, and of records with a false peak, as a row."""
     lines: list[bool] = []
     resonances: list[bool] = []
-    false = white = 0
+    false, coloured = [], []
     for seed in seeds:
         s = scenario.replace({"run.seed": seed})
         record = simulate(s)
@@ -95,10 +99,76 @@ def found(scenario: Scenario, seeds: range, modes: int = 2) -> str:
         hit, wrong = hits(result, s)
         lines += [ok for _, pure, ok in hit if pure]
         resonances += [ok for _, pure, ok in hit if not pure]
-        false += wrong > 0
-        white += result.white
+        false += [seed] * (wrong > 0)
+        coloured += [seed] * (not result.white)
     shares = [f"{np.mean(x):.1%}" if x else "-" for x in (lines, resonances)]
-    return " | ".join([*shares, f"{false} of {len(seeds)}", f"{white} of {len(seeds)}"])
+    return " | ".join([*shares, counted(false, seeds), f"{len(seeds) - len(coloured)} of {len(seeds)}"])
+
+
+def counted(those: list[int], seeds: range) -> str:
+    """How many of the seeds, and which."""
+    return f"{len(those)} of {len(seeds)}" + (f" (seeds {', '.join(map(str, those))})" if those else "")
+
+
+def drawn(scenario: Scenario, seed: int) -> Record:
+    """A Gaussian record of tip and tilt with the spectra that the scenario's z has, the mirror at rest: of frozen flow in a
+    fraction of the time of a simulation. The DFT is longer than the record, which therefore does not come round."""
+    rng, steps = np.random.default_rng(1000 + seed), round(scenario.run.duration / scenario.dt)
+    z = []
+    for mode in (0, 1):
+        S = true_spectra(scenario, mode).measured
+        n = 2 * (len(S) - 1)
+        z.append(np.fft.irfft(np.sqrt(S) * np.fft.rfft(rng.standard_normal(n)), n)[:steps])
+    return Record(np.column_stack(z), np.zeros((steps, 2)), scenario.dt)
+
+
+def flow(scenario: Scenario, seeds: range) -> str:
+    """Of frozen flow without vibration: records in which a peak is found, and modes whose rest is white, as a row."""
+    results = {seed: identify(drawn(scenario.replace(QUIET), seed)) for seed in seeds}
+    white = [mode.whiteness.white for r in results.values() for mode in r.modes]
+    return f"{counted([seed for seed, r in results.items() if r.peaks], seeds)} | {sum(white)} of {len(white)}"
+
+
+NOISE, TURBULENCE = 0.014, (7.0686, 0.9, 0.5)
+"""Of `coverage`: rms of the noise [um]; omega [rad/s], damping, rms [um] of turbulence."""
+WITH = ((30.0, 0.02, 0.008), (52.0, 0.01, 0.006), (20.3, 0.0, 0.002), (70.031, 0.0, 0.0015))
+"""Frequency [Hz], damping, rms [um] of its peaks."""
+
+
+def lossy(seed: int, rate: float, duration: float, lost: float) -> Record:
+    """One mode of AR(2) processes, random from the first sample on, of which a share is lost, frame by frame."""
+    rng, dt, n = np.random.default_rng(seed), 1.0 / rate, round(duration * rate)
+    z = NOISE * rng.standard_normal(n) + Ar2(*TURBULENCE, dt).sample(n, rng)
+    for f, xi, rms in WITH:
+        pure = sqrt(2.0) * rms * np.cos(2.0 * pi * f * dt * np.arange(n) + rng.uniform(0.0, 2.0 * pi))
+        z += pure if xi == 0 else Ar2(2.0 * pi * f, xi, rms, dt).sample(n, rng)
+    z[rng.random(n) < lost] = np.nan
+    return Record(z[:, None], np.zeros((n, 1)), dt)
+
+
+def coverage(seeds: range, rate: float, duration: float, lost: float) -> None:
+    """How many of the 95 % intervals, 1.96 stated standard deviations, hold the truth, by quantity; records with a peak more."""
+    inside: dict[str, list[bool]] = {}
+    more = []
+    for seed in seeds:
+        mode = identify(lossy(seed, rate, duration, lost)).modes[0]
+        omega, damping, rms = TURBULENCE
+        pairs = [("noise", mode.noise, NOISE)]
+        if t := mode.turbulence:
+            pairs += [("turbulence, corner", t.frequency, omega / (2.0 * pi)), ("turbulence, damping", t.damping, damping),
+                      ("turbulence, rms", t.rms, rms)]
+        more += [seed] * (len(mode.peaks) > len(WITH))
+        for f, xi, rms in WITH:
+            near = [p for p in mode.peaks if p.pure == (xi == 0) and abs(p.frequency.value - f) < max(0.3, 4.0 * p.frequency.std)]
+            for p in sorted(near, key=lambda p: abs(p.frequency.value - f))[:1]:
+                kind = "resonance" if xi else "line"
+                pairs += [(f"{kind}, frequency", p.frequency, f), (f"{kind}, rms", p.rms, rms)]
+                pairs += [("resonance, damping", p.damping, xi)] if xi else []
+        for name, number, true in pairs:
+            inside.setdefault(name, []).append(abs(number.value - true) < 1.96 * number.std)
+    print(f"{rate:g} Hz, {duration:g} s, {lost:.0%} lost, seeds {seeds[0]} to {seeds[-1]}; a peak more: {counted(more, seeds)}")
+    for name, held in inside.items():
+        print(f"  {name}: {sum(held)} of {len(held)}, {np.mean(held):.1%}", flush=True)
 
 
 def spread(scenario: Scenario, seeds: range) -> dict[str, Any]:
@@ -134,8 +204,8 @@ def filters(scenario: Scenario, seeds: range) -> str:
         for target, values in ratios.items():
             values.append(max(errors[0][key] / errors[1][key] for key in errors[1] if key[0] == target))
     return "; ".join(
-        f"{target} {np.median(r):.3f} (up to {max(r):.3f}), {np.mean(np.array(r) < 1.05):.0%} below 1.05"
-        for target, r in ratios.items())
+        f"{target} {np.median(r):.3f} (up to {max(r):.3f}), {np.mean(np.array(r) < 1.05):.0%} below 1.05, by seed "
+        + " ".join(f"{x:.3f}" for x in r) for target, r in ratios.items())
 
 
 def twin(record: Record) -> Record:
@@ -160,23 +230,32 @@ def twins(scenario: Scenario, seeds: range) -> str:
 
 if __name__ == "__main__":
     count, duration = int(sys.argv[1]) if len(sys.argv) > 1 else 100, float(sys.argv[2]) if len(sys.argv) > 2 else 60.0
+    parts = sys.argv[3:] or ["search", "flow", "filters", "coverage"]
     seeds, few = range(1, count + 1), range(1, max(count // 2, 2) + 1)
     quiet = PRESETS["paper"]().replace({**QUIET, "run.duration": duration})
     resonant = PRESETS["paper"]().replace({"run.duration": duration, "vibration.source": "ar2"})
-    print(f"{count} seeds, {duration:g} s\n\n| Record | lines found | resonances found | records with a false peak | white |")
-    print("|---|---|---|---|---|")
-    print("| turbulence and noise alone |", found(quiet, seeds), "|", flush=True)
-    print("| lines and resonances in tip and tilt |", found(known_peaks(duration), seeds), "|", flush=True)
-    print("| the same in tip alone |", found(known_peaks(duration, 1), seeds), "|", flush=True)
-    print("| in tip alone, lines at 30 times the floor |", found(known_peaks(duration, 1, 30.0), seeds), "|", flush=True)
-    print("| a record of tip alone |", found(known_peaks(duration, 1), seeds, 1), "|", flush=True)
-    print("| in tip alone, record twice as long |", found(known_peaks(2 * duration, 1), seeds), "|\n", flush=True)
-    for name in ("ut4", "galacsi-nfm"):
-        flow = PRESETS[name]().replace({"run.duration": duration})
-        print(f"| frozen flow of {name} without vibration |", found(flow.replace(QUIET), few), "|", flush=True)
-        print(f"Filters, {name} with its vibration:", filters(flow, range(1, 6)), flush=True)
-    print("Lines, at best:", theory(duration), flush=True)
-    print("Filters, known peaks:", filters(known_peaks(duration), few), flush=True)
-    print("Filters, peaks of the paper:", filters(resonant, few), flush=True)
-    print("Closed against open loop:", twins(known_peaks(duration), range(1, 4)), flush=True)
-    print("Error over stated standard deviation:", spread(known_peaks(duration, 2, 40.0), seeds), flush=True)
+    print(f"{count} seeds, {duration:g} s", flush=True)
+    if "search" in parts:
+        print("| Record | lines found | resonances found | records with a false peak | white |\n|---|---|---|---|---|")
+        print("| turbulence and noise alone |", found(quiet, seeds), "|", flush=True)
+        print("| lines and resonances in tip and tilt |", found(known_peaks(duration), seeds), "|", flush=True)
+        print("| the same in tip alone |", found(known_peaks(duration, 1), seeds), "|", flush=True)
+        print("| in tip alone, lines at 30 times the floor |", found(known_peaks(duration, 1, 30.0), seeds), "|", flush=True)
+        print("| a record of tip alone |", found(known_peaks(duration, 1), seeds, 1), "|", flush=True)
+        print("| in tip alone, record twice as long |", found(known_peaks(2 * duration, 1), seeds), "|\n", flush=True)
+        print("Lines, at best:", theory(duration), flush=True)
+        print("Closed against open loop:", twins(known_peaks(duration), range(1, 4)), flush=True)
+        print("Error over stated standard deviation:", spread(known_peaks(duration, 2, 40.0), seeds), flush=True)
+    if "flow" in parts:
+        for name in ("ut4", "galacsi-nfm"):
+            scenario = PRESETS[name]().replace({"run.duration": duration})
+            print(f"| frozen flow of {name} without vibration |", flow(scenario, seeds), "|", flush=True)
+    if "filters" in parts:
+        for name in ("ut4", "galacsi-nfm"):
+            scenario = PRESETS[name]().replace({"run.duration": duration})
+            print(f"Filters, {name} with its vibration:", filters(scenario, range(1, 6)), flush=True)
+        print("Filters, known peaks:", filters(known_peaks(duration), few), flush=True)
+        print("Filters, peaks of the paper:", filters(resonant, few), flush=True)
+    if "coverage" in parts:
+        for rate, lost in ((1000.0, 0.0), (1000.0, 0.03), (1000.0, 0.1), (1000.0, 0.3), (2000.0, 0.0)):
+            coverage(seeds, rate, duration, lost)

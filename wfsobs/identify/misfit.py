@@ -17,8 +17,8 @@ ABOUT = np.sqrt(2.0)
 """Factor in frequency on either side over which dips are gathered."""
 LEVEL = 1e-3
 """Probability with which the right spectrum is given a margin at a frequency."""
-MEAN, VARIANCE = 0.25, 0.3125
-"""Of max(-x, 0)^2 / 2 of a standard normal x: what a dip of the right spectrum is worth in log-likelihood."""
+MEAN, VARIANCE = 0.2772, 0.3543
+"""Of what a dip of the right spectrum is worth in log-likelihood, 0 for means above one; of normal means 0.25 and 0.3125."""
 
 
 def margin(ratio: Array) -> Array:
