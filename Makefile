@@ -70,7 +70,7 @@ bench: $(BENCH)  ## time the observers, and compare them with other libraries
 
 clean:  ## remove .venv and all that was built
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis test-output
-	find app assets scripts tests wfsobs -name __pycache__ -prune -exec rm -rf {} +
+	find docs scripts tests wfsobs -name __pycache__ -prune -exec rm -rf {} +
 
 $(MADE):
 	@scripts/make_venv.sh "$(PYTHON)" $(VENV)

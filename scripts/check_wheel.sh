@@ -48,9 +48,8 @@ def files(folder):
     return {str(f.relative_to(folder)) for f in folder.rglob("*") if f.is_file() and "__pycache__" not in f.parts}
 
 installed = pathlib.Path(wfsobs.__file__).parent
-for package, source in (("", "wfsobs"), ("app", "app"), ("assets", "assets")):
-    lost = files(checkout / source) - files(installed / package)
-    assert not lost, f"not in the wheel: {lost}"
+lost = files(checkout / "wfsobs") - files(installed)
+assert not lost, f"not in the wheel: {lost}"
 print(len(names), "modules,", len(files(installed / "assets")), "assets")
 PY
 

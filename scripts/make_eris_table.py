@@ -1,4 +1,4 @@
-"""Make assets/eris_ut4.csv anew from the wheel that carries the spectrum: `python scripts/make_eris_table.py`.
+"""Make wfsobs/assets/eris_ut4.csv anew from the wheel that carries the spectrum: `python scripts/make_eris_table.py`.
 
 The wheel is `astro-tiptop==1.6.0` (MIT); pip fetches it into a folder that goes afterwards. Needs astropy (wfsobs[fits]).
 

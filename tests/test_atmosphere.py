@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
-from wfsobs import atmosphere
-from wfsobs.disturbance import make_disturbance
-from wfsobs.lgs import lgs_error_process, lgs_error_variance, low_frequency_process
-from wfsobs.observers.kalman import modelled_processes
+from wfsobs.atmosphere.von_karman import spectrum
+from wfsobs.observers.kalman.single import modelled_processes
 from wfsobs.scenario import Scenario
-from wfsobs.sensing import measure
-from wfsobs.turbulence import turbulence_process, turbulence_rms
-from wfsobs.von_karman import spectrum
-from wfsobs.zernike import noll_covariance
+from wfsobs.sensors.zernike import noll_covariance
+from wfsobs.simulation import layers as atmosphere
+from wfsobs.simulation.disturbance import make_disturbance
+from wfsobs.simulation.guide_stars import lgs_error_process, lgs_error_variance, low_frequency_process
+from wfsobs.simulation.sensing import measure
+from wfsobs.simulation.turbulence import turbulence_process, turbulence_rms
 
 FLOW: dict[str, Any] = {"turbulence.source": "frozen-flow", "sensors.kind": "zernike"}
 QUIET_SENSORS: dict[str, Any] = {"sensors.lgs_noise": 0.0, "sensors.ngs_noise": 0.0, "vibration.source": "none"}

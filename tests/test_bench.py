@@ -13,9 +13,9 @@ from wfsobs import bench, cli
 from wfsobs.bench import external, textbook
 from wfsobs.bench.measure import OURS, max_error, row, timed, with_ratios
 from wfsobs.bench.sizes import Sizes
-from wfsobs.observers.gpr_offline import train
-from wfsobs.observers.gpr_online import predict_sliding
-from wfsobs.observers.kernels import SquaredExponential
+from wfsobs.observers.gpr.kernels import SquaredExponential
+from wfsobs.observers.gpr.offline import train
+from wfsobs.observers.gpr.online import predict_sliding
 
 TINY = Sizes(
     settings={

@@ -9,13 +9,13 @@ import pytest
 from scipy.linalg import cholesky, solve_triangular, toeplitz
 from scipy.stats import binom
 
-from wfsobs.arrays import Array
-from wfsobs.bound import least_errors
-from wfsobs.loop import simulate
+from wfsobs.evaluation.bound import least_errors
+from wfsobs.evaluation.scores import rms
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
-from wfsobs.scores import rms
-from wfsobs.true_spectra import TrueSpectra, true_spectra
+from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
+from wfsobs.typing import Array
 
 RATE, SEEDS = 250.0, 100
 

@@ -9,10 +9,10 @@ import pytest
 from click.testing import CliRunner
 
 import wfsobs
-from wfsobs import configfile
 from wfsobs.cli import main
 from wfsobs.observers import OBSERVERS
-from wfsobs.presets import paper
+from wfsobs.scenario import configfile
+from wfsobs.scenario.presets import paper
 
 QUICK = ["--set", "run.duration=2", "--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=50",
          "--set", "adaptive.window=0.5"]

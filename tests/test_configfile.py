@@ -4,12 +4,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs import configfile
-from wfsobs.groups.vibration import Peak
-from wfsobs.presets import PRESETS, paper
-from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
-from wfsobs.variations import parse_variation
+from wfsobs.scenario import Scenario, configfile
+from wfsobs.scenario.grid import parse_variation
+from wfsobs.scenario.groups.vibration import Peak
+from wfsobs.scenario.presets import PRESETS, paper
+from wfsobs.scenario.settings import SettingError
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from wfsobs.cost import adaptive_seconds, frozen_flow_seconds, gpr_offline_seconds, gpr_online_seconds, part_seconds, run_seconds
-from wfsobs.presets import paper, ut4
+from wfsobs.scenario.presets import paper, ut4
 
 
 @pytest.mark.parametrize(("m", "depth", "measured"), [

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wfsobs.arrays import Array
-from wfsobs.describe import Description, describe
+from wfsobs.evaluation.description import Description, describe
 from wfsobs.observers import OBSERVERS
-from wfsobs.presets import PRESETS
+from wfsobs.progress import QUIET
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.watch import QUIET
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.typing import Array
 
 
 def impulse_response(observer: str, scenario: Scenario, steps: int, lgs: int | None = None, ngs: int | None = None) -> Array:

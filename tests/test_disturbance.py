@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.signal import periodogram
 
-from wfsobs.disturbance import Disturbance, make_disturbance, vibration_variance
 from wfsobs.scenario import Scenario
-from wfsobs.turbulence import turbulence_process
+from wfsobs.simulation.disturbance import Disturbance, make_disturbance, vibration_variance
+from wfsobs.simulation.turbulence import turbulence_process
 
 N = 4000
 

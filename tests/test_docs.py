@@ -14,10 +14,9 @@ from types import ModuleType
 import pytest
 from click.testing import CliRunner
 
-from wfsobs import configfile
 from wfsobs.cli import main
 from wfsobs.observers import OBSERVERS
-from wfsobs.scenario import Scenario
+from wfsobs.scenario import Scenario, configfile
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"

@@ -10,22 +10,22 @@ import numpy as np
 import pytest
 
 from wfsobs import PRESETS, Scenario, SettingError, observe, simulate
-from wfsobs.ar2 import Ar2, turbulence_corner
-from wfsobs.bound import bounds
 from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.control.tables import rows
 from wfsobs.cost import run_bytes, run_seconds
-from wfsobs.disturbance import make_disturbance
-from wfsobs.events import moved, moved_process, read
-from wfsobs.groups.events import Event
-from wfsobs.identify import identify
-from wfsobs.lgs import lgs_weights
-from wfsobs.loop import integrator
+from wfsobs.evaluation.bound import bounds
+from wfsobs.identification import identify
 from wfsobs.observers import OBSERVERS
 from wfsobs.record import Record
-from wfsobs.schedule import air_time, shift, strength, turns
-from wfsobs.spectrum import bin_frequencies, random_phase_signal
-from wfsobs.telemetry import load_record, save_record
+from wfsobs.scenario.groups.events import Event
+from wfsobs.scenario.timeline import air_time, shift, strength, turns
+from wfsobs.signal.ar2 import Ar2, turbulence_corner
+from wfsobs.signal.spectrum import bin_frequencies, random_phase_signal
+from wfsobs.simulation.disturbance import make_disturbance
+from wfsobs.simulation.events import moved, moved_process, read
+from wfsobs.simulation.guide_stars import lgs_weights
+from wfsobs.simulation.loop import integrator
+from wfsobs.telemetry.records import load_record, save_record
 
 SHORT = {"run.duration": 3.0, "run.warm_up": 0.5, "gpr_online.training_size": 100, "gpr_offline.training_size": 100}
 

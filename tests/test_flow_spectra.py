@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy.signal import csd, welch
 
-from wfsobs.bound import bound, bounds
-from wfsobs.flow_spectra import flow_spectra
-from wfsobs.lgs import lgs_error_variance
-from wfsobs.loop import simulate
+from wfsobs.evaluation.bound import bound, bounds
 from wfsobs.observers import OBSERVERS
+from wfsobs.progress import QUIET
 from wfsobs.scenario import Scenario
-from wfsobs.true_spectra import is_known, n_frequencies, true_spectra
-from wfsobs.turbulence import turbulence_rms
-from wfsobs.watch import QUIET
-from wfsobs.wiener import circle_mean
+from wfsobs.signal.wiener import circle_mean
+from wfsobs.simulation.flow_spectra import flow_spectra
+from wfsobs.simulation.guide_stars import lgs_error_variance
+from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.true_spectra import is_known, n_frequencies, true_spectra
+from wfsobs.simulation.turbulence import turbulence_rms
 
 FLOW = Scenario().replace({
     "turbulence.source": "frozen-flow", "vibration.source": "none", "sensors.kind": "zernike", "sensors.lgs_noise": 0.02,

@@ -9,10 +9,10 @@ import pytest
 from scipy.signal import welch
 from scipy.special import j0, jv
 
-from wfsobs.frozen_flow import Grid, View, frozen_flow, period_steps, waves
-from wfsobs.von_karman import Layer, spectrum
-from wfsobs.wave import Footprint
-from wfsobs.zernike import ZernikeProjection, noll, noll_covariance, over_argument
+from wfsobs.atmosphere.frozen_flow import Grid, View, frozen_flow, period_steps, waves
+from wfsobs.atmosphere.plane_waves import Footprint
+from wfsobs.atmosphere.von_karman import Layer, spectrum
+from wfsobs.sensors.zernike import ZernikeProjection, noll, noll_covariance, over_argument
 
 D, R0, L0 = 8.0, 0.157, 25.0
 STRENGTH = R0 ** (-5 / 3)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from wfsobs import PRESETS, observe, simulate
-from wfsobs.gaps import bridged, held
+from wfsobs.evaluation.scores import PREDICTION, RESIDUAL, rms
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman import kalman_model, measurement_noise
+from wfsobs.observers.kalman.single import kalman_model, measurement_noise
+from wfsobs.observers.missing import bridged, held
 from wfsobs.pipeline import each_estimate
 from wfsobs.record import Record
-from wfsobs.riccati import steady_state
 from wfsobs.scenario import Scenario
-from wfsobs.scores import PREDICTION, RESIDUAL, rms
+from wfsobs.signal.riccati import steady_state
 
 
 def scenario() -> Scenario:

@@ -12,28 +12,27 @@ import pytest
 from click.testing import CliRunner
 from scipy.stats import binom, gamma, kstest
 
-from wfsobs import configfile
-from wfsobs.ar2 import Ar2
 from wfsobs.cli import main
-from wfsobs.identify import Identified, identify, misfit
-from wfsobs.identify.lines import Line, nearest_line
-from wfsobs.identify.misfit import margin
-from wfsobs.identify.model import Spectrum
-from wfsobs.identify.one_mode import OneMode
-from wfsobs.identify.periodogram import Cells, fast_length, frequencies, inflation, periodogram
-from wfsobs.identify.process import Number, Process, merged
-from wfsobs.identify.report import annotated, plain, verdict, written
-from wfsobs.identify.search import PAD, search
-from wfsobs.identify.whiteness import autocorrelation_test, cumulated_test, innovations
-from wfsobs.identify.whittle import fitted, information, negative_log_likelihood
-from wfsobs.loop import simulate
+from wfsobs.identification import Identified, identify, misfit
+from wfsobs.identification.misfit import margin
+from wfsobs.identification.one_mode import OneMode
+from wfsobs.identification.process import Number, Process, merged
+from wfsobs.identification.report import annotated, plain, verdict, written
+from wfsobs.identification.whiteness import autocorrelation_test, cumulated_test, innovations
 from wfsobs.pipeline import observe
-from wfsobs.presets import PRESETS
+from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record, RecordError
-from wfsobs.scenario import Scenario
-from wfsobs.telemetry import save_record
-from wfsobs.true_spectra import true_spectra
-from wfsobs.watch import Cancelled, Watch
+from wfsobs.scenario import Scenario, configfile
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.true_spectra import true_spectra
+from wfsobs.spectral.lines import Line, nearest_line
+from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.periodogram import Cells, fast_length, frequencies, inflation, periodogram
+from wfsobs.spectral.search import PAD, search
+from wfsobs.spectral.whittle import fitted, information, negative_log_likelihood
+from wfsobs.telemetry.records import save_record
 
 DT = 1e-3
 MODEL = Spectrum(0.014, DT, Ar2(7.0, 0.9, 0.5, DT), (Ar2(2 * pi * 30.0, 0.02, 0.004, DT),))

@@ -9,14 +9,14 @@ import pytest
 from scipy.linalg import circulant
 from scipy.stats import binom
 
-from wfsobs.ar2 import Ar2
-from wfsobs.arrays import Array
-from wfsobs.identify import identify
-from wfsobs.identify.missing import Missing
-from wfsobs.identify.model import Spectrum
-from wfsobs.identify.periodogram import Cells, frequencies
-from wfsobs.identify.whittle import information
+from wfsobs.identification import identify
 from wfsobs.record import Record, RecordError
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.spectral.missing import Missing
+from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.periodogram import Cells, frequencies
+from wfsobs.spectral.whittle import information
+from wfsobs.typing import Array
 
 DT = 1e-3
 N = 600

@@ -11,27 +11,26 @@ from click.testing import CliRunner
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from wfsobs import configfile
-from wfsobs.ar2 import Ar2
-from wfsobs.ar3 import Ar3
-from wfsobs.arrays import Array
-from wfsobs.bound import bound
 from wfsobs.cli import main
 from wfsobs.control.lqg import LQG
 from wfsobs.control.mirror import Mirror
-from wfsobs.identify import Identified, identify
-from wfsobs.identify.process import Number, Process, merged
-from wfsobs.identify.report import toml
-from wfsobs.observers.kalman import modelled_peak, steady_filter
-from wfsobs.observers.kalman_multi import prior
+from wfsobs.evaluation.bound import bound
+from wfsobs.identification import Identified, identify
+from wfsobs.identification.process import Number, Process, merged
+from wfsobs.identification.report import toml
+from wfsobs.observers.kalman.multi import prior
+from wfsobs.observers.kalman.single import modelled_peak, steady_filter
 from wfsobs.pipeline import observe, run
-from wfsobs.presets import PRESETS
-from wfsobs.prior import Prior
+from wfsobs.prior.model import Prior
 from wfsobs.record import Record
-from wfsobs.scenario import Scenario
-from wfsobs.statespace import sampled
-from wfsobs.telemetry import save_record
-from wfsobs.turbulence import turbulence_rms
+from wfsobs.scenario import Scenario, configfile
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.statespace import sampled
+from wfsobs.simulation.turbulence import turbulence_rms
+from wfsobs.telemetry.records import save_record
+from wfsobs.typing import Array
 
 DT = 1e-3
 QUICK = ("kf-lgs", "kf-multi", "butterworth-cl")

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.disturbance import make_disturbance, vibration_variance
-from wfsobs.lgs import lgs_error_process, lgs_error_variance, lgs_noise_rms, lgs_weights, seen_turbulence
-from wfsobs.loop import simulate
-from wfsobs.observers.kalman import measurement_noise
+from wfsobs.observers.kalman.single import measurement_noise
 from wfsobs.pipeline import observe
 from wfsobs.record import delayed
 from wfsobs.scenario import Scenario
-from wfsobs.sensing import measure
+from wfsobs.simulation.disturbance import make_disturbance, vibration_variance
+from wfsobs.simulation.guide_stars import lgs_error_process, lgs_error_variance, lgs_noise_rms, lgs_weights, seen_turbulence
+from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.sensing import measure
 
 BEST: dict[str, Any] = {"sensors.lgs_combination": "minimum-variance"}
 FLOW: dict[str, Any] = {"turbulence.source": "frozen-flow", "sensors.kind": "zernike"}

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.lifted import BLOCK, PeriodicFilter
+from wfsobs.signal.periodic import BLOCK, PeriodicFilter
 
 Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.loop import TRAINING_MARGIN, integrator, simulate
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
+from wfsobs.scenario.settings import SettingError
+from wfsobs.simulation.loop import TRAINING_MARGIN, integrator, simulate
 
 NOISELESS = {"sensors.lgs_noise": 0.0, "sensors.ngs_noise": 0.0, "sensors.lgs_low_frequency_rms": 0.0}
 

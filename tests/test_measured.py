@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from wfsobs.app.views.plots import marked_peaks
-from wfsobs.disturbance import make_disturbance, vibration_variance
-from wfsobs.groups.vibration import Vibration
-from wfsobs.measured import ALL, LINES, PARTS, SPECTRA, measured_spectrum
-from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.groups.vibration import Vibration
+from wfsobs.scenario.measured_spectra import ALL, LINES, PARTS, SPECTRA, measured_spectrum
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.disturbance import make_disturbance, vibration_variance
 
 ERIS = measured_spectrum("eris-ut4")
 DF = 0.028

@@ -10,9 +10,9 @@ from click.testing import CliRunner
 
 from wfsobs import PRESETS, SettingError
 from wfsobs.cli import main
+from wfsobs.cli.recovery_tables import OverTime
+from wfsobs.evaluation.recovery import Pooled, recovery, running_rms, trailing_rms
 from wfsobs.observers.base import VIBRATION, Estimate
-from wfsobs.over_time import Pooled, recovery, running_rms, trailing_rms
-from wfsobs.over_time_tables import OverTime
 from wfsobs.pipeline import run
 from wfsobs.record import Record
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from wfsobs import PRESETS, Record, Scenario, SettingError, observe, run, simulate
-from wfsobs.bound import bound
+from wfsobs.evaluation.bound import bound
+from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL, rms
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.pipeline import Failure, as_stated, each_estimate
-from wfsobs.scores import LOOP, PREDICTION, RESIDUAL, rms
-from wfsobs.watch import Cancelled, Watch
+from wfsobs.progress import Cancelled, Watch
 
 
 def scenario(changes: dict[str, Any] | None = None) -> Scenario:

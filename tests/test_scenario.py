@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from wfsobs import PRESETS
-from wfsobs.disturbance import vibration_variance
-from wfsobs.groups.vibration import PAPER_PEAK_HZ
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
+from wfsobs.scenario.groups.vibration import PAPER_PEAK_HZ
+from wfsobs.scenario.settings import SettingError
+from wfsobs.simulation.disturbance import vibration_variance
 
 TABLE = {"frequency": [1.0, 2.0, 3.0], "tip": [1.0, 1.0, 1.0], "tilt": [1.0, 1.0, 1.0]}
 FLOW: dict[str, Any] = {"turbulence.source": "frozen-flow"}

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.ar2 import Ar2
+from wfsobs.evaluation.scores import cumulative_rms, lag, rms, scored_samples, supervised_scores, unsupervised_scores, welch_psd
 from wfsobs.observers.base import Estimate
 from wfsobs.record import Record
-from wfsobs.scores import cumulative_rms, lag, rms, scored_samples, supervised_scores, unsupervised_scores, welch_psd
+from wfsobs.signal.ar2 import Ar2
 
 NAMES = ["tip", "tilt"]
 

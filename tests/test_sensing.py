@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.disturbance import Disturbance
 from wfsobs.scenario import Scenario
-from wfsobs.sensing import measure
+from wfsobs.simulation.disturbance import Disturbance
+from wfsobs.simulation.sensing import measure
 
 N = 4000
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from wfsobs import simulate
-from wfsobs.observers.kalman import measurement_noise
-from wfsobs.presets import PRESETS
+from wfsobs.observers.kalman.single import measurement_noise
+from wfsobs.progress import QUIET
 from wfsobs.scenario import Scenario
-from wfsobs.sensors import aliasing_rms, noise_covariance, noise_rms, sensor, shack_hartmann
-from wfsobs.settings import SettingError
-from wfsobs.turbulence import SOURCES
-from wfsobs.watch import QUIET
-from wfsobs.zernike import ZernikeProjection
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.settings import SettingError
+from wfsobs.sensors.zernike import ZernikeProjection
+from wfsobs.simulation.sensor_noise import aliasing_rms, noise_covariance, noise_rms, sensor, shack_hartmann
+from wfsobs.simulation.turbulence import SOURCES
 
 SHORT = {"run.duration": 0.4, "run.warm_up": 0.1, "gpr_offline.training_size": 2, "gpr_offline.depth": 2}
 

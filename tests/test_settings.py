@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.groups.vibration import Peak
-from wfsobs.parameters import Reals, allowed, unit_of
 from wfsobs.scenario import Scenario
-from wfsobs.settings import Group, SettingError
+from wfsobs.scenario.groups.vibration import Peak
+from wfsobs.scenario.parameters import Reals, allowed, unit_of
+from wfsobs.scenario.settings import Group, SettingError
 
 EXAMPLES = settings(max_examples=30, deadline=None, derandomize=True)
 HUGE = 10**400

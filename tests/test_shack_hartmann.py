@@ -11,17 +11,17 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import j1, jv
 
-from wfsobs import zernike
-from wfsobs.aliasing import Aliasing
-from wfsobs.frozen_flow import Grid, View, frozen_flow, waves
-from wfsobs.lenslets import Lenslets
-from wfsobs.reconstructor import interaction, polynomials, reconstructor
-from wfsobs.shack_hartmann import ShackHartmann
-from wfsobs.spots import ARCSEC, Spots
-from wfsobs.trigonometric import TrigonometricSum, lagrange_weights
-from wfsobs.von_karman import Layer, spectrum
-from wfsobs.wave import Footprint, Wave
-from wfsobs.zernike import ZernikeProjection, up_to_order
+from wfsobs.atmosphere.frozen_flow import Grid, View, frozen_flow, waves
+from wfsobs.atmosphere.plane_waves import Footprint, Wave
+from wfsobs.atmosphere.von_karman import Layer, spectrum
+from wfsobs.sensors import zernike
+from wfsobs.sensors.aliasing import Aliasing
+from wfsobs.sensors.lenslets import Lenslets
+from wfsobs.sensors.nufft import TrigonometricSum, lagrange_weights
+from wfsobs.sensors.reconstructor import interaction, polynomials, reconstructor
+from wfsobs.sensors.shack_hartmann import ShackHartmann
+from wfsobs.sensors.spots import ARCSEC, Spots
+from wfsobs.sensors.zernike import ZernikeProjection, up_to_order
 
 D, R0, L0 = 8.0, 0.157, 25.0
 STRENGTH = R0 ** (-5 / 3)

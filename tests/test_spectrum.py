@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from wfsobs.spectrum import bin_edges, bin_frequencies, gaussian_signal, random_phase_signal, resonance_power, table_power
+from wfsobs.signal.spectrum import bin_edges, bin_frequencies, gaussian_signal, random_phase_signal, resonance_power, table_power
 
 EXAMPLES = settings(max_examples=25, deadline=None, derandomize=True)
 EPS = np.finfo(float).eps

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wfsobs.ar2 import Ar2
-from wfsobs.ar3 import Ar3
-from wfsobs.statespace import disturbance_model, paper_matrices, sampled
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.statespace import disturbance_model, paper_matrices, sampled
 
 TURBULENCE, VIBRATION = Ar2(7.0686, 0.9, 0.5, 1e-3), Ar2(298.4, 0.03, 0.015, 1e-3)
 

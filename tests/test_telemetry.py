@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from wfsobs.loop import simulate
-from wfsobs.presets import paper
 from wfsobs.record import RecordError
-from wfsobs.telemetry import load_record, save_arrays, save_record
+from wfsobs.scenario.presets import paper
+from wfsobs.simulation.loop import simulate
+from wfsobs.telemetry.records import load_record, save_arrays, save_record
 
 
 @pytest.fixture(scope="module")

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.special import expit, logit
 
-from wfsobs.ar3 import TOLERANCE, Ar3, fitted_ar3
-from wfsobs.arrays import Array
-from wfsobs.observers.kalman import measurement_noise, modelled_processes
-from wfsobs.presets import PRESETS
-from wfsobs.true_spectra import seen_turbulence
-from wfsobs.whittle import information, whittle_fit
+from wfsobs.observers.kalman.single import measurement_noise, modelled_processes
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.signal.ar3 import TOLERANCE, Ar3, fitted_ar3
+from wfsobs.signal.whittle import information, whittle_fit
+from wfsobs.simulation.true_spectra import seen_turbulence
+from wfsobs.typing import Array
 
 F = np.geomspace(1.0, 100.0, 200)
 COUNT = np.linspace(1.0, 50.0, 200)

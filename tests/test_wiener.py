@@ -8,17 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_toeplitz
 
-from wfsobs.ar2 import Ar2, turbulence_corner
-from wfsobs.arrays import Array
-from wfsobs.bound import bound
-from wfsobs.disturbance import vibration_variance
+from wfsobs.evaluation.bound import bound
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman import kalman_model, measurement_noise
-from wfsobs.presets import PRESETS
-from wfsobs.riccati import steady_state
+from wfsobs.observers.kalman.single import kalman_model, measurement_noise
 from wfsobs.scenario import Scenario
-from wfsobs.true_spectra import TrueSpectra, line_width, n_frequencies, true_spectra
-from wfsobs.wiener import advanced, causal_error, circle_mean, factorise
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.signal.ar2 import Ar2, turbulence_corner
+from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.wiener import advanced, causal_error, circle_mean, factorise
+from wfsobs.simulation.disturbance import vibration_variance
+from wfsobs.simulation.true_spectra import TrueSpectra, line_width, n_frequencies, true_spectra
+from wfsobs.typing import Array
 
 # The loop of one 530 nm turbulence, one 50 nm line at 47.5 Hz, 20 nm of noise.
 MATCHED = Scenario().replace({

@@ -8,8 +8,8 @@ from math import factorial
 import numpy as np
 import pytest
 
-from wfsobs.wave import Footprint, Wave
-from wfsobs.zernike import ZernikeProjection, looked_up, noll, noll_covariance, over_argument, transform, up_to_order
+from wfsobs.atmosphere.plane_waves import Footprint, Wave
+from wfsobs.sensors.zernike import ZernikeProjection, looked_up, noll, noll_covariance, over_argument, transform, up_to_order
 
 MODES = range(1, 29)
 

@@ -7,12 +7,12 @@
     [('kf-lgs', 'turbulence', 'tip'), ('kf-lgs', 'turbulence', 'tilt')]
 """
 
-from wfsobs.loop import simulate
 from wfsobs.pipeline import Result, observe, run
-from wfsobs.presets import PRESETS
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.settings import SettingError
+from wfsobs.simulation.loop import simulate
 
 __version__ = "0.1.0"
 

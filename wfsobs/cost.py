@@ -9,10 +9,10 @@ moment or a wait.
 
 from __future__ import annotations
 
-from wfsobs.loop import TRAINING_MARGIN
-from wfsobs.observers.modes import AT_ONCE
+from wfsobs.atmosphere.von_karman import FIELD
+from wfsobs.observers.per_mode import AT_ONCE
 from wfsobs.scenario import Scenario
-from wfsobs.von_karman import FIELD
+from wfsobs.simulation.loop import TRAINING_MARGIN
 
 CORES = 2
 
@@ -20,7 +20,7 @@ CORES = 2
 def run_seconds(scenario: Scenario) -> float:
     """About how long simulation, every observer and the scores take [s].
 
-    >>> from wfsobs.presets import paper
+    >>> from wfsobs.scenario.presets import paper
     >>> round(run_seconds(paper()), 1), round(run_seconds(paper().replace({"run.duration": 300})))
     (0.6, 20)
     """
@@ -89,7 +89,7 @@ def run_bytes(scenario: Scenario) -> float:
     step, turbulence that grown wind carries past besides, and the windows of the larger GPR, or the waves of frozen flow that are
     at work.
 
-    >>> from wfsobs.presets import paper
+    >>> from wfsobs.scenario.presets import paper
     >>> round(run_bytes(paper()) / 1e6), round(run_bytes(paper().replace({"run.duration": 300})) / 1e6)
     (108, 282)
     """

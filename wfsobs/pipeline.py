@@ -6,17 +6,17 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 
-from wfsobs.arrays import Array
-from wfsobs.bound import Bound, bound_scores, bounds
-from wfsobs.gaps import bridged
-from wfsobs.loop import simulate
+from wfsobs.evaluation.bound import Bound, bound_scores, bounds
+from wfsobs.evaluation.scores import Score, supervised_scores, unsupervised_scores
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Observer
+from wfsobs.observers.missing import bridged
+from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.scores import Score, supervised_scores, unsupervised_scores
-from wfsobs.settings import SettingError
-from wfsobs.watch import QUIET, Watch
+from wfsobs.scenario.settings import SettingError
+from wfsobs.simulation.loop import simulate
+from wfsobs.typing import Array
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wfsobs.arrays import Array
+from wfsobs.typing import Array
 
 DELAY = 2
 """The paper's delay: a command is computed once y_lgs[k] is known, acts during step k + 1, and is seen at k + 2."""
@@ -43,7 +43,8 @@ class Record:
     delay       : steps from a command to the first measurement that sees it, y_lgs[k] = phi_dist[k-1] + u[k-delay] + noise
     origin      : what a file said of unit, sign and timing before it was brought into this form, one line
 
-    NaN in y_lgs, u and the rest is a sample that is missing; what observers are given in its place is `wfsobs.gaps.bridged`.
+    NaN in y_lgs, u and the rest is a sample that is missing; `wfsobs.observers.missing.bridged` fills it for
+    observers.
     """
 
     y_lgs: Array

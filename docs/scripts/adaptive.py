@@ -11,7 +11,7 @@ import numpy as np
 
 from wfsobs import PRESETS, Record, Scenario, simulate
 from wfsobs.observers import OBSERVERS
-from wfsobs.watch import QUIET
+from wfsobs.progress import QUIET
 
 KNOWING, NAMES = "kf-multi", ("kf-adaptive", "kf-multi", "kf-lgs")
 CASES = (("paper", 4.0), ("strong-turbulence", 4.0), ("ut4", 4.0), ("ut4", 8.0))

@@ -8,15 +8,15 @@ from statistics import median
 
 import numpy as np
 
-from wfsobs.bound import BOUND
 from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.integrator import highest_stable_gain
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.tables import label, rows
-from wfsobs.loop import simulate
-from wfsobs.presets import PRESETS
+from wfsobs.evaluation.bound import BOUND
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.loop import simulate
 
 MATCHED = Scenario().replace({
     "turbulence.rms": 0.53, "vibration.source": "ar2", "kalman.frequency": 47.5,

@@ -19,13 +19,13 @@ from importlib.metadata import version
 
 import numpy as np
 
-from wfsobs import zernike
-from wfsobs.arrays import Array
-from wfsobs.lenslets import Lenslets
-from wfsobs.reconstructor import reconstructor
-from wfsobs.shack_hartmann import ShackHartmann
-from wfsobs.spots import ARCSEC
-from wfsobs.von_karman import spectrum
+from wfsobs.atmosphere.von_karman import spectrum
+from wfsobs.sensors import zernike
+from wfsobs.sensors.lenslets import Lenslets
+from wfsobs.sensors.reconstructor import reconstructor
+from wfsobs.sensors.shack_hartmann import ShackHartmann
+from wfsobs.sensors.spots import ARCSEC
+from wfsobs.typing import Array
 
 R0, L0 = 0.157, 25.0  # [m]
 PERIOD = 32.0  # of a screen [m]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from itertools import groupby
 
+from wfsobs.cli.recovery_tables import OverTime, recovery_texts
+from wfsobs.cli.tables import label_of
 from wfsobs.observers.base import TARGETS
-from wfsobs.over_time_tables import OverTime, recovery_texts
 from wfsobs.pipeline import run
-from wfsobs.presets import PRESETS
-from wfsobs.tables import label_of
+from wfsobs.scenario.presets import PRESETS
 
 CASES = {
     "peak-jump": TARGETS[1:], "peak-drift": TARGETS[1:], "wind-change": TARGETS, "laser-dropout": TARGETS,

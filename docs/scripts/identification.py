@@ -16,13 +16,13 @@ from scipy.optimize import brentq
 from scipy.stats import ncx2
 
 from wfsobs import PRESETS, Record, Scenario, observe, simulate
-from wfsobs.ar2 import Ar2
-from wfsobs.identify import Identified, identify
-from wfsobs.identify.identification import ALONE, LEVEL
-from wfsobs.identify.search import BELOW, LOWEST, OF_LINES, STRUCTURES
-from wfsobs.lgs import lgs_error_process, lgs_noise_rms
-from wfsobs.true_spectra import true_spectra
-from wfsobs.turbulence import turbulence_process
+from wfsobs.identification import Identified, identify
+from wfsobs.identification.identification import ALONE, LEVEL
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.simulation.guide_stars import lgs_error_process, lgs_noise_rms
+from wfsobs.simulation.true_spectra import true_spectra
+from wfsobs.simulation.turbulence import turbulence_process
+from wfsobs.spectral.search import BELOW, LOWEST, OF_LINES, STRUCTURES
 
 QUIET: dict[str, Any] = {"vibration.source": "none"}
 """Turbulence and noise alone."""

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wfsobs.telemetry import save_arrays
+from wfsobs.telemetry.records import save_arrays
 
 RATE = 1000.0
 """Frames per second, about [Hz]."""

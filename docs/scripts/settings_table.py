@@ -1,4 +1,4 @@
-"""Writes docs/settings.md from the declarations in wfsobs/scenario.py: `python docs/scripts/settings_table.py`."""
+"""Writes docs/settings.md from the declarations in wfsobs/scenario/scenario.py: `python docs/scripts/settings_table.py`."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 
 import param
 
-from wfsobs.parameters import Reals, unit_of
-from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
-from wfsobs.settings import Group, holds_groups
+from wfsobs.scenario.parameters import Reals, unit_of
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.settings import Group, holds_groups
 
 PAGE = Path(__file__).parents[1] / "settings.md"
 
@@ -21,7 +21,7 @@ Every setting of a run, by the path that it has on the command line (`--set path
 `Scenario.replace`. Items of a list are numbered from 0, and the number one past the end adds an item; N stands for such a
 number. The defaults are those of `Scenario()`; what a preset changes stands at the end of the page.
 
-This page is written by [settings_table.py](scripts/settings_table.py) from `wfsobs/scenario.py`.
+This page is written by [settings_table.py](scripts/settings_table.py) from `wfsobs/scenario/scenario.py`.
 """
 
 

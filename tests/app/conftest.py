@@ -18,9 +18,9 @@ from wfsobs.app.service import Service, Session
 from wfsobs.app.sources import Source
 from wfsobs.app.store import Store
 from wfsobs.app.work import Shown, compute
-from wfsobs.presets import PRESETS
+from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
-from wfsobs.watch import Watch
+from wfsobs.scenario.presets import PRESETS
 
 SHORT = {
     "run.duration": 2.0, "run.warm_up": 0.5, "gpr_offline.training_size": 40, "gpr_offline.depth": 20,

@@ -21,11 +21,11 @@ from wfsobs.app.report.maker import ReportError
 from wfsobs.app.share import to_query
 from wfsobs.app.work import Shown, compute
 from wfsobs.cli import main
-from wfsobs.configfile import from_toml
-from wfsobs.presets import PRESETS
+from wfsobs.progress import QUIET
 from wfsobs.scenario import Scenario
-from wfsobs.telemetry import load_record, read_record
-from wfsobs.watch import QUIET
+from wfsobs.scenario.configfile import from_toml
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.telemetry.records import load_record, read_record
 
 WIND = "turbulence.wind_speed"
 

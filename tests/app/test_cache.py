@@ -19,10 +19,10 @@ from wfsobs.app.limits import NONE
 from wfsobs.app.service import Service
 from wfsobs.app.work import Shown, Spectrum, compute
 from wfsobs.pipeline import Result
+from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
-from wfsobs.watch import QUIET, Watch
+from wfsobs.scenario.settings import SettingError
 
 WAIT = 20.0
 

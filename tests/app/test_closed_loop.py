@@ -15,10 +15,10 @@ from wfsobs.app.pages.loop_figures import CURVES
 from wfsobs.app.pages.pages import EXPLORE, LOOP
 from wfsobs.app.style import LOOKS
 from wfsobs.app.views.envelope import envelope
-from wfsobs.bound import BOUND
 from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.tables import rows
+from wfsobs.evaluation.bound import BOUND
 
 
 def opened(dashboard: Dashboard) -> ClosedLoopPage:

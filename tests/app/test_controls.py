@@ -13,9 +13,9 @@ from wfsobs.app.controls.names import name_of
 from wfsobs.app.controls.panel import FIRST, Controls, status_of
 from wfsobs.app.work import Shown
 from wfsobs.pipeline import Result
-from wfsobs.presets import PRESETS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
 
 PATH = "vibration.peaks"
 

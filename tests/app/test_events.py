@@ -15,9 +15,9 @@ from wfsobs.app.pin import pin
 from wfsobs.app.store import Store
 from wfsobs.app.views.envelope import envelope
 from wfsobs.app.views.traces import BINS
-from wfsobs.groups.events import OF_KIND, Event
-from wfsobs.over_time import running_rms
+from wfsobs.evaluation.recovery import running_rms
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.groups.events import OF_KIND, Event
 
 EVENTS = [
     {"kind": "wind", "start": 1.6, "duration": 0.2, "wind_factor": 2.0},

@@ -13,9 +13,9 @@ from wfsobs.app.store import STEPS_BACK, Store
 from wfsobs.app.work import Shown
 from wfsobs.cost import run_seconds
 from wfsobs.pipeline import Result
-from wfsobs.presets import PRESETS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
 
 WIND = "turbulence.wind_speed"
 LONG = {"run.duration": 300}

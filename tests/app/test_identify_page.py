@@ -19,15 +19,15 @@ from wfsobs.app.pages.identify import EARLIER, IdentifyPage
 from wfsobs.app.pages.pages import EXPLORE, IDENTIFY
 from wfsobs.app.sources import Kept, Loaded
 from wfsobs.app.style import LOOKS
-from wfsobs.formats import format_of
-from wfsobs.identify import Identified, identify
-from wfsobs.identify.process import Number
-from wfsobs.identify.report import verdict, written
-from wfsobs.loop import simulate
+from wfsobs.evaluation.scores import BOUND
+from wfsobs.identification import Identified, identify
+from wfsobs.identification.process import Number
+from wfsobs.identification.report import verdict, written
 from wfsobs.pipeline import observe
 from wfsobs.scenario import Scenario
-from wfsobs.scores import BOUND
-from wfsobs.telemetry import read_record, record_arrays
+from wfsobs.simulation.loop import simulate
+from wfsobs.telemetry.formats import format_of
+from wfsobs.telemetry.records import read_record, record_arrays
 
 LINE = 25.0
 """A pure line of 50 nm in tip [Hz]; the warm-up of the figures plays no part in it."""

@@ -18,9 +18,9 @@ from wfsobs.app.share import from_query, to_file
 from wfsobs.app.store import Store
 from wfsobs.app.work import Shown
 from wfsobs.cost import run_bytes, run_seconds
-from wfsobs.presets import PRESETS, paper
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
+from wfsobs.scenario.presets import PRESETS, paper
+from wfsobs.scenario.settings import SettingError
 
 
 def refused(limits: Limits, changes: dict[str, Any]) -> str:

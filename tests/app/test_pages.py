@@ -14,7 +14,7 @@ from wfsobs.app.pages.figures import PSD_TOP_HZ, Figures
 from wfsobs.app.pages.pages import EXPLORE, FIGURES, MODEL
 from wfsobs.app.style import LOOKS
 from wfsobs.app.work import TRUTH
-from wfsobs.describe import describe
+from wfsobs.evaluation.description import describe
 from wfsobs.scenario import Scenario
 
 

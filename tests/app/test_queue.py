@@ -20,7 +20,7 @@ from wfsobs.app.jobs.queue import JobQueue
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.limits import NONE
 from wfsobs.app.service import Service
-from wfsobs.watch import Watch
+from wfsobs.progress import Watch
 
 WAIT = 20.0
 KINDS = ("run", "loop", "identify", "tune", "upload", "report")

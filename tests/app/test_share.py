@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 import wfsobs
 from wfsobs.app.share import LONGEST, changes, from_file, from_query, to_command, to_file, to_python, to_query
 from wfsobs.cli import main
-from wfsobs.groups.atmosphere import Layer, Process
-from wfsobs.groups.vibration import Peak
-from wfsobs.identify import identify
-from wfsobs.loop import simulate
-from wfsobs.presets import PRESETS
+from wfsobs.identification import identify
 from wfsobs.scenario import Scenario
-from wfsobs.settings import Group, SettingError
+from wfsobs.scenario.groups.atmosphere import Layer, Process
+from wfsobs.scenario.groups.vibration import Peak
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.settings import Group, SettingError
+from wfsobs.simulation.loop import simulate
 
 QUICK = {
     "run.duration": 1.0, "run.warm_up": 0.5, "gpr_online.training_size": 20, "gpr_offline.training_size": 50,

@@ -11,11 +11,11 @@ from wfsobs import pipeline
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING, Tell
 from wfsobs.app.store import Store
 from wfsobs.app.work import Shown
-from wfsobs.presets import PRESETS
+from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
-from wfsobs.watch import Cancelled, Watch
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.settings import SettingError
 
 
 def answer(scenario: Scenario) -> Shown:

@@ -19,10 +19,10 @@ from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.pages.tune_views import unit_for
 from wfsobs.app.sources import Loaded
 from wfsobs.app.tune_work import CHOICES, best_so_far, seconds
-from wfsobs.configfile import changes
-from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import changes
+from wfsobs.simulation.loop import simulate
 from wfsobs.tuning import Evaluation, Tuned, tune
 from wfsobs.tuning.judge import Errors
 

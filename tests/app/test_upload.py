@@ -19,11 +19,11 @@ from wfsobs.app.picker import LARGEST
 from wfsobs.app.pin import pin
 from wfsobs.app.service import Service
 from wfsobs.app.upload import SILENT
-from wfsobs.formats import format_of
-from wfsobs.loop import simulate
 from wfsobs.pipeline import observe
 from wfsobs.scenario import Scenario
-from wfsobs.telemetry import read_record, record_arrays
+from wfsobs.simulation.loop import simulate
+from wfsobs.telemetry.formats import format_of
+from wfsobs.telemetry.records import read_record, record_arrays
 
 
 def file_of(short: Scenario, ending: str = ".csv", **changes: Any) -> bytes:

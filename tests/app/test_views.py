@@ -17,8 +17,8 @@ from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.traces import BINS
 from wfsobs.app.work import TRUTH
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
-from wfsobs.scores import BOUND
 
 
 def trace(dashboard: Dashboard, target: str) -> dict[str, Any]:

@@ -10,10 +10,10 @@ import pytest
 
 from wfsobs.app import work
 from wfsobs.app.work import TRUTH, Shown, compute
+from wfsobs.evaluation.scores import scored_samples, welch_psd
 from wfsobs.observers import OBSERVERS
+from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.scenario import Scenario
-from wfsobs.scores import scored_samples, welch_psd
-from wfsobs.watch import QUIET, Cancelled, Watch
 
 
 def keys(shown: Shown) -> set[tuple[str, str]]:

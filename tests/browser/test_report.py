@@ -21,9 +21,9 @@ import wfsobs
 from wfsobs.app.display import UNITS, number, per_micrometre
 from wfsobs.app.work import TRUTH
 from wfsobs.cli import main
+from wfsobs.cli.tables import label_of
+from wfsobs.evaluation.scores import cumulative_rms, spectra
 from wfsobs.observers.base import TARGETS
-from wfsobs.scores import cumulative_rms, spectra
-from wfsobs.tables import label_of
 
 SETTINGS = {
     "run.duration": 2.0, "run.warm_up": 0.5, "gpr_online.training_size": 20, "gpr_offline.training_size": 50,

@@ -8,9 +8,9 @@ from typing import Any
 
 from playwright.sync_api import expect
 
-from wfsobs.loop import simulate
-from wfsobs.presets import paper
-from wfsobs.telemetry import save_record
+from wfsobs.scenario.presets import paper
+from wfsobs.simulation.loop import simulate
+from wfsobs.telemetry.records import save_record
 
 SHORT = "run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40"
 

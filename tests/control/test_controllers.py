@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.arrays import Array
 from wfsobs.control.closed_loop import ClosedLoop, Outcome, closed_loop, design, residual_rms, strehl
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.integrator import best_gain, highest_stable_gain, integrator_law, limited_integrator
@@ -18,18 +17,19 @@ from wfsobs.control.lqg import lqg_kf_lgs
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.prediction import gpr_offline_ahead
 from wfsobs.control.residual import residual_variance
-from wfsobs.loop import simulate
-from wfsobs.observers.kalman import kalman_model, measurement_noise, modelled_processes
-from wfsobs.observers.reference import online_reference
-from wfsobs.presets import PRESETS
+from wfsobs.evaluation.scores import welch_psd
+from wfsobs.observers.baselines import online_reference
+from wfsobs.observers.kalman.single import kalman_model, measurement_noise, modelled_processes
+from wfsobs.progress import QUIET
 from wfsobs.record import Record, RecordError
-from wfsobs.riccati import steady_state
 from wfsobs.scenario import Scenario
-from wfsobs.scores import welch_psd
-from wfsobs.settings import SettingError
-from wfsobs.statespace import paper_matrices
-from wfsobs.true_spectra import true_spectra
-from wfsobs.watch import QUIET
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.settings import SettingError
+from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.statespace import paper_matrices
+from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.true_spectra import true_spectra
+from wfsobs.typing import Array
 
 # The loop of one 530 nm turbulence, one 50 nm line at 47.5 Hz, 20 nm of noise, and a model that is the truth.
 MATCHED = Scenario().replace({

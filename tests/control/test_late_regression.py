@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.arrays import Array
 from wfsobs.control.late_regression import LateRegression
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.prediction import VibrationPredictor, of_z
-from wfsobs.observers.inputs import Scale, window_signals
-from wfsobs.observers.kernels import SquaredExponential
-from wfsobs.observers.reference import online_reference
+from wfsobs.observers.baselines import online_reference
+from wfsobs.observers.gpr.inputs import Scale, window_signals
+from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.scenario import Scenario
+from wfsobs.typing import Array
 
 
 def plain_prediction(z: Array, targets: Array, k: int, depth: int, m: int, late: int, kernel: SquaredExponential) -> float:

@@ -14,7 +14,7 @@ from wfsobs.control.law import Law, transfer
 from wfsobs.control.lqg import lqg_kf_lgs
 from wfsobs.control.margins import Margins, crossings, frequencies, margins
 from wfsobs.control.mirror import Mirror
-from wfsobs.presets import PRESETS
+from wfsobs.scenario.presets import PRESETS
 
 DT = 1e-3
 

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from wfsobs.arrays import Array
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
-from wfsobs.loop import simulate
+from wfsobs.progress import QUIET
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.watch import QUIET
+from wfsobs.simulation.loop import simulate
+from wfsobs.typing import Array
 
 LINE = Scenario().replace({  # one pure line in the middle of its band-pass, next to no noise
     "turbulence.source": "none", "vibration.source": "peaks",

@@ -8,13 +8,13 @@ from math import degrees, log10
 import pytest
 from click.testing import CliRunner, Result
 
-from wfsobs import configfile
-from wfsobs.bound import BOUND
 from wfsobs.cli import main
 from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.tables import LIMITED, NOT_APPLICABLE, label
-from wfsobs.loop import simulate
+from wfsobs.evaluation.bound import BOUND
+from wfsobs.scenario import configfile
+from wfsobs.simulation.loop import simulate
 
 QUICK = ["--set", "run.duration=2", "--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=50"]
 ASKED = {"controller", "mode", "residual_rms_nm", "residual_rms_mas", "strehl", "stable", "seed"}

@@ -8,11 +8,11 @@ import math
 import numpy as np
 import pytest
 
-from wfsobs.formats.contents import Contents
-from wfsobs.intake import Stated, record_of
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.telemetry import read_record, record_arrays
+from wfsobs.telemetry.formats.contents import Contents
+from wfsobs.telemetry.intake import Stated, record_of
+from wfsobs.telemetry.records import read_record, record_arrays
 
 RNG = np.random.default_rng(1)
 N = 40

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wfsobs import configfile
 from wfsobs.cli import main
-from wfsobs.telemetry import load_record
+from wfsobs.scenario import configfile
+from wfsobs.telemetry.records import load_record
 
 DOCS = Path(__file__).parents[2] / "docs" / "scripts"
 

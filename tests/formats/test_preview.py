@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from wfsobs import preview as module
-from wfsobs.formats import FORMATS, format_of
-from wfsobs.intake import Stated
-from wfsobs.loop import simulate
-from wfsobs.presets import paper
-from wfsobs.preview import MOST_FILE, preview
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.telemetry import read_record, record_arrays
+from wfsobs.scenario.presets import paper
+from wfsobs.simulation.loop import simulate
+from wfsobs.telemetry import preview as module
+from wfsobs.telemetry.formats import FORMATS, format_of
+from wfsobs.telemetry.intake import Stated
+from wfsobs.telemetry.preview import MOST_FILE, preview
+from wfsobs.telemetry.records import read_record, record_arrays
 
 ENDINGS = [fmt.endings[0] for fmt in FORMATS]
 RECORD = replace(simulate(paper().replace({"run.duration": 1.5, "turbulence.rms": 0.01})), training=None)

@@ -12,8 +12,8 @@ from astropy.io import fits
 from click.testing import CliRunner
 
 from wfsobs.cli import main
-from wfsobs.formats.psd import load_psd, read_psd
 from wfsobs.record import RecordError
+from wfsobs.telemetry.formats.psd import load_psd, read_psd
 
 F, TIP, TILT = np.array([5.0, 10.0, 20.0]), np.array([1.0, 4.0, 2.0]), np.array([0.0, 3.0, 1.5])
 CSV = "# measured\nfrequency [Hz],tip [{u}],extra,tilt [{u}]\n" + "".join(

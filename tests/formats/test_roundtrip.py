@@ -13,11 +13,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from wfsobs.formats import FORMATS, format_of
-from wfsobs.loop import simulate
-from wfsobs.presets import paper
 from wfsobs.record import Record, RecordError, Training
-from wfsobs.telemetry import load_record, read_record, record_arrays, save_record
+from wfsobs.scenario.presets import paper
+from wfsobs.simulation.loop import simulate
+from wfsobs.telemetry.formats import FORMATS, format_of
+from wfsobs.telemetry.records import load_record, read_record, record_arrays, save_record
 
 AOT = ".aot.fits"
 ENDINGS = [fmt.endings[0] for fmt in FORMATS]

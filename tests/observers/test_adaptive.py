@@ -9,19 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.ar2 import Ar2
-from wfsobs.identify.densities import densities
-from wfsobs.identify.model import Spectrum
-from wfsobs.identify.periodogram import frequencies
-from wfsobs.identify.quick import quick_spectrum
-from wfsobs.observers import kalman_adaptive
-from wfsobs.observers.kalman import steady_filter
-from wfsobs.observers.kalman_adaptive import filter_of, kf_adaptive
+from wfsobs.identification.quick import quick_spectrum
+from wfsobs.observers.kalman import adaptive as kalman_adaptive
+from wfsobs.observers.kalman.adaptive import filter_of, kf_adaptive
+from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.record import Record, RecordError, delayed
-from wfsobs.riccati import RiccatiError
 from wfsobs.scenario import Scenario
-from wfsobs.statespace import disturbance_model
-from wfsobs.watch import QUIET, Cancelled, Watch
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.riccati import RiccatiError
+from wfsobs.signal.statespace import disturbance_model
+from wfsobs.spectral.densities import densities
+from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.periodogram import frequencies
 
 DT, NOISE = 1e-3, 0.014
 TURBULENCE = Ar2(7.0, 0.9, 0.5, DT)

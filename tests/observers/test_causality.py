@@ -11,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
-from wfsobs.presets import PRESETS
+from wfsobs.progress import QUIET
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.watch import QUIET
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.loop import simulate
 
 GPR = ("gpr-offline", "gpr-online")
 WINDOWS = (*GPR, "ridge")

@@ -11,14 +11,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, lfilter, sosfilt
 
-from wfsobs.loop import simulate
-from wfsobs.observers.gpr_offline import gpr_offline, train, training_targets
-from wfsobs.observers.kernels import ConditionError, SquaredExponential
-from wfsobs.presets import PRESETS
+from wfsobs.evaluation.scores import lag
+from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
+from wfsobs.observers.gpr.offline import gpr_offline, train, training_targets
+from wfsobs.progress import QUIET
 from wfsobs.record import RecordError, Training
 from wfsobs.scenario import Scenario
-from wfsobs.scores import lag
-from wfsobs.watch import QUIET
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.loop import simulate
 
 EPS = np.finfo(float).eps
 

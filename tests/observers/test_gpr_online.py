@@ -12,14 +12,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, lfilter, sosfilt
 
-from wfsobs.loop import simulate
-from wfsobs.observers.gpr_online import gpr_online, predict_sliding
-from wfsobs.observers.kernels import ConditionError, SquaredExponential
-from wfsobs.presets import PRESETS
+from wfsobs.evaluation.scores import lag
+from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
+from wfsobs.observers.gpr.online import gpr_online, predict_sliding
+from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.scores import lag
-from wfsobs.watch import QUIET, Cancelled, Watch
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.loop import simulate
 
 EPS = np.finfo(float).eps
 

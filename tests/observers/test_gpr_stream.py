@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from wfsobs.loop import simulate
-from wfsobs.observers.gpr_online import gpr_online, predict_sliding
-from wfsobs.observers.gpr_stream import OnlineGprStream, SlidingRegression
-from wfsobs.observers.inputs import scale_of
-from wfsobs.observers.kernels import ConditionError, SquaredExponential
-from wfsobs.presets import paper
-from wfsobs.watch import QUIET
+from wfsobs.observers.gpr.inputs import scale_of
+from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
+from wfsobs.observers.gpr.online import gpr_online, predict_sliding
+from wfsobs.observers.gpr.stream import OnlineGprStream, SlidingRegression
+from wfsobs.progress import QUIET
+from wfsobs.scenario.presets import paper
+from wfsobs.simulation.loop import simulate
 
 EPS = np.finfo(float).eps
 

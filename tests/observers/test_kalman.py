@@ -9,9 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.ar2 import Ar2
-from wfsobs.loop import simulate
-from wfsobs.observers.kalman import (
+from wfsobs.observers.kalman.single import (
     between_frames,
     kalman_model,
     kf_lgs,
@@ -20,11 +18,13 @@ from wfsobs.observers.kalman import (
     modelled_processes,
     steady_filter,
 )
-from wfsobs.presets import PRESETS
+from wfsobs.progress import QUIET
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.statespace import paper_matrices
-from wfsobs.watch import QUIET
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.statespace import paper_matrices
+from wfsobs.simulation.loop import simulate
 
 
 def scenario(changes: dict[str, Any] | None = None, preset: str = "paper") -> Scenario:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.observers.kernels import (
+from wfsobs.observers.gpr.kernels import (
     ConditionError,
     SquaredExponential,
     band,

@@ -8,22 +8,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_lyapunov
 
-from wfsobs.ar2 import Ar2
-from wfsobs.ar3 import Ar3, fitted_ar3
-from wfsobs.bound import bound
-from wfsobs.disturbance import vibration_lines
-from wfsobs.loop import simulate
+from wfsobs.evaluation.bound import bound
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman import modelled_processes
-from wfsobs.observers.kalman_multi import modelled_turbulence, multi_model, predicted_rms
+from wfsobs.observers.kalman.multi import modelled_turbulence, multi_model, predicted_rms
+from wfsobs.observers.kalman.single import modelled_processes
 from wfsobs.observers.ridge import TAPS, fit, predict
-from wfsobs.presets import PRESETS
+from wfsobs.progress import QUIET
 from wfsobs.record import RecordError
-from wfsobs.riccati import steady_state
 from wfsobs.scenario import Scenario
-from wfsobs.sensors import noise_covariance
-from wfsobs.statespace import disturbance_model, third_order_model
-from wfsobs.watch import QUIET
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3, fitted_ar3
+from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.statespace import disturbance_model, third_order_model
+from wfsobs.simulation.disturbance import vibration_lines
+from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.sensor_noise import noise_covariance
 
 
 def small(changes: dict | None = None) -> Scenario:

@@ -5,8 +5,8 @@ import threading
 import numpy as np
 import pytest
 
-from wfsobs.observers.modes import over_modes
-from wfsobs.watch import QUIET, Cancelled, Watch
+from wfsobs.observers.per_mode import over_modes
+from wfsobs.progress import QUIET, Cancelled, Watch
 
 
 def test_columns_in_the_order_of_the_modes():

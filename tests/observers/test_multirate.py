@@ -7,19 +7,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.ar2 import Ar2
-from wfsobs.loop import simulate
-from wfsobs.observers.kalman import kalman_model, kf_lgs, kf_ngs, modelled_processes
-from wfsobs.observers.multirate import multirate, multirate_filter, multirate_noise
-from wfsobs.observers.multirate_optimal import multirate_optimal
+from wfsobs.observers.kalman.multirate import multirate, multirate_filter, multirate_noise
+from wfsobs.observers.kalman.multirate_optimal import multirate_optimal
+from wfsobs.observers.kalman.single import kalman_model, kf_lgs, kf_ngs, modelled_processes
 from wfsobs.pipeline import run
-from wfsobs.presets import PRESETS
+from wfsobs.progress import QUIET
 from wfsobs.record import Record
-from wfsobs.riccati import RiccatiError, steady_state
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
-from wfsobs.statespace import disturbance_model, paper_matrices
-from wfsobs.watch import QUIET
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.settings import SettingError
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.riccati import RiccatiError, steady_state
+from wfsobs.signal.statespace import disturbance_model, paper_matrices
+from wfsobs.simulation.loop import simulate
 
 
 def scenario(changes: dict[str, Any] | None = None) -> Scenario:

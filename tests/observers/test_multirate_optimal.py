@@ -7,15 +7,15 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from wfsobs.ar2 import Ar2
-from wfsobs.loop import simulate
-from wfsobs.observers.kalman import kalman_model, modelled_processes
-from wfsobs.observers.multirate_optimal import multirate_optimal, optimal_cycle, optimal_filter, optimal_model
-from wfsobs.presets import paper
-from wfsobs.riccati import periodic_steady_state, steady_state
+from wfsobs.observers.kalman.multirate_optimal import multirate_optimal, optimal_cycle, optimal_filter, optimal_model
+from wfsobs.observers.kalman.single import kalman_model, modelled_processes
+from wfsobs.progress import QUIET
 from wfsobs.scenario import Scenario
-from wfsobs.statespace import disturbance_model, process_model
-from wfsobs.watch import QUIET
+from wfsobs.scenario.presets import paper
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.riccati import periodic_steady_state, steady_state
+from wfsobs.signal.statespace import disturbance_model, process_model
+from wfsobs.simulation.loop import simulate
 
 DT = 1e-3
 TURBULENCE = Ar2(7.0686, 0.9, 0.5, DT)

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import BANDS, LINES, MODEL, TRAINING, Observer
-from wfsobs.presets import PRESETS
+from wfsobs.progress import QUIET
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.watch import QUIET
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.loop import simulate
 
 OTHER: dict[str, dict[str, Any]] = {
     MODEL: {"turbulence.wind_speed": 40.0, "kalman.frequency": 31.0, "kalman.turbulence_rms": 0.1, "sensors.lgs_noise": 0.1,

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, freqz_sos, lfilter
 
-from wfsobs.bandpass import bandpass_bank, filter_causal, filter_zero_phase
-from wfsobs.loop import simulate
-from wfsobs.observers.reference import butterworth_cl, butterworth_ol, open_loop_reference, zero
-from wfsobs.presets import PRESETS
+from wfsobs.evaluation.scores import lag
+from wfsobs.observers.baselines import butterworth_cl, butterworth_ol, open_loop_reference, zero
+from wfsobs.progress import QUIET
 from wfsobs.scenario import Scenario
-from wfsobs.scores import lag
-from wfsobs.watch import QUIET
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.signal.bandpass import bandpass_bank, filter_causal, filter_zero_phase
+from wfsobs.simulation.loop import simulate
 
 
 def scenario(changes: dict[str, Any] | None = None) -> Scenario:

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from wfsobs.ar2 import Ar2
-from wfsobs.bandpass import bandpass_bank, filter_causal
-from wfsobs.loop import simulate
-from wfsobs.observers.kalman import kalman_model, kf_lgs, modelled_processes, steady_filter
-from wfsobs.observers.multirate import multirate, multirate_noise
-from wfsobs.presets import paper
+from wfsobs.observers.kalman.multirate import multirate, multirate_noise
+from wfsobs.observers.kalman.single import kalman_model, kf_lgs, modelled_processes, steady_filter
+from wfsobs.progress import QUIET
 from wfsobs.record import Record
-from wfsobs.riccati import steady_state
 from wfsobs.scenario import Scenario
-from wfsobs.spectrum import random_phase_signal
-from wfsobs.statespace import paper_matrices
-from wfsobs.watch import QUIET
+from wfsobs.scenario.presets import paper
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.bandpass import bandpass_bank, filter_causal
+from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.spectrum import random_phase_signal
+from wfsobs.signal.statespace import paper_matrices
+from wfsobs.simulation.loop import simulate
 
 
 @pytest.fixture(scope="module", name="case")

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 import wfsobs
+from wfsobs.evaluation.scores import Score
 from wfsobs.observers import OBSERVERS
-from wfsobs.scores import Score
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reproduction.md").read_text(encoding="utf-8").partition("## UT4")[2]
 QUICK = ("kf-lgs", "kf-ngs", "multirate", "multirate-optimal", "butterworth-ol", "butterworth-cl", "gpr-offline",

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from wfsobs.pipeline import Result, run
-from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
 
 SHORT = {
     "run.duration": 2.0, "run.warm_up": 0.5, "gpr_offline.training_size": 40, "gpr_offline.depth": 20,

@@ -17,9 +17,9 @@ from wfsobs.app.report import maker
 from wfsobs.app.report.maker import ReportError
 from wfsobs.app.work import Shown
 from wfsobs.cli import main
+from wfsobs.cli.tables import TIME, rows
+from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.scenario import Scenario
-from wfsobs.tables import TIME, rows
-from wfsobs.watch import QUIET, Cancelled, Watch
 
 QUICK = ["--set", "run.duration=1.5", "--set", "run.warm_up=0.5", "--set", "gpr_online.training_size=20",
          "--set", "gpr_offline.training_size=50", "--set", "gpr_online.depth=20", "--set", "gpr_offline.depth=20",

@@ -21,11 +21,11 @@ from wfsobs.app.display import number
 from wfsobs.app.report.data import Grid, Report, state_of
 from wfsobs.app.report.page import page
 from wfsobs.app.report.text import FILE, LONGEST, command_of
-from wfsobs.configfile import from_toml, scenario_from
+from wfsobs.cli.tables import TIME, label_of, looks_ahead, stretch_of
 from wfsobs.pipeline import Result, observe, run
 from wfsobs.scenario import Scenario
-from wfsobs.tables import TIME, label_of, looks_ahead, stretch_of
-from wfsobs.variations import Variation, parse_variation, scenarios
+from wfsobs.scenario.configfile import from_toml, scenario_from
+from wfsobs.scenario.grid import Variation, parse_variation, scenarios
 
 MADE = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"

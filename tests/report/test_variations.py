@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
-from wfsobs.variations import MOST, Variation, parse_variation, scenarios
+from wfsobs.scenario.grid import MOST, Variation, parse_variation, scenarios
+from wfsobs.scenario.settings import SettingError
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False) | st.integers(-(2**53), 2**53)
 VALUES = st.one_of(*(

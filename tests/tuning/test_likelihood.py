@@ -9,10 +9,10 @@ from scipy.stats import multivariate_normal
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from wfsobs.loop import simulate
-from wfsobs.observers.gpr_offline import training_targets
-from wfsobs.observers.kernels import SquaredExponential
-from wfsobs.presets import PRESETS
+from wfsobs.observers.gpr.kernels import SquaredExponential
+from wfsobs.observers.gpr.offline import training_targets
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.loop import simulate
 from wfsobs.tuning.likelihood import likelihood, log_marginal_likelihood
 
 

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.observers import OBSERVERS
-from wfsobs.presets import PRESETS
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
 from wfsobs.tuning.search import Spent, search
 from wfsobs.tuning.space import TUNABLE, numbers, space
 

@@ -12,22 +12,21 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wfsobs import configfile
 from wfsobs.cli import main
-from wfsobs.loop import simulate
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman import kalman_model, measurement_noise, steady_filter
+from wfsobs.observers.kalman.single import kalman_model, measurement_noise, steady_filter
 from wfsobs.pipeline import observe, run
-from wfsobs.presets import PRESETS
+from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.record import Record, RecordError
-from wfsobs.scenario import Scenario
-from wfsobs.sensors import noise_covariance
-from wfsobs.settings import SettingError
+from wfsobs.scenario import Scenario, configfile
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.settings import SettingError
+from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.sensor_noise import noise_covariance
 from wfsobs.tuning import Evaluation, tune
 from wfsobs.tuning.records import NEXT, REFERENCE, TRUTH, cut, piece, simulated, stream
 from wfsobs.tuning.report import plain, toml
 from wfsobs.tuning.space import TUNABLE, space
-from wfsobs.watch import QUIET, Cancelled, Watch
 
 
 def short(**more: Any) -> Scenario:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.arrays import Array
-from wfsobs.observers.kernels import SquaredExponential
+from wfsobs.observers.gpr.kernels import SquaredExponential
+from wfsobs.typing import Array
 
 SKLEARN, FILTERPY, STATSMODELS = "scikit-learn", "filterpy", "statsmodels"
 LIBRARIES = {SKLEARN: "sklearn", FILTERPY: "filterpy", STATSMODELS: "statsmodels"}

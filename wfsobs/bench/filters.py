@@ -6,20 +6,20 @@ from collections.abc import Callable, Collection, Iterator
 
 import numpy as np
 
-from wfsobs.arrays import Array
 from wfsobs.bench import external, textbook
 from wfsobs.bench.external import FILTERPY, STATSMODELS
 from wfsobs.bench.measure import OURS, Row, max_error, row, timed
 from wfsobs.bench.sizes import Sizes
-from wfsobs.loop import simulate
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman import kalman_model, measurement_noise, modelled_processes, steady_filter
-from wfsobs.observers.kalman_adaptive import adapting
-from wfsobs.observers.multirate import multirate_filter, multirate_noise
+from wfsobs.observers.kalman.adaptive import adapting
+from wfsobs.observers.kalman.multirate import multirate_filter, multirate_noise
+from wfsobs.observers.kalman.single import kalman_model, measurement_noise, modelled_processes, steady_filter
 from wfsobs.record import pseudo_open_loop
-from wfsobs.riccati import steady_state
 from wfsobs.scenario import Scenario
-from wfsobs.statespace import paper_matrices
+from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.statespace import paper_matrices
+from wfsobs.simulation.loop import simulate
+from wfsobs.typing import Array
 
 EXACT_STEPS = 3000
 """Steps compared with the textbook's loop in extended precision."""

@@ -9,22 +9,22 @@ from time import perf_counter
 
 import numpy as np
 
-from wfsobs.arrays import Array
 from wfsobs.bench import external, textbook
 from wfsobs.bench.external import SKLEARN
 from wfsobs.bench.measure import OURS, Row, max_error, row, timed
 from wfsobs.bench.sizes import Sizes
-from wfsobs.loop import simulate
 from wfsobs.observers.base import VIBRATION
-from wfsobs.observers.gpr_offline import train, training_targets
-from wfsobs.observers.gpr_online import gpr_online, kernel_of
-from wfsobs.observers.gpr_stream import OnlineGprStream
-from wfsobs.observers.inputs import window_signals
-from wfsobs.observers.kernels import SquaredExponential
-from wfsobs.observers.reference import online_reference
+from wfsobs.observers.baselines import online_reference
+from wfsobs.observers.gpr.inputs import window_signals
+from wfsobs.observers.gpr.kernels import SquaredExponential
+from wfsobs.observers.gpr.offline import train, training_targets
+from wfsobs.observers.gpr.online import gpr_online, kernel_of
+from wfsobs.observers.gpr.stream import OnlineGprStream
+from wfsobs.progress import QUIET
 from wfsobs.record import Record, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.watch import QUIET
+from wfsobs.simulation.loop import simulate
+from wfsobs.typing import Array
 
 ENOUGH_FOR_P999 = 1000
 """Steps below which a 99.9th percentile says nothing."""

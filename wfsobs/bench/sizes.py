@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from wfsobs.presets import paper
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import paper
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import cho_factor, cho_solve
 
-from wfsobs.arrays import Array
-from wfsobs.observers.kernels import SquaredExponential
+from wfsobs.observers.gpr.kernels import SquaredExponential
+from wfsobs.typing import Array
 
 BLOCK = 256
 """Windows predicted at a time, so that the covariances stay in the cache."""

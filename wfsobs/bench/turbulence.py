@@ -9,9 +9,9 @@ import numpy as np
 
 from wfsobs.bench.measure import OURS, Row, peak_memory_mb, row, timed
 from wfsobs.bench.sizes import Sizes
+from wfsobs.progress import QUIET
 from wfsobs.scenario import Scenario
-from wfsobs.turbulence import SOURCES
-from wfsobs.watch import QUIET
+from wfsobs.simulation.turbulence import SOURCES
 
 ONE_LAYER: dict[str, Any] = {"turbulence.source": "frozen-flow"}
 """As the preset is otherwise: tip and tilt, one layer, two LGS on the axis and an NGS."""

@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 
 from wfsobs import __version__
 from wfsobs.record import RecordError
-from wfsobs.settings import SettingError
+from wfsobs.scenario.settings import SettingError
 
 
 class Commands(click.Group):

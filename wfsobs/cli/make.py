@@ -9,15 +9,15 @@ from typing import Any
 import click
 from rich.console import Console
 
-from wfsobs import configfile
 from wfsobs.cli.options import scenario_options
 from wfsobs.cli.show import progress_bar, warn
 from wfsobs.files import check_writable, write_whole
 from wfsobs.pipeline import run as run_scenario
-from wfsobs.presets import PRESETS
-from wfsobs.settings import SettingError
-from wfsobs.variations import MOST, parse_variation, scenarios
-from wfsobs.watch import Watch
+from wfsobs.progress import Watch
+from wfsobs.scenario import configfile
+from wfsobs.scenario.grid import MOST, parse_variation, scenarios
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.settings import SettingError
 
 
 @click.command()

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import click
 
-from wfsobs.intake import Stated
-from wfsobs.presets import PRESETS
 from wfsobs.record import DELAY, Record
 from wfsobs.scenario import Scenario
-from wfsobs.telemetry import load_record
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.telemetry.intake import Stated
+from wfsobs.telemetry.records import load_record
 from wfsobs.units import UNITS
 
 

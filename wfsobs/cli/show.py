@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from wfsobs.over_time_tables import OverTime
+from wfsobs.cli.recovery_tables import OverTime
+from wfsobs.cli.tables import TIME, Row, score_table
 from wfsobs.pipeline import Result
-from wfsobs.tables import TIME, Row, score_table
 
 
 def show(all_rows: list[Row], as_json: bool) -> None:

@@ -6,20 +6,20 @@ import json
 
 import click
 
-from wfsobs import configfile
 from wfsobs.cli.options import scenario_options
+from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.show import progress_bar, show, show_over_time, show_table, warn
+from wfsobs.cli.tables import Row, rows
 from wfsobs.control import tables as loop_tables
 from wfsobs.control.closed_loop import closed_loop, design
-from wfsobs.formats.psd import load_psd
-from wfsobs.loop import simulate
-from wfsobs.over_time_tables import OverTime
 from wfsobs.pipeline import observe as observe_record
-from wfsobs.settings import SettingError
-from wfsobs.tables import Row, rows
-from wfsobs.telemetry import save_record
+from wfsobs.progress import Watch
+from wfsobs.scenario import configfile
+from wfsobs.scenario.settings import SettingError
+from wfsobs.simulation.loop import simulate
+from wfsobs.telemetry.formats.psd import load_psd
+from wfsobs.telemetry.records import save_record
 from wfsobs.units import UNITS
-from wfsobs.watch import Watch
 
 
 @click.command()

@@ -6,20 +6,20 @@ import json
 
 import click
 
-from wfsobs import configfile
 from wfsobs.cli.options import loaded, record_options, scenario_options
 from wfsobs.cli.show import progress_bar, show, show_table, warn
+from wfsobs.cli.tables import rows
 from wfsobs.files import check_writable, write_whole
-from wfsobs.identify import identify as identify_record
-from wfsobs.identify import report as identified
-from wfsobs.identify.identification import LEVEL
-from wfsobs.identify.search import LOWEST
-from wfsobs.intake import Stated
+from wfsobs.identification import identify as identify_record
+from wfsobs.identification import report as identified
+from wfsobs.identification.identification import LEVEL
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
-from wfsobs.tables import rows
-from wfsobs.telemetry import save_arrays
-from wfsobs.watch import Watch
+from wfsobs.progress import Watch
+from wfsobs.scenario import configfile
+from wfsobs.spectral.search import LOWEST
+from wfsobs.telemetry.intake import Stated
+from wfsobs.telemetry.records import save_arrays
 
 
 @click.command()

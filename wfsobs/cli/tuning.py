@@ -6,19 +6,19 @@ import json
 
 import click
 
-from wfsobs import configfile
 from wfsobs.cli.options import loaded, record_options, scenario_options
 from wfsobs.cli.show import progress_bar, show_table
 from wfsobs.files import check_writable, write_whole
-from wfsobs.intake import Stated
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.settings import SettingError
+from wfsobs.progress import Watch
+from wfsobs.scenario import configfile
+from wfsobs.scenario.settings import SettingError
+from wfsobs.telemetry.intake import Stated
 from wfsobs.tuning import report
 from wfsobs.tuning import tune as search
 from wfsobs.tuning.space import TUNABLE
 from wfsobs.tuning.tuning import EVALUATIONS
-from wfsobs.watch import Watch
 
 NAMES = [name for name in OBSERVERS if name in TUNABLE and TUNABLE[name].usual]
 

@@ -19,24 +19,24 @@ from math import pi
 
 import numpy as np
 
-from wfsobs.arrays import Array
-from wfsobs.bound import least_errors
 from wfsobs.control.controllers import CONTROLLERS, Controller
 from wfsobs.control.integrator import limited_integrator
 from wfsobs.control.law import Law
 from wfsobs.control.margins import Margins, frequencies, margins
 from wfsobs.control.mirror import Mirror, mirror_of
 from wfsobs.control.residual import residual_variance
-from wfsobs.gaps import bridged
-from wfsobs.observers.multirate import UnstableCycle
-from wfsobs.observers.reference import online_reference
+from wfsobs.evaluation.bound import least_errors
+from wfsobs.evaluation.scores import rms
+from wfsobs.observers.baselines import online_reference
+from wfsobs.observers.kalman.multirate import UnstableCycle
+from wfsobs.observers.missing import bridged
 from wfsobs.pipeline import as_stated
+from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.scores import rms
-from wfsobs.settings import SettingError
-from wfsobs.true_spectra import TrueSpectra, is_known, true_spectra
-from wfsobs.watch import QUIET, Watch
+from wfsobs.scenario.settings import SettingError
+from wfsobs.simulation.true_spectra import TrueSpectra, is_known, true_spectra
+from wfsobs.typing import Array
 
 
 @dataclass(frozen=True)

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from wfsobs.arrays import Array
 from wfsobs.control.integrator import best_gain, integrator_law
 from wfsobs.control.law import Law
 from wfsobs.control.lqg import LQG
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
 from wfsobs.observers.base import BANDS, LINES, MODEL, NOTHING, SPECTRA, TRAINING
+from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.true_spectra import TrueSpectra
-from wfsobs.watch import Watch
+from wfsobs.simulation.true_spectra import TrueSpectra
+from wfsobs.typing import Array
 
 MakeLaw = Callable[[Scenario, int, Mirror, TrueSpectra | None], Law]
 """(scenario, mode, mirror, its true spectra if known) -> law. Raises ValueError saying why there is none."""

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wfsobs.arrays import Array
 from wfsobs.control.law import Law
 from wfsobs.control.margins import frequencies
 from wfsobs.control.mirror import Mirror
-from wfsobs.wiener import Complex
+from wfsobs.signal.wiener import Complex
+from wfsobs.typing import Array
 
 
 @dataclass(frozen=True)

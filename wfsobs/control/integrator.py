@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from wfsobs.arrays import Array
 from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.residual import residual_density
-from wfsobs.lifted import PeriodicFilter
-from wfsobs.true_spectra import TrueSpectra
+from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.simulation.true_spectra import TrueSpectra
+from wfsobs.typing import Array
 
 FINE, COARSE = 2048, 64
 """Bins kept as they are, and how many of the others count as one: the integrator's response is smooth there."""

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from wfsobs.arrays import Array
-from wfsobs.observers.gpr_stream import SlidingRegression
-from wfsobs.observers.kernels import SquaredExponential
+from wfsobs.observers.gpr.kernels import SquaredExponential
+from wfsobs.observers.gpr.stream import SlidingRegression
+from wfsobs.typing import Array
 
 
 class LateRegression(SlidingRegression):

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import schur
 
-from wfsobs.arrays import Array
-from wfsobs.lifted import PeriodicFilter
-from wfsobs.wiener import Complex
+from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.wiener import Complex
+from wfsobs.typing import Array
 
 
 @dataclass(frozen=True)

@@ -13,16 +13,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wfsobs.arrays import Array
 from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman import kalman_model, measurement_noise, steady_filter
-from wfsobs.observers.kalman_multi import multi_model
-from wfsobs.observers.multirate import MultiRateFilter, multirate_filter, multirate_noise
-from wfsobs.observers.multirate_optimal import optimal_filter, optimal_model
+from wfsobs.observers.kalman.multi import multi_model
+from wfsobs.observers.kalman.multirate import MultiRateFilter, multirate_filter, multirate_noise
+from wfsobs.observers.kalman.multirate_optimal import optimal_filter, optimal_model
+from wfsobs.observers.kalman.single import kalman_model, measurement_noise, steady_filter
 from wfsobs.scenario import Scenario
-from wfsobs.statespace import DisturbanceModel
+from wfsobs.signal.statespace import DisturbanceModel
+from wfsobs.typing import Array
 
 
 def command_rows(A: Array, phi: Array, mirror: Mirror) -> Array:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wfsobs.arrays import Array
-from wfsobs.wiener import Complex
+from wfsobs.signal.wiener import Complex
+from wfsobs.typing import Array
 
 Response = Callable[[Array], Complex]
 """omega (n,) [rad per step] -> (n,)."""

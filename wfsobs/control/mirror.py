@@ -16,9 +16,9 @@ from math import inf
 import numpy as np
 from scipy.signal import lfilter
 
-from wfsobs.arrays import Array
 from wfsobs.scenario import Scenario
-from wfsobs.wiener import Complex
+from wfsobs.signal.wiener import Complex
+from wfsobs.typing import Array
 
 
 @dataclass(frozen=True)

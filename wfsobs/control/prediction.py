@@ -11,18 +11,18 @@ from typing import TypeVar
 
 import numpy as np
 
-from wfsobs.arrays import Array
-from wfsobs.bandpass import StreamingBank, bandpass_bank
 from wfsobs.control.late_regression import LateRegression
 from wfsobs.control.mirror import Mirror
-from wfsobs.groups.observers import OfflineGpr, OnlineGpr
-from wfsobs.observers.gpr_offline import train, training_targets
-from wfsobs.observers.gpr_online import kernel_of
-from wfsobs.observers.inputs import Scale, StreamingInputs, scale_of, window_signals
-from wfsobs.observers.modes import over_modes
+from wfsobs.observers.gpr.inputs import Scale, StreamingInputs, scale_of, window_signals
+from wfsobs.observers.gpr.offline import train, training_targets
+from wfsobs.observers.gpr.online import kernel_of
+from wfsobs.observers.per_mode import over_modes
+from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.watch import Watch
+from wfsobs.scenario.groups.observers import OfflineGpr, OnlineGpr
+from wfsobs.signal.bandpass import StreamingBank, bandpass_bank
+from wfsobs.typing import Array
 
 G = TypeVar("G", OfflineGpr, OnlineGpr)
 

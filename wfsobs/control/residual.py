@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from wfsobs.arrays import Array
 from wfsobs.control.law import Law
 from wfsobs.control.margins import frequencies
 from wfsobs.control.mirror import Mirror
-from wfsobs.true_spectra import TrueSpectra
+from wfsobs.simulation.true_spectra import TrueSpectra
+from wfsobs.typing import Array
 
 AT_A_TIME = 2**17
 """Frequencies; slow winds have millions of them."""

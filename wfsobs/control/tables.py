@@ -10,11 +10,11 @@ from typing import Any
 
 from rich.table import Table
 
+from wfsobs.cli.tables import NOT_OBSERVERS, Row
 from wfsobs.control.closed_loop import ClosedLoop, residual_rms, strehl
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers.base import SPECTRA
-from wfsobs.scores import BOUND
-from wfsobs.tables import NOT_OBSERVERS, Row
 from wfsobs.units import micrometres_per
 
 LIMITED = "theory and margins are not applicable: a limit of the mirror acts, and the loop is no longer linear"

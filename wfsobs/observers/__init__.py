@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from wfsobs.observers.base import BANDS, LINES, MODEL, TARGETS, TRAINING, TURBULENCE, VIBRATION, Observer
-from wfsobs.observers.gpr_offline import gpr_offline
-from wfsobs.observers.gpr_online import gpr_online
-from wfsobs.observers.kalman import kf_lgs, kf_ngs
-from wfsobs.observers.kalman_adaptive import kf_adaptive
-from wfsobs.observers.kalman_multi import kf_multi
-from wfsobs.observers.multirate import multirate
-from wfsobs.observers.multirate_optimal import multirate_optimal
-from wfsobs.observers.reference import butterworth_cl, butterworth_ol, persistence, zero
+from wfsobs.observers.baselines import butterworth_cl, butterworth_ol, persistence, zero
+from wfsobs.observers.gpr.offline import gpr_offline
+from wfsobs.observers.gpr.online import gpr_online
+from wfsobs.observers.kalman.adaptive import kf_adaptive
+from wfsobs.observers.kalman.multi import kf_multi
+from wfsobs.observers.kalman.multirate import multirate
+from wfsobs.observers.kalman.multirate_optimal import multirate_optimal
+from wfsobs.observers.kalman.single import kf_lgs, kf_ngs
 from wfsobs.observers.ridge import ridge, ridge_30
 
 _NGS = ("y_ngs", "ratio")

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from wfsobs.arrays import Array
+from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.watch import Watch
+from wfsobs.typing import Array
 
 TURBULENCE, VIBRATION = "turbulence", "vibration"
 TARGETS = (TURBULENCE, VIBRATION)

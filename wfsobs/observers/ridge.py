@@ -11,16 +11,16 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import solve
 
-from wfsobs.arrays import Array
-from wfsobs.blas import eliminate, solved_rows
 from wfsobs.observers.base import VIBRATION
-from wfsobs.observers.gpr_offline import training_targets
-from wfsobs.observers.inputs import scale_of, window_signals
-from wfsobs.observers.kernels import sliding_products, square_from_band
-from wfsobs.observers.modes import over_modes
+from wfsobs.observers.gpr.inputs import scale_of, window_signals
+from wfsobs.observers.gpr.kernels import sliding_products, square_from_band
+from wfsobs.observers.gpr.offline import training_targets
+from wfsobs.observers.per_mode import over_modes
+from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.watch import QUIET, Watch
+from wfsobs.signal.linalg import eliminate, solved_rows
+from wfsobs.typing import Array
 
 TAPS = 30
 """Samples of z that the plain predictor sees."""

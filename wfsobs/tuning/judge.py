@@ -7,14 +7,14 @@ from math import isfinite
 
 import numpy as np
 
+from wfsobs.evaluation.scores import PREDICTION, supervised_scores, unsupervised_scores
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION, Estimate
 from wfsobs.pipeline import Failure, each_estimate
+from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.scores import PREDICTION, supervised_scores, unsupervised_scores
-from wfsobs.settings import SettingError
-from wfsobs.watch import Watch
+from wfsobs.scenario.settings import SettingError
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from wfsobs.arrays import Array
-from wfsobs.blas import eliminate
-from wfsobs.gaps import bridged
-from wfsobs.observers.gpr_offline import training_targets
-from wfsobs.observers.gpr_online import kernel_of, online_targets
-from wfsobs.observers.inputs import scale_of, window_signals
-from wfsobs.observers.kernels import SquaredExponential, band, check_condition, square_from_band
+from wfsobs.observers.gpr.inputs import scale_of, window_signals
+from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
+from wfsobs.observers.gpr.offline import training_targets
+from wfsobs.observers.gpr.online import kernel_of, online_targets
+from wfsobs.observers.missing import bridged
+from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.watch import QUIET, Watch
+from wfsobs.signal.linalg import eliminate
+from wfsobs.typing import Array
 
 GPRS = ("gpr-offline", "gpr-online")
 

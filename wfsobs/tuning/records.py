@@ -12,17 +12,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wfsobs.arrays import Array
-from wfsobs.gaps import bridged
-from wfsobs.loop import TRAINING_MARGIN, simulate
+from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION
-from wfsobs.observers.reference import open_loop_reference
+from wfsobs.observers.baselines import open_loop_reference
+from wfsobs.observers.missing import bridged
+from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError, Training, delayed, frame_mean
 from wfsobs.scenario import Scenario
-from wfsobs.scores import PREDICTION
+from wfsobs.simulation.loop import TRAINING_MARGIN, simulate
 from wfsobs.tuning.space import Space
-from wfsobs.watch import Watch
+from wfsobs.typing import Array
 
 VALIDATION, DESIGN = 1, 2
 """Beside `run.seed`, the streams of the validation record and of the search."""

@@ -7,10 +7,10 @@ from typing import Any
 
 from rich.table import Table
 
-from wfsobs.configfile import annotated, changes, to_toml
+from wfsobs.cli.tables import label_of
+from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.scenario import Scenario
-from wfsobs.scores import PREDICTION
-from wfsobs.tables import label_of
+from wfsobs.scenario.configfile import annotated, changes, to_toml
 from wfsobs.tuning.judge import Errors
 from wfsobs.tuning.records import TRUTH
 from wfsobs.tuning.tuning import Stage, Tuned

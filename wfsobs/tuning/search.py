@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import qmc
 
-from wfsobs.arrays import Array
+from wfsobs.typing import Array
 
 DESIGN = 3
 """One evaluation in so many goes to the hypercube."""

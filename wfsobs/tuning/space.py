@@ -13,14 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import param
 
-from wfsobs.arrays import Array
-from wfsobs.atmosphere import relative_rms
-from wfsobs.disturbance import vibration_lines, vibration_variance
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman import measurement_noise
+from wfsobs.observers.kalman.single import measurement_noise
 from wfsobs.scenario import Scenario
-from wfsobs.settings import SettingError
-from wfsobs.turbulence import turbulence_process
+from wfsobs.scenario.settings import SettingError
+from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
+from wfsobs.simulation.layers import relative_rms
+from wfsobs.simulation.turbulence import turbulence_process
+from wfsobs.typing import Array
 
 FROM_ZERO = 1e-3
 """A range that begins at 0 is searched from this part of its end."""

@@ -7,19 +7,19 @@ from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import Any
 
-from wfsobs.arrays import Array
+from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import as_stated
+from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.scores import PREDICTION
-from wfsobs.settings import SettingError
+from wfsobs.scenario.settings import SettingError
 from wfsobs.tuning.judge import Errors, Judge, target_of
 from wfsobs.tuning.likelihood import likelihood
 from wfsobs.tuning.records import DESIGN, MEASURES, Records, cut, simulated, stream
 from wfsobs.tuning.search import Spent, search
 from wfsobs.tuning.space import Space, space
-from wfsobs.watch import QUIET, Watch
+from wfsobs.typing import Array
 
 EVALUATIONS = 40
 LEARNING, LATEST = 0.25, 0.5

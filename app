@@ -1,0 +1,1 @@
+wfsobs/app

@@ -1,0 +1,166 @@
+"""The row of actions: share the settings, save data and figures, make a report, open a scenario; undo and redo by keys."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.downloads import TooLarge, data_csv, data_npz
+from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.report.maker import LIMIT, ReportError, make
+from wfsobs.app.share import FILE, Link, from_file, from_query, to_command, to_file, to_python, to_query
+from wfsobs.app.store import Store
+from wfsobs.app.style import LOOKS, asset
+from wfsobs.app.work import Shown
+from wfsobs.scenario.settings import SettingError
+
+LARGEST = 2_000_000
+"""Of a scenario file that is opened [bytes]."""
+
+REPORT = "wfsobs-report.html"
+
+
+class Toolbar(JSComponent):
+    """The row in the browser: texts down, messages {action, ...} up, files down as messages."""
+
+    query = param.String("", doc="What a link to the settings has after its ?.")
+    linked = param.Boolean(True, doc="Whether the settings are short enough for a link.")
+    command = param.String("", doc="The settings as a command line.")
+    python = param.String("", doc="The settings as Python.")
+    ready = param.Boolean(False, doc="Whether there are results to save.")
+    reporting = param.Boolean(False, doc="Whether a report is being made.")
+    said = param.String("", doc="What was done, in one line.")
+    notes = param.List([], doc="What was refused, a line each.")
+    labels = param.Dict({}, doc="Name of a line in the figures -> what it is called, for the legends of figures that are saved.")
+    largest = param.Integer(LARGEST, doc="The largest scenario file that is read [bytes].")
+
+    _esm = asset("figures.js") + asset("actions.js")
+    _stylesheets = [asset("actions.css")]  # noqa: RUF012
+
+    def __init__(self, **params: Any):
+        self.on_action: Callable[[dict[str, Any]], None] | None = None
+        super().__init__(**params)
+
+    def _handle_msg(self, data: dict[str, Any]) -> None:
+        if self.on_action is not None and isinstance(data, dict) and isinstance(data.get("action"), str):
+            self.on_action(data)
+
+    def save(self, name: str, kind: str, content: bytes) -> None:
+        """Have the browser save a file."""
+        self._send_msg({"name": name, "kind": kind, "content": base64.b64encode(content).decode()})
+
+
+class Actions:
+    """The toolbar over a store."""
+
+    def __init__(self, store: Store):
+        self.store = store
+        self.toolbar = Toolbar(
+            labels={name: it.label for name, it in LOOKS.items()}, sizing_mode="stretch_width", margin=0)
+        self.toolbar.on_action = self.handle
+        self._tasks: dict[str, BackgroundTask] = {}
+        self._under_way: dict[str, tuple[str, Callable[[Any], None]]] = {}
+        store.param.watch(self._refresh, ["scenario", "preset"])
+        store.run.param.watch(self._refresh_ready, "result")
+        self._refresh()
+
+    def handle(self, msg: dict[str, Any]) -> None:
+        """Do what a message of the toolbar says."""
+        does: dict[str, Callable[[], None]] = {
+            "undo": self.store.undo,
+            "redo": self.store.redo,
+            "open": lambda: self.open_file(str(msg.get("name", "")), msg.get("text")),
+            "unlinked": lambda: self._note("These settings are too long for a link: save the scenario and send the file."),
+            "report": self.make_report,
+            "toml": self.save_scenario,
+            "csv": lambda: self.save_data("wfsobs.csv", "text/csv", data_csv),
+            "npz": lambda: self.save_data("wfsobs.npz", "application/octet-stream", data_npz),
+        }
+        if msg.get("action") in does:
+            does[msg["action"]]()
+
+    def open_link(self, query: str) -> None:
+        """Take the settings that the page's address asks for, and name what cannot be taken."""
+        link = from_query(query, self.store.validate)
+        self.store.load(link.scenario, link.preset)
+        self.toolbar.notes = [f"Not used from the link: {line}" for line in link.rejected]
+
+    def open_file(self, name: str, text: object) -> None:
+        """Take the settings of a TOML file, read in a thread, or say in one line why not; then nothing changes."""
+        if not isinstance(text, str) or len(text) > LARGEST:
+            self._note(f"{name[:80]}: larger than {LARGEST // 1_000_000} MB, not a scenario")
+            return
+        job = Job("upload", lambda _watch, _tell: from_file(text), refusal=SettingError)
+        self._start("open", name[:80], job, partial(self._take, name))
+
+    def _take(self, name: str, link: Link) -> None:
+        try:
+            self.store.load(link.scenario, link.preset or None)
+        except SettingError as error:
+            self._note(f"{name[:80]}: {_reason(str(error))}")
+        else:
+            self.toolbar.param.update(notes=[], said=f"Opened {name[:80]}.")
+
+    def save_scenario(self) -> None:
+        """Send the settings as TOML."""
+        text = to_file(self.store.scenario, self.store.preset)
+        self.toolbar.save(FILE, "application/toml", text.encode())
+
+    def save_data(self, name: str, kind: str, make: Callable[[Shown], bytes]) -> None:
+        """Make a file of the results shown, beside the page, and send it."""
+        shown = self.store.run.result
+        if shown is None:
+            self._note("There are no results to save yet.")
+            return
+        job = Job("save", lambda _watch, _tell: make(shown), refusal=TooLarge)
+        self._start(name, name, job, partial(self.toolbar.save, name, kind))
+
+    def make_report(self) -> None:
+        """Make the report of the results shown, beside everything else, and send it; one at a time."""
+        shown, preset = self.store.run.result, self.store.preset
+        if shown is None or self.toolbar.reporting:
+            return
+        job = Job("report", partial(make, shown, preset), time_limit=LIMIT, wait_limit=LIMIT, refusal=ReportError)
+        self._start("report", "Report", job, partial(self.toolbar.save, REPORT, "text/html"))
+
+    def _start(self, which: str, name: str, job: Job, then: Callable[[Any], None]) -> None:
+        """Have a job done, one of each at a time, say under a name how it goes, and then do something with its result."""
+        self._under_way[which] = name, then
+        if which not in self._tasks:
+            task = self._tasks[which] = BackgroundTask(self.store.session)
+            task.param.watch(lambda *_: self._follow(which), ["state", "place"])
+        self._tasks[which].start(job)
+
+    def _follow(self, which: str) -> None:
+        task, (name, then) = self._tasks[which], self._under_way[which]
+        if which == "report":
+            self.toolbar.reporting = task.state == RUNNING
+        if task.state == FAILED:
+            self._note(f"{name}: {_reason(task.message)}")
+        else:
+            self.toolbar.param.update(notes=[], said=f"{name}: {task.line()}" if task.place else "")
+        if task.state == DONE:
+            then(task.result)
+
+    def _note(self, line: str) -> None:
+        self.toolbar.param.update(notes=[line], said="")
+
+    def _refresh(self, *_: object) -> None:
+        scenario, preset = self.store.scenario, self.store.preset
+        query = to_query(scenario, preset)
+        self.toolbar.param.update(
+            linked=query is not None, query=query or "", command=to_command(scenario, preset),
+            python=to_python(scenario, preset))
+
+    def _refresh_ready(self, *_: object) -> None:
+        self.toolbar.ready = self.store.run.result is not None
+
+
+def _reason(text: str) -> str:
+    return text.removeprefix("file: ")[:300]

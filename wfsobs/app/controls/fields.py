@@ -1,0 +1,234 @@
+"""One setting, one field: the widgets that fit its kind, kept in step with the store.
+
+Numbers are typed as text, so that whatever is typed reaches the setting's own check and its answer can be shown
+beside it; a number with a usual range has a slider as well.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from html import escape
+from typing import Any
+
+import panel as pn
+import panel_material_ui as pmui
+import param
+
+from wfsobs.app.controls.names import named
+from wfsobs.app.display import label_of, written_unit
+from wfsobs.app.store import Store
+from wfsobs.scenario.parameters import Reals
+
+ROOM = {"sizing_mode": "stretch_width", "margin": (4, 0)}
+NUMBER_WIDTH = 92
+
+UNNAMED = {
+    "& .MuiInputLabel-root": {"clipPath": "inset(50%)", "overflow": "hidden", "width": "1px", "height": "1px"},
+    "& legend": {"display": "none"}, "& fieldset": {"top": 0},
+}
+"""A box whose name is heard but not seen: the slider beside it has the same."""
+
+TAG = "setting:"
+"""Stands before the path of its setting in the tag of a widget: the browser knows by it what was changed."""
+
+SOON = 5
+"""How long a message of a slider or switch waits for the next to go with it [ms]: by default 50, a tenth of a redraw."""
+
+
+def number_text(value: float) -> str:
+    """A number as a person would type it."""
+    return f"{value:.10g}"
+
+
+def parsed(text: str) -> float | str:
+    """What a typed text stands for; text that is no number stays text, for the setting to refuse."""
+    text = text.strip().replace("−", "-")
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+class Field:
+    """The widgets of one setting; `view` is what the page shows."""
+
+    def __init__(self, store: Store, path: str, p: param.Parameter):
+        self.store, self.path, self.parameter = store, path, p
+        self.widgets = self._widgets()
+        self.view = pn.Column(self._row(), sizing_mode="stretch_width", margin=0)
+        self.refresh()
+        store.param.watch(self.refresh, ["scenario", "errors"])
+
+    def refresh(self, *_: object) -> None:
+        """Show the accepted value, or leave what was refused and say why."""
+        reason = self.store.errors.get(self.path, "")
+        if not reason:
+            self.show(self.store.value(self.path))
+        if reason or len(self.view) > 1:
+            note = [pn.pane.HTML(error_html(named(reason)), margin=(0, 0, 6, 0))] if reason else []
+            self.view[1:] = note
+        for widget in self.widgets:
+            if "error_state" in widget.param:
+                widget.error_state = bool(reason)
+
+    def show(self, value: Any) -> None:
+        """Put a value into the widgets."""
+        raise NotImplementedError
+
+    def enter(self, value: Any) -> None:
+        """Do as if a value had been typed or chosen. Raises ValueError where that cannot be."""
+        self.widgets[-1].value = value
+
+    def _widgets(self) -> list[Any]:
+        raise NotImplementedError
+
+    def _row(self) -> Any:
+        return self.widgets[0]
+
+    def _change(self, event: param.parameterized.Event) -> None:
+        self.store.change(self.path, event.new)
+
+    def _names(self) -> dict[str, Any]:
+        return {
+            "label": label_of(self.parameter), "description": written_unit(self.parameter.doc or ""), "tags": [TAG + self.path]}
+
+
+class ChoiceField(Field):
+    """One of several words."""
+
+    def _widgets(self) -> list[Any]:
+        select = pmui.Select(options=list(self.parameter.objects), size="small", **self._names(), **ROOM)  # type: ignore[attr-defined]
+        select.param.watch(self._change, "value")
+        return [select]
+
+    def show(self, value: Any) -> None:
+        """Put a value into the widget."""
+        self.widgets[0].value = value
+
+
+class SwitchField(Field):
+    """On or off."""
+
+    def _widgets(self) -> list[Any]:
+        switch = pmui.Switch(**self._names(), **ROOM)
+        switch.param.watch(self._change, "value")
+        return [switch]
+
+    def show(self, value: Any) -> None:
+        """Put a value into the widget."""
+        self.widgets[0].value = value
+
+
+class TextField(Field):
+    """A number, typed."""
+
+    def _widgets(self) -> list[Any]:
+        return [self._text(**self._names(), **ROOM)]
+
+    def _text(self, **options: Any) -> pmui.TextInput:
+        text = pmui.TextInput(size="small", **options)
+        text.param.watch(self._typed, "value")
+        return text
+
+    def _typed(self, event: param.parameterized.Event) -> None:
+        if self.path in self.store.errors or event.new != self.written(self.store.value(self.path)):
+            self.store.change(self.path, self.read(event.new))
+
+    def show(self, value: Any) -> None:
+        """Put a value into the text."""
+        written = self.written(value)
+        self.widgets[-1].param.update(value=written, value_input=written)
+
+    def enter(self, value: Any) -> None:
+        """Type a text, or the number that the slider stands at."""
+        super().enter(value if isinstance(value, str) else number_text(float(value)))
+
+    def written(self, value: Any) -> str:
+        """The value as text."""
+        return number_text(value)
+
+    def read(self, text: str) -> Any:
+        """The text as a value."""
+        return parsed(text)
+
+
+class NumbersField(TextField):
+    """A list of numbers, typed with commas between them."""
+
+    def written(self, value: Any) -> str:
+        """The numbers as text."""
+        return ", ".join(number_text(v) for v in value)
+
+    def read(self, text: str) -> Any:
+        """The text as numbers."""
+        return [parsed(part) for part in re.split(r"[,;\s]+", text.strip()) if part]
+
+
+class SliderField(TextField):
+    """A number with a usual range: a slider over that range, and the number itself to type."""
+
+    _value: Any = None
+    """What the slider stands at, as far as it has said or was told."""
+
+    def _widgets(self) -> list[Any]:
+        p: Any = self.parameter
+        whole = isinstance(p, param.Integer)
+        low, high = p.softbounds
+        names = self._names()
+        kind = pmui.IntSlider if whole else pmui.FloatSlider
+        slider = kind(
+            start=low, end=high, value=low, step=p.step or (1 if whole else _step(low, high)), show_value=False,
+            size="small", **names, **ROOM)
+        slider._debounce = SOON  # type: ignore[misc]
+        slider.param.watch(self._released, "value_throttled")
+        text = self._text(
+            label=names["label"], tags=[TAG + self.path], width=NUMBER_WIDTH, margin=(4, 0, 4, 8), align="end", sx=UNNAMED)
+        return [slider, text]
+
+    def _row(self) -> Any:
+        return pn.Row(*self.widgets, sizing_mode="stretch_width", margin=0)
+
+    def _released(self, event: param.parameterized.Event) -> None:
+        self._value = event.new
+        if event.new is not None and event.new != self.store.value(self.path):
+            self.store.change(self.path, event.new)
+
+    def show(self, value: Any) -> None:
+        """Put a value into the text and the slider, whose range grows to hold it.
+
+        A value that came from the slider does not go back to it: by then it may have been moved on.
+        """
+        super().show(value)
+        if value == self._value:
+            return
+        self._value = value
+        slider = self.widgets[0]
+        low, high = self.parameter.softbounds  # type: ignore[attr-defined]
+        with param.edit_constant(slider):  # value_throttled too: releasing at its old value must count as news
+            slider.param.update(start=min(low, value), end=max(high, value), value=value, value_throttled=value)
+
+
+def make_field(store: Store, path: str, p: param.Parameter) -> Field:
+    """The field that fits a setting."""
+    if isinstance(p, param.Boolean):
+        return SwitchField(store, path, p)
+    if isinstance(p, param.Selector):
+        return ChoiceField(store, path, p)
+    if isinstance(p, Reals):
+        return NumbersField(store, path, p)
+    if isinstance(p, param.Number) and p.softbounds:
+        return SliderField(store, path, p)
+    return TextField(store, path, p)
+
+
+def error_html(reason: str) -> str:
+    """A refusal, to stand beside its setting."""
+    return f'<div role="alert" style="color:#d93025;font-size:12px">{escape(reason)}</div>' if reason else ""
+
+
+def _step(low: float, high: float) -> float:
+    """A round step, about a two-hundredth of the range."""
+    return 10.0 ** math.floor(math.log10((high - low) / 100.0))

@@ -1,0 +1,79 @@
+"""What settings are called on the page, where messages have their paths."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from functools import cache
+
+import param
+
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.settings import Group, holds_groups
+from wfsobs.sensors.modes import TIP_TILT
+
+SHORT = {
+    "frequency": "f", "damping": "ξ", "height": "h", "fraction": "share", "wind_factor": "V / V₀", "wind_direction": "wind to",
+    "frequency_shift": "shift",
+}
+"""Setting -> its name above a narrow column; any other has its own."""
+
+PATH = re.compile(r"\b[a-z_]+(?:\.(?:[a-z_]+|\d+))+\b")
+
+
+def named(line: str) -> str:
+    """A message with the names of the page in place of paths.
+
+    >>> named("vibration.peaks.0.rms.1 = -1.0: takes a number from 0"), named("night.toml: turbulence.wind_speed = 200")
+    ('Peak 1: tilt = -1.0: takes a number from 0', 'night.toml: Wind speed V₀ = 200')
+    """
+    return PATH.sub(lambda match: name_of(match[0]), line)
+
+
+def column_of(key: str) -> str:
+    """The name of a setting of a list's item; rms.0 is the first of a list of numbers, one per mode.
+
+    >>> column_of("frequency"), column_of("rms.0"), column_of("start")
+    ('f', 'tip', 'start')
+    """
+    setting, _, mode = key.partition(".")
+    return TIP_TILT[int(mode)].name if mode.isdecimal() and int(mode) < len(TIP_TILT) else SHORT.get(setting, setting)
+
+
+@cache
+def name_of(path: str) -> str:
+    """What a setting is called on the page; its topic stands before a name that several have. A path that is none stays.
+
+    >>> name_of("gpr_online.depth"), name_of("vibration.peaks.14"), name_of("vibration.peaks.0.height")
+    ('Online GPR: Depth d', 'Peak 15', 'vibration.peaks.0.height')
+    """
+    node: Group = Scenario()
+    topic, *_ = keys = path.split(".")
+    for i, key in enumerate(keys):
+        p = node.settings().get(key)
+        if p is None:
+            return path
+        value, rest = getattr(node, key), keys[i + 1 :]
+        if isinstance(value, Group):
+            node = value
+        elif isinstance(p, param.List) and holds_groups(p) and rest:
+            return _item(p, *rest) or path
+        else:
+            several = not rest and _labels()[str(p.label)] > 1
+            return f"{Scenario.settings()[topic].label}: {p.label}" if several else str(p.label)
+    return path
+
+
+def _item(p: param.List, number: str, *keys: str) -> str:
+    """What an item of a list is called, or a setting of it."""
+    kind = p.item_type
+    if not number.isdecimal() or (keys and keys[0] not in kind.settings()):  # type: ignore[union-attr]
+        return ""
+    item = f"{kind.__name__} {int(number) + 1}"  # type: ignore[union-attr]
+    return f"{item}: {column_of('.'.join(keys))}" if keys else item
+
+
+@cache
+def _labels() -> Counter[str]:
+    """How many settings have a label."""
+    return Counter(str(p.label) for _, _, p in Scenario().walk())

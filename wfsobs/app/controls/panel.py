@@ -1,0 +1,237 @@
+"""The drawer: preset, run, progress, and every setting by topic."""
+
+from __future__ import annotations
+
+import contextlib
+from html import escape
+from typing import Any
+
+import panel as pn
+import panel_material_ui as pmui
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.controls.fields import ROOM, TAG, Field, make_field
+from wfsobs.app.controls.names import name_of
+from wfsobs.app.controls.rows import RowEditor
+from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
+from wfsobs.app.store import Store
+from wfsobs.app.style import asset
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.settings import Group
+
+FIRST = ("turbulence.wind_speed", "sensors.exposure_ratio")
+"""Settings that stand above the topics."""
+
+TOPICS = ("vibration", "gpr_offline", "gpr_online")
+"""Topics that come first; the others follow as declared."""
+
+
+PRESET = "preset"
+"""What the box of presets is called where the others are called by the paths of their settings."""
+
+
+NO_CHANGES = "Nothing changed"
+TWO_LINES = """
+.MuiFormHelperText-root {
+  height: 2lh; overflow: hidden; overflow-wrap: anywhere;
+  display: -webkit-box; -webkit-line-clamp: 2; -webkit-box-orient: vertical;
+}
+"""
+"""What is below must not move under the pointer with every change."""
+
+
+class Status(JSComponent):
+    """The state of the run in the browser."""
+
+    progress = param.Number(0.0, doc="Fraction done.")
+    text = param.String("", doc="The state, in words.")
+    note = param.String("", doc="What was refused.")
+    label = param.String("Progress of the run", doc="What the bar is the progress of.")
+
+    _esm = asset("status.js")
+    _stylesheets = [asset("status.css")]  # noqa: RUF012
+
+
+class Controls:
+    """Everything in the drawer, in step with the store."""
+
+    def __init__(self, store: Store):
+        self.store = store
+        self.fields: dict[str, Field] = {}
+        self.lists: dict[str, RowEditor] = {}
+        self.parts: list[tuple[str, Any]] = []
+        self.preset = pmui.Select(
+            label="Preset", tags=[TAG + PRESET], value=store.preset, options={_title(name): name for name in PRESETS},
+            helper_text=NO_CHANGES, size="small", stylesheets=[TWO_LINES], **ROOM)
+        self.reset = pmui.Button(
+            label="Reset", icon="restart_alt", variant="text", size="small", margin=(4, 0))
+        self.undo, self.redo = (
+            pmui.Button(label=name, icon=name.lower(), variant="text", size="small", margin=(4, 4, 4, 0), disabled=True)
+            for name in ("Undo", "Redo"))
+        self.run = pmui.Button(label="Run", icon="play_arrow", color="primary", **ROOM)
+        self.cancel = pmui.Button(label="Cancel", icon="stop", variant="outlined", margin=(4, 0, 4, 8))
+        self.status = Status(sizing_mode="stretch_width", margin=(4, 0))
+        self.topics = _names()
+        self.rooms = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
+        self.accordion = pmui.Accordion(
+            *((title, self.rooms[name]) for name, title in self.topics.items()),
+            title_variant="body2", variant="outlined", disable_gutters=True, dynamic=True,
+            sizing_mode="stretch_width", margin=(8, 0),
+        )
+        self._watch()
+        self.accordion.active = [0]
+        self._refresh_run()
+        self._refresh_preset()
+
+    def view(self) -> pn.Column:
+        """What goes into the drawer."""
+        first = [self._field(path) for path in FIRST]
+        return pn.Column(
+            self.preset, pn.Row(self.undo, self.redo, self.reset, sizing_mode="stretch_width", margin=0),
+            pn.Row(self.run, self.cancel, sizing_mode="stretch_width", margin=0),
+            self.status, *(f.view for f in first), self.accordion,
+            sizing_mode="stretch_width", margin=(8, 14),
+        )
+
+    def open_topic(self, name: str) -> None:
+        """Fill a topic with its fields, the first time it is opened."""
+        column = self.rooms[name]
+        if len(column):
+            return
+        own = {path: RowEditor(self.store, path, p) for path, p in self.store.scenario.lists() if path.split(".")[0] == name}
+        self.lists |= own
+        views = [*((path, editor.view) for path, editor in own.items()), *self._fields_of(name)]
+        self.parts += views
+        self._refresh_parts()
+        column[:] = [view for _, view in views]
+
+    def take(self, change: dict[str, Any]) -> None:
+        """Make a change of the visitor's that did not arrive: {setting, value} of a box, {setting, message} of a table.
+
+        One that makes no sense, or none any more, is left.
+        """
+        path, value, message = (change.get(key) for key in ("setting", "value", "message"))
+        with contextlib.suppress(ValueError, TypeError, KeyError, IndexError):
+            if path == PRESET:
+                self.preset.value = value
+            elif isinstance(path, str) and path.split(".")[0] in self.rooms:
+                self.open_topic(path.split(".")[0])
+                if path in self.fields:
+                    self.fields[path].enter(value)
+                elif path in self.lists and isinstance(message, dict):
+                    self.lists[path].handle(message)
+
+    def _refresh_parts(self, *_: object) -> None:
+        """Hide what has no meaning for the settings as they are."""
+        with pn.io.hold():
+            for path, view in self.parts:
+                topic, *below = path.split(".")
+                if below:
+                    view.visible = below[0] not in getattr(self.store.scenario, topic).idle()
+
+    def _fields_of(self, name: str) -> list[tuple[str, Any]]:
+        """The fields of a topic under the headings of its groups, with the paths of both; none where it is a list."""
+        group = getattr(self.store.scenario, name)
+        if not isinstance(group, Group):
+            return []
+        views: list[tuple[str, Any]] = []
+        heading = name
+        for setting, _, _ in group.walk(f"{name}."):
+            if setting in FIRST or any(setting.startswith(f"{listed}.") for listed in self.lists):
+                continue
+            *_, above, _name = setting.split(".")
+            if above != heading:
+                heading = above
+                title = escape(str(group.settings()[above].label))
+                views.append((f"{name}.{above}", pn.pane.HTML(f"<b>{title}</b>", margin=(8, 0, 0, 0))))
+            views.append((setting, self._field(setting).view))
+        return views
+
+    def _field(self, path: str) -> Field:
+        if path not in self.fields:
+            p = next(p for where, _, p in self.store.scenario.walk() if where == path)
+            self.fields[path] = make_field(self.store, path, p)
+        return self.fields[path]
+
+    def _watch(self) -> None:
+        self.preset.param.watch(self._chosen, "value")
+        self.reset.on_click(lambda _event: self.store.choose(self.store.preset))
+        self.undo.on_click(lambda _event: self.store.undo())
+        self.redo.on_click(lambda _event: self.store.redo())
+        self.run.on_click(lambda _event: self.store.start())
+        self.cancel.on_click(lambda _event: self.store.run.cancel())
+        self.accordion.param.watch(self._opened, "active")
+        self.store.param.watch(self._refresh_preset, ["scenario", "preset", "can_undo", "can_redo"])
+        self.store.param.watch(self._refresh_parts, "scenario")
+        self.store.param.watch(self._refresh_run, ["errors", "waiting"])
+        self.store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"])
+
+    def _chosen(self, event: param.parameterized.Event) -> None:
+        if event.new != self.store.preset:
+            self.store.choose(event.new)
+
+    def _opened(self, event: param.parameterized.Event) -> None:
+        names = list(self.topics)
+        for index in event.new:
+            self.open_topic(names[index])
+
+    def _refresh_preset(self, *_: object) -> None:
+        changed = self.store.changed()
+        self.preset.value = self.store.preset
+        self.preset.helper_text = f"{len(changed)} changed: {', '.join(changed)}" if changed else NO_CHANGES
+        self.reset.disabled = not changed
+        self.undo.disabled, self.redo.disabled = not self.store.can_undo, not self.store.can_redo
+
+    def _refresh_run(self, *_: object) -> None:
+        run = self.store.run
+        running = run.state == RUNNING
+        self.cancel.disabled = not running
+        text, note = status_of(self.store)
+        self.status.param.update(progress=run.progress, text=text, note=note)
+
+
+def status_of(store: Store) -> tuple[str, str]:
+    """A line on the run, and one on what was refused."""
+    run = store.run
+    seconds = f" in {run.result.seconds:.2f} s" if run.result and run.state == DONE else ""
+    text = {
+        RUNNING: run.line(),
+        DONE: f"Done{seconds}",
+        CANCELLED: "Cancelled",
+        FAILED: "The run failed",
+    }.get(run.state, "")
+    if store.waiting:
+        text = waiting_text(store.waiting)
+    note = f"Not accepted: {', '.join(map(name_of, store.errors))}" if store.errors else ""
+    return text, note
+
+
+def waiting_text(seconds: float) -> str:
+    """How long a run takes that waits to be asked for.
+
+    >>> waiting_text(12.3), waiting_text(1000.0)
+    ('About 12 s: press Run', 'About 17 min: press Run')
+    """
+    length = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+    return f"About {length}: press Run"
+
+
+def _names() -> dict[str, str]:
+    """Topic -> title, in the order of the drawer."""
+    settings = {name: str(p.label) for name, p in Scenario.settings().items()}
+    return {name: settings[name] for name in (*TOPICS, *(n for n in settings if n not in TOPICS))}
+
+
+ACRONYMS = ("ut4", "galacsi", "nfm", "wfm")
+
+
+def _title(preset: str) -> str:
+    """A preset's name as the page writes it.
+
+    >>> _title("ut4-floor"), _title("strong-turbulence")
+    ('UT4 floor', 'Strong turbulence')
+    """
+    words = [word.upper() if word in ACRONYMS else word for word in preset.split("-")]
+    return " ".join([words[0] if words[0].isupper() else words[0].capitalize(), *words[1:]])

@@ -1,0 +1,117 @@
+"""A list of groups of settings, such as the vibration peaks: a table to add to, remove from and edit in place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import panel as pn
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.controls.fields import TAG, number_text, parsed, written_unit
+from wfsobs.app.controls.names import column_of, named
+from wfsobs.app.store import Store
+from wfsobs.app.style import asset
+from wfsobs.scenario.parameters import Reals, unit_of
+from wfsobs.scenario.settings import Group
+from wfsobs.sensors.modes import TIP_TILT
+
+
+class RowTable(JSComponent):
+    """The table in the browser: texts down, messages {action, row, key, text} up."""
+
+    rows = param.List([], doc="One list of texts per item, None for what means nothing in it.")
+    columns = param.List([], doc="{key, name, doc, choices} of every column.")
+    errors = param.Dict({}, doc="'row.key' -> {text, reason} of refused cells.")
+    noun = param.String("item", doc="What an item is called.")
+
+    _esm = asset("rows.js")
+    _stylesheets = [asset("rows.css")]  # noqa: RUF012
+
+    def __init__(self, **params: Any):
+        self.on_edit: Any = None
+        super().__init__(**params)
+
+    def _handle_msg(self, msg: dict[str, Any]) -> None:
+        if self.on_edit is not None:
+            self.on_edit(msg)
+
+
+class RowEditor:
+    """The table of one list of groups, kept in step with the store."""
+
+    def __init__(self, store: Store, path: str, p: param.List):
+        self.store, self.path = store, path
+        self._kind: type[Group] = p.item_type  # type: ignore[assignment]
+        self._texts: dict[str, str] = {}
+        self.table = RowTable(
+            columns=_columns(self._kind), noun=self._kind.__name__.lower(), tags=[TAG + path],
+            sizing_mode="stretch_width", margin=(0, 0, 8, 0))
+        self.table.on_edit = self.handle
+        self.view = pn.Column(self.table, sizing_mode="stretch_width", margin=0)
+        self.refresh()
+        store.param.watch(self.refresh, ["scenario", "errors"])
+
+    def handle(self, msg: dict[str, Any]) -> None:
+        """Do what a message of the table says."""
+        action, row = msg.get("action"), int(msg.get("row", -1))
+        if action == "add":
+            self.add()
+        elif action == "remove":
+            self.remove(row)
+        elif action == "edit":
+            self.edit(row, str(msg["key"]), str(msg["text"]))
+
+    def add(self) -> None:
+        """One more item, with the defaults."""
+        self._replace([*self._plain(), self._kind().to_dict()])
+
+    def remove(self, row: int) -> None:
+        """One item less."""
+        items = self._plain()
+        del items[row]
+        self._replace(items)
+
+    def edit(self, row: int, key: str, text: str) -> None:
+        """Set one cell; `key` is the setting within the item, rms.0 for the first of a list of numbers."""
+        path = f"{self.path}.{row}.{key}"
+        self._texts[path] = text
+        self.store.change(path, parsed(text))
+
+    def refresh(self, *_: object) -> None:
+        """Show the accepted items and what was refused."""
+        items = self.store.value(self.path)
+        rows = [[None if c["key"] in item.idle() else _cell(item, c["key"]) for c in self.table.columns] for item in items]
+        errors: dict[str, dict[str, str]] = {}
+        for path, reason in self.store.errors.items():
+            if f"{path}.".startswith(f"{self.path}."):
+                errors[path.removeprefix(f"{self.path}.")] = {"text": self._texts.get(path, ""), "reason": named(reason)}
+        self.table.param.update(rows=rows, errors=errors)
+
+    def _plain(self) -> list[dict[str, Any]]:
+        return [item.to_dict() for item in self.store.value(self.path)]
+
+    def _replace(self, items: list[dict[str, Any]]) -> None:
+        self.store.change(self.path, items)
+
+
+def _columns(kind: type[Group]) -> list[dict[str, Any]]:
+    """One column per number or word, one for tip and one for tilt per list of numbers, named from the settings."""
+    out = []
+    for setting, p in kind.settings().items():
+        keys = [setting]
+        if isinstance(p, Reals):
+            keys = [f"{setting}.{i}" for i, _ in enumerate(TIP_TILT)]
+        unit = written_unit(unit_of(p))
+        choices = list(p.objects) if isinstance(p, param.Selector) else []
+        out += [{"key": key, "name": f"{name} [{unit}]" if unit else name, "doc": p.doc or "", "choices": choices}
+                for key in keys for name in [column_of(key)]]
+    return out
+
+
+def _cell(item: Group, key: str) -> str:
+    name, _, mode = key.partition(".")
+    value = getattr(item, name)
+    if mode:
+        value = value[int(mode)] if int(mode) < len(value) else 0.0
+    return value if isinstance(value, str) else number_text(value)

@@ -1,0 +1,128 @@
+"""How results are shown: which mode, signal or error, and in which unit. Nothing here changes a result."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import param
+
+from wfsobs.app.pin import Pin
+from wfsobs.scenario.parameters import unit_of
+from wfsobs.sensors.modes import HIGHEST_ORDER, TIP_TILT, Mode, modes_up_to
+
+SIGNAL, ERROR, RUNNING_RMS = "signal", "error", "running rms"
+PSD, CUMULATIVE = "psd", "cumulative"
+UNITS = {"nm": "nm", "mas": "mas", "um": "µm"}
+"""Unit -> how it is written."""
+
+NOTHING = "–"
+IN_MOST = "where the error of an optimal observer lies in 95 % of records"
+
+NO_ANGLE = ("mas",)
+"""Units that only tip and tilt can be in."""
+
+MODES = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
+"""Every mode that a run can have; it has the first of them."""
+
+MAS_PER_RADIAN = math.degrees(1.0) * 3600.0 * 1000.0
+
+
+def per_micrometre(unit: str, diameter: float) -> float:
+    """How many `unit` one micrometre of a tip or tilt coefficient is.
+
+    A Noll-normalised coefficient a tilts the wavefront by 4 a / D on sky; diameter D [m].
+
+    >>> round(per_micrometre("mas", 8.0), 1)
+    103.1
+    """
+    return {"nm": 1e3, "mas": 4e-6 / diameter * MAS_PER_RADIAN, "um": 1.0}[unit]
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number with some significant digits and no exponent where it is of common size."""
+    if value is None:
+        return NOTHING
+    if value == 0:
+        return "0"
+    if not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}"
+    text = f"{value:#.{digits}g}"
+    return (f"{value:.0f}" if "e" in text else text.rstrip(".")).replace("-", "−")
+
+
+def written_unit(unit: str) -> str:
+    """A unit as the page writes it.
+
+    >>> written_unit("um^2/Hz")
+    'µm²/Hz'
+    """
+    return re.sub(r"\bum\b", "µm", unit).replace("^2", "²")
+
+
+def label_of(p: param.Parameter) -> str:
+    """A setting's label with its unit in [brackets]."""
+    unit = written_unit(unit_of(p))
+    return f"{p.label} [{unit}]" if unit else str(p.label)
+
+
+def short_name(mode: Mode) -> str:
+    """A mode's name where there is little room: a long one is Z and Noll's index.
+
+    >>> [short_name(mode) for mode in modes_up_to(2)]
+    ['tip', 'tilt', 'defocus', 'Z5', 'Z6']
+    """
+    return mode.name if len(mode.name) <= len("defocus") else f"Z{mode.noll}"
+
+
+class Display(param.Parameterized):
+    """The switches above the figures."""
+
+    mode = param.Selector(default=MODES[0], objects=MODES, label="Mode")
+    show = param.Selector(default=SIGNAL, objects=[SIGNAL, ERROR, RUNNING_RMS], label="Show")
+    unit = param.Selector(default="nm", objects=list(UNITS), label="Unit")
+    hidden = param.Dict({}, doc="Target -> names of its hidden lines.")
+    dark = param.Boolean(False, doc="Dark mode.")
+    spectrum = param.Selector(default=PSD, objects=[PSD, CUMULATIVE], label="Spectrum")
+    best_first = param.Boolean(True, label="Best first", doc="Sort the observers of the table by their error.")
+    pinned = param.ClassSelector(class_=Pin, default=None, allow_None=True, doc="The run to compare with.")
+
+    @property
+    def column(self) -> int:
+        """The column of the mode in every array."""
+        return MODES.index(self.mode)
+
+    @property
+    def mode_label(self) -> str:
+        """The mode as axes write it."""
+        return short_name(modes_up_to(HIGHEST_ORDER)[self.column])
+
+    @property
+    def units(self) -> list[str]:
+        """Those that the mode can be in: only tip and tilt are angles."""
+        return [unit for unit in UNITS if unit not in NO_ANGLE or self.mode in [m.name for m in TIP_TILT]]
+
+    @property
+    def compared(self) -> Pin | None:
+        """The pinned run, where it has the mode shown."""
+        return self.pinned if self.pinned is not None and self.column < len(self.pinned.scenario.modes) else None
+
+    @property
+    def error(self) -> bool:
+        """Whether errors are shown, as they are or as their running rms."""
+        return self.show != SIGNAL
+
+    @property
+    def running(self) -> bool:
+        """Whether the time traces are the running rms of the errors."""
+        return self.show == RUNNING_RMS
+
+    @property
+    def cumulative(self) -> bool:
+        """Whether spectra are summed from high to low frequency."""
+        return self.spectrum == CUMULATIVE
+
+    @property
+    def unit_label(self) -> str:
+        """The unit as it is written."""
+        return UNITS[self.unit]

@@ -1,0 +1,77 @@
+"""The closed loop of the results shown: quick controllers first, each as it is done."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from wfsobs.app.jobs.job import Tell
+from wfsobs.app.work import Shown
+from wfsobs.control.closed_loop import ClosedLoop, design, each_outcome
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.curves import Curves, curves
+from wfsobs.control.tables import Row, rows
+from wfsobs.evaluation.scores import welch_psd
+from wfsobs.progress import Watch
+from wfsobs.scenario import Scenario
+from wfsobs.typing import Array
+
+PATIENCE = 60.0
+"""A controller that would take longer is left out here [s]; `wfsobs loop` runs it."""
+
+
+@dataclass(frozen=True)
+class LoopShown:
+    """What a closed loop has given so far.
+
+    rows    : those of `wfsobs loop --json`
+    spectra : controller -> (frequency (n,) [Hz], density of the residual (n, n_modes) [um^2/Hz])
+    curves  : controller -> per mode, of stable time-invariant laws
+    """
+
+    result: ClosedLoop
+    rows: tuple[Row, ...] = ()
+    spectra: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+    curves: Mapping[str, tuple[Curves, ...]] = field(default_factory=dict)
+    done: bool = False
+
+    def residual(self, controller: str) -> Array | None:
+        """(n_steps, n_modes) [um], or None."""
+        return next((o.residual for o in self.result.outcomes if o.controller == controller), None)
+
+
+def compute(of: Shown, watch: Watch, tell: Tell) -> LoopShown | None:
+    """Run every controller on the record shown; tell what is done once the quick ones are, and after each of the others."""
+    record, shown = of.result.record, None
+    plan = design(of.scenario, [name for name in CONTROLLERS if seconds(name, of.scenario) <= PATIENCE])
+    linear = {
+        name: tuple(curves(d.law, plan.mirror, record.dt) for d in laws if d.law)
+        for name, laws in plan.laws.items() if all(d.margins for d in laws)}
+    outcomes: list[Any] = []
+    spectra: dict[str, tuple[Array, Array]] = {}
+    start = round(of.scenario.run.warm_up / record.dt)
+    names = list(plan.laws)
+    quick = [name for name in names if CONTROLLERS[name].predict is None]
+    for outcome in each_outcome(record, plan, watch):
+        outcomes.append(outcome)
+        if outcome.residual is not None:
+            spectra[outcome.controller] = welch_psd(outcome.residual[start:], record.dt)
+        if outcome.controller not in quick[:-1]:
+            result = ClosedLoop(plan, record, tuple(outcomes))
+            shown = LoopShown(result, tuple(rows(result, None)), dict(spectra), linear, outcome.controller == names[-1])
+            if not shown.done:
+                tell(result=shown)
+    return shown
+
+
+def cost(scenario: Scenario) -> float:
+    """About how long all that are not left out take at most [s]."""
+    return sum(s for s in (seconds(name, scenario) for name in CONTROLLERS) if s <= PATIENCE)
+
+
+def seconds(controller: str, scenario: Scenario) -> float:
+    """About how long a controller takes at most [s]: the online GPR is a step of 0.1 ms + 0.7 ns m^2 at a time."""
+    if controller != "integrator+gpr-online":
+        return 0.0
+    return scenario.n_steps * len(scenario.modes) * (1e-4 + 0.7e-9 * scenario.gpr_online.training_size**2)

@@ -1,0 +1,210 @@
+"""The paper's figures, drawn from the results shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+import panel as pn
+from bokeh.models import BoxAnnotation, ColumnDataSource, DataRange1d, GlyphRenderer, Range1d
+from bokeh.plotting import figure
+
+from wfsobs.app.display import Display, number, per_micrometre
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.style import asset, look, swatch
+from wfsobs.app.views.envelope import envelope, envelope_times
+from wfsobs.app.views.plots import call, new_figure
+from wfsobs.app.views.table import find
+from wfsobs.app.work import TRUTH, Shown
+from wfsobs.observers.base import TURBULENCE, VIBRATION
+from wfsobs.sensors.modes import TIP_TILT
+
+ZOOM_S = 0.5
+"""Length of a zoomed plot [s], in the middle of the record."""
+
+BINS = 700
+PSD_TOP_HZ = 100.0
+WHOLE, ZOOMED, SPECTRUM = "whole record", "zoomed", "power spectrum"
+
+
+@dataclass(frozen=True)
+class Plot:
+    """One plot: what of it (WHOLE, ZOOMED, SPECTRUM), of which column of the arrays."""
+
+    what: str
+    column: int = 0
+
+
+@dataclass(frozen=True)
+class PaperFigure:
+    """A figure of the paper: its lines beside the reference, its plots from the top; printed: the paper's RMS errors."""
+
+    title: str
+    caption: str
+    target: str
+    observers: tuple[str, ...]
+    plots: tuple[Plot, ...]
+    printed: str = ""
+
+
+FIGURES = (
+    PaperFigure(
+        "Butterworth reference, open loop",
+        "Figure 4a of the paper: vibration filtered from open-loop data, bottom plot zoomed; tip only.",
+        VIBRATION, ("butterworth-ol",), (Plot(WHOLE), Plot(ZOOMED)), "The paper: 7.66e-3, taken as µm."),
+    PaperFigure(
+        "Butterworth reference, closed loop",
+        "Figure 4b of the paper: vibration filtered from closed-loop data, bottom plot zoomed; tip only.",
+        VIBRATION, ("butterworth-cl",), (Plot(WHOLE), Plot(ZOOMED)), "The paper: 13.4e-3, taken as µm."),
+    PaperFigure(
+        "Estimation of the atmospheric turbulence", "Figure 5 of the paper: tip above, tilt below.",
+        TURBULENCE, ("kf-lgs", "kf-ngs", "multirate"), (Plot(WHOLE, 0), Plot(WHOLE, 1))),
+    PaperFigure(
+        "Estimation of structural vibrations",
+        "Figure 6 of the paper: traces, a zoom into them, and their power spectra; tip only.",
+        VIBRATION, ("kf-lgs", "gpr-offline", "gpr-online"), (Plot(WHOLE), Plot(ZOOMED), Plot(SPECTRUM)),
+        "The paper: LGS KF 16.6e-3, offline GPR 12.4e-3, online GPR 13.3e-3, taken as µm."),
+)
+
+
+class Figures:
+    """The page; redrawn with the results and the unit while it is visible."""
+
+    def __init__(self, run: BackgroundTask, display: Display):
+        self.run, self.display = run, display
+        self.visible = False
+        self.sheets = [_Sheet(it) for it in FIGURES]
+        run.param.watch(self._refresh, "result")
+        display.param.watch(self._refresh, ["unit", "dark"])
+
+    def view(self) -> pn.Column:
+        """The figures, one below the other."""
+        return pn.Column(
+            *(sheet.view() for sheet in self.sheets), sizing_mode="stretch_width", margin=0,
+            stylesheets=[":host { gap: 10px; }"])
+
+    def show(self, visible: bool) -> None:
+        """Draw what has come meanwhile, and go on while visible."""
+        behind = visible and not self.visible
+        self.visible = visible
+        if behind:
+            self._refresh()
+
+    def _refresh(self, *_: object) -> None:
+        shown = self.run.result
+        if self.visible and shown is not None:
+            with pn.io.hold():
+                for sheet in self.sheets:
+                    sheet.draw(shown, self.display)
+
+
+class _Sheet:
+    """One figure of the paper: heading, legend, plots, caption."""
+
+    def __init__(self, figure: PaperFigure):
+        self.figure = figure
+        self.names = (*figure.observers, TRUTH)  # the reference on top
+        self.plots = [_Drawn(plot, self.names, figure) for plot in figure.plots]
+        sheet = [asset("style.css")]
+        self.head = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, stylesheets=sheet)
+        self.caption = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, stylesheets=sheet)
+
+    def view(self) -> pn.Column:
+        """What the page shows."""
+        panes = [pn.pane.Bokeh(drawn.figure, sizing_mode="stretch_width", margin=0) for drawn in self.plots]
+        return pn.Column(self.head, *panes, self.caption, sizing_mode="stretch_width", margin=0, stylesheets=[asset("box.css")])
+
+    def draw(self, shown: Shown, display: Display) -> None:
+        """Every plot and the texts."""
+        legend = "".join(
+            f'<span class="mark">{swatch(n, display.dark, dashed=_dashed(n, self.figure))}{escape(_label(n))}</span>'
+            for n in self.names)
+        self.head.object = f'<h2 class="title">{escape(self.figure.title)}</h2><div class="caption legend">{legend}</div>'
+        self.caption.object = f'<p class="text">{escape(self.figure.caption)} {escape(self._errors(shown, display))}</p>'
+        for drawn in self.plots:
+            drawn.draw(shown, display)
+
+    def _errors(self, shown: Shown, display: Display) -> str:
+        """The RMS errors of the lines, mode by mode."""
+        scale = per_micrometre(display.unit, shown.scenario.telescope.diameter)
+        parts = []
+        for column in sorted({plot.column for plot in self.figure.plots}):
+            mode = TIP_TILT[column].name
+            scores = {name: find(shown, name, self.figure.target, mode) for name in self.figure.observers}
+            found = ", ".join(f"{_label(n)} {number(s.rms * scale)}" for n, s in scores.items() if s)
+            if found:
+                parts.append(f"RMS error of {mode} [{display.unit_label}]: {found}.")
+        return " ".join([*parts, self.figure.printed]).strip()
+
+
+class _Drawn:
+    """One plot."""
+
+    def __init__(self, plot: Plot, names: tuple[str, ...], of: PaperFigure):
+        self.plot, self.of = plot, of
+        if plot.what == SPECTRUM:
+            self.figure: figure = new_figure(
+                x_range=Range1d(start=0.0, end=PSD_TOP_HZ), y_range=Range1d(start=1e-3, end=1.0), y_axis_type="log")
+        else:
+            self.figure = new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=DataRange1d())
+        self.figure.xaxis.axis_label = "frequency [Hz]" if plot.what == SPECTRUM else "time [s]"
+        call(self.figure, f"{of.title}, {TIP_TILT[plot.column].name}, {plot.what}")
+        self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
+        self.lines: dict[str, GlyphRenderer] = {
+            name: self.figure.line(
+                "x", "y", source=source, line_width=1.6, line_dash=list(look(name).dash) if _dashed(name, of) else [], name=name)
+            for name, source in self.sources.items()}
+        self.window = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.15, line_width=0, level="underlay")
+        if plot.what == WHOLE and any(p.what == ZOOMED for p in of.plots):
+            self.figure.add_layout(self.window)
+
+    def draw(self, shown: Shown, display: Display) -> None:
+        """Send every line in the colours of the paper."""
+        scale = per_micrometre(display.unit, shown.scenario.telescope.diameter)
+        for name, line in self.lines.items():
+            line.glyph.line_color = look(name).colour(display.dark)  # type: ignore[union-attr]
+        mode = TIP_TILT[self.plot.column].name
+        if self.plot.what == SPECTRUM:
+            self.figure.yaxis.axis_label = f"PSD, {mode} [{display.unit_label}²/Hz]"
+            self._draw_spectra(shown, scale**2)
+        else:
+            self.figure.yaxis.axis_label = f"{mode} [{display.unit_label}]"
+            self._draw_traces(shown, scale)
+
+    def _draw_traces(self, shown: Shown, scale: float) -> None:
+        dt, n = shown.result.record.dt, shown.result.record.n_steps
+        begin = min(round(shown.scenario.run.warm_up / dt), n - 2)
+        middle, half = (begin + n) // 2, min(round(ZOOM_S / dt), n - begin) // 2
+        zoomed = (middle - half, middle + half)
+        first, last = zoomed if self.plot.what == ZOOMED else (begin, n)
+        times = envelope_times(first, last, BINS, dt)
+        for name, source in self.sources.items():
+            values = shown.values(name, self.of.target)
+            lines = np.full(last - first, np.nan) if values is None else values[first:last, self.plot.column]
+            source.data = {"x": times, "y": (scale * envelope(lines, BINS)).astype(np.float32)}
+        self.figure.x_range.update(start=first * dt, end=last * dt, reset_start=first * dt, reset_end=last * dt)
+        self.window.update(left=zoomed[0] * dt, right=zoomed[1] * dt)
+
+    def _draw_spectra(self, shown: Shown, scale: float) -> None:
+        tops: list[float] = []
+        for name, source in self.sources.items():
+            spectrum = shown.spectra.get((name, self.of.target))
+            if spectrum is None:
+                source.data = {"x": [], "y": []}
+                continue
+            within = (spectrum.frequency > 0) & (spectrum.frequency <= PSD_TOP_HZ)
+            y = scale * spectrum.signal[within, self.plot.column]
+            source.data = {"x": spectrum.frequency[within], "y": y}
+            tops.append(float(y.max()))
+        if tops and max(tops) > 0:
+            self.figure.y_range.update(start=1e-5 * max(tops), end=2 * max(tops))
+
+
+def _label(name: str) -> str:
+    return "Reference" if name == TRUTH else look(name).label
+
+
+def _dashed(name: str, of: PaperFigure) -> bool:
+    """Whether a line has its dashes; one alone with the reference needs none."""
+    return name == TRUTH or len(of.observers) > 1

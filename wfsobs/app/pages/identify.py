@@ -1,0 +1,168 @@
+"""The model of the record shown: its spectrum, the numbers of what is in it, and whether anything is left."""
+
+from __future__ import annotations
+
+from functools import partial
+from html import escape
+
+import panel as pn
+import panel_material_ui as pmui
+
+from wfsobs.app.controls.fields import parsed
+from wfsobs.app.display import Display
+from wfsobs.app.identify_work import Measured, compute, fit, measured, same, seconds
+from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.pages.identify_figure import NAMES, SpectrumFigure
+from wfsobs.app.pages.identify_table import table_html, verdict_html
+from wfsobs.app.pages.parts import WIDE, Starter, box, html, legend, line, text
+from wfsobs.app.sources import Kept, Source
+from wfsobs.app.store import Store
+from wfsobs.identification import Identified
+from wfsobs.identification.identification import LEVEL
+from wfsobs.record import Record, RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.parameters import hint
+from wfsobs.scenario.settings import SettingError
+from wfsobs.spectral.search import LOWEST
+
+INTRO = (
+    "From the pseudo-open-loop measurement z of the record shown, simulated or loaded: white noise, turbulence, then "
+    "vibration peaks one at a time until nothing is left that the tests see. “Filters only” keeps the record and tells the "
+    "filters this model. “As a new simulation” replaces the record by a simulation of this model, which the filters then know "
+    "exactly.")
+ABOUT = (
+    "± is one standard deviation. What is left is called white where, in a mode, two tests of level 1 % pass and no candidate "
+    "remains unexplained: Bartlett's on the cumulated ratio of the measured to the fitted spectrum, and Ljung and Box's on the "
+    "innovations of the Kalman filter that the model gives. p is how likely white noise is to look less white than what is left.")
+EARLIER = "This model is of an earlier record than the one shown now."
+REPLACED = (
+    "The record that this model was identified from is replaced by a simulation of the model. Errors are now those of filters "
+    "that know the simulated spectra, and cannot be compared with errors on the record before. Undo brings it back.")
+
+
+class IdentifyPage:
+    """The page. The measured spectrum follows the results shown while it is visible; the model comes when asked for."""
+
+    def __init__(self, store: Store, display: Display):
+        self.store, self.run, self.display = store, store.run, display
+        self.work = BackgroundTask(store.session)
+        self.starter = Starter(self.work, "Identify the record", "Progress of the identification",
+            uses=("Filters only", "As a new simulation"))
+        self.level, self.lowest = _number("Level", LEVEL), _number("Lowest peak [Hz]", LOWEST)
+        self.figure = SpectrumFigure()
+        self.legend, self.table, self.verdict, self.note = html(), html(), html(), html()
+        self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
+        self.of: Measured | None = None
+        self.measuring = BackgroundTask(store.session)
+        self._made: Scenario | None = None
+        self.visible, self._measured = False, object()
+        self.starter.start.on_click(lambda _event: self.start())
+        filters, simulation = self.starter.uses
+        filters.on_click(lambda _event: self.tell_filters())
+        simulation.on_click(lambda _event: self.simulate())
+        self.work.param.watch(self._redraw, "result")
+        self.measuring.param.watch(self._land, ["state", "place"])
+        self.run.param.watch(self._follow, ["result", "state"])
+        display.param.watch(self._redraw, ["mode", "unit", "dark"])
+
+    def view(self) -> pn.Column:
+        """What is shown."""
+        row = line(self.level, self.lowest, *self.starter.view())
+        return pn.Column(
+            box("Identification", text(INTRO), row, self.starter.status, self.stale, self.verdict),
+            box("Spectrum", self.legend, self.note, pn.pane.Bokeh(self.figure.figure, **WIDE)),
+            box("Model", self.table, text(ABOUT)), **WIDE, stylesheets=[":host { gap: 10px; }"])
+
+    def show(self, visible: bool) -> None:
+        """Draw what has changed meanwhile, and go on while visible."""
+        self.visible = visible
+        self._follow()
+        self._redraw()  # mode, unit or theme may have changed
+
+    def start(self) -> None:
+        """Identify the record shown."""
+        of = self.run.result
+        if of is None:
+            self.work.refuse("There is no record yet.")
+            return
+        try:
+            level, lowest = _read(self.level, 1e-9, 0.5), _read(self.lowest, 1e-3, 1e4)
+            cost = seconds(of.result.record)
+            self.store.limits.check_seconds(cost, "identification")
+        except SettingError as error:
+            self.work.refuse(str(error))
+        else:
+            work = partial(compute, of, level, lowest)
+            self.work.start(Job("identify", work, cost=cost, time_limit=self.store.limits.seconds))
+
+    def tell_filters(self) -> None:
+        """Take the model into the settings, for the filters alone: the record stays, be it loaded or simulated."""
+        self._take(self.store.source or Kept(self.store.scenario))
+
+    def simulate(self) -> None:
+        """Take the model into the settings, and simulate it in place of the record."""
+        self._take(None)
+
+    def _take(self, source: Source | None) -> None:
+        result, _ = self._identified()
+        if result is not None:
+            try:
+                self.store.run_on(source, result.scenario(self.store.scenario))
+            except SettingError as error:
+                self.work.refuse(str(error))
+            else:
+                self._made = self.store.scenario if source is None else None
+                self._redraw()
+
+    def _follow(self, *_: object) -> None:
+        """Measure the record shown, once its run is over."""
+        of = self.run.result
+        if not self.visible or of is None or self.run.state == RUNNING or of is self._measured:
+            return
+        self._measured = of
+        self.measuring.start(Job("identify", partial(measured, of), refusal=RecordError))
+
+    def _land(self, *_: object) -> None:
+        task = self.measuring
+        if task.state in (DONE, FAILED):
+            self.of = task.result if task.state == DONE else None
+        said = f'<p class="failure">No spectrum: {escape(task.message)}</p>' if task.state == FAILED else ""
+        self.note.object = f'<p class="text">{task.line()}</p>' if task.place else said
+        if task.state != RUNNING:
+            self._redraw()
+
+    def _identified(self) -> tuple[Identified, Record] | tuple[None, None]:
+        """The model, and the record that it is of."""
+        return self.work.result or (None, None)
+
+    def _redraw(self, *_: object) -> None:
+        of, shown = self.of, self.run.result
+        if not self.visible or of is None or shown is None or self.display.column >= of.mean.shape[1]:
+            return
+        diameter, column = shown.scenario.telescope.diameter, self.display.column
+        result, record = self._identified()
+        mode = result.modes[column] if result and column < len(result.modes) else None
+        with pn.io.hold():
+            self.legend.object = legend(NAMES, self.display.dark)
+            self.figure.draw_measured(of, self.display, diameter)
+            self.figure.draw_fit(mode, fit(mode, result) if mode and result else None, self.display, diameter)
+            self.figure.restyle(self.display.dark)
+            if result and record:
+                self.verdict.object = verdict_html(result)
+                self.table.object = table_html(mode, self.display, diameter) if mode else ""
+                replaced = self.store.source is None and self._made == self.store.scenario
+                self.stale.param.update(object=REPLACED if replaced else EARLIER, visible=not same(record, of.record))
+
+
+def _number(label: str, value: float) -> pmui.TextInput:
+    return pmui.TextInput(label=label, value=f"{value:g}", size="small", width=120, margin=0)
+
+
+def _read(field: pmui.TextInput, low: float, high: float) -> float:
+    """What was typed. Raises SettingError."""
+    value = parsed(str(field.value))
+    if isinstance(value, str) or not low <= value <= high:
+        raise SettingError(
+            f"{field.label} = {str(field.value)[:40]!r}: takes a number from {low:g} to {high:g}{hint(str(field.value))}")
+    return float(value)

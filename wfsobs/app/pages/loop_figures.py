@@ -1,0 +1,173 @@
+"""The figures of the closed loop, a line per controller."""
+
+from __future__ import annotations
+
+import numpy as np
+from bokeh.models import ColumnDataSource, Range1d
+from bokeh.plotting import figure
+
+from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.loop_work import LoopShown
+from wfsobs.app.style import look
+from wfsobs.app.views.envelope import envelope, envelope_times
+from wfsobs.app.views.plots import add_line, new_figure, restyle
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.signal.wiener import Complex
+from wfsobs.typing import Array
+
+BINS = 600
+DECADES = 7
+NYQUIST = 2.5
+"""How far the Nyquist plot reaches from the origin."""
+
+NONE = "none"
+CURVES = tuple(name for name in CONTROLLERS if name == "integrator" or name.startswith("lqg-kf"))
+"""Controllers that have a transfer function."""
+
+NOWHERE = (np.empty(0), np.empty(0, dtype=complex), np.empty(0, dtype=complex))
+
+
+class Lines:
+    """A figure with a line per controller."""
+
+    def __init__(self, fig: figure, names: tuple[str, ...]):
+        self.figure = fig
+        self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
+        self.lines = {name: add_line(fig, name, source) for name, source in self.sources.items()}
+
+    def restyle(self, dark: bool, hidden: list[str]) -> None:
+        """The colours of the mode, and no hidden lines."""
+        restyle(self.lines, dark, hidden)
+
+    def highest(self) -> float:
+        """The largest number in any line."""
+        return max((float(np.max(s.data["y"])) for s in self.sources.values() if len(s.data["y"])), default=0.0)
+
+
+class Trace(Lines):
+    """The residual of every controller over time; that of none would dwarf the rest."""
+
+    def __init__(self, what: str):
+        super().__init__(
+            new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=Range1d(start=-1.0, end=1.0)),
+            tuple(name for name in CONTROLLERS if name != NONE))
+        self.what = what
+        self.figure.xaxis.axis_label = "time [s]"
+
+    def draw(self, shown: LoopShown, display: Display, first: int, last: int) -> None:
+        """Send the samples first ... last - 1 of every line."""
+        dt = shown.result.record.dt
+        scale = per_micrometre(display.unit, shown.result.scenario.telescope.diameter)
+        times = envelope_times(first, last, BINS, dt)
+        for name, source in self.sources.items():
+            residual = shown.residual(name)
+            source.data = {"x": [], "y": []} if residual is None else {
+                "x": times, "y": (scale * envelope(residual[first:last, display.column], BINS)).astype(np.float32)}
+        self.figure.x_range.update(start=first * dt, end=last * dt, reset_start=first * dt, reset_end=last * dt)
+        self.figure.yaxis.axis_label = f"residual {display.mode_label} [{display.unit_label}]"
+
+    def fit(self, hidden: list[str]) -> None:
+        """Have the axis hold every visible line."""
+        lines = [np.abs(s.data["y"]) for name, s in self.sources.items() if name not in hidden and len(s.data["y"])]
+        top = 1.1 * max((float(y.max()) for y in lines), default=1.0)
+        self.figure.y_range.update(start=-top, end=top, reset_start=-top, reset_end=top)
+
+
+class Spectrum(Lines):
+    """The power spectral density of every residual."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            new_figure(
+                x_range=Range1d(start=0.5, end=500.0), y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log",
+                y_axis_type="log"), tuple(CONTROLLERS))
+        self.figure.xaxis.axis_label = "frequency [Hz]"
+
+    def draw(self, shown: LoopShown, display: Display) -> None:
+        """Send every line."""
+        scale = per_micrometre(display.unit, shown.result.scenario.telescope.diameter) ** 2
+        for name, source in self.sources.items():
+            frequency, density = shown.spectra.get(name, (np.empty(0), np.empty((0, display.column + 1))))
+            source.data = {"x": frequency[1:], "y": scale * density[1:, display.column]}
+            if frequency.size:
+                self.figure.x_range.update(start=float(frequency[1]), end=float(frequency[-1]))
+        top = 3.0 * self.highest() or 1.0
+        self.figure.y_range.update(start=top * 10.0**-DECADES, end=top)
+        self.figure.yaxis.axis_label = f"PSD of residual, {display.mode_label} [{display.unit_label}²/Hz]"
+
+
+class Response(Lines):
+    """Rejection and noise transfer of the loops that have them."""
+
+    def __init__(self) -> None:
+        fig = new_figure(x_range=Range1d(start=0.5, end=500.0), y_range=Range1d(start=-50.0, end=15.0), x_axis_type="log")
+        super().__init__(fig, CURVES)
+        self.noise = {name: ColumnDataSource({"x": [], "y": []}) for name in CURVES}
+        self.faint = {name: add_line(fig, name, source) for name, source in self.noise.items()}
+        for line in self.lines.values():
+            line.glyph.line_width = 2.2  # type: ignore[union-attr]
+        for line in self.faint.values():
+            line.glyph.update(line_alpha=0.45, line_width=1.2)
+        fig.xaxis.axis_label, fig.yaxis.axis_label = "frequency [Hz]", "amplitude [dB]"
+
+    def draw(self, shown: LoopShown, display: Display) -> None:
+        """Send every line."""
+        nyquist = 0.5 / shown.result.record.dt
+        self.figure.x_range.update(start=1e-3 * nyquist, end=nyquist)
+        for name in CURVES:
+            of = shown.curves.get(name)
+            curves = of[display.column] if of else None
+            x, rejection, noise = (curves.frequency, curves.rejection, curves.noise) if curves else NOWHERE
+            self.sources[name].data = {"x": x, "y": _decibel(rejection)}
+            self.noise[name].data = {"x": x, "y": _decibel(noise)}
+
+    def restyle(self, dark: bool, hidden: list[str]) -> None:
+        """The faint lines too."""
+        super().restyle(dark, hidden)
+        restyle(self.faint, dark, hidden)
+
+
+def _decibel(x: Complex) -> Array:
+    return 20.0 * np.log10(np.maximum(np.abs(x), 1e-6))
+
+
+class Nyquist(Lines):
+    """The loop gain in the complex plane, the unit circle, and where the margins are measured."""
+
+    def __init__(self) -> None:
+        fig = new_figure(
+            x_range=Range1d(start=-NYQUIST, end=NYQUIST), y_range=Range1d(start=-NYQUIST, end=NYQUIST))
+        fig.update(height=None, aspect_ratio=1.0, max_width=480)
+        turn = np.linspace(0.0, 2.0 * np.pi, 181)
+        fig.line(np.cos(turn), np.sin(turn), line_color="#888888", line_dash=[4, 3])
+        fig.scatter([-1.0], [0.0], marker="x", size=11, line_color="#888888", line_width=2)
+        super().__init__(fig, CURVES)
+        self.marks = ColumnDataSource({"x": [], "y": [], "colour": [], "marker": []})
+        fig.scatter("x", "y", source=self.marks, marker="marker", line_color="colour", fill_alpha=0.0, size=9, line_width=2)
+        fig.xaxis.axis_label, fig.yaxis.axis_label = "real part", "imaginary part"
+        self._at: dict[str, list[tuple[complex, str]]] = {}
+
+    def draw(self, shown: LoopShown, display: Display) -> None:
+        """Send every line and mark."""
+        self._at = {}
+        for name, source in self.sources.items():
+            of = shown.curves.get(name)
+            L = of[display.column].loop_gain if of else np.empty(0, dtype=complex)
+            L = np.where(np.abs(L) < 20.0, L, np.nan)
+            source.data = {"x": np.real(L), "y": np.imag(L)}
+            margins = shown.result.design.laws[name][display.column].margins if name in shown.result.design.laws else None
+            if margins is None or not L.size:
+                continue
+            self._at[name] = [(complex(-1.0 / margins.gain), "circle")] if margins.gain else []
+            if margins.phase is not None:
+                both = [-np.exp(1j * sign * margins.phase) for sign in (1.0, -1.0)]
+                self._at[name].append((min(both, key=lambda p, L=L: np.nanmin(np.abs(L - p))), "square"))
+
+    def restyle(self, dark: bool, hidden: list[str]) -> None:
+        """The marks too."""
+        super().restyle(dark, hidden)
+        shown = [(point, marker, look(name).colour(dark)) for name, at in self._at.items() if name not in hidden
+                 for point, marker in at]
+        self.marks.data = {
+            "x": [p.real for p, *_ in shown], "y": [p.imag for p, *_ in shown], "colour": [c for *_, c in shown],
+            "marker": [m for _, m, _ in shown]}

@@ -1,0 +1,88 @@
+"""The tables of the closed loop, plain HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+from wfsobs.app.display import NOTHING, Display, number, per_micrometre
+from wfsobs.app.loop_work import LoopShown
+from wfsobs.app.style import LOOKS, swatch
+from wfsobs.app.views.table import BEST
+from wfsobs.control.tables import LIMITED, NOT_APPLICABLE, Row, label
+from wfsobs.evaluation.bound import BOUND
+
+UNSTABLE = '<span class="tag above">unstable</span>'
+
+
+def of_mode(shown: LoopShown, display: Display) -> list[Row]:
+    """The rows of the mode shown, least residual first, those without one last."""
+    rows = [r for r in shown.rows if r["mode"] == display.mode]
+    return sorted(rows, key=lambda r: float("inf") if r["residual_rms_nm"] is None else r["residual_rms_nm"])
+
+
+def table_html(shown: LoopShown, display: Display) -> str:
+    """Residual and Strehl of every controller, and the bound."""
+    unit = display.unit_label
+    columns = {
+        "Controller": "and its line in the figures", f"Residual [{unit}]": "rms after the warm-up",
+        f"Theory [{unit}]": "by the true spectra, for an endless record",
+        f"Strehl at {shown.result.scenario.control.wavelength:g} µm": "of all simulated modes together, of nothing else",
+        "Gain": "of the integrator", "At a limit [%]": "steps in which a limit of the mirror changed the command",
+        "Needs": "what it must be given beside measurements",
+    }
+    rows = of_mode(shown, display)
+    best = next((r["controller"] for r in rows if r["controller"] != BOUND and r["residual_rms_nm"] is not None), None)
+    scale = 1e-3 * per_micrometre(display.unit, shown.result.scenario.telescope.diameter)
+    body = "".join(_row(r, display, scale, r["controller"] == best) for r in rows)
+    notes = {r["note"]: label(r["controller"]) for r in reversed(rows) if r["note"] and not r["limited"]}
+    failures = "".join(f'<p class="failure">{escape(name)}: {escape(note)}</p>' for note, name in notes.items())
+    return _table("Controllers", columns, body) + limits_note(rows) + failures
+
+
+def limits_note(rows: Sequence[Row]) -> str:
+    """Why some of the rows have no theory and no margins; nothing where no limit of the mirror acts."""
+    return f"<p>{NOT_APPLICABLE}: {LIMITED}</p>" if any(r["limited"] for r in rows) else ""
+
+
+def unlimited(row: Row, value: str) -> str:
+    """What is shown of the linear loop: not applicable where a limit of the mirror acts."""
+    return f'<span title="{LIMITED}">{NOT_APPLICABLE}</span>' if row["limited"] else value
+
+
+def _row(row: Row, display: Display, scale: float, best: bool) -> str:
+    def scaled(key: str) -> str:
+        return NOTHING if row[key] is None else number(row[key] * scale)
+
+    residual = UNSTABLE if row["stable"] is False else scaled("residual_rms_nm")
+    cells = [
+        (BEST if best else "") + residual, unlimited(row, scaled("predicted_rms_nm")),
+        NOTHING if row["strehl"] is None else f"{row['strehl']:.4f}", number(row["gain"]),
+        NOTHING if row["limited"] is None else number(100.0 * row["limited"], 2), escape(row["needs"]),
+    ]
+    return _line(row, display, cells)
+
+
+def margins_html(shown: LoopShown, display: Display) -> str:
+    """Margins of the loops that have a transfer function."""
+    columns = {
+        "Controller": "", "Gain margin [dB]": "by which the loop gain may rise", "Phase margin [°]": "by which it may turn",
+        "Delay margin [ms]": "by which it may come later",
+    }
+    rows = [r for r in of_mode(shown, display) if r["phase_margin_deg"] is not None]
+    body = "".join(
+        _line(r, display, [number(r[key]) for key in ("gain_margin_db", "phase_margin_deg", "delay_margin_ms")]) for r in rows)
+    return _table("Margins", columns, body)
+
+
+def _line(row: Row, display: Display, cells: list[str]) -> str:
+    name = row["controller"]
+    line = swatch(name, display.dark) if name in LOOKS else ""
+    values = "".join(f"<td>{c}</td>" for c in cells)
+    return f'<tr data-controller="{name}"><th scope=row>{line}{escape(label(name))}</th>{values}</tr>'
+
+
+def _table(name: str, columns: dict[str, str], body: str) -> str:
+    head = "".join(f'<th scope=col title="{escape(why)}">{escape(column)}</th>' for column, why in columns.items())
+    return (f'<div class="scroll" tabindex=0 role=region aria-label="{name}">'
+            f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')

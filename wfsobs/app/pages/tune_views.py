@@ -1,0 +1,91 @@
+"""A tuning in a figure and a table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+from bokeh.models import ColumnDataSource, DataRange1d
+
+from wfsobs.app.display import NO_ANGLE, NOTHING, UNITS, Display, number, per_micrometre
+from wfsobs.app.style import look
+from wfsobs.app.tune_work import LIKELIHOOD, OTHER, SETTING, TEST, TOGETHER, VALIDATION, best_so_far, rows
+from wfsobs.app.views.plots import call, new_figure
+from wfsobs.app.views.table import change
+from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.tuning import Evaluation, Tuned
+from wfsobs.tuning.records import MEASURES, NEXT, REFERENCE, TRUTH
+from wfsobs.tuning.report import remarks
+
+TITLES = {
+    SETTING: "Settings", VALIDATION: "{measure} on the validation record, which the search sees [{unit}]",
+    TEST: "{measure} on the test record, which it does not [{unit}]",
+    OTHER: "The same of what it was not tuned for, turbulence or vibration [{unit}]",
+    LIKELIHOOD: "Log marginal likelihood of the training targets, for information",
+}
+LEGEND = {"tried": "what was tried", "fitted": "least so far"}
+
+AXES = {MEASURES[TRUTH]: "rms error", MEASURES[NEXT]: "prediction error", MEASURES[REFERENCE]: "rms distance"}
+"""What a tuning makes small, short enough for an axis."""
+
+
+class HistoryFigure:
+    """The error, or what takes its place, on the validation record of every evaluation, and the least so far."""
+
+    def __init__(self) -> None:
+        self.figure = new_figure(x_range=DataRange1d(range_padding=0.02), y_range=DataRange1d())
+        call(self.figure, "History of the tuning")
+        self.figure.xaxis.axis_label = "evaluation"
+        self.source = ColumnDataSource({"x": [], "tried": [], "best": []})
+        self._tried = self.figure.scatter("x", "tried", source=self.source, size=6, fill_alpha=0.7)
+        self._best = self.figure.step("x", "best", source=self.source, mode="after", line_width=2.0)
+
+    def draw(self, history: Sequence[Evaluation], measure: str, unit: str, diameter: float) -> None:
+        """Send the evaluations so far; what failed has no point."""
+        scale = per_micrometre(unit, diameter)
+        tried, best = (scale * np.array(y, dtype=float) for y in ([e.rms for e in history], best_so_far(history)))
+        self.source.data = {
+            "x": np.arange(1, len(history) + 1), "tried": np.where(np.isfinite(tried), tried, np.nan),
+            "best": np.where(np.isfinite(best), best, np.nan)}
+        self.figure.yaxis.axis_label = f"{AXES[measure]}, validation [{UNITS[unit]}]"
+
+    def restyle(self, dark: bool) -> None:
+        """The colours of the mode."""
+        colour = look("tried").colour(dark)
+        self._tried.glyph.update(line_color=colour, fill_color=colour)
+        self._best.glyph.update(line_color=look("fitted").colour(dark))
+
+
+def unit_for(tuned: Tuned | None, display: Display) -> str:
+    """The unit shown; where modes have no angle, none that is one."""
+    modes = (tuned.before.validation or tuned.after.validation) if tuned else None
+    angles = modes is None or set(modes.modes) <= {mode.name for mode in TIP_TILT}
+    return "nm" if display.unit in NO_ANGLE and not angles else display.unit
+
+
+def table_html(tuned: Tuned, display: Display, diameter: float) -> str:
+    """Settings, errors and likelihoods before and after."""
+    unit = unit_for(tuned, display)
+    scale, body, last = per_micrometre(unit, diameter), "", ""
+    for section, name, before, after in rows(tuned):
+        if section != last:
+            title = TITLES[section].format(measure=tuned.measure, unit=UNITS[unit])
+            body += f'<tr><th colspan=4 class="target" scope=rowgroup>{escape(title)}</th></tr>'
+            last = section
+        error = section in (VALIDATION, TEST, OTHER)
+        cells = [_cell(x, scale if error else 1.0, 4) for x in (before, after)]
+        known = error and isinstance(before, float) and isinstance(after, float)
+        cells.append(change(before, after) if known else "")  # type: ignore[arg-type]
+        shown = f"<b>{escape(name)}</b>" if name == TOGETHER else escape(name)
+        body += f'<tr data-section="{section}"><th scope=row>{shown}</th>{"".join(f"<td>{c}</td>" for c in cells)}</tr>'
+    head = "".join(f"<th scope=col>{name}</th>" for name in ("What", "Before", "After", "Change [%]"))
+    notes = "".join(f'<p class="text">{escape(line)}.</p>' for line in remarks(tuned) if "likelihood" not in line)
+    return (f'<div class="scroll" tabindex=0 role=region aria-label="Before and after">'
+            f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>{notes}')
+
+
+def _cell(value: float | str | None, scale: float, digits: int) -> str:
+    if isinstance(value, str):
+        return escape(value)
+    return NOTHING if value is None else number(value * scale, digits)

@@ -1,0 +1,246 @@
+"""What a report holds: the rows of every state, and its lines as few points.
+
+Nothing in this package imports Panel: with it in the process Bokeh's files do not work offline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wfsobs.app.style import observers_of
+from wfsobs.app.views.envelope import envelope, envelope_times
+from wfsobs.app.work import TRUTH
+from wfsobs.cli.tables import Row, rows
+from wfsobs.control.closed_loop import closed_loop, design
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.tables import rows as controller_rows
+from wfsobs.evaluation.scores import cumulative_rms, spectra
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS
+from wfsobs.pipeline import Result
+from wfsobs.record import RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.grid import Variation
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+WINDOW_S = 0.5
+"""A stretch in the middle of the record that keeps every sample [s]."""
+
+POINTS = 1_250_000
+"""Points of all lines of all states together, spectra included: what fits into 5 MB beside Bokeh."""
+
+SPECTRUM, SPECTRUM_BINS = 400, 100
+"""Points of a spectrum that are kept as they are (up to 200 Hz), and pairs of extremes of those above."""
+
+CUMULATIVE = 150
+"""Points of a cumulative spectrum, evenly spaced on a logarithmic axis."""
+
+FEWEST, MOST_BINS = 200, 10_000
+"""Pairs of extremes kept of a line, however many states there are, and however few."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Which points of a line are kept: the extremes of bins, but every sample where the bins are not worth it and
+    between `first` and `last`."""
+
+    n: int
+    dt: float
+    bins: int
+
+    @property
+    def whole(self) -> bool:
+        """Whether every sample of the record is kept."""
+        return self.n <= 2 * self.bins + self.width
+
+    @property
+    def width(self) -> int:
+        """Samples in the window."""
+        return min(round(WINDOW_S / self.dt), self.n)
+
+    @property
+    def first(self) -> int:
+        """The window's first sample."""
+        return 0 if self.whole else (self.n - self.width) // 2
+
+    @property
+    def last(self) -> int:
+        """One past the window's last sample."""
+        return self.n if self.whole else self.first + self.width
+
+    def _parts(self) -> list[tuple[int, int, int]]:
+        """(start, stop, bins) of the pieces, all samples where the bins are 0."""
+        left, right = self.first, self.n - self.last
+        share = round(self.bins * left / max(left + right, 1))
+        parts = [(0, left, share), (self.first, self.last, 0), (self.last, self.n, self.bins - share)]
+        return [part for part in parts if part[1] > part[0]]
+
+    def times(self) -> Array:
+        """Times [s] of the points kept."""
+        return np.concatenate([
+            envelope_times(a, b, bins or b - a, self.dt) for a, b, bins in self._parts()])
+
+    def thin(self, x: Array) -> Floats:
+        """The points kept of a signal (n,)."""
+        return np.concatenate([envelope(x[a:b], bins or b - a) for a, b, bins in self._parts()]).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class State:
+    """One combination of the settings varied, and what came of it.
+
+    rows    : as `wfsobs run --json` gives them, and the computing time
+    reasons : why an observer gave nothing, a line each
+    grid    : the points kept of the traces
+    lines   : "kind/target/observer/mode" -> points; kind is signal, error [um], psd, psd-error [um^2/Hz], cumulative or
+              cumulative-error [um]; frequencies [Hz] of the latter two pairs as "frequency", "frequency-cumulative"
+    loop    : as `wfsobs loop --json` gives them, of the controllers without a GPR; none where the record has no truth
+    """
+
+    scenario: Scenario
+    rows: list[Row]
+    reasons: tuple[str, ...]
+    grid: Grid
+    lines: Mapping[str, Floats]
+    loop: Sequence[Row] = ()
+
+
+@dataclass(frozen=True)
+class Report:
+    """All of a report: states are the product of the variations, the last one running fastest.
+
+    preset : what the settings are compared with; base : the settings that were varied; recorded : whether on a record
+    that was loaded, not simulated
+    """
+
+    preset: str
+    base: Scenario
+    variations: tuple[Variation, ...]
+    states: tuple[State, ...]
+    recorded: bool = False
+
+    @property
+    def start(self) -> int:
+        """The state shown first: that of the settings as they were, if it is one."""
+        return next((i for i, state in enumerate(self.states) if state.scenario == self.base), 0)
+
+
+def bins_for(states: int, observers: int, modes: int) -> int:
+    """How many pairs of extremes of a line can be kept."""
+    lines = modes * (2 * observers + len(TARGETS))  # signals and errors; of the truth the signal alone
+    points = POINTS / max(states * lines, 1) - SPECTRUM - 2 * SPECTRUM_BINS - CUMULATIVE - 1000 * WINDOW_S
+    return int(np.clip(points / 2, FEWEST, MOST_BINS))
+
+
+def state_of(result: Result, states: int = 1) -> State:
+    """What a report of so many states keeps of a run."""
+    record, scenario = result.record, result.scenario
+    names = [m.name for m in scenario.modes][: record.n_modes]
+    lines: dict[str, Floats] = {}
+    shown = {(target, name) for target in TARGETS for name in observers_of(target)}
+    drawn = {(e.target, e.observer): e.values for e in result.estimates if (e.target, e.observer) in shown}
+    grid = Grid(record.n_steps, record.dt, bins_for(states, len(shown), len(names)))
+    truths = {target: record.truth(target) for target in TARGETS}
+    drawn |= {(target, TRUTH): truth for target, truth in truths.items() if truth is not None}
+    for (target, observer), values in drawn.items():
+        truth = truths[target]
+        signals = {"signal": values}
+        if truth is not None and observer != TRUTH:
+            signals["error"] = values - truth
+        found = spectra(record, target, values, scenario.run.warm_up)
+        for i, mode in enumerate(names):
+            where = f"{target}/{observer}/{mode}"
+            lines |= {f"{kind}/{where}": grid.thin(signal[:, i]) for kind, signal in signals.items()}
+            if found:
+                lines |= _frequencies(found[0])
+                for suffix, density in zip(("", "-error") if "error" in signals else ("",), found[1:], strict=False):
+                    lines[f"psd{suffix}/{where}"], lines[f"cumulative{suffix}/{where}"] = _spectra(found[0], density[:, i])
+    return State(scenario, rows(result.scores, scenario.run.seed), tuple(_reasons(result)), grid, lines, loop_rows(result))
+
+
+def loop_rows(result: Result) -> list[Row]:
+    """The closed loop on the record of a run, of the controllers that take a moment; none where the truth is not known."""
+    quick = [name for name, controller in CONTROLLERS.items() if controller.predict is None]
+    try:
+        return controller_rows(closed_loop(result.record, design(result.scenario, quick)), result.scenario.run.seed)
+    except RecordError:
+        return []
+
+
+def _reasons(result: Result) -> list[str]:
+    """Why an observer gave nothing."""
+    done = {item.observer for item in (*result.estimates, *result.failures)}
+    waiting = [f"{name} left out: not finished when the report was made" for name in OBSERVERS if name not in done]
+    return [f.reason for f in result.failures] + waiting
+
+
+def _frequencies(frequency: Array) -> dict[str, Floats]:
+    """The frequencies [Hz] of the points kept of spectra, from the first above zero."""
+    n, step = frequency.size, float(frequency[1])
+    high = envelope_times(min(SPECTRUM, n), n, SPECTRUM_BINS, step)
+    return {
+        "frequency": np.concatenate([frequency[1:SPECTRUM], high]).astype(np.float32),
+        "frequency-cumulative": frequency[_spaced(n)].astype(np.float32),
+    }
+
+
+def _spectra(frequency: Array, density: Array) -> tuple[Floats, Floats]:
+    """The points kept of a density, and of its cumulative rms."""
+    thin = np.concatenate([density[1:SPECTRUM], envelope(density[SPECTRUM:], SPECTRUM_BINS)])
+    return thin.astype(np.float32), cumulative_rms(frequency[1:], density[1:])[_spaced(density.size) - 1].astype(np.float32)
+
+
+def _spaced(n: int) -> NDArray[np.int64]:
+    """Indices from 1 to n - 1, evenly on a logarithmic axis."""
+    return np.unique(np.round(np.geomspace(1, n - 1, CUMULATIVE)).astype(np.int64))
+
+
+# ---------------------------------------------------------------------- into the file
+
+class Pool:
+    """Arrays in the file, each once however many states share it."""
+
+    def __init__(self) -> None:
+        self.number: dict[bytes, int] = {}
+
+    def add(self, content: bytes) -> int:
+        """The number of an array's bytes."""
+        return self.number.setdefault(content, len(self.number))
+
+    def all(self) -> list[bytes]:
+        """Every array, in order."""
+        return list(self.number)
+
+
+LEVELS = 65_534
+"""Steps between the lowest and the highest point of a line; one number more stands for none."""
+
+
+def coded(line: Sequence[float] | Floats, pool: Pool, logarithmic: bool = False) -> list[float]:
+    """A line in 16 bits a point: [number in the pool, lowest, step], of its decimal logarithm where that is wanted."""
+    x = np.asarray(line, dtype=np.float64)
+    if logarithmic:
+        x = np.log10(np.where(x > 0, x, np.nan))
+    known = np.isfinite(x)
+    low, high = (float(x[known].min()), float(x[known].max())) if known.any() else (0.0, 0.0)
+    step = (high - low) / LEVELS or 1.0
+    levels = np.full(x.size, LEVELS + 1, dtype="<u2")
+    levels[known] = np.round((x[known] - low) / step).astype("<u2")
+    return [pool.add(levels.tobytes()), low, step]
+
+
+def window_of(states: Sequence[State]) -> tuple[float, float] | None:
+    """(start, end) [s] of the stretch that keeps every sample in all states; None where all of the record does."""
+    grids = [s.grid for s in states]
+    if all(g.whole for g in grids):
+        return None
+    if any((a.n, a.dt) != (b.n, b.dt) for a, b in pairwise(grids)):
+        return None
+    return grids[0].first * grids[0].dt, (grids[0].last - 1) * grids[0].dt

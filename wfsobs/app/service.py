@@ -1,0 +1,119 @@
+"""What the sessions of a server share, and all that they share: the line of jobs, the results kept, the limits."""
+
+from __future__ import annotations
+
+import gc
+import itertools
+import logging
+import threading
+from collections.abc import Callable
+from time import monotonic
+
+from wfsobs.app.cache import Cache, key_of
+from wfsobs.app.jobs.job import Job, Listener, Tell, Work
+from wfsobs.app.jobs.queue import JobQueue, give_back
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.limits import Limits
+from wfsobs.app.logs import event
+from wfsobs.app.sources import Source
+from wfsobs.app.work import Shown, compute
+from wfsobs.cost import run_seconds
+from wfsobs.progress import Watch
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.settings import SettingError
+
+Compute = Callable[[Scenario, Watch, Tell, Source | None], Shown]
+Post = Callable[[Callable[[], None]], None]
+"""Has a function called soon on the thread that owns the session; may itself be called from any thread."""
+
+
+class Full(Exception):
+    """No more sessions on this server: one line saying so."""
+
+
+class Service:
+    """One per server.
+
+    workers    : jobs at once
+    most_bytes : of results kept
+    """
+
+    def __init__(self, limits: Limits, workers: int, most_bytes: int, work: Compute = compute):
+        self.limits = limits
+        self.cache: Cache[Shown] = Cache(most_bytes)
+        self.queue = JobQueue(workers, self.cache)
+        self.sessions = 0
+        self._work = work
+        self._lock = threading.Lock()
+        self._numbers = itertools.count(1)
+
+    def enter(self) -> Session:
+        """A new session. Raises Full."""
+        with self._lock:
+            if self.full:
+                event("refused", logging.WARNING, what="session", sessions=self.sessions)
+                raise Full(f"There are {self.sessions} visitors, as many as this server takes. Please try again later.")
+            self.sessions += 1
+            number = next(self._numbers)
+        event("session-start", session=number, sessions=self.sessions)
+        return Session(self, number)
+
+    @property
+    def full(self) -> bool:
+        """Whether there are as many sessions as may be."""
+        return self.sessions >= self.limits.sessions
+
+    def held(self, scenario: Scenario, source: Source | None = None) -> bool:
+        """Whether the results are there already."""
+        return _key(scenario, source) in self.cache
+
+    def left(self) -> None:
+        """A session has ended."""
+        with self._lock:
+            self.sessions -= 1
+            last = self.sessions == 0
+        if last:  # nobody is kept waiting
+            gc.collect()
+            give_back()
+
+    def run(self, scenario: Scenario, source: Source | None = None) -> Job:
+        """The job that computes the results of a scenario, or of the observers on another record. Raises SettingError."""
+        self.limits.check(scenario)
+        if source is not None:
+            source.check(self.limits)
+        work: Work = lambda watch, tell: self._work(scenario, watch, tell, source)  # noqa: E731
+        return Job("run", work, key=_key(scenario, source), cost=run_seconds(scenario), refusal=SettingError)
+
+    def close(self, timeout: float = 1.5) -> bool:
+        """Stop every job; whether all have ended in time [s]. To set `queue.closing` alone does the same later."""
+        return self.queue.close(timeout)
+
+
+class Session:
+    """One visitor: their number, their tasks, and how another thread has something done on theirs."""
+
+    def __init__(self, service: Service, number: int):
+        self.service, self.number = service, number
+        self.post: Post = lambda function: function()
+        self.tasks: list[BackgroundTask] = []
+        self.closed = False
+        self._since = monotonic()
+
+    def submit(self, job: Job, listener: Listener, before: Callable[[], None] = lambda: None) -> Callable[[], None]:
+        """Have a job done when its turn comes, in place of the one before; how to take it back."""
+        if self.closed:
+            return lambda: None
+        return self.service.queue.submit(job, self.number, listener, before)
+
+    def leave(self) -> None:
+        """The session has ended, and takes its jobs with it."""
+        if not self.closed:
+            self.closed = True
+            for task in self.tasks:
+                task.close()
+            self.service.left()
+            event("session-end", session=self.number, seconds=monotonic() - self._since, sessions=self.service.sessions)
+
+
+def _key(scenario: Scenario, source: Source | None) -> str:
+    return key_of(scenario, source.key if source else "")

@@ -1,0 +1,213 @@
+"""Settings as links, command lines and Python: only what differs from the preset, each field in its own words.
+
+A link's query is `preset=ut4&turbulence.wind_speed=20&vibration.peaks=45,0.03,0.01,0.01;...`: lists with commas, a
+peak as frequency, damping and its rms per mode, a layer likewise, peaks and layers with semicolons. Whatever of a
+query cannot be used is named, and the rest is used. Nothing of it is ever opened or evaluated.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import reduce
+from typing import Any
+from urllib.parse import parse_qsl, quote
+
+import param
+
+from wfsobs.app.controls.fields import parsed
+from wfsobs.scenario import Scenario, configfile
+from wfsobs.scenario.configfile import from_toml, parse_toml, pristine, to_toml
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.settings import SettingError, holds_groups, settings_of
+
+Check = Callable[[Scenario], None]
+
+LONGEST = 8000
+"""Characters of a query, or of a command line; what is longer travels as a file."""
+
+SHORTEST_NAME = next(iter(PRESETS))
+"""The preset of a query that names none."""
+
+ROUNDS = 3
+MOST = 200
+"""Fields of a query that are read."""
+
+PASSED_OVER = ("theme",)
+"""Keys of a query that are not ours."""
+
+FILE = "wfsobs.toml"
+
+
+@dataclass(frozen=True)
+class Link:
+    """What a query asks for; rejected : a line for every field that could not be used."""
+
+    scenario: Scenario
+    preset: str
+    rejected: tuple[str, ...] = field(default=())
+
+
+def changes(scenario: Scenario, preset: str) -> dict[str, Any]:
+    """Dotted path -> plain value of the settings that differ from the preset's."""
+    return configfile.changes(scenario, pristine(preset))
+
+
+# ---------------------------------------------------------------------- links
+
+def to_query(scenario: Scenario, preset: str) -> str | None:
+    """The query of a link to these settings, without "?"; None where it would be too long."""
+    changed = changes(scenario, preset)
+    parts = [f"preset={preset}"] if preset != SHORTEST_NAME or changed else []
+    parts += [f"{path}={quote(written(path, value), safe=',;:+-.')}" for path, value in changed.items()]
+    query = "&".join(parts)
+    return query if len(query) <= LONGEST else None
+
+
+def from_query(query: str, check: Check = Scenario.validate) -> Link:
+    """The settings that a query asks for, and a line for every field of it that was refused.
+
+    check : raises SettingError where settings do not go together
+    """
+    if len(query) > LONGEST:
+        return Link(PRESETS[SHORTEST_NAME](), SHORTEST_NAME, (
+            f"The link has {len(query)} characters, at most {LONGEST} are read: nothing of it was used.",))
+    pairs = parse_qsl(query.removeprefix("?").replace("+", "%2B"), keep_blank_values=True)
+    fields = {key: text for key, text in pairs[:MOST] if key not in PASSED_OVER}
+    name = fields.pop("preset", SHORTEST_NAME)
+    rejected = []
+    if name not in PRESETS:
+        rejected.append(_line("preset", name, f"takes one of {', '.join(PRESETS)}"))
+        name = SHORTEST_NAME
+    scenario, refused = _apply(PRESETS[name](), fields, check)
+    return Link(scenario, name, (*rejected, *refused))
+
+
+def written(path: str, value: Any) -> str:
+    """A setting's plain value as a link has it."""
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return ";".join(written(path, [v for one in item.values() for v in (one if isinstance(one, list) else [one])])
+                        for item in value)
+    if isinstance(value, list):
+        return ",".join(map(_word, value))
+    return _word(value)
+
+
+def read(path: str, text: str, known: Mapping[str, param.Parameter]) -> Any:
+    """The value that a link has written; what makes no sense stays text, for the setting itself to refuse."""
+    p = known.get(path)
+    if isinstance(p, param.List) and holds_groups(p):
+        return [_item(part, settings_of(p)) for part in text.split(";")] if text else []
+    if isinstance(p, param.List):
+        return [parsed(part) for part in text.split(",")] if text else []
+    if isinstance(p, param.Boolean):
+        return {"true": True, "false": False}.get(text, text)
+    return parsed(text) if isinstance(p, param.Number) else text
+
+
+def _item(text: str, settings: Mapping[str, param.Parameter]) -> Any:
+    """One group of a list: its numbers in the order of its settings, a list of numbers at the end."""
+    numbers = [parsed(part) for part in text.split(",")]
+    *names, last = settings
+    rest = numbers[len(names) :]
+    if not rest or (len(rest) > 1 and not isinstance(settings[last], param.List)):
+        return text
+    return {**dict(zip(names, numbers, strict=False)), last: rest if isinstance(settings[last], param.List) else rest[0]}
+
+
+def _apply(base: Scenario, fields: Mapping[str, str], check: Check) -> tuple[Scenario, list[str]]:
+    """Every field that can be applied, whatever their order, and a line for every other."""
+    known = {path: p for path, _, p in base.walk()} | dict(base.lists())
+    values, refused = {}, {}
+    scenario = base.copy()
+    for path, text in fields.items():
+        values[path] = read(path, text, known)
+        try:
+            _set(scenario, path, values[path])
+        except SettingError as error:
+            refused[path] = str(error)
+    if _clash(scenario, check):
+        scenario = base.copy()
+        waiting = {path: value for path, value in values.items() if path not in refused}
+        for _ in range(ROUNDS):  # what one field needs, a later one may bring
+            for path, value in list(waiting.items()):
+                before = reduce(getattr, path.split("."), scenario)
+                _set(scenario, path, value)
+                refused[path] = _clash(scenario, check)
+                if refused[path]:
+                    _set(scenario, path, before)
+                else:
+                    del waiting[path], refused[path]
+    return scenario, [_line(path, fields[path], refused[path]) for path in fields if path in refused]
+
+
+def _set(scenario: Scenario, path: str, value: Any) -> None:
+    """Set one setting in place; items of lists have no path here. Raises SettingError."""
+    for key in reversed(path.split(".")):
+        value = {key: value}
+    scenario.update(value)
+
+
+def _clash(scenario: Scenario, check: Check) -> str:
+    """Why settings do not go together, or nothing."""
+    try:
+        check(scenario)
+    except SettingError as error:
+        return str(error)
+    return ""
+
+
+def _line(path: str, text: str, reason: str) -> str:
+    """The line of a field that was refused; a reason that does not name it gets it in front."""
+    line = reason if reason.startswith(path) else f"{path} = {text}: {reason}"
+    return line if len(line) <= 200 else f"{line[:197]}..."
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
+
+
+# ---------------------------------------------------------------------- other languages
+
+def to_command(scenario: Scenario, preset: str) -> str:
+    """The command that prints the RMS table of these settings."""
+    words = ["wfsobs", "run", "--preset", preset]
+    for path, value in changes(scenario, preset).items():
+        words += ["--set", f"{path}={configfile.written(value)}"]
+    command = shlex.join(words)
+    return command if len(command) <= LONGEST else f"wfsobs run --config {FILE}"
+
+
+def to_python(scenario: Scenario, preset: str) -> str:
+    """A script that runs these settings and prints the errors."""
+    changed = changes(scenario, preset)
+    lines = [f"    {json.dumps(path)}: {value!r},\n" for path, value in changed.items()]
+    made = f'wfsobs.PRESETS["{preset}"]()' + (f".replace({{\n{''.join(lines)}}})" if lines else "")
+    imports = "import wfsobs\n"
+    if len(made) > LONGEST:
+        imports, made = "import wfsobs\nfrom wfsobs import configfile\n", f'configfile.load("{FILE}")'
+    return (
+        f"{imports}\nscenario = {made}\nresult = wfsobs.run(scenario)\n"
+        "for s in result.scores:\n"
+        '    print(f"{s.target:10} {s.mode:4} {s.observer:17} {1e3 * s.rms:8.2f} nm")\n'
+    )
+
+
+def to_file(scenario: Scenario, preset: str) -> str:
+    """Every setting as TOML, with the preset that they are compared with."""
+    return f'preset = "{preset}"\n{to_toml(scenario)}'
+
+
+def from_file(text: str) -> Link:
+    """The settings of a TOML file; preset "" where it names none. Raises SettingError with one line."""
+    try:
+        scenario = from_toml(text, where="file")
+        preset = parse_toml(text).get("preset", "")
+        scenario.validate()
+    except SettingError as error:
+        raise SettingError(str(error).partition("\n")[0]) from None
+    return Link(scenario, preset)

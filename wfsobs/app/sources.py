@@ -1,0 +1,81 @@
+"""What the observers run on where it is not the simulation of the settings: a file, or a simulation that is kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from wfsobs.app.cache import key_of
+from wfsobs.app.limits import Limits
+from wfsobs.progress import Watch
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.simulation.loop import simulate
+from wfsobs.telemetry.intake import Stated
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """A record that was loaded.
+
+    key    : names its content and what was said of it
+    what   : one line on it;  stated : what was said of it;  sha256 : of the file, in hexadecimal digits
+    """
+
+    record: Record
+    name: str
+    key: str
+    what: str = ""
+    stated: Stated = field(default_factory=Stated)
+    sha256: str = ""
+
+    simulation = None
+
+    def make(self, _watch: Watch) -> Record:
+        """The record."""
+        return self.record
+
+    def check(self, limits: Limits) -> None:
+        """Raises SettingError where a server does not allow it."""
+        limits.check_steps(self.record.n_steps)
+
+    @property
+    def title(self) -> str:
+        """What takes the place of the simulation."""
+        return f"Record {self.name}: {self.what}"
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """The simulation of other settings than those that the observers are told."""
+
+    simulation: Scenario
+
+    @property
+    def key(self) -> str:
+        """The same settings, the same key."""
+        return key_of(self.simulation)
+
+    def make(self, watch: Watch) -> Record:
+        """The record. Raises SettingError, Cancelled."""
+        return simulate(self.simulation, watch=watch)
+
+    def check(self, limits: Limits) -> None:
+        """Raises SettingError where the simulation cannot be, or is more than a server allows."""
+        self.simulation.validate()
+        limits.check(self.simulation)
+
+    @property
+    def title(self) -> str:
+        """What takes the place of the simulation of the settings."""
+        vibration = self.simulation.vibration
+        count = 0 if "peaks" in vibration.idle() else len(vibration.peaks)
+        peaks = f" with {count} peak{'s' * (count > 1)}" if count else ""
+        return f"The simulation{peaks} is kept; the settings are what the filters are told."
+
+
+Source = Loaded | Kept
+
+
+def same(one: Source | None, other: Source | None) -> bool:
+    """Whether two give the same record; None is the simulation of the settings."""
+    return one is other or (one is not None and other is not None and one.key == other.key)

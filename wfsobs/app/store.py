@@ -1,0 +1,192 @@
+"""What a session knows: the settings as they stand, what they run on, and the one run that follows them.
+
+A `Scenario` in the store is replaced, never changed in place, so whoever holds one holds a snapshot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import param
+
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.service import Post, Session
+from wfsobs.app.sources import Kept, Loaded, Source, same
+from wfsobs.cost import run_seconds
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import pristine
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.settings import SettingError
+
+Step = tuple[Scenario, str, Source | None]
+"""Settings, the preset that they are compared with, and what they run on where that is not their simulation."""
+
+AT_ONCE = 5.0
+"""A run that takes longer waits to be asked for [s]."""
+
+STEPS_BACK = 100
+"""Changes that can be undone."""
+
+
+class Store(param.Parameterized):
+    """The settings of a session, what was refused of them, and their run."""
+
+    scenario: Scenario = param.ClassSelector(class_=Scenario, doc="The settings as accepted.")  # type: ignore
+    errors = param.Dict({}, doc="Dotted path of a refused setting -> why, in one line.")
+    preset = param.Selector(default=next(iter(PRESETS)), objects=list(PRESETS), doc="Where the settings started.")
+    source: Source | None = param.Parameter(None, doc="What the observers run on; None for the simulation of the settings.")  # type: ignore
+    stale = param.Boolean(False, doc="Whether the results shown are not those of the settings.")
+    waiting = param.Number(0.0, doc="How long the run would take that waits to be asked for [s]; 0 where none does.")
+    can_undo = param.Boolean(False, doc="Whether there is a change to undo.")
+    can_redo = param.Boolean(False, doc="Whether there is an undone change to make again.")
+
+    def __init__(self, post: Post, session: Session, scenario: Scenario | None = None):
+        super().__init__(scenario=scenario or PRESETS[next(iter(PRESETS))]())
+        self.session, self.limits = session, session.service.limits
+        session.post = post
+        self._refused: dict[str, Any] = {}
+        self._past: list[Step] = []
+        self._future: list[Step] = []
+        self.run = BackgroundTask(session)
+        self.run.param.watch(self._compare, "result")
+
+    def start(self) -> None:
+        """Run the settings as they stand."""
+        self.waiting = 0.0
+        try:
+            self.run.start(self.session.service.run(self.scenario, self.source))
+        except SettingError as error:
+            self.run.refuse(str(error))
+
+    def follow(self) -> None:
+        """Run the settings as they stand, unless that takes long: then stop, and wait to be asked."""
+        seconds = run_seconds(self.scenario)
+        if seconds <= AT_ONCE or self.session.service.held(self.scenario, self.source):
+            self.start()
+        else:
+            self.run.cancel()
+            self.waiting = seconds
+
+    def undo(self) -> None:
+        """Take back the last change that was accepted."""
+        if self._past:
+            self._future.append(self._step)
+            self._accept(self._past.pop(), {}, step=False)
+
+    def redo(self) -> None:
+        """Make the last change again that was taken back."""
+        if self._future:
+            self._past.append(self._step)
+            self._accept(self._future.pop(), {}, step=False)
+
+    def value(self, path: str) -> Any:
+        """The accepted value of a setting, by dotted path."""
+        node: Any = self.scenario
+        for key in path.split("."):
+            node = node[int(key)] if isinstance(node, list) else getattr(node, key)
+        return node
+
+    def change(self, path: str, value: Any) -> bool:
+        """Set one setting and run; a refused value changes nothing and is noted in `errors`.
+
+        Values refused before are tried again with it, so that settings that only go together can be given
+        one by one. Returns whether the value was accepted.
+        """
+        waiting = {p: v for p, v in self._refused.items() if not _covers(path, p)}
+        reason = ""
+        for changes in ({**waiting, path: value}, {path: value}) if waiting else ({path: value},):
+            try:
+                fresh = self.scenario.replace(changes)
+                self.validate(fresh)
+            except SettingError as error:
+                reason = str(error)
+            else:
+                self._accept((fresh, self.preset, self.source), {p: v for p, v in waiting.items() if p not in changes})
+                return True
+        self._refused = {**waiting, path: value}
+        self.errors = {p: e for p, e in self.errors.items() if p in waiting} | {path: reason}
+        return False
+
+    def validate(self, scenario: Scenario) -> None:
+        """Raises SettingError where settings do not go together, or are more than is allowed here."""
+        scenario.validate()
+        self.limits.check(scenario)
+
+    def load(self, scenario: Scenario, preset: str | None = None, kept: Kept | None = None) -> None:
+        """Replace every setting and run; a loaded record stays. Raises SettingError where they do not go together.
+
+        preset : the one that they are to be compared with from now on; as it was if not given
+        """
+        self._put(scenario, preset or self.preset, self.source if isinstance(self.source, Loaded) else kept)
+
+    def replace(self, changes: Mapping[str, Any]) -> None:
+        """Set several settings (dotted path -> value) in one step and run. Raises SettingError."""
+        self._put(self.scenario.replace(changes), self.preset, self.source)
+
+    def run_on(self, source: Source | None, scenario: Scenario) -> None:
+        """Run on a record, or on the simulation of the settings (None), and take the settings with it. Raises SettingError."""
+        self._put(scenario, self.preset, source)
+
+    def choose(self, name: str) -> None:
+        """Start again from a preset."""
+        self.load(PRESETS[name](), name)
+
+    def changed(self) -> list[str]:
+        """Dotted paths of the settings that differ from the preset's."""
+        return _paths(self.scenario.difference(pristine(self.preset)))
+
+    def close(self) -> None:
+        """The session has ended."""
+        self.session.leave()
+
+    @property
+    def _step(self) -> Step:
+        return self.scenario, self.preset, self.source
+
+    def _put(self, scenario: Scenario, preset: str, source: Source | None) -> None:
+        self.validate(scenario)
+        if source is not None:
+            source.check(self.limits)
+        self._accept((scenario, preset, source), {})
+
+    def _accept(self, to: Step, refused: dict[str, Any], step: bool = True) -> None:
+        """The one way in for new settings. step : whether it is a change of its own, to be undone later."""
+        scenario, preset, source = to
+        unchanged, stays = scenario == self.scenario, same(source, self.source)
+        if step and not (unchanged and stays and preset == self.preset):
+            self._past = _of_one_file([*self._past, self._step], source)[-STEPS_BACK:]
+            self._future = []
+        self._refused = refused
+        errors = {path: reason for path, reason in self.errors.items() if path in refused}
+        self.param.update(
+            scenario=self.scenario if unchanged else scenario, source=self.source if stays else source, errors=errors,
+            preset=preset, can_undo=bool(self._past), can_redo=bool(self._future))
+        if unchanged and stays:
+            return
+        self.follow()  # first, so that a warning of stale results does not come and go
+        self._compare()
+
+    def _compare(self, *_: object) -> None:
+        shown = self.run.result
+        self.stale = shown is not None and (shown.scenario != self.scenario or not same(shown.source, self.source))
+
+
+def _of_one_file(steps: list[Step], source: Source | None) -> list[Step]:
+    """Without those on another file than the one that is loaded: a session holds one."""
+    def other(step: Step) -> bool:
+        return isinstance(step[2], Loaded) and isinstance(source, Loaded) and not same(step[2], source)
+    return [step for step in steps if not other(step)]
+
+
+def _covers(path: str, other: str) -> bool:
+    """Whether setting `path` replaces what stands at `other`."""
+    return other == path or other.startswith(f"{path}.")
+
+
+def _paths(tree: dict[str, Any], prefix: str = "") -> list[str]:
+    """Dotted paths of the leaves of nested dictionaries."""
+    out: list[str] = []
+    for name, value in tree.items():
+        out += _paths(value, f"{prefix}{name}.") if isinstance(value, dict) else [f"{prefix}{name}"]
+    return out

@@ -1,0 +1,235 @@
+"""A record of the visitor's own in place of the simulation, or a vibration spectrum: a file, a preview to confirm, then the
+same views.
+
+The browser sends the file in parts. What it is said to be can be changed while the preview stands; nothing runs before it
+is confirmed. Reading is done beside the page, in a thread.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from html import escape
+from typing import Any
+
+import numpy as np
+import panel as pn
+import panel_material_ui as pmui
+from bokeh.models import ColumnDataSource
+
+from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job, Tell
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.picker import Parcel, Picker, too_large
+from wfsobs.app.sources import Loaded
+from wfsobs.app.store import Store
+from wfsobs.app.views.plots import new_figure, send
+from wfsobs.pipeline import as_stated
+from wfsobs.progress import Watch
+from wfsobs.record import RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.parameters import hint
+from wfsobs.scenario.settings import SettingError
+from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.telemetry.intake import Stated
+from wfsobs.telemetry.preview import Preview, SpectrumPreview, preview_any, safe_name
+from wfsobs.units import UNITS
+
+SILENT = "as the file says"
+NOTHING = np.empty(0)
+COLOURS = ("#0B4F6C", "#FF6600")
+
+
+class Upload:
+    """How a record comes into a session's store, whose aperture turns angles into wavefronts."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self.picker = Picker(sizing_mode="stretch_width", margin=0)
+        self.picker.on_message = self.handle
+        self.unit = self._select("Unit", [SILENT, *UNITS])
+        self.sign = self._select("Commands", {SILENT: 0, "add to what is seen (+1)": 1, "are taken off (-1)": -1})
+        self.delay, self.rate = self._text("Delay of commands [steps]"), self._text("Rate [Hz]")
+        self.use = pmui.Button(label="Use this record", color="primary", size="small", margin=4)
+        self.drop = pmui.Button(label="Discard", variant="outlined", size="small", margin=4)
+        self.text = pn.pane.HTML("", sizing_mode="stretch_width", margin=(4, 0))
+        self.figure = new_figure(x_axis_type="log", y_axis_type="log")
+        self.figure.name = "Spectrum of the record"
+        self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = "frequency [Hz]", "PSD of z [µm²/Hz]"
+        self.sources = [ColumnDataSource({"x": [], "y": []}) for _ in TIP_TILT]
+        for source, colour, mode in zip(self.sources, COLOURS, TIP_TILT, strict=True):
+            self.figure.line("x", "y", source=source, color=colour, line_width=1.4, legend_label=mode.name)
+        self.room = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
+        self._parcel: Parcel | None = None
+        self._name, self._content = "", b""
+        self._preview: Preview | SpectrumPreview | None = None
+        self.reading = BackgroundTask(store.session)
+        self.reading.param.watch(self._read, ["state", "place", "message"])
+        self.use.on_click(lambda _event: self.confirm())
+        self.drop.on_click(lambda _event: self.discard())
+        for widget in (self.unit, self.sign, self.delay, self.rate):
+            widget.param.watch(lambda _event: self.look(), "value")
+        self._diameter = store.scenario.telescope.diameter
+        store.param.watch(self._follow, "scenario")
+        store.param.watch(self._entitle, "source")
+
+    def _follow(self, _event: object) -> None:
+        diameter = self.store.scenario.telescope.diameter
+        if diameter != self._diameter:
+            self._diameter = diameter
+            self.look()
+
+    def _entitle(self, _event: object) -> None:
+        self.picker.loaded = self.store.source.title if self.store.source else ""
+
+    # ------------------------------------------------------------------ the file
+
+    def handle(self, msg: dict[str, Any]) -> None:
+        """Do what a message of the browser says; one that makes no sense is a file that cannot be read."""
+        action = msg.get("action")
+        if action == "simulate":
+            self.simulate()
+        elif action == "large":
+            self._say(too_large(safe_name(str(msg.get("name", "")))))
+        elif action == "part":
+            self._take(msg)
+
+    def _take(self, msg: dict[str, Any]) -> None:
+        if msg.get("index") == 0:
+            self.discard()
+            self._parcel = Parcel(safe_name(str(msg.get("name", ""))))
+        if self._parcel is None:  # more of a file that has been given up
+            return
+        try:
+            content = self._parcel.take(msg)
+        except ValueError as error:
+            self.discard(str(error))
+            return
+        if content is not None:
+            self._name, self._content = self._parcel.name, content
+            self._parcel = None
+            if not content:
+                self._say(f"{self._name}: is empty")
+            self.look()
+
+    # ------------------------------------------------------------------ the preview
+
+    def stated(self) -> Stated:
+        """What the fields say. Raises RecordError where one holds no number."""
+        def number(field: Any, kind: type, least: float) -> Any:
+            text = str(field.value or "").strip()
+            if not text:
+                return None
+            try:
+                value = kind(text)
+            except ValueError:
+                value = -1
+            if not least <= value < 1e6:
+                raise RecordError(f"{field.label}: takes a number from {least:g}, not {text[:40]!r}{hint(text)}")
+            return value
+        unit = None if self.unit.value == SILENT else self.unit.value
+        return Stated(unit, self.sign.value or None, number(self.delay, int, 1), number(self.rate, float, 1e-3))
+
+    def look(self) -> None:
+        """Read the file, beside the page, as what the fields say."""
+        if not self._content:
+            return
+        content, name = self._content, self._name
+        scenario = self.store.scenario.replace({"telescope.radial_order": 6})  # as many modes as there may be
+        try:
+            stated = self.stated()
+        except RecordError as error:
+            self.reading.refuse(str(error))
+            return
+
+        def read(_watch: Watch, _tell: Tell) -> Preview | SpectrumPreview:
+            try:
+                return preview_any(content, name, scenario, stated)
+            except RecordError:
+                raise
+            except Exception:  # whatever a stranger's file may do
+                raise RecordError(f"{name}: cannot be read") from None
+
+        self.reading.start(Job("upload", read))
+
+    def _read(self, *_: object) -> None:
+        task = self.reading
+        if task.state == RUNNING:
+            self._say(task.line() if task.place else f"Reading {self._name} …")
+        elif self._content and task.state != CANCELLED:
+            self._show(RecordError(task.message) if task.state == FAILED else task.result)
+
+    def _show(self, found: Preview | SpectrumPreview | RecordError) -> None:
+        self._preview = None if isinstance(found, RecordError) else found
+        spectrum = isinstance(found, SpectrumPreview)
+        self.use.label = "Use this spectrum" if spectrum else "Use this record"
+        self.figure.yaxis.axis_label = "PSD [µm²/Hz]" if spectrum else "PSD of z [µm²/Hz]"
+        self.picker.said = "" if self._preview else str(found)
+        self.use.disabled = self._preview is None
+        lines = self._preview.lines() if self._preview else [str(found)]
+        self.text.object = f"<p><b>{escape(self._name)}</b></p><ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
+        for mode, source in enumerate(self.sources):
+            there = self._preview is not None and mode < self._preview.spectrum.shape[1]
+            x, y = (self._preview.frequency, self._preview.spectrum[:, mode]) if self._preview and there else (NOTHING, NOTHING)
+            send(source, {"x": x[x > 0], "y": y[x > 0]})
+        if not len(self.room):
+            self.room[:] = [
+                self.text, pn.FlexBox(self.unit, self.sign, self.delay, self.rate, gap="8px", margin=0),
+                pn.pane.Bokeh(self.figure, sizing_mode="stretch_width", margin=0), pn.Row(self.use, self.drop, margin=0)]
+        self.room.visible = True
+
+    def confirm(self) -> None:
+        """Let the record take the place of the simulation, the settings of rate, ratio and length with it."""
+        found = self._preview
+        if isinstance(found, SpectrumPreview):
+            self._vibrate(found)
+        if not isinstance(found, Preview):
+            return
+        record = found.record
+        stated, digest = self.stated(), hashlib.sha256(self._content).hexdigest()
+        key = hashlib.sha256(repr((digest, stated, self.store.scenario.telescope.diameter)).encode()).hexdigest()
+        try:
+            self.store.run_on(
+                Loaded(record, found.name, key, found.lines()[0], stated, digest), fitting(record, self.store.scenario))
+        except SettingError as error:
+            self._say(f"{found.name}: {error}")
+        else:
+            self.discard()
+
+    def _vibrate(self, found: SpectrumPreview) -> None:
+        """Take a spectrum as that of the vibration."""
+        try:
+            self.store.replace({"vibration.source": "psd", "vibration.psd": found.table})
+        except SettingError as error:
+            self._say(f"{found.name}: {str(error)[:300]}")
+        else:
+            self.discard(f"The vibration has the spectrum of {found.name}.")
+
+    def simulate(self) -> None:
+        """Go back to the simulation; to the settings of one that was kept."""
+        if (source := self.store.source) is not None:
+            self.store.run_on(None, source.simulation or self.store.scenario)
+
+    def discard(self, why: str = "") -> None:
+        """Forget the file that is being looked at."""
+        self._content, self._parcel, self._preview = b"", None, None
+        self.reading.cancel()
+        self.room.visible = False
+        self._say(why)
+
+    def _say(self, line: str) -> None:
+        self.picker.said = line
+
+    def _select(self, label: str, options: Any) -> pmui.Select:
+        first = options[0] if isinstance(options, list) else next(iter(options.values()))
+        return pmui.Select(label=label, options=options, value=first, size="small", width=190, margin=(4, 0))
+
+    def _text(self, label: str) -> pmui.TextInput:
+        return pmui.TextInput(label=label, value="", placeholder=SILENT, size="small", width=190, margin=(4, 0))
+
+
+def fitting(record: Any, scenario: Scenario) -> Scenario:
+    """The scenario with the rate, ratio, length and modes of a record. Raises SettingError."""
+    order = next((n for n in range(1, 7) if (n + 1) * (n + 2) // 2 - 1 >= record.n_modes), 6)
+    duration = record.n_steps * record.dt
+    changes = {
+        "telescope.radial_order": order, "run.duration": duration, "run.warm_up": min(scenario.run.warm_up, 0.2 * duration)}
+    return as_stated(record, scenario).replace(changes)

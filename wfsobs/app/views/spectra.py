@@ -1,0 +1,144 @@
+"""Power spectra: one figure per target, log-log, the modelled peaks marked."""
+
+from __future__ import annotations
+
+import numpy as np
+import panel as pn
+from bokeh.models import ColumnDataSource, HoverTool, Range1d, VSpan
+
+from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.style import observers_of
+from wfsobs.app.views.plots import MODEL, PEAKS, Faint, add_line, marked_peaks, new_figure, restyle, send
+from wfsobs.app.work import TRUTH, Array, Shown, Spectrum
+from wfsobs.evaluation.scores import cumulative_rms
+from wfsobs.observers.base import TARGETS, VIBRATION
+
+DECADES = 8
+"""The most that an axis of densities spans; one of amplitudes spans half of it."""
+
+
+class Spectra:
+    """The figures, redrawn when the results or the switches change."""
+
+    def __init__(self, run: BackgroundTask, display: Display):
+        self.run, self.display = run, display
+        self.visible, self._behind = True, False
+        self.x_range = Range1d(start=0.5, end=500.0)
+        self.spectra = {target: _Spectrum(target, self.x_range) for target in TARGETS}
+        run.param.watch(self._redraw, "result")
+        display.param.watch(self._redraw, ["mode", "show", "unit", "spectrum", "pinned"])
+        display.param.watch(self._restyle, ["dark", "hidden"])
+
+    def pane(self, target: str) -> pn.pane.Bokeh:
+        """The figure of one target."""
+        return pn.pane.Bokeh(self.spectra[target].figure, sizing_mode="stretch_width", margin=0)
+
+    def show(self, visible: bool) -> None:
+        """Draw what has come meanwhile, and go on while visible."""
+        self.visible = visible
+        if visible and self._behind:
+            self._redraw()
+
+    def _redraw(self, *_: object) -> None:
+        shown = self.run.result
+        self._behind = not self.visible
+        if shown is None or self._behind:
+            return
+        with pn.io.hold():
+            for spectrum in self.spectra.values():
+                spectrum.draw(shown, self.display)
+            frequencies = next((s.frequency for s in shown.spectra.values()), None)
+            if frequencies is not None:
+                limits = {"start": float(frequencies[1]), "end": float(frequencies[-1])}
+                if self.x_range.reset_start != limits["start"] or self.x_range.reset_end != limits["end"]:
+                    self.x_range.update(**limits, reset_start=limits["start"], reset_end=limits["end"])
+
+    def _restyle(self, *_: object) -> None:
+        with pn.io.hold():
+            for target, spectrum in self.spectra.items():
+                restyle(spectrum.lines, self.display.dark, self.display.hidden.get(target, []))
+                spectrum.draw_pinned(self.display)
+
+
+class _Spectrum:
+    """One figure: the spectra of the truth and of the estimates of one target, or of their errors."""
+
+    def __init__(self, target: str, x_range: Range1d):
+        self.target = target
+        self.figure = new_figure(
+            x_range=x_range, y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log",
+        )
+        self.figure.xaxis.axis_label = "frequency [Hz]"
+        if target == VIBRATION:
+            self._add_marks()
+        self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in (TRUTH, *observers_of(target))}
+        self.lines = {name: add_line(self.figure, name, source) for name, source in self.sources.items()}
+        self.faint = Faint(self.figure)
+
+    def _add_marks(self) -> None:
+        """Vertical lines at the scenario's peaks and at the one that the Kalman filters model."""
+        self.peaks = ColumnDataSource({"x": [], "text": []})
+        self.model = ColumnDataSource({"x": [], "text": []})
+        peaks = self.figure.add_glyph(self.peaks, VSpan(x="x", line_color=PEAKS, line_alpha=0.4, line_width=1.5))
+        model = self.figure.add_glyph(
+            self.model, VSpan(x="x", line_color=MODEL, line_dash=[4, 3], line_width=1.5))
+        self.figure.add_tools(HoverTool(renderers=[peaks, model], tooltips="@text"))
+
+    def draw(self, shown: Shown, display: Display) -> None:
+        """Send every line, its axis and the marks."""
+        diameter = shown.scenario.telescope.diameter
+        drawn: list[Array] = []
+        for name, source in self.sources.items():
+            spectrum = shown.spectra.get((name, self.target))
+            if spectrum is None:
+                send(source, {"x": [], "y": []})
+                continue
+            y = _curve(spectrum, name, display, diameter)
+            send(source, {"x": spectrum.frequency[1:], "y": y})
+            drawn.append(y)
+        self._fit(drawn + self.draw_pinned(display), display.cumulative)
+        of = " of error" if display.error else ""
+        what, unit = (
+            (f"cumulative rms{of}", display.unit_label) if display.cumulative else (f"PSD{of}", f"{display.unit_label}²/Hz"))
+        self.figure.yaxis.axis_label = f"{what}, {display.mode_label} [{unit}]"
+        if self.target == VIBRATION:
+            self._draw_marks(shown)
+
+    def draw_pinned(self, display: Display) -> list[Array]:
+        """Send the pinned run's visible lines; what was sent."""
+        kept, lines = display.compared, {}
+        if kept is not None:
+            diameter = kept.scenario.telescope.diameter
+            for name, line in self.lines.items():
+                spectrum = kept.spectra.get((name, self.target))
+                if line.visible and spectrum is not None:
+                    lines[name] = (spectrum.frequency[1:], _curve(spectrum, name, display, diameter))
+        self.faint.draw(lines, display.dark)
+        return [y for _, y in lines.values()]
+
+    def _fit(self, lines: list[Array], cumulative: bool) -> None:
+        """Have the axis hold every line, but for what lies too far below the highest."""
+        positive = [y[y > 0] for y in lines if (y > 0).any()]
+        if positive:
+            low, high = min(float(np.quantile(y, 0.02)) for y in positive), max(float(y.max()) for y in positive)
+            room, decades = (1.5, DECADES / 2) if cumulative else (3.0, DECADES)
+            self.figure.y_range.update(start=max(low / room, high * 10.0**-decades), end=high * room)
+
+    def _draw_marks(self, shown: Shown) -> None:
+        simulated = shown.result.record.vibration is not None  # peaks of the settings are not those of a record
+        drawn, kalman = marked_peaks(shown.scenario) if simulated else [], shown.scenario.kalman
+        send(self.peaks, {
+            "x": [p.frequency for p in drawn],
+            "text": [f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}" for p in drawn],
+        })
+        send(self.model, {
+            "x": [kalman.frequency], "text": [f"model of the Kalman filters {kalman.frequency:.5g} Hz"],
+        })
+
+
+def _curve(spectrum: Spectrum, name: str, display: Display, diameter: float) -> Array:
+    """What is drawn of a spectrum above zero frequency. Under "error" the truth stays: it is the error of answering zero."""
+    scale = per_micrometre(display.unit, diameter)
+    density = (spectrum.error if display.error and name != TRUTH else spectrum.signal)[1:, display.column]
+    return scale * cumulative_rms(spectrum.frequency[1:], density) if display.cumulative else scale**2 * density

@@ -1,0 +1,87 @@
+"""The strip above a target's figures: a card per observer with its number, which is the legend as well."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.display import NOTHING, Display, number, per_micrometre
+from wfsobs.app.jobs.job import RUNNING
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.style import asset, look, observers_of
+from wfsobs.app.views.table import find
+from wfsobs.app.work import TRUTH, Shown
+from wfsobs.cli.tables import NOT_OBSERVERS, own_stretch, rows
+from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL, Score
+
+
+class Cards(JSComponent):
+    """The cards in the browser; a click on one hides or shows its line."""
+
+    items = param.List([], doc="{name, label, colour, dash, value, unit, note} of every card.")
+    hidden = param.List([], doc="Names of the cards whose lines are hidden.")
+
+    _esm = asset("strip.js")
+    _stylesheets = [asset("strip.css")]  # noqa: RUF012
+
+
+class Strip:
+    """The cards of one target, in step with the results and the switches."""
+
+    def __init__(self, target: str, run: BackgroundTask, display: Display):
+        self.target, self.run, self.display = target, run, display
+        self.cards = Cards(items=self.items(), sizing_mode="stretch_width", margin=0)
+        run.param.watch(self._refresh, ["result", "state"])
+        display.param.watch(self._refresh, ["mode", "unit", "dark"])
+
+    def _refresh(self, *_: object) -> None:
+        self.cards.items = self.items()
+
+    def items(self) -> list[dict[str, Any]]:
+        """What the cards say."""
+        shown = self.run.result
+        observers = [self._observer(name, shown) for name in observers_of(self.target)]
+        return [self._truth(shown), *observers]
+
+    def _observer(self, name: str, shown: Shown | None) -> dict[str, Any]:
+        score = find(shown, name, self.target, self.display.mode) if shown else None
+        if shown is None or score is None:
+            if shown is not None and shown.result.estimate(name, self.target) is not None:
+                return self._without_truth(name, shown)
+            waiting = self.run.state == RUNNING
+            return self._card(name, None, "computing …" if waiting else "no result")
+        return self._scored(name, score, shown, "truth")
+
+    def _scored(self, name: str, score: Score, shown: Shown, base: str) -> dict[str, Any]:
+        relative = f"{score.normalised_rms:.2f} × {base}" if score.normalised_rms is not None else ""
+        return self._card(name, self._scaled(score.rms, shown), own_stretch(rows([score], None)[0]) or relative)
+
+    def _without_truth(self, name: str, shown: Shown) -> dict[str, Any]:
+        """How well the next measurement is predicted, by whoever says what it will be."""
+        score = find(shown, name, PREDICTION, self.display.mode)
+        return self._scored(name, score, shown, "z, next z") if score else self._card(name, None, "no truth")
+
+    def _truth(self, shown: Shown | None) -> dict[str, Any]:
+        of = (self.target, self.display.mode)
+        scores = [s for s in shown.result.scores if (s.target, s.mode) == of and not s.apart] if shown else []
+        if shown is None or not scores:
+            left = find(shown, LOOP, RESIDUAL, self.display.mode) if shown else None
+            return self._loop(left, shown) if shown and left else self._card(TRUTH, None, "")
+        return self._card(TRUTH, self._scaled(scores[0].truth_rms, shown), "rms")
+
+    def _loop(self, left: Score, shown: Shown) -> dict[str, Any]:
+        """What the recorded loop left, in the place of the truth, which has no line either."""
+        return self._scored(TRUTH, left, shown, "z, residual") | {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
+
+    def _scaled(self, value: float, shown: Shown) -> float:
+        return value * per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
+
+    def _card(self, name: str, value: float | None, note: str) -> dict[str, Any]:
+        it = look(name)
+        return {
+            "name": name, "label": it.label, "colour": it.colour(self.display.dark), "dash": list(it.dash),
+            "note": note, "value": NOTHING if value is None else number(value),
+            "unit": "" if value is None else self.display.unit_label,
+        }

@@ -1,0 +1,187 @@
+"""The RMS table, plain HTML."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from html import escape
+
+import panel as pn
+
+from wfsobs.app.display import IN_MOST, NOTHING, Display, number, per_micrometre
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.style import asset, observers_of, swatch
+from wfsobs.app.work import Shown
+from wfsobs.cli.tables import (
+    NOT_OBSERVERS,
+    competes,
+    label_of,
+    looks_ahead,
+    needs_of,
+    own_stretch,
+    rows,
+    stretch_of,
+)
+from wfsobs.evaluation.scores import BOUND, LOOP, RESIDUAL, Score
+from wfsobs.observers.base import TARGETS
+
+BEST = '<span class="tag best">best</span> '
+ABOVE = '<span class="tag above">above truth</span> '
+
+
+def find(shown: Shown, observer: str, target: str, mode: str) -> Score | None:
+    """The score of one observer, target and mode, or None."""
+    return next((s for s in shown.result.scores if (s.observer, s.target, s.mode) == (observer, target, mode)), None)
+
+
+class Table:
+    """Every score of the mode shown, one row per observer and target."""
+
+    def __init__(self, run: BackgroundTask, display: Display):
+        self.run, self.display = run, display
+        self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
+        run.param.watch(self._refresh, "result")
+        display.param.watch(self._refresh, ["mode", "unit", "dark", "best_first", "pinned"])
+
+    def _refresh(self, *_: object) -> None:
+        self.pane.object = self.html()
+
+    def html(self) -> str:
+        """The table."""
+        columns = self._columns()
+        head = "".join(f'<th scope=col title="{why}">{name}</th>' for name, why in columns.items())
+        body = self._measured(len(columns)) or "".join(self._target(target, len(columns)) for target in TARGETS)
+        table = f'<table class="rms"><thead><tr>{head}</tr></thead>{body}</table>'
+        return f'<div class="scroll" tabindex=0 role=region aria-label="RMS errors">{table}</div>{self._notes()}'
+
+    def _columns(self) -> dict[str, str]:
+        """Heading -> explanation."""
+        unit = self.display.unit_label
+        pinned = {
+            f"Pinned [{unit}]": "RMS error in the pinned run", "Change [%]": "from the pinned run to this one",
+        } if self.display.pinned else {}
+        base = "z" if self._without_truth() else "truth"
+        return {
+            "Observer": "and its line in the figures",
+            f"RMS error [{unit}]": "of the estimate, after the warm-up, on samples that all have", **pinned,
+            f"RMS {base} [{unit}]": "the error of answering zero", f"error / {base}": "above 1 is worse than answering zero",
+            "Needs": "what has to be given beside measurements",
+            "Lag [ms]": "how late the estimate is", "Time per step [µs]": "computing time per step and mode",
+            "Real-time factor": "time per step over the step of the loop; below 1 keeps up with it",
+        }
+
+    def _without_truth(self) -> list[Score]:
+        """The scores of a record without truth, of the mode shown."""
+        shown = self.run.result
+        scores = [s for s in shown.result.scores if s.mode == self.display.mode] if shown else []
+        return scores if any(s.target == RESIDUAL for s in scores) else []
+
+    def _measured(self, columns: int) -> str:
+        """The rows of a record without truth: predictions of the next measurement, and what the recorded loop left."""
+        scores = self._without_truth()
+        if self.display.best_first:
+            scores.sort(key=lambda s: (s.target == RESIDUAL, s.apart, s.rms))
+        best = min((s.rms for s in scores if competes(s.observer, s.apart)), default=None)
+        shown, out = self.run.result, []
+        for score in scores:
+            assert shown is not None
+            scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
+            loop = score.observer == LOOP
+            is_best = score.rms == best and competes(score.observer, score.apart)
+            cells = [(BEST if is_best else "") + number(score.rms * scale),
+                     *self._pinned(score.observer, score.target, score), number(score.truth_rms * scale),
+                     number(score.normalised_rms), needs_of(score.observer), NOTHING, *_times(score, shown.result.record.dt)]
+            label = "Recorded loop, residual" if loop else (
+                f"{swatch(score.observer, self.display.dark)}{escape(label_of(score.observer))}{_own(score)}")
+            values = "".join(f"<td>{c}</td>" for c in cells)
+            head = f"<th scope=row>{label}</th>"
+            out.append(f'<tr data-observer="{score.observer}" data-target="{score.target}">{head}{values}</tr>')
+        title = f"Next measurement z, {self.display.mode}{_scored(scores)}, one step ahead: the record has no truth"
+        head = f'<tr><th colspan={columns} class="target" scope=rowgroup>{title}</th></tr>'
+        return f"<tbody>{head}{''.join(out)}</tbody>" if out else ""
+
+    def _target(self, target: str, columns: int) -> str:
+        """The rows of a target, best first if asked for, those without a score last."""
+        shown = self.run.result
+        scores = {
+            name: find(shown, name, target, self.display.mode) if shown else None
+            for name in (*observers_of(target, hidden=True), BOUND)}
+        best = min((s.rms for n, s in scores.items() if s and competes(n, s.apart)), default=None)
+        order = list(scores.items())
+        if self.display.best_first:
+            order.sort(key=lambda item: (item[1].apart, item[1].rms) if item[1] else (True, math.inf))
+        body = "".join(self._row(name, target, score, best) for name, score in order)
+        title = f"{target.capitalize()}, {self.display.mode}{_scored([s for s in scores.values() if s])}"
+        return f'<tbody><tr><th colspan={columns} class="target" scope=rowgroup>{title}</th></tr>{body}</tbody>'
+
+    def _row(self, name: str, target: str, score: Score | None, best: float | None) -> str:
+        label = escape(label_of(name)) + (" <sup>looks ahead</sup>" if looks_ahead(name) else "") + _own(score)
+        shown, pinned = self.run.result, self._pinned(name, target, score)
+        cells = [NOTHING, *pinned, *[NOTHING] * 2, needs_of(name), *[NOTHING] * 3]
+        if shown and score:
+            scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
+            is_best = score.rms == best and competes(name, score.apart)
+            cells = [
+                (BEST if is_best else "") + number(score.rms * scale) + interval_html(score.interval, scale), *pinned,
+                number(score.truth_rms * scale),
+                (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
+                needs_of(name),
+                NOTHING if score.lag is None else f"{1e3 * score.lag:.2f}".replace("-", "−"),
+                *_times(score, shown.result.record.dt),
+            ]
+        values = "".join(f"<td>{c}</td>" for c in cells)
+        head = f"<th scope=row>{swatch(name, self.display.dark)}{label}</th>"
+        return f'<tr data-observer="{name}" data-target="{target}">{head}{values}</tr>'
+
+    def _pinned(self, name: str, target: str, score: Score | None) -> list[str]:
+        """The pinned run's error and the change since; nothing while nothing is pinned."""
+        kept = self.display.pinned
+        if kept is None:
+            return []
+        before = kept.score(name, target, self.display.mode)
+        if before is None:
+            return [NOTHING] * 2
+        scale = per_micrometre(self.display.unit, kept.scenario.telescope.diameter)
+        return [number(before.rms * scale), change(before.rms, score.rms if score else None)]
+
+    def _notes(self) -> str:
+        shown = self.run.result
+        failures = shown.result.failures if shown else ()
+        return "".join(f'<p class="failure">{escape(f.reason)}</p>' for f in failures)
+
+
+def _scored(scores: list[Score]) -> str:
+    """What was scored of rows that can be compared, for the end of a heading."""
+    stretch = stretch_of(rows(scores, None))
+    return f", {stretch}" if stretch else ""
+
+
+def _own(score: Score | None) -> str:
+    """What is beside the name of an observer that was scored on samples of its own."""
+    return f" <sup>{own_stretch(rows([score], None)[0])}</sup>" if score and score.apart else ""
+
+
+def interval_html(interval: Sequence[float] | None, scale: float) -> str:
+    """The interval of a bound, behind it."""
+    if interval is None:
+        return ""
+    low, high = (number(x * scale) for x in interval)
+    return f' <span class="range" title="{IN_MOST}">{low} – {high}</span>'
+
+
+def _times(score: Score, dt: float) -> list[str]:
+    """Time per step [us], and over the step of the loop."""
+    if score.observer in NOT_OBSERVERS:
+        return [NOTHING] * 2
+    return [number(1e6 * score.seconds_per_step), number(score.seconds_per_step / dt, 2)]
+
+
+def change(before: float, now: float | None) -> str:
+    """A change in per cent, signed.
+
+    >>> change(20.0, 15.0)
+    '−25.0'
+    """
+    if now is None or before == 0:
+        return NOTHING
+    return f"{100.0 * (now / before - 1.0):+.1f}".replace("-", "−")

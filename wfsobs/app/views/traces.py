@@ -1,0 +1,204 @@
+"""Time traces: one figure per target, sharing their time axis."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import panel as pn
+from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, Range1d, Span
+from numpy.typing import NDArray
+
+from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.style import observers_of
+from wfsobs.app.views.envelope import envelope, envelope_times
+from wfsobs.app.views.event_marks import EventMarks, room
+from wfsobs.app.views.plots import Faint, add_line, new_figure, restyle, send
+from wfsobs.app.work import TRUTH, Shown
+from wfsobs.evaluation.recovery import trailing_rms
+from wfsobs.observers.base import TARGETS
+
+Array = NDArray[np.float64]
+
+BINS = 500
+"""Pairs of extremes per figure, about one per pixel."""
+
+MARGIN = 0.25
+"""What is sent beyond either side of a zoomed window, as a share of it: a pan shows something at once."""
+
+WINDOW_S = 1.0
+"""Over which the running rms of an error is taken [s]."""
+
+SETTLE_MS = 60
+"""A zoom is answered when the window has not moved for this long."""
+
+
+class Traces:
+    """The figures, redrawn when the results, the switches or the window change."""
+
+    def __init__(self, run: BackgroundTask, display: Display):
+        self.run, self.display = run, display
+        self.x_range = Range1d(start=0.0, end=10.0)
+        self.length = 0.0
+        self._waiting = self._behind = False
+        self.visible = True
+        crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
+        self.traces = {target: _Trace(target, self.x_range, crosshair) for target in TARGETS}
+        run.param.watch(self._redraw, "result")
+        display.param.watch(self._redraw, ["mode", "show", "unit", "pinned"])
+        display.param.watch(self._restyle, ["dark", "hidden"])
+        for end in ("start", "end"):
+            self.x_range.on_change(end, self._moved)
+
+    def pane(self, target: str) -> pn.pane.Bokeh:
+        """The figure of one target."""
+        return pn.pane.Bokeh(self.traces[target].figure, sizing_mode="stretch_width", margin=0)
+
+    def show(self, visible: bool) -> None:
+        """Draw what has come meanwhile, and go on while visible."""
+        self.visible = visible
+        if visible and self._behind:
+            self._redraw()
+
+    def _redraw(self, *_: object) -> None:
+        shown = self.run.result
+        self._behind = not self.visible
+        if shown is None or self._behind:
+            return
+        record = shown.result.record
+        length = record.n_steps * record.dt
+        with pn.io.hold():
+            if length != self.length:
+                self.length = length
+                self.x_range.update(start=0.0, end=length, reset_start=0.0, reset_end=length)
+            first, last = self._window(record.n_steps, record.dt)
+            for trace in self.traces.values():
+                trace.draw(shown, self.display, first, last)
+
+    def _window(self, n_steps: int, dt: float) -> tuple[int, int]:
+        """The samples to send: those in view and a margin."""
+        start, end = sorted((float(self.x_range.start), float(self.x_range.end)))  # type: ignore[arg-type]
+        margin = 0.0 if end - start >= self.length else MARGIN * (end - start)
+        first = max(int((start - margin) / dt), 0)
+        return min(first, n_steps - 2), min(max(int((end + margin) / dt) + 2, 2), n_steps)
+
+    def _moved(self, attr: str, old: object, new: object) -> None:
+        if not self._waiting:
+            self._waiting = True
+            later(self._settled, SETTLE_MS)
+
+    def _settled(self) -> None:
+        self._waiting = False
+        self._redraw()
+
+    def zoom(self, seconds: float | None) -> None:
+        """Show a stretch of the record around the middle of the one in view, or all of it."""
+        length = min(seconds or self.length, self.length)
+        middle = 0.5 * (float(self.x_range.start) + float(self.x_range.end))  # type: ignore[arg-type]
+        start = min(max(middle - 0.5 * length, 0.0), self.length - length)
+        self.x_range.update(start=start, end=start + length)
+
+    def _restyle(self, *_: object) -> None:
+        with pn.io.hold():
+            for target, trace in self.traces.items():
+                restyle(trace.lines, self.display.dark, self.display.hidden.get(target, []))
+        self._redraw()
+
+
+class _Trace:
+    """One figure: the truth and the estimates of one target, all lines in one data source."""
+
+    def __init__(self, target: str, x_range: Range1d, crosshair: CrosshairTool):
+        self.target = target
+        self.names = [TRUTH, *observers_of(target)]
+        self.source = ColumnDataSource({"x": [], **{name: [] for name in self.names}})
+        self.figure = new_figure(x_range=x_range, y_range=Range1d(start=-1.0, end=1.0))
+        self.figure.xaxis.axis_label = "time [s]"
+        self.figure.add_tools(crosshair)
+        self.warm_up = BoxAnnotation(
+            left=0, right=0, fill_color="#808080", fill_alpha=0.10, line_width=0, level="underlay")
+        self.figure.add_layout(self.warm_up)
+        self.lines = {name: add_line(self.figure, name, self.source, name) for name in self.names}
+        self.faint = Faint(self.figure)
+        self.events = EventMarks(self.figure)
+
+    def draw(self, shown: Shown, display: Display, first: int, last: int) -> None:
+        """Send the samples first ... last - 1 of every line."""
+        scale = per_micrometre(display.unit, shown.scenario.telescope.diameter)
+        data: dict[str, Any] = {"x": envelope_times(first, last, BINS, shown.result.record.dt)}
+        for name in self.names:
+            values = _line(shown, name, self.target, display, first, last)
+            data[name] = (scale * envelope(values, BINS)).astype(np.float32)
+        send(self.source, data)
+        warm_up = shown.scenario.run.warm_up
+        self.warm_up.right = warm_up
+        settled = warm_up + WINDOW_S * display.running
+        self._fit(data, settled, self._draw_pinned(display, data["x"]), room(shown))
+        self.events.draw(shown, display.dark)
+        what = f"{'running rms of ' if display.running else ''}{'error of ' if display.error else ''}{display.mode_label}"
+        self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
+
+    def _draw_pinned(self, display: Display, times: Array) -> dict[str, tuple[Array, Array]]:
+        """Send the pinned run's visible lines between the first and the last of the times; what was sent."""
+        kept, lines = display.compared, {}
+        if kept is not None and not display.running:  # what is kept of it are extremes
+            first, last = np.searchsorted(kept.times, [times[0], times[-1]])
+            cut = slice(first, last + 1)
+            x = _thinned(kept.times[cut])
+            scale = per_micrometre(display.unit, kept.scenario.telescope.diameter)
+            for name, line in self.lines.items():
+                values = (kept.errors if display.error else kept.signals).get((name, self.target))
+                if line.visible and values is not None:
+                    lines[name] = (x, scale * envelope(values[cut, display.column].astype(np.float64), BINS))
+        self.faint.draw(lines, display.dark)
+        return lines
+
+    def _fit(self, data: dict[str, Any], warm_up: float, pinned: dict[str, tuple[Array, Array]], above: float) -> None:
+        """Have the axis hold every visible line; what a filter does while it settles does not count."""
+        counted = data["x"] >= warm_up
+        if not counted.any():
+            counted[:] = True
+        lines = [data[name][counted] for name, line in self.lines.items() if line.visible]
+        lines += [y[x >= warm_up] for x, y in pinned.values()]
+        values = np.concatenate(lines) if lines else np.empty(0)
+        values = values[np.isfinite(values)]
+        if values.size:
+            low, high = float(values.min()), float(values.max())
+            pad = 0.05 * (high - low) or 1.0
+            self.figure.y_range.update(start=low - pad, end=high + pad + above * (high - low))
+
+
+def _thinned(times: Array) -> Array:
+    """The times of an envelope of samples that are a run of times themselves."""
+    if times.size <= 2 * BINS:
+        return times
+    return np.interp(envelope_times(0, times.size, BINS, 1.0), np.arange(times.size), times)
+
+
+def _line(shown: Shown, name: str, target: str, display: Display, first: int, last: int) -> Array:
+    """The samples of one line [um], NaN where there is nothing to draw."""
+    values, truth = shown.values(name, target), shown.values(TRUTH, target)
+    nothing = np.full(last - first, np.nan)
+    if values is None:
+        return nothing
+    n = max(round(WINDOW_S / shown.result.record.dt), 1)
+    before = min(n - 1, first) if display.running else 0
+    cut = slice(first - before, last), slice(display.column, display.column + 1)
+    if not display.error:
+        return values[cut][:, 0]
+    if truth is None or name == TRUTH:
+        return nothing
+    error = values[cut] - truth[cut]
+    if display.running:  # where there is no estimate yet, that of a while ago is not shown in its place
+        error = np.where(np.isnan(error), np.nan, trailing_rms(error, n))
+    return error[before:, 0]
+
+
+def later(function: Any, milliseconds: int) -> None:
+    """Call a function a little later on the session's thread; at once where there is no session."""
+    doc = pn.state.curdoc
+    if doc is None or doc.session_context is None:
+        function()
+    else:
+        doc.add_timeout_callback(function, milliseconds)

@@ -1,0 +1,216 @@
+"""The work of one run, done in a thread: what it delivers, and how often.
+
+Nothing here knows of Panel. `compute` runs the core and hands over what is done so far: the quick observers where the
+others keep one waiting, all but those that learn during the run as soon as they are done, then those, in parts where they
+come in parts.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from time import perf_counter, sleep
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from wfsobs.app.jobs.job import INTERVAL, Tell
+from wfsobs.app.sources import Source
+from wfsobs.evaluation.bound import Bound, bounds
+from wfsobs.evaluation.scores import spectra
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS, Estimate
+from wfsobs.pipeline import Failure, Result, as_stated, collect, each_estimate
+from wfsobs.progress import Watch
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.simulation.loop import simulate
+
+Array = NDArray[np.float64]
+Key = tuple[str, str]
+"""(observer or TRUTH, target)."""
+
+TRUTH = "truth"
+
+DELIVERY_INTERVAL = 0.4
+"""Least time between two deliveries [s], each of which has the page drawn anew."""
+
+DRAWING = 0.15
+"""What the page takes to draw a delivery [s]."""
+
+LEARNING = frozenset(o.id for o in OBSERVERS.values() if o.weight >= 50.0)
+"""The observers that learn during the run: the others do not wait for them."""
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Power spectral densities [um^2/Hz], one column per mode, of a signal and of its error; frequency in [Hz]."""
+
+    frequency: Array
+    signal: Array
+    error: Array
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a run has given so far.
+
+    partial : values so far, NaN where there are none yet, of observers still at work
+    spectra : of the truth and of every finished estimate
+    source : what they are of where that is not the simulation of the settings
+    """
+
+    result: Result
+    partial: Mapping[Key, Array] = field(default_factory=dict)
+    spectra: Mapping[Key, Spectrum] = field(default_factory=dict)
+    seconds: float = 0.0
+    source: Source | None = None
+
+    @property
+    def recorded(self) -> bool:
+        """Whether the record stays whatever the settings."""
+        return self.source is not None
+
+    @property
+    def simulation(self) -> Scenario | None:
+        """What the record was simulated from; None where it was loaded."""
+        return self.scenario if self.source is None else self.source.simulation
+
+    @property
+    def scenario(self) -> Scenario:
+        """The settings this was computed from."""
+        return self.result.scenario
+
+    def values(self, observer: str, target: str) -> Array | None:
+        """(n_steps, n_modes) [um] of the truth, a finished or a growing estimate, or None."""
+        if observer == TRUTH:
+            return self.result.record.truth(target)
+        estimate = self.result.estimate(observer, target)
+        return estimate.values if estimate else self.partial.get((observer, target))
+
+
+
+
+def one_blas_thread() -> None:
+    """Let BLAS use one thread: the observers bring their own, and sessions share the processors."""
+    threadpool_limits(limits=1, user_api="blas")
+
+
+def compute(scenario: Scenario, watch: Watch, tell: Tell, source: Source | None = None) -> Shown:
+    """Run everything on a scenario, or the observers on another record; tells the results that there are. Raises
+    SettingError, Cancelled."""
+    return _Work(scenario, watch, tell, source).run()
+
+
+class _Work:
+    def __init__(self, scenario: Scenario, watch: Watch, tell: Tell, source: Source | None):
+        self.scenario, self.tell, self.source = scenario, tell, source
+        self.simulation = scenario if source is None else source.simulation
+        self.report = watch.progress
+        self.watch = Watch(progress=self._progress, cancelled=watch.cancelled)
+        self.estimates: list[Estimate] = []
+        self.failures: list[Failure] = []
+        self.bounds: list[Bound] = []
+        self.growing: dict[Key, Array] = {}  # written to by the observers' threads
+        self.spectra: dict[Key, Spectrum] = {}
+        self.started = self.told = self.delivered = perf_counter()
+        self.news = False  # since the last delivery
+        self.fraction = 0.0
+        self.lock, self.telling = threading.Lock(), threading.Lock()
+        self.record: Record | None = None
+
+    def run(self) -> Shown:
+        self.watch.step(0.0)
+        stated = self.scenario
+        if self.source is None:
+            record = simulate(stated, watch=self.watch)
+        else:
+            record = self.source.make(self.watch)
+            stated = as_stated(record, stated)
+            stated.validate()
+        self.record = record
+        self._add_truth(record)
+        handed_over = False  # the quick ones
+        for item in each_estimate(record, stated, self.watch, on_partial=self._grow):
+            with self.lock:
+                if isinstance(item, Failure):
+                    self.failures.append(item)
+                else:
+                    self._add(record, item)
+                self.news = True
+                quick = not handed_over and self._left() <= LEARNING
+                shown = self._deliver(record) if quick else None
+            if shown is not None:
+                handed_over = True
+                self.report(self.fraction)
+                self.tell(result=shown)
+                self._let_draw()
+                if self.simulation is not None:
+                    self.bounds = bounds(self.simulation, record)
+        return self._so_far(record)
+
+    def _left(self) -> set[str]:
+        """The observers that have not said all that they will."""
+        said = {(e.observer, e.target) for e in self.estimates}
+        left = {o.id for o in OBSERVERS.values() if any((o.id, target) not in said for target in o.targets)}
+        return left - {f.observer for f in self.failures}
+
+    def _let_draw(self) -> None:
+        """Leave the processors to the page and the browser while all but the slow observers are drawn."""
+        until = perf_counter() + DRAWING
+        while perf_counter() < until:
+            self.watch.check()
+            sleep(0.01)
+
+    def _deliver(self, record: Record) -> Shown:
+        self.delivered, self.news = perf_counter(), False
+        return self._so_far(record)
+
+    def _so_far(self, record: Record) -> Shown:
+        result = collect(self.scenario, record, self.estimates, self.failures, least=self.bounds)
+        partial = {key: values.copy() for key, values in self.growing.items()}
+        return Shown(result, partial, dict(self.spectra), perf_counter() - self.started, self.source)
+
+    def _progress(self, fraction: float) -> None:
+        """Called from any thread of the observers."""
+        with self.telling:  # one after the other, or a report could arrive before one that it was made after
+            with self.lock:
+                now = perf_counter()
+                if now - self.told < INTERVAL or self.record is None:
+                    return
+                self.told = now
+                self.fraction = fraction = max(self.fraction, fraction)  # modes at work in parallel overtake each other
+                shown = None
+                if self.news and now - self.delivered >= DELIVERY_INTERVAL:
+                    shown = self._deliver(self.record)
+            self.report(fraction)
+            if shown is not None:
+                self.tell(result=shown)
+
+    def _grow(self, observer: str, target: str, values: Array) -> None:
+        with self.lock:
+            self.growing[observer, target] = values
+            self.news = True
+
+    def _add(self, record: Record, estimate: Estimate) -> None:
+        key = (estimate.observer, estimate.target)
+        self.estimates.append(estimate)
+        self.growing.pop(key, None)
+        truth = record.truth(estimate.target)
+        spectrum = self._spectrum(record, estimate.target, estimate.values)
+        if spectrum is not None:
+            self.spectra[key] = spectrum if truth is not None else replace(spectrum, error=np.full_like(spectrum.error, np.nan))
+
+    def _add_truth(self, record: Record) -> None:
+        for target in TARGETS:
+            truth = record.truth(target)
+            spectrum = self._spectrum(record, target, truth) if truth is not None else None
+            if spectrum is not None:
+                self.spectra[TRUTH, target] = spectrum
+
+    def _spectrum(self, record: Record, target: str, values: Array) -> Spectrum | None:
+        """Over the samples that count for the scores; None where there are too few."""
+        found = spectra(record, target, values, self.scenario.run.warm_up)
+        return Spectrum(*found) if found else None

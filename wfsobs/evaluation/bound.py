@@ -1,0 +1,147 @@
+"""The bound: the least error that any causal observer of the mean of the LGS could have on a scenario.
+
+It is the Wiener filter's (`wiener`), which knows the true spectra of the scenario (`true_spectra`) and its noise, after an
+infinitely long record; pure lines are then known. What a row of an observer lacks to it is what a better model, better tuning
+or more training could gain. Who has more than the mean of the LGS may be better: each star by itself, where they see different
+air, or the NGS. So may be one who remembers a record of random phases, which repeats itself (`synthesis`).
+
+A record is neither infinitely long nor the mean of all. `interval` says where the rms of an observer lies that is optimal for
+all that was measured since the record began, in 95 % of records.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from math import inf, log
+
+import numpy as np
+from scipy.stats import chi2
+
+from wfsobs.evaluation.scores import BOUND, Score, rms
+from wfsobs.observers.base import TARGETS
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.signal.wiener import advanced, circle_mean, error_spectrum, explained, factorise, freedom
+from wfsobs.simulation.true_spectra import TrueSpectra, is_known, true_spectra
+from wfsobs.typing import Array
+
+SHARE = 0.95
+"""Of the records whose rms lies in an interval."""
+
+MOST_PAST = 4000
+"""Measurements up to which their gain is computed; what is then still to be gained falls with the inverse of their number, as it
+does of pure lines."""
+
+TOTAL = "total"
+
+
+@dataclass(frozen=True)
+class LeastError:
+    """The error of an optimal filter.
+
+    covariance : (n_lags,) [um^2] its autocovariance after an infinitely long record
+    started  : (n_past,) [um^2] its variance after 0, 1, 2, ... measurements
+    n_lines  : how many pure lines there are, whose phases and amplitudes are learnt from the record
+    """
+
+    covariance: Array
+    started: Array
+    n_lines: int = 0
+
+    @property
+    def rms(self) -> float:
+        """[um], over all records, infinitely long ones."""
+        return float(np.sqrt(self.covariance[0]))
+
+    def interval(self, first: int, last: int) -> tuple[float, float]:
+        """Where its rms [um] over the steps `first` to `last` of a record lies in SHARE of records."""
+        least = float(self.covariance[0])
+        excess, past = np.maximum(self.started[first:last] - least, 0.0), self.started.size
+        later = max(self.started[-1] - least, 0.0) * past / np.arange(max(first, past) + 1, last + 1)
+        learning = float(excess.sum() + later.sum()) / (last - first)
+        mean = least + learning
+        if not mean > 0:
+            return 0.0, 0.0
+        n = freedom(self.covariance, last - first) if least > 0 else inf
+        if self.n_lines:
+            n = mean**2 / (least**2 / n + learning**2 / (2 * self.n_lines * learning_freedom(last / max(first, 1))))
+        low, high = np.sqrt(mean * chi2.ppf([0.5 - 0.5 * SHARE, 0.5 + 0.5 * SHARE], n) / n)
+        return float(low), float(high)
+
+
+def learning_freedom(ratio: float) -> float:
+    """Degrees of freedom of the mean square of W(t) / t, the error of an amplitude learnt in white noise, from t = 1 to `ratio`.
+
+    W is Brownian, so that the mean square has the mean ln r and the variance 4 (ln r - 1 + 1 / r), either over r - 1, its square.
+    """
+    if ratio < 1.01:
+        return 1.0
+    return log(ratio) ** 2 / (2.0 * (log(ratio) - 1.0 + 1.0 / ratio))
+
+
+def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict[str, LeastError]:
+    """Target -> the least error of phi[k + ahead] from z[k], z[k-1], ...; TOTAL is that of both together.
+
+    n_steps : steps of the record that intervals are wanted of
+    """
+    past, known = min(n_steps, MOST_PAST), spectra.without_lines
+    whitener = factorise(known.measured)
+    wanted = {name: (known.signal[name], advanced(known.shared[name], 1 + ahead)) for name in known.signal}
+    wanted[TOTAL] = known.total[0], advanced(known.total[1], 1 + ahead)
+    lines = spectra.line_covariance(past + 1 + ahead)
+    of_lines = {"vibration": 1.0, TOTAL: 1.0}
+    cross = np.array([
+        np.fft.irfft(shared, whitener.n)[:past] + of_lines.get(name, 0.0) * spectra.gain * lines[1 + ahead :]
+        for name, (_, shared) in wanted.items()])
+    measured = np.fft.irfft(known.measured, whitener.n)[:past] + spectra.gain**2 * lines[:past]
+    gained = np.hstack([np.zeros((len(wanted), 1)), explained(measured, cross)])
+    return {
+        name: LeastError(
+            np.fft.irfft(error_spectrum(own, shared, whitener), whitener.n)[: min(n_steps, whitener.n // 2)],
+            circle_mean(own) + of_lines.get(name, 0.0) * lines[0] - gained[i],
+            len(spectra.pure))
+        for i, (name, (own, shared)) in enumerate(wanted.items())}
+
+
+def bound(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:
+    """Target -> rms [um] of the least error, as `least_errors`, of one mode of a scenario."""
+    return {name: error.rms for name, error in least_errors(true_spectra(scenario, mode), ahead).items()}
+
+
+@dataclass(frozen=True)
+class Bound:
+    """The least error of a target in a mode of a record."""
+
+    target: str
+    mode: str
+    column: int
+    error: LeastError
+
+
+def bounds(scenario: Scenario, record: Record) -> list[Bound]:
+    """The bounds of a record that was simulated from the scenario; none where its spectra are not known."""
+    if not is_known(scenario):
+        return []
+    modes = scenario.modes[: record.n_modes]
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda mode: least_errors(true_spectra(scenario, mode), n_steps=record.n_steps), range(len(modes))))
+    return [Bound(target, it.name, i, found[i][target]) for i, it in enumerate(modes) for target in TARGETS]
+
+
+def bound_scores(bounds: Sequence[Bound], record: Record, scores: Sequence[Score], warm_up: float) -> list[Score]:
+    """The rows of bounds, for the samples that the rows of the observers are for, or all after the warm-up [s]."""
+    stretches = {(s.target, s.mode): (s.start, s.stop) for s in scores if not s.apart}
+    out = []
+    for it in bounds:
+        start, stop = stretches.get((it.target, it.mode), (None, None))
+        first = round((warm_up if start is None else start) / record.dt)
+        last = record.n_steps if stop is None else round(stop / record.dt)
+        truth = record.truth(it.target)
+        if truth is not None and first < last:
+            scale = rms(truth[first:last, it.column])
+            out.append(Score(
+                BOUND, it.target, it.mode, it.error.rms, scale, it.error.rms / scale if scale > 0 else None, None, 0.0,
+                first * record.dt, last * record.dt, interval=it.error.interval(first, last)))
+    return out

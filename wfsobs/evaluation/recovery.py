@@ -1,0 +1,112 @@
+"""Error against time: who is thrown off by an event, and how soon who is back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from wfsobs.observers.base import Estimate
+from wfsobs.record import Record
+from wfsobs.typing import Array
+
+BACK = 1.1
+"""An observer is back where its error is at most that much of what it was before the event."""
+
+
+def running_rms(record: Record, estimate: Estimate, window: float) -> Array:
+    """Rms of the error over the last `window` [s] at every step, (n_steps, n_modes) [um].
+
+    Steps without an estimate or a truth do not count; NaN where none is left, and before one window has passed. Raises ValueError
+    where the record has no truth for the target.
+    """
+    truth = record.truth(estimate.target)
+    if truth is None:
+        raise ValueError(f"the record has no true {estimate.target}")
+    return trailing_rms(estimate.values - truth, max(round(window / record.dt), 1))
+
+
+def trailing_rms(x: Array, n: int) -> Array:
+    """Rms of x[k-n+1] ... x[k] at every k, (n_steps, n_columns); NaN do not count, and where k < n - 1 it is NaN."""
+    known = ~np.isnan(x)
+    count = trailing_sum(known.astype(float), n)
+    mean = np.divide(trailing_sum(np.where(known, x, 0.0) ** 2, n), count, out=np.full(x.shape, np.nan), where=count > 0)
+    mean[: n - 1] = np.nan
+    return np.sqrt(mean)
+
+
+def trailing_sum(x: Array, n: int) -> Array:
+    """x[k-n+1] + ... + x[k] at every k, zeros before the start; same shape as x (n_steps, n_columns).
+
+    Of blocks of n, the sum from the start of the block to k and that from k - n + 1 to the end of the block before: nothing is
+    taken away, so that a large error leaves no trace in the sums after it.
+    """
+    steps, columns = x.shape
+    blocks = np.zeros((1 + -(-steps // n), n, columns))
+    blocks[1:].reshape(-1, columns)[:steps] = x
+    upto = np.cumsum(blocks, axis=1)
+    after = np.zeros_like(blocks)
+    after[:, :-1] = np.cumsum(blocks[:, :0:-1], axis=1)[:, ::-1]
+    return (upto[1:] + after[:-1]).reshape(-1, columns)[:steps]
+
+
+@dataclass
+class Pooled:
+    """The running rms of several records of one length together: root of the mean of squares, NaN left out."""
+
+    total: Array | float = 0.0
+    count: Array | int = 0
+
+    def add(self, running: Array) -> None:
+        """One more record's, (n_steps, n_modes)."""
+        known = ~np.isnan(running)
+        self.total = self.total + np.where(known, running, 0.0) ** 2
+        self.count = self.count + known
+
+    @property
+    def rms(self) -> Array:
+        """(n_steps, n_modes), NaN where no record has any."""
+        total, count = np.asarray(self.total), np.asarray(self.count)
+        return np.sqrt(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What an event did to an observer in one mode.
+
+    start   : of the event [s]
+    settled : rms of the error before it [um]
+    worst   : highest running rms from it to the next [um]
+    last    : running rms at the end of that time [um]
+    back    : time from its start until the running rms is within 10 % of what it was, and stays so until the next [s]; None
+        where it never is
+    """
+
+    start: float
+    settled: float
+    worst: float
+    last: float
+    back: float | None
+
+
+def recovery(running: Array, dt: float, starts: Sequence[float], window: float, warm_up: float) -> list[Recovery | None]:
+    """What each event did, from a running rms (n_steps,) [um] over `window` [s]; None where nothing is known before or after it.
+
+    starts : of the events [s]; those that start together count as one. What an observer had settled to is its rms over the second
+    half of the time since the event before, or the warm-up.
+    """
+    times = sorted(set(starts))
+    out: list[Recovery | None] = []
+    for before, start, after in zip([warm_up, *times], times, [*times[1:], running.size * dt], strict=False):
+        first, at, end = (min(round(t / dt), running.size) for t in (0.5 * (before + start) + window, start, after))
+        quiet, then = running[min(first, max(at - 1, 0)) : at], running[at:end]
+        quiet, known = quiet[~np.isnan(quiet)], ~np.isnan(then)
+        if not quiet.size or not known.any():
+            out.append(None)
+            continue
+        settled = float(np.sqrt(np.mean(quiet**2)))
+        late = np.flatnonzero(known & (then > BACK * settled))
+        back = 0.0 if not late.size else float((late[-1] + 1) * dt) if late[-1] + 1 < then.size else None
+        out.append(Recovery(start, settled, float(then[known].max()), float(then[known][-1]), back))
+    return out

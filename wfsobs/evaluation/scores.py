@@ -1,0 +1,219 @@
+"""How good estimates are: error, lag, spectra, all after the warm-up; errors that are compared, on common samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import welch
+
+from wfsobs.observers.base import TARGETS, Estimate
+from wfsobs.record import Record
+from wfsobs.typing import Array
+
+PREDICTION, RESIDUAL = "next z", "residual y"
+"""What takes the place of a target where there is no truth: the next measurement, and what the loop left of it."""
+
+LOOP, BOUND = "loop", "bound"
+"""In the place of an observer: the loop that made the record, and the least error that any observer of the LGS could have."""
+
+MAX_LAG = 0.025
+"""Lags beyond this [s] are not looked for."""
+
+SHARE = 0.5
+"""Of the samples after the warm-up, those that the observers of a table must have in common; who leaves fewer stands apart."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """One row of the RMS table: one observer, target and mode.
+
+    rms, truth_rms [um]; normalised_rms = rms / truth_rms, None where the truth is zero; lag [s], positive if the
+    estimate is late, None where it is constant; seconds_per_step: computing time [s] per step and mode.
+    start, stop : the stretch [s] that was scored, None for a mean over all records
+    apart : whether the stretch is the observer's own, not that of the other rows, so that it cannot be compared with them
+    interval [um]: of the bound, where the rms of an optimal observer lies in 95 % of records.
+    """
+
+    observer: str
+    target: str
+    mode: str
+    rms: float
+    truth_rms: float
+    normalised_rms: float | None
+    lag: float | None
+    seconds_per_step: float
+    start: float | None = None
+    stop: float | None = None
+    apart: bool = False
+    interval: tuple[float, float] | None = None
+
+
+def common_samples(known: Sequence[Array]) -> list[tuple[Array, bool]]:
+    """What is scored of every estimate, and whether it stands apart, from the samples that each of them has, (n,) bool.
+
+    From the one with most samples on, everyone takes part whose own leave SHARE of those in common. All of these are scored on
+    the samples that they have in common, every other one on its own, apart.
+    """
+    if not known:
+        return []
+    order = sorted(range(len(known)), key=lambda i: -known[i].sum())
+    shared, apart = known[order[0]], set()
+    for i in order[1:]:
+        both = shared & known[i]
+        if both.sum() >= SHARE * known[order[0]].sum():
+            shared = both
+        else:
+            apart.add(i)
+    return [(known[i] if i in apart else shared, i in apart) for i in range(len(known))]
+
+
+def supervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:
+    """One Score per estimate and mode, those of a target and mode on common samples; none where the record has no truth for the
+    target or no sample is left."""
+    out = []
+    for target in TARGETS:
+        truth, of = record.truth(target), [e for e in estimates if e.target == target]
+        if truth is None:
+            continue
+        for mode, name in enumerate(mode_names):
+            true = truth[:, mode]
+            counts = _after(record, warm_up) & ~np.isnan(true)
+            scored = common_samples([counts & ~np.isnan(e.values[:, mode]) for e in of])
+            for e, (samples, apart) in zip(of, scored, strict=True):
+                if not samples.any():
+                    continue
+                t, value = true[samples], e.values[samples, mode]
+                out.append(Score(
+                    e.observer, target, name, rms(value - t), rms(t), _ratio(value - t, t), lag(t, value, record.dt),
+                    e.seconds_per_step, *_stretch(samples, record.dt), apart))
+    return out
+
+
+def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:
+    """What can be said without truth, on common samples as well; truth_rms is the rms of z throughout.
+
+    - PREDICTION: rms of z[k+1] - phi_hat[k], one step ahead, since z[k+1] = phi_dist[k] + noise and phi_hat[k] knows y up to
+      k. The noise of the measurement stays in. Only an observer that estimates both turbulence and vibration says what
+      z will be; the others cannot be scored so. Samples that were missing do not count.
+    - RESIDUAL: rms of y_lgs, what the recorded loop left.
+    """
+    out: list[Score] = []
+    whole: dict[str, list[Estimate]] = {}
+    for estimate in estimates:
+        whole.setdefault(estimate.observer, []).append(estimate)
+    both = {observer: parts for observer, parts in whole.items() if {e.target for e in parts} == set(TARGETS)}
+    counts = _after(record, warm_up + record.dt)
+    for mode, name in enumerate(mode_names):
+        z, left = record.z[:, mode], record.y_lgs[:, mode]
+        measured = counts & ~np.isnan(z)
+        if not rms(z[measured]) > 0:
+            continue
+        errors = [z - _later(sum(e.values[:, mode] for e in parts)) for parts in both.values()]  # type: ignore[arg-type]
+        scored = common_samples([measured & ~np.isnan(error) for error in errors])
+        for (observer, parts), error, (samples, apart) in zip(both.items(), errors, scored, strict=True):
+            if samples.any():
+                out.append(Score(
+                    observer, PREDICTION, name, rms(error[samples]), rms(z[samples]), _ratio(error[samples], z[samples]), None,
+                    max(e.seconds_per_step for e in parts), *_stretch(samples, record.dt), apart))
+        samples = next((s for s, apart in scored if not apart and s.any()), measured) & ~np.isnan(left)
+        if samples.any():
+            out.append(Score(LOOP, RESIDUAL, name, rms(left[samples]), rms(z[samples]), _ratio(left[samples], z[samples]), None,
+                             0.0, *_stretch(samples, record.dt)))
+    return out
+
+
+def _after(record: Record, warm_up: float) -> Array:
+    """Which steps are after the warm-up [s]."""
+    return np.arange(record.n_steps) >= round(warm_up / record.dt)
+
+
+def _later(x: Array) -> Array:
+    """One step later, NaN first."""
+    return np.concatenate([[np.nan], x[:-1]])
+
+
+def _stretch(samples: Array, dt: float) -> tuple[float, float]:
+    """From the first of the samples to the end of the last [s]."""
+    return float(np.argmax(samples) * dt), float((samples.size - np.argmax(samples[::-1])) * dt)
+
+
+def _ratio(error: Array, signal: Array) -> float | None:
+    """The rms of an error over that of the signal, None where that is zero."""
+    scale = rms(signal)
+    return rms(error) / scale if scale > 0 else None
+
+
+def scored_samples(record: Record, truth: Array, value: Array, warm_up: float) -> tuple[Array, Array]:
+    """(truth, estimate) without the warm-up [s] and without the steps where the estimate is NaN."""
+    start = round(warm_up / record.dt)
+    known = ~np.isnan(value[start:]) & ~np.isnan(truth[start:])
+    return truth[start:][known], value[start:][known]
+
+
+def rms(x: Array) -> float:
+    """Root of the mean square; the mean stays in."""
+    return float(np.sqrt(np.mean(np.square(x)))) if x.size else 0.0
+
+
+def lag(truth: Array, value: Array, dt: float) -> float | None:
+    """Delay of `value` behind `truth` [s]: where their correlation coefficient is highest, between samples by a parabola
+    through three points. Positive is late; None where either is constant.
+
+    The middle of the truth is compared with equally long pieces of the estimate, each with its own mean and variance:
+    a plain cross-correlation has fewer terms at larger lags, which draws the peak of a slow signal, broad as it is, to
+    zero. Of peaks within 2 % of the highest, the periods of a pure tone, it is the one nearest to zero.
+    """
+    reach = min(round(MAX_LAG / dt), (truth.size - 1) // 4)
+    middle = truth[reach : truth.size - reach]
+    if np.ptp(value) == 0 or np.ptp(middle) == 0:
+        return None
+    n, moving = middle.size, value - value.mean()
+    sums, squares = (np.concatenate([[0.0], np.cumsum(x)]) for x in (moving, moving**2))
+    power = squares[n:] - squares[:-n] - (sums[n:] - sums[:-n]) ** 2 / n
+    if not power.max() > 0:  # so small that its square is nothing
+        return None
+    power = np.maximum(power, 1e-12 * power.max())
+    alike = np.correlate(moving, middle - middle.mean(), "valid") / np.sqrt(power)
+    inner = alike[1:-1]
+    tops = 1 + np.flatnonzero((inner >= alike[:-2]) & (inner >= alike[2:]) & (inner >= 0.98 * alike.max()))
+    if tops.size == 0:
+        return float((np.argmax(alike) - reach) * dt)
+    peak = tops[np.argmin(np.abs(tops - reach))]
+    before, at, after = alike[peak - 1 : peak + 2]
+    curvature = before - 2.0 * at + after
+    shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
+    return float((peak - reach + shift) * dt)
+
+
+def welch_psd(x: Array, dt: float, resolution: float = 0.5) -> tuple[Array, Array]:
+    """Frequencies [Hz] and one-sided power spectral density [unit^2/Hz] of x (n, n_columns): Welch's average of
+    half-overlapping Hann windows of 1 / resolution seconds, or of the whole record if that is shorter."""
+    window = min(round(1.0 / (resolution * dt)), x.shape[0])
+    frequency, density = welch(x, fs=1.0 / dt, nperseg=window, axis=0, detrend="constant")
+    return frequency, density
+
+
+def spectra(record: Record, target: str, values: Array, warm_up: float) -> tuple[Array, Array, Array] | None:
+    """(frequency [Hz], density of the values, density of their error against the truth [um^2/Hz], a column per mode).
+
+    Over every sample after the warm-up [s] that has an estimate; None where there are too few. Without a truth the error is zero.
+    """
+    truth = record.truth(target)
+    truth = values if truth is None else truth
+    columns = [scored_samples(record, truth[:, mode], values[:, mode], warm_up) for mode in range(record.n_modes)]
+    shortest = min(true.size for true, _ in columns)
+    if shortest < 16:
+        return None
+    true = np.column_stack([t[-shortest:] for t, _ in columns])
+    value = np.column_stack([v[-shortest:] for _, v in columns])
+    frequency, density = welch_psd(np.hstack([value, value - true]), record.dt)
+    signal, error = np.hsplit(density, 2)
+    return frequency, signal, error
+
+
+def cumulative_rms(frequency: Array, density: Array) -> Array:
+    """Root of the variance above each frequency, from high to low (the AO habit); same shape as `density`."""
+    df = frequency[1] - frequency[0]
+    return np.sqrt(np.cumsum(density[::-1], axis=0)[::-1] * df)

@@ -1,0 +1,157 @@
+"""From a record to its model: noise, turbulence, then peaks one at a time until the residual is white."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import gamma
+
+from wfsobs.identification.one_mode import OneMode
+from wfsobs.identification.remarks import in_time, remarks
+from wfsobs.identification.result import Identified, read_off
+from wfsobs.identification.whiteness import Whiteness, autocorrelation_test, cumulated_test, innovations
+from wfsobs.observers.missing import held
+from wfsobs.progress import QUIET, Watch
+from wfsobs.record import Record, RecordError, pseudo_open_loop
+from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.riccati import RiccatiError
+from wfsobs.spectral.periodogram import fast_length, periodogram
+from wfsobs.spectral.search import LOWEST, PAD, Candidate, Found, search
+from wfsobs.typing import Array
+
+LEVEL = 0.05
+"""Probability of any false peak in a record."""
+EVERY_SWEEP, SELDOM = 8, 4
+"""All numbers are fitted anew after every peak, of many peaks after every so many: each has been fitted alone."""
+MOST_PEAKS = 40
+"""Per mode."""
+SHORTEST = 1000
+"""Samples of a record at least."""
+ALONE = 0.8
+"""Share of the level for modes alone, where there are several: a line in one of them has no power to spare, one in all has."""
+LEAST = 0.5
+"""Share of the samples that are measured at least."""
+RESTING = 1e-9
+"""Rms over largest value of a measurement that is a constant with rounding errors."""
+JOINT = 1e-3
+"""A candidate of all modes together belongs to those in which white noise would be as high with this probability."""
+
+
+def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, watch: Watch = QUIET) -> Identified:
+    """The model of every mode of a record, from its pseudo-open-loop measurement z; lost samples are told from measured ones.
+
+    level : probability of finding any peak where there is none;  lowest : frequency from which peaks are looked for [Hz]
+    Raises RecordError for a record that is too short, lacks too much or does not move, Cancelled.
+    """
+    if np.isinf(record.y_lgs).any() or np.isinf(record.u).any():
+        raise RecordError("the record has samples that are infinite")
+    z = pseudo_open_loop(record.y_lgs, held(record.u), record.delay)[record.delay :]
+    z = z[: fast_length(len(z))]
+    if len(z) < SHORTEST:
+        raise RecordError(f"the record has {record.n_steps} samples, to identify it takes {SHORTEST + record.delay} or more")
+    if not lowest < 0.25 / record.dt:
+        raise RecordError(f"peaks from {lowest:g} Hz: takes a frequency below a quarter of the rate, {0.25 / record.dt:g} Hz")
+    names = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
+    if record.n_modes > len(names):
+        raise RecordError(f"the record has {record.n_modes} modes, at most {len(names)} can be identified")
+    for name, column in zip(names, z.T, strict=False):
+        if (count := np.count_nonzero(np.isfinite(column))) < max(SHORTEST, LEAST * len(z)):
+            raise RecordError(
+                f"{name}: {count} of {len(z)} samples are measured, to identify it takes {SHORTEST}, and {LEAST:.0%}")
+        if not np.nanstd(column) > RESTING * np.nanmax(np.abs(column)):
+            raise RecordError(f"{name}: z does not change, there is nothing to identify")
+    modes = []
+    for column in z.T:
+        watch.check()
+        modes.append(OneMode(column, record.dt))
+    grow(modes, level, lowest, watch)
+    left = unexplained(modes, level, lowest)
+    found = tuple(
+        read_off(name, mode, lowest, tested(mode, count)) for name, mode, count in zip(names, modes, left, strict=False))
+    watch.step(1.0)
+    return Identified(found, record.dt, len(z), level)
+
+
+def grow(modes: Sequence[OneMode], level: float, lowest: float, watch: Watch) -> None:
+    """Add peaks to the modes, one to each at a time, until no test sees any more; then polish, and look once more."""
+    for again in (False, True):  # the first spectra are rough: they say what not to fit, not what is a peak
+        look(modes, level, lowest)
+        for mode in modes:
+            mode.refit(reshape=again)
+    polished = False
+    for sweep in range(3 * MOST_PEAKS):
+        watch.step(1.0 - 1.0 / (1.0 + 0.1 * sweep))
+        seen = False
+        for mode, best in zip(modes, look(modes, level, lowest), strict=True):
+            if best is None or mode.peaks >= MOST_PEAKS:
+                continue
+            seen = True
+            if mode.explain(best) and (sweep < EVERY_SWEEP or sweep % SELDOM == 0):
+                mode.refit()
+        if not seen:
+            if polished and not sum(mode.prune() for mode in modes):
+                return
+            third = any(isinstance(mode.spectrum.turbulence, Ar3) for mode in modes)
+            for mode in modes:
+                mode.polish(third)
+        polished = not seen
+
+
+def look(modes: Sequence[OneMode], level: float, lowest: float) -> list[Candidate | None]:
+    """The strongest candidate of every mode, if any; what is strong takes no part in the next fit."""
+    out = []
+    for mode, found in zip(modes, candidates(modes, level, lowest), strict=True):
+        mode.strong = np.logical_or.reduce([one.strong for one in found])
+        out.append(max((one.best for one in found if one.best), key=lambda c: c.strength, default=None))
+    return out
+
+
+def candidates(modes: Sequence[OneMode], level: float, lowest: float) -> list[list[Found]]:
+    """What the search finds in every mode, alone and with all the others."""
+    whitened = [mode.whitened() for mode in modes]
+    n, dt, several = modes[0].n, modes[0].dt, len(modes) > 1
+    alone = ALONE * level if several else level
+    out = [[search(fine, n, dt, 1, alone / len(modes), lowest)] for fine in whitened]
+    if several:
+        together = search(sum(whitened, np.zeros_like(whitened[0])), n, dt, len(modes), level - alone, lowest)
+        for own, fine in zip(out, whitened, strict=True):
+            if together.best is not None and _has_part(fine, n * dt, together.best.frequency, together.best.width):
+                own.append(together)
+    return out
+
+
+def _has_part(fine: Array, T: float, frequency: float, width: int) -> bool:
+    """Whether a mode is high itself where all of them together are."""
+    if width == 1:
+        return bool(fine[max(round(frequency * PAD * T) - 1, 0)] > -np.log(JOINT))
+    centre = round(frequency * T)
+    bins = fine[PAD - 1 :: PAD][max(centre - width // 2 - 1, 0) : centre + width // 2]
+    return bool(bins.sum() > gamma.isf(JOINT, width))
+
+
+def unexplained(modes: Sequence[OneMode], level: float, lowest: float) -> list[int]:
+    """Per mode, how many of the candidates that no peak explained the search still sees."""
+    refused = [mode.refused for mode in modes]
+    for mode in modes:
+        mode.refused = []
+    out = []
+    for mode, were, found in zip(modes, refused, candidates(modes, level, lowest), strict=True):
+        flagged = mode.f[np.logical_or.reduce([one.flagged for one in found])]
+        out.append(sum(bool(np.any(np.abs(flagged - c.frequency) <= (c.width + 1) * mode.f[0])) for c in were))
+        mode.refused = were
+    return out
+
+
+def tested(mode: OneMode, left: int) -> Whiteness:
+    """The tests of what a mode's model leaves; left : candidates that no peak explains."""
+    ratio = periodogram(mode.complete, mode.dt) / mode.spectrum.psd(mode.f)
+    cumulated = cumulated_test(ratio, mode.n)
+    try:
+        e = innovations(mode.complete, mode.spectrum)
+    except RiccatiError as error:  # of what is no noise at all
+        return Whiteness(cumulated, 0.0, left, (str(error),))
+    result = Whiteness(cumulated, autocorrelation_test(e, len(mode.spectrum.vector)), left)
+    return replace(result, remarks=tuple(in_time(e, mode.dt)) if result.white else remarks(mode.f, ratio, e, mode.dt))

@@ -1,0 +1,253 @@
+"""The model of one mode as it grows: a spectrum, and the pure lines that have been taken off."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import pi
+
+import numpy as np
+
+from wfsobs.identification.misfit import margin
+from wfsobs.identification.order import of_best_order, with_background
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.spectral.lines import Line, nearest_line
+from wfsobs.spectral.missing import Missing
+from wfsobs.spectral.model import RMS, Spectrum
+from wfsobs.spectral.periodogram import Cells, frequencies, inflation, periodogram
+from wfsobs.spectral.search import PAD, Candidate
+from wfsobs.spectral.whittle import first_guess, fitted, negative_log_likelihood, standard_deviations
+from wfsobs.typing import Array
+
+NEIGHBOURS = 4.0
+"""Bins, beside half its width, within which something new is no peak of its own: two peaks that near are one."""
+WIDEST_LINE = 9
+"""Bins over which a pure line may be the best of what was looked at."""
+RESOLVED = 0.2
+"""Half width at half maximum of a resonance at least, in bins; what is narrower is a line."""
+WIDEST = 0.5
+"""Damping of a resonance at most."""
+SURE = 2.0
+"""Standard deviations that the rms of a resonance has at least."""
+WORTH = 6.0
+"""Log-likelihood that three numbers more have to gain: noise gives as much with a probability of 0.7 % (chi squared of 12)."""
+SPLIT = 8.0
+"""The same for two resonances in the place of one, which every wide one is tried for."""
+
+SETTLED = 0.01
+"""Of the error of a fill that repeated filling and fitting leaves: each leaves the share that is missing, about."""
+
+
+class OneMode:
+    """z (n,) of one mode, mean taken off, and what has been found in it; NaN is a missing sample.
+
+    spectrum, lines : the model;  left : z without the lines, filled as the model expects;  I : expected periodogram of that
+        if it were complete;  share : of every bin that is measured, see `missing`;  refused : candidates that no peak explains
+    """
+
+    def __init__(self, z: Array, dt: float, rng: np.random.Generator | None = None):
+        self.measured, self.dt, self.n = z - np.nanmean(z), dt, len(z)
+        self.missing = Missing(np.isnan(z), dt, rng or np.random.default_rng(0))
+        self.f = frequencies(self.n, dt)
+        self.share, self.unknown, self.lost = np.ones(len(self.f)), np.zeros((0, self.n)), np.zeros(len(self.f))
+        self.z = self.missing.interpolated(self.measured)
+        self.lines: list[Line] = []
+        self._take_off()
+        self.spectrum = first_guess(self.f, self.I, dt)
+        self.strong = np.zeros(len(self.f), bool)
+        self.refused: list[Candidate] = []
+        self._fill()
+
+    def _fill(self) -> None:
+        """Fill z as the model expects it now."""
+        if self.missing.any:
+            S, lines = self.spectrum.psd(self.f), self._signal()
+            self.unknown = self.missing.unknown(S)
+            self.share = self.missing.measured(S, self.unknown)
+            self.lost = (1.0 - self.share) * S
+            self.z = self.missing.filled(self.measured - lines, S) + lines
+            self._take_off()
+
+    def _signal(self) -> Array:
+        return sum((line.signal(self.n, self.dt) for line in self.lines), np.zeros(self.n))
+
+    def _take_off(self) -> None:
+        self.left = self.z - self._signal()
+        self.I = periodogram(self.left, self.dt) + self.lost
+
+    @property
+    def complete(self) -> Array:
+        """`left` with a sample of what is unknown in its gaps, (n,): as likely as the record that would have been."""
+        return self.left + self.unknown[0] if self.missing.any else self.left
+
+    @property
+    def peaks(self) -> int:
+        """How many there are."""
+        return len(self.lines) + len(self.spectrum.resonances)
+
+    def whitened(self) -> Array:
+        """I / S at PAD frequencies per bin, 1 at what has been refused; S as high as it may be (`misfit`)."""
+        f = frequencies(self.n, self.dt, PAD)
+        S = self.spectrum.psd(self.f)
+        S = np.exp(np.interp(f, self.f, np.log(S * self.share * margin(self.I / S))))
+        ratio = periodogram(self.left, self.dt, PAD) / S
+        for candidate in self.refused:
+            ratio[np.abs(f - candidate.frequency) <= (0.5 * candidate.width + 0.5) * self.f[0]] = 1.0
+        return ratio
+
+    def cells(self, everything: bool = False) -> Cells:
+        """The bins for a fit: all but those that a test finds far too high and that no resonance is near."""
+        keep = np.ones(len(self.f)) if everything else np.where(self.strong, 0.0, 1.0)
+        for p in self.spectrum.resonances:
+            centre, half = p.omega / (2 * pi), max(4.0 * p.damping * p.omega / (2 * pi), 20.0 * self.f[0])
+            keep[np.abs(self.f - centre) < half] = 1.0
+        return Cells(self.f, self.I, keep, [p.omega / (2 * pi) for p in self.spectrum.resonances], self.share)
+
+    def refit(self, reshape: bool = False, third: bool = False) -> None:
+        """All numbers of the spectrum at once; reshape : whether order of the turbulence and background are chosen anew, third :
+        third order in any case. A resonance that has become as narrow as a line is one from then on; one that has become as
+        wide as turbulence is dropped."""
+        cells = self.cells()
+        self.spectrum = fitted(self.spectrum, cells)
+        if reshape:
+            self.spectrum = with_background(of_best_order(self.spectrum, cells, third), cells)
+        for p in [p for p in self.spectrum.resonances if not self._sound(p)]:
+            self.spectrum = replace(self.spectrum, resonances=tuple(q for q in self.spectrum.resonances if q is not p))
+            frequency = p.omega / (2 * pi)
+            if p.damping < WIDEST and 2.0 * self.f[0] < frequency < self.f[-1]:
+                self.lines = [*self.lines, nearest_line(self.left, self.dt, frequency, 0.75 * self.f[0])]
+            self.refused.append(Candidate(frequency, WIDEST_LINE, 0.0))  # or it would come back
+            self._take_off()
+        self._fill()
+
+    def _sound(self, p: Ar2) -> bool:
+        """Whether a resonance is wide enough to be told from a line, narrow enough to be told from turbulence, and below half the
+        rate."""
+        frequency = p.omega / (2 * pi)
+        return RESOLVED * self.f[0] < p.damping * frequency and p.damping < WIDEST and 2.0 * self.f[0] < frequency < self.f[-1]
+
+    def explain(self, candidate: Candidate) -> bool:
+        """Add the line or the resonance that explains the candidate best, or where there are lines beside it make one
+        resonance of them; whether that is worth its numbers."""
+        window = self._window(candidate)
+        before = self._misfit(window, self.spectrum, self.I)
+        lines, spectrum = self.lines, self.spectrum
+        beside = [line for line in lines if abs(line.frequency - candidate.frequency) < self._reach(candidate)]
+        trials: list[tuple[list[Line], Spectrum]] = []
+        if beside:
+            self.lines = rest = [line for line in lines if line not in beside]
+            self._take_off()
+            centre = float(np.mean([line.frequency for line in beside]))
+            trials.append((rest, self._with_resonance(Candidate(centre, max(candidate.width, 3), candidate.strength))))
+        elif not any(abs(p.omega / (2 * pi) - candidate.frequency) < self._reach(candidate) for p in spectrum.resonances):
+            trials.append((lines, self._with_resonance(candidate)))
+            if candidate.width <= WIDEST_LINE:
+                at = self._strongest_bin(candidate)
+                trials.append(([*lines, nearest_line(self.left, self.dt, at, 0.75 * self.f[0])], spectrum))
+        outcomes = []
+        for some, shape in trials:
+            self.lines = some
+            self._take_off()
+            if len(shape.resonances) > len(spectrum.resonances) and not self._sound(shape.resonances[-1]):
+                continue
+            peaks_more = len(some) - len(lines) + len(shape.resonances) - len(spectrum.resonances)
+            gain = before - self._misfit(window, shape, self.I) - WORTH * peaks_more
+            outcomes.append((gain, some, shape))
+        gain, some, shape = max(outcomes, key=lambda o: o[0], default=(0.0, lines, spectrum))
+        if gain <= 0:
+            some, shape = lines, spectrum
+            self.refused.append(candidate)
+        self.lines, self.spectrum = some, shape
+        self._take_off()
+        return gain > 0
+
+    def _reach(self, candidate: Candidate) -> float:
+        return (NEIGHBOURS + candidate.width / 2.0) * self.f[0]
+
+    def _window(self, candidate: Candidate) -> Array:
+        """The bins over which explanations of a candidate are compared."""
+        half = max(3.0 * self._reach(candidate), 0.03 * candidate.frequency)
+        return np.abs(self.f - candidate.frequency) < half
+
+    def _misfit(self, window: Array, spectrum: Spectrum, I: Array) -> float:  # noqa: E741
+        S = spectrum.psd(self.f[window])
+        return float(np.sum(np.log(S) + I[window] / S))
+
+    def _strongest_bin(self, candidate: Candidate) -> float:
+        near = np.abs(self.f - candidate.frequency) <= candidate.width / 2.0 * self.f[0]
+        if candidate.width == 1:
+            return candidate.frequency
+        return float(self.f[near][np.argmax(self.I[near] / self.spectrum.psd(self.f[near]))])
+
+    def _with_resonance(self, candidate: Candidate) -> Spectrum:
+        """A resonance of the candidate's width more, it alone fitted to the bins about it."""
+        f0, half = candidate.frequency, 0.5 * candidate.width * self.f[0]
+        near = np.abs(self.f - f0) <= max(half, self.f[0])
+        excess = np.maximum(self.I[near] - self.spectrum.psd(self.f[near]), 0.0)
+        power, f0 = float(excess.sum() * self.f[0]), float(excess @ self.f[near] / excess.sum()) if excess.any() else f0
+        best: tuple[float, Spectrum] | None = None
+        for share in (0.15, 0.5):
+            damping = min(max(share * half / f0, 1e-6), 0.5)
+            new = Ar2(2.0 * pi * f0, damping, np.sqrt(max(power, 1e-16)), self.dt)
+            wider = replace(self.spectrum, resonances=(*self.spectrum.resonances, new))
+            window = self._window(candidate)
+            keep = np.where(window, 1.0, 0.0)
+            cells = Cells(self.f, self.I, keep, [p.omega / (2 * pi) for p in wider.resonances])
+            count = len(wider.vector)
+            shape = fitted(wider, cells, range(count - 3, count))
+            value = negative_log_likelihood(shape, cells)
+            if best is None or value < best[0]:
+                best = value, shape
+        assert best is not None
+        return best[1]
+
+    def polish(self, third: bool = False) -> None:
+        """Every line once more with the others taken off, and all numbers on all bins; third : turbulence of third order in any
+        case, as another mode has it."""
+        for again in range(self.missing.rounds(SETTLED)):
+            self._polish_lines()
+            self.refit(not again, third)
+        for p in self.spectrum.resonances:
+            self._split(p)
+
+    def _polish_lines(self) -> None:
+        for i, line in enumerate(self.lines):
+            alone = self.left + line.signal(self.n, self.dt)
+            again = nearest_line(alone, self.dt, line.frequency, 0.25 * self.f[0])
+            self.left = alone - again.signal(self.n, self.dt)
+            self.lines[i] = again
+        self._take_off()
+
+    def _split(self, p: Ar2) -> None:
+        """Two resonances in the place of one that is several bins wide, where they are worth it: neighbours look like one."""
+        f0 = p.omega / (2 * pi)
+        half = p.damping * f0
+        if half < 2.0 * NEIGHBOURS * self.f[0]:
+            return
+        rest = [q for q in self.spectrum.resonances if q is not p]
+        two = [Ar2(2 * pi * (f0 + sign * 0.7 * half), 0.4 * p.damping, p.rms / np.sqrt(2.0), self.dt) for sign in (-1, 1)]
+        start = replace(self.spectrum, resonances=(*rest, *two))
+        keep = np.where(self._window(Candidate(f0, int(4.0 * half / self.f[0]), 0.0)), 1.0, 0.0)
+        cells = Cells(self.f, self.I, keep, [q.omega / (2 * pi) for q in (*start.resonances, p)])
+        count = len(start.vector)
+        shape = fitted(start, cells, range(count - 6, count))
+        gain = negative_log_likelihood(self.spectrum, cells) - negative_log_likelihood(shape, cells)
+        if gain > SPLIT and all(map(self._sound, shape.resonances[-2:])):
+            self.spectrum = shape
+            self.refit()
+
+    def prune(self) -> bool:
+        """Take off the resonance whose rms is least certain, if that is below SURE of its standard deviations: a neighbour has
+        its power as well. Whether there was one."""
+        std, starts = self.errors(), self.spectrum.starts[len(self.spectrum.processes) - len(self.spectrum.resonances) :]
+        worst = max(range(len(self.spectrum.resonances)), key=lambda i: std[starts[i] + RMS], default=None)
+        if worst is None or std[starts[worst] + RMS] * SURE < 1.0:
+            return False
+        p = self.spectrum.resonances[worst]
+        self.spectrum = replace(self.spectrum, resonances=tuple(q for q in self.spectrum.resonances if q is not p))
+        self.refused.append(Candidate(p.omega / (2 * pi), max(round(p.damping * p.omega / pi / self.f[0]), WIDEST_LINE), 0.0))
+        self.refit()
+        return True
+
+    def errors(self) -> Array:
+        """Standard deviations of the spectrum's numbers, see `standard_deviations`."""
+        return standard_deviations(self.spectrum, self.cells(everything=True), inflation(self.n))

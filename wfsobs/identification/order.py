@@ -1,0 +1,65 @@
+"""What is smooth in the spectrum of a mode: turbulence of second or of third order, and a coloured background or none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.periodogram import Cells
+from wfsobs.spectral.whittle import fitted, negative_log_likelihood
+
+WORTH = 6.0
+"""Log-likelihood that the third corner has to gain: noise gives as much with a probability of 0.05 % (chi squared of 12)."""
+STARTS = (1.5, 6.0)
+"""Third corners, over the first two, that a fit starts from."""
+BACKGROUND, DAMPING = 8.0, 0.8
+"""The same for a background, which has two numbers: 0.03 % (chi squared of 16); and its damping."""
+APART = 5.0
+"""Corner of a background over that of turbulence at least."""
+REACHES = (0.02, 0.08)
+"""Corners of a background, over the rate, that a fit starts from: 20 and 80 Hz at 1 kHz."""
+
+
+def of_best_order(spectrum: Spectrum, cells: Cells, third: bool = False) -> Spectrum:
+    """A fitted spectrum with its turbulence an AR(2) or, where that is worth one number more or asked for, of third order."""
+    t = spectrum.turbulence
+    if t is None or (third and isinstance(t, Ar3)):
+        return spectrum
+    if isinstance(t, Ar3):
+        lower, higher = _smooth(replace(spectrum, turbulence=Ar2(t.omega, t.damping, t.rms, t.dt)), cells), spectrum
+    else:
+        starts = [replace(spectrum, turbulence=Ar3(t.omega, t.damping, k * t.omega, t.rms, t.dt)) for k in STARTS]
+        lower, higher = spectrum, min((_smooth(s, cells) for s in starts), key=lambda s: negative_log_likelihood(s, cells))
+    gain = negative_log_likelihood(lower, cells) - negative_log_likelihood(higher, cells)
+    return higher if third or gain > WORTH else lower
+
+
+def with_background(spectrum: Spectrum, cells: Cells) -> Spectrum:
+    """A fitted spectrum with a background, if that is worth it, or without: an AR(2) so damped that it is flat up to its corner,
+    far above that of turbulence. The aliasing of a Shack-Hartmann sensor is like that."""
+    if spectrum.background:
+        without, wide = _smooth(replace(spectrum, background=None), cells), spectrum
+    else:
+        dt, shapes = spectrum.dt, []
+        for reach in REACHES:
+            rms = spectrum.noise * np.sqrt(reach)  # half of the density of the noise, about
+            shapes.append(_smooth(replace(spectrum, background=Ar2(2.0 * np.pi * reach / dt, DAMPING, rms, dt)), cells))
+        without, wide = spectrum, min(shapes, key=lambda s: negative_log_likelihood(s, cells))
+    gain = negative_log_likelihood(without, cells) - negative_log_likelihood(wide, cells)
+    return wide if gain > BACKGROUND and _beyond_turbulence(wide) else without
+
+
+def _beyond_turbulence(spectrum: Spectrum) -> bool:
+    """Whether a background is none of the turbulence's own shape."""
+    assert spectrum.background is not None
+    return spectrum.turbulence is None or spectrum.background.omega > APART * spectrum.turbulence.omega
+
+
+def _smooth(spectrum: Spectrum, cells: Cells) -> Spectrum:
+    """All that is smooth fitted, resonances left as they are."""
+    spectrum = spectrum.moved(spectrum.vector)  # within the bounds of its numbers
+    return fitted(spectrum, cells, range(spectrum.starts[len(spectrum.processes) - len(spectrum.resonances)]))

@@ -1,0 +1,129 @@
+"""An identification as rows for machines, as a table for people, and as a TOML file of settings."""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import Any
+
+from rich.table import Table
+
+from wfsobs.identification.process import Number, Process
+from wfsobs.identification.result import Identified, IdentifiedMode
+from wfsobs.identification.whiteness import LEVEL
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import annotated, to_toml
+
+Row = tuple[str, Number | None, Number | None, Number | None]
+"""What it is, its frequency [Hz], its damping, its rms [um]."""
+
+
+def plain(result: Identified) -> dict[str, Any]:
+    """What `wfsobs identify --json` prints: every number with its standard deviation as `_std`, rms in um, frequencies in Hz."""
+    def numbers(**named: Number) -> dict[str, float]:
+        return {k: v for name, n in named.items() for k, v in ((name, n.value), (f"{name}_std", n.std))}
+
+    def of(p: Process) -> dict[str, float]:
+        return numbers(**{name: n for name, n in vars(p).items() if n is not None})
+
+    return {
+        "duration": result.duration, "level": result.level, "white": result.white,
+        "modes": [
+            {
+                "mode": m.name, **numbers(noise=m.noise),
+                "turbulence": None if m.turbulence is None else of(m.turbulence),
+                "background": None if m.background is None else of(m.background),
+                "peaks": [{**of(p), "pure": p.pure} for p in m.peaks],
+                "whiteness": {"cumulated_p": m.whiteness.cumulated, "innovations_p": m.whiteness.innovations,
+                              "unexplained": m.whiteness.left, "white": m.whiteness.white,
+                              "remarks": list(m.whiteness.remarks)},
+            }
+            for m in result.modes
+        ],
+    }
+
+
+def table(result: Identified) -> Table:
+    """Noise, turbulence and peaks of every mode."""
+    out = Table(title=f"Identified from {result.duration:.1f} s, with standard deviations")
+    for name in ("Mode", "What"):
+        out.add_column(name, no_wrap=True)
+    for name in ("frequency, Hz", "damping", "rms, nm"):
+        out.add_column(name, justify="right", no_wrap=True)
+    for m in result.modes:
+        out.add_section()
+        for what, frequency, damping, rms in rows(m):
+            numbers = (frequency, damping, None if rms is None else _nm(rms))
+            out.add_row(m.name, what, *("" if n is None else written(n) for n in numbers))
+    return out
+
+
+def rows(mode: IdentifiedMode) -> list[Row]:
+    """Everything in a mode, peaks by frequency."""
+    out: list[Row] = [("white noise", None, None, mode.noise)]
+    if (t := mode.turbulence) is not None:
+        out.append(("turbulence", t.frequency, t.damping, t.rms))
+        if (third := t.third_corner) is not None:
+            out.append(("its third corner", Number(*(x * t.frequency.value for x in third)), None, None))
+    if (b := mode.background) is not None:
+        out.append(("background, up to", b.frequency, None, b.rms))
+    return out + [("line" if p.pure else "resonance", p.frequency, p.damping, p.rms) for p in mode.peaks]
+
+
+def verdict(result: Identified) -> list[str]:
+    """One line per mode on what is left."""
+    out = []
+    for m in result.modes:
+        w = m.whiteness
+        tests = f"cumulated spectrum p = {w.cumulated:.2g}, innovations p = {w.innovations:.2g}"
+        rest = f"; {w.left} candidates that no peak explains" if w.left else ""
+        why = "".join(f"; {remark}" for remark in w.remarks)
+        out.append(f"{m.name}: what is left is {'white' if w.white else 'NOT white'} at {LEVEL:.0%} ({tests}{rest}){why}")
+    return out
+
+
+def _nm(n: Number) -> Number:
+    return Number(n.value * 1e3, n.std * 1e3)
+
+
+def written(n: Number) -> str:
+    """A number to two digits of its standard deviation; the damping of a pure line, which is not estimated, as 0.
+
+    >>> written(Number(47.43812, 0.0264)), written(Number(502.3, 25.1)), written(Number(0.0, 0.0))
+    ('47.438 +- 0.026', '502 +- 25', '0')
+    """
+    if n == (0.0, 0.0):
+        return "0"
+    digits = max(0, 1 - int(f"{n.std:e}".split("e")[1])) if n.std > 0 else 4
+    return f"{n.value:.{digits}f} +- {n.std:.{digits}f}"
+
+
+def toml(result: Identified, scenario: Scenario) -> str:
+    """The scenario of the result as TOML, a standard deviation beside every number that was found."""
+    count = sqrt(scenario.sensors.lgs_count)
+    notes = {path: f"+- {number.std:.2g}" for path, number in result.shared(scenario).items()}
+    notes["sensors.lgs_noise_per_mode"] = "+- " + ", ".join(f"{count * m.noise.std:.2g}" for m in result.modes)
+    smooth = [(m.name, what, p) for m in result.modes for what, p in _smooth(m)]
+    for i, (mode, what, p) in enumerate(smooth):
+        notes |= _notes(f"turbulence.processes.{i}", p, f"{mode}, {what}, ")
+    for i, (mode, p) in enumerate(result.all_peaks):
+        notes |= _notes(f"vibration.peaks.{i}", p, f"{mode}, ")
+    head = [f"Identified from {result.duration:.1f} s; +- is one standard deviation.", *verdict(result)]
+    return "\n".join(f"# {line}" for line in head) + "\n\n" + annotated(to_toml(scenario), notes)
+
+
+def _smooth(mode: IdentifiedMode) -> list[tuple[str, Process | None]]:
+    """What a mode has in `turbulence.processes`, in its order; a resonance too low for a peak has no numbers here."""
+    named = [("turbulence", mode.turbulence), ("background", mode.background)]
+    found: list[tuple[str, Process | None]] = [(what, p) for what, p in named if p is not None]
+    return found + [("below the lowest peak", None)] * (len(mode.prior.turbulence) - len(found))
+
+
+def _notes(path: str, p: Process | None, whose: str) -> dict[str, str]:
+    """Comments of the settings of one process or peak."""
+    if p is None:
+        return {f"{path}.frequency": whose.removesuffix(", ")}
+    numbers = {"frequency": p.frequency, "damping": p.damping, "rms": p.rms, "third_corner": p.third_corner}
+    notes = {f"{path}.{name}": f"+- {n.std:.2g}" for name, n in numbers.items() if n is not None and n.std}
+    if p.pure:
+        notes[f"{path}.damping"] = "a pure line"
+    return notes | {f"{path}.frequency": f"{whose}+- {p.frequency.std:.2g}"}

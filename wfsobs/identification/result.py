@@ -1,0 +1,148 @@
+"""What an identification found, with the standard deviation of every number, and the scenario that it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi, sqrt
+from typing import Any
+
+import numpy as np
+
+from wfsobs.identification.one_mode import OneMode
+from wfsobs.identification.process import Number, Peak, Process, mean, merged
+from wfsobs.identification.settings import fitting, told
+from wfsobs.identification.whiteness import Whiteness
+from wfsobs.prior.model import Line, Prior
+from wfsobs.scenario import Scenario
+from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
+from wfsobs.signal.ar2 import Ar2, turbulence_corner
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.simulation.layers import relative_rms
+from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.whittle import NO_NEARER
+from wfsobs.typing import Array
+
+LARGEST = 100.0
+"""Strength of turbulence [um] that a scenario's settings allow."""
+
+
+@dataclass(frozen=True)
+class IdentifiedMode:
+    """The model of one mode: noise, rms of z's white noise [um]; turbulence, or None; coloured background, or None; peaks by
+    frequency; what the tests say.
+
+    spectrum : of all but the pure lines;  prior : what an observer is told of the mode
+    """
+
+    name: str
+    noise: Number
+    turbulence: Process | None
+    background: Process | None
+    peaks: tuple[Process, ...]
+    spectrum: Spectrum
+    prior: Prior
+    whiteness: Whiteness
+
+
+@dataclass(frozen=True)
+class Identified:
+    """The model of a record: one IdentifiedMode per column; dt [s], samples used, level of the search."""
+
+    modes: tuple[IdentifiedMode, ...]
+    dt: float
+    n_steps: int
+    level: float
+
+    @property
+    def duration(self) -> float:
+        """What was used of the record [s]."""
+        return self.n_steps * self.dt
+
+    @property
+    def white(self) -> bool:
+        """Whether what is left of every mode passes every test."""
+        return all(mode.whiteness.white for mode in self.modes)
+
+    @property
+    def peaks(self) -> list[Peak]:
+        """The peaks of all modes together, those that agree as one."""
+        return merged([mode.peaks for mode in self.modes])
+
+    @property
+    def all_peaks(self) -> list[tuple[str, Process]]:
+        """Name of the mode and peak, of every peak of every mode, in the order that `scenario` has them."""
+        found = [(p.frequency.value, p.damping.value, p.rms.value, i, p) for i, mode in enumerate(self.modes) for p in mode.peaks]
+        return [(self.modes[i].name, p) for *_, i, p in sorted(found, key=lambda each: each[:4])]
+
+    def scenario(self, base: Scenario | None = None) -> Scenario:
+        """A scenario whose z has the spectra found, every mode with its own noise, turbulence and peaks; the Kalman filters
+        follow it. A background counts as turbulence.
+
+        base : where everything else comes from, but its events, which name peaks by their number, and bands that the rate has no
+            room for. Wind, damping and strength of turbulence become the means over the modes, for who goes on from there.
+        """
+        out = (base or Scenario()).before_events.replace(
+            {"telescope.radial_order": _order(len(self.modes)), "sensors.lgs_rate": 1.0 / self.dt})
+        changes: dict[str, Any] = {path: number.value for path, number in self.shared(out).items()}
+        return out.replace(changes | fitting(out, 0.5 / self.dt) | told([mode.prior for mode in self.modes], out) | {
+            "sensors.noise_from": "nm", "sensors.lgs_combination": "mean", "sensors.lgs_low_frequency_rms": 0.0,
+            "sensors.tip_tilt_indetermination": False,
+            "kalman.process_noise": "matched", "kalman.measurement_noise": "matched", "kalman.peak": "matched",
+        })
+
+    def shared(self, scenario: Scenario) -> dict[str, Number]:
+        """Dotted path -> number of the settings that all modes share, and their errors; within what the settings allow."""
+        modes = [*zip(self.modes, scenario.modes, strict=False)]
+        noises = [_scaled(m.noise, sqrt(scenario.sensors.lgs_count)) for m in self.modes]
+        out = {"sensors.lgs_noise": _within(mean(noises), 0.0, 10.0)}
+        seen = [(i, m.turbulence, mode.radial_order) for i, (m, mode) in enumerate(modes) if m.turbulence]
+        if seen:
+            corner = [2 * pi / turbulence_corner(1.0, scenario.telescope.diameter, order) for _, _, order in seen]
+            winds = [_scaled(t.frequency, per) for (_, t, _), per in zip(seen, corner, strict=True)]
+            out["turbulence.wind_speed"] = _within(mean(winds), 0.1, 100.0)
+            out["turbulence.damping"] = _within(mean([t.damping for _, t, _ in seen]), 0.01, 1.0)
+            strengths = [_scaled(t.rms, 1.0 / relative_rms(scenario, i)) for i, t, _ in seen]
+            if thirds := [t.third_corner for _, t, _ in seen if t.third_corner]:
+                out["turbulence.third_corner"] = _within(mean(thirds), 1.0, 1000.0)
+            out["turbulence.rms"] = _within(mean(strengths), 0.0, LARGEST)
+        return out
+
+
+def read_off(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> IdentifiedMode:
+    """The numbers of a mode and their standard deviations. A resonance below the lowest frequency [Hz] that was looked at is a
+    part of the turbulence's shape, and no peak; an observer is told of it as such."""
+    std = mode.errors()
+    noise = _scaled(Number(1.0, float(std[0])), mode.spectrum.noise)
+    found = [_process(p, std[start:]) for start, p in zip(mode.spectrum.starts, mode.spectrum.processes, strict=False)]
+    turbulence, background = (None if p is None else found.pop(0) for p in (mode.spectrum.turbulence, mode.spectrum.background))
+    for line in mode.lines:
+        floor = float(mode.spectrum.psd(np.array([line.frequency]))[0]) / float(np.interp(line.frequency, mode.f, mode.share))
+        in_frequency, in_rms = line.standard_deviations(mode.n, mode.dt, floor)
+        found.append(Process(Number(line.frequency, in_frequency), Number(0.0, 0.0), Number(line.rms, in_rms)))
+    peaks = sorted((p for p in found if p.frequency.value >= lowest), key=lambda p: p.frequency.value)
+    s = mode.spectrum
+    below = [p for p in s.resonances if p.omega / (2 * pi) < lowest]
+    prior = Prior(s.noise, s.dt, tuple(p for p in (s.turbulence, s.background, *below) if p is not None),
+                  tuple(Line(p.frequency.value, p.damping.value, p.rms.value) for p in peaks))
+    return IdentifiedMode(name, noise, turbulence, background, tuple(peaks), s, prior, whiteness)
+
+
+def _process(p: Ar2 | Ar3, std: Array) -> Process:
+    """With the standard deviations of its numbers, those of frequency, rms and third corner relative, the first of std."""
+    beyond = p.corner / p.omega - 1.0 if isinstance(p, Ar3) else 0.0
+    return Process(_scaled(Number(1.0, float(std[0])), p.omega / (2 * pi)), Number(p.damping, float(std[1])),
+                   _scaled(Number(1.0, float(std[2])), p.rms),
+                   Number(1.0 + beyond, max(beyond, NO_NEARER - 1.0) * float(std[3])) if isinstance(p, Ar3) else None)
+
+
+def _scaled(n: Number, factor: float) -> Number:
+    return Number(n.value * factor, n.std * factor)
+
+
+def _within(n: Number, low: float, high: float) -> Number:
+    return Number(min(max(n.value, low), high), n.std)
+
+
+def _order(n_modes: int) -> int:
+    """The lowest radial order of which there are as many modes."""
+    return next(order for order in range(1, HIGHEST_ORDER + 1) if len(modes_up_to(order)) >= n_modes)

@@ -1,0 +1,116 @@
+"""Offline Gaussian process regression: trained once, on a record of its own (paper, Algorithms 1 and 2).
+
+The target of a window is the zero-phase Butterworth reference of the training record's open-loop twin at the
+window's last step; without a twin, that of its z. With w = a - b c and c = (delta.a) / (1 / s2 + delta.b) (`kernels` has
+a, b, delta), a prediction is
+
+    mean = kappa.w + delta_t c.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided
+
+from wfsobs.observers.base import VIBRATION
+from wfsobs.observers.baselines import open_loop_reference
+from wfsobs.observers.gpr.inputs import scale_of, window_signals
+from wfsobs.observers.gpr.kernels import (
+    Points,
+    SquaredExponential,
+    band,
+    check_condition,
+    sliding_products,
+    square_from_band,
+    squared_norms,
+)
+from wfsobs.observers.gpr.online import kernel_of
+from wfsobs.observers.per_mode import over_modes
+from wfsobs.progress import QUIET, Watch
+from wfsobs.record import DELAY, Record, RecordError, Training, pseudo_open_loop
+from wfsobs.scenario import Scenario
+from wfsobs.signal.linalg import eliminate, solved_rows
+from wfsobs.typing import Array
+
+ROWS = 256
+"""Steps predicted at a time."""
+
+
+@dataclass(frozen=True)
+class TrainedGpr:
+    """What training leaves: signals (d + m - 1, channels) [l] that the m windows are cut from, the windows as points,
+    their weights (m,), and the constant c."""
+
+    signals: Array
+    depth: int
+    points: Points
+    weights: Array
+    constant: float
+    kernel: SquaredExponential
+
+    def predict(self, signals: Array, watch: Watch = QUIET) -> Array:
+        """Mean at every step of signals (n, channels), (n,); NaN before the first full window."""
+        n, m, d = signals.shape[0], self.weights.size, self.depth
+        out = np.full(n, np.nan)
+        signals = signals / self.kernel.length_scale
+        tests = self.kernel.points(squared_norms(signals, d))
+        for start in range(d - 1, n, ROWS):
+            watch.step(start / n)
+            rows = min(ROWS, n - start)
+            # products[r, c] of test window start + r and training window c + r - rows + 1
+            products = sliding_products(signals, self.signals, d, start, d - rows, rows, m + rows - 1)
+            row, item = products.strides
+            G = as_strided(products[:, rows - 1 :], (rows, m), (row - item, item))
+            here = tests.seen(lambda p, start=start, rows=rows: p[start : start + rows])
+            known = self.kernel.split_times(G, here, self.points, self.weights)
+            out[start : start + rows] = known + here.delta * self.constant
+        return out
+
+
+def train(
+    signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential, watch: Watch = QUIET
+) -> TrainedGpr:
+    """Fit the first m windows of signals (n, channels) to targets (n,), one per step.
+
+    Raises RecordError where the record is too short, ConditionError where the precision is not enough.
+    """
+    if signals.shape[0] < depth + m:
+        raise RecordError(f"the training record has {signals.shape[0]} steps, depth + training size need {depth + m}")
+    first = depth - 1
+    V, points = band(signals, depth, kernel, first, m, m - 1)
+    watch.check()
+    S = np.empty((m + 2, m + 2), order="F")  # the covariance with the targets and delta as two more rows
+    S[:m, :m] = square_from_band(V, 0, m)
+    S[m:, :m] = targets[first : first + m], points.delta
+    check_condition(S[:m, :m], kernel)
+    eliminate(S, m, watch.check)
+    a, b = solved_rows(S, m)
+    constant = (points.delta @ a) / (1.0 / kernel.variance + points.delta @ b)
+    return TrainedGpr(signals[: first + m] / kernel.length_scale, depth, points, a - b * constant, float(constant), kernel)
+
+
+def training_targets(training: Training, scenario: Scenario, dt: float, delay: int = DELAY) -> Array:
+    """The vibration reference of the training record, (n, n_modes) [um]; NaN at the last step."""
+    twin = training.open_loop_y
+    return open_loop_reference(
+        scenario, pseudo_open_loop(training.y_lgs, training.u, delay) if twin is None else twin, dt)
+
+
+def gpr_offline(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """Train on the record's training record and predict over the record, all modes at the same time."""
+    g, training = scenario.gpr_offline, record.training
+    assert training is not None
+    if record.n_steps < g.depth:
+        raise RecordError(f"the record has {record.n_steps} steps; depth needs {g.depth}")
+    targets = training_targets(training, scenario, record.dt, record.delay)
+    training_z = pseudo_open_loop(training.y_lgs, training.u, record.delay)
+
+    def one(mode: int, watch: Watch) -> Array:
+        scale = scale_of(g, training, record.delay, mode)
+        signals = window_signals(g, training.y_lgs, training.u, training_z, mode, record.dt, scale)
+        model = train(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), watch)
+        return model.predict(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt, scale), watch)
+
+    return {VIBRATION: over_modes(record.n_modes, one, watch)}

@@ -1,0 +1,112 @@
+"""Online Gaussian process regression: trained anew at every step on the last m windows (paper, Algorithm 3).
+
+At step k the newest training pair is (x[k-1], target[k-1]). The target of window j is the vibration at step j: the
+causal Butterworth bank on z, of which value j + 1 belongs to step j and is known at step j + 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from wfsobs.observers.base import VIBRATION
+from wfsobs.observers.baselines import online_reference
+from wfsobs.observers.gpr.inputs import scale_of, window_signals
+from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
+from wfsobs.observers.gpr.sliding import finish, run_lengths, slide
+from wfsobs.observers.per_mode import over_modes
+from wfsobs.progress import QUIET, Watch
+from wfsobs.record import Record, RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.groups.observers import OfflineGpr, OnlineGpr
+from wfsobs.typing import Array
+
+BAND_ENTRIES, BAND_ROWS = 4_000_000, 8192
+"""Covariances (32 MB) and windows at a time: enough to share the overlap of the runs, and soon done."""
+
+
+def kernel_of(settings: OfflineGpr | OnlineGpr) -> SquaredExponential:
+    """The kernel with the numbers of the settings."""
+    return SquaredExponential(settings.signal_std, settings.length_scale, settings.noise_std)
+
+
+def online_targets(record: Record, scenario: Scenario) -> Array:
+    """The vibration at every step, as far as the causal bank tells it one step later, (n, n_modes) [um]; 0 at the last step."""
+    f = online_reference(scenario, record.z, record.dt)
+    return np.vstack([f[1:], np.zeros((1, record.n_modes))])
+
+
+def gpr_online(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """The online GPR over a record, all modes at the same time, delivered block by block."""
+    g = scenario.gpr_online
+    if record.n_steps < g.depth + g.training_size:
+        raise RecordError(f"the record has {record.n_steps} steps; depth + training size need {g.depth + g.training_size}")
+    targets = online_targets(record, scenario)
+    values = np.full((record.n_steps, record.n_modes), np.nan)
+    done = np.zeros(record.n_modes)
+
+    def one(mode: int, watch: Watch) -> Array:
+        def deliver(start: int, stop: int, mean: Array) -> None:
+            values[start:stop, mode] = mean
+            done[mode] = stop / record.n_steps
+            watch.step(float(done.mean()))
+            watch.partial(VIBRATION, values)
+
+        scale = scale_of(g, record.training, record.delay, mode)
+        signals = window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt, scale)
+        return predict_sliding(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), deliver, watch.check)[0]
+
+    return {VIBRATION: over_modes(record.n_modes, one, watch)}
+
+
+def predict_sliding(
+    signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential,
+    deliver: Callable[[int, int, Array], None] | None = None, check: Callable[[], None] = QUIET.check,
+) -> tuple[Array, Array]:
+    """Predict at every step from the m windows before it.
+
+    signals (n, channels), targets (n,): target of the window ending at each step; step k uses targets k - m ... k - 1.
+    deliver : told (start, stop, mean) of each block of steps as it is done
+    check   : called between pieces of work; what it raises ends the work
+    Returns (mean, variance), each (n,), NaN before step depth + m - 1; variance is that of a noisy target.
+    """
+    n = signals.shape[0]
+    mean, variance = np.full(n, np.nan), np.full(n, np.nan)
+    lengths = run_lengths(m)
+    run = lengths[0] if lengths else 256
+    leaf_window = lengths[-1] - 1 if lengths else m
+    # As many runs at a time as the band has room for: their windows overlap.
+    chunk = run * max(1, (min(BAND_ENTRIES // (m + 1), BAND_ROWS) - m) // run)
+    for start in range(depth + m - 1, n, chunk):
+        stop = min(start + chunk, n)
+        runs = -(-(stop - start) // run)
+        V, points = band(signals, depth, kernel, start - m, m + runs * run, m)
+        for r in range(runs):
+            check()
+            at = start + r * run
+            to = min(at + run, n)
+            leaves = np.empty((leaf_window + 3, leaf_window + 3, run))
+            S, f = _whole_run(V, points.delta, targets, kernel, at, r * run, m, run)
+            check_condition(S[:m, :m], kernel)
+            slide(S, f, m, lengths, leaves, check=check)
+            values, spread = finish(leaves, leaf_window)
+            mean[at:to], variance[at:to] = values[: to - at], spread[: to - at]
+            if deliver:
+                deliver(at, to, mean[at:to])
+    return mean, variance
+
+
+def _whole_run(
+    V: Array, delta: Array, targets: Array, kernel: SquaredExponential, at: int, row: int, m: int, run: int
+) -> tuple[Array, Array]:
+    """The matrix over [m + run points | f | delta] of the steps at ... at + run - 1, and the points' targets."""
+    n = m + run
+    S = np.zeros((n + 2, n + 2), order="F")
+    S[:n, :n] = square_from_band(V, row, n)
+    S[n + 1, :n] = delta[row : row + n]
+    S[n + 1, n + 1] = -1.0 / kernel.variance
+    f = np.zeros(n)
+    known = targets[at - m : at + run]
+    f[: known.size] = known
+    return S, f

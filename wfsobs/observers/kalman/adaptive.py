@@ -1,0 +1,79 @@
+"""The Kalman filter of a model that is identified anew from the last seconds of z, again and again.
+
+Nothing has to be known beforehand, and what changes is followed: noise, turbulence and peaks of every window are found
+(`identify.quick`), and the steady-state filter of that model runs until the next. A new filter starts at rest at the beginning of
+its window, so that its state has converged when it takes over, and what it says is kept from there on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from wfsobs.identification.quick import SHORTEST, quick_spectrum
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.kalman.single import MIN_NOISE, by_target, steady_filter
+from wfsobs.progress import Watch
+from wfsobs.record import Record, RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.groups.observers import Adaptive
+from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.statespace import disturbance_model
+from wfsobs.spectral.model import Spectrum
+from wfsobs.typing import Array
+
+STILL = PeriodicFilter([(np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((2, 1)), np.zeros((2, 1)))])
+"""The filter of white noise: nothing moves."""
+
+
+def kf_adaptive(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """The filter on the LGS measurement, at every fast step; NaN until the first window is full. Raises RecordError for a
+    record shorter than a window, or a window of too few samples."""
+    a = scenario.adaptive
+    window = round(a.window / record.dt)
+    if window < SHORTEST:
+        raise RecordError(f"adaptive.window = {a.window:g}: takes {SHORTEST * record.dt:g} s or more, {SHORTEST} samples")
+    needed = window + record.delay
+    if record.n_steps < needed:
+        raise RecordError(f"the record has {record.n_steps} steps; adaptive.window = {a.window:g} s needs {needed}")
+    z = record.z[record.delay :]  # what the mirror did before the record is not known
+    columns = []
+    for mode in range(record.n_modes):  # one after the other: steps as short as these leave a second thread no room
+        def tell(fraction: float, mode: int = mode) -> None:
+            watch.step((mode + fraction) / record.n_modes)
+
+        columns.append(np.vstack([np.full((record.delay, len(TARGETS)), np.nan), adapting(z[:, mode], record.dt, a, tell)]))
+    return by_target(columns)
+
+
+def adapting(z: Array, dt: float, settings: Adaptive, tell: Callable[[float], None]) -> Array:
+    """Turbulence and vibration (n, 2) [um] of one mode's z (n,) [um]; tell : told the fraction done.
+
+    A window whose model or filter cannot be found leaves the filter before it in charge.
+    """
+    n, window, interval = len(z), round(settings.window / dt), max(round(settings.interval / dt), 1)
+    out = np.full((n, len(TARGETS)), np.nan)
+    spectrum: Spectrum | None = None
+    kalman: PeriodicFilter | None = None
+    for start in range(0, n - window + 1, interval):
+        tell(start / n)
+        now, stop = start + window - 1, min(start + window - 1 + interval, n)
+        try:
+            with np.errstate(divide="raise", over="raise", invalid="raise"):
+                spectrum = quick_spectrum(z[start : now + 1], dt, settings.peak_count, settings.lowest, spectrum)
+                kalman = filter_of(spectrum)
+        except (ValueError, ArithmeticError):
+            pass
+        if kalman is not None:
+            mean = z[start : now + 1].mean()  # what does not move in a window is turbulence, whatever its model says
+            out[now:stop] = kalman.run((z[start:stop] - mean)[:, None, None])[window - 1 :, :, 0] + [mean, 0.0]
+    return out
+
+
+def filter_of(spectrum: Spectrum) -> PeriodicFilter:
+    """The steady-state filter of a spectrum: z -> turbulence, vibration. Raises ValueError where there is none."""
+    if not spectrum.processes:
+        return STILL
+    model = disturbance_model([] if spectrum.turbulence is None else [spectrum.turbulence], spectrum.resonances)
+    return steady_filter(model, max(spectrum.noise, MIN_NOISE))[0]

@@ -1,0 +1,94 @@
+"""The paper's multi-rate Kalman filter: LGS at every step, NGS at every n-th (section 2.2.1).
+
+    x_pred[k+1] = A x_hat[k]
+    x_hat[k] = x_pred[k] + L_j (z_j[k] - C_j x_pred[k])        (eq. 11)
+
+with two steady-state gains: L_LGS from C_LGS and r_LGS, and L_LGS^NGS from both rows with diag(r_LGS, r_NGS), as if
+both came at every step. The paper prints the predictor gain K; the correction of a state that is already
+predicted takes the filter gain L. An NGS frame counts as a measurement of phi_dist[k-1], like the LGS.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from wfsobs.observers.base import TARGETS, TURBULENCE
+from wfsobs.observers.kalman.single import by_target, filter_step, kalman_model, measurement_noise
+from wfsobs.progress import Watch
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.settings import SettingError
+from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.statespace import DisturbanceModel
+from wfsobs.typing import Array
+
+
+class UnstableCycle(SettingError):
+    """Two gains, each stable, that make an unstable cycle."""
+
+
+def multirate_noise(scenario: Scenario, mode: int) -> tuple[float, float]:
+    """Square roots of r_LGS and r_NGS [um] in one mode."""
+    m = scenario.multirate
+    return (m.lgs_noise, m.ngs_noise) if m.measurement_noise == "manual" else measurement_noise(scenario, mode)
+
+
+@dataclass(frozen=True)
+class MultiRateFilter:
+    """first: (F, G, H, J) of step 0, which has no NGS frame; cycle: the steps from k = 1 on, the frame last."""
+
+    first: tuple[Array, Array, Array, Array]
+    cycle: PeriodicFilter
+
+    def run(self, z: Array) -> Array:
+        """Filter z (n_steps, 2) = (z_lgs, z_ngs), any number where there is no frame; (n_steps, n_targets)."""
+        _, G, _, J = self.first
+        start = z[0] * [1.0, 0.0]
+        rest = self.cycle.run(z[1:, :, None], (G @ start)[:, None])[:, :, 0]
+        return np.vstack([J @ start, rest])
+
+
+def multirate_filter(
+    model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, outputs: Array | None = None
+) -> MultiRateFilter:
+    """The filter for an NGS frame every `ratio` steps; lgs_noise, ngs_noise: square roots of r [um].
+
+    outputs : rows wanted of the state x_hat[k], (p, n); every target by default.
+    Raises UnstableCycle.
+    """
+    C_lgs, C_both = np.atleast_2d(model.C), np.vstack([model.C, model.C])
+    L_lgs = steady_state(model.A, C_lgs, model.Q, np.array(lgs_noise**2)).L
+    L_both = steady_state(model.A, C_both, model.Q, np.diag([lgs_noise**2, ngs_noise**2])).L
+    rows = model.output_rows(TARGETS) if outputs is None else outputs
+    alone = filter_step(model.A, C_both, np.hstack([L_lgs, np.zeros_like(L_lgs)]), rows)
+    cycle = PeriodicFilter([*([alone] * (ratio - 1)), filter_step(model.A, C_both, L_both, rows)])
+    radius = np.abs(np.linalg.eigvals(cycle.cycle_matrix())).max()
+    if radius >= 1.0:
+        raise UnstableCycle(
+            f"multi-rate filter: the cycle of {ratio} steps is unstable (spectral radius {radius:.3g}) with LGS noise "
+            f"{lgs_noise * 1e3:.4g} nm and NGS noise {ngs_noise * 1e3:.4g} nm; bring the two closer together")
+    return MultiRateFilter(alone, cycle)
+
+
+def run_modes(record: Record, watch: Watch, make: Callable[[int], MultiRateFilter]) -> list[Array]:
+    """Run the filter that `make` gives for each mode; per mode (n_steps, n_targets)."""
+    z = np.stack([record.z, np.nan_to_num(record.z_ngs)], axis=1)
+    columns = []
+    for mode in range(record.n_modes):
+        watch.step(mode / record.n_modes)
+        columns.append(make(mode).run(z[:, :, mode]))
+    return columns
+
+
+def multirate(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """The multi-rate filter over a record, for turbulence."""
+    assert record.ratio is not None
+    ratio = record.ratio
+    columns = run_modes(
+        record, watch, lambda mode: multirate_filter(
+            kalman_model(scenario, mode, record.dt), ratio, *multirate_noise(scenario, mode)))
+    return {TURBULENCE: by_target(columns)[TURBULENCE]}

@@ -1,0 +1,90 @@
+"""The optimal multi-rate Kalman filter: periodic gains, and the NGS frame modelled as the mean that it is.
+
+To the state of the disturbance model come the mean of what the running NGS frame has seen so far,
+
+    frame[k+1] = (frame[k], or 0 if a frame has just been read) + phi_dist[k] / n,
+
+so that z_ngs[k] = frame[k] + noise at k = n, 2n, ..., and (an option) the slow AR(2) error of the LGS mean. The gains solve
+the periodic Riccati equation of the n steps. Optimal for its model only; the paper's two gains are `multirate`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.kalman.multirate import MultiRateFilter, multirate_noise, run_modes
+from wfsobs.observers.kalman.single import by_target, filter_step, kalman_model
+from wfsobs.progress import Watch
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.riccati import SteadyState, Step, periodic_steady_state
+from wfsobs.signal.statespace import DisturbanceModel, process_model
+from wfsobs.simulation.guide_stars import lgs_error_process
+from wfsobs.typing import Array
+
+
+def optimal_cycle(
+    model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, lgs_error: Ar2 | None = None
+) -> list[Step]:
+    """(A, C, Q, R) of the steps k = 1 ... n, the NGS frame at the last; noises as standard deviations [um].
+
+    State (disturbance model, slow LGS error if any, frame). C has two rows at every step, LGS and NGS; where there is no
+    frame the second is zero.
+    """
+    A0, C0, Q0 = model.A, model.C, model.Q
+    now = sum(model.outputs.values()) / ratio
+    if lgs_error is not None:
+        error = process_model(lgs_error)
+        A0, Q0 = block_diag(A0, error.A), block_diag(Q0, error.Q)
+        C0, now = np.append(C0, error.now), np.append(now, [0.0, 0.0])
+    n = len(A0)
+    R = np.diag([lgs_noise**2, ngs_noise**2])
+    steps: list[Step] = []
+    for j in range(1, ratio + 1):
+        frame = j == ratio
+        A = block_diag(A0, np.array([[0.0 if frame else 1.0]]))
+        A[n, :n] = now
+        C = np.zeros((2, n + 1))
+        C[0, :n] = C0
+        C[1, n] = float(frame)
+        steps.append((A, C, block_diag(Q0, np.zeros((1, 1))), R))
+    return steps
+
+
+def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[MultiRateFilter, list[SteadyState]]:
+    """The filter of a cycle, and its covariances at steps 1 ... n; outputs (p, n_states) rows wanted of the state.
+
+    Step 0, before the first frame, measures the LGS alone and starts the frame anew.
+    """
+    states = periodic_steady_state(cycle)
+    steps = [filter_step(A, C, s.L, outputs) for (A, C, _, _), s in zip(cycle, states, strict=True)]
+    A, C, _, R = cycle[-1]
+    alone = C * [[1.0], [0.0]]
+    L = np.linalg.solve(alone @ states[-1].P @ alone.T + R, alone @ states[-1].P).T
+    return MultiRateFilter(filter_step(A, alone, L, outputs), PeriodicFilter(steps)), states
+
+
+def optimal_model(
+    scenario: Scenario, mode: int, dt: float, ratio: int, model: DisturbanceModel | None = None
+) -> tuple[list[Step], Array]:
+    """The cycle and output rows of one mode of a scenario; model: of the disturbance, that of `kalman` unless given."""
+    model = model or kalman_model(scenario, mode, dt)
+    error = None
+    if scenario.multirate.model_lgs_error:
+        error = lgs_error_process(scenario, mode, dt)
+    cycle = optimal_cycle(model, ratio, *multirate_noise(scenario, mode), error)
+    rows = model.output_rows(TARGETS)
+    return cycle, np.hstack([rows, np.zeros((len(rows), len(cycle[0][0]) - rows.shape[1]))])
+
+
+def multirate_optimal(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """The optimal multi-rate filter over a record."""
+    assert record.ratio is not None
+    ratio = record.ratio
+    columns = run_modes(
+        record, watch, lambda mode: optimal_filter(*optimal_model(scenario, mode, record.dt, ratio))[0])
+    return by_target(columns)

@@ -1,0 +1,143 @@
+"""Steady-state Kalman filters on LGS or NGS measurements (paper, section 2.2).
+
+    x_pred[k+1] = A x_hat[k],    x_hat[k] = x_pred[k] + L (z[k] - C x_pred[k])
+
+with the filter gain L = P C' (C P C' + R)^-1; the paper's eq. 9 is the predictor form with K = A L, which uses
+y up to k - 1. Here phi_hat[k] uses y[k] too, like the GPR. The mirror's part is known and taken off before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from wfsobs.observers.base import TARGETS
+from wfsobs.progress import Watch
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.riccati import SteadyState, steady_state
+from wfsobs.signal.statespace import MIN_MODEL_DAMPING, DisturbanceModel, disturbance_model
+from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
+from wfsobs.simulation.guide_stars import lgs_noise_rms
+from wfsobs.simulation.layers import relative_rms
+from wfsobs.simulation.sensor_noise import noise_rms
+from wfsobs.simulation.turbulence import turbulence_process
+from wfsobs.typing import Array
+
+MIN_NOISE = 1e-6
+"""Floor of a modelled measurement noise [um]: a filter for perfect measurements has no Riccati solution."""
+
+
+def modelled_processes(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2, Ar2]:
+    """The turbulence and the one vibration peak of the model, sampled every `dt` [s] (paper, Tables 1 and 2)."""
+    k, tip_tilt = scenario.kalman, scenario.modes[mode].radial_order == 1
+    manual = k.process_noise == "manual"
+    turbulence = turbulence_process(scenario, mode, dt)
+    if manual:
+        turbulence = replace(turbulence, rms=k.turbulence_rms * relative_rms(scenario, mode))
+    vibration_rms = k.vibration_rms if manual and tip_tilt else float(np.sqrt(vibration_variance(scenario, mode)))
+    frequency, damping = modelled_peak(scenario, mode)
+    return turbulence, Ar2(2.0 * np.pi * frequency, max(damping, MIN_MODEL_DAMPING), vibration_rms, dt)
+
+
+def modelled_peak(scenario: Scenario, mode: int) -> tuple[float, float]:
+    """Natural frequency [Hz] and damping of the one peak of the model."""
+    k, lines = scenario.kalman, vibration_lines(scenario, mode)
+    if k.peak == "manual" or not lines:
+        return k.frequency, k.damping
+    frequency, damping, _ = max(lines, key=lambda line: line[2])
+    return frequency, damping
+
+
+def kalman_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
+    """The state-space model of the two processes."""
+    turbulence, vibration = modelled_processes(scenario, mode, dt)
+    return disturbance_model([turbulence], [vibration])
+
+
+def measurement_noise(scenario: Scenario, mode: int) -> tuple[float, float]:
+    """Standard deviation of the modelled noise [um] of the LGS together and of an NGS frame in one mode."""
+    k = scenario.kalman
+    if k.measurement_noise == "manual":
+        return k.lgs_noise, k.ngs_noise
+    return max(lgs_noise_rms(scenario, mode), MIN_NOISE), max(noise_rms(scenario, "ngs")[mode], MIN_NOISE)
+
+
+def filter_step(A: Array, C: Array, L: Array, outputs: Array) -> tuple[Array, Array, Array, Array]:
+    """(F, G, H, J) of one step with transition A (n, n), measurement rows C (m, n) and filter gain L (n, m): the state
+    is x_pred[k], the result outputs (p, n) times x_hat[k]."""
+    reduced = np.eye(len(A)) - L @ C
+    return A @ reduced, A @ L, outputs @ reduced, outputs @ L
+
+
+def steady_filter(
+    model: DisturbanceModel, noise: float, outputs: Array | None = None
+) -> tuple[PeriodicFilter, SteadyState]:
+    """The steady-state filter of z (1 input), and its covariances; noise [um].
+
+    outputs : rows wanted of the state x_hat[k], (p, n); every target by default.
+    """
+    steady = steady_state(model.A, model.C, model.Q, np.array(noise**2))
+    rows = model.output_rows(TARGETS) if outputs is None else outputs
+    return PeriodicFilter([filter_step(model.A, np.atleast_2d(model.C), steady.L, rows)]), steady
+
+
+def kf_lgs(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """The Kalman filter on the LGS measurement, at every fast step."""
+    z = record.z
+    columns = []
+    for mode in range(record.n_modes):
+        watch.step(mode / record.n_modes)
+        kalman, _ = steady_filter(kalman_model(scenario, mode, record.dt), measurement_noise(scenario, mode)[0])
+        columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
+    return by_target(columns)
+
+
+def kf_ngs(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+    """The Kalman filter on NGS frames, with the coefficients for T_NGS.
+
+    A frame at k = n i measures slow step i - 1 (fast steps k - n ... k - 1); the estimate is that of slow
+    step i, the fast steps k ... k + n - 1. It is held over them, or spread by the fast model.
+    """
+    assert record.ratio is not None
+    n = record.ratio
+    frames = record.z_ngs[n::n]
+    columns = []
+    for mode in range(record.n_modes):
+        watch.step(mode / record.n_modes)
+        model = kalman_model(scenario, mode, n * record.dt)
+        kalman, _ = steady_filter(model, measurement_noise(scenario, mode)[1], model.pairs)
+        slow = kalman.run(frames[:, None, mode, None])[:, :, 0]  # of each process, slow steps i and i - 1
+        fast = np.full((record.n_steps, len(TARGETS)), np.nan)
+        for target, process in enumerate(modelled_processes(scenario, mode, record.dt)):
+            spread = between_frames(process, n, scenario.kalman.ngs_between_frames)
+            values = slow[:, 2 * target : 2 * target + 2] @ spread.T
+            fast[n:, target] = values.ravel()[: record.n_steps - n]
+        columns.append(fast)
+    return by_target(columns)
+
+
+def between_frames(process: Ar2, n: int, how: str) -> Array:
+    """Weights (n, 2) of the slow estimates i and i - 1, both given frame i, in those of the fast steps of slow step i.
+
+    hold: (1, 0). propagate: the conditional mean of phi[n i + j] given the two slow means under the fast
+    model, Cov(phi, s) Cov(s)^-1.
+    """
+    if how == "hold" or process.rms == 0:
+        return np.column_stack([np.ones(n), np.zeros(n)])
+    r = process.autocovariance(2 * n)
+    lag = np.abs(np.subtract.outer(np.arange(2 * n), np.arange(2 * n)))
+    covariance = r[lag]  # of fast steps n (i - 1) ... n (i + 1) - 1
+    means = np.kron(np.eye(2), np.full((1, n), 1.0 / n))[::-1]  # rows: slow step i, slow step i - 1
+    cross, between = covariance[n:] @ means.T, means @ covariance @ means.T
+    return np.linalg.lstsq(between, cross.T, rcond=1e-14)[0].T
+
+
+def by_target(columns: list[Array]) -> dict[str, Array]:
+    """Per-mode results (n_steps, n_targets) as {target: (n_steps, n_modes)}."""
+    stacked = np.stack(columns, axis=-1)
+    return {target: stacked[:, i] for i, target in enumerate(TARGETS)}
+

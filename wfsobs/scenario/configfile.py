@@ -1,0 +1,193 @@
+"""Scenarios as TOML files, and settings as they are typed on a command line."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from wfsobs.files import write_whole
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.scenario.settings import SettingError
+
+DEEPEST = 8
+"""Tables and lists inside one another that a text may have; settings have four."""
+
+LONG_NAME = re.compile(rf"(?<![\w\"'-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){{{DEEPEST + 1}}}")
+"""Refused before it is parsed, which takes the cube of its length."""
+
+
+class NotToml(SettingError):
+    """A text that is not TOML."""
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The tables of a TOML text, from a file, a command line or a link.
+
+    Raises NotToml, and SettingError where values are nested more than DEEPEST deep.
+    """
+    too_deep = SettingError(f"tables or lists nested more than {DEEPEST} deep")
+    if LONG_NAME.search(text):
+        raise too_deep
+    try:
+        values = tomllib.loads(text)
+    except RecursionError:
+        raise too_deep from None
+    except ValueError as error:  # TOMLDecodeError, and whole numbers of thousands of digits
+        raise NotToml(f"not TOML: {error}") from None
+    level: list[Any] = [values]
+    for _ in range(DEEPEST + 1):  # level by level: a recursion would end where the parser's did
+        level = [child for node in level if isinstance(node, (dict, list))
+                 for child in (node.values() if isinstance(node, dict) else node)]
+    if level:
+        raise too_deep
+    return values
+
+
+def to_toml(scenario: Scenario) -> str:
+    """Every setting as TOML, peaks as [[vibration.peaks]] tables; `from_toml` gives back the very same scenario."""
+    return tomli_w.dumps(scenario.to_dict())
+
+
+def annotated(text: str, notes: Mapping[str, str]) -> str:
+    """TOML with a comment after the settings that have one, by dotted path."""
+    out, where, counts = [], "", dict[str, int]()
+    for line in text.splitlines():
+        if head := re.fullmatch(r"\[\[([\w.]+)\]\]", line):
+            name = head.group(1)
+            counts[name] = counts.get(name, -1) + 1
+            where = f"{name}.{counts[name]}."
+        elif head := re.fullmatch(r"\[([\w.]+)\]", line):
+            where = head.group(1) + "."
+        note = notes.get(where + line.split(" = ")[0]) if " = " in line else None
+        out.append(f"{line}  # {note}" if note else line)
+    return "\n".join(out) + "\n"
+
+
+def from_toml(text: str, base: Scenario | None = None, where: str = "TOML") -> Scenario:
+    """A scenario with the settings of a (partial) TOML text on top of `base`.
+
+    Without `base`, a top-level `preset = "name"` says what to start from, else the defaults. Lists are replaced as a
+    whole. Raises SettingError, its line starting with `where`.
+    """
+    try:
+        values = parse_toml(text)
+        name = values.pop("preset", None)
+        scenario = base.copy() if base is not None else preset(name) if name is not None else Scenario()
+        scenario.update(values)
+    except SettingError as error:
+        raise SettingError(f"{where}: {error}") from None
+    return scenario
+
+
+def load(path: str | Path, base: Scenario | None = None) -> Scenario:
+    """The scenario of a TOML file (see `from_toml`). Raises SettingError, also where it cannot be read."""
+    return from_toml(_text(path), base, str(path))
+
+
+def _text(path: str | Path) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from None
+
+
+def save(scenario: Scenario, path: str | Path) -> None:
+    """Write every setting to a TOML file. Raises OSError."""
+    write_whole(path, lambda file: file.write(to_toml(scenario).encode()))
+
+
+@cache
+def pristine(name: str) -> Scenario:
+    """A preset to compare with, made once; not to be changed."""
+    return PRESETS[name]()
+
+
+def preset(name: Any) -> Scenario:
+    """The preset `name`. Raises SettingError for an unknown one."""
+    if not isinstance(name, str) or name not in PRESETS:
+        raise SettingError(f"preset = {name!r}: takes one of {', '.join(PRESETS)}")
+    return PRESETS[name]()
+
+
+def preset_name(chosen: str | None, config: str | Path | None, default: str = "paper") -> str:
+    """The preset that the arguments of `scenario_from` start from. Raises SettingError where the file cannot be read."""
+    if chosen is not None or config is None:
+        return chosen or default
+    try:
+        return parse_toml(_text(config)).get("preset", default)
+    except SettingError as error:
+        raise SettingError(f"{config}: {error}") from None
+
+
+def parse_assignment(text: str) -> tuple[str, Any]:
+    """("a.b", value) of "a.b=value"; the value in TOML's syntax, or a bare word.
+
+    >>> parse_assignment("turbulence.wind_speed=20")
+    ('turbulence.wind_speed', 20)
+    >>> parse_assignment("vibration.source=ar2")
+    ('vibration.source', 'ar2')
+    """
+    path, equals, value = text.partition("=")
+    if not equals or not path.strip():
+        raise SettingError(f"--set {text}: takes name=value, such as turbulence.wind_speed=20")
+    try:
+        parsed = parse_toml(f"value = {value.strip()}")
+    except NotToml:
+        return path.strip(), value.strip()
+    except SettingError as error:
+        raise SettingError(f"--set {path.strip()}: {error}") from None
+    return path.strip(), parsed["value"] if set(parsed) == {"value"} else value.strip()
+
+
+def changes(scenario: Scenario, base: Scenario) -> dict[str, Any]:
+    """Dotted path -> plain value of the settings that differ from those of `base`; lists as a whole."""
+    return dict(_leaves(scenario.difference(base)))
+
+
+def written(value: Any) -> str:
+    """A plain value as `parse_assignment` reads it: TOML on one line, words bare.
+
+    >>> written([{"frequency": 18.1, "rms": [0.02, 0.01]}]), written("ar2")
+    ('[{frequency = 18.1, rms = [0.02, 0.01]}]', 'ar2')
+    """
+    return value if isinstance(value, str) else _inline(value)
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_inline(v)}" for key, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_inline, value)) + "]"
+    return json.dumps(value)
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def scenario_from(
+    preset_name: str | None, config: str | Path | None, assignments: tuple[str, ...], default: str = "paper"
+) -> Scenario:
+    """What a command line asks for: the preset (or the file's own, or `default`), then the file, then each
+    assignment. Raises SettingError."""
+    base = preset(preset_name) if preset_name is not None else None
+    if config is not None:
+        scenario = load(config, base)
+    else:
+        scenario = base if base is not None else preset(default)
+    for path, value in map(parse_assignment, assignments):
+        scenario.set(path, value)
+    scenario.validate()
+    return scenario

@@ -1,0 +1,97 @@
+"""Some settings varied, each over a list of values, and the scenarios of every combination: `wfsobs export --vary`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from math import prod
+from typing import Any
+
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import NotToml, parse_toml, written
+from wfsobs.scenario.settings import Plain, SettingError
+
+MOST = 60
+"""Combinations that are run at once."""
+
+
+@dataclass(frozen=True)
+class Variation:
+    """A setting by its dotted path, and the plain values that it takes one after the other."""
+
+    path: str
+    values: tuple[Any, ...]
+
+    def __str__(self) -> str:
+        """As `parse_variation` reads it."""
+        return f"{self.path}={','.join(map(written, self.values))}"
+
+
+def parse_variation(text: str) -> Variation:
+    """A Variation of "a.b=v1,v2,v3"; values in TOML's syntax, or bare words. Raises SettingError.
+
+    >>> parse_variation("turbulence.wind_speed=5,10,15")
+    Variation(path='turbulence.wind_speed', values=(5, 10, 15))
+    >>> parse_variation("butterworth.frequencies=[18.1],[18.1,48.3]").values
+    ([18.1], [18.1, 48.3])
+    >>> parse_variation("vibration.source=peaks,ar2").values
+    ('peaks', 'ar2')
+    """
+    path, equals, listed = (part.strip() for part in text.partition("="))
+    if not (path and equals and listed):
+        raise SettingError(f"--vary {text}: takes name=value,value, such as turbulence.wind_speed=5,10,15")
+    try:
+        parsed = parse_toml(f"values = [{listed}]")
+    except NotToml:
+        parsed = {}
+    except SettingError as error:
+        raise SettingError(f"--vary {path}: {error}") from None
+    values = parsed["values"] if set(parsed) == {"values"} else [_word(part.strip()) for part in listed.split(",")]
+    for i, value in enumerate(values):
+        if value in values[:i]:
+            raise SettingError(f"--vary {path}: has {value!r} twice")
+    return Variation(path, tuple(values))
+
+
+def scenarios(base: Scenario, variations: Sequence[Variation]) -> list[Scenario]:
+    """The scenario of every combination, the last variation running fastest; the base alone where nothing varies.
+
+    Raises SettingError where there are more than MOST, where two are the same, and for a value that a setting refuses.
+    """
+    _check_number(variations)
+    out: list[Scenario] = []
+    seen: list[Plain] = []
+    for values in product(*(v.values for v in variations)):
+        changes = {v.path: value for v, value in zip(variations, values, strict=True)}
+        one = base.replace(changes)
+        one.validate()
+        plain = one.to_dict()
+        if plain in seen:
+            raise SettingError(f"--vary: {_listed(changes.items())} gives the same settings as another combination")
+        seen.append(plain)
+        out.append(one)
+    return out
+
+
+def _check_number(variations: Sequence[Variation]) -> None:
+    paths = [v.path for v in variations]
+    for i, path in enumerate(paths):
+        if path in paths[:i]:
+            raise SettingError(f"--vary {path}: is given twice; put all its values into one list")
+    counts = [len(v.values) for v in variations]
+    if prod(counts) > MOST:
+        raise SettingError(f"--vary: {' x '.join(map(str, counts))} = {prod(counts)} combinations, at most {MOST} can be run")
+
+
+def _word(text: str) -> Any:
+    """One value in TOML's syntax, or the bare word."""
+    try:
+        parsed = parse_toml(f"value = {text}")
+    except NotToml:
+        return text
+    return parsed["value"] if set(parsed) == {"value"} else text
+
+
+def _listed(changes: Iterable[tuple[str, Any]]) -> str:
+    return ", ".join(f"{path} = {value}" for path, value in changes)

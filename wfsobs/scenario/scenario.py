@@ -1,0 +1,170 @@
+"""Every setting, declared once: the `Scenario` tree; its groups are declared in `wfsobs.scenario.groups`, one module per topic.
+
+Labels carry the name and the paper's letter, documentation strings the unit in [brackets] and the
+source. "The paper" is Jaufmann et al., "Simulation of Wavefront-based Disturbance Observers for
+Large Telescopes". Wavefronts are Noll-normalised Zernike coefficients in micrometres rms.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import param
+
+from wfsobs.scenario.groups.atmosphere import PsdTable, Telescope, Turbulence
+from wfsobs.scenario.groups.control import Control
+from wfsobs.scenario.groups.events import FRAMES, LASER, PEAK, WIND, Event
+from wfsobs.scenario.groups.observers import Adaptive, Butterworth, Kalman, MultiPeak, MultiRate, OfflineGpr, OnlineGpr
+from wfsobs.scenario.groups.run import Loop, Run
+from wfsobs.scenario.groups.sensors import Sensors
+from wfsobs.scenario.groups.vibration import Vibration
+from wfsobs.scenario.lenslet_fit import fit
+from wfsobs.scenario.settings import Group, SettingError, section
+from wfsobs.scenario.timeline import air_time, shift
+from wfsobs.sensors.modes import Mode, modes_up_to
+
+HIGHEST = 0.9
+"""Height of a layer over that of the laser guide stars: in a higher one the beam all but ends."""
+SMALLEST = 0.25
+"""Outer scale over the aperture: below, variance moves to waves that frozen flow samples coarsely."""
+SLOWEST = 4e6
+"""Steps in which a layer crosses the aperture: frozen flow takes Fourier transforms of four times as many."""
+
+MOST_AIR = 10.0
+"""How much longer a record of the turbulence may be than the run, for wind that grows."""
+
+
+class Scenario(Group):
+    """Every setting of a run.
+
+    >>> s = Scenario()
+    >>> s.set("turbulence.wind_speed", 200)
+    Traceback (most recent call last):
+    ...
+    wfsobs.scenario.settings.SettingError: turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s
+    """
+
+    telescope = section(Telescope, "Telescope")
+    turbulence = section(Turbulence, "Turbulence")
+    vibration = section(Vibration, "Vibration")
+    sensors = section(Sensors, "Sensors")
+    loop = section(Loop, "Loop")
+    kalman = section(Kalman, "Kalman filters")
+    multipeak = section(MultiPeak, "Multi-peak Kalman filter")
+    adaptive = section(Adaptive, "Adaptive Kalman filter")
+    multirate = section(MultiRate, "Multi-rate filter")
+    butterworth = section(Butterworth, "Butterworth reference")
+    gpr_offline = section(OfflineGpr, "Offline GPR")
+    gpr_online = section(OnlineGpr, "Online GPR")
+    control = section(Control, "Controllers")
+    run = section(Run, "Run")
+    events = param.List([], item_type=Event, bounds=(0, 20), label="Events", doc="What changes during the record.")
+
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """The Zernike modes of the run, one column of every array each."""
+        return modes_up_to(self.telescope.radial_order)
+
+    @property
+    def dt(self) -> float:
+        """Time step of the loop [s]."""
+        return 1.0 / self.sensors.lgs_rate
+
+    @property
+    def n_steps(self) -> int:
+        """Number of steps of the record."""
+        return round(self.run.duration * self.sensors.lgs_rate)
+
+    @property
+    def before_events(self) -> Scenario:
+        """The scenario as it is without its events: what observers were made for, and the training record is of."""
+        return self.replace({"events": []}) if self.events else self
+
+    @property
+    def air(self) -> float:
+        """How long a piece of turbulence the wind carries past during the record, at the speed that it has without events [s]."""
+        wind = [event for event in self.events if event.kind == WIND]
+        return float(air_time(wind, np.linspace(0.0, self.run.duration, 1001))[-1]) if wind else self.run.duration
+
+    def validate(self) -> None:
+        """Check what no single setting can: raises SettingError naming the settings and the limit."""
+        nyquist = self.sensors.lgs_rate / 2
+        if self.run.warm_up >= self.run.duration:
+            raise SettingError(f"run.warm_up = {self.run.warm_up:g}: must be below run.duration = {self.run.duration:g} s")
+        for i, peak in enumerate(self.vibration.peaks):
+            if peak.frequency >= nyquist:
+                raise SettingError(f"vibration.peaks.{i}.frequency = {peak.frequency:g}: must be below half the "
+                                   f"LGS rate, {nyquist:g} Hz")
+        if self.kalman.frequency >= nyquist:
+            raise SettingError(f"kalman.frequency = {self.kalman.frequency:g}: must be below half the LGS rate, {nyquist:g} Hz")
+        if self.vibration.source == "psd":
+            _validate_psd(self.vibration.psd, "vibration")
+        if self.turbulence.source == "psd":
+            _validate_psd(self.turbulence.psd, "turbulence")
+        if self.turbulence.source == "frozen-flow":
+            self._validate_layers()
+        if self.sensors.noise_from == "photons" or (
+                self.turbulence.source == "frozen-flow" and self.sensors.kind == "shack-hartmann"):
+            for kind in ("lgs", "ngs"):
+                fit(self.sensors.lenslets, kind, self.telescope.diameter, self.telescope.radial_order)
+        self._validate_events()
+        widest = max(self.butterworth.bandwidth_offline, self.butterworth.bandwidth_online) / 2
+        for i, f in enumerate(self.butterworth.frequencies):
+            if not (f - widest > 0 and f + widest < nyquist):
+                raise SettingError(f"butterworth.frequencies.{i} = {f:g}: the band of +- {widest:g} Hz around it must lie "
+                                   f"between 0 and half the LGS rate, {nyquist:g} Hz")
+
+    def _validate_events(self) -> None:
+        stars = self.sensors.lgs_count
+        for i, event in enumerate(self.events):
+            if event.start >= self.run.duration:
+                raise SettingError(f"events.{i}.start = {event.start:g}: must be below run.duration = {self.run.duration:g} s")
+            if event.kind in (LASER, FRAMES) and event.duration == 0:
+                raise SettingError(f"events.{i}.duration = 0: takes a number above 0 s, for kind {event.kind}")
+            if event.kind == LASER and event.lasers > stars:
+                raise SettingError(f"events.{i}.lasers = {event.lasers}: takes up to sensors.lgs_count = {stars}")
+            if event.kind == PEAK:
+                self._validate_moving_peak(i, event)
+        if self.air > (MOST_AIR + 1e-9) * self.run.duration:
+            raise SettingError(f"events: the wind carries {self.air:.3g} s of turbulence past in {self.run.duration:g} s; at "
+                               f"most {MOST_AIR:g} times as much as the record is long")
+
+    def _validate_moving_peak(self, i: int, event: Event) -> None:
+        v, nyquist = self.vibration, self.sensors.lgs_rate / 2
+        if v.source not in ("peaks", "ar2"):
+            raise SettingError(f"events.{i}.kind = peak: takes vibration.source = peaks or ar2, not {v.source}")
+        if event.peak >= len(v.peaks):
+            raise SettingError(f"events.{i}.peak = {event.peak}: vibration.peaks has {len(v.peaks)} entries, numbered from 0")
+        own = [e for e in self.events if e.kind == PEAK and e.peak == event.peak]
+        turning = np.array([t for e in own for t in (np.nextafter(e.start, 0.0), e.start, e.start + e.duration)])
+        reached = v.peaks[event.peak].frequency + shift(own, np.minimum(turning, self.run.duration))
+        for f in reached:
+            if not 0 < f < nyquist:
+                raise SettingError(f"events.{i}.frequency_shift = {event.frequency_shift:g}: moves peak {event.peak} to {f:g} "
+                                   f"Hz; it must stay between 0 and half the LGS rate, {nyquist:g} Hz")
+
+    def _validate_layers(self) -> None:
+        layers, smallest = self.turbulence.layers, SMALLEST * self.telescope.diameter
+        if self.turbulence.outer_scale < smallest:
+            raise SettingError(f"turbulence.outer_scale = {self.turbulence.outer_scale:g}: frozen flow takes {SMALLEST:g} of "
+                               f"telescope.diameter or more, {smallest:g} m")
+        if not sum(layer.fraction for layer in layers) > 0:
+            raise SettingError("turbulence.layers: needs a layer of a fraction above 0, for turbulence.source = frozen-flow")
+        for i, layer in enumerate(layers):
+            if layer.height > HIGHEST * self.sensors.lgs_altitude:
+                raise SettingError(f"turbulence.layers.{i}.height = {layer.height:g}: takes up to {HIGHEST:g} of "
+                                   f"sensors.lgs_altitude, {HIGHEST * self.sensors.lgs_altitude:g} m")
+            crossing = self.telescope.diameter / (self.turbulence.wind_speed * layer.wind_factor)
+            if crossing * self.sensors.lgs_rate > SLOWEST:
+                raise SettingError(f"turbulence.layers.{i}.wind_factor = {layer.wind_factor:g}: it takes {crossing:.3g} s to "
+                                   f"cross the aperture, at most {SLOWEST / self.sensors.lgs_rate:.3g} s at this LGS rate")
+
+
+def _validate_psd(psd: PsdTable, group: str) -> None:
+    f = psd.frequency
+    if len(f) < 2 or any(b <= a for a, b in pairwise(f)):
+        raise SettingError(f"{group}.psd.frequency: needs at least two frequencies, increasing, for {group}.source = psd")
+    for name in ("tip", "tilt"):
+        if len(getattr(psd, name)) != len(f):
+            raise SettingError(f"{group}.psd.{name}: has {len(getattr(psd, name))} numbers, {group}.psd.frequency {len(f)}")

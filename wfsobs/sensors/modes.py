@@ -1,0 +1,31 @@
+"""The Zernike modes that columns of an array stand for."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+from wfsobs.sensors.zernike import name, noll, up_to_order
+
+HIGHEST_ORDER = 6
+
+
+class Mode(NamedTuple):
+    """One Zernike mode: name, Noll index, radial order n(i) of the paper's eq. 1d."""
+
+    name: str
+    noll: int
+    radial_order: int
+
+
+@cache
+def modes_up_to(order: int) -> tuple[Mode, ...]:
+    """All modes up to a radial order, piston left out, in Noll's order.
+
+    >>> [mode.name for mode in modes_up_to(2)]
+    ['tip', 'tilt', 'defocus', 'oblique astigmatism', 'vertical astigmatism']
+    """
+    return tuple(Mode(name(j), j, noll(j)[0]) for j in up_to_order(order))
+
+
+TIP_TILT = modes_up_to(1)

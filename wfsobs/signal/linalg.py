@@ -1,0 +1,93 @@
+"""The few BLAS and LAPACK routines that the observers stand on, from scipy, on sub-matrices in place.
+
+scipy publishes the addresses of its BLAS and LAPACK for other compiled code (`scipy.linalg.cython_blas`). Called
+through ctypes they work on any part of a column-major matrix without a copy, and without the interpreter lock, so
+that two modes run on two cores. scipy's own Python wrappers do neither.
+
+Every matrix here is float64 in column-major (Fortran) order, or a rectangular part of one, and only lower
+triangles of symmetric matrices are read or written.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+from scipy.linalg import cython_blas, cython_lapack
+
+from wfsobs.typing import Array
+
+_api = ctypes.pythonapi
+_name, _pointer = _api.PyCapsule_GetName, _api.PyCapsule_GetPointer
+_name.restype, _name.argtypes = ctypes.c_char_p, [ctypes.py_object]
+_pointer.restype, _pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+
+
+def _routine(module: object, name: str, n_arguments: int):
+    """A Fortran routine by name: every argument an address."""
+    capsule = module.__pyx_capi__[name]  # type: ignore[attr-defined]
+    return ctypes.CFUNCTYPE(None, *([ctypes.c_void_p] * n_arguments))(_pointer(capsule, _name(capsule)))
+
+
+_potrf = _routine(cython_lapack, "dpotrf", 5)
+_trsm = _routine(cython_blas, "dtrsm", 11)
+_syrk = _routine(cython_blas, "dsyrk", 10)
+
+_keep: list[ctypes._SimpleCData] = []  # what the addresses below point at
+
+
+@cache
+def _int(value: int) -> int:
+    _keep.append(ctypes.c_int(value))
+    return ctypes.addressof(_keep[-1])
+
+
+@cache
+def _real(value: float) -> int:
+    _keep.append(ctypes.c_double(value))
+    return ctypes.addressof(_keep[-1])
+
+
+@cache
+def _char(value: bytes) -> int:
+    _keep.append(ctypes.c_char(value))
+    return ctypes.addressof(_keep[-1])
+
+
+PANEL = 256
+"""Columns eliminated at a time: the same work as all at once, with a moment to stop in between."""
+
+
+def eliminate(S: Array, n: int, check: Callable[[], None]) -> None:
+    """Eliminate the first `n` rows and columns of the symmetric S (N, N), in place.
+
+    With S11 = L L', the lower triangle of S[n:, n:] becomes the Schur complement S22 - S21 S11^-1 S12, and the first n
+    columns become L over S21 L'^-1. check: called between pieces of work; what it raises ends the work.
+    Raises numpy.linalg.LinAlgError where S11 is not positive definite.
+    """
+    for done in range(0, n, PANEL):
+        check()
+        _eliminate_panel(S[done:, done:], min(PANEL, n - done))
+
+
+def _eliminate_panel(S: Array, n: int) -> None:
+    size = S.shape[0]
+    lead, here, item = _int(S.strides[1] // S.itemsize), S.ctypes.data, S.itemsize
+    below, corner = here + n * item, here + n * (S.strides[1] + item)
+    info = ctypes.c_int(0)
+    rest = _int(size - n)
+    _potrf(_char(b"L"), _int(n), here, lead, ctypes.addressof(info))
+    if info.value:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    _trsm(_char(b"R"), _char(b"L"), _char(b"T"), _char(b"N"), rest, _int(n), _real(1.0), here, lead, below, lead)
+    _syrk(_char(b"L"), _char(b"N"), rest, _int(n), _real(-1.0), below, lead, _real(1.0), corner, lead)
+
+
+def solved_rows(S: Array, n: int) -> Array:
+    """S21 S11^-1, (N - n, n), from what `eliminate` left of S; in place, over what was S21."""
+    size, lead, here = S.shape[0], _int(S.strides[1] // S.itemsize), S.ctypes.data
+    _trsm(_char(b"R"), _char(b"L"), _char(b"N"), _char(b"N"), _int(size - n), _int(n), _real(1.0), here, lead,
+          here + n * S.itemsize, lead)
+    return S[n:, :n]

@@ -1,0 +1,95 @@
+"""Linear filters whose matrices repeat every few steps, run over a whole record without a loop per step.
+
+    x[k+1] = F_j x[k] + G_j v[k],    e[k] = H_j x[k] + J_j v[k],    j = k mod cycle
+
+A block of steps is one linear map of the state at its start and of its inputs ("lifting"), so a record
+is a few matrix products over all blocks, and the block states are the same kind of recursion with one
+step per block. Nothing is diagonalised: near-defective matrices are as good as any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from wfsobs.typing import Array
+
+BLOCK = 48
+"""Steps per block, about; the work per step grows with it, the number of blocks falls."""
+
+
+@dataclass(frozen=True)
+class PeriodicFilter:
+    """One tuple (F, G, H, J) per step of the cycle: F (n, n), G (n, m), H (p, n), J (p, m)."""
+
+    steps: Sequence[tuple[Array, Array, Array, Array]]
+
+    def cycle_matrix(self) -> Array:
+        """Product of the F over one cycle, (n, n); the filter is stable if its spectral radius is below 1."""
+        out = np.eye(self.steps[0][0].shape[0])
+        for F, *_ in self.steps:
+            out = F @ out
+        return out
+
+    def run(self, v: Array, x0: Array | None = None) -> Array:
+        """Filter inputs v (n_steps, m, n_columns) from state x0 (n, n_columns; zero by default).
+
+        Returns e (n_steps, p, n_columns); every column is a signal of its own.
+        """
+        n_steps, m, columns = v.shape
+        cycle = len(self.steps)
+        length = cycle * max(1, round(BLOCK / cycle))
+        blocks = -(-n_steps // length)
+        padded = np.zeros((blocks * length, m, columns))
+        padded[:n_steps] = v
+        # (inputs of a block, all blocks and columns)
+        inputs = padded.reshape(blocks, length * m, columns).transpose(1, 0, 2).reshape(length * m, -1)
+        F, G, H, J = self._lift(length)
+        n = F.shape[0]
+        start = np.zeros((n, columns)) if x0 is None else x0
+        states = _block_states(F, (G @ inputs).reshape(n, blocks, columns), start)
+        out = H @ states.reshape(n, -1) + J @ inputs
+        p = H.shape[0] // length
+        return out.reshape(length, p, blocks, columns).transpose(2, 0, 1, 3).reshape(-1, p, columns)[:n_steps]
+
+    def _lift(self, length: int) -> tuple[Array, Array, Array, Array]:
+        """The map of one block: (F, G, H, J) with all the inputs and outputs of the block stacked."""
+        F0, G0, H0, _ = self.steps[0]
+        n, m, p = F0.shape[0], G0.shape[1], H0.shape[0]
+        state, from_inputs = np.eye(n), np.zeros((n, length * m))
+        H, J = np.zeros((length * p, n)), np.zeros((length * p, length * m))
+        for i in range(length):
+            Fi, Gi, Hi, Ji = self.steps[i % len(self.steps)]
+            rows, columns = slice(i * p, (i + 1) * p), slice(i * m, (i + 1) * m)
+            H[rows] = Hi @ state
+            J[rows] = Hi @ from_inputs
+            J[rows, columns] = Ji
+            state, from_inputs = Fi @ state, Fi @ from_inputs
+            from_inputs[:, columns] = Gi
+        return state, from_inputs, H, J
+
+
+def _block_states(F: Array, driven: Array, start: Array) -> Array:
+    """State at the start of each block: x_0 = start, x_b+1 = F x_b + driven_b; shape of `driven`
+    (n, blocks, columns). The same trick once more: blocks of blocks, then one short loop."""
+    n, blocks, columns = driven.shape
+    length = max(1, int(np.sqrt(blocks)))
+    groups = -(-blocks // length)
+    padded = np.zeros((n, groups * length, columns))
+    padded[:, :blocks] = driven
+    padded = padded.reshape(n, groups, length, columns)
+    local = np.zeros((n, groups, length + 1, columns))  # states of every group started from zero
+    for i in range(length):
+        local[:, :, i + 1] = np.tensordot(F, local[:, :, i], 1) + padded[:, :, i]
+    powers = [np.eye(n)]
+    for _ in range(length):
+        powers.append(F @ powers[-1])
+    out = np.empty((n, groups, length, columns))
+    x = start
+    for g in range(groups):
+        for_group = np.einsum("lij,jc->ilc", np.array(powers), x)
+        out[:, g] = local[:, g, :length] + for_group[:, :length]
+        x = local[:, g, length] + for_group[:, length]
+    return out.reshape(n, -1, columns)[:, :blocks]

@@ -1,0 +1,182 @@
+"""Steady-state Kalman gains: discrete algebraic Riccati equations by structured doubling.
+
+    P = A P A' - A P C' (C P C' + R)^-1 C P A' + Q        (paper, eq. 8b)
+
+and the periodic one, where (A, C, Q, R) repeat every few steps. One step maps a covariance to the next as
+
+    P -> H + A_' P (I + G P)^-1 A_,    A_ = A', G = C' R^-1 C, H = Q,
+
+and two such maps in a row are one of the same kind. Composing a cycle, then the cycle with itself over and over, doubles
+the steps in every pass: about twelve passes do, even for hardly damped lines, and H is then the solution.
+What rounding leaves is taken out by Kleinman steps: the covariance that the gains at hand really give is a
+Lyapunov equation, a sum of positive terms that loses nothing, and its gains are better, quadratically. Where the noise
+is so small that rounding spoils the doubling, they start from the covariance without any measurement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import reduce
+
+import numpy as np
+
+from wfsobs.typing import Array
+
+Step = tuple[Array, Array, Array, Array]
+"""(A, C, Q, R) of one step: measure with C and R, then predict with A and Q."""
+
+RESIDUAL = 1e-9
+"""Largest residual of an accepted solution, relative to the covariance."""
+
+
+class RiccatiError(ValueError):
+    """No usable steady-state filter for the given model; one line saying why."""
+
+
+@dataclass(frozen=True)
+class SteadyState:
+    """P (n, n) predicted covariance; L (n, m) filter gain; K = A L (n, m) predictor gain;
+    filtered (n, n) covariance after the measurement; residual: of the Riccati equation, relative to P."""
+
+    P: Array
+    L: Array
+    K: Array
+    filtered: Array
+    residual: float
+
+
+def steady_state(A: Array, C: Array, Q: Array, R: Array) -> SteadyState:
+    """Solve the Riccati equation of a filter that does the same at every step.
+
+    A (n, n) stable, C (m, n) or (n,), Q (n, n), R (m, m) or scalar, positive definite. The result does not depend on
+    the unit. Raises RiccatiError where R is not positive definite or no stable solution is reached.
+    """
+    return periodic_steady_state([(A, np.atleast_2d(C), Q, np.atleast_2d(np.asarray(R, dtype=float)))])[0]
+
+
+def periodic_steady_state(cycle: Sequence[Step]) -> list[SteadyState]:
+    """Solve the Riccati equation of a filter whose steps repeat; one solution per step of the cycle.
+
+    Raises RiccatiError like `steady_state`.
+    """
+    found = _refined(cycle, _doubled(cycle))
+    if found[0].residual > RESIDUAL:
+        found = _refined(cycle, _without_measurements(cycle))
+    residual = found[0].residual
+    if not residual <= RESIDUAL:
+        raise RiccatiError(f"no accurate steady-state filter: the Riccati equation is met to {residual:.1e} only; "
+                           "measurement noise and process noise are too far apart")
+    radius = np.abs(np.linalg.eigvals(_closed_loop(cycle, found))).max()
+    if radius >= 1.0:
+        raise RiccatiError(f"the steady-state filter is not stable: spectral radius {radius:.6f}")
+    return found
+
+
+def _refined(cycle: Sequence[Step], P: Array) -> list[SteadyState]:
+    """The best that Kleinman steps from P find: until rounding is all that is left, or three of them bring nothing."""
+    best = _around(cycle, P)
+    states, idle = best, 0
+    while idle < 3 and best[0].residual > 1e-14:
+        try:
+            states = _around(cycle, _lyapunov_around(cycle, states))
+        except RiccatiError:  # gains from a poor start need not be stable
+            break
+        idle = 0 if states[0].residual < 0.5 * best[0].residual else idle + 1
+        best = min(best, states, key=lambda s: s[0].residual)
+    return best
+
+
+Map = tuple[Array, Array, Array]
+"""(A_, G, H) of P -> H + A_' P (I + G P)^-1 A_."""
+
+
+def _map(A: Array, C: Array, Q: Array, R: Array) -> Map:
+    try:
+        whitened = np.linalg.solve(np.linalg.cholesky(R), C)
+    except np.linalg.LinAlgError:
+        raise RiccatiError("the measurement noise must be above zero") from None
+    return A.T, whitened.T @ whitened, Q
+
+
+def _compose(first: Map, then: Map) -> Map:
+    """The map of two steps in a row."""
+    A1, G1, H1 = first
+    A2, G2, H2 = then
+    n = A1.shape[0]
+    W = np.linalg.solve(np.eye(n) + G2 @ H1, np.hstack([A2, G2]))
+    G = G1 + A1 @ W[:, n:] @ A1.T
+    H = H2 + A2.T @ H1 @ W[:, :n]
+    return A1 @ W[:, :n], 0.5 * (G + G.T), 0.5 * (H + H.T)
+
+
+def _doubled(cycle: Sequence[Step]) -> Array:
+    """The covariance after very many cycles, by doubling: until it stands still, or only rounding moves it."""
+    m = reduce(_compose, (_map(*step) for step in cycle))
+    last = np.inf
+    for _ in range(60):
+        before = m
+        m = _compose(m, m)
+        if not np.isfinite(m[2]).all():
+            return before[2]
+        moved = np.abs(m[2] - before[2]).max() / max(np.abs(m[2]).max(), np.finfo(float).tiny)
+        if moved <= 1e-15 or (moved < 1e-9 and moved >= last):
+            break
+        last = moved
+    return m[2]
+
+
+def _without_measurements(cycle: Sequence[Step]) -> Array:
+    """The covariance of the model itself, from which Kleinman steps lead to the solution as surely, if more slowly."""
+    blind = _around([(A, np.zeros_like(C), Q, R) for A, C, Q, R in cycle], np.zeros_like(cycle[0][2]))
+    return _lyapunov_around(cycle, blind)
+
+
+def _around(cycle: Sequence[Step], P: Array) -> list[SteadyState]:
+    """Gains and covariances once around the cycle from predicted covariance P, and how far it comes back to P."""
+    found: list[tuple[Array, Array, Array, Array]] = []
+    start = P
+    for A, C, Q, R in cycle:
+        L = np.linalg.solve(C @ P @ C.T + R, C @ P).T
+        # Joseph form: a sum of squares, so the covariance stays symmetric and non-negative.
+        reduced = np.eye(len(A)) - L @ C
+        filtered = reduced @ P @ reduced.T + L @ R @ L.T
+        found.append((P, L, A @ L, filtered))
+        P = A @ filtered @ A.T + Q
+    with np.errstate(over="ignore", invalid="ignore"):  # a start that doubling has spoiled is far off, and is then dropped
+        residual = float(np.abs(P - start).max() / max(np.abs(start).max(), np.finfo(float).tiny))
+    residual = residual if np.isfinite(residual) else np.inf
+    return [SteadyState(*one, residual) for one in found]
+
+
+def _lyapunov_around(cycle: Sequence[Step], states: Sequence[SteadyState]) -> Array:
+    """Predicted covariance at the start of the cycle that the given gains lead to."""
+    F = np.eye(len(cycle[0][0]))
+    W = np.zeros_like(F)
+    for (A, C, Q, R), state in zip(cycle, states, strict=True):
+        Fj = A - state.K @ C
+        W = Fj @ W @ Fj.T + state.K @ R @ state.K.T + Q
+        F = Fj @ F
+    return lyapunov(F, W)
+
+
+def _closed_loop(cycle: Sequence[Step], states: Sequence[SteadyState]) -> Array:
+    F = np.eye(len(cycle[0][0]))
+    for (A, C, _, _), state in zip(cycle, states, strict=True):
+        F = (A - state.K @ C) @ F
+    return F
+
+
+def lyapunov(F: Array, W: Array) -> Array:
+    """S = F S F' + W by doubling: every pass doubles the number of terms summed. Raises RiccatiError if F is not stable."""
+    S = W
+    for _ in range(60):
+        with np.errstate(over="ignore", invalid="ignore"):
+            step = F @ S @ F.T
+            S = S + step
+            F = F @ F
+        if not np.isfinite(S).all():
+            break
+        if np.abs(step).max() <= 1e-17 * np.abs(S).max():
+            return 0.5 * (S + S.T)
+    raise RiccatiError("the filter is not stable: its error would grow without bound")

@@ -1,0 +1,98 @@
+"""Spectra and signals: damped lines, tables, and the inverse DFT with Gaussian amplitudes or random phases (paper, Algorithm 4).
+
+All spectra are one-sided power spectral densities: their integral over positive frequencies is the
+variance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wfsobs.typing import Array
+
+
+def bin_frequencies(n: int, dt: float) -> Array:
+    """Frequencies [Hz] of the DFT of `n` samples every `dt` [s], 0 to Nyquist, spaced 1 / (n dt)."""
+    return np.fft.rfftfreq(n, dt)
+
+
+def resonance_power(frequency: float, damping: float, edges: ArrayLike) -> Array:
+    """Share of a damped resonance's variance between successive `edges` [Hz], shape (len(edges) - 1,).
+
+    The density is that of a white-driven mass-spring-damper, S(f) ~ 1 / |f0^2 - f^2 + 2 i xi f0 f|^2,
+    of integral 1 over (0, inf). It is integrated in closed form, so a line that is narrower than
+    its bin keeps its power. With p = f0 (sqrt(1 - xi^2) + i xi), 1 / ((f^2 - p^2) (f^2 - p*^2))
+    has the antiderivative Im(log((f - p) / (f + p)) / 2p) / Im(p^2).
+    Damping 1 (a double pole) is taken as 1 - 1e-9.
+    """
+    xi = min(max(damping, 1e-12), 1.0 - 1e-9)
+    p = complex(np.sqrt(1.0 - xi**2), xi)  # in units of f0
+    f = np.asarray(edges, dtype=float) / frequency
+    # Both logarithms stay on one side of the cut for real f >= 0, Im p > 0.
+    integral = ((np.log(p - f) - np.log(p + f)) / (2.0 * p)).imag
+    total = (1j * np.pi / (2.0 * p)).imag  # log(p - f) - log(p + f) -> i pi
+    return np.maximum(np.diff(integral) / total, 0.0)
+
+
+def bin_edges(n: int, dt: float) -> Array:
+    """Edges [Hz] of the DFT bins; the first bin (frequency 0) and the last are half as wide."""
+    f = bin_frequencies(n, dt)
+    df = 1.0 / (n * dt)
+    return np.clip(np.append(f - df / 2.0, f[-1] + df / 2.0), 0.0, 0.5 / dt)
+
+
+def table_power(frequency: ArrayLike, density: ArrayLike, n: int, dt: float) -> Array:
+    """Variance in each DFT bin of a tabulated density [unit^2/Hz], linear between its frequencies [Hz]
+    and zero outside them, shape (n // 2 + 1,).
+
+    The density is integrated over the bin, so a line narrower than the bins of a short record keeps its power.
+    """
+    f, S = np.asarray(frequency, float), np.asarray(density, float)
+    edges = bin_edges(n, dt)
+    grid = np.union1d(f, edges)
+    heights = np.interp(grid, f, S, left=0.0, right=0.0)
+    # np.interp is zero outside [f[0], f[-1]] but not at these two: the pieces that end there from outside are empty.
+    pieces = 0.5 * np.diff(grid) * (heights[1:] + heights[:-1])
+    pieces[(grid[1:] <= f[0]) | (grid[:-1] >= f[-1])] = 0.0
+    total = np.concatenate([[0.0], np.cumsum(pieces)])
+    return np.diff(total[np.searchsorted(grid, edges)])
+
+
+def random_phase_signal(power: ArrayLike, n: int, rng: np.random.Generator) -> Array:
+    """A real signal of `n` samples whose DFT bins carry `power` [unit^2] with random phases, shape (n,).
+
+    The amplitude of a bin of power S df is sqrt(2 S df), its phase uniform on [0, 2 pi) (paper,
+    Algorithm 4, which prints S itself as amplitude and drops the imaginary unit). The bins at zero
+    and at Nyquist stay empty: a phase means nothing there.
+    """
+    power = _one_per_bin(power, n)
+    phases = 2.0 * np.pi * rng.random(power.size)
+    return _of_bins(np.sqrt(2.0 * power), np.exp(1j * phases), n)
+
+
+def gaussian_signal(power: ArrayLike, n: int, rng: np.random.Generator) -> Array:
+    """One period of `n` samples of the stationary Gaussian process with the variance `power` [unit^2] in each DFT bin, (n,).
+
+    Cosine and sine of a bin have independent normal amplitudes (Shinozuka and Deodatis, Appl. Mech. Rev. 44, 1991). The
+    process is periodic; a piece of it that is short beside the period is not.
+    """
+    power = _one_per_bin(power, n)
+    a, b = rng.standard_normal((2, power.size))
+    return _of_bins(np.sqrt(power), a + 1j * b, n)
+
+
+def _one_per_bin(power: ArrayLike, n: int) -> Array:
+    power = np.asarray(power, dtype=float)
+    if power.shape != (n // 2 + 1,):
+        raise ValueError(f"power must have one entry per DFT bin, {n // 2 + 1}, not {power.shape}")
+    return power
+
+
+def _of_bins(amplitude: Array, turn: NDArray[np.complex128], n: int) -> Array:
+    """The signal of `n` samples whose bins have these amplitudes and factors, zero and Nyquist left out."""
+    bins = 0.5 * n * amplitude * turn
+    bins[0] = 0.0
+    if n % 2 == 0:
+        bins[-1] = 0.0
+    return np.fft.irfft(bins, n)

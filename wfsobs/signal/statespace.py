@@ -1,0 +1,132 @@
+"""The paper's state-space model (eq. 6 and 7), for one Zernike mode.
+
+State x[k] = (phi_turb[k], phi_turb[k-1], phi_vib[k], phi_vib[k-1], u[k-1], u[k-2]), so that
+y[k] = C x[k] + w[k] = phi_dist[k-1] + u[k-2] + w[k]. With the B_u = (0, 1) that the paper prints, y[k]
+would see u[k-1]; B_u = (1, 0) is what its sensor and mirror equations (3 to 5) say.
+
+The mirror's part of the state is known exactly: the Riccati solution is zero there, and the filter
+on y[k] and u[k] is the filter of the disturbance alone on z[k] = y[k] - u[k-2]. Observers use that
+smaller model, `DisturbanceModel`, in coordinates that keep its digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.signal import lfilter, lfiltic
+
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.typing import Array
+
+MIN_MODEL_DAMPING = 1e-4
+"""Damping floor of a modelled process: a line of damping 0 would put an estimator pole on the unit circle."""
+
+
+@dataclass(frozen=True)
+class DisturbanceModel:
+    """Sum of autoregressive processes measured one step late, z[k] = C x[k] + w[k].
+
+    A (n, n), C (n,), Q (n, n); x holds as many numbers per process as it has poles (`process_model`).
+    outputs : target -> row (n,) that gives its phi[k] [um].
+    pairs   : (two per process, n) that gives the paper's state (phi_1[k], phi_1[k-1], phi_2[k], ...) [um].
+    """
+
+    A: Array
+    C: Array
+    Q: Array
+    outputs: dict[str, Array]
+    pairs: Array
+
+    def output_rows(self, targets: Sequence[str]) -> Array:
+        """The rows of several targets, (len(targets), n)."""
+        return np.array([self.outputs[target] for target in targets])
+
+
+class ProcessModel(NamedTuple):
+    """One process of p poles as a state-space model: A, Q (p, p); rows (p,) that give phi[k] and phi[k-1]."""
+
+    A: Array
+    Q: Array
+    now: Array
+    before: Array
+
+
+def process_model(p: Ar2) -> ProcessModel:
+    """An AR(2) process in coordinates of variance one, uncorrelated with each other.
+
+    The paper's pair (phi[k], phi[k-1]) is all but linearly dependent for a slow process, which costs the Riccati equation
+    its digits. With rho the correlation of the two, s = sqrt(1 - rho^2) and
+
+        phi[k] = rms xi_0,    phi[k-1] = rms (rho xi_0 + s xi_1)
+
+    the same process is xi[k+1] = [[rho, a2 s], [s, -rho a2]] xi[k] + (1, -rho / s) v[k], v for phi of rms one. For s, nothing is
+    subtracted from one: s (1 - a2) = |1 - exp(-2 xi w T + 2 i angle)| has the two squares below.
+    """
+    damped, angle = p.damping * p.omega * p.dt, p.omega * np.sqrt(1.0 - p.damping**2) * p.dt
+    rho = p.a1 / (1.0 - p.a2)
+    s = np.hypot(np.expm1(-2.0 * damped), 2.0 * np.exp(-damped) * np.sin(angle)) / (1.0 - p.a2)
+    drive = np.array([1.0, -rho / s])
+    return ProcessModel(
+        A=np.array([[rho, p.a2 * s], [s, -rho * p.a2]]),
+        Q=p.unit_drive_variance * np.outer(drive, drive),
+        now=p.rms * np.array([1.0, 0.0]),
+        before=p.rms * np.array([rho, s]),
+    )
+
+
+def third_order_model(p: Ar3) -> ProcessModel:
+    """A third-order process in coordinates of variance one, uncorrelated with each other, like `process_model`.
+
+    xi_0 is phi[k], xi_1 what phi[k-1] has beyond it, xi_2 what phi[k-2] has beyond both, each over its own rms. With the
+    partial autocorrelations k_i and s_i = sqrt(1 - k_i^2), (A | drive) has orthonormal rows (the normalised lattice of Gray and
+    Markel, IEEE Trans. ASSP 23, 268, 1975), so the state keeps its variance whatever rounding did to the k_i.
+    """
+    k1, k2, k3 = p.reflections
+    s1, s2, s3 = np.sqrt(1.0 - p.reflections**2)
+    drive = np.array([s1 * s2 * s3, -k1 * s2 * s3, -k2 * s3])
+    return ProcessModel(
+        A=np.array([[k1, k2 * s1, k3 * s1 * s2], [s1, -k1 * k2, -k1 * k3 * s2], [0.0, s2, -k2 * k3]]),
+        Q=np.outer(drive, drive),
+        now=p.rms * np.array([1.0, 0.0, 0.0]),
+        before=p.rms * np.array([k1, s1, 0.0]),
+    )
+
+
+def sampled(p: Ar3, n: int, rng: np.random.Generator) -> Array:
+    """`n` steps of a third-order process, stationary from the first, (n,)."""
+    model, denominator = third_order_model(p), np.poly(p.poles).real
+    drive = model.Q[:, 0] / np.sqrt(model.Q[0, 0])
+    x, first = rng.standard_normal(3), []
+    for v in rng.standard_normal(3):  # of variance one and uncorrelated, as the state is
+        first.append(float(x[0]))
+        x = model.A @ x + drive * v
+    gain = [drive[0]]
+    rest, _ = lfilter(gain, denominator, rng.standard_normal(max(n - 3, 0)), zi=lfiltic(gain, denominator, first[::-1]))
+    return p.rms * np.concatenate([first, rest])[:n]
+
+
+def disturbance_model(turbulence: Sequence[Ar2 | Ar3], vibration: Sequence[Ar2 | Ar3]) -> DisturbanceModel:
+    """The model of all the given processes, each with its own drive (paper, eq. 1, 2 and 7)."""
+    models = [third_order_model(p) if isinstance(p, Ar3) else process_model(p) for p in (*turbulence, *vibration)]
+    now = np.concatenate([m.now for m in models])
+    first = np.arange(now.size) < sum(m.now.size for m in models[: len(turbulence)])
+    return DisturbanceModel(
+        A=block_diag(*(m.A for m in models)),
+        C=np.concatenate([m.before for m in models]),
+        Q=block_diag(*(m.Q for m in models)),
+        outputs={"turbulence": np.where(first, now, 0.0), "vibration": np.where(first, 0.0, now)},
+        pairs=block_diag(*(np.array([m.now, m.before]) for m in models)),
+    )
+
+
+def paper_matrices(turbulence: Ar2, vibration: Ar2) -> tuple[Array, Array, Array]:
+    """A (6, 6), B (6,), C (6,) of the paper's eq. 7, with the B_u that its equations 3 to 5 imply."""
+    A = block_diag(turbulence.transition, vibration.transition, [[0.0, 0.0], [1.0, 0.0]])
+    B = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    C = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 1.0])
+    return A, B, C

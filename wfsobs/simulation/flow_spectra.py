@@ -1,0 +1,109 @@
+"""Temporal spectra of frozen flow as ideal sensors see it: what `frozen_flow` draws its signals from, without a draw.
+
+A layer of wind speed v turns the spatial frequency k_x along the wind into f = k_x v / 2 pi. With Phi the von Karman density and
+M_i the transform of a functional (`wave`), two of them have the one-sided cross spectrum
+
+    S_ij(f) = (2 pi / v) 2 integral dk_y Phi(k) conj(M_i(k)) M_j(k),
+
+times sinc^2(f T) for the mean over a step. Layers are independent and add. The Shack-Hartmann sensor's aliasing is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wfsobs.atmosphere.plane_waves import Footprint
+from wfsobs.atmosphere.von_karman import CORE, Layer, across, fine_rule, spectrum
+from wfsobs.scenario import Scenario
+from wfsobs.sensors.zernike import ZernikeProjection, looked_up
+from wfsobs.simulation import layers as atmosphere
+from wfsobs.simulation.guide_stars import lgs_weights
+from wfsobs.typing import Array
+
+LOWEST = 1e-3
+"""Where spectra are flat: this share of the frequency of wind across the outer scale."""
+
+RIPPLES = 24
+"""Spectra have ripples, speed / diameter wide; up to this many they are followed, beyond only their mean."""
+
+
+class FlowSpectra(NamedTuple):
+    """One-sided densities [um^2/Hz] of one mode on the axis, of what the LGS together see of it, and between the two."""
+
+    own: Array
+    seen: Array
+    shared: NDArray[np.complex128]
+
+
+def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra:
+    """At frequencies from 0 on [Hz], shape (n,) each."""
+    found = atmosphere.layers(scenario)
+    f = _frequencies(scenario, min(layer.speed for layer in found), float(frequency[-1]))
+    total = np.sum([_layer(scenario, mode, layer, f) for layer in found], axis=0)
+    exposure = np.sinc(f * scenario.dt) ** 2
+    at = np.log(np.maximum(frequency, f[0]))
+    own, seen = (np.exp(np.interp(at, np.log(f), np.log(np.maximum((part * exposure).real, 1e-300)))) for part in total[:2])
+    # Between the two only the share of their geometric mean is interpolated: it is smooth, and never above one.
+    share = total[2] / np.sqrt(np.maximum((total[0] * total[1]).real, 1e-300))
+    shared = np.sqrt(own * seen) * (np.interp(at, np.log(f), share.real) + 1j * np.interp(at, np.log(f), share.imag))
+    return FlowSpectra(own, seen, shared)
+
+
+def _frequencies(scenario: Scenario, speed: float, highest: float) -> Array:
+    """Where the densities are computed: by ratio, then by the width of the ripples of the slowest layer, then by ratio again."""
+    ripple = speed / scenario.telescope.diameter
+    lowest = min(LOWEST * speed / scenario.turbulence.outer_scale, 0.01 * ripple)
+    f = np.concatenate([
+        np.geomspace(lowest, ripple / 40, 32, endpoint=False), ripple / 40 * np.arange(1, 160),
+        ripple / 12 * np.arange(48, 12 * RIPPLES), np.geomspace(RIPPLES * ripple, max(highest, 2 * RIPPLES * ripple), 48)])
+    return f[: int(np.searchsorted(f, highest)) + 1]
+
+
+def _layer(scenario: Scenario, mode: int, layer: Layer, f: Array) -> NDArray[np.complex128]:
+    """own, seen and shared of one layer, (3, n)."""
+    kx = 2.0 * np.pi * f / layer.speed
+    front = CORE / (0.5 * scenario.telescope.diameter)
+    out = np.zeros((3, f.size), complex)
+    for part in _blocks(kx, front):
+        out[:, part] = _block(scenario, mode, layer, kx[part], front)
+    return out
+
+
+def _blocks(kx: Array, front: float) -> Iterator[slice]:
+    """Runs of frequencies that share their nodes across the wind."""
+    start = 0
+    while start < kx.size:
+        end = front if kx[start] < front else 1.5 * kx[start]
+        stop = max(int(np.searchsorted(kx, end)), start + 1)
+        yield slice(start, stop)
+        start = stop
+
+
+def _block(scenario: Scenario, mode: int, layer: Layer, kx: Array, front: float) -> NDArray[np.complex128]:
+    diameter, q0 = scenario.telescope.diameter, 2.0 * np.pi / scenario.turbulence.outer_scale
+    if kx[0] < front:
+        ky, weight = across(q0, front, *fine_rule(layer.height, diameter))
+    else:
+        ky, weight = across(float(np.hypot(q0, kx[0])), 4.0 * kx[-1], np.inf, 0.25)
+    density = (4.0 * np.pi / layer.speed) * weight[:, None] * spectrum(
+        kx**2 + ky[:, None] ** 2, layer.strength, scenario.turbulence.outer_scale)
+    c, s = np.cos(layer.angle), np.sin(layer.angle)
+    x, y = c * kx - s * ky[:, None], s * kx + c * ky[:, None]
+    own = _of_mode(scenario, mode, x, y, Footprint())
+    seen = np.zeros_like(own)
+    for star, gains in zip(atmosphere.laser_stars(scenario), lgs_weights(scenario)[mode], strict=True):
+        footprint = atmosphere.view(atmosphere.ideal_sensor(scenario), star, (layer,)).footprints[0]
+        for other, gain in enumerate(gains):
+            blind = scenario.sensors.tip_tilt_indetermination and scenario.modes[other].radial_order == 1
+            if gain != 0.0 and not blind:
+                seen = seen + gain * _of_mode(scenario, other, x, y, footprint)
+    return np.array([(density * z).sum(axis=0) for z in (np.abs(own) ** 2, np.abs(seen) ** 2, own.conj() * seen)])
+
+
+def _of_mode(scenario: Scenario, mode: int, x: Array, y: Array, footprint: Footprint) -> NDArray[np.complex128]:
+    sensor = ZernikeProjection(scenario.telescope.diameter, (scenario.modes[mode].noll,))
+    return sensor.transform(x, y, footprint, looked_up)[0]

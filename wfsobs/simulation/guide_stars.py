@@ -1,0 +1,111 @@
+"""What laser guide stars get wrong, and how several make one measurement.
+
+The minimum-variance weights are those of the best linear estimate of the disturbance on the axis from all that the LGS
+measure in the same step,
+
+    W = C_ty C_yy^-1,    C_ty = E phi_dist y',    C_yy = E y y',
+
+with the covariances of the model: turbulence as each beam sees it, vibration, which all see alike, and noise. They know of
+the angle between the stars and of their cones, not of time. They weigh measurements from which the mirror's part has been
+taken, so that a loop sees its own commands in full.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from wfsobs.scenario import Scenario
+from wfsobs.signal.ar2 import Ar2, turbulence_corner
+from wfsobs.simulation import layers as atmosphere
+from wfsobs.simulation.disturbance import vibration_variance
+from wfsobs.simulation.sensor_noise import noise_covariance, noise_rms
+from wfsobs.simulation.turbulence import turbulence_process, turbulence_rms
+from wfsobs.typing import Array
+
+MEAN = "mean"
+"""The combination that needs no model."""
+
+
+def low_frequency_process(scenario: Scenario, mode: int) -> Ar2:
+    """The AR(2) that stands for cone effect and uplink turbulence of one LGS in one mode; none with frozen flow.
+
+    It has the corner of the turbulence, since the part of the beam that an LGS misses moves with the same wind. A higher
+    order has the rms of tip in the ratio of their cone effects.
+    """
+    t = scenario.turbulence
+    corner = turbulence_corner(t.wind_speed, scenario.telescope.diameter, scenario.modes[mode].radial_order)
+    rms = 0.0
+    if t.source != "frozen-flow":
+        rms = scenario.sensors.lgs_low_frequency_rms * atmosphere.relative_cone_error(scenario, mode)
+    return Ar2(corner, t.damping, rms, scenario.dt)
+
+
+def lgs_weights(scenario: Scenario, stars: int | None = None) -> Array:
+    """Of mode j of star i in mode k of the combination, (n_modes, n_lgs, n_modes); of the first `stars` alone if given."""
+    stars, modes = stars or scenario.sensors.lgs_count, len(scenario.modes)
+    if scenario.sensors.lgs_combination == MEAN:
+        return np.tile(np.eye(modes)[:, None] / stars, (1, stars, 1))
+    return _best_weights(scenario, stars)
+
+
+@lru_cache(maxsize=8)  # a scenario is what its settings are, whenever it was asked
+def _best_weights(scenario: Scenario, stars: int) -> Array:
+    """Those of minimum variance, of the first so many stars."""
+    modes = len(scenario.modes)
+    seen, noise = seen_turbulence(scenario), noise_covariance(scenario, "lgs")
+    for mode in range(modes):
+        seen[:, mode, :, mode] += vibration_variance(scenario, mode)
+    for star in range(1, stars + 1):
+        seen[star, :, star] += noise
+    n = stars * modes
+    last = 1 + stars
+    measured = seen[1:last, :, 1:last].reshape(n, n)
+    found = seen[0, :, 1:last].reshape(modes, n) @ np.linalg.pinv(measured, rcond=1e-12, hermitian=True)
+    found.flags.writeable = False
+    return found.reshape(modes, stars, modes)
+
+
+def seen_turbulence(scenario: Scenario) -> Array:
+    """Covariance [um^2] of the turbulence on the axis and as each LGS sees it, errors of its own included, noise not,
+    (1 + n_lgs, n_modes, 1 + n_lgs, n_modes)."""
+    stars, modes = 1 + scenario.sensors.lgs_count, len(scenario.modes)
+    if scenario.turbulence.source == "frozen-flow":
+        out = atmosphere.star_covariance(scenario).copy()
+    else:
+        own = np.diag([turbulence_rms(scenario, mode) ** 2 for mode in range(modes)])
+        out = np.tile(own[None, :, None, :], (stars, 1, stars, 1))
+    if scenario.sensors.tip_tilt_indetermination:
+        blind = [i for i, mode in enumerate(scenario.modes) if mode.radial_order == 1]
+        out[1:, blind] = 0.0
+        out[:, :, 1:, blind] = 0.0
+    for mode in range(modes):
+        out[range(1, stars), mode, range(1, stars), mode] += low_frequency_process(scenario, mode).rms ** 2
+    return out
+
+
+def lgs_error_variance(scenario: Scenario, mode: int) -> float:
+    """Variance [um^2] of what the combination makes of the turbulence less the turbulence on the axis, noise aside."""
+    combined = np.concatenate([np.zeros((1, len(scenario.modes))), lgs_weights(scenario)[mode]])
+    combined[0, mode] = -1.0
+    return float(np.einsum("ij,ijkl,kl->", combined, seen_turbulence(scenario), combined))
+
+
+def lgs_error_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
+    """The slow error of the LGS together in one mode, sampled every `dt` [s]: the AR(2) process of its variance with the
+    corner of the turbulence."""
+    if scenario.turbulence.source != "frozen-flow" and scenario.sensors.lgs_combination == MEAN:
+        one = low_frequency_process(scenario, mode)
+        return replace(one, rms=one.rms / np.sqrt(scenario.sensors.lgs_count), dt=dt)
+    rms = float(np.sqrt(max(lgs_error_variance(scenario, mode), 0.0)))
+    return replace(turbulence_process(scenario, mode, dt), rms=rms)
+
+
+def lgs_noise_rms(scenario: Scenario, mode: int) -> float:
+    """Rms [um] of the white noise of the LGS together in one mode."""
+    if scenario.sensors.lgs_combination == MEAN:
+        return float(noise_rms(scenario, "lgs")[mode] / np.sqrt(scenario.sensors.lgs_count))
+    own = lgs_weights(scenario)[mode]
+    return float(np.sqrt(np.einsum("ij,jk,ik->", own, noise_covariance(scenario, "lgs"), own)))

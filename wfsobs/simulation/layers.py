@@ -1,0 +1,160 @@
+"""The scenario's atmosphere: layers along the line of sight, the beams of its stars through them, and their covariances.
+
+Airmass lengthens the way to layers and to guide stars alike, so that a laser's cone has the same share of the aperture in a
+layer whatever the zenith angle.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from wfsobs.atmosphere.frozen_flow import View
+from wfsobs.atmosphere.plane_waves import Footprint, Sensor
+from wfsobs.atmosphere.von_karman import CORE, Layer, across, fine_rule, spectrum
+from wfsobs.scenario import Scenario
+from wfsobs.sensors.zernike import ZernikeProjection, looked_up, over_argument
+from wfsobs.typing import Array
+
+ARCSEC = np.pi / 180.0 / 3600.0
+
+CONE = 8.0 / 90.0
+"""Height of the layer over that of the guide star for which the low-frequency error of an LGS stands."""
+
+
+class Star(NamedTuple):
+    """direction : (x, y) from the axis [rad]; distance: along the line of sight [m], infinite for a natural star."""
+
+    direction: tuple[float, float]
+    distance: float
+
+
+def airmass(scenario: Scenario) -> float:
+    """Way through the atmosphere over that at the zenith, of plane layers."""
+    return float(1.0 / np.cos(np.radians(scenario.telescope.zenith_angle)))
+
+
+def layers(scenario: Scenario) -> tuple[Layer, ...]:
+    """The layers as the telescope sees them, their shares divided by their sum."""
+    t, way = scenario.turbulence, airmass(scenario)
+    total = sum(layer.fraction for layer in t.layers)
+    strength = t.r0 ** (-5.0 / 3.0) * way
+    return tuple(
+        Layer(strength * layer.fraction / total, layer.height * way, t.wind_speed * layer.wind_factor, float(np.radians(
+            layer.wind_direction)))
+        for layer in t.layers)
+
+
+def effective_wind(scenario: Scenario) -> float:
+    """The wind speed [m/s] of the one layer that stands for all, (sum of share v^(5/3))^(3/5) (Roddier 1981)."""
+    if scenario.turbulence.source != "frozen-flow":
+        return scenario.turbulence.wind_speed
+    found = layers(scenario)
+    mean = sum(x.strength * x.speed ** (5.0 / 3.0) for x in found) / sum(x.strength for x in found)
+    return float(mean**0.6)
+
+
+def on_axis() -> Star:
+    """Where the truth is."""
+    return Star((0.0, 0.0), np.inf)
+
+
+def natural_star(scenario: Scenario) -> Star:
+    """The NGS."""
+    x, y = scenario.sensors.ngs_direction
+    return Star((x * ARCSEC, y * ARCSEC), np.inf)
+
+
+def laser_stars(scenario: Scenario) -> list[Star]:
+    """The LGS, evenly on their circle."""
+    s = scenario.sensors
+    angles = np.radians(s.lgs_angle) + 2.0 * np.pi * np.arange(s.lgs_count) / s.lgs_count
+    radius, distance = s.lgs_radius * ARCSEC, s.lgs_altitude * airmass(scenario)
+    return [Star((radius * float(np.cos(a)), radius * float(np.sin(a))), distance) for a in angles]
+
+
+def view(sensor: Sensor, star: Star, of: tuple[Layer, ...]) -> View:
+    """A sensor on a star, through these layers."""
+    (x, y), distance = star
+    return View(sensor, tuple(
+        Footprint(1.0 - layer.height / distance, (layer.height * x, layer.height * y)) for layer in of))
+
+
+def ideal_sensor(scenario: Scenario) -> ZernikeProjection:
+    """The plain projection on the scenario's modes."""
+    return ZernikeProjection(scenario.telescope.diameter, tuple(mode.noll for mode in scenario.modes))
+
+
+# ---------------------------------------------------------------------- covariances
+
+LOG_K = np.linspace(np.log(1e-9), np.log(1e4), 6000)
+"""Spatial frequencies, times D / 2, of integrals over all directions; the least lie below any outer scale."""
+
+
+@lru_cache(maxsize=256)
+def mode_variance(order: int, diameter: float, strength: float, outer_scale: float, cone: float = 1.0) -> float:
+    """Variance [um^2] of a Zernike mode of a radial order; with `cone`, of what a beam narrower by that factor gets wrong.
+
+    diameter, outer_scale [m]; strength: r0^(-5/3) [m^(-5/3)], r0 at 500 nm.
+    """
+    x = np.exp(LOG_K)
+    seen = over_argument(order + 1, x) - (over_argument(order + 1, cone * x) if cone != 1.0 else 0.0)
+    k = x / (0.5 * diameter)
+    density = spectrum(k**2, strength, outer_scale) * 4.0 * (order + 1) * seen**2
+    return float(np.trapezoid(2.0 * np.pi * k**2 * density, LOG_K))
+
+
+def relative_rms(scenario: Scenario, mode: int) -> float:
+    """Rms of a mode over that of tip, of the scenario's r0 and outer scale."""
+    return _relative(scenario, mode, 1.0)
+
+
+def relative_cone_error(scenario: Scenario, mode: int) -> float:
+    """What a guide star gets wrong in a mode over what it gets wrong in tip."""
+    return _relative(scenario, mode, 1.0 - CONE)
+
+
+def _relative(scenario: Scenario, mode: int, cone: float) -> float:
+    order = scenario.modes[mode].radial_order
+    if order == 1:
+        return 1.0
+    air = scenario.telescope.diameter, 1.0, scenario.turbulence.outer_scale, cone
+    return float(np.sqrt(mode_variance(order, *air) / mode_variance(1, *air)))
+
+
+def frozen_flow_variance(scenario: Scenario, mode: int) -> float:
+    """Variance [um^2] of one mode on the axis."""
+    strength = sum(layer.strength for layer in layers(scenario))
+    return mode_variance(
+        scenario.modes[mode].radial_order, scenario.telescope.diameter, strength, scenario.turbulence.outer_scale)
+
+
+def star_covariance(scenario: Scenario) -> Array:
+    """Covariance [um^2] of the modes that an ideal sensor would see on the axis and on each LGS,
+    (1 + n_lgs, n_modes, 1 + n_lgs, n_modes)."""
+    stars = (on_axis(), *laser_stars(scenario))
+    return _covariance(ideal_sensor(scenario), layers(scenario), scenario.turbulence.outer_scale, stars)
+
+
+@lru_cache(maxsize=32)
+def _covariance(sensor: ZernikeProjection, of: tuple[Layer, ...], outer_scale: float, stars: tuple[Star, ...]) -> Array:
+    """By the rule that frozen flow has across the wind, here in both directions."""
+    n = len(stars) * sensor.n_outputs
+    total = np.zeros((n, n))
+    for i, layer in enumerate(of):
+        nodes, weights = across(
+            2.0 * np.pi / outer_scale, CORE / (0.5 * sensor.diameter), *fine_rule(layer.height, sensor.diameter))
+        half = nodes.size // 2
+        kx, ky = nodes[half:], nodes[:, None]
+        power = 2.0 * weights[half:] * weights[:, None] * spectrum(kx**2 + ky**2, layer.strength, outer_scale)
+        footprints = [view(sensor, star, of).footprints[i] for star in stars]
+        distinct = list(dict.fromkeys(footprints))
+        seen = np.concatenate([sensor.transform(kx, ky, f, looked_up).reshape(sensor.n_outputs, -1) for f in distinct])
+        seen *= np.sqrt(power).ravel()
+        parts = np.real(seen @ seen.conj().T)
+        rows = np.concatenate([np.arange(sensor.n_outputs) + distinct.index(f) * sensor.n_outputs for f in footprints])
+        total += parts[np.ix_(rows, rows)]
+    total.flags.writeable = False
+    return total.reshape(len(stars), sensor.n_outputs, len(stars), sensor.n_outputs)

@@ -1,0 +1,91 @@
+"""What the wavefront sensors see of the disturbance, the mirror at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from wfsobs.progress import QUIET, Watch
+from wfsobs.record import delayed, frame_mean
+from wfsobs.scenario import Scenario
+from wfsobs.simulation import events
+from wfsobs.simulation.disturbance import Disturbance
+from wfsobs.simulation.guide_stars import MEAN, lgs_weights, low_frequency_process
+from wfsobs.simulation.sensor_noise import white_noise
+from wfsobs.typing import Array
+
+
+@dataclass(frozen=True)
+class OpenLoop:
+    """Open-loop measurements [um]: lgs (n_steps, n_modes), that of the LGS together, and ngs, NaN in
+    steps without a frame; both NaN where a frame is lost."""
+
+    lgs: Array
+    ngs: Array
+
+
+def measure(
+    scenario: Scenario, disturbance: Disturbance, rng: np.random.Generator, watch: Watch = QUIET
+) -> OpenLoop:
+    """LGS at every step, NGS at every n-th, both of the wavefront up to the step before.
+
+    LGS: the mean over the guide stars of phi_dist[k-1] + error (paper, eq. 3), or their combination of minimum variance, each
+    guide star with noise and error of its own; of frozen flow, each sees what is in its own beam. NGS at k = n, 2n, ...: the
+    mean of phi_dist[k-1] ... phi_dist[k-n], plus noise. With tip-tilt indetermination the LGS see no turbulence in tip and tilt.
+    Without a laser, and where a frame is lost, NaN.
+    """
+    lgs_rng, ngs_rng, lost_rng = rng.spawn(3)
+    n_steps, n_modes = disturbance.total.shape
+    errors = _lgs_errors(scenario, n_steps, n_modes, lgs_rng, watch)
+    seen = [_without_blind(scenario, x) for x in disturbance.lgs_turbulence or [disturbance.turbulence]]
+    lgs, working = np.full((n_steps, n_modes), np.nan), events.lasers(scenario, n_steps)
+    for stars in np.unique(working[working > 0]):
+        lgs[working == stars] = _together(scenario, seen, disturbance.vibration, errors[:stars])[working == stars]
+
+    n = scenario.sensors.exposure_ratio
+    noise = white_noise(scenario, "ngs", n_steps, ngs_rng)
+    frame = np.arange(n_steps)
+    is_frame = (frame % n == 0) & (frame >= n)
+    ngs_turbulence = disturbance.turbulence if disturbance.ngs_turbulence is None else disturbance.ngs_turbulence
+    total = ngs_turbulence + disturbance.vibration
+    ngs = np.where(is_frame[:, None], frame_mean(total, n) + noise, np.nan)
+    lost = events.lost_frames(scenario, n_steps, lost_rng)
+    lgs[lost["lgs"]], ngs[lost["ngs"]] = np.nan, np.nan
+    return OpenLoop(lgs, ngs)
+
+
+def _together(scenario: Scenario, seen: Sequence[Array], vibration: Array, errors: Sequence[Array]) -> Array:
+    """What the LGS measure together, as many as there are errors, (n_steps, n_modes)."""
+    stars = len(errors)
+    if scenario.sensors.lgs_combination == MEAN:
+        turbulence = seen[0] if len(seen) == 1 else np.mean(seen[:stars], axis=0)
+        return delayed(turbulence + vibration, 1) + np.mean(errors, axis=0)
+    every = list(seen) * stars if len(seen) == 1 else seen[:stars]
+    each = [delayed(x + vibration, 1) + error for x, error in zip(every, errors, strict=True)]
+    return np.tensordot(np.stack(each, axis=1), lgs_weights(scenario, stars), ([1, 2], [1, 2]))
+
+
+def _without_blind(scenario: Scenario, turbulence: Array) -> Array:
+    """What is left of the turbulence where an LGS cannot see tip and tilt."""
+    if not scenario.sensors.tip_tilt_indetermination:
+        return turbulence
+    visible = [mode.radial_order > 1 for mode in scenario.modes[: turbulence.shape[1]]]
+    return np.where(visible, turbulence, 0.0)
+
+
+def _lgs_errors(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.Generator, watch: Watch) -> list[Array]:
+    """Errors of every guide star [um], each (n_steps, n_modes): white noise, plus what stands for the cone effect where
+    turbulence has no layers, which the wind carries along with the turbulence."""
+    out, at = [], events.clock(scenario, n_steps)
+    for star in rng.spawn(scenario.sensors.lgs_count):
+        noise_rng, slow_rng = star.spawn(2)
+        error = white_noise(scenario, "lgs", n_steps, noise_rng)
+        for mode, stream in enumerate(slow_rng.spawn(n_modes)):
+            watch.check()
+            process = low_frequency_process(scenario, mode)
+            if process.rms > 0:
+                error[:, mode] += events.read(process.sample(events.steps_of_air(at, n_steps), stream), at)
+        out.append(error)
+    return out

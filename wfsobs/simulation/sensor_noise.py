@@ -1,0 +1,89 @@
+"""The scenario's wavefront sensors: what they are, how noisy, and what they alias."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from wfsobs.atmosphere.plane_waves import Sensor
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.lenslet_fit import Kind, fit
+from wfsobs.sensors.aliasing import Aliasing
+from wfsobs.sensors.lenslets import Lenslets
+from wfsobs.sensors.shack_hartmann import ShackHartmann
+from wfsobs.sensors.spots import Spots
+from wfsobs.simulation import layers as atmosphere
+from wfsobs.typing import Array
+
+
+def sensor(scenario: Scenario, kind: Kind) -> Sensor:
+    """What looks at an LGS or at the NGS. Raises SettingError where its slopes do not determine the modes."""
+    return atmosphere.ideal_sensor(scenario) if scenario.sensors.kind == "zernike" else shack_hartmann(scenario, kind)
+
+
+def shack_hartmann(scenario: Scenario, kind: Kind) -> ShackHartmann:
+    """The Shack-Hartmann sensor on an LGS or on the NGS, see `sensor`."""
+    lenslets, order = fit(scenario.sensors.lenslets, kind, scenario.telescope.diameter, scenario.telescope.radial_order)
+    return _made(lenslets, tuple(mode.noll for mode in scenario.modes), order)
+
+
+@lru_cache(maxsize=4)  # tens of megabytes each, for many modes
+def _made(lenslets: Lenslets, nolls: tuple[int, ...], order: int) -> ShackHartmann:
+    return ShackHartmann(lenslets, nolls, order)
+
+
+def noise_covariance(scenario: Scenario, kind: Kind) -> Array:
+    """Covariance [um^2] of the white noise of one LGS, or of the NGS, in one frame, (n_modes, n_modes).
+
+    That of photons and read noise is the noise of Shack-Hartmann slopes, correlated between modes, whatever the sensor.
+    """
+    s = scenario.sensors
+    if s.noise_from == "nm":
+        return np.diag(_stated_noise(scenario, kind) ** 2)
+    photons, fwhm = (s.spots.lgs_photons, s.spots.lgs_fwhm) if kind == "lgs" else (s.spots.ngs_photons, s.spots.ngs_fwhm)
+    spots = Spots(photons, s.spots.read_noise, fwhm, s.spots.pixel_scale, s.spots.pixels)
+    return shack_hartmann(scenario, kind).noise_covariance(spots)
+
+
+def _stated_noise(scenario: Scenario, kind: Kind) -> Array:
+    """Rms [um] per mode, of noise from nm, (n_modes,)."""
+    s = scenario.sensors
+    if kind == "ngs":
+        return np.full(len(scenario.modes), s.ngs_noise)
+    own = s.lgs_noise_per_mode[: len(scenario.modes)]
+    return np.array(own + [s.lgs_noise] * (len(scenario.modes) - len(own)))
+
+
+def noise_rms(scenario: Scenario, kind: Kind) -> Array:
+    """Rms [um] of that noise in each mode, (n_modes,)."""
+    return np.sqrt(np.diag(noise_covariance(scenario, kind)))
+
+
+def white_noise(scenario: Scenario, kind: Kind, n_steps: int, rng: np.random.Generator) -> Array:
+    """The noise of one LGS, or of the NGS, at every step [um], (n_steps, n_modes). Higher modes leave tip and tilt the
+    numbers that they have alone."""
+    n_modes = len(scenario.modes)
+    normal = np.hstack([rng.standard_normal((n_steps, 2)), rng.standard_normal((n_steps, n_modes - 2))])
+    if scenario.sensors.noise_from == "nm":
+        return normal * _stated_noise(scenario, kind)
+    return normal @ np.linalg.cholesky(noise_covariance(scenario, kind)).T
+
+
+def aliasing_rms(scenario: Scenario, kind: Kind) -> Array:
+    """Rms [um] of what an LGS, or the NGS, takes for its modes and is none of them, (n_modes,): the sensor less the Zernike
+    coefficients of the same beam. None where turbulence has no layers or the sensor is the ideal one."""
+    if scenario.turbulence.source != "frozen-flow" or scenario.sensors.kind == "zernike":
+        return np.zeros(len(scenario.modes))
+    error, outer_scale = _aliasing(shack_hartmann(scenario, kind)), scenario.turbulence.outer_scale
+    layers = atmosphere.layers(scenario)
+    star = atmosphere.laser_stars(scenario)[0] if kind == "lgs" else atmosphere.natural_star(scenario)
+    variance = sum(
+        np.diag(error.covariance(layer.strength, outer_scale, footprint.scale))
+        for layer, footprint in zip(layers, atmosphere.view(error.sensor, star, layers).footprints, strict=True))
+    return np.sqrt(variance)
+
+
+@lru_cache(maxsize=4)
+def _aliasing(of: ShackHartmann) -> Aliasing:
+    return Aliasing(of)

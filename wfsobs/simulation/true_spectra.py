@@ -1,0 +1,207 @@
+"""The spectra that a scenario really has, mode by mode, from its settings alone.
+
+How wide lines are decides how well they can be told ahead. Damped ones have the width that they have in the record
+(`synthesis`); pure lines are told ahead without error after long enough (`TrueSpectra.without_lines`). What a controller
+leaves of those is asked of lines `line_width` wide at half maximum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+
+from wfsobs.scenario import Scenario
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.wiener import Complex
+from wfsobs.simulation import layers as atmosphere
+from wfsobs.simulation.disturbance import peak_rms, pure_lines, vibration_power
+from wfsobs.simulation.flow_spectra import flow_spectra
+from wfsobs.simulation.guide_stars import lgs_noise_rms, lgs_weights, low_frequency_process
+from wfsobs.simulation.synthesis import damping_at_least, line_width, widened
+from wfsobs.simulation.turbulence import processes, table_variance, third_order_process, turbulence_process
+from wfsobs.typing import Array
+
+DECAYED = 2.5
+"""How far correlations have decayed after half the DFT, as an exponent; a line that turns round by then is nothing new."""
+
+SMOOTH = 4.0
+"""The same for processes of a known width, whose correlations may not come round at all: exp(-10) of them does."""
+
+MOST = 2**20
+"""Length of the DFT at most: of an AR(2) what decays more slowly comes round, which moves the bound by little."""
+
+FLOOR = 1e-6
+"""Least noise of a measurement [um]."""
+
+
+@dataclass(frozen=True)
+class TrueSpectra:
+    """What one mode of a scenario really is, on the frequencies of `wiener`, all (n // 2 + 1,) [um^2 per sample].
+
+    measured : S_z of the pseudo-open-loop LGS measurement, noise and all
+    signal   : target -> S_s;  shared : target -> spectrum between s[k] and what z[k + 1] has of it
+    lines    : of the pure lines in the vibration, `line_width` wide; gain : what the measurement has of them
+    pure     : (frequency [cycles per step], variance [um^2]) of each
+    """
+
+    measured: Array
+    signal: dict[str, Array]
+    shared: dict[str, Complex | Array]
+    lines: Array | None = None
+    gain: float = 1.0
+    pure: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def total(self) -> tuple[Array, Complex | Array]:
+        """(signal, shared) of the whole disturbance; turbulence and vibration are independent."""
+        return sum(self.signal.values(), np.zeros(1)), sum(self.shared.values(), np.zeros(1))
+
+
+    @property
+    def without_lines(self) -> TrueSpectra:
+        """What is left to be estimated once the pure lines are known."""
+        if self.lines is None:
+            return self
+        return TrueSpectra(
+            self.measured - self.gain**2 * self.lines,
+            self.signal | {"vibration": self.signal["vibration"] - self.lines},
+            self.shared | {"vibration": self.shared["vibration"] - self.gain * self.lines})
+
+
+    def line_covariance(self, n: int) -> Array:
+        """Autocovariance of the pure lines at the lags 0 to n - 1, (n,)."""
+        lag = np.arange(n)
+        return sum((variance * np.cos(2.0 * pi * f * lag) for f, variance in self.pure), np.zeros(n))
+
+
+def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
+    """The spectra of one mode, from the settings alone."""
+    n = n_frequencies(scenario)
+    turbulence, seen, shared = TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n)
+    vibration, gain = _vibration(scenario, mode, n), lgs_weights(scenario)[mode, :, mode].sum()
+    lines = _pure_lines(scenario, mode, n)
+    if lines is not None:
+        vibration = vibration + lines
+    return TrueSpectra(
+        measured=seen + gain**2 * vibration + max(lgs_noise_rms(scenario, mode), FLOOR) ** 2,
+        signal={"turbulence": turbulence, "vibration": vibration},
+        shared={"turbulence": shared, "vibration": gain * vibration},
+        lines=lines, gain=float(gain), pure=tuple((f * scenario.dt, variance) for f, variance in pure_lines(scenario, mode)),
+    )
+
+
+def seen_turbulence(scenario: Scenario, mode: int) -> Array:
+    """S of what the LGS together see of the turbulence, on the frequencies of `true_spectra`."""
+    return TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n_frequencies(scenario))[1]
+
+
+def n_frequencies(scenario: Scenario) -> int:
+    """Length of the DFT, a power of two: the slowest correlation has decayed by its half."""
+    return min(_wanted_frequencies(scenario), MOST)
+
+
+def is_known(scenario: Scenario) -> bool:
+    """Whether the spectra can be told: not those of frozen flow so slow that its low frequencies would not be resolved, nor
+    where events change them."""
+    source = scenario.turbulence.source
+    if scenario.events:
+        return False
+    return source in TURBULENCE_SPECTRA and (source != "frozen-flow" or _wanted_frequencies(scenario) <= 2 * MOST)
+
+
+def _wanted_frequencies(scenario: Scenario) -> int:
+    return 2 ** int(np.ceil(np.log2(2.0 * DECAYED / (min(_decay_rates(scenario)) * scenario.dt))))
+
+
+def _decay_rates(scenario: Scenario) -> list[float]:
+    """How fast the correlations of the disturbances decay [1/s], xi w, with the margin that smooth spectra leave."""
+    v, least = scenario.vibration, pi * line_width(scenario)
+    smooth = [turbulence_process(scenario, 0, scenario.dt)]
+    if scenario.turbulence.source == "processes":
+        smooth = [p for mode in range(len(scenario.modes)) for p in processes(scenario, mode, scenario.dt)]
+    rates = [2.0, *(p.omega * p.damping / SMOOTH for p in smooth)]
+    if v.source in ("psd", "measured"):
+        rates.append(least)
+    elif v.source != "none":
+        rates += [max(2.0 * pi * p.frequency * p.damping / SMOOTH, least) for p in v.peaks]
+    if scenario.turbulence.source == "frozen-flow":
+        rates.append(min(layer.speed for layer in atmosphere.layers(scenario)) / (16.0 * scenario.turbulence.outer_scale))
+    elif scenario.turbulence.source == "psd":
+        rates.append(least)
+    return rates
+
+
+def _density(process: Ar2 | Ar3, n: int) -> Array:
+    """Of an autoregressive process, per sample."""
+    return process.psd(np.fft.rfftfreq(n, process.dt)) / (2.0 * process.dt)
+
+
+Looks = tuple[Array, Array, Complex | Array]
+"""S of the turbulence, of what the LGS together see of it, errors of their own included, and between the two."""
+
+
+def _through_lgs(scenario: Scenario, mode: int, own: Array) -> Looks:
+    """Turbulence that all stars see alike, each LGS with a slow error of its own."""
+    weights = lgs_weights(scenario)[mode, :, mode]
+    error = _density(low_frequency_process(scenario, mode), 2 * (own.size - 1)) * np.sum(weights**2)
+    blind = scenario.sensors.tip_tilt_indetermination and scenario.modes[mode].radial_order == 1
+    gain = 0.0 if blind else weights.sum()
+    return own, gain**2 * own + error, gain * own
+
+
+def _ar2_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
+    return _through_lgs(scenario, mode, _density(turbulence_process(scenario, mode, scenario.dt), n))
+
+
+def _ar3_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
+    return _through_lgs(scenario, mode, _density(third_order_process(scenario, mode, scenario.dt), n))
+
+
+def _sum_of_processes(scenario: Scenario, mode: int, n: int) -> Looks:
+    own = [_density(p, n) for p in processes(scenario, mode, scenario.dt)]
+    return _through_lgs(scenario, mode, sum(own, np.zeros(n // 2 + 1)))
+
+
+def _no_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
+    return _through_lgs(scenario, mode, np.zeros(n // 2 + 1))
+
+
+def _table(scenario: Scenario, mode: int, n: int) -> Looks:
+    return _through_lgs(scenario, mode, 0.5 * n * table_variance(scenario, mode, n))
+
+
+def _frozen_flow(scenario: Scenario, mode: int, n: int) -> Looks:
+    own, seen, shared = flow_spectra(scenario, mode, np.fft.rfftfreq(n, scenario.dt))
+    per_sample = 0.5 / scenario.dt
+    return per_sample * own, per_sample * seen, per_sample * shared
+
+
+def _vibration(scenario: Scenario, mode: int, n: int) -> Array:
+    v, dt = scenario.vibration, scenario.dt
+    if v.source == "ar2":
+        out = np.zeros(n // 2 + 1)
+        for peak in v.peaks:
+            omega = 2.0 * pi * peak.frequency
+            damping = damping_at_least(line_width(scenario), peak.frequency, peak.damping)
+            out += _density(Ar2(omega, damping, peak_rms(peak.rms, mode), dt), n)
+        return out
+    return 0.5 * n * vibration_power(scenario, mode, n)
+
+
+def _pure_lines(scenario: Scenario, mode: int, n: int) -> Array | None:
+    """The spectrum of the pure lines; None where there is none."""
+    power = np.zeros(n // 2 + 1)
+    for frequency, variance in pure_lines(scenario, mode):
+        power[min(round(frequency * n * scenario.dt), n // 2)] += variance
+    return widened(0.5 * n * power, line_width(scenario) * scenario.dt) if power.any() else None
+
+
+TURBULENCE_SPECTRA: dict[str, Callable[[Scenario, int, int], Looks]] = {
+    "ar2": _ar2_turbulence, "ar3": _ar3_turbulence, "processes": _sum_of_processes,
+    "frozen-flow": _frozen_flow, "psd": _table, "none": _no_turbulence,
+}
+"""How the turbulence of each source looks to `true_spectra`."""

@@ -1,0 +1,157 @@
+"""Turbulence of one run, made from a scenario, and what the stars see of it.
+
+A new source is one more function in `SOURCES`, under the name that the scenario's `turbulence.source` knows it by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import hypot, pi
+
+import numpy as np
+
+from wfsobs.atmosphere.frozen_flow import frozen_flow
+from wfsobs.progress import Watch
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.groups.atmosphere import PsdTable
+from wfsobs.signal.ar2 import Ar2, turbulence_corner
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.spectrum import gaussian_signal, table_power
+from wfsobs.signal.statespace import sampled
+from wfsobs.simulation import layers as atmosphere
+from wfsobs.simulation.sensor_noise import sensor
+from wfsobs.simulation.synthesis import line_width, period_steps, widened
+from wfsobs.typing import Array
+
+
+@dataclass(frozen=True)
+class Turbulence:
+    """Turbulence [um], each array (n_steps, n_modes).
+
+    on_axis  : the truth
+    ngs, lgs : what the NGS and each of the LGS see of it, or None where all see the truth
+    """
+
+    on_axis: Array
+    ngs: Array | None = None
+    lgs: tuple[Array, ...] | None = None
+
+
+Source = Callable[[Scenario, int, np.random.Generator, Watch], Turbulence]
+"""(scenario, number of steps, generator, watch) -> turbulence."""
+ModeSource = Callable[[Scenario, int, int, np.random.Generator], Array]
+"""(scenario, mode index, number of steps, generator) -> one signal [um], shape (n_steps,)."""
+
+
+def turbulence_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
+    """The AR(2) turbulence of one mode (paper, eq. 1), sampled every `dt` [s], rms in [um]; where turbulence is made
+    another way, the AR(2) process of its variance and effective wind, or of its strongest process."""
+    rms = turbulence_rms(scenario, mode)
+    if found := processes(scenario, mode, dt) if scenario.turbulence.source == "processes" else []:
+        strongest = max(found, key=lambda p: p.rms)
+        return Ar2(strongest.omega, strongest.damping, rms, dt)
+    corner = turbulence_corner(
+        atmosphere.effective_wind(scenario), scenario.telescope.diameter, scenario.modes[mode].radial_order)
+    return Ar2(corner, scenario.turbulence.damping, rms, dt)
+
+
+def processes(scenario: Scenario, mode: int, dt: float) -> list[Ar2 | Ar3]:
+    """The coloured noises whose sum the turbulence of one mode is, for source processes."""
+    out: list[Ar2 | Ar3] = []
+    for p in scenario.turbulence.processes:
+        omega, rms = 2.0 * pi * p.frequency, p.rms[mode] if mode < len(p.rms) else 0.0
+        if rms > 0:
+            third = p.third_corner * omega
+            out.append(Ar3(omega, p.damping, third, rms, dt) if third else Ar2(omega, p.damping, rms, dt))
+    return out
+
+
+def third_order_process(scenario: Scenario, mode: int, dt: float) -> Ar3:
+    """The turbulence of one mode with its third corner, for source ar3."""
+    p = turbulence_process(scenario, mode, dt)
+    return Ar3(p.omega, p.damping, scenario.turbulence.third_corner * p.omega, p.rms, dt)
+
+
+def turbulence_rms(scenario: Scenario, mode: int) -> float:
+    """Standard deviation [um] that the scenario's turbulence has in one mode."""
+    t = scenario.turbulence
+    if t.source == "none":
+        return 0.0
+    if t.source == "processes":
+        return hypot(*(p.rms for p in processes(scenario, mode, scenario.dt)))
+    if t.source == "psd":
+        return float(np.sqrt(table_variance(scenario, mode, period_steps(scenario, scenario.n_steps)).sum()))
+    if t.source == "frozen-flow":
+        return float(np.sqrt(atmosphere.frozen_flow_variance(scenario, mode)))
+    return t.rms * atmosphere.relative_rms(scenario, mode)
+
+
+def mode_power(table: PsdTable, scenario: Scenario, mode: int, n: int) -> Array:
+    """Variance [um^2] that a table gives one mode in each DFT bin of `n` steps; modes that it does not hold have none."""
+    density = getattr(table, scenario.modes[mode].name, None)
+    return np.zeros(n // 2 + 1) if density is None else table_power(table.frequency, density, n, scenario.dt)
+
+
+def table_variance(scenario: Scenario, mode: int, n: int) -> Array:
+    """Variance [um^2] of the turbulence of source psd in each DFT bin of `n` steps, an even number."""
+    power = mode_power(scenario.turbulence.psd, scenario, mode, n)
+    power[0] = 0.0
+    return widened(power, line_width(scenario) * scenario.dt)
+
+
+def columns(source: ModeSource, scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch) -> Array:
+    """One signal per mode, each with a random stream of its own, (n_steps, n_modes)."""
+    out = []
+    for mode, stream in enumerate(rng.spawn(len(scenario.modes))):
+        watch.check()
+        out.append(source(scenario, mode, n_steps, stream))
+    return np.column_stack(out)
+
+
+def _mode_by_mode(source: ModeSource) -> Source:
+    """A source that knows no stars."""
+    return lambda scenario, n, rng, watch: Turbulence(columns(source, scenario, n, rng, watch))
+
+
+def _none(_scenario: Scenario, _mode: int, n: int, _rng: np.random.Generator) -> Array:
+    return np.zeros(n)
+
+
+def _ar2(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
+    return turbulence_process(scenario, mode, scenario.dt).sample(n, rng)
+
+
+def _ar3(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
+    return sampled(third_order_process(scenario, mode, scenario.dt), n, rng)
+
+
+def _processes(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
+    found = processes(scenario, mode, scenario.dt)
+    parts = [sampled(p, n, own) if isinstance(p, Ar3) else p.sample(n, own)
+             for p, own in zip(found, rng.spawn(len(found)), strict=True)]
+    return np.sum(parts, axis=0) if parts else np.zeros(n)
+
+
+def _psd(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
+    """A Gaussian process with the spectrum of the table, all of it up to half the rate."""
+    period = period_steps(scenario, n)
+    return gaussian_signal(table_variance(scenario, mode, period), period, rng)[:n]
+
+
+def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Watch) -> Turbulence:
+    """Von Karman layers: their modes on the axis, and what the sensors on the NGS and on every LGS see."""
+    layers = atmosphere.layers(scenario)
+    ideal, on_ngs, on_lgs = atmosphere.ideal_sensor(scenario), sensor(scenario, "ngs"), sensor(scenario, "lgs")
+    looking = [(ideal, atmosphere.on_axis()), (on_ngs, atmosphere.natural_star(scenario))]
+    looking += [(on_lgs, star) for star in atmosphere.laser_stars(scenario)]
+    views = [atmosphere.view(what, star, layers) for what, star in looking]
+    on_axis, ngs, *lgs = frozen_flow(
+        layers, scenario.turbulence.outer_scale, scenario.telescope.diameter, views, n, scenario.dt, rng, watch)
+    return Turbulence(on_axis, ngs, tuple(lgs))
+
+
+SOURCES: dict[str, Source] = {
+    "ar2": _mode_by_mode(_ar2), "ar3": _mode_by_mode(_ar3), "processes": _mode_by_mode(_processes),
+    "frozen-flow": _frozen_flow, "psd": _mode_by_mode(_psd), "none": _mode_by_mode(_none),
+}

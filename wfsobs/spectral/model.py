@@ -1,0 +1,116 @@
+"""The spectrum of one mode of z: white noise, turbulence of order two or three, AR(2) resonances. Pure lines are in `lines`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
+
+import numpy as np
+from scipy.special import expit, logit
+
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.typing import Array
+
+STEP = 1e-4
+"""Of the central differences, in the logarithm of a parameter."""
+
+SLOW, FAST, LEAST = 1e-3, 1.5, 0.02
+"""Bounds of omega of turbulence of third order, over the rate, and of its damping: beyond them it loses digits."""
+RMS = 2
+"""Place of the log of the rms among the numbers of a process."""
+HIGHEST = 0.999
+"""Damping of a process at most: at 1 its two poles are one."""
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """noise : rms of the white noise [um]; turbulence, background : coloured noise, or None each; resonances : any number."""
+
+    noise: float
+    dt: float
+    turbulence: Ar2 | Ar3 | None = None
+    resonances: tuple[Ar2, ...] = ()
+    background: Ar2 | None = None
+
+    @property
+    def processes(self) -> tuple[Ar2 | Ar3, ...]:
+        """Turbulence and background, where there are any, and the resonances."""
+        return tuple(p for p in (self.turbulence, self.background) if p is not None) + self.resonances
+
+    def psd(self, f: Array) -> Array:
+        """One-sided power spectral density [um^2/Hz] at f [Hz]."""
+        at = _Frequencies(f, self.dt)
+        return 2.0 * self.dt * self.noise**2 + sum((at.density(p) for p in self.processes), np.zeros_like(f))
+
+    @property
+    def vector(self) -> Array:
+        """log noise, then log omega, logit damping, log rms of every process, (numbers,); a third corner lies beyond
+        omega, its number is the log of how far, over omega."""
+        return np.concatenate([[np.log(self.noise)], *map(_vector, self.processes)])
+
+    @property
+    def starts(self) -> list[int]:
+        """Where the numbers of every process start in `vector`, and where the last ends."""
+        return list(accumulate((3 + isinstance(p, Ar3) for p in self.processes), initial=1))
+
+    @property
+    def fixed(self) -> list[int]:
+        """Which numbers of `vector` no fit moves: the damping of the background, which is to be flat up to its corner."""
+        return [] if self.background is None else [self.starts[0 if self.turbulence is None else 1] + 1]
+
+    def moved(self, vector: Array) -> Spectrum:
+        """The spectrum with these numbers as its `vector`."""
+        processes = [_process(vector[a:b], self.dt) for a, b in pairwise(self.starts)]
+        turbulence, background = (None if p is None else processes.pop(0) for p in (self.turbulence, self.background))
+        return replace(self, noise=float(np.exp(vector[0])), turbulence=turbulence, background=background,
+                       resonances=tuple(processes))
+
+    def slopes(self, f: Array, wanted: Sequence[int]) -> Array:
+        """Derivatives of the density by the wanted numbers of `vector`, in their order, (len(wanted), len(f)) [um^2/Hz]."""
+        on = _Frequencies(f, self.dt)
+        rows = {0: np.full_like(f, 4.0 * self.dt * self.noise**2)}
+        for start, p in zip(self.starts, self.processes, strict=False):
+            at = _vector(p)
+            for i in range(len(at)):
+                if start + i not in wanted:
+                    continue
+                if i == RMS:
+                    rows[start + i] = 2.0 * on.density(p)
+                    continue
+                move = np.zeros(len(at))
+                move[i] = STEP * p.damping if i == 0 else STEP  # a resonance is as narrow as its damping
+                up, down = (on.density(_process(at + sign * move, self.dt)) for sign in (1.0, -1.0))
+                rows[start + i] = (up - down) / (2.0 * move[i])
+        return np.array([rows[i] for i in wanted])
+
+
+class _Frequencies:
+    """Where the densities of many processes are taken: they share sine and cosine, which is most of the work of `Ar2.psd`."""
+
+    def __init__(self, f: Array, dt: float):
+        self.f, self.sine, self.cosine = f, np.sin(np.pi * f * dt), np.cos(np.pi * f * dt)
+
+    def density(self, p: Ar2 | Ar3) -> Array:
+        """One-sided power spectral density [um^2/Hz] of a process."""
+        if isinstance(p, Ar3):
+            return p.psd(self.f)
+        damped, half = p.damping * p.omega * p.dt, 0.5 * p.omega * np.sqrt(1.0 - p.damping**2) * p.dt
+        # |1 - exp(-damped + 2i x)|^2 = (1 - exp(-damped))^2 + 4 exp(-damped) sin^2 x at both x = pi f dt -+ half
+        a, b = self.sine * np.cos(half), self.cosine * np.sin(half)
+        flat, turning = np.expm1(-damped) ** 2, 4.0 * np.exp(-damped)
+        return 2.0 * p.dt * p.drive_variance / ((flat + turning * (a - b) ** 2) * (flat + turning * (a + b) ** 2))
+
+
+def _vector(p: Ar2 | Ar3) -> Array:
+    more = [np.log(max(p.corner / p.omega - 1.0, 1e-6))] if isinstance(p, Ar3) else []
+    return np.array([np.log(p.omega), logit(p.damping), np.log(p.rms), *more])
+
+
+def _process(v: Array, dt: float) -> Ar2 | Ar3:
+    omega, damping, rms = float(np.exp(v[0])), float(np.clip(expit(v[1]), 1e-9, HIGHEST)), float(np.exp(v[2]))
+    if len(v) == 3:
+        return Ar2(omega, damping, rms, dt)
+    omega = min(max(omega, SLOW / dt), FAST / dt)
+    return Ar3(omega, max(damping, LEAST), min(omega * (1.0 + float(np.exp(v[3]))), 2.0 * FAST / dt), rms, dt)

@@ -1,0 +1,108 @@
+"""Fits of a `Spectrum` to a periodogram by Whittle's likelihood (`wfsobs.signal.whittle`), errors, first guesses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from wfsobs.signal import whittle
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.periodogram import Cells
+from wfsobs.typing import Array
+
+STEPS = 40
+"""Of a fit, at most."""
+TOLERANCE = 1e-2
+"""Distance of a fit from its minimum, in standard deviations of its numbers."""
+NOISE, TURBULENCE, BACKGROUND, RESONANCE = 3.0, (2.0, 8.0, 4.0, 3.0), (1.5, 0.0, 4.0), (0.1, 6.0, 4.0)
+"""How far the numbers of a vector may leave their start: a resonance stays at its place."""
+NO_NEARER = 1.1
+"""Third corner, over the first two, at which its standard deviation is taken at least."""
+
+
+def negative_log_likelihood(spectrum: Spectrum, cells: Cells) -> float:
+    """- log L, less a constant."""
+    return whittle.negative_log_likelihood(spectrum.psd(cells.frequency), cells.mean, cells.count)
+
+
+def information(spectrum: Spectrum, cells: Cells, wanted: Sequence[int] | None = None) -> Array:
+    """Fisher information of the wanted numbers of `Spectrum.vector`, all unless told, (p, p).
+
+    Where samples are missing, with g the share of a bin that is measured, it is sum g^2 d d' + v v' / sum g (1 - g) with
+    v = sum g (1 - g) d: random gaps carry what a bin loses to all others alike, where noise finds it again and a peak does not.
+    """
+    wanted = range(spectrum.starts[-1]) if wanted is None else wanted
+    d = spectrum.slopes(cells.frequency, wanted) / spectrum.psd(cells.frequency)
+    carried = cells.count * cells.share * (1.0 - cells.share)
+    v = d @ carried
+    return (d * (cells.count * cells.share**2)) @ d.T + np.outer(v, v) / max(carried.sum(), 1e-300)
+
+
+def fitted(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = None) -> Spectrum:
+    """The spectrum of greatest likelihood near the given one; free : which numbers of its vector may move, all unless told but
+    the damping of a background."""
+    start = spectrum.vector
+    index = [i for i in (range(len(start)) if free is None else free) if i not in spectrum.fixed]
+    first = () if spectrum.turbulence is None else TURBULENCE[: spectrum.starts[1] - 1]
+    second = () if spectrum.background is None else BACKGROUND
+    reach = np.array([NOISE, *first, *second, *RESONANCE * len(spectrum.resonances)])[index]
+
+    def moved(x: Array) -> Spectrum:
+        vector = start.copy()
+        vector[index] = x
+        return spectrum.moved(vector)
+
+    def density(x: Array) -> Array:
+        return moved(x).psd(cells.frequency)
+
+    def log_slopes(x: Array, S: Array) -> Array:
+        return moved(x).slopes(cells.frequency, index) / S
+
+    bounds = np.transpose([start[index] - reach, start[index] + reach])
+    return moved(whittle.whittle_fit(density, log_slopes, start[index], bounds, cells.mean, cells.count, TOLERANCE, STEPS))
+
+
+def standard_deviations(spectrum: Spectrum, cells: Cells, inflation: float) -> Array:
+    """Of the numbers of the vector, but of the damping itself in the place of its logit, (p,)."""
+    t = spectrum.turbulence
+    if isinstance(t, Ar3):  # at its bound the corner's own number says nothing
+        spectrum = replace(spectrum, turbulence=replace(t, corner=max(t.corner, NO_NEARER * t.omega)))
+    std = np.zeros(spectrum.starts[-1])
+    free = [i for i in range(len(std)) if i not in spectrum.fixed]
+    covariance = np.linalg.inv(information(spectrum, cells, free) + 1e-12 * np.eye(len(free)))
+    std[free] = np.sqrt(np.maximum(np.diag(covariance) * inflation, 0.0))
+    for start, p in zip(spectrum.starts, spectrum.processes, strict=False):
+        std[start + 1] *= p.damping * (1.0 - p.damping)
+    return std
+
+
+def first_guess(f: Array, I: Array, dt: float, starts: int = 4) -> Spectrum:  # noqa: E741
+    """Noise and turbulence from the medians of the periodogram over bands, which lines and narrow resonances leave as they are;
+    without turbulence where white noise alone is as likely. starts : corners tried, of four, the lowest first."""
+    edges = np.unique(np.concatenate([[0], np.geomspace(3, len(f), 60).astype(int)]))
+    bands = [slice(a, b) for a, b in pairwise(edges)]
+    at = np.array([f[b].mean() for b in bands])
+    level = np.array([np.median(I[b]) for b in bands]) / np.log(2.0)
+    weight = np.sqrt([b.stop - b.start for b in bands])
+
+    def misfit(vector: Array, shape: Spectrum) -> Array:
+        return weight * (np.log(level) - np.log(shape.moved(vector).psd(at)))
+
+    noise = float(np.sqrt(np.median(I[len(I) // 2 :]) / np.log(2.0) / (2.0 * dt)))
+    alone = Spectrum(noise, dt)
+    rms = float(np.sqrt(max(np.sum(I) * f[0] - noise**2, 1e-4 * noise**2)))
+    found = []
+    for corner in np.geomspace(max(3 * f[0], 0.1), 0.02 / dt, 4)[:starts]:
+        shape = Spectrum(noise, dt, Ar2(2.0 * np.pi * corner, 0.7, rms, dt))
+        fit = least_squares(misfit, shape.vector, args=(shape,), loss="soft_l1", max_nfev=60,
+                            bounds=(shape.vector - 12.0, shape.vector + 12.0))
+        found.append((fit.cost, shape.moved(fit.x)))
+    cost, best = min(found, key=lambda pair: pair[0])
+    nothing = least_squares(misfit, alone.vector, args=(alone,), loss="soft_l1")
+    return best if nothing.cost - cost > 3.0 * np.log(len(f)) else alone.moved(nothing.x)

@@ -1,0 +1,140 @@
+"""Records as AOT, the Adaptive Optics Telemetry format (T. Gomes et al., J. Astron. Telesc. Instrum. Syst. 10, 2024), through
+aotpy (the extra wfsobs[aot]).
+
+Read is the first control loop of a file. y_lgs are its sensor's measurements, turned into modes by measurements_to_modes where
+the file has it and otherwise taken as they are, tip and tilt of one subaperture; u are its modal coefficients, or its commands
+turned by commands_to_modes. y_ngs are the measurements of a second sensor, that of a natural guide star. Written are
+measurements and commands: AOT has no place for a truth, an open-loop twin or a training record.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import IO, Any
+
+import numpy as np
+
+from wfsobs.record import DELAY, RecordError
+from wfsobs.telemetry.formats.contents import NUMBERS, Contents, TooMuch, numbers_and_texts
+from wfsobs.telemetry.formats.fits import opened, read_whole
+from wfsobs.typing import Array
+
+PREFIX = "WFSOBS-"
+"""Of the names of images and metadata written here."""
+
+
+def _aotpy() -> Any:
+    try:
+        import aotpy
+    except ModuleNotFoundError:
+        raise RecordError("AOT files need aotpy; install wfsobs with its extra: wfsobs[aot]") from None
+    return aotpy
+
+
+def read(file: IO[bytes], most: int) -> Contents:
+    """Raises RecordError, TooMuch. Images outside the file are refused: nothing but the file is opened."""
+    aotpy = _aotpy()
+    with opened(file, most) as hdus:  # checks the sizes
+        for hdu in hdus[1:]:
+            _check_lists(hdu, most)
+    from aotpy.io.fits._file import AOTFITSErrorLevel
+
+    critical = AOTFITSErrorLevel.CRITICAL
+    try:
+        reader = aotpy.AOTFITSReader(
+            io.BytesIO(read_whole(file)), externals="disallow", exception_level=critical, log_level=critical)
+        return _contents(reader.get_system(), aotpy)
+    except RecordError:
+        raise
+    except Exception as error:  # of many kinds, by what a file lacks
+        raise RecordError(f"not an AOT file that aotpy can read: {' '.join(str(error).split())[:200]}") from None
+
+
+def _check_lists(hdu: Any, most: int) -> None:
+    """Lists of a table lie in a heap that many rows may point to: count what they would be in memory."""
+    if getattr(hdu, "columns", None) is None or hdu.data is None:
+        return
+    for column in hdu.columns:
+        if ("P" in column.format or "Q" in column.format) and len(hdu.data):
+            raw = np.asarray(hdu.data.view(np.ndarray)[column.name])
+            if raw.reshape(len(hdu.data), -1)[:, 0].astype(float).sum() * 8 > most:
+                raise TooMuch(most)
+
+
+def _contents(system: Any, aotpy: Any) -> Contents:
+    loops = [loop for loop in system.loops if isinstance(loop, aotpy.ControlLoop) and loop.input_sensor is not None
+             and loop.input_sensor.measurements is not None]
+    if not loops:
+        raise RecordError("has no control loop with measurements")
+    loop = loops[0]
+    sensor, contents = loop.input_sensor, Contents()
+    measured, to_modes = sensor.measurements, loop.measurements_to_modes
+    _take(contents, "y_lgs", measured, None if to_modes is None else to_modes.data)
+    if loop.modal_coefficients is not None:
+        _take(contents, "u", loop.modal_coefficients, None)
+    elif loop.commands is not None:
+        _take(contents, "u", loop.commands, None if loop.commands_to_modes is None else loop.commands_to_modes.data)
+    other = next((s for s in system.wavefront_sensors if s is not sensor and s.measurements is not None
+                  and isinstance(s.source, aotpy.NaturalGuideStar)), None)
+    if other is not None:
+        _take(contents, "y_ngs", other.measurements, None)
+    for name, clock in (("time", measured.time or loop.time), ("time_ngs", other and other.measurements.time)):
+        if clock is not None and clock.timestamps:
+            contents.arrays[name] = np.asarray(clock.timestamps, dtype=np.float64)
+    if loop.framerate:
+        contents.arrays["dt"] = np.array(1.0 / loop.framerate)
+    if loop.delay is not None and np.isfinite(loop.delay):
+        # both count from the middle of an exposure to the middle of the step in which its command acts
+        contents.arrays["delay"] = np.array(max(1, round(float(loop.delay))))
+    for entry in system.metadata:
+        if entry.key.upper().startswith(PREFIX):
+            name = entry.key[len(PREFIX):].lower()
+            contents.arrays[name] = np.array(float(entry.value) if name in NUMBERS else entry.value)
+    return contents
+
+
+def _take(contents: Contents, name: str, image: Any, matrix: Array | None) -> None:
+    """Rows of an image as modes, through a matrix (m, ...) where there is one."""
+    data = np.asarray(image.data, dtype=np.float64)
+    rows = data.reshape(data.shape[0], -1)
+    if matrix is not None:
+        rows = rows @ np.asarray(matrix, dtype=np.float64).reshape(len(matrix), -1).T
+    contents.arrays[name] = rows
+    if image.unit and matrix is None:
+        contents.state_unit(name, image.unit)
+
+
+def write(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
+    """Write measurements and commands as one control loop."""
+    aotpy = _aotpy()
+    plain = numbers_and_texts(arrays)
+    n_modes = arrays["y_lgs"].shape[1]
+    telescope = aotpy.MainTelescope(uid="telescope")
+
+    def image(name: str, shape: tuple[int, ...]) -> Any:
+        return aotpy.Image(name=PREFIX + name, data=np.asarray(arrays[name], dtype=np.float64).reshape(shape), unit="um")
+
+    def sensor(uid: str, source: Any, name: str) -> Any:
+        # one signal per mode; for tip and tilt that is a sensor of a single subaperture
+        measurements = image(name, (-1, 1, n_modes))
+        return aotpy.Pyramid(uid=uid, source=source, dimensions=1, n_valid_subapertures=n_modes, n_sides=4,
+                             measurements=measurements)
+
+    laser = aotpy.SodiumLaserGuideStar(uid="LGS")
+    lgs = sensor("LGS WFS", laser, "y_lgs")
+    sources, sensors = [laser], [lgs]
+    if "y_ngs" in arrays:
+        star = aotpy.NaturalGuideStar(uid="NGS")
+        sources.append(star)
+        sensors.append(sensor("NGS WFS", star, "y_ngs"))
+    mirror = aotpy.DeformableMirror(uid="mirror", telescope=telescope, n_valid_actuators=n_modes)
+    loop = aotpy.ControlLoop(
+        uid="loop", commanded_corrector=mirror, input_sensor=lgs, modal_coefficients=image("u", (-1, n_modes)),
+        framerate=1.0 / float(plain["dt"]), delay=float(plain.get("delay", DELAY)))
+    system = aotpy.AOSystem(
+        ao_mode="LTAO", name="wfsobs", main_telescope=telescope, sources=sources, wavefront_sensors=sensors,
+        wavefront_correctors=[mirror], loops=[loop], config="; ".join(str(plain.get("scenario", "")).splitlines()) or None,
+        # as texts: a number in a header has sixteen digits, one less than dt may need
+        metadata=[aotpy.Metadatum(PREFIX + key.upper(), str(plain[key])) for key in (*NUMBERS, "origin") if key in plain])
+    aotpy.AOTFITSWriter(system).get_hdulist().writeto(file)

@@ -1,0 +1,112 @@
+"""What a file of a record holds, by name, whatever its format."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from wfsobs.record import RecordError
+from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.typing import Array
+from wfsobs.units import unit_named
+
+FAST = ("y_lgs", "u", "turbulence", "vibration", "open_loop_y")
+"""One row per fast step."""
+
+NGS = "y_ngs"
+TRAINING = ("training_y", "training_u", "training_open_loop_y")
+SIGNALS = (*FAST, NGS, *TRAINING)
+"""Arrays (n, n_modes)."""
+
+TIME, TIME_NGS = "time", "time_ngs"
+CLOCKS = (TIME, TIME_NGS)
+"""Arrays (n,) [s]."""
+
+NUMBERS = ("dt", "ratio", "delay", "command_sign")
+TEXTS = ("unit", "origin", "scenario")
+NAMES = (*SIGNALS, *CLOCKS, *NUMBERS, *TEXTS)
+
+COLUMN = re.compile(r"(?:truth/)?(?P<array>[a-z_]+)/(?P<mode>[A-Za-z0-9 -]+?)(?:_(?P<unit>[A-Za-zµμ]+))?$")
+"""A column of one mode, such as y_lgs/tip_um."""
+
+
+@dataclass
+class Contents:
+    """arrays : name (of NAMES) -> array as it was in the file, numbers and texts of no dimension
+    units    : name of a signal -> its unit, where the file states one for it alone
+    """
+
+    arrays: dict[str, Array] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+
+    def state_unit(self, name: str, text: str) -> None:
+        """Note the unit of a signal. Raises RecordError for one that is not known, or not that of its other modes."""
+        unit = unit_named(text)
+        if unit is None:
+            raise RecordError(f"{name} is in {text!r}, which is no unit of a wavefront")
+        if self.units.setdefault(name, unit) != unit:
+            raise RecordError(f"{name} is in {self.units[name]} and in {unit}")
+
+
+def from_columns(columns: Mapping[str, Array]) -> Contents:
+    """Contents of columns (n,) named as COLUMN says, time_s or time_ngs_s; others are left aside.
+
+    Modes are in the order of the columns of y_lgs. Raises RecordError where an array lacks one of them.
+    """
+    contents = Contents()
+    found: dict[str, dict[str, Array]] = {}
+    for heading, values in columns.items():
+        clock = heading.removesuffix("_s")
+        match = COLUMN.fullmatch(heading)
+        if clock in CLOCKS:
+            contents.arrays[clock] = values
+        elif match and match["array"] in SIGNALS:
+            name = match["array"]
+            if match["mode"] in found.setdefault(name, {}):
+                raise RecordError(f"two columns are {name}/{match['mode']}")
+            found[name][match["mode"]] = values
+            if match["unit"]:
+                contents.state_unit(name, match["unit"])
+    if "y_lgs" not in found:
+        return contents
+    modes = list(found["y_lgs"])
+    for name, by_mode in found.items():
+        if set(by_mode) != set(modes):
+            raise RecordError(f"{name} has the modes {', '.join(by_mode)}; y_lgs has {', '.join(modes)}")
+        longest = max(map(len, by_mode.values()))
+        contents.arrays[name] = np.column_stack([_padded(by_mode[mode], longest) for mode in modes])
+    return contents
+
+
+def to_columns(arrays: Mapping[str, Array], unit: str = "um") -> dict[str, Array]:
+    """The signals and clocks as columns (n,), named as COLUMN says."""
+    columns = {f"{name}_s": np.asarray(arrays[name]) for name in CLOCKS if name in arrays}
+    for name in SIGNALS:
+        if name in arrays:
+            for i, values in enumerate(np.asarray(arrays[name]).T):
+                columns[f"{name}/{mode_name(i)}_{unit}"] = values
+    return columns
+
+
+def mode_name(column: int) -> str:
+    """The name of a column's mode: tip, tilt, then Noll's numbers, Z4 and up."""
+    return TIP_TILT[column].name if column < len(TIP_TILT) else f"Z{column + 2}"
+
+
+def numbers_and_texts(arrays: Mapping[str, Array]) -> dict[str, float | int | str]:
+    """What is not a signal or a clock, as plain values."""
+    return {name: np.asarray(arrays[name]).item() for name in (*NUMBERS, *TEXTS) if name in arrays}
+
+
+def _padded(x: Array, n: int) -> Array:
+    return np.concatenate([x, np.full(n - len(x), np.nan)])
+
+
+class TooMuch(RecordError):
+    """A file that holds more than it may."""
+
+    def __init__(self, most: int):
+        super().__init__(f"holds more than {most / 1e6:.4g} MB of numbers, which is the most that is read here")

@@ -1,0 +1,116 @@
+"""Records as CSV: one row per step, one column per signal and mode, such as y_lgs/tip_um.
+
+Lines before the heading that start with # can hold numbers and texts, such as `# dt: 0.001`. `nan` and an empty cell are a
+missing sample; where a column is empty to the end, it ends there.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator, Mapping
+from typing import IO
+
+import numpy as np
+
+from wfsobs.record import RecordError
+from wfsobs.telemetry.formats.contents import (
+    FAST,
+    NUMBERS,
+    TEXTS,
+    TIME,
+    Contents,
+    TooMuch,
+    from_columns,
+    numbers_and_texts,
+    to_columns,
+)
+from wfsobs.typing import Array
+
+LONGEST_LINE = 65_536
+"""Bytes."""
+
+
+def read(file: IO[bytes], most: int) -> Contents:
+    """Raises RecordError naming the line, TooMuch."""
+    plain, heading, rows = _head(file)
+    if len(set(heading)) < len(heading):
+        raise RecordError("two columns have the same heading")
+    width = len(heading)
+    columns, ends = [array("d") for _ in heading], [0] * width
+    for step, (line, cells) in enumerate(rows):
+        if len(cells) != width:
+            raise RecordError(f"line {line} has {len(cells)} cells, the heading {width}; cells are separated by commas")
+        if (step + 1) * width * 8 > most:
+            raise TooMuch(most)
+        for i, cell in enumerate(cells):
+            text = cell.strip()
+            if text:
+                ends[i] = step + 1
+            try:
+                columns[i].append(float(text or "nan"))
+            except ValueError:
+                raise RecordError(f"line {line}, {heading[i]}: {text[:40]!r} is not a number") from None
+    contents = from_columns({name: np.array(c[:end]) for name, c, end in zip(heading, columns, ends, strict=True)})
+    _level(contents)
+    contents.arrays |= plain
+    return contents
+
+
+def lines_of(file: IO[bytes]) -> Iterator[tuple[int, str]]:
+    """(number, text) of every line that is not blank."""
+    number = 0
+    while line := file.readline(LONGEST_LINE + 1):
+        number += 1
+        if len(line) > LONGEST_LINE:
+            raise RecordError(f"line {number} is longer than {LONGEST_LINE} bytes")
+        try:
+            text = line.decode("utf-8-sig" if number == 1 else "utf-8").strip()
+        except UnicodeDecodeError:
+            raise RecordError(f"line {number} is not UTF-8 text") from None
+        if "\0" in text:
+            raise RecordError(f"line {number} is not text")
+        if text:
+            yield number, text
+
+
+def _head(file: IO[bytes]) -> tuple[dict[str, Array], list[str], Iterator[tuple[int, list[str]]]]:
+    """Numbers and texts of the comments, the heading, and the rows to come as (line, cells)."""
+    plain: dict[str, Array] = {}
+    lines = lines_of(file)
+    for number, text in lines:
+        if not text.startswith("#"):
+            heading = [cell.strip().strip('"') for cell in text.split(",")]
+            return plain, heading, ((n, t.split(",")) for n, t in lines if not t.startswith("#"))
+        name, colon, value = text.lstrip("# ").partition(":")
+        if colon and name in TEXTS:
+            plain[name] = np.array(value.strip())
+        elif colon and name in NUMBERS:
+            try:
+                plain[name] = np.array(float(value))
+            except ValueError:
+                raise RecordError(f"line {number}: {name} takes a number, not {value.strip()[:40]!r}") from None
+    raise RecordError("holds no table")
+
+
+def _level(contents: Contents) -> None:
+    """Give all signals of the fast steps the length of the longest: frames that are missing at the end are empty cells."""
+    fast = [name for name in FAST if name in contents.arrays]
+    n = max((len(contents.arrays[name]) for name in (*fast, *((TIME,) if TIME in contents.arrays else ()))), default=0)
+    for name in fast:
+        values = contents.arrays[name]
+        contents.arrays[name] = np.pad(values, ((0, n - len(values)), (0, 0)), constant_values=np.nan)
+
+
+def write(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
+    """Write the arrays; every number with as many digits as bring it back."""
+    plain = numbers_and_texts(arrays)
+    scenario = str(plain.pop("scenario", ""))
+    head = [f"# {name}: {value}" for name, value in plain.items()]
+    head += [f"# {line}".rstrip() for line in scenario.splitlines()]
+    columns = to_columns(arrays)
+    file.write("\n".join([*head, ",".join(columns), ""]).encode())
+    texts = [list(map(repr, values.astype(float).tolist())) for values in columns.values()]
+    longest = max(map(len, texts), default=0)
+    padded = [text + [""] * (longest - len(text)) for text in texts]
+    for row in zip(*padded, strict=True):
+        file.write((",".join(row) + "\n").encode())

@@ -1,0 +1,112 @@
+"""A user's own vibration spectrum from CSV or FITS, for the settings vibration.psd.
+
+CSV: columns frequency, tip and tilt, each with its unit in brackets, such as `tip [nm^2/Hz]`. FITS: a table of those columns
+with TUNITn, or an image of three rows, frequency, tip, tilt, with BUNIT. One-sided densities; frequencies in Hz.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from wfsobs.record import RecordError
+from wfsobs.telemetry.formats.csv import lines_of
+from wfsobs.telemetry.formats.fits import opened
+from wfsobs.typing import Array
+from wfsobs.units import UNITS, micrometres_per, unit_named
+
+COLUMNS = ("frequency", "tip", "tilt")
+MOST = 64_000_000
+"""Bytes of numbers in a file; a scenario takes 100 000 frequencies."""
+
+SQUARED = re.compile(r"(?P<unit>[A-Za-zµμ]+)\s*(?:\^|\*\*)?2\s*(?:/\s*|\s)Hz(?:\^?-1)?")
+Table = tuple[dict[str, Array], dict[str, str]]
+"""Columns, and the units stated for them."""
+
+
+class NoSpectrumError(RecordError):
+    """A file without the columns or rows of a spectrum."""
+
+
+def load_psd(path: str | Path, unit: str | None = None, diameter: float = 8.0) -> dict[str, list[float]]:
+    """The table as vibration.psd takes it, {frequency, tip, tilt}, densities in [um^2/Hz].
+
+    unit : of the amplitude (one of UNITS), where the file states none; diameter [m] of the aperture, for angles.
+    Raises RecordError.
+    """
+    try:
+        with open(path, "rb") as file:
+            return read_psd(file, str(path), unit, diameter)
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def read_psd(file: IO[bytes], name: str, unit: str | None = None, diameter: float = 8.0) -> dict[str, list[float]]:
+    """The same of an open file; its name says the format and is never opened."""
+    try:
+        fits = name.lower().endswith((".fits", ".fit", ".fts"))
+        columns, units = _from_fits(file) if fits else _from_csv(file)
+        return _scaled(columns, units, unit, diameter)
+    except RecordError as error:
+        raise type(error)(f"{name}: {error}") from None
+
+
+def _from_csv(file: IO[bytes]) -> Table:
+    rows = [(n, text.split(",")) for n, text in lines_of(file) if not text.startswith("#")]
+    if not rows:
+        raise NoSpectrumError("holds no table")
+    found: dict[str, int] = {}
+    units: dict[str, str] = {}
+    for i, heading in enumerate(rows[0][1]):
+        name, _, rest = heading.strip().strip('"').partition("[")
+        found[name.strip().lower()] = i
+        units[name.strip().lower()] = rest.rstrip("] ")
+    missing = [name for name in COLUMNS if name not in found]
+    if missing:
+        raise NoSpectrumError(f"has no column {missing[0]}; it takes frequency [Hz], tip [nm^2/Hz], tilt [nm^2/Hz]")
+    columns: dict[str, list[float]] = {name: [] for name in COLUMNS}
+    for line, cells in rows[1:]:
+        for name in COLUMNS:
+            try:
+                columns[name].append(float(cells[found[name]]))
+            except (ValueError, IndexError):
+                raise RecordError(f"line {line}: {name} is not a number") from None
+    return {name: np.array(values) for name, values in columns.items()}, {n: u for n, u in units.items() if n in COLUMNS}
+
+
+def _from_fits(file: IO[bytes]) -> Table:
+    with opened(file, MOST) as hdus:
+        for hdu in hdus:
+            names = {c.name.lower(): c for c in getattr(hdu, "columns", None) or ()}
+            if all(name in names for name in COLUMNS):
+                columns = {name: np.array(hdu.data[names[name].name], dtype=np.float64) for name in COLUMNS}
+                return columns, {name: names[name].unit or "" for name in COLUMNS}
+            if hdu.is_image and hdu.data is not None and hdu.data.ndim == 2 and hdu.data.shape[0] == len(COLUMNS):
+                density = str(hdu.header.get("BUNIT", ""))
+                rows = np.array(hdu.data, dtype=np.float64)
+                return dict(zip(COLUMNS, rows, strict=True)), {"frequency": "Hz", "tip": density, "tilt": density}
+    raise NoSpectrumError("has neither a table of frequency, tip and tilt nor an image of three rows")
+
+
+def _scaled(columns: dict[str, Array], units: dict[str, str], unit: str | None, diameter: float) -> dict[str, list[float]]:
+    if units["frequency"] not in ("", "Hz", "hz"):
+        raise RecordError(f"frequency is in {units['frequency']!r}; it takes Hz")
+    for name, values in columns.items():
+        if values.ndim != 1 or not np.isfinite(values).all():
+            raise RecordError(f"{name} does not hold one finite number per row")
+    out = {"frequency": columns["frequency"].tolist()}
+    for name in COLUMNS[1:]:
+        match = SQUARED.fullmatch(units[name].strip())
+        own = unit_named(match["unit"]) if match else None
+        if units[name] and own is None:
+            raise RecordError(f"{name} is in {units[name]!r}; it takes the square of {', '.join(UNITS)} per Hz")
+        if own and unit and own != unit:
+            raise RecordError(f"{name} is in {own}^2/Hz, but {unit} is stated")
+        amplitude = own or unit
+        if amplitude is None:
+            raise RecordError(f"does not say the unit of {name}: say it, one of {', '.join(UNITS)} (squared, per Hz)")
+        out[name] = (columns[name] * micrometres_per(amplitude, diameter) ** 2).tolist()
+    return out

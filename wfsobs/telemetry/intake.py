@@ -1,0 +1,213 @@
+"""From the named arrays of a file to a `Record`: shapes, units, signs and clocks, each checked here and nowhere else.
+
+A record has y_lgs and u (n_steps, n_modes) and dt or time; optionally y_ngs (the same shape, NaN where there is no frame, or
+one row per frame) with ratio or time_ngs, the truth turbulence and vibration, open_loop_y, and for the offline GPR training_y,
+training_u and training_open_loop_y (n, n_modes).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from wfsobs.record import DELAY, Record, RecordError, Training
+from wfsobs.scenario import Scenario
+from wfsobs.telemetry import timestamps as clock
+from wfsobs.telemetry.formats.contents import FAST, NGS, SIGNALS, TRAINING, Contents
+from wfsobs.typing import Array
+from wfsobs.units import ANGLES, micrometres_per, unit_named
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What is said of a file from outside: it counts where the file is silent, and must not contradict it.
+
+    unit : of y_lgs, u and the rest, one of wfsobs.units.UNITS; um where nobody says
+    command_sign  : +1, y = disturbance + u, or -1, y = disturbance - u
+    command_delay : steps from a command to the first measurement that sees it, 1 or more
+    rate : of the fast steps [Hz]
+    """
+
+    unit: str | None = None
+    command_sign: int | None = None
+    command_delay: int | None = None
+    rate: float | None = None
+
+
+def record_of(contents: Contents, scenario: Scenario, stated: Stated) -> Record:
+    """The record of a file's contents. Raises RecordError with one line saying what, where and what is expected."""
+    arrays = contents.arrays
+    for name in ("y_lgs", "u"):
+        if name not in arrays:
+            raise RecordError(f"has no {name}; a record needs y_lgs, u and dt")
+    signals = {name: _signal(name, arrays[name]) for name in SIGNALS if name in arrays}
+    n, n_modes = signals["y_lgs"].shape
+    most = len(scenario.modes)
+    if not 1 <= n_modes <= most or n < 2:
+        raise RecordError(f"y_lgs has shape {(n, n_modes)}; it takes (n_steps >= 2, 1 to {most} modes)")
+    for name in signals:
+        rows = signals["training_y"].shape[0] if name in TRAINING and "training_y" in signals else n
+        rows = signals[name].shape[0] if name == NGS else rows  # may have one row per frame
+        if signals[name].shape != (rows, n_modes):
+            raise RecordError(f"{name} has shape {signals[name].shape}; expected ({rows}, {n_modes})")
+    origin, sign = _into_micrometres(signals, contents, stated, scenario.telescope.diameter)
+    signals["u"] *= sign
+    if "training_u" in signals:
+        signals["training_u"] *= sign
+    dt, ratio = _timed(signals, arrays, stated)
+    if np.isnan(signals["y_lgs"]).all(axis=0).any():
+        raise RecordError("y_lgs holds no measurement of one of its modes")
+    delay = _whole("delay", arrays, stated.command_delay, DELAY)
+    if delay < 1:
+        raise RecordError(f"delay takes a whole number from 1, not {delay}")
+    fields = {name: signals[name] for name in (*FAST, NGS) if name in signals}
+    return Record(**fields, dt=dt, ratio=ratio, training=_training(signals), delay=delay, origin=origin)  # type: ignore[arg-type]
+
+
+def _signal(name: str, raw: Array) -> Array:
+    """A signal as native float64 of its own, NaN where a sample is missing."""
+    if raw.dtype.kind not in "fiu":
+        raise RecordError(f"{name} holds {raw.dtype}, not numbers")
+    if raw.ndim != 2:
+        raise RecordError(f"{name} has shape {raw.shape}; expected (any, any)")
+    out = np.array(raw, dtype=np.float64, order="C")
+    bad = np.isinf(out) if name not in TRAINING else ~np.isfinite(out)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise RecordError(f"{name} is {out[row, column]} at step {row}, mode {column}; it takes finite numbers")
+    return out
+
+
+def _into_micrometres(
+    signals: dict[str, Array], contents: Contents, stated: Stated, diameter: float
+) -> tuple[str, int]:
+    """Scale every signal to um; returns (what to keep of unit, sign and aperture as one line, sign of the commands)."""
+    arrays, own = contents.arrays, contents.units
+    if "unit" in arrays:
+        unit = unit_named(str(arrays["unit"]))
+        if unit is None:
+            raise RecordError(f"unit is {str(arrays['unit'])[:40]!r}, which is no unit of a wavefront")
+        own = dict.fromkeys(signals, unit) | own
+    for name, unit in own.items():
+        if stated.unit is not None and unit != stated.unit:
+            raise RecordError(f"{name} is in {unit}, but {stated.unit} is stated")
+    units = {name: own.get(name, stated.unit or "um") for name in signals}
+    if set(units.values()) & set(ANGLES) and signals["y_lgs"].shape[1] > 2:
+        raise RecordError("angles are for tip and tilt alone, of which there are two")
+    for name, unit in units.items():
+        if unit != "um":
+            signals[name] *= micrometres_per(unit, diameter)
+    sign = _whole("command_sign", arrays, stated.command_sign, 1)
+    if sign not in (1, -1):
+        raise RecordError(f"command_sign takes 1 or -1, not {sign}")
+    said = [f"unit {unit}" for unit in dict.fromkeys(units.values()) if unit != "um"]
+    said += [f"aperture {diameter:g} m"] if set(units.values()) & set(ANGLES) else []
+    said += ["command sign -1"] if sign < 0 else []
+    before = [str(arrays["origin"])] if "origin" in arrays else []
+    return ", ".join(before + said), sign
+
+
+def _timed(signals: dict[str, Array], arrays: Mapping[str, Array], stated: Stated) -> tuple[float, int | None]:
+    """Put the rows where their time stamps say, and NGS frames beside them; returns the fast step [s] and the ratio."""
+    n = signals["y_lgs"].shape[0]
+    dt = None if "dt" not in arrays else _number("dt", arrays["dt"])
+    if stated.rate is not None:
+        if dt is not None and abs(dt * stated.rate - 1.0) > clock.AGREE:
+            raise RecordError(f"its rate is {1.0 / dt:.6g} Hz, but {stated.rate:.6g} Hz are stated")
+        dt = 1.0 / stated.rate if dt is None else dt
+    start = 0.0
+    if "time" in arrays:
+        time = _clock("time", arrays["time"], n)
+        steps, dt = clock.steps_of(time, dt)
+        start = float(time[0])
+        for name, values in signals.items():
+            if name not in TRAINING and values.shape[0] == n:
+                signals[name] = clock.spread(values, steps)
+    if dt is None:
+        raise RecordError("has no dt and no time; a record needs y_lgs, u and dt")
+    if NGS not in signals:
+        return dt, None
+    if "time_ngs" in arrays:
+        ratio = _stamped_frames(signals, arrays, start, dt)
+    else:
+        ratio = _whole("ratio", arrays)
+        signals[NGS] = _numbered_frames(signals[NGS], signals["y_lgs"].shape[0], ratio)
+    signals[NGS] = _frames(signals[NGS], ratio)
+    return dt, ratio
+
+
+def _numbered_frames(frames: Array, n: int, ratio: int) -> Array:
+    """Frames with a row per fast step, or else one row per frame, given a row per fast step."""
+    if frames.shape[0] == n:
+        return frames
+    out = np.full((n, frames.shape[1]), np.nan)
+    due = out[ratio::ratio]
+    if not 0 <= frames.shape[0] - len(due) <= 1:
+        raise RecordError(f"y_ngs has {frames.shape[0]} rows; it takes {n}, or one per frame, {len(due)}")
+    due[:] = frames[: len(due)]
+    return out
+
+
+def _stamped_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start: float, dt: float) -> int:
+    """Put the frames at their stamps, and let the record start `ratio` steps before a frame; returns the ratio."""
+    frames, n = signals[NGS], signals["y_lgs"].shape[0]
+    steps = clock.frames_at(_clock("time_ngs", arrays["time_ngs"], frames.shape[0]), start, dt)
+    between = int(np.median(np.diff(steps))) if steps.size > 1 else None
+    ratio = _whole("ratio", arrays, None, between)
+    late = np.flatnonzero((steps - steps[0]) % ratio)
+    if late.size:
+        raise RecordError(f"time_ngs: the frame in row {late[0]} is not a whole number of {ratio} steps after the first")
+    inside = (steps >= 0) & (steps < n)
+    signals[NGS] = np.full((n, frames.shape[1]), np.nan)
+    signals[NGS][steps[inside]] = frames[inside]
+    for name in (*FAST, NGS):
+        if name in signals:
+            signals[name] = signals[name][steps[0] % ratio :]
+    return ratio
+
+
+def _training(signals: Mapping[str, Array]) -> Training | None:
+    found = [name for name in TRAINING[:2] if name in signals]
+    if len(found) == 1:
+        raise RecordError("training_y and training_u must come together")
+    return Training(*(signals.get(name) for name in TRAINING)) if found else None  # type: ignore[arg-type]
+
+
+def _clock(name: str, raw: Array, n: int) -> Array:
+    if raw.dtype.kind not in "fiu" or raw.shape != (n,):
+        raise RecordError(f"{name} takes {n} numbers, not {raw.dtype} of shape {raw.shape}")
+    return raw.astype(np.float64)
+
+
+def _number(name: str, raw: Array) -> float:
+    if raw.ndim != 0 or raw.dtype.kind not in "fiu" or not np.isfinite(raw) or raw <= 0:
+        raise RecordError(f"{name} takes one number above 0, not {np.array2string(raw, threshold=4)}")
+    return float(raw)
+
+
+def _whole(name: str, arrays: Mapping[str, Array], stated: int | None = None, default: int | None = None) -> int:
+    """A whole number of the file, else the one stated, else the default."""
+    if name not in arrays:
+        if stated is None and default is None:
+            raise RecordError("y_ngs needs ratio, the number of fast steps per NGS frame")
+        return int(stated if stated is not None else default)  # type: ignore[arg-type]
+    value = float(raw) if (raw := arrays[name]).ndim == 0 and raw.dtype.kind in "fiu" else np.nan
+    if value != round(value, 0) or (name == "ratio" and value <= 0):
+        raise RecordError(f"{name} takes a whole number, not {value:g}")
+    if stated is not None and value != stated:
+        raise RecordError(f"{name} is {value:g}, but {stated} is stated")
+    return int(value)
+
+
+def _frames(y_ngs: Array, ratio: int) -> Array:
+    """Check that frames are where the ratio says, at k = n, 2n, ...; a frame at k = 0 saw nothing and is dropped, as is
+    what is left of one in which a mode is missing."""
+    steps = np.arange(y_ngs.shape[0])
+    due = (steps % ratio == 0) & (steps >= ratio)
+    wrong = ~due & ~np.isnan(y_ngs).all(axis=1) & (steps > 0)
+    if wrong.any():
+        raise RecordError(f"y_ngs has a frame at step {int(np.argmax(wrong))}; with ratio = {ratio} "
+                          f"frames are at steps {ratio}, {2 * ratio}, ... and NaN elsewhere")
+    return np.where((due & ~np.isnan(y_ngs).any(axis=1))[:, None], y_ngs, np.nan)
