@@ -1,7 +1,9 @@
-# `make help` lists the targets. Everything goes into .venv, but for the tests' browser (scripts/need_browser.sh).
+# `make help` lists the targets. Everything goes into .venv, what builds the documentation into .venv-docs, and the tests'
+# browser where scripts/need_browser.sh puts it.
 
 PYTHON ?= python3
 PORT ?= 5006
+TUTORIALS ?= run
 VENV := .venv
 BIN := $(VENV)/bin
 
@@ -18,6 +20,7 @@ MADE := $(VENV)/.made-$(PLACE)
 RUN := $(VENV)/.run-$(PINS)
 TEST := $(VENV)/.test-$(PINS)
 BENCH := $(VENV)/.bench-$(PINS)
+DOCS := $(VENV)-docs/.docs-$(PINS)
 
 # $(call install,requirements): these pins and the project itself, editable; stamps of other pins go.
 define install
@@ -30,7 +33,7 @@ define install
 endef
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: help run test setup check wheel wheel-check load container-check bench clean
+.PHONY: help run test setup check wheel wheel-check load container-check bench docs clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' Makefile
@@ -68,8 +71,12 @@ container-check:  ## run the steps of the Dockerfile in an empty environment, wi
 bench: $(BENCH)  ## time the observers, and compare them with other libraries
 	$(BIN)/wfsobs bench
 
+docs: $(DOCS)  ## build this documentation in build/site, the tutorials run again (TUTORIALS=shown: as they are)
+	PYTHONPATH=. TUTORIALS=$(TUTORIALS) $(VENV)-docs/bin/properdocs build --strict --quiet --config-file mkdocs.yml
+	$(VENV)-docs/bin/python docs/scripts/check_site.py build/site
+
 clean:  ## remove .venv and all that was built
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis test-output
+	rm -rf $(VENV) $(VENV)-docs build dist *.egg-info .pytest_cache .ruff_cache .hypothesis test-output
 	find docs scripts tests wfsobs -name __pycache__ -prune -exec rm -rf {} +
 
 $(MADE):
@@ -84,3 +91,9 @@ $(TEST): | $(MADE)
 
 $(BENCH): | $(MADE)
 	$(call install,requirements-bench.txt)
+
+$(DOCS):
+	@echo "Installing requirements-docs.txt in $(VENV)-docs ..."
+	@scripts/make_venv.sh "$(PYTHON)" $(VENV)-docs
+	@$(VENV)-docs/bin/python -m pip --disable-pip-version-check install --quiet -r requirements-docs.txt
+	@touch $@

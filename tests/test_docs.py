@@ -8,24 +8,42 @@ import importlib.util
 import io
 import re
 import shlex
+import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from wfsobs import RecordError
 from wfsobs.cli import main
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario, configfile
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.telemetry.formats.contents import Contents
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
-PAGES = [README, *sorted((ROOT / "docs").glob("**/*.md"))]
+DOCS = ROOT / "docs"
+PAGES = [README, *sorted(DOCS.glob("**/*.md"))]
+COMMANDS = [p for p in PAGES if p.parent.name != "tutorials" and p.stem != "read-your-telemetry"]
+"""Pages whose commands stand alone; those of the others go with their code."""
 SHORT = ("--set", "run.duration=2", "--set", "run.warm_up=0.5", "--set", "events=[]", "--set", "gpr_online.training_size=50",
          "--set", "gpr_offline.training_size=50")
 
 
 def script(name: str) -> ModuleType:
+    sys.path.insert(0, str(DOCS / "scripts"))  # they import each other
+    try:
+        return load_script(name)
+    finally:
+        sys.path.remove(str(DOCS / "scripts"))
+
+
+def load_script(name: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / "scripts" / f"{name}.py")
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
@@ -106,13 +124,13 @@ def names_of(file: Path) -> set[str]:
     return out
 
 
-def test_readme_lists_the_observers() -> None:
-    rows = re.findall(r"^\| `([\w-]+)` \| ([^|]+?) \| ([^|]+?) \|", prose(README), flags=re.M)
+def test_the_page_of_observers_lists_them() -> None:
+    rows = re.findall(r"^\| `([\w-]+)` \| ([^|]+?) \| ([^|]+?) \|", prose(DOCS / "observers.md"), flags=re.M)
     here = {(id_, name, targets) for id_, name, targets in rows if id_ in OBSERVERS}
     assert here == {(o.id, o.label, ", ".join(o.targets)) for o in OBSERVERS.values()}
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if p.parent.name != "tutorials"], ids=lambda p: p.name)
+@pytest.mark.parametrize("page", COMMANDS, ids=lambda p: p.name)
 def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every line of a ```sh block that starts with wfsobs, in order, in one folder, on short records."""
     monkeypatch.chdir(tmp_path)
@@ -130,28 +148,141 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
             Path(out).write_text(result.stdout, encoding="utf-8")
 
 
-def test_readme_output_is_real() -> None:
+def test_output_on_the_page_of_the_command_line_is_real() -> None:
     """The errors and truths in the table under `wfsobs run` are those of that command."""
     def table(text: str) -> list[list[str]]:
         return [[cell.strip() for cell in line.strip("│").split("│")][:6] for line in text.splitlines() if line.startswith("│")]
 
-    printed = table(blocks(README, "text")[0])
+    printed = table(blocks(DOCS / "command-line.md", "text")[0])
     assert len(printed) > 10
     assert sorted(table(CliRunner().invoke(main, ["run"]).stdout)) == sorted(printed)
 
 
-def test_readme_python_and_toml() -> None:
+def test_readme_is_short() -> None:
+    assert len(README.read_text(encoding="utf-8").splitlines()) < 120
+
+
+@pytest.mark.parametrize("page", [README, DOCS / "python.md"], ids=lambda p: p.name)
+def test_python_of_readme_and_its_page(page: Path) -> None:
     said = io.StringIO()
-    for code in blocks(README, "python"):
-        with contextlib.redirect_stdout(said):
-            exec(compile(code, "README.md", "exec"), {})
+    (code,) = blocks(page, "python")
+    with contextlib.redirect_stdout(said):
+        exec(compile(code, page.name, "exec"), {})
     assert "gpr-online vibration tip" in said.getvalue()
-    for text in blocks(README, "toml"):
-        assert configfile.from_toml(text).sensors.lgs_count == 4
 
 
-def test_readme_texts_are_what_the_program_says() -> None:
-    listed, refused = blocks(README, "text")[1:]
+def test_settings_file_of_the_command_line() -> None:
+    (text,) = blocks(DOCS / "command-line.md", "toml")
+    assert configfile.from_toml(text).sensors.lgs_count == 4
+
+
+def test_the_new_observer_runs(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """It stands beside the others, and is better than taking the measurement as it is."""
+    monkeypatch.setitem(OBSERVERS, "low-pass", OBSERVERS["zero"])  # so that it is taken out again
+    run_page(DOCS / "how-to" / "add-an-observer.md")
+    errors = {line.split()[0]: float(line.split()[1]) for line in capsys.readouterr().out.splitlines()}
+    assert set(errors) == {"low-pass", "kf-lgs", "persistence"}
+    assert errors["low-pass"] < errors["persistence"]
+
+
+def test_the_new_format_brings_a_record_back(tmp_path: Path) -> None:
+    names = run_page(DOCS / "how-to" / "add-a-file-format.md")
+    arrays = {"y_lgs": np.array([[0.1, np.nan], [0.3, -1e-9]]), "u": np.zeros((2, 2)), "dt": np.array(1e-3)}
+    with (tmp_path / "record.json").open("wb+") as file:
+        names["write"](file, arrays)
+        size = file.seek(0, 2)
+        file.seek(0)
+        back = names["read"](file, size, Contents()).arrays
+        assert back.keys() == arrays.keys()
+        assert all(np.array_equal(back[name], arrays[name], equal_nan=True) for name in arrays)
+        file.seek(0)
+        with pytest.raises(RecordError, match="holds more than"):
+            names["read"](file, size - 1, Contents())
+    with pytest.raises(RecordError, match="is no JSON"):
+        names["read"](io.BytesIO(b"{"), 100, Contents())
+
+
+def test_telemetry_is_read_as_the_page_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its commands and its code in the order of the page, on a shorter record."""
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    text = (DOCS / "how-to" / "read-your-telemetry.md").read_text(encoding="utf-8")
+    for language, block in re.findall(r"^```(python|sh)\n(.*?)^```$", text, flags=re.M | re.S):
+        if language == "python":
+            exec(compile(block.replace('"run.duration": 20.0', '"run.duration": 6.0'), "page", "exec"), names)
+        else:
+            result = CliRunner().invoke(main, [*shlex.split(block)[1:], "--set", "gpr_online.training_size=50"])
+            assert result.exit_code == 0, result.output
+    assert names["vibration"].shape == names["telemetry"].u.shape
+
+
+def run_page(page: Path) -> dict[str, Any]:
+    """Every block of Python on a page, in order, in one namespace."""
+    names: dict[str, Any] = {}
+    for code in blocks(page, "python"):
+        exec(compile(code, page.name, "exec"), names)
+    return names
+
+
+def test_reference_holds_every_entry_and_module() -> None:
+    made = script("reference").pages()
+    for page, entries in (("presets", PRESETS), ("observers", OBSERVERS), ("controllers", CONTROLLERS)):
+        text = made[f"reference/{page}.md"]
+        assert all(name in text for name in entries), page
+    shown = set(re.findall(r"^::: (wfsobs\.[\w.]+)$", "\n".join(made.values()), flags=re.M))
+    library = [p for p in (ROOT / "wfsobs").rglob("*.py") if p.relative_to(ROOT / "wfsobs").parts[0] not in ("app", "assets")]
+    assert shown == {".".join(p.relative_to(ROOT).with_suffix("").parts) for p in library if not p.stem.startswith("__")}
+
+
+def test_plan_of_the_code_is_that_of_the_imports(tmp_path: Path) -> None:
+    rooms = script("rooms")
+    for name, code in {
+        "__init__.py": "", "units.py": "", "far.py": "from wfsobs.low import one\n", "low/__init__.py": '"""Low."""\n',
+        "low/one.py": "from typing import TYPE_CHECKING\nimport numpy\nfrom wfsobs import units\n"
+                      "if TYPE_CHECKING:\n    from wfsobs.far import x\n",
+        "top/__init__.py": "import wfsobs.far\nimport wfsobs.units\n\ndef later():\n    from wfsobs.low.one import x\n",
+    }.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(code, encoding="utf-8")
+    told = rooms.plan(tmp_path)
+    assert told.imports == {"units": set(), "far": {"low"}, "low": {"units"}, "top": {"far", "units"}}
+    assert told.later == {"units": set(), "far": set(), "low": set(), "top": {"low"}}
+    assert told.says["low"] == "Low."
+    assert rooms.floors(told.imports) == {"units": 0, "low": 1, "far": 2, "top": 3}
+    assert rooms.reduced(told.imports)["top"] == {"far"}
+    assert rooms.svg(told).count("<rect") == 4 and rooms.svg(told).count("<path") == 4
+    assert rooms.floors({"a": {"b"}, "b": {"a"}, "c": {"a"}}) == {"a": 0, "b": 0, "c": 1}
+
+
+def test_pins_of_the_documentation_are_those_of_the_tests() -> None:
+    """They stand in two files, since the documentation is built without the dashboard; ruff's is that of the tests."""
+    def pins(name: str) -> dict[str, str]:
+        lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
+        return dict(line.split("==") for line in lines if "==" in line)
+
+    ours = pins("requirements-docs.txt")
+    others = pins("requirements.txt") | pins("requirements-bench.txt") | pins("requirements-test.txt")
+    assert {"numpy", "ruff", "matplotlib", "mkdocs-material"} <= ours.keys()
+    assert {name: version for name, version in ours.items() if others.get(name, version) != version} == {}
+
+
+def test_check_of_the_site_finds_what_is_wrong(tmp_path: Path) -> None:
+    good = '<a href="b.html#here">b</a><a href="https://example.org">elsewhere</a><img src="p.png">'
+    (tmp_path / "a.html").write_text(good, "utf-8")
+    (tmp_path / "b.html").write_text('<p id="here">', "utf-8")
+    (tmp_path / "p.png").write_bytes(b"")
+    check = script("check_site")
+    assert check.faults(tmp_path) == []
+    bad = '<p id="there"><a href="none.html"></a><script src="https://example.org/x.js"></script>'
+    (tmp_path / "b.html").write_text(bad, "utf-8")
+    (tmp_path / "s.css").write_text("@import 'https://example.org/font.css'", "utf-8")
+    assert check.faults(tmp_path) == [
+        "a.html: b.html#here leads nowhere", "b.html: loads https://example.org/x.js", "b.html: none.html leads nowhere",
+        "s.css: loads https://example.org/font.css"]
+
+
+def test_texts_of_the_command_line_are_what_the_program_says() -> None:
+    _, listed, refused = blocks(DOCS / "command-line.md", "text")
     assert CliRunner().invoke(main, ["presets"]).stdout == listed
     result = CliRunner().invoke(main, ["run", "--set", "turbulence.wind_speed=200"])
     assert result.exit_code == 2 and result.stderr == refused

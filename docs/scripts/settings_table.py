@@ -9,7 +9,6 @@ import param
 
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.parameters import Reals, unit_of
-from wfsobs.scenario.presets import PRESETS
 from wfsobs.scenario.settings import Group, holds_groups
 
 PAGE = Path(__file__).parents[1] / "settings.md"
@@ -19,7 +18,7 @@ HEAD = """\
 
 Every setting of a run, by the path that it has on the command line (`--set path=value`), in TOML files and in
 `Scenario.replace`. Items of a list are numbered from 0, and the number one past the end adds an item; N stands for such a
-number. The defaults are those of `Scenario()`; what a preset changes stands at the end of the page.
+number. The defaults are those of `Scenario()`; `wfsobs presets NAME` prints those of a preset.
 
 This page is written by [settings_table.py](scripts/settings_table.py) from `wfsobs/scenario/scenario.py`.
 """
@@ -27,12 +26,7 @@ This page is written by [settings_table.py](scripts/settings_table.py) from `wfs
 
 def page() -> str:
     """The whole page."""
-    parts = [HEAD, *sections(Scenario(), "")]
-    parts.append("## What the presets change\n\n`wfsobs presets NAME` prints a preset in full.\n")
-    for name, make in PRESETS.items():
-        rows = [f"| `{path}` | {value} |" for path, value in changes(make(), Scenario())]
-        parts.append("\n".join([f"### {name}\n", "| Path | Value |", "|---|---|", *rows, ""]))
-    return "\n".join(parts)
+    return "\n".join([HEAD, *sections(Scenario(), "")])
 
 
 def sections(group: Group, prefix: str) -> list[str]:

@@ -50,22 +50,23 @@ def _command(line: str) -> str:
     return result.stdout
 
 
-def renewed(page: Path) -> str:
-    """The page with the outputs of now, run in the current folder."""
-    outputs = iter([output for _, _, output in run(page)])
+def renewed(page: Path) -> tuple[str, dict[str, bytes]]:
+    """The page with the outputs of now, and the figures that its code saves; run in a folder of its own."""
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        outputs = iter([output for _, _, output in run(page)])
+        figures = {figure.name: figure.read_bytes() for figure in Path(folder).glob("*.png")}
 
     def block(match: re.Match[str]) -> str:
         language, code, output = match.group(1), match.group(2), next(outputs)
         return f"```{language}\n{code}```\n" + (f"\n```text\n{output}```\n" if output else "")
 
-    return BLOCK.sub(block, page.read_text(encoding="utf-8"))
+    return BLOCK.sub(block, page.read_text(encoding="utf-8")), figures
 
 
 if __name__ == "__main__":
     for name in map(Path, sys.argv[1:]):
         page = name.resolve()
-        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-            text = renewed(page)
-            for figure in Path(folder).glob("*.png"):
-                (page.parent / figure.name).write_bytes(figure.read_bytes())
+        text, figures = renewed(page)
+        for figure, content in figures.items():
+            (page.parent / figure).write_bytes(content)
         page.write_text(text, encoding="utf-8")
