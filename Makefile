@@ -51,9 +51,10 @@ test: setup  ## run all tests, then the tutorials, then those in a browser
 setup: $(TEST)  ## install all that the tests need, the browser included
 	@scripts/need_browser.sh $(VENV)
 
-check: $(TEST)  ## ruff and pyright
+check: $(TEST)  ## ruff, pyright, and the walls between the rooms
 	$(BIN)/ruff check .
 	$(BIN)/pyright
+	$(BIN)/lint-imports --no-logo --no-cache
 
 wheel: $(TEST)  ## build dist/*.tar.gz, and from it dist/*.whl
 	rm -rf dist

@@ -10,9 +10,9 @@ from scipy.linalg import cholesky, solve_triangular, toeplitz
 from scipy.stats import binom
 
 from wfsobs.evaluation.bound import least_errors
-from wfsobs.evaluation.scores import rms
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
+from wfsobs.signal.welch import rms
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array

@@ -11,7 +11,7 @@ import pytest
 
 from wfsobs import PRESETS, Scenario, SettingError, observe, simulate
 from wfsobs.control.closed_loop import closed_loop, design
-from wfsobs.control.tables import rows
+from wfsobs.control.rows import rows
 from wfsobs.cost import run_bytes, run_seconds
 from wfsobs.evaluation.bound import bounds
 from wfsobs.identification import identify

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from wfsobs import PRESETS, observe, simulate
-from wfsobs.evaluation.scores import PREDICTION, RESIDUAL, rms
+from wfsobs.evaluation.scores import PREDICTION, RESIDUAL
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.single import kalman_model, measurement_noise
-from wfsobs.observers.missing import bridged, held
+from wfsobs.observers.missing import bridged
 from wfsobs.pipeline import each_estimate
-from wfsobs.record import Record
+from wfsobs.record import Record, held
 from wfsobs.scenario import Scenario
 from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.welch import rms
 
 
 def scenario() -> Scenario:

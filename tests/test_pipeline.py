@@ -10,11 +10,12 @@ import pytest
 
 from wfsobs import PRESETS, Record, Scenario, SettingError, observe, run, simulate
 from wfsobs.evaluation.bound import bound
-from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL, rms
+from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.pipeline import Failure, as_stated, each_estimate
 from wfsobs.progress import Cancelled, Watch
+from wfsobs.signal.welch import rms
 
 
 def scenario(changes: dict[str, Any] | None = None) -> Scenario:

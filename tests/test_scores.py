@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.evaluation.scores import cumulative_rms, lag, rms, scored_samples, supervised_scores, unsupervised_scores, welch_psd
+from wfsobs.evaluation.scores import cumulative_rms, lag, scored_samples, supervised_scores, unsupervised_scores
 from wfsobs.observers.base import Estimate
 from wfsobs.record import Record
 from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.welch import rms, welch_psd
 
 NAMES = ["tip", "tilt"]
 

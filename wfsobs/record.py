@@ -110,3 +110,12 @@ def frame_mean(x: Array, n: int) -> Array:
     for j in range(1, n + 1):
         total += delayed(x, j)
     return total / n
+
+
+def held(x: Array) -> Array:
+    """x (n, n_columns) with every NaN replaced by the last number before it in its column, zero where there is none."""
+    gone = np.isnan(x)
+    if not gone.any():
+        return x
+    last = np.maximum.accumulate(np.where(gone, -1, np.arange(x.shape[0])[:, None]), axis=0)
+    return np.where(last < 0, 0.0, np.take_along_axis(x, np.maximum(last, 0), axis=0))

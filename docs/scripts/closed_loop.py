@@ -12,7 +12,7 @@ from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.integrator import highest_stable_gain
 from wfsobs.control.mirror import Mirror
-from wfsobs.control.tables import label, rows
+from wfsobs.control.rows import label, rows
 from wfsobs.evaluation.bound import BOUND
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

@@ -6,7 +6,7 @@ import sys
 from itertools import groupby
 
 from wfsobs.cli.recovery_tables import OverTime, recovery_texts
-from wfsobs.cli.tables import label_of
+from wfsobs.evaluation.rows import label_of
 from wfsobs.observers.base import TARGETS
 from wfsobs.pipeline import run
 from wfsobs.scenario.presets import PRESETS

@@ -16,13 +16,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # two are slower at these si
 import numpy as np
 
 import wfsobs
-from wfsobs.evaluation.scores import rms
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.kalman.single import by_target, measurement_noise, modelled_processes, steady_filter
 from wfsobs.record import Record, Training
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.bandpass import bandpass_bank, filter_causal, filter_zero_phase
 from wfsobs.signal.statespace import disturbance_model
+from wfsobs.signal.welch import rms
 
 SEEDS = range(1, 21)
 PRINTED = {"butterworth-ol": 7.66, "butterworth-cl": 13.4, "kf-lgs": 16.6, "gpr-offline": 12.4, "gpr-online": 13.3}

@@ -17,7 +17,7 @@ from wfsobs.app.style import LOOKS
 from wfsobs.app.views.envelope import envelope
 from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.tables import rows
+from wfsobs.control.rows import rows
 from wfsobs.evaluation.bound import BOUND
 
 

@@ -13,10 +13,10 @@ from wfsobs.app.pin import differences, name_of, pin
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.table import change, number
 from wfsobs.app.work import TRUTH
-from wfsobs.evaluation.scores import rms
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
+from wfsobs.signal.welch import rms
 
 
 def press(dashboard: Dashboard) -> None:

@@ -10,10 +10,11 @@ import pytest
 
 from wfsobs.app import work
 from wfsobs.app.work import TRUTH, Shown, compute
-from wfsobs.evaluation.scores import scored_samples, welch_psd
+from wfsobs.evaluation.scores import scored_samples
 from wfsobs.observers import OBSERVERS
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.scenario import Scenario
+from wfsobs.signal.welch import welch_psd
 
 
 def keys(shown: Shown) -> set[tuple[str, str]]:

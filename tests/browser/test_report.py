@@ -21,7 +21,7 @@ import wfsobs
 from wfsobs.app.display import UNITS, number, per_micrometre
 from wfsobs.app.work import TRUTH
 from wfsobs.cli import main
-from wfsobs.cli.tables import label_of
+from wfsobs.evaluation.rows import label_of
 from wfsobs.evaluation.scores import cumulative_rms, spectra
 from wfsobs.observers.base import TARGETS
 

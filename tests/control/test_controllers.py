@@ -17,7 +17,6 @@ from wfsobs.control.lqg import lqg_kf_lgs
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.prediction import gpr_offline_ahead
 from wfsobs.control.residual import residual_variance
-from wfsobs.evaluation.scores import welch_psd
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.kalman.single import kalman_model, measurement_noise, modelled_processes
 from wfsobs.progress import QUIET
@@ -27,6 +26,7 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.scenario.settings import SettingError
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import paper_matrices
+from wfsobs.signal.welch import welch_psd
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.typing import Array

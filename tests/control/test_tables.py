@@ -11,7 +11,7 @@ from click.testing import CliRunner, Result
 from wfsobs.cli import main
 from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.tables import LIMITED, NOT_APPLICABLE, label
+from wfsobs.control.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.evaluation.bound import BOUND
 from wfsobs.scenario import configfile
 from wfsobs.simulation.loop import simulate

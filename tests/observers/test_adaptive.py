@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.identification.quick import quick_spectrum
 from wfsobs.observers.kalman import adaptive as kalman_adaptive
 from wfsobs.observers.kalman.adaptive import filter_of, kf_adaptive
 from wfsobs.observers.kalman.single import steady_filter
@@ -22,6 +21,7 @@ from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.densities import densities
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.periodogram import frequencies
+from wfsobs.spectral.quick import quick_spectrum
 
 DT, NOISE = 1e-3, 0.014
 TURBULENCE = Ar2(7.0, 0.9, 0.5, DT)

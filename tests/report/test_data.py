@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from wfsobs.app.report.data import LEVELS, Grid, Pool, Report, bins_for, coded, state_of, window_of
 from wfsobs.app.report.packing import packed, unpacked
 from wfsobs.app.work import TRUTH
-from wfsobs.cli.tables import rows
-from wfsobs.evaluation.scores import cumulative_rms, welch_psd
+from wfsobs.evaluation.rows import rows
+from wfsobs.evaluation.scores import cumulative_rms
 from wfsobs.pipeline import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation
+from wfsobs.signal.welch import welch_psd
 
 
 @given(st.integers(2, 30_000), st.integers(10, 800), st.sampled_from([1e-2, 1e-3, 2e-4]))

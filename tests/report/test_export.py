@@ -17,7 +17,7 @@ from wfsobs.app.report import maker
 from wfsobs.app.report.maker import ReportError
 from wfsobs.app.work import Shown
 from wfsobs.cli import main
-from wfsobs.cli.tables import TIME, rows
+from wfsobs.evaluation.rows import TIME, rows
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.scenario import Scenario
 

@@ -21,7 +21,7 @@ from wfsobs.app.display import number
 from wfsobs.app.report.data import Grid, Report, state_of
 from wfsobs.app.report.page import page
 from wfsobs.app.report.text import FILE, LONGEST, command_of
-from wfsobs.cli.tables import TIME, label_of, looks_ahead, stretch_of
+from wfsobs.evaluation.rows import TIME, label_of, looks_ahead, stretch_of
 from wfsobs.pipeline import Result, observe, run
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import from_toml, scenario_from

@@ -11,10 +11,10 @@ from wfsobs.app.work import Shown
 from wfsobs.control.closed_loop import ClosedLoop, design, each_outcome
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.curves import Curves, curves
-from wfsobs.control.tables import Row, rows
-from wfsobs.evaluation.scores import welch_psd
+from wfsobs.control.rows import Row, rows
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
+from wfsobs.signal.welch import welch_psd
 from wfsobs.typing import Array
 
 PATIENCE = 60.0

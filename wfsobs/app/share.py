@@ -189,7 +189,7 @@ def to_python(scenario: Scenario, preset: str) -> str:
     made = f'wfsobs.PRESETS["{preset}"]()' + (f".replace({{\n{''.join(lines)}}})" if lines else "")
     imports = "import wfsobs\n"
     if len(made) > LONGEST:
-        imports, made = "import wfsobs\nfrom wfsobs import configfile\n", f'configfile.load("{FILE}")'
+        imports, made = "import wfsobs\nfrom wfsobs.scenario import configfile\n", f'configfile.load("{FILE}")'
     return (
         f"{imports}\nscenario = {made}\nresult = wfsobs.run(scenario)\n"
         "for s in result.scores:\n"

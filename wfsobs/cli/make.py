@@ -9,6 +9,7 @@ from typing import Any
 import click
 from rich.console import Console
 
+from wfsobs.cli.bench_table import bench_table
 from wfsobs.cli.options import scenario_options
 from wfsobs.cli.show import progress_bar, warn
 from wfsobs.files import check_writable, write_whole
@@ -75,7 +76,7 @@ def bench(full: bool, as_json: bool) -> None:
         click.echo(json.dumps(measured, allow_nan=False))
         return
     console = Console()
-    table = benches.bench_table(measured, markdown=not console.is_terminal)
+    table = bench_table(measured, markdown=not console.is_terminal)
     (console if console.is_terminal else Console(width=200)).print(table)
     click.echo(benches.machine(benches.LIBRARIES))
 

@@ -9,8 +9,8 @@ from math import inf
 import numpy as np
 from rich.table import Table
 
-from wfsobs.cli.tables import Row, label_of
 from wfsobs.evaluation.recovery import Pooled, Recovery, recovery, running_rms
+from wfsobs.evaluation.rows import Row, label_of
 from wfsobs.pipeline import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.settings import SettingError

@@ -12,7 +12,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from wfsobs.cli.recovery_tables import OverTime
-from wfsobs.cli.tables import TIME, Row, score_table
+from wfsobs.cli.tables import score_table
+from wfsobs.evaluation.rows import TIME, Row
 from wfsobs.pipeline import Result
 
 

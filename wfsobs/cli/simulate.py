@@ -6,12 +6,13 @@ import json
 
 import click
 
+from wfsobs.cli.loop_table import loop_table
 from wfsobs.cli.options import scenario_options
 from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.show import progress_bar, show, show_over_time, show_table, warn
-from wfsobs.cli.tables import Row, rows
-from wfsobs.control import tables as loop_tables
 from wfsobs.control.closed_loop import closed_loop, design
+from wfsobs.control.rows import rows as loop_rows
+from wfsobs.evaluation.rows import Row, rows
 from wfsobs.pipeline import observe as observe_record
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
@@ -80,8 +81,8 @@ def loop(
         for i in range(seeds):
             one = scenario.replace({"run.seed": scenario.run.seed + i})
             result = closed_loop(simulate(one), plan, Watch(progress=lambda f, i=i: update((i + f) / seeds)))
-            all_rows += loop_tables.rows(result, one.run.seed)
+            all_rows += loop_rows(result, one.run.seed)
     if as_json:
         click.echo(json.dumps(all_rows, allow_nan=False))
     else:
-        show_table(loop_tables.table(all_rows))
+        show_table(loop_table(all_rows))

@@ -1,38 +1,14 @@
-"""Results as rows for machines and as a table for people."""
+"""Scores as a table for people."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from statistics import median
-from typing import Any
 
 from rich.table import Table
 
-from wfsobs.evaluation.scores import BOUND, LOOP, RESIDUAL, Score
-from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import SPECTRA
-
-Row = dict[str, Any]
-
-TIME = "time_per_step_us"
-"""Computing time per step and mode [us]: in the table, but not part of the result, which the seed fixes."""
-
-
-NOT_OBSERVERS = {LOOP: "Recorded loop", BOUND: "Bound, mean of the LGS"}
-"""Labels of rows that stand among the observers' and are none."""
-
-
-def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
-    """One plain dictionary per score: the keys of `wfsobs run --json`, and TIME."""
-    return [
-        {
-            "observer": s.observer, "target": s.target, "mode": s.mode, "rms_um": s.rms, "truth_rms_um": s.truth_rms,
-            "normalised_rms": s.normalised_rms, "lag_s": s.lag, "start_s": s.start, "stop_s": s.stop, "apart": s.apart,
-            "needs": needs_of(s.observer), "interval_um": None if s.interval is None else list(s.interval), "seed": seed,
-            TIME: None if s.observer in NOT_OBSERVERS else s.seconds_per_step * 1e6,
-        }
-        for s in scores
-    ]
+from wfsobs.evaluation.rows import TIME, Row, interval_text, label_of, looks_ahead, needs_of, own_stretch, stretch_of
+from wfsobs.evaluation.scores import RESIDUAL
 
 
 def score_table(rows: Sequence[Row]) -> Table:
@@ -67,47 +43,6 @@ def score_table(rows: Sequence[Row]) -> Table:
     return table
 
 
-def interval_text(interval: Sequence[float] | None, scale: float) -> str:
-    """Where the rms of an optimal observer lies in 95 % of records, "low - high"; "-" for rows that have none."""
-    return "-" if interval is None else f"{interval[0] * scale:.2f} - {interval[1] * scale:.2f}"
-
-
-def label_of(observer: str) -> str:
-    """What a row is called."""
-    return NOT_OBSERVERS.get(observer) or OBSERVERS[observer].label
-
-
-def needs_of(observer: str) -> str:
-    """What a row has to be given beside measurements: the bound the true spectra."""
-    if observer in NOT_OBSERVERS:
-        return SPECTRA if observer == BOUND else ""
-    return OBSERVERS[observer].told
-
-
-def competes(observer: str, apart: bool) -> bool:
-    """Whether a row can be the best: not the bound, nor what looks ahead or was scored on samples of its own."""
-    return observer not in NOT_OBSERVERS and not looks_ahead(observer) and not apart
-
-
-def stretch_of(rows: Iterable[Row]) -> str:
-    """What was scored of rows that can be compared, from the earliest to the latest, nothing where there are none.
-
-    >>> stretch_of([{"start_s": 4.001, "stop_s": 9.999, "apart": False}, {"start_s": None, "stop_s": None, "apart": False}])
-    '4.00 to 10.00 s'
-    """
-    return _span([r for r in rows if not r["apart"]])
-
-
-def own_stretch(row: Row) -> str:
-    """What was scored of a row that stands apart, nothing of any other."""
-    return f"{_span([row])} only" if row["apart"] else ""
-
-
-def _span(rows: Sequence[Row]) -> str:
-    known = [(r["start_s"], r["stop_s"]) for r in rows if r["start_s"] is not None]
-    return f"{min(start for start, _ in known):.2f} to {max(stop for _, stop in known):.2f} s" if known else ""
-
-
 def _own(same: Sequence[Row]) -> str:
     """What is said of an observer that stands apart, for some seeds or all."""
     return f" ({own_stretch(own[0])})" if (own := [r for r in same if r["apart"]]) else ""
@@ -120,11 +55,6 @@ def _caption(rows: Sequence[Row]) -> str:
     if len(spans) > 1:
         return "Scored: " + "; ".join(f"{target} {span}" for target, span in found.items() if span)
     return f"Scored: {spans.pop()}" if spans else ""
-
-
-def looks_ahead(observer: str) -> bool:
-    """Whether an estimate uses later samples."""
-    return observer not in NOT_OBSERVERS and not OBSERVERS[observer].causal
 
 
 def _number(same: Sequence[Row], key: str, scale: float, digits: int) -> str:

@@ -6,9 +6,10 @@ import json
 
 import click
 
+from wfsobs.cli.identification_table import identification_table
 from wfsobs.cli.options import loaded, record_options, scenario_options
 from wfsobs.cli.show import progress_bar, show, show_table, warn
-from wfsobs.cli.tables import rows
+from wfsobs.evaluation.rows import rows
 from wfsobs.files import check_writable, write_whole
 from wfsobs.identification import identify as identify_record
 from wfsobs.identification import report as identified
@@ -74,6 +75,6 @@ def identify(
     if as_json:
         click.echo(json.dumps(identified.plain(result), allow_nan=False))
         return
-    show_table(identified.table(result))
+    show_table(identification_table(result))
     for line in identified.verdict(result):
         click.echo(line)

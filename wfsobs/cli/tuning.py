@@ -8,6 +8,7 @@ import click
 
 from wfsobs.cli.options import loaded, record_options, scenario_options
 from wfsobs.cli.show import progress_bar, show_table
+from wfsobs.cli.tuning_tables import errors_table, settings_table
 from wfsobs.files import check_writable, write_whole
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -60,7 +61,7 @@ def tune(
     if as_json:
         click.echo(json.dumps(report.plain(tuned), allow_nan=False))
         return
-    show_table(report.settings_table(tuned))
-    show_table(report.errors_table(tuned))
+    show_table(settings_table(tuned))
+    show_table(errors_table(tuned))
     for line in report.remarks(tuned):
         click.echo(line)

@@ -26,7 +26,6 @@ from wfsobs.control.margins import Margins, frequencies, margins
 from wfsobs.control.mirror import Mirror, mirror_of
 from wfsobs.control.residual import residual_variance
 from wfsobs.evaluation.bound import least_errors
-from wfsobs.evaluation.scores import rms
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.kalman.multirate import UnstableCycle
 from wfsobs.observers.missing import bridged
@@ -35,6 +34,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.settings import SettingError
+from wfsobs.signal.welch import rms
 from wfsobs.simulation.true_spectra import TrueSpectra, is_known, true_spectra
 from wfsobs.typing import Array
 

@@ -19,10 +19,11 @@ from math import inf, log
 import numpy as np
 from scipy.stats import chi2
 
-from wfsobs.evaluation.scores import BOUND, Score, rms
+from wfsobs.evaluation.scores import BOUND, Score
 from wfsobs.observers.base import TARGETS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
+from wfsobs.signal.welch import rms
 from wfsobs.signal.wiener import advanced, circle_mean, error_spectrum, explained, factorise, freedom
 from wfsobs.simulation.true_spectra import TrueSpectra, is_known, true_spectra
 from wfsobs.typing import Array

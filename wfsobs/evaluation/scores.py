@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import welch
 
 from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.record import Record
+from wfsobs.signal.welch import rms, welch_psd
 from wfsobs.typing import Array
 
 PREDICTION, RESIDUAL = "next z", "residual y"
@@ -152,11 +152,6 @@ def scored_samples(record: Record, truth: Array, value: Array, warm_up: float) -
     return truth[start:][known], value[start:][known]
 
 
-def rms(x: Array) -> float:
-    """Root of the mean square; the mean stays in."""
-    return float(np.sqrt(np.mean(np.square(x)))) if x.size else 0.0
-
-
 def lag(truth: Array, value: Array, dt: float) -> float | None:
     """Delay of `value` behind `truth` [s]: where their correlation coefficient is highest, between samples by a parabola
     through three points. Positive is late; None where either is constant.
@@ -185,14 +180,6 @@ def lag(truth: Array, value: Array, dt: float) -> float | None:
     curvature = before - 2.0 * at + after
     shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
     return float((peak - reach + shift) * dt)
-
-
-def welch_psd(x: Array, dt: float, resolution: float = 0.5) -> tuple[Array, Array]:
-    """Frequencies [Hz] and one-sided power spectral density [unit^2/Hz] of x (n, n_columns): Welch's average of
-    half-overlapping Hann windows of 1 / resolution seconds, or of the whole record if that is shorter."""
-    window = min(round(1.0 / (resolution * dt)), x.shape[0])
-    frequency, density = welch(x, fs=1.0 / dt, nperseg=window, axis=0, detrend="constant")
-    return frequency, density
 
 
 def spectra(record: Record, target: str, values: Array, warm_up: float) -> tuple[Array, Array, Array] | None:

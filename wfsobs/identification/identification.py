@@ -12,9 +12,8 @@ from wfsobs.identification.one_mode import OneMode
 from wfsobs.identification.remarks import in_time, remarks
 from wfsobs.identification.result import Identified, read_off
 from wfsobs.identification.whiteness import Whiteness, autocorrelation_test, cumulated_test, innovations
-from wfsobs.observers.missing import held
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record, RecordError, pseudo_open_loop
+from wfsobs.record import Record, RecordError, held, pseudo_open_loop
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.riccati import RiccatiError

@@ -1,11 +1,9 @@
-"""An identification as rows for machines, as a table for people, and as a TOML file of settings."""
+"""An identification as a plain dictionary, as rows and lines of text, and as a TOML file of settings."""
 
 from __future__ import annotations
 
 from math import sqrt
 from typing import Any
-
-from rich.table import Table
 
 from wfsobs.identification.process import Number, Process
 from wfsobs.identification.result import Identified, IdentifiedMode
@@ -42,21 +40,6 @@ def plain(result: Identified) -> dict[str, Any]:
     }
 
 
-def table(result: Identified) -> Table:
-    """Noise, turbulence and peaks of every mode."""
-    out = Table(title=f"Identified from {result.duration:.1f} s, with standard deviations")
-    for name in ("Mode", "What"):
-        out.add_column(name, no_wrap=True)
-    for name in ("frequency, Hz", "damping", "rms, nm"):
-        out.add_column(name, justify="right", no_wrap=True)
-    for m in result.modes:
-        out.add_section()
-        for what, frequency, damping, rms in rows(m):
-            numbers = (frequency, damping, None if rms is None else _nm(rms))
-            out.add_row(m.name, what, *("" if n is None else written(n) for n in numbers))
-    return out
-
-
 def rows(mode: IdentifiedMode) -> list[Row]:
     """Everything in a mode, peaks by frequency."""
     out: list[Row] = [("white noise", None, None, mode.noise)]
@@ -79,10 +62,6 @@ def verdict(result: Identified) -> list[str]:
         why = "".join(f"; {remark}" for remark in w.remarks)
         out.append(f"{m.name}: what is left is {'white' if w.white else 'NOT white'} at {LEVEL:.0%} ({tests}{rest}){why}")
     return out
-
-
-def _nm(n: Number) -> Number:
-    return Number(n.value * 1e3, n.std * 1e3)
 
 
 def written(n: Number) -> str:

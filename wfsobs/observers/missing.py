@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from wfsobs.observers.kalman.single import kalman_model, measurement_noise
-from wfsobs.record import Record, delayed, frame_mean
+from wfsobs.record import Record, delayed, frame_mean, held
 from wfsobs.scenario import Scenario
 from wfsobs.signal.riccati import steady_state
 from wfsobs.typing import Array
@@ -37,15 +37,6 @@ def bridged(record: Record, scenario: Scenario) -> Record:
         y_ngs = y_ngs.copy()
         y_ngs[n::n] = predicted(y_ngs[n::n] - mirror, scenario, n * record.dt, NGS) + mirror
     return replace(record, y_lgs=y_lgs, u=u, y_ngs=y_ngs, open_loop_y=open_loop_y)
-
-
-def held(x: Array) -> Array:
-    """x (n, n_columns) with every NaN replaced by the last number before it in its column, zero where there is none."""
-    gone = np.isnan(x)
-    if not gone.any():
-        return x
-    last = np.maximum.accumulate(np.where(gone, -1, np.arange(x.shape[0])[:, None]), axis=0)
-    return np.where(last < 0, 0.0, np.take_along_axis(x, np.maximum(last, 0), axis=0))
 
 
 def predicted(z: Array, scenario: Scenario, dt: float, star: int) -> Array:

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wfsobs.evaluation.scores import rms, welch_psd
-from wfsobs.observers.missing import held
-from wfsobs.record import Record, RecordError
+from wfsobs.record import Record, RecordError, held
 from wfsobs.scenario import Scenario
+from wfsobs.signal.welch import rms, welch_psd
 from wfsobs.telemetry.formats.psd import NoSpectrumError, read_psd
 from wfsobs.telemetry.intake import Stated
 from wfsobs.telemetry.records import read_record

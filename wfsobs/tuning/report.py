@@ -1,14 +1,11 @@
-"""A tuning as a dictionary for machines, as tables for people, and as a TOML file of settings."""
+"""A tuning as a plain dictionary, as lines of text, and as a TOML file of settings."""
 
 from __future__ import annotations
 
 from functools import reduce
 from typing import Any
 
-from rich.table import Table
-
-from wfsobs.cli.tables import label_of
-from wfsobs.evaluation.scores import PREDICTION
+from wfsobs.evaluation.rows import label_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import annotated, changes, to_toml
 from wfsobs.tuning.judge import Errors
@@ -40,17 +37,6 @@ def _modes(errors: Errors | None) -> dict[str, float] | None:
     return dict(errors.modes) if errors else None
 
 
-def settings_table(tuned: Tuned) -> Table:
-    """The settings that were searched, and those that were set by hand for it, before and after."""
-    out = Table(title=f"{label_of(tuned.observer)}: settings after {len(tuned.history)} evaluations")
-    out.add_column("Setting", no_wrap=True)
-    for name in ("before", "after"):
-        out.add_column(name, justify="right", no_wrap=True)
-    for path, before, after in settings(tuned):
-        out.add_row(path, before, after)
-    return out
-
-
 def settings(tuned: Tuned) -> list[tuple[str, str, str]]:
     """(dotted path, before, after) of every setting that was searched or set by hand."""
     changed = [path for path in changes(tuned.scenario, tuned.before.scenario) if path not in tuned.start]
@@ -72,24 +58,8 @@ def _shown(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def errors_table(tuned: Tuned) -> Table:
-    """Errors, or what takes their place, on validation and test record, mode by mode and together."""
-    out = Table(title=f"{tuned.measure}{'' if tuned.target == PREDICTION else f' in {tuned.target}'}, nm")
-    out.add_column("", no_wrap=True)
-    for name in ("validation, before", "after", "test, before", "after"):
-        out.add_column(name, justify="right", no_wrap=True)
-    stages = (tuned.before, tuned.after)
-    cells = [s.validation for s in stages] + [s.test for s in stages]
-    for mode in next(e for e in cells if e).modes:
-        out.add_row(mode, *(_nm(e.modes[mode]) if e else "fails" for e in cells))
-    out.add_section()
-    out.add_row("rms over modes", *(_nm(e.rms) if e else "fails" for e in cells))
-    if any(s.other for s in stages):
-        out.add_row("in the other target", "", "", *(_nm(s.other.rms) if s.other else "fails" for s in stages))
-    return out
-
-
-def _nm(rms: float) -> str:
+def nm(rms: float) -> str:
+    """An error in [nm], to two digits."""
     return f"{rms * 1e3:.2f}"
 
 
@@ -120,4 +90,4 @@ def toml(tuned: Tuned) -> str:
 
 
 def _of(errors: Errors | None) -> str:
-    return f"{_nm(errors.rms)} nm" if errors else "fails"
+    return f"{nm(errors.rms)} nm" if errors else "fails"

@@ -9,7 +9,7 @@ from wfsobs.app.display import NOTHING, Display, number, per_micrometre
 from wfsobs.app.loop_work import LoopShown
 from wfsobs.app.style import LOOKS, swatch
 from wfsobs.app.views.table import BEST
-from wfsobs.control.tables import LIMITED, NOT_APPLICABLE, Row, label
+from wfsobs.control.rows import LIMITED, NOT_APPLICABLE, Row, label
 from wfsobs.evaluation.bound import BOUND
 
 UNSTABLE = '<span class="tag above">unstable</span>'

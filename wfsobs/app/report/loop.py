@@ -8,8 +8,8 @@ from itertools import groupby
 from wfsobs.app.display import NOTHING, number
 from wfsobs.app.report.data import Report, State
 from wfsobs.app.report.text import state_name
-from wfsobs.cli.tables import Row
-from wfsobs.control.tables import LIMITED, NOT_APPLICABLE, label
+from wfsobs.control.rows import LIMITED, NOT_APPLICABLE, label
+from wfsobs.evaluation.rows import Row
 
 INTRO = (
     "The same disturbance and noise under every controller, with the delay and the limits of the mirror that the settings under "

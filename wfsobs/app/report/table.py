@@ -8,7 +8,7 @@ from itertools import groupby
 
 from wfsobs.app.display import IN_MOST, NOTHING, number, per_micrometre
 from wfsobs.app.report.data import State
-from wfsobs.cli.tables import TIME, Row, competes, label_of, looks_ahead, own_stretch, stretch_of
+from wfsobs.evaluation.rows import TIME, Row, competes, label_of, looks_ahead, own_stretch, stretch_of
 from wfsobs.evaluation.scores import RESIDUAL
 
 COLUMNS = {

@@ -13,7 +13,7 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, Shown
-from wfsobs.cli.tables import NOT_OBSERVERS, own_stretch, rows
+from wfsobs.evaluation.rows import NOT_OBSERVERS, own_stretch, rows
 from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL, Score
 
 

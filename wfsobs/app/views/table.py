@@ -12,16 +12,7 @@ from wfsobs.app.display import IN_MOST, NOTHING, Display, number, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import Shown
-from wfsobs.cli.tables import (
-    NOT_OBSERVERS,
-    competes,
-    label_of,
-    looks_ahead,
-    needs_of,
-    own_stretch,
-    rows,
-    stretch_of,
-)
+from wfsobs.evaluation.rows import NOT_OBSERVERS, competes, label_of, looks_ahead, needs_of, own_stretch, rows, stretch_of
 from wfsobs.evaluation.scores import BOUND, LOOP, RESIDUAL, Score
 from wfsobs.observers.base import TARGETS
 

@@ -11,7 +11,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wfsobs.identification.quick import SHORTEST, quick_spectrum
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.single import MIN_NOISE, by_target, steady_filter
 from wfsobs.progress import Watch
@@ -21,6 +20,7 @@ from wfsobs.scenario.groups.observers import Adaptive
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.quick import SHORTEST, quick_spectrum
 from wfsobs.typing import Array
 
 STILL = PeriodicFilter([(np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((2, 1)), np.zeros((2, 1)))])

@@ -1,0 +1,28 @@
+"""An identification as a table for people."""
+
+from __future__ import annotations
+
+from rich.table import Table
+
+from wfsobs.identification.process import Number
+from wfsobs.identification.report import rows, written
+from wfsobs.identification.result import Identified
+
+
+def identification_table(result: Identified) -> Table:
+    """Noise, turbulence and peaks of every mode."""
+    out = Table(title=f"Identified from {result.duration:.1f} s, with standard deviations")
+    for name in ("Mode", "What"):
+        out.add_column(name, no_wrap=True)
+    for name in ("frequency, Hz", "damping", "rms, nm"):
+        out.add_column(name, justify="right", no_wrap=True)
+    for m in result.modes:
+        out.add_section()
+        for what, frequency, damping, rms in rows(m):
+            numbers = (frequency, damping, None if rms is None else _nm(rms))
+            out.add_row(m.name, what, *("" if n is None else written(n) for n in numbers))
+    return out
+
+
+def _nm(n: Number) -> Number:
+    return Number(n.value * 1e3, n.std * 1e3)

@@ -1,0 +1,77 @@
+"""Scores as plain rows, and what is said of a row in every table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from wfsobs.evaluation.scores import BOUND, LOOP, Score
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import SPECTRA
+
+Row = dict[str, Any]
+
+TIME = "time_per_step_us"
+"""Computing time per step and mode [us]: in the table, but not part of the result, which the seed fixes."""
+
+NOT_OBSERVERS = {LOOP: "Recorded loop", BOUND: "Bound, mean of the LGS"}
+"""Labels of rows that stand among the observers' and are none."""
+
+
+def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
+    """One plain dictionary per score: the keys of `wfsobs run --json`, and TIME."""
+    return [
+        {
+            "observer": s.observer, "target": s.target, "mode": s.mode, "rms_um": s.rms, "truth_rms_um": s.truth_rms,
+            "normalised_rms": s.normalised_rms, "lag_s": s.lag, "start_s": s.start, "stop_s": s.stop, "apart": s.apart,
+            "needs": needs_of(s.observer), "interval_um": None if s.interval is None else list(s.interval), "seed": seed,
+            TIME: None if s.observer in NOT_OBSERVERS else s.seconds_per_step * 1e6,
+        }
+        for s in scores
+    ]
+
+
+def interval_text(interval: Sequence[float] | None, scale: float) -> str:
+    """Where the rms of an optimal observer lies in 95 % of records, "low - high"; "-" for rows that have none."""
+    return "-" if interval is None else f"{interval[0] * scale:.2f} - {interval[1] * scale:.2f}"
+
+
+def label_of(observer: str) -> str:
+    """What a row is called."""
+    return NOT_OBSERVERS.get(observer) or OBSERVERS[observer].label
+
+
+def needs_of(observer: str) -> str:
+    """What a row has to be given beside measurements: the bound the true spectra."""
+    if observer in NOT_OBSERVERS:
+        return SPECTRA if observer == BOUND else ""
+    return OBSERVERS[observer].told
+
+
+def competes(observer: str, apart: bool) -> bool:
+    """Whether a row can be the best: not the bound, nor what looks ahead or was scored on samples of its own."""
+    return observer not in NOT_OBSERVERS and not looks_ahead(observer) and not apart
+
+
+def stretch_of(rows: Iterable[Row]) -> str:
+    """What was scored of rows that can be compared, from the earliest to the latest, nothing where there are none.
+
+    >>> stretch_of([{"start_s": 4.001, "stop_s": 9.999, "apart": False}, {"start_s": None, "stop_s": None, "apart": False}])
+    '4.00 to 10.00 s'
+    """
+    return _span([r for r in rows if not r["apart"]])
+
+
+def own_stretch(row: Row) -> str:
+    """What was scored of a row that stands apart, nothing of any other."""
+    return f"{_span([row])} only" if row["apart"] else ""
+
+
+def _span(rows: Sequence[Row]) -> str:
+    known = [(r["start_s"], r["stop_s"]) for r in rows if r["start_s"] is not None]
+    return f"{min(start for start, _ in known):.2f} to {max(stop for _, stop in known):.2f} s" if known else ""
+
+
+def looks_ahead(observer: str) -> bool:
+    """Whether an estimate uses later samples."""
+    return observer not in NOT_OBSERVERS and not OBSERVERS[observer].causal
