@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import doctest
 import importlib.util
 import io
 import re
 import shlex
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -229,9 +230,23 @@ def test_reference_holds_every_entry_and_module() -> None:
     for page, entries in (("presets", PRESETS), ("observers", OBSERVERS), ("controllers", CONTROLLERS)):
         text = made[f"reference/{page}.md"]
         assert all(name in text for name in entries), page
+    sections = dict(re.findall(r"^## wfsobs (\w+)\n(.*?)(?=^## |\Z)", made["reference/command-line.md"], flags=re.M | re.S))
+    assert sections.keys() == main.commands.keys()
+    for name, command in main.commands.items():
+        assert all(option in sections[name] for p in command.params for option in p.opts if option.startswith("-")), name
     shown = set(re.findall(r"^::: (wfsobs\.[\w.]+)$", "\n".join(made.values()), flags=re.M))
     library = [p for p in (ROOT / "wfsobs").rglob("*.py") if p.relative_to(ROOT / "wfsobs").parts[0] not in ("app", "assets")]
     assert shown == {".".join(p.relative_to(ROOT).with_suffix("").parts) for p in library if not p.stem.startswith("__")}
+
+
+def test_docstrings_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "griffe", SimpleNamespace(Extension=object))  # type: ignore[arg-type]
+    docstrings = script("docstrings")
+    assert doctest.testmod(docstrings).failed == 0
+    sections = "Sum.\n\nParameters\n----------\nx : float\n    A number."
+    assert docstrings.as_markdown(sections) == sections
+    text = "Sum.\n\nx : a number,\n    of any size\n\nFor x: more."
+    assert docstrings.as_markdown(text) == "Sum.\n\n- `x`: a number,\n    of any size\n\nFor x: more."
 
 
 def test_plan_of_the_code_is_that_of_the_imports(tmp_path: Path) -> None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import click
 from settings_table import changes
 
+from wfsobs.cli import main
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
@@ -23,28 +26,32 @@ APART = ("app", "assets")
 def pages() -> dict[str, str]:
     """Path of a page in the site -> its Markdown."""
     return {**api(), "reference/presets.md": presets(), "reference/observers.md": observers(),
-            "reference/controllers.md": controllers(), "reference/command-line.md": COMMANDS}
+            "reference/controllers.md": controllers(), "reference/command-line.md": commands()}
 
 
-COMMANDS = """\
-# Command line
+def commands() -> str:
+    """Every command with its arguments and options, as `--help` has them."""
+    out = ["# Command line\n\n[The command line](../command-line.md) is an introduction with examples.\n"]
+    for command in main.commands.values():
+        context = click.Context(command, info_name=command.name, parent=click.Context(main, info_name="wfsobs"))
+        records = (p.get_help_record(context) for p in command.get_params(context))
+        rows = ((f"`{option}`", linked(text)) for option, text in filter(None, records) if text)
+        usage = command.get_usage(context).removeprefix("Usage: ")
+        text = linked(inspect.cleandoc(command.help or ""))
+        out.append(f"## wfsobs {command.name}\n\n{text}\n\n    {usage}\n\n{table(('Option', 'Meaning'), rows)}\n")
+    return "\n".join(out)
 
-[The command line](../command-line.md) is an introduction with examples.
 
-::: mkdocs-click
-    :module: wfsobs.cli
-    :command: main
-    :prog_name: wfsobs
-    :depth: 1
-    :style: table
-    :list_subcommands: True
-"""
+def linked(text: str) -> str:
+    """A text of the program, the pages that it names as links."""
+    return re.sub(r"docs/([\w-]+)\.md", r"[\1](../\1.md)", text.replace("|", "\\|"))
 
 
 def api() -> dict[str, str]:
     """The public names, a page per package with all its modules, and the list of both for the navigation."""
     out = {"reference/api/index.md": "# Public names\n\nWhat `import wfsobs` gives.\n\n"
-           "::: wfsobs\n    options:\n      show_root_heading: false\n      show_root_toc_entry: false\n      heading_level: 2\n"}
+           "::: wfsobs\n    options:\n      show_root_heading: false\n      show_root_toc_entry: false\n      heading_level: 2\n"
+           "      members_order: [__all__]\n"}
     links = ["* [Public names](index.md)"]
     for package in packages(ROOT / "wfsobs"):
         name = ".".join(package.relative_to(ROOT).parts)

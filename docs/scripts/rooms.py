@@ -135,9 +135,9 @@ def svg(told: Plan) -> str:
 
 def _arrow(start: tuple[float, float], end: tuple[float, float], dashes: str) -> str:
     (x1, y1), (x2, y2) = start, end
-    down = 1 if y2 > y1 else -1
-    y1, y2 = y1 + down * HEIGHT / 2, y2 - down * HEIGHT / 2
-    bend = (y1 + y2) / 2
+    down = 1 if y2 >= y1 else -1
+    y1, y2 = y1 + down * HEIGHT / 2, y2 - (down if y2 != y1 else -1) * HEIGHT / 2
+    bend = (y1 + y2) / 2 if y2 != y1 else y1 + 0.8 * (FLOOR - HEIGHT)  # beside each other: a bow below
     return (f'<path d="M{x1:.0f} {y1:.0f}C{x1:.0f} {bend:.0f} {x2:.0f} {bend:.0f} {x2:.0f} {y2:.0f}" fill="none" '
             f'stroke="currentColor" stroke-opacity="0.45"{dashes}/>')
 
