@@ -10,11 +10,15 @@ from typing import Any
 import param
 from panel.custom import JSComponent
 
-from wfsobs.app.downloads import TooLarge, data_csv, data_npz
+from wfsobs.app.copies import EXPLORED, to_command, to_python
+from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
 from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.pages.pages import Pages
+from wfsobs.app.pages.parts import Offers
 from wfsobs.app.report.maker import LIMIT, ReportError, make
-from wfsobs.app.share import FILE, Link, from_file, from_query, to_command, to_file, to_python, to_query
+from wfsobs.app.share import FILE, Link, from_file, from_query, to_file, to_query
+from wfsobs.app.sources import Kept
 from wfsobs.app.store import Store
 from wfsobs.app.style import LOOKS, asset
 from wfsobs.app.work import Shown
@@ -38,6 +42,7 @@ class Toolbar(JSComponent):
     said = param.String("", doc="What was done, in one line.")
     notes = param.List([], doc="What was refused, a line each.")
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called, for the legends of figures that are saved.")
+    saves = param.List([], doc="What the page can save beside the data, as it is called in the menu.")
     largest = param.Integer(LARGEST, doc="The largest scenario file that is read [bytes].")
 
     _esm = asset("figures.js") + asset("actions.js")
@@ -66,8 +71,29 @@ class Actions:
         self.toolbar.on_action = self.handle
         self._tasks: dict[str, BackgroundTask] = {}
         self._under_way: dict[str, tuple[str, Callable[[Any], None]]] = {}
-        store.param.watch(self._refresh, ["scenario", "preset"])
+        self._pages: Pages | None = None
+        store.param.watch(self._refresh, ["scenario", "preset", "source"])
         store.run.param.watch(self._refresh_ready, "result")
+        self._refresh()
+
+    def attach(self, pages: Pages) -> None:
+        """The pages, of which the one that is shown says what is copied and saved."""
+        self._pages = pages
+        self._watched: set[str] = set()
+        pages.param.watch(self._turn, "current")
+
+    @property
+    def _offers(self) -> Offers | None:
+        page = self._pages and self._pages.made.get(self._pages.current)
+        return page if isinstance(page, Offers) else None
+
+    def _turn(self, _event: object) -> None:
+        page = self._offers
+        if page is not None and self._pages is not None and self._pages.current not in self._watched:
+            self._watched.add(self._pages.current)
+            for field in page.inputs:
+                field.param.watch(self._refresh, "value")
+        self.toolbar.saves = [*page.saves()] if page else []
         self._refresh()
 
     def handle(self, msg: dict[str, Any]) -> None:
@@ -81,6 +107,7 @@ class Actions:
             "toml": self.save_scenario,
             "csv": lambda: self.save_data("wfsobs.csv", "text/csv", data_csv),
             "npz": lambda: self.save_data("wfsobs.npz", "application/octet-stream", data_npz),
+            "page": lambda: self.save_of_page(str(msg.get("name", ""))),
         }
         if msg.get("action") in does:
             does[msg["action"]]()
@@ -88,7 +115,8 @@ class Actions:
     def open_link(self, query: str) -> None:
         """Take the settings that the page's address asks for, and name what cannot be taken."""
         link = from_query(query, self.store.validate)
-        self.store.load(link.scenario, link.preset)
+        kept = Kept(link.simulation) if link.simulation and link.simulation != link.scenario else None
+        self.store.load(link.scenario, link.preset, kept)
         self.toolbar.notes = [f"Not used from the link: {line}" for line in link.rejected]
 
     def open_file(self, name: str, text: object) -> None:
@@ -117,9 +145,21 @@ class Actions:
         shown = self.store.run.result
         if shown is None:
             self._note("There are no results to save yet.")
-            return
-        job = Job("save", lambda _watch, _tell: make(shown), refusal=TooLarge)
-        self._start(name, name, job, partial(self.toolbar.save, name, kind))
+        else:
+            self._save(Save(name, kind, lambda: make(shown)))
+
+    def save_of_page(self, what: str) -> None:
+        """Make a file of what the page shown has found, and send it."""
+        saves = self._offers.saves() if self._offers else {}
+        if (save := saves.get(what)) is not None:
+            self._save(save)
+        elif what in saves:
+            self._note(f"{what}: there is none yet.")
+
+    def _save(self, save: Save) -> None:
+        """Make a file beside the page, and send it."""
+        job = Job("save", lambda _watch, _tell: save.content(), refusal=TooLarge)
+        self._start(save.name, save.name, job, partial(self.toolbar.save, save.name, save.kind))
 
     def make_report(self) -> None:
         """Make the report of the results shown, beside everything else, and send it; one at a time."""
@@ -152,11 +192,12 @@ class Actions:
         self.toolbar.param.update(notes=[line], said="")
 
     def _refresh(self, *_: object) -> None:
-        scenario, preset = self.store.scenario, self.store.preset
-        query = to_query(scenario, preset)
+        scenario, preset, source = self.store.scenario, self.store.preset, self.store.source
+        query = to_query(scenario, preset, source.simulation if source else None)
+        task = self._offers.task if self._offers else EXPLORED
         self.toolbar.param.update(
-            linked=query is not None, query=query or "", command=to_command(scenario, preset),
-            python=to_python(scenario, preset))
+            linked=query is not None, query=query or "", command=to_command(scenario, preset, source, task),
+            python=to_python(scenario, preset, source, task))
 
     def _refresh_ready(self, *_: object) -> None:
         self.toolbar.ready = self.store.run.result is not None

@@ -87,6 +87,7 @@ class Dashboard:
     def page(self) -> pmui.Page:
         """The whole page."""
         self.pages = Pages(self.explore, self.store, self.display)
+        self.actions.attach(self.pages)
         page = pmui.Page(
             title="wfsobs", sidebar=[self.controls.view()], sidebar_width=340, theme_config=theme(), favicon=None,
             main=[_title(), pn.Column(

@@ -1,13 +1,16 @@
-"""What a run leaves to take home: its data as CSV and NPZ, its scenario in both."""
+"""What a run and the pages leave to take home: data as CSV and NPZ, the scenario in both; tables as CSV."""
 
 from __future__ import annotations
 
+import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wfsobs.app.loop_work import LoopShown
 from wfsobs.app.work import Shown
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario.configfile import to_toml
@@ -17,6 +20,14 @@ Array = NDArray[np.float64]
 
 MOST = 4_000_000
 """Numbers in a download: about 100 s at 1 kHz."""
+
+
+class Save(NamedTuple):
+    """A file to be saved; content is made in a thread. Raises TooLarge."""
+
+    name: str
+    kind: str
+    content: Callable[[], bytes]
 
 
 class TooLarge(ValueError):
@@ -29,9 +40,7 @@ def data_npz(shown: Shown) -> bytes:
     _check(shown)
     arrays = record_arrays(result.record, to_toml(shown.scenario))
     arrays |= {f"{e.observer}/{e.target}": e.values for e in result.estimates}
-    file = io.BytesIO()
-    np.savez_compressed(file, allow_pickle=False, **arrays)
-    return file.getvalue()
+    return _npz(arrays)
 
 
 def data_csv(shown: Shown) -> bytes:
@@ -40,14 +49,48 @@ def data_csv(shown: Shown) -> bytes:
     Numbers have nine digits; NaN where there is none. Raises TooLarge.
     """
     _check(shown)
-    names, columns = zip(*_columns(shown), strict=True)
     record = shown.result.record
     # comments of the TOML text too, and what a record is read by
     head = [f"# # dt: {record.dt!r}", *([f"# # ratio: {record.ratio}"] if record.ratio else [])]
     head += [f"# {line}".rstrip() for line in to_toml(shown.scenario).splitlines()]
-    row = ",".join(["%.9g"] * len(names))
-    lines = [row % tuple(values) for values in np.column_stack(columns).tolist()]
-    return "\n".join([*head, ",".join(names), *lines, ""]).encode()
+    return _csv(head, dict(_columns(shown)))
+
+
+def residuals_npz(shown: LoopShown) -> bytes:
+    """The residual of every controller that has one, (n_steps, n_modes) [um], as residual/controller; dt; the scenario."""
+    arrays = {f"residual/{o.controller}": o.residual for o in shown.result.outcomes if o.residual is not None}
+    return _npz(arrays | {"dt": np.array(shown.result.record.dt), "scenario": np.array(to_toml(shown.result.scenario))})
+
+
+def residuals_csv(shown: LoopShown) -> bytes:
+    """Time and the residual of every controller that has one, a row per step; nine digits; the scenario as comments."""
+    record, scenario = shown.result.record, shown.result.scenario
+    modes = [m.name for m in scenario.modes][: record.n_modes]
+    columns = {"time_s": np.asarray(np.arange(record.n_steps) * record.dt, dtype=np.float64)} | {
+        f"{o.controller}/{mode}_um": o.residual[:, i]
+        for o in shown.result.outcomes if o.residual is not None for i, mode in enumerate(modes)}
+    return _csv([f"# {line}".rstrip() for line in to_toml(scenario).splitlines()], columns)
+
+
+def table_csv(rows: Sequence[Mapping[str, object]]) -> bytes:
+    """Rows of the same keys as a table, these at its head; empty where there is no value."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue().encode()
+
+
+def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+    return file.getvalue()
+
+
+def _csv(head: Sequence[str], columns: Mapping[str, Array]) -> bytes:
+    row = ",".join(["%.9g"] * len(columns))
+    lines = [row % tuple(values) for values in np.column_stack([*columns.values()]).tolist()]
+    return "\n".join([*head, ",".join(columns), *lines, ""]).encode()
 
 
 def _columns(shown: Shown) -> Iterator[tuple[str, Array]]:

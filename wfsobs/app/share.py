@@ -1,14 +1,13 @@
-"""Settings as links, command lines and Python: only what differs from the preset, each field in its own words.
+"""Settings as links and files; a link holds only what differs from the preset, each field in its own words.
 
 A link's query is `preset=ut4&turbulence.wind_speed=20&vibration.peaks=45,0.03,0.01,0.01;...`: lists with commas, a
-peak as frequency, damping and its rms per mode, a layer likewise, peaks and layers with semicolons. Whatever of a
+peak as frequency, damping and its rms per mode, a layer likewise, peaks and layers with semicolons. A simulation
+that is kept has its settings after `simulation.`, on top of the same preset. Whatever of a
 query cannot be used is named, and the rest is used. Nothing of it is ever opened or evaluated.
 """
 
 from __future__ import annotations
 
-import json
-import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import reduce
@@ -38,16 +37,23 @@ MOST = 200
 PASSED_OVER = ("theme",)
 """Keys of a query that are not ours."""
 
+KEPT = "simulation"
+"""The field, and before a dot the prefix, of a simulation that is kept."""
+
 FILE = "wfsobs.toml"
 
 
 @dataclass(frozen=True)
 class Link:
-    """What a query asks for; rejected : a line for every field that could not be used."""
+    """What a query asks for.
+
+    rejected : a line for every field that could not be used;  simulation : of other settings, which is kept
+    """
 
     scenario: Scenario
     preset: str
     rejected: tuple[str, ...] = field(default=())
+    simulation: Scenario | None = None
 
 
 def changes(scenario: Scenario, preset: str) -> dict[str, Any]:
@@ -57,13 +63,22 @@ def changes(scenario: Scenario, preset: str) -> dict[str, Any]:
 
 # ---------------------------------------------------------------------- links
 
-def to_query(scenario: Scenario, preset: str) -> str | None:
-    """The query of a link to these settings, without "?"; None where it would be too long."""
+def to_query(scenario: Scenario, preset: str, simulation: Scenario | None = None) -> str | None:
+    """The query of a link to these settings, without "?"; None where it would be too long.
+
+    simulation : of other settings, which is kept
+    """
     changed = changes(scenario, preset)
-    parts = [f"preset={preset}"] if preset != SHORTEST_NAME or changed else []
-    parts += [f"{path}={quote(written(path, value), safe=',;:+-.')}" for path, value in changed.items()]
+    parts = [f"preset={preset}"] if preset != SHORTEST_NAME or changed or simulation else []
+    parts += _fields(changed)
+    if simulation is not None:
+        parts += [KEPT, *_fields(changes(simulation, preset), f"{KEPT}.")]
     query = "&".join(parts)
     return query if len(query) <= LONGEST else None
+
+
+def _fields(changed: Mapping[str, Any], prefix: str = "") -> list[str]:
+    return [f"{prefix}{path}={quote(written(path, value), safe=',;:+-.')}" for path, value in changed.items()]
 
 
 def from_query(query: str, check: Check = Scenario.validate) -> Link:
@@ -81,8 +96,11 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
     if name not in PRESETS:
         rejected.append(_line("preset", name, f"takes one of {', '.join(PRESETS)}"))
         name = SHORTEST_NAME
-    scenario, refused = _apply(PRESETS[name](), fields, check)
-    return Link(scenario, name, (*rejected, *refused))
+    kept = {key.removeprefix(f"{KEPT}."): text for key, text in fields.items() if key.startswith(f"{KEPT}.")}
+    told = {key: text for key, text in fields.items() if key != KEPT and not key.startswith(f"{KEPT}.")}
+    scenario, refused = _apply(PRESETS[name](), told, check)
+    simulation, more = _apply(PRESETS[name](), kept, check) if kept or KEPT in fields else (None, [])
+    return Link(scenario, name, (*rejected, *refused, *more), simulation)
 
 
 def written(path: str, value: Any) -> str:
@@ -171,31 +189,7 @@ def _word(value: Any) -> str:
     return repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
 
 
-# ---------------------------------------------------------------------- other languages
-
-def to_command(scenario: Scenario, preset: str) -> str:
-    """The command that prints the RMS table of these settings."""
-    words = ["wfsobs", "run", "--preset", preset]
-    for path, value in changes(scenario, preset).items():
-        words += ["--set", f"{path}={configfile.written(value)}"]
-    command = shlex.join(words)
-    return command if len(command) <= LONGEST else f"wfsobs run --config {FILE}"
-
-
-def to_python(scenario: Scenario, preset: str) -> str:
-    """A script that runs these settings and prints the errors."""
-    changed = changes(scenario, preset)
-    lines = [f"    {json.dumps(path)}: {value!r},\n" for path, value in changed.items()]
-    made = f'wfsobs.PRESETS["{preset}"]()' + (f".replace({{\n{''.join(lines)}}})" if lines else "")
-    imports = "import wfsobs\n"
-    if len(made) > LONGEST:
-        imports, made = "import wfsobs\nfrom wfsobs.scenario import configfile\n", f'configfile.load("{FILE}")'
-    return (
-        f"{imports}\nscenario = {made}\nresult = wfsobs.run(scenario)\n"
-        "for s in result.scores:\n"
-        '    print(f"{s.target:10} {s.mode:4} {s.observer:17} {1e3 * s.rms:8.2f} nm")\n'
-    )
-
+# ---------------------------------------------------------------------- files
 
 def to_file(scenario: Scenario, preset: str) -> str:
     """Every setting as TOML, with the preset that they are compared with."""

@@ -176,6 +176,10 @@ export function render({model, view, el}) {
   ])
   menu(bar, "Save", () => [
     ["Scenario as TOML", ask("toml")],
+    ...model.saves.map((name) => [name, () => {
+      model.said = "Preparing the file …"
+      model.send_msg({action: "page", name})
+    }]),
     ...(model.ready ? [["Data as CSV", ask("csv")], ["Data as NPZ", ask("npz")]] : []),
     ...figures().flatMap(([name, view]) =>
       KINDS.map((kind) => [`${name} as ${kind.toUpperCase()}`, () => saveFigure(name, view, kind, model)])),

@@ -27,8 +27,9 @@ def scenario_options(command: Callable) -> Callable:
 
 
 def record_options(command: Callable) -> Callable:
-    """--unit, --command-sign, --command-delay and --rate: what a record does not say of itself."""
+    """--unit, --command-sign, --command-delay and --rate, what a record does not say of itself; --sha256, which one it is."""
     for option in (
+        click.option("--sha256", metavar="HEX", help="Refuse the record unless its file has this SHA-256."),
         click.option("--rate", type=click.FloatRange(0, min_open=True), metavar="HZ",
                      help="Rate of the rows where they have no time."),
         click.option("--command-delay", type=click.IntRange(1, 100), metavar="N",
@@ -41,9 +42,9 @@ def record_options(command: Callable) -> Callable:
     return command
 
 
-def loaded(record_file: str, scenario: Scenario, stated: Stated) -> Record:
+def loaded(record_file: str, scenario: Scenario, stated: Stated, sha256: str | None = None) -> Record:
     """The record of a file; what was understood of it is said on standard error."""
-    record = load_record(record_file, scenario, stated)
+    record = load_record(record_file, scenario, stated, sha256)
     if record.origin:
         click.echo(f"wfsobs: {record_file}: read as {record.origin}", err=True)
     if record.missing:

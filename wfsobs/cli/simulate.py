@@ -7,18 +7,20 @@ import json
 import click
 
 from wfsobs.cli.loop_table import loop_table
-from wfsobs.cli.options import scenario_options
+from wfsobs.cli.options import loaded, record_options, scenario_options
 from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.show import progress_bar, show, show_over_time, show_table, warn
 from wfsobs.control.closed_loop import closed_loop, design
 from wfsobs.control.rows import rows as loop_rows
 from wfsobs.evaluation.rows import Row, rows
+from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
 from wfsobs.scenario.settings import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats.psd import load_psd
+from wfsobs.telemetry.intake import Stated
 from wfsobs.telemetry.records import save_record
 from wfsobs.units import UNITS
 
@@ -69,19 +71,30 @@ def run(
               help="Run this controller alone; can be given many times.")
 @click.option("--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N",
               help="Repeat with seeds run.seed ... run.seed + N - 1.")
+@click.option("--record", "record_file", metavar="RECORD", help="On the disturbance and noise of a record with its truth.")
+@record_options
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def loop(
-    preset: str | None, config: str | None, assignments: tuple[str, ...], controllers: tuple[str, ...], seeds: int, as_json: bool,
+    preset: str | None, config: str | None, assignments: tuple[str, ...], controllers: tuple[str, ...], seeds: int,
+    record_file: str | None, unit: str | None, command_sign: str | None, command_delay: int | None, rate: float | None,
+    sha256: str | None, as_json: bool,
 ) -> None:
     """Close the loop with every controller on the same disturbance and print what is left of it (docs/closed_loop.md)."""
-    scenario = configfile.scenario_from(preset, config, assignments)
+    scenario, record = configfile.scenario_from(preset, config, assignments), None
+    if record_file is not None:
+        if seeds > 1:
+            raise SettingError("--seeds: is for simulated records, leave it out with --record")
+        stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
+        record = loaded(record_file, scenario, stated, sha256)
+        scenario = as_stated(record, scenario)
     all_rows: list[Row] = []
     with progress_bar("controllers") as update:
         plan = design(scenario, controllers or None)
         for i in range(seeds):
             one = scenario.replace({"run.seed": scenario.run.seed + i})
-            result = closed_loop(simulate(one), plan, Watch(progress=lambda f, i=i: update((i + f) / seeds)))
-            all_rows += loop_rows(result, one.run.seed)
+            given = simulate(one) if record is None else record
+            result = closed_loop(given, plan, Watch(progress=lambda f, i=i: update((i + f) / seeds)))
+            all_rows += loop_rows(result, one.run.seed if record is None else None)
     if as_json:
         click.echo(json.dumps(all_rows, allow_nan=False))
     else:

@@ -31,11 +31,13 @@ from wfsobs.telemetry.records import save_arrays
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def observe(
     record_file: str, preset: str | None, config: str | None, assignments: tuple[str, ...], unit: str | None,
-    command_sign: str | None, command_delay: int | None, rate: float | None, out: str | None, as_json: bool,
+    command_sign: str | None, command_delay: int | None, rate: float | None, sha256: str | None, out: str | None,
+    as_json: bool,
 ) -> None:
     """Run the observers on a record: .npz, .csv, .fits or AOT (preset paper unless told)."""
     scenario = configfile.scenario_from(preset, config, assignments)
-    record = loaded(record_file, scenario, Stated(unit, int(command_sign) if command_sign else None, command_delay, rate))
+    stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
+    record = loaded(record_file, scenario, stated, sha256)
     with progress_bar() as update:
         result = observe_record(record, scenario, Watch(progress=update))
     warn(result)
@@ -59,12 +61,13 @@ def observe(
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 def identify(
     record_file: str, preset: str | None, config: str | None, assignments: tuple[str, ...], unit: str | None,
-    command_sign: str | None, command_delay: int | None, rate: float | None, level: float, lowest: float, out: str | None,
-    as_json: bool,
+    command_sign: str | None, command_delay: int | None, rate: float | None, sha256: str | None, level: float, lowest: float,
+    out: str | None, as_json: bool,
 ) -> None:
     """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
     scenario = configfile.scenario_from(preset, config, assignments)
-    record = loaded(record_file, scenario, Stated(unit, int(command_sign) if command_sign else None, command_delay, rate))
+    stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
+    record = loaded(record_file, scenario, stated, sha256)
     if out:
         check_writable(out)
     with progress_bar("sweeps") as update:

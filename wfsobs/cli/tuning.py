@@ -41,7 +41,8 @@ NAMES = [name for name in OBSERVERS if name in TUNABLE and TUNABLE[name].usual]
 def tune(
     observer: str, preset: str | None, config: str | None, assignments: tuple[str, ...], settings: tuple[str, ...],
     target: str | None, evaluations: int, validation: float | None, record_file: str | None, unit: str | None,
-    command_sign: str | None, command_delay: int | None, rate: float | None, out: str | None, as_json: bool,
+    command_sign: str | None, command_delay: int | None, rate: float | None, sha256: str | None,
+    out: str | None, as_json: bool,
 ) -> None:
     """Search for the settings of an observer that are best on a validation record (docs/tuning.md)."""
     scenario, record = configfile.scenario_from(preset, config, assignments), None
@@ -49,7 +50,7 @@ def tune(
         if validation is not None:
             raise SettingError("--validation: is for simulated records, leave it out with --record")
         stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
-        record = loaded(record_file, scenario, stated)
+        record = loaded(record_file, scenario, stated, sha256)
     if out:
         check_writable(out)
     with progress_bar("evaluations") as update:

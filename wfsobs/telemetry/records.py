@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO
@@ -50,10 +51,20 @@ def save_arrays(path: str | Path, arrays: Mapping[str, Array]) -> None:
     write_whole(path, lambda file: write_npz(file, arrays))
 
 
-def load_record(path: str | Path, scenario: Scenario | None = None, stated: Stated | None = None) -> Record:
-    """Read and check the record of a file. Raises RecordError with one line saying what, where and what is expected."""
+def load_record(
+    path: str | Path, scenario: Scenario | None = None, stated: Stated | None = None, sha256: str | None = None
+) -> Record:
+    """Read and check the record of a file. Raises RecordError with one line saying what, where and what is expected.
+
+    sha256 : of the file, in hexadecimal digits; another file is refused
+    """
     try:
         with open(path, "rb") as file:
+            if sha256 is not None:
+                found = hashlib.file_digest(file, "sha256").hexdigest()
+                if found != sha256.lower():
+                    raise RecordError(f"{path}: is another file: its SHA-256 is {found}, not {sha256[:64]}")
+                file.seek(0)
             return read_record(file, str(path), scenario, stated)
     except OSError as error:
         raise RecordError(f"{path}: cannot be read: {error.strerror or error}") from None

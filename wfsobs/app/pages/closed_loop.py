@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from html import escape
 from typing import Any
 
 import panel as pn
 
+from wfsobs.app.copies import LOOP, Task
 from wfsobs.app.display import NOTHING, Display, number, per_micrometre
+from wfsobs.app.downloads import Save, residuals_csv, residuals_npz, table_csv
 from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.loop_work import LoopShown, compute, cost, seconds
 from wfsobs.app.pages.loop_figures import Nyquist, Response, Spectrum, Trace
 from wfsobs.app.pages.loop_table import margins_html, table_html
-from wfsobs.app.pages.parts import WIDE, box, captioned, html, text
+from wfsobs.app.pages.parts import WIDE, Offers, box, captioned, html, text
 from wfsobs.app.style import look
 from wfsobs.app.views.strip import Cards
 from wfsobs.control.controllers import CONTROLLERS
@@ -35,7 +38,7 @@ ABOUT = (
     "linear: they have neither.")
 
 
-class ClosedLoopPage:
+class ClosedLoopPage(Offers):
     """The page; computed anew when the results change, while it is visible."""
 
     def __init__(self, run: BackgroundTask, display: Display):
@@ -75,6 +78,21 @@ class ClosedLoopPage:
         self.visible = visible
         self._follow()
         self._redraw()  # mode or unit may have changed
+
+    @property
+    def task(self) -> Task:
+        """To close the loop."""
+        return Task(LOOP)
+
+    def saves(self) -> Mapping[str, Save | None]:
+        """The table of `wfsobs loop --json`, and the residuals."""
+        shown = self.shown
+        if shown is None:
+            return {"Controllers as CSV": None, "Residuals as CSV": None, "Residuals as NPZ": None}
+        return {
+            "Controllers as CSV": Save("wfsobs-controllers.csv", "text/csv", lambda: table_csv(shown.rows)),
+            "Residuals as CSV": Save("wfsobs-residuals.csv", "text/csv", lambda: residuals_csv(shown)),
+            "Residuals as NPZ": Save("wfsobs-residuals.npz", "application/octet-stream", lambda: residuals_npz(shown))}
 
     def _follow(self, *_: object) -> None:
         """Start the loop of the results shown, once their run is over; stop where the page is hidden."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from html import escape
 
@@ -9,17 +10,21 @@ import panel as pn
 import panel_material_ui as pmui
 
 from wfsobs.app.controls.fields import parsed
+from wfsobs.app.copies import IDENTIFY, Task
 from wfsobs.app.display import Display
+from wfsobs.app.downloads import Save
 from wfsobs.app.identify_work import Measured, compute, fit, measured, same, seconds
 from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.identify_figure import NAMES, SpectrumFigure
 from wfsobs.app.pages.identify_table import table_html, verdict_html
-from wfsobs.app.pages.parts import WIDE, Starter, box, html, legend, line, text
+from wfsobs.app.pages.parts import WIDE, Offers, Starter, box, html, legend, line, text
 from wfsobs.app.sources import Kept, Source
 from wfsobs.app.store import Store
 from wfsobs.identification import Identified
 from wfsobs.identification.identification import LEVEL
+from wfsobs.identification.report import toml
+from wfsobs.pipeline import as_stated
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.parameters import hint
@@ -41,7 +46,7 @@ REPLACED = (
     "that know the simulated spectra, and cannot be compared with errors on the record before. Undo brings it back.")
 
 
-class IdentifyPage:
+class IdentifyPage(Offers):
     """The page. The measured spectrum follows the results shown while it is visible; the model comes when asked for."""
 
     def __init__(self, store: Store, display: Display):
@@ -50,6 +55,7 @@ class IdentifyPage:
         self.starter = Starter(self.work, "Identify the record", "Progress of the identification",
             uses=("Filters only", "As a new simulation"))
         self.level, self.lowest = _number("Level", LEVEL), _number("Lowest peak [Hz]", LOWEST)
+        self.inputs = (self.level, self.lowest)
         self.figure = SpectrumFigure()
         self.legend, self.table, self.verdict, self.note = html(), html(), html(), html()
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
@@ -103,6 +109,19 @@ class IdentifyPage:
     def simulate(self) -> None:
         """Take the model into the settings, and simulate it in place of the record."""
         self._take(None)
+
+    @property
+    def task(self) -> Task:
+        """To identify the record."""
+        return Task(IDENTIFY, {"level": parsed(str(self.level.value)), "lowest": parsed(str(self.lowest.value))})
+
+    def saves(self) -> Mapping[str, Save | None]:
+        """The model as `wfsobs identify --out` writes it."""
+        result, record = self._identified()
+        if result is None or record is None:
+            return {"Model as TOML": None}
+        text = toml(result, result.scenario(as_stated(record, self.store.scenario)))
+        return {"Model as TOML": Save("wfsobs-model.toml", "application/toml", text.encode)}
 
     def _take(self, source: Source | None) -> None:
         result, _ = self._identified()

@@ -13,10 +13,29 @@ from bokeh.plotting import figure
 
 from wfsobs.app.controls.names import named
 from wfsobs.app.controls.panel import Status
+from wfsobs.app.copies import EXPLORED, Task
+from wfsobs.app.downloads import Save
 from wfsobs.app.jobs.job import CANCELLED, DONE, RUNNING
 from wfsobs.app.jobs.task import IDLE, BackgroundTask
 from wfsobs.app.style import asset, swatch
 from wfsobs.app.views.plots import call
+
+
+class Offers:
+    """What a page has for the row of actions: what it does, to be copied, and what it has found, to be saved."""
+
+    inputs: Sequence[Any] = ()
+    """Fields that the task depends on."""
+
+    @property
+    def task(self) -> Task:
+        """What the page does with the record."""
+        return EXPLORED
+
+    def saves(self) -> Mapping[str, Save | None]:
+        """What can be saved, by its name in the menu; None where it is not there yet."""
+        return {}
+
 
 WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})
 

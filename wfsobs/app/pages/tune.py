@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -9,13 +10,15 @@ import panel as pn
 import panel_material_ui as pmui
 
 from wfsobs.app.controls.fields import parsed
+from wfsobs.app.copies import TUNE, Task
 from wfsobs.app.display import UNITS, Display, number, per_micrometre
+from wfsobs.app.downloads import Save, table_csv
 from wfsobs.app.jobs.job import RUNNING, SWEEP, Job
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.pages.parts import WIDE, Starter, box, html, legend, line, text
+from wfsobs.app.pages.parts import WIDE, Offers, Starter, box, html, legend, line, text
 from wfsobs.app.pages.tune_views import LEGEND, HistoryFigure, table_html, unit_for
 from wfsobs.app.store import Store
-from wfsobs.app.tune_work import CHOICES, MOST, best_so_far, compute, measure, seconds
+from wfsobs.app.tune_work import CHOICES, MOST, best_so_far, compute, measure, rows, seconds
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION
 from wfsobs.record import RecordError
@@ -24,6 +27,7 @@ from wfsobs.scenario.parameters import hint
 from wfsobs.scenario.settings import SettingError
 from wfsobs.tuning import Evaluation, Tuned
 from wfsobs.tuning.records import MEASURES, TRUTH
+from wfsobs.tuning.report import toml
 from wfsobs.tuning.space import TUNABLE
 from wfsobs.tuning.tuning import EVALUATIONS
 
@@ -34,9 +38,10 @@ INTRO = (
     "error of z, or of the distance to a Butterworth reference. “Use it” takes the tuned settings into the drawer.")
 EARLIER = "The settings of the drawer have changed since: this was tuned for others."
 START = "gpr-online"
+COLUMNS: tuple[str, ...] = ("section", "name", "before", "after")
 
 
-class TunePage:
+class TunePage(Offers):
     """The page. Nothing is computed before it is asked for."""
 
     def __init__(self, store: Store, display: Display):
@@ -47,6 +52,7 @@ class TunePage:
             label="Observer", options=dict(CHOICES), value=START, size="small", width=190, margin=0)
         self.target = pmui.Select(label="Error of", options=[], size="small", width=130, margin=0)
         self.evaluations = pmui.TextInput(label="Evaluations", value=str(EVALUATIONS), size="small", width=110, margin=0)
+        self.inputs = (self.observer, self.target, self.evaluations)
         self.figure = HistoryFigure()
         self.measure = MEASURES[TRUTH]
         self.searched, self.legend, self.table = html(), html(), html()
@@ -100,6 +106,21 @@ class TunePage:
                 self.store.replace(changes(tuned.scenario, tuned.before.scenario))
             except SettingError as error:
                 self.work.refuse(str(error))
+
+    @property
+    def task(self) -> Task:
+        """To tune the chosen observer."""
+        return Task(TUNE, {
+            "observer": self.observer.value, "target": self.target.value, "evaluations": parsed(str(self.evaluations.value))})
+
+    def saves(self) -> Mapping[str, Save | None]:
+        """The table, errors [um], and the settings as `wfsobs tune --out` writes them."""
+        if (tuned := self._tuned()) is None:
+            return {"Tuning table as CSV": None, "Tuned settings as TOML": None}
+        table = [dict(zip(COLUMNS, row, strict=True)) for row in rows(tuned)]
+        return {
+            "Tuning table as CSV": Save("wfsobs-tuning.csv", "text/csv", lambda: table_csv(table)),
+            "Tuned settings as TOML": Save("wfsobs-tuned.toml", "application/toml", toml(tuned).encode)}
 
     def _choose(self, *_: object) -> None:
         """Offer what the observer estimates, and say what is searched."""

@@ -1,0 +1,252 @@
+"""What is copied of a page does what the page does: the command in a shell, the script as it is, both compared with the page."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import hashlib
+import io
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from wfsobs.app.run import RUNNING
+
+from wfsobs.app.copies import LOOP, OBSERVE, TUNE, Task, to_command
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.pages.closed_loop import ClosedLoopPage
+from wfsobs.app.pages.identify import IdentifyPage
+from wfsobs.app.pages.tune import TunePage
+from wfsobs.app.share import from_query
+from wfsobs.app.sources import Kept, Loaded
+from wfsobs.app.work import Shown
+from wfsobs.control.rows import rows
+from wfsobs.evaluation.scores import BOUND
+from wfsobs.identification import report as identified
+from wfsobs.record import RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.loop import simulate
+from wfsobs.telemetry.formats import format_of
+from wfsobs.telemetry.records import load_record, record_arrays
+from wfsobs.tuning import report as tunings
+
+CLOSE = 1e-6
+"""Another process may add up in another order, which the GPR magnify; numbers are printed with all digits."""
+SIMULATED, LOADED, KEPT = "simulated", "loaded", "kept"
+FILE = "the night's record.npz"
+
+
+@pytest.fixture
+def short(short: Scenario) -> Scenario:
+    return short.replace({"run.duration": 4.0, "gpr_offline.training_size": 20, "gpr_online.training_size": 20,
+                          "adaptive.interval": 2.0})
+
+
+def file_of(short: Scenario) -> bytes:
+    """A record in nm whose commands are taken off, which does not say so, nor its rate and delay; it has its truth."""
+    record = simulate(short.replace({"run.seed": 9}))
+    arrays = record_arrays(record)
+    for name in ("unit", "command_sign", "delay", "dt"):
+        del arrays[name]
+    arrays |= {name: 1e3 * values for name, values in arrays.items() if values.ndim == 2}
+    arrays |= {name: -arrays[name] for name in ("u", "training_u")}
+    file = io.BytesIO()
+    format_of(".npz").write(file, arrays)
+    return file.getvalue()
+
+
+@pytest.fixture(params=[SIMULATED, LOADED, KEPT])
+def board(request: Any, dashboard: Dashboard, loop: Any, short: Scenario, tmp_path: Path, monkeypatch: Any) -> Dashboard:
+    """A dashboard on a record of every source, its files in the current folder."""
+    monkeypatch.chdir(tmp_path)
+    if request.param == LOADED:
+        content = file_of(short)
+        upload = dashboard.upload
+        for widget, value in ((upload.unit, "nm"), (upload.sign, -1), (upload.delay, "2"), (upload.rate, "1000")):
+            widget.value = value
+        upload.handle({"action": "part", "name": FILE, "index": 0, "count": 1, "data": base64.b64encode(content).decode()})
+        loop.until(lambda: not upload.picker.said.startswith("Reading"))
+        upload.confirm()
+        assert isinstance(dashboard.store.source, Loaded), upload.picker.said
+        (tmp_path / dashboard.store.source.name).write_bytes(content)
+        loop.finish(dashboard.store)
+    if request.param == KEPT:
+        told = dashboard.store.scenario.replace({"turbulence.wind_speed": 11.0, "vibration.peaks": [{"frequency": 33.0}]})
+        dashboard.store.run_on(Kept(dashboard.store.scenario), told)
+        loop.finish(dashboard.store)
+    return dashboard
+
+
+def shell(dashboard: Dashboard) -> Any:
+    """What the command that is copied prints as JSON."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    done = subprocess.run(
+        f"{dashboard.actions.toolbar.command} --json", shell=True, capture_output=True, text=True,
+        env={**os.environ, "PATH": path})
+    assert done.returncode == 0, f"{dashboard.actions.toolbar.command}\n{done.stderr}"
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def script(dashboard: Dashboard) -> dict[str, Any]:
+    """The names that the script leaves."""
+    made: dict[str, Any] = {}
+    exec(dashboard.actions.toolbar.python, made)
+    return made
+
+
+def of(dashboard: Dashboard) -> Shown:
+    shown = dashboard.store.run.shown
+    assert shown is not None
+    return shown
+
+
+def test_explore(board: Dashboard) -> None:
+    shown = {(s.observer, s.target, s.mode): s.rms for s in of(board).result.scores}
+    if board.store.source is not None:  # who observes a record does not know what it is bound by
+        shown = {key: value for key, value in shown.items() if key[0] != BOUND}
+    assert {(r["observer"], r["target"], r["mode"]): r["rms_um"] for r in shell(board)} == pytest.approx(shown, rel=CLOSE)
+    made = script(board)
+    assert {(s.observer, s.target, s.mode): s.rms for s in made["result"].scores} == pytest.approx(shown, rel=CLOSE)
+
+
+def test_closed_loop(board: Dashboard, loop: Any) -> None:
+    board.pages.current = "loop"
+    page = board.pages.made["loop"]
+    assert isinstance(page, ClosedLoopPage)
+    loop.until(lambda: page.shown is not None and page.shown.done, 60)
+    assert page.shown is not None
+
+    def residuals(given: Any) -> dict[tuple[str, str], float]:
+        return {(r["controller"], r["mode"]): r["residual_rms_nm"] for r in given if r["residual_rms_nm"] is not None}
+
+    expected = residuals(page.shown.rows)
+    assert len(expected) > 10
+    assert residuals(shell(board)) == pytest.approx(expected, rel=CLOSE)
+    assert residuals(rows(script(board)["result"], None)) == pytest.approx(expected, rel=CLOSE)
+
+
+def test_identify(board: Dashboard, loop: Any) -> None:
+    board.pages.current = "identify"
+    page = board.pages.made["identify"]
+    assert isinstance(page, IdentifyPage)
+    page.level.value, page.lowest.value = "0.02", "8"
+    page.start()
+    loop.until(lambda: page.work.state != RUNNING, 60)
+    expected = identified.plain(page.work.result[0])
+    for found in (shell(board), identified.plain(script(board)["found"])):
+        assert [[p["frequency"] for p in m["peaks"]] for m in found["modes"]] == [
+            pytest.approx([p["frequency"] for p in m["peaks"]], rel=CLOSE) for m in expected["modes"]]
+        assert [m["noise"] for m in found["modes"]] == pytest.approx([m["noise"] for m in expected["modes"]], rel=CLOSE)
+
+
+def test_tune(board: Dashboard, loop: Any) -> None:
+    board.pages.current = "tune"
+    page = board.pages.made["tune"]
+    assert isinstance(page, TunePage)
+    page.observer.value, page.evaluations.value = "kf-lgs", "4"
+    page.start()
+    loop.until(lambda: page.work.state != RUNNING, 60)
+    expected = tunings.plain(page.work.result)
+    for found in (shell(board), tunings.plain(script(board)["tuned"])):
+        assert found["settings"] == pytest.approx(expected["settings"], rel=CLOSE)
+        for stage in ("before", "after"):
+            assert found[stage]["test_um"] == pytest.approx(expected[stage]["test_um"], rel=CLOSE)
+
+
+def test_a_link_has_the_simulation_that_is_kept(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    store = dashboard.store
+    simulation = short.replace({"run.seed": 4, "vibration.peaks": [{"frequency": 20.0}, {"frequency": 30.0}]})
+    store.run_on(Kept(simulation), short.replace({"turbulence.wind_speed": 11.0}))
+    link = from_query(dashboard.actions.toolbar.query)
+    assert (link.scenario, link.simulation, link.rejected) == (store.scenario, simulation, ())
+    store.load(short)
+    assert "simulation" not in dashboard.actions.toolbar.query
+    dashboard.actions.open_link("?preset=paper&run.duration=2&simulation&simulation.run.duration=2&simulation.loop.gain=9")
+    assert isinstance(store.source, type(None)), "what is refused leaves the same settings"
+    dashboard.actions.open_link("?run.duration=2&simulation.run.duration=2&simulation.run.seed=3")
+    assert isinstance(store.source, Kept) and store.source.simulation.run.seed == 3 and store.scenario.run.seed != 3
+
+
+def test_another_file_of_the_same_name_is_refused(tmp_path: Path, short: Scenario) -> None:
+    content = file_of(short)
+    path = tmp_path / "a.npz"
+    path.write_bytes(content)
+    record = Loaded(simulate(short), "a.npz", "key", sha256=hashlib.sha256(content + b".").hexdigest())
+    assert f"--sha256 {record.sha256}" in to_command(short, "paper", record)
+    with pytest.raises(RecordError, match=r"a\.npz: is another file: its SHA-256 is [0-9a-f]{64}, not [0-9a-f]{64}$"):
+        load_record(path, sha256=record.sha256)
+
+
+def test_names_that_are_no_words_of_a_shell() -> None:
+    for name in ("a b.npz", "-x.npz", "$(touch x).npz", "it's.npz"):
+        source = Loaded(simulate(PRESETS["paper"]().replace({"run.duration": 1.2})), name, "key")
+        for task in (Task(OBSERVE), Task(LOOP), Task(TUNE, {"observer": "kf-lgs"})):
+            command = to_command(PRESETS["paper"](), "paper", source, task)
+            words = subprocess.run(f"printf '%s\\n' {command}", shell=True, capture_output=True, text=True)
+            assert f"./{name}" in words.stdout.splitlines() or name in words.stdout.splitlines()
+            assert "-x.npz" not in words.stdout.splitlines()
+
+
+@pytest.fixture
+def sent(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, str]]:
+    out: list[dict[str, str]] = []
+    monkeypatch.setattr(dashboard.actions.toolbar, "_send_msg", out.append)
+    return out
+
+
+def saved(dashboard: Dashboard, loop: Any, sent: list[dict[str, str]]) -> dict[str, bytes]:
+    """Every file of the page shown, by name."""
+    del sent[:]
+    names = dashboard.actions.toolbar.saves
+    for name in names:
+        dashboard.actions.handle({"action": "page", "name": name})
+    loop.until(lambda: len(sent) == len(names))
+    return {file["name"]: base64.b64decode(file["content"]) for file in sent}
+
+
+def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: list[dict[str, str]]) -> None:
+    assert dashboard.actions.toolbar.saves == []
+    dashboard.pages.current = "identify"
+    dashboard.actions.handle({"action": "page", "name": "Model as TOML"})
+    assert dashboard.actions.toolbar.notes == ["Model as TOML: there is none yet."]
+    page: Any = dashboard.pages.made["identify"]
+    page.start()
+    loop.until(lambda: page.work.state != RUNNING, 60)
+    files = saved(dashboard, loop, sent)
+    result = page.work.result[0]
+    assert files["wfsobs-model.toml"].decode() == identified.toml(result, result.scenario(dashboard.store.scenario))
+
+    dashboard.pages.current = "tune"
+    page = dashboard.pages.made["tune"]
+    page.observer.value, page.evaluations.value = "kf-lgs", "3"
+    page.start()
+    loop.until(lambda: page.work.state != RUNNING, 60)
+    files = saved(dashboard, loop, sent)
+    table = [*csv.DictReader(io.StringIO(files["wfsobs-tuning.csv"].decode()))]
+    test = {r["name"]: float(r["after"]) for r in table if r["section"] == "test"}
+    assert test == {**page.work.result.after.test.modes, "rms over modes": page.work.result.after.test.rms}
+    assert tomllib.loads(files["wfsobs-tuned.toml"].decode()) == page.work.result.scenario.to_dict()
+
+    dashboard.pages.current = "loop"
+    page = dashboard.pages.made["loop"]
+    loop.until(lambda: page.shown is not None and page.shown.done, 60)
+    files = saved(dashboard, loop, sent)
+    table = [*csv.DictReader(io.StringIO(files["wfsobs-controllers.csv"].decode()))]
+    assert [(r["controller"], r["mode"], r["residual_rms_nm"]) for r in table] == [
+        (r["controller"], r["mode"], "" if r["residual_rms_nm"] is None else str(r["residual_rms_nm"])) for r in page.shown.rows]
+    outcomes = {o.controller: o.residual for o in page.shown.result.outcomes if o.residual is not None}
+    with np.load(io.BytesIO(files["wfsobs-residuals.npz"]), allow_pickle=False) as arrays:
+        assert {n for n in arrays.files if "/" in n} == {f"residual/{name}" for name in outcomes}
+        np.testing.assert_array_equal(arrays["residual/integrator"], outcomes["integrator"])
+    head, *lines = [x for x in files["wfsobs-residuals.csv"].decode().splitlines() if not x.startswith("#")]
+    column = head.split(",").index("integrator/tilt_um")
+    np.testing.assert_allclose([float(x.split(",")[column]) for x in lines], outcomes["integrator"][:, 1], rtol=1e-8)
+    dashboard.pages.current = "explore"
+    assert dashboard.actions.toolbar.saves == []

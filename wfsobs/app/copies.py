@@ -1,0 +1,138 @@
+"""What a page shows as a command line and as Python: the same record, the same settings, the same numbers."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from wfsobs.app.share import FILE, LONGEST, changes
+from wfsobs.app.sources import Kept, Loaded, Source
+from wfsobs.scenario import Scenario, configfile
+
+RECORD, SIMULATION = "wfsobs-record.npz", "wfsobs-simulation.toml"
+"""Files of a command: a simulation that is saved, and its settings where they are too long to be written out."""
+
+OBSERVE, LOOP, IDENTIFY, TUNE = "observe", "loop", "identify", "tune"
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a page does with the record: one of the above, and its arguments by name."""
+
+    what: str = OBSERVE
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+
+EXPLORED = Task()
+
+
+# ---------------------------------------------------------------------- command lines
+
+def to_command(scenario: Scenario, preset: str, source: Source | None = None, task: Task = EXPLORED) -> str:
+    """The command that prints what a page shows; two where the record has to be simulated first."""
+    given = _options(scenario, preset, FILE)
+    more = [word for name, value in task.arguments.items() for word in (f"--{name}", str(value))]
+    if source is None and task.what != IDENTIFY:
+        return shlex.join(["wfsobs", "run" if task.what == OBSERVE else task.what, *more, *given])
+    file, said = (source.name, _said(source)) if isinstance(source, Loaded) else (RECORD, [])
+    # a name that starts with a dash would be read as an option
+    file = f"./{file}" if file.startswith("-") else file
+    positional = [file] if task.what in (OBSERVE, IDENTIFY) else ["--record", file]
+    command = shlex.join(["wfsobs", task.what, *positional, *more, *given, *said])
+    if isinstance(source, Loaded):
+        return command
+    simulation = _options(source.simulation, preset, SIMULATION) if source else given
+    return f"{shlex.join(['wfsobs', 'run', *simulation, '--save', RECORD])} &&\n{command}"
+
+
+def _options(scenario: Scenario, preset: str, file: str) -> list[str]:
+    words = ["--preset", preset]
+    for path, value in changes(scenario, preset).items():
+        words += ["--set", f"{path}={configfile.written(value)}"]
+    return words if len(shlex.join(words)) <= LONGEST else ["--config", file]
+
+
+def _said(source: Loaded) -> list[str]:
+    """What was said of a file, and what tells it from another."""
+    stated = source.stated
+    sign = None if stated.command_sign is None else f"{stated.command_sign:+d}"
+    named = {"unit": stated.unit, "command-sign": sign, "command-delay": stated.command_delay, "rate": stated.rate,
+             "sha256": source.sha256 or None}
+    return [word for name, value in named.items() if value is not None for word in (f"--{name}", str(value))]
+
+
+# ---------------------------------------------------------------------- Python
+
+def to_python(scenario: Scenario, preset: str, source: Source | None = None, task: Task = EXPLORED) -> str:
+    """A script that computes and prints what a page shows."""
+    imports, lines = {"import wfsobs"}, [f"scenario = {_made(scenario, preset, FILE)}"]
+    if isinstance(source, Loaded):
+        stated = "".join(f"{name}={value!r}, " for name, value in vars(source.stated).items() if value is not None)
+        imports |= {"from wfsobs.telemetry.intake import Stated", "from wfsobs.telemetry.records import load_record"}
+        check = f", sha256={source.sha256!r}" if source.sha256 else ""
+        lines.append(f"record = load_record({source.name!r}, scenario, Stated({stated.removesuffix(', ')}){check})")
+    elif isinstance(source, Kept):
+        lines += [f"simulation = {_made(source.simulation, preset, SIMULATION)}", "record = wfsobs.simulate(simulation)"]
+    elif task.what in (LOOP, IDENTIFY):
+        lines.append("record = wfsobs.simulate(scenario)")
+    more_imports, more_lines = _DOES[task.what](source is not None, task.arguments)
+    if any("configfile." in line for line in lines):
+        imports.add("from wfsobs.scenario import configfile")
+    return "\n".join([*sorted(imports | more_imports, key=_order), "", *lines, *more_lines, ""])
+
+
+def _order(line: str) -> tuple[bool, str]:
+    return line.startswith("from"), line
+
+
+def _made(scenario: Scenario, preset: str, file: str) -> str:
+    lines = [f"    {json.dumps(path)}: {value!r},\n" for path, value in changes(scenario, preset).items()]
+    made = f'wfsobs.PRESETS["{preset}"]()' + (f".replace({{\n{''.join(lines)}}})" if lines else "")
+    return made if len(made) <= LONGEST else f'configfile.load("{file}")'
+
+
+Lines = tuple[set[str], list[str]]
+"""Imports, and lines of a script."""
+
+
+def _observe(recorded: bool, _arguments: Mapping[str, Any]) -> Lines:
+    return set(), [
+        f"result = {'wfsobs.observe(record, scenario)' if recorded else 'wfsobs.run(scenario)'}",
+        "for s in result.scores:",
+        '    print(f"{s.target:10} {s.mode:4} {s.observer:17} {1e3 * s.rms:8.2f} nm")']
+
+
+def _loop(_recorded: bool, _arguments: Mapping[str, Any]) -> Lines:
+    return {"from wfsobs.control.rows import rows", "from wfsobs.control.closed_loop import closed_loop, design"}, [
+        "result = closed_loop(record, design(scenario))",
+        "for row in rows(result, None):",
+        '    print(row["controller"], row["mode"], row["residual_rms_nm"], "nm")']
+
+
+def _identify(_recorded: bool, arguments: Mapping[str, Any]) -> Lines:
+    return {"from wfsobs.identification import identify, report"}, [
+        f"found = identify(record, {_arguments(arguments)})",
+        "for mode in found.modes:",
+        "    for what, frequency, damping, rms in report.rows(mode):",
+        "        print(mode.name, what, *(n.value for n in (frequency, damping, rms) if n is not None))",
+        'print("\\n".join(report.verdict(found)))']
+
+
+def _tune(recorded: bool, arguments: Mapping[str, Any]) -> Lines:
+    named = {k: v for k, v in arguments.items() if k != "observer"}
+    record = ", record=record" if recorded else ""
+    return {"from wfsobs.tuning import report, tune"}, [
+        f"tuned = tune(scenario, {arguments['observer']!r}, {_arguments(named)}{record})",
+        "for path, before, after in report.settings(tuned):",
+        "    print(path, before, after)",
+        'print("validation rms [um]", *(s.validation.rms if s.validation else None for s in (tuned.before, tuned.after)))']
+
+
+def _arguments(arguments: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name}={value!r}" for name, value in arguments.items())
+
+
+_DOES = {OBSERVE: _observe, LOOP: _loop, IDENTIFY: _identify, TUNE: _tune}
