@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from wfsobs.app.run import RUNNING
 
 from wfsobs.app.copies import LOOP, OBSERVE, TUNE, Task, to_command
 from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.jobs.job import RUNNING
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.identify import IdentifyPage
 from wfsobs.app.pages.tune import TunePage
@@ -43,12 +43,6 @@ SIMULATED, LOADED, KEPT = "simulated", "loaded", "kept"
 FILE = "the night's record.npz"
 
 
-@pytest.fixture
-def short(short: Scenario) -> Scenario:
-    return short.replace({"run.duration": 4.0, "gpr_offline.training_size": 20, "gpr_online.training_size": 20,
-                          "adaptive.interval": 2.0})
-
-
 def file_of(short: Scenario) -> bytes:
     """A record in nm whose commands are taken off, which does not say so, nor its rate and delay; it has its truth."""
     record = simulate(short.replace({"run.seed": 9}))
@@ -66,8 +60,9 @@ def file_of(short: Scenario) -> bytes:
 def board(request: Any, dashboard: Dashboard, loop: Any, short: Scenario, tmp_path: Path, monkeypatch: Any) -> Dashboard:
     """A dashboard on a record of every source, its files in the current folder."""
     monkeypatch.chdir(tmp_path)
+    simulation = short.replace({"run.duration": 9.0} if request.function is test_tune else {})  # a tuning cuts it in three
     if request.param == LOADED:
-        content = file_of(short)
+        content = file_of(simulation)
         upload = dashboard.upload
         for widget, value in ((upload.unit, "nm"), (upload.sign, -1), (upload.delay, "2"), (upload.rate, "1000")):
             widget.value = value
@@ -76,11 +71,11 @@ def board(request: Any, dashboard: Dashboard, loop: Any, short: Scenario, tmp_pa
         upload.confirm()
         assert isinstance(dashboard.store.source, Loaded), upload.picker.said
         (tmp_path / dashboard.store.source.name).write_bytes(content)
-        loop.finish(dashboard.store)
+        loop.until(lambda: dashboard.store.run.state != RUNNING, 120)
     if request.param == KEPT:
-        told = dashboard.store.scenario.replace({"turbulence.wind_speed": 11.0, "vibration.peaks": [{"frequency": 33.0}]})
-        dashboard.store.run_on(Kept(dashboard.store.scenario), told)
-        loop.finish(dashboard.store)
+        told = simulation.replace({"turbulence.wind_speed": 11.0, "vibration.peaks": [{"frequency": 33.0}]})
+        dashboard.store.run_on(Kept(simulation), told)
+        loop.until(lambda: dashboard.store.run.state != RUNNING, 120)
     return dashboard
 
 
@@ -102,7 +97,7 @@ def script(dashboard: Dashboard) -> dict[str, Any]:
 
 
 def of(dashboard: Dashboard) -> Shown:
-    shown = dashboard.store.run.shown
+    shown = dashboard.store.run.result
     assert shown is not None
     return shown
 
@@ -120,7 +115,7 @@ def test_closed_loop(board: Dashboard, loop: Any) -> None:
     board.pages.current = "loop"
     page = board.pages.made["loop"]
     assert isinstance(page, ClosedLoopPage)
-    loop.until(lambda: page.shown is not None and page.shown.done, 60)
+    loop.until(lambda: page.shown is not None and page.shown.done, 120)
     assert page.shown is not None
 
     def residuals(given: Any) -> dict[tuple[str, str], float]:
@@ -138,7 +133,7 @@ def test_identify(board: Dashboard, loop: Any) -> None:
     assert isinstance(page, IdentifyPage)
     page.level.value, page.lowest.value = "0.02", "8"
     page.start()
-    loop.until(lambda: page.work.state != RUNNING, 60)
+    loop.until(lambda: page.work.state != RUNNING, 120)
     expected = identified.plain(page.work.result[0])
     for found in (shell(board), identified.plain(script(board)["found"])):
         assert [[p["frequency"] for p in m["peaks"]] for m in found["modes"]] == [
@@ -152,7 +147,7 @@ def test_tune(board: Dashboard, loop: Any) -> None:
     assert isinstance(page, TunePage)
     page.observer.value, page.evaluations.value = "kf-lgs", "4"
     page.start()
-    loop.until(lambda: page.work.state != RUNNING, 60)
+    loop.until(lambda: page.work.state != RUNNING, 120)
     expected = tunings.plain(page.work.result)
     for found in (shell(board), tunings.plain(script(board)["tuned"])):
         assert found["settings"] == pytest.approx(expected["settings"], rel=CLOSE)
@@ -218,7 +213,7 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
     assert dashboard.actions.toolbar.notes == ["Model as TOML: there is none yet."]
     page: Any = dashboard.pages.made["identify"]
     page.start()
-    loop.until(lambda: page.work.state != RUNNING, 60)
+    loop.until(lambda: page.work.state != RUNNING, 120)
     files = saved(dashboard, loop, sent)
     result = page.work.result[0]
     assert files["wfsobs-model.toml"].decode() == identified.toml(result, result.scenario(dashboard.store.scenario))
@@ -227,7 +222,7 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
     page = dashboard.pages.made["tune"]
     page.observer.value, page.evaluations.value = "kf-lgs", "3"
     page.start()
-    loop.until(lambda: page.work.state != RUNNING, 60)
+    loop.until(lambda: page.work.state != RUNNING, 120)
     files = saved(dashboard, loop, sent)
     table = [*csv.DictReader(io.StringIO(files["wfsobs-tuning.csv"].decode()))]
     test = {r["name"]: float(r["after"]) for r in table if r["section"] == "test"}
@@ -236,7 +231,7 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
 
     dashboard.pages.current = "loop"
     page = dashboard.pages.made["loop"]
-    loop.until(lambda: page.shown is not None and page.shown.done, 60)
+    loop.until(lambda: page.shown is not None and page.shown.done, 120)
     files = saved(dashboard, loop, sent)
     table = [*csv.DictReader(io.StringIO(files["wfsobs-controllers.csv"].decode()))]
     assert [(r["controller"], r["mode"], r["residual_rms_nm"]) for r in table] == [
