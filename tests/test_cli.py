@@ -144,3 +144,8 @@ def test_the_core_needs_numpy_scipy_and_param_alone():
         "assert len(wfsobs.run(s).scores) > 10\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_loop_takes_seeds_or_a_record():
+    result = call("loop", "--record", "r.npz", "--seeds", "2")
+    assert result.exit_code == 2 and result.stderr == "wfsobs: --seeds: is for simulated records, leave it out with --record\n"
