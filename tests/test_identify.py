@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from math import pi, sqrt
+from math import nan, pi, sqrt
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +14,12 @@ from scipy.stats import binom, gamma, kstest
 
 from wfsobs.cli import main
 from wfsobs.identification import Identified, identify, misfit
+from wfsobs.identification.continuum import of_continuum
 from wfsobs.identification.misfit import margin
 from wfsobs.identification.one_mode import OneMode
-from wfsobs.identification.process import Number, Process, merged
-from wfsobs.identification.report import annotated, plain, verdict, written
+from wfsobs.identification.process import Number, Process, mean, merged
+from wfsobs.identification.process import known as known_number
+from wfsobs.identification.report import annotated, plain, rows, toml, verdict, written
 from wfsobs.identification.whiteness import autocorrelation_test, cumulated_test, innovations
 from wfsobs.pipeline import observe
 from wfsobs.progress import Cancelled, Watch
@@ -35,7 +37,8 @@ from wfsobs.spectral.whittle import fitted, information, negative_log_likelihood
 from wfsobs.telemetry.records import save_record
 
 DT = 1e-3
-MODEL = Spectrum(0.014, DT, Ar2(7.0, 0.9, 0.5, DT), (Ar2(2 * pi * 30.0, 0.02, 0.004, DT),))
+TURBULENCE = Ar2(7.0, 0.9, 0.5, DT)
+MODEL = Spectrum(0.014, DT, TURBULENCE, (Ar2(2 * pi * 30.0, 0.02, 0.004, DT),))
 
 
 def known(duration: float = 60.0, **more: object) -> Scenario:
@@ -131,8 +134,8 @@ def test_search_finds_nothing_in_white_noise_as_often_as_it_says(modes: int) -> 
     n, level, runs = 4000, 0.2, 150
     rng = np.random.default_rng(3)
     hits = sum(
-        search(sum(periodogram(rng.standard_normal(n), DT, PAD) for _ in range(modes)) / (2.0 * DT), n, DT, modes, level).best
-        is not None for _ in range(runs))
+        search(np.sum([periodogram(rng.standard_normal(n), DT, PAD) for _ in range(modes)], axis=0) / (2.0 * DT),
+               n, DT, modes, level).best is not None for _ in range(runs))
     assert 0.2 * level * runs < hits < level * runs + 3.0 * sqrt(level * runs)  # a bound, near since the widths overlap
 
 
@@ -150,7 +153,7 @@ def test_whiteness_tests_are_uniform_on_white_noise_and_see_what_is_not() -> Non
 def test_innovations_have_the_variance_that_the_spectrum_says() -> None:
     """Kolmogorov: log of the variance of one-step prediction is the mean of log S."""
     rng = np.random.default_rng(5)
-    z = 0.014 * rng.standard_normal(40_000) + sum(p.sample(40_000, rng) for p in MODEL.processes)
+    z = 0.014 * rng.standard_normal(40_000) + sum(p.sample(40_000, rng) for p in (TURBULENCE, *MODEL.resonances))
     f = np.linspace(0.0, 0.5 / DT, 200_001)
     least = np.exp(np.mean(np.log(MODEL.psd(f) / (2.0 * DT))))
     assert np.var(innovations(z, MODEL)) == pytest.approx(least, rel=4.0 * sqrt(2.0 / 40_000))
@@ -222,14 +225,18 @@ def test_third_order_and_background_are_found_where_they_are() -> None:
     assert got.white and not got.peaks
     for m in got.modes:
         assert m.turbulence and m.turbulence.third_corner and m.background
-        pairs = [(m.turbulence.frequency, 7.0686 / (2 * pi)), (m.turbulence.damping, 0.9), (m.turbulence.third_corner, 3.0),
-                 (m.background.frequency, 30.0), (m.background.rms, 0.004)]
+        for number, true in ((m.turbulence.damping, 0.9), (m.turbulence.third_corner, 3.0)):
+            if np.isnan(number.std):  # at a bound, or known to a third at best: of the right size all the same
+                assert 0.5 < number.value / true < 2.0
+            else:
+                assert abs(number.value - true) < 4.0 * number.std
+        pairs = [(m.turbulence.frequency, 7.0686 / (2 * pi)), (m.background.frequency, 30.0), (m.background.rms, 0.004)]
         for number, true in pairs:
             assert abs(number.value - true) < 4.0 * number.std
             assert number.std < 0.6 * true
     model = got.scenario(s)
     assert [p.third_corner > 0 for p in model.turbulence.processes] == [True, False] * 2
-    assert model.turbulence.third_corner == pytest.approx(3.0, abs=4.0 * got.shared(s)["turbulence.third_corner"].std)
+    assert model.turbulence.third_corner == pytest.approx(3.0, rel=0.5)  # the mean of two that are known to a third
 
 
 def test_frozen_flow_leaves_white_noise_and_no_peak() -> None:
@@ -257,14 +264,14 @@ def test_a_right_spectrum_has_no_margin_and_one_with_lobes_that_of_its_lobes() -
 
 @pytest.mark.parametrize("name", ["ut4", "galacsi-nfm"])
 def test_lobes_of_frozen_flow_are_no_peaks(name: str) -> None:
-    """Records drawn from the closed form of their spectrum, of many layers a peak in 17 of 25 and more where lobes count; with a
+    """Tip drawn from the closed form of its spectrum: of many layers a peak in each of these records where lobes count; with a
     margin not more than the level allows."""
     s, found = PRESETS[name]().replace({"vibration.source": "none", "run.duration": 60.0}), 0
-    S = [true_spectra(s, mode).measured for mode in (0, 1)]
-    n = 2 * (len(S[0]) - 1)
+    S = true_spectra(s, 0).measured
+    n = 2 * (len(S) - 1)
     for seed in range(1001, 1005):
         rng = np.random.default_rng(seed)
-        z = np.column_stack([np.fft.irfft(np.sqrt(x) * np.fft.rfft(rng.standard_normal(n)), n)[:60_000] for x in S])
+        z = np.fft.irfft(np.sqrt(S) * np.fft.rfft(rng.standard_normal(n)), n)[:60_000, None]
         found += bool(identify(Record(z, np.zeros_like(z), DT)).peaks)
     assert found <= binom.isf(0.01, 4, 0.05)
 
@@ -357,3 +364,49 @@ def test_written_and_annotated() -> None:
     assert written(Number(0.00312, 0.00099)) == "0.00312 +- 0.00099"
     text = annotated('[a]\nx = 1\n\n[[a.b]]\nx = 2\n\n[[a.b]]\nx = 3\n', {"a.x": "one", "a.b.1.x": "three"})
     assert text == '[a]\nx = 1  # one\n\n[[a.b]]\nx = 2\n\n[[a.b]]\nx = 3  # three\n'
+
+
+@pytest.mark.parametrize(("damping", "rms", "frequency", "smooth"), [
+    (0.15, 0.02, 8.0, True),  # on the slope of turbulence, where its density is as high: no maximum
+    (0.02, 0.02, 8.0, False),  # narrow
+    (0.15, 0.1, 8.0, False),  # stronger than turbulence by far: a maximum
+    (0.3, 0.02, 60.0, False),  # far above, where there is nothing but noise
+    (0.02, 0.02, 4.0, True),  # below what is looked at
+])
+def test_a_resonance_without_a_maximum_is_of_the_continuum(damping: float, rms: float, frequency: float, smooth: bool) -> None:
+    p = Ar2(2 * pi * frequency, damping, rms, DT)
+    assert of_continuum(Spectrum(0.014, DT, TURBULENCE, (p,)), p, 5.0) == smooth
+
+
+def test_turbulence_that_no_third_order_fits_is_no_vibration() -> None:
+    """A second process on its slope: found, told to the filters as turbulence, written, and no peak."""
+    rng = np.random.default_rng(12)
+    z = 0.014 * rng.standard_normal(60_000) + sum(p.sample(60_000, rng) for p in (TURBULENCE, Ar2(2 * pi * 8.0, 0.2, 0.02, DT)))
+    got = identify(Record(z[:, None], np.zeros((60_000, 1)), DT))
+    (mode,) = got.modes
+    assert got.white and not got.peaks and len(mode.broad) == 1
+    (p,) = mode.broad
+    for number, true in ((p.frequency, 8.0), (p.rms, 0.02)):
+        assert abs(number.value - true) < 4.0 * number.std
+    assert p.damping.value > 0.1
+    assert len(mode.prior.turbulence) == 2 and not mode.prior.lines
+    assert len(got.scenario().turbulence.processes) == 2
+    assert "broad, of the continuum" in [name for name, *_ in rows(mode)]
+
+
+def test_a_number_has_no_interval_where_none_is_known_to_hold() -> None:
+    """Of a record so short that turbulence hardly moves; a line two bins from half the rate."""
+    rng, n = np.random.default_rng(13), 5000
+    z = 0.014 * rng.standard_normal(n) + Ar2(2.0, 0.9, 0.5, DT).sample(n, rng)
+    z += 0.02 * np.cos(2 * pi * (500.0 - 2.0 / (n * DT)) * DT * np.arange(n))
+    result = identify(Record(z[:, None], np.zeros((n, 1)), DT))
+    (mode,) = result.modes
+    assert mode.turbulence and np.isnan(mode.turbulence.frequency.std) and np.isfinite(mode.noise.std)
+    (line,) = [p for p in mode.peaks if p.frequency.value > 490.0]
+    assert np.isnan(line.rms.std)
+    assert plain(result)["modes"][0]["turbulence"]["frequency_std"] is None
+    assert known_number(Number(0.3, 0.11)).value == 0.3 and np.isnan(known_number(Number(0.3, 0.11)).std)
+    assert known_number(Number(0.3, 0.09)) == Number(0.3, 0.09)
+    assert "+- -" in toml(result, result.scenario())
+    assert tuple(mean([Number(1.0, nan), Number(2.0, 0.1)])) == pytest.approx((2.0, 0.1), rel=1e-12)
+    assert np.isnan(mean([Number(1.0, nan), Number(2.0, nan)]).std)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot, log, sqrt
+from math import hypot, isnan, log, nan, sqrt
 from typing import NamedTuple
 
 
 class Number(NamedTuple):
-    """A value and the standard deviation of its estimate, both in the same unit."""
+    """A value and the standard deviation of its estimate, both in the same unit; NaN where no interval holds."""
 
     value: float
     std: float
@@ -41,16 +41,26 @@ class Peak:
     rms: tuple[Number | None, ...]
 
 
+POOR = 1.0 / 3.0
+"""Standard deviation over the number beyond which it is none: the likelihood of a positive number is not normal then."""
 AGREE = 3.0
 """Standard deviations of their difference within which two numbers are the same."""
 UNSURE = 0.02, 0.5
 """Standard deviation of a frequency and of a damping, over the number, from which it agrees with none: it could be any."""
 
 
+def known(n: Number) -> Number:
+    """A positive number, without a standard deviation where that is more than POOR of it."""
+    return n if n.std <= POOR * n.value else Number(n.value, nan)
+
+
 def mean(numbers: list[Number]) -> Number:
-    """The mean weighted by 1 / std^2, of values of the same thing."""
-    weights = [1.0 / max(n.std, 1e-9 * abs(n.value), 1e-300) ** 2 for n in numbers]
-    return Number(sum(w * n.value for w, n in zip(weights, numbers, strict=True)) / sum(weights), 1.0 / sqrt(sum(weights)))
+    """The mean weighted by 1 / std^2, of values of the same thing; of those without a standard deviation where none has one."""
+    sure = [n for n in numbers if not isnan(n.std)]
+    if not sure:
+        return Number(sum(n.value for n in numbers) / len(numbers), nan)
+    weights = [1.0 / max(n.std, 1e-9 * abs(n.value), 1e-300) ** 2 for n in sure]
+    return Number(sum(w * n.value for w, n in zip(weights, sure, strict=True)) / sum(weights), 1.0 / sqrt(sum(weights)))
 
 
 def merged(modes: list[tuple[Process, ...]]) -> list[Peak]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import sqrt
+from math import isnan, sqrt
 from typing import Any
 
 from wfsobs.identification.process import Number, Process
@@ -16,11 +16,13 @@ Row = tuple[str, Number | None, Number | None, Number | None]
 
 
 def plain(result: Identified) -> dict[str, Any]:
-    """What `wfsobs identify --json` prints: every number with its standard deviation as `_std`, rms in um, frequencies in Hz."""
-    def numbers(**named: Number) -> dict[str, float]:
-        return {k: v for name, n in named.items() for k, v in ((name, n.value), (f"{name}_std", n.std))}
+    """What `wfsobs identify --json` prints: every number with its standard deviation as `_std`, null where it has none; rms in
+    um, frequencies in Hz."""
+    def numbers(**named: Number) -> dict[str, float | None]:
+        std = {f"{name}_std": None if isnan(n.std) else n.std for name, n in named.items()}
+        return {key: (n.value if key == name else std[key]) for name, n in named.items() for key in (name, f"{name}_std")}
 
-    def of(p: Process) -> dict[str, float]:
+    def of(p: Process) -> dict[str, float | None]:
         return numbers(**{name: n for name, n in vars(p).items() if n is not None})
 
     return {
@@ -30,6 +32,7 @@ def plain(result: Identified) -> dict[str, Any]:
                 "mode": m.name, **numbers(noise=m.noise),
                 "turbulence": None if m.turbulence is None else of(m.turbulence),
                 "background": None if m.background is None else of(m.background),
+                "broad": [of(p) for p in m.broad],
                 "peaks": [{**of(p), "pure": p.pure} for p in m.peaks],
                 "whiteness": {"cumulated_p": m.whiteness.cumulated, "innovations_p": m.whiteness.innovations,
                               "unexplained": m.whiteness.left, "white": m.whiteness.white,
@@ -49,6 +52,7 @@ def rows(mode: IdentifiedMode) -> list[Row]:
             out.append(("its third corner", Number(*(x * t.frequency.value for x in third)), None, None))
     if (b := mode.background) is not None:
         out.append(("background, up to", b.frequency, None, b.rms))
+    out += [("broad, of the continuum", p.frequency, p.damping, p.rms) for p in mode.broad]
     return out + [("line" if p.pure else "resonance", p.frequency, p.damping, p.rms) for p in mode.peaks]
 
 
@@ -65,13 +69,16 @@ def verdict(result: Identified) -> list[str]:
 
 
 def written(n: Number) -> str:
-    """A number to two digits of its standard deviation; the damping of a pure line, which is not estimated, as 0.
+    """A number to two digits of its standard deviation, to three of its own where it has none; the damping of a pure line, which
+    is not estimated, as 0.
 
-    >>> written(Number(47.43812, 0.0264)), written(Number(502.3, 25.1)), written(Number(0.0, 0.0))
-    ('47.438 +- 0.026', '502 +- 25', '0')
+    >>> written(Number(47.43812, 0.0264)), written(Number(502.3, 25.1)), written(Number(0.0, 0.0)), written(Number(0.1412, nan))
+    ('47.438 +- 0.026', '502 +- 25', '0', '0.141 +- -')
     """
     if n == (0.0, 0.0):
         return "0"
+    if isnan(n.std):
+        return f"{n.value:.3g} +- -"
     digits = max(0, 1 - int(f"{n.std:e}".split("e")[1])) if n.std > 0 else 4
     return f"{n.value:.{digits}f} +- {n.std:.{digits}f}"
 
@@ -79,8 +86,8 @@ def written(n: Number) -> str:
 def toml(result: Identified, scenario: Scenario) -> str:
     """The scenario of the result as TOML, a standard deviation beside every number that was found."""
     count = sqrt(scenario.sensors.lgs_count)
-    notes = {path: f"+- {number.std:.2g}" for path, number in result.shared(scenario).items()}
-    notes["sensors.lgs_noise_per_mode"] = "+- " + ", ".join(f"{count * m.noise.std:.2g}" for m in result.modes)
+    notes = {path: f"+- {_std(number.std)}" for path, number in result.shared(scenario).items()}
+    notes["sensors.lgs_noise_per_mode"] = "+- " + ", ".join(_std(count * m.noise.std) for m in result.modes)
     smooth = [(m.name, what, p) for m in result.modes for what, p in _smooth(m)]
     for i, (mode, what, p) in enumerate(smooth):
         notes |= _notes(f"turbulence.processes.{i}", p, f"{mode}, {what}, ")
@@ -90,19 +97,20 @@ def toml(result: Identified, scenario: Scenario) -> str:
     return "\n".join(f"# {line}" for line in head) + "\n\n" + annotated(to_toml(scenario), notes)
 
 
-def _smooth(mode: IdentifiedMode) -> list[tuple[str, Process | None]]:
-    """What a mode has in `turbulence.processes`, in its order; a resonance too low for a peak has no numbers here."""
-    named = [("turbulence", mode.turbulence), ("background", mode.background)]
-    found: list[tuple[str, Process | None]] = [(what, p) for what, p in named if p is not None]
-    return found + [("below the lowest peak", None)] * (len(mode.prior.turbulence) - len(found))
+def _smooth(mode: IdentifiedMode) -> list[tuple[str, Process]]:
+    """What a mode has in `turbulence.processes`, in its order."""
+    named = [("turbulence", mode.turbulence), ("background", mode.background), *(("broad", p) for p in mode.broad)]
+    return [(what, p) for what, p in named if p is not None]
 
 
-def _notes(path: str, p: Process | None, whose: str) -> dict[str, str]:
+def _std(std: float) -> str:
+    return "-" if isnan(std) else f"{std:.2g}"
+
+
+def _notes(path: str, p: Process, whose: str) -> dict[str, str]:
     """Comments of the settings of one process or peak."""
-    if p is None:
-        return {f"{path}.frequency": whose.removesuffix(", ")}
     numbers = {"frequency": p.frequency, "damping": p.damping, "rms": p.rms, "third_corner": p.third_corner}
-    notes = {f"{path}.{name}": f"+- {n.std:.2g}" for name, n in numbers.items() if n is not None and n.std}
+    notes = {f"{path}.{name}": f"+- {_std(n.std)}" for name, n in numbers.items() if n is not None and n.std}
     if p.pure:
         notes[f"{path}.damping"] = "a pure line"
-    return notes | {f"{path}.frequency": f"{whose}+- {p.frequency.std:.2g}"}
+    return notes | {f"{path}.frequency": f"{whose}+- {_std(p.frequency.std)}"}

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import pi, sqrt
+from dataclasses import dataclass, replace
+from math import nan, pi, sqrt
 from typing import Any
 
 import numpy as np
 
+from wfsobs.identification.continuum import of_continuum
 from wfsobs.identification.one_mode import OneMode
-from wfsobs.identification.process import Number, Peak, Process, mean, merged
+from wfsobs.identification.process import Number, Peak, Process, known, mean, merged
 from wfsobs.identification.settings import fitting, told
 from wfsobs.identification.whiteness import Whiteness
 from wfsobs.prior.model import Line, Prior
@@ -18,10 +19,14 @@ from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.simulation.layers import relative_rms
-from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.model import HIGHEST, Spectrum
 from wfsobs.spectral.whittle import NO_NEARER
 from wfsobs.typing import Array
 
+SLOWEST = 10.0
+"""Periods of turbulence in a record at least, or its corner has no standard deviation: a slower one is not seen."""
+EDGE = 4.0
+"""Bins from zero and from half the rate within which a line has none: its image overlaps it."""
 LARGEST = 100.0
 """Strength of turbulence [um] that a scenario's settings allow."""
 
@@ -29,7 +34,7 @@ LARGEST = 100.0
 @dataclass(frozen=True)
 class IdentifiedMode:
     """The model of one mode: noise, rms of z's white noise [um]; turbulence, or None; coloured background, or None; peaks by
-    frequency; what the tests say.
+    frequency; broad, resonances that are part of the continuum; what the tests say.
 
     spectrum : of all but the pure lines;  prior : what an observer is told of the mode
     """
@@ -39,6 +44,7 @@ class IdentifiedMode:
     turbulence: Process | None
     background: Process | None
     peaks: tuple[Process, ...]
+    broad: tuple[Process, ...]
     spectrum: Spectrum
     prior: Prior
     whiteness: Whiteness
@@ -109,30 +115,40 @@ class Identified:
 
 
 def read_off(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> IdentifiedMode:
-    """The numbers of a mode and their standard deviations. A resonance below the lowest frequency [Hz] that was looked at is a
-    part of the turbulence's shape, and no peak; an observer is told of it as such."""
+    """The numbers of a mode and their standard deviations, those that hold. A resonance that is a part of the continuum is no
+    peak; an observer is told of it as of turbulence. lowest : frequency from which peaks were looked for [Hz]"""
     std = mode.errors()
     noise = _scaled(Number(1.0, float(std[0])), mode.spectrum.noise)
     found = [_process(p, std[start:]) for start, p in zip(mode.spectrum.starts, mode.spectrum.processes, strict=False)]
     turbulence, background = (None if p is None else found.pop(0) for p in (mode.spectrum.turbulence, mode.spectrum.background))
+    if turbulence is not None and turbulence.frequency.value < SLOWEST * mode.f[0]:
+        turbulence = replace(turbulence, frequency=Number(turbulence.frequency.value, nan))
+    smooth = [of_continuum(mode.spectrum, p, lowest) for p in mode.spectrum.resonances]
+    broad = [p for p, is_smooth in zip(found, smooth, strict=True) if is_smooth]
+    found = [p for p, is_smooth in zip(found, smooth, strict=True) if not is_smooth]
     for line in mode.lines:
         floor = float(mode.spectrum.psd(np.array([line.frequency]))[0]) / float(np.interp(line.frequency, mode.f, mode.share))
         in_frequency, in_rms = line.standard_deviations(mode.n, mode.dt, floor)
-        found.append(Process(Number(line.frequency, in_frequency), Number(0.0, 0.0), Number(line.rms, in_rms)))
+        if not EDGE * mode.f[0] < line.frequency < mode.f[-1] - EDGE * mode.f[0]:
+            in_frequency = in_rms = nan
+        found.append(Process(known(Number(line.frequency, in_frequency)), Number(0.0, 0.0), known(Number(line.rms, in_rms))))
     peaks = sorted((p for p in found if p.frequency.value >= lowest), key=lambda p: p.frequency.value)
     s = mode.spectrum
-    below = [p for p in s.resonances if p.omega / (2 * pi) < lowest]
-    prior = Prior(s.noise, s.dt, tuple(p for p in (s.turbulence, s.background, *below) if p is not None),
+    shapes = (p for p, is_smooth in zip(s.resonances, smooth, strict=True) if is_smooth)
+    prior = Prior(s.noise, s.dt, tuple(p for p in (s.turbulence, s.background, *shapes) if p is not None),
                   tuple(Line(p.frequency.value, p.damping.value, p.rms.value) for p in peaks))
-    return IdentifiedMode(name, noise, turbulence, background, tuple(peaks), s, prior, whiteness)
+    return IdentifiedMode(name, known(noise), turbulence, background, tuple(peaks), tuple(broad), s, prior, whiteness)
 
 
 def _process(p: Ar2 | Ar3, std: Array) -> Process:
-    """With the standard deviations of its numbers, those of frequency, rms and third corner relative, the first of std."""
+    """With the standard deviations of its numbers, those of frequency, rms and third corner relative, the first of std. A damping
+    at its bound has none."""
+    at_bound = p.damping > HIGHEST - 1e-4
     beyond = p.corner / p.omega - 1.0 if isinstance(p, Ar3) else 0.0
-    return Process(_scaled(Number(1.0, float(std[0])), p.omega / (2 * pi)), Number(p.damping, float(std[1])),
-                   _scaled(Number(1.0, float(std[2])), p.rms),
-                   Number(1.0 + beyond, max(beyond, NO_NEARER - 1.0) * float(std[3])) if isinstance(p, Ar3) else None)
+    third = Number(1.0 + beyond, max(beyond, NO_NEARER - 1.0) * float(std[3])) if isinstance(p, Ar3) else None
+    return Process(known(_scaled(Number(1.0, float(std[0])), p.omega / (2 * pi))),
+                   known(Number(p.damping, nan if at_bound else float(std[1]))),
+                   known(_scaled(Number(1.0, float(std[2])), p.rms)), third and known(third))
 
 
 def _scaled(n: Number, factor: float) -> Number:

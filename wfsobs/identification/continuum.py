@@ -1,0 +1,36 @@
+"""Which resonances are no vibration: they shape the continuum, and no peak of theirs is to be seen in it."""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.spectral.model import Spectrum
+
+BROAD = 0.1
+"""Damping from which a resonance may belong to the continuum: modes of structures have 0.005 to 0.05."""
+STANDS_OUT = 1.25
+"""Density at the maximum of a broad resonance over that of the dip below it, at least, for it to be a vibration."""
+POINTS = 200
+"""At which the density is looked at."""
+
+
+def of_continuum(spectrum: Spectrum, p: Ar2, lowest: float) -> bool:
+    """Whether a resonance of the spectrum is a part of turbulence or background.
+
+    It is if it lies below `lowest`, the frequency [Hz] from which peaks are looked for; or if it is broad, and the density of the
+    whole model has no maximum where it is that stands out of the dip on its lower side. Likelihood cannot decide: where no model
+    of turbulence fits, a resonance raises it by any amount.
+    """
+    f0 = p.omega / (2.0 * pi)
+    if f0 < lowest:
+        return True
+    if p.damping <= BROAD:
+        return False
+    f = np.linspace(max(1.0 - 3.0 * p.damping, 0.1) * f0, min((1.0 + p.damping) * f0, 0.5 / p.dt), POINTS)
+    S = spectrum.psd(f)
+    near = np.flatnonzero(f >= (1.0 - p.damping) * f0)
+    top = near[np.argmax(S[near])]
+    return bool(S[top] < STANDS_OUT * S[: top + 1].min())
