@@ -19,25 +19,28 @@ from typing import NamedTuple
 from playwright.sync_api import Page, expect, sync_playwright
 
 ROOT = Path(__file__).parents[2]
-SLOW = 120_000
+SLOW = 300_000
 """The longest that is waited for a result [ms]."""
 
 
 class Picture(NamedTuple):
-    """query : settings, as in a shared link; clicks : buttons; seen : a text that is there in the end; size [pixels]."""
+    """query : settings, as in a shared link; clicks : buttons; seen : what is there in the end; size, drawer included [pixels];
+    drawer : whether the drawer and the header are shown."""
 
     query: str = ""
     clicks: tuple[str, ...] = ()
-    seen: str = ""
+    seen: str = "text=Done in"
     size: tuple[int, int] = (1400, 1000)
+    drawer: bool = False
 
 
 PICTURES = {
-    "screenshot": Picture(size=(1400, 1420)),
+    "screenshot": Picture(size=(1400, 1420), drawer=True),
     "pictures/peak-jump": Picture("?preset=peak-jump", ("Run", "Running rms"), size=(1400, 1000)),
     "pictures/identify": Picture(
-        "?preset=paper&run.duration=20&gpr_online.training_size=50", ("Run", "Identify", "Identify the record"), "white"),
-    "pictures/closed-loop": Picture("", ("Closed loop",), "Done in", (1400, 1200)),
+        "?preset=paper&run.duration=20&gpr_online.training_size=50", ("Run", "Identify", "Identify the record"),
+        "text=/is white|not white/"),
+    "pictures/closed-loop": Picture("", ("Closed loop",), 'tr[data-controller="integrator+gpr-online"] td', (1400, 1100)),
 }
 
 
@@ -72,11 +75,13 @@ def take(page: Page, address: str, picture: Picture, path: Path) -> None:
         page.get_by_role("button", name=name, exact=True).click(timeout=SLOW)
         if name == "Run":
             page.wait_for_timeout(1000)
-            expect(page.get_by_text("Done in").first).to_be_visible(timeout=SLOW)
-    expect(page.get_by_text(picture.seen or "Done in").first).to_be_visible(timeout=SLOW)
+            expect(page.locator("text=Done in").first).to_be_visible(timeout=SLOW)
+    expect(page.locator(picture.seen).first).to_be_visible(timeout=SLOW)
     page.wait_for_timeout(3000)  # figures are drawn after their data have come
     path.parent.mkdir(exist_ok=True)
-    page.screenshot(path=path)
+    box = page.get_by_role("main").bounding_box()
+    left, top = (0.0, 0.0) if picture.drawer or box is None else (box["x"], box["y"])
+    page.screenshot(path=path, clip={"x": left, "y": top, "width": picture.size[0] - left, "height": picture.size[1] - top})
 
 
 if __name__ == "__main__":
@@ -85,6 +90,7 @@ if __name__ == "__main__":
         browser = p.chromium.launch(executable_path=os.environ.get("CHROMIUM") or "/usr/bin/chromium", args=["--no-sandbox"])
         for name in chosen:
             page = browser.new_page()
+            page.set_default_timeout(SLOW)
             take(page, address, PICTURES[name], ROOT / "docs" / f"{name}.png")
             page.close()
         browser.close()
