@@ -5,15 +5,60 @@
     >>> result = wfsobs.run(scenario, observers=["kf-lgs", "zero"])
     >>> [(s.observer, s.target, s.mode) for s in result.scores][:2]
     [('kf-lgs', 'turbulence', 'tip'), ('kf-lgs', 'turbulence', 'tilt')]
+
+The names below are imported when they are first used: `import wfsobs` alone takes no time.
 """
 
-from wfsobs.pipeline import Result, observe, run
-from wfsobs.record import Record, RecordError
-from wfsobs.scenario import Scenario
-from wfsobs.scenario.presets import PRESETS
-from wfsobs.scenario.settings import SettingError
-from wfsobs.simulation.loop import simulate
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from wfsobs.app.report.export import export
+    from wfsobs.control.closed_loop import close_loop
+    from wfsobs.evaluation.scores import score
+    from wfsobs.identification.identification import identify
+    from wfsobs.pipeline import Result, observe, run
+    from wfsobs.record import Record, RecordError
+    from wfsobs.scenario import Scenario
+    from wfsobs.scenario.presets import PRESETS
+    from wfsobs.scenario.settings import SettingError
+    from wfsobs.simulation.loop import simulate
+    from wfsobs.telemetry.records import load
+    from wfsobs.tuning.tuning import tune
 
 __version__ = "0.1.0"
 
-__all__ = ["PRESETS", "Record", "RecordError", "Result", "Scenario", "SettingError", "observe", "run", "simulate"]
+_HOMES = {
+    "export": "app.report.export",
+    "close_loop": "control.closed_loop",
+    "score": "evaluation.scores",
+    "identify": "identification.identification",
+    "Result": "pipeline", "observe": "pipeline", "run": "pipeline",
+    "Record": "record", "RecordError": "record",
+    "Scenario": "scenario",
+    "PRESETS": "scenario.presets",
+    "SettingError": "scenario.settings",
+    "simulate": "simulation.loop",
+    "load": "telemetry.records",
+    "tune": "tuning.tuning",
+}
+"""Public name -> the module below wfsobs that defines it."""
+
+__all__ = [
+    "PRESETS", "Record", "RecordError", "Result", "Scenario", "SettingError", "close_loop", "export", "identify", "load",
+    "observe", "run", "score", "simulate", "tune",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Public names, imported or not."""
+    return sorted({*globals(), *__all__})

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 from wfsobs.evaluation.bound import Bound, bound_scores, bounds
-from wfsobs.evaluation.scores import Score, supervised_scores, unsupervised_scores
+from wfsobs.evaluation.rows import rows
+from wfsobs.evaluation.scores import Score, score
+from wfsobs.notebook import html_table
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Observer
 from wfsobs.observers.missing import bridged
@@ -18,6 +21,9 @@ from wfsobs.scenario.settings import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 
+if TYPE_CHECKING:
+    import pandas
+
 
 @dataclass(frozen=True)
 class Failure:
@@ -27,7 +33,7 @@ class Failure:
     reason: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """All of a run: what was asked, what was measured, what was estimated, how well.
 
@@ -40,18 +46,33 @@ class Result:
     scores: tuple[Score, ...]
     failures: tuple[Failure, ...] = ()
 
+    def __repr__(self) -> str:
+        left_out = f", {len(self.failures)} left out" if self.failures else ""
+        observers = len({e.observer for e in self.estimates})
+        return f"Result({observers} observers, {len(self.scores)} scores{left_out}, {self.record!r})"
+
+    def _repr_html_(self) -> str:
+        cells = [(s.target, s.mode, s.observer, f"{s.rms * 1e3:.2f}") for s in self.scores]
+        return html_table(("Target", "Mode", "Observer", "error, nm"), cells)
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """One row per score, the keys of `wfsobs run --json` as columns. Raises ImportError without pandas."""
+        import pandas
+
+        return pandas.DataFrame(rows(self.scores, self.scenario.run.seed))
+
     def estimate(self, observer: str, target: str) -> Estimate | None:
         """The estimate of one observer and target, or None."""
         return next((e for e in self.estimates if (e.observer, e.target) == (observer, target)), None)
 
 
-def run(scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | None = None) -> Result:
+def run(scenario: Scenario, *, observers: Sequence[str] | None = None, watch: Watch = QUIET) -> Result:
     """Simulate a record and run the observers (all unless named) on it. Raises SettingError, Cancelled."""
-    return observe(simulate(scenario, watch=watch), scenario, watch, observers, simulated=True)
+    return observe(simulate(scenario, watch=watch), scenario, observers=observers, watch=watch, simulated=True)
 
 
 def observe(
-    record: Record, scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | None = None, simulated: bool = False
+    record: Record, scenario: Scenario, *, observers: Sequence[str] | None = None, watch: Watch = QUIET, simulated: bool = False
 ) -> Result:
     """Run the observers on a record. What the record states (step, exposure ratio) overrides the scenario.
 
@@ -87,7 +108,7 @@ def collect(
     ordered = sorted(estimates, key=lambda e: (order[e.observer], e.target))
     watch.check()
     known = record.turbulence is not None or record.vibration is not None
-    scores = (supervised_scores if known else unsupervised_scores)(record, ordered, scenario.run.warm_up, names)
+    scores = score(record, ordered, warm_up=scenario.run.warm_up, mode_names=names)
     if known:
         scores.sort(key=lambda s: (order[s.observer], s.target))
     scores += bound_scores(least, record, scores, scenario.run.warm_up)

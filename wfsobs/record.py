@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wfsobs.notebook import html_table
 from wfsobs.typing import Array
 
 DELAY = 2
@@ -28,7 +29,7 @@ class Training:
     open_loop_y: Array | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Record:
     """Measurements and commands, one row per fast (LGS) step.
 
@@ -58,6 +59,21 @@ class Record:
     training: Training | None = None
     delay: int = DELAY
     origin: str = ""
+
+    def __repr__(self) -> str:
+        return f"Record({', '.join(f'{what} {value}' for what, value in self._told())})"
+
+    def _repr_html_(self) -> str:
+        return html_table(("Record", ""), self._told())
+
+    def _told(self) -> list[tuple[str, str]]:
+        """What it is, in a few words."""
+        parts = [("turbulence", self.turbulence), ("vibration", self.vibration)]
+        return [
+            ("length", f"{self.n_steps * self.dt:g} s"), ("rate", f"{1.0 / self.dt:g} Hz"), ("modes", str(self.n_modes)),
+            ("NGS", "none" if self.ratio is None else f"every {self.ratio} steps"),
+            ("truth", " and ".join(name for name, x in parts if x is not None) or "none"), ("missing", str(self.missing)),
+        ]
 
     @property
     def n_steps(self) -> int:

@@ -110,7 +110,8 @@ def test_a_loaded_record_is_cut(page: TunePage, dashboard: Dashboard, loop: Any,
     found = tuned(page, loop)
     assert "RMS one-step prediction error of z on the validation record" in page.table.object
     assert page.figure.figure.yaxis.axis_label == "prediction error, validation [nm]" and "RMS error" not in page.table.object
-    assert found.target == "next z" and found.history == tune(dashboard.store.scenario, "kf-lgs", None, 8, record=record).history
+    again = tune(dashboard.store.scenario, "kf-lgs", evaluations=8, record=record)
+    assert found.target == "next z" and found.history == again.history
 
 
 def test_progress_cancel_and_errors(page: TunePage, dashboard: Dashboard, loop: Any) -> None:

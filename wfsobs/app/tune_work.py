@@ -63,7 +63,8 @@ def compute(
             tell(latest=tuple(history))
 
     record = of.result.record if of.recorded else None
-    return tune(scenario, observer, None, evaluations, watch, record, target=target, told=told)
+    return tune(
+        scenario, observer, evaluations=evaluations, record=record, target=target, told=told, watch=watch)
 
 
 def best_so_far(history: Sequence[Evaluation]) -> list[float]:

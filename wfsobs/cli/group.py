@@ -1,25 +1,64 @@
-"""The group of all commands, and what becomes of the errors that a user can cause."""
+"""The group of all commands, and the one line that a user's error becomes."""
 
 from __future__ import annotations
 
-from typing import Any
+from importlib import import_module
+from typing import Any, NamedTuple
 
 import click
 from threadpoolctl import threadpool_limits
 
 from wfsobs import __version__
-from wfsobs.record import RecordError
-from wfsobs.scenario.settings import SettingError
+
+
+class Place(NamedTuple):
+    """Where a command is, a module of this package, and its line in `wfsobs --help`."""
+
+    module: str
+    help: str
+
+
+COMMANDS = {
+    "bench": Place("bench", "Time the observers beside textbook versions, and other libraries if installed."),
+    "export": Place("export", "Write a report: one HTML file with figures and numbers that opens without a network."),
+    "identify": Place("telemetry", "Find noise, turbulence and vibration peaks in a record."),
+    "loop": Place("simulate", "Close the loop with every controller on the same disturbance and print what is left of it."),
+    "observe": Place("telemetry", "Run the observers on a record: .npz, .csv, .fits or AOT."),
+    "presets": Place("presets", "List the presets, or print one as TOML."),
+    "run": Place("simulate", "Simulate the loop, run every observer and print the RMS table."),
+    "serve": Place("serve", "Serve the dashboard."),
+    "tune": Place("tuning", "Search for the settings of an observer that are best on a validation record."),
+}
 
 
 class Commands(click.Group):
-    """Turns the errors a user can cause into one line and exit status 2."""
+    """Imports a command when it is called, and turns the errors a user can cause into one line and exit status 2."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names of all commands."""
+        return sorted(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command of this name."""
+        if cmd_name not in COMMANDS:
+            return None
+        return getattr(import_module(f"wfsobs.cli.{COMMANDS[cmd_name].module}"), cmd_name)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list of commands, without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, COMMANDS[name].help) for name in self.list_commands(ctx)])
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command."""
         try:
             return super().invoke(ctx)
-        except (SettingError, RecordError) as error:
+        except ValueError as error:
+            from wfsobs.record import RecordError
+            from wfsobs.scenario.settings import SettingError
+
+            if not isinstance(error, (SettingError, RecordError)):
+                raise
             click.echo(f"wfsobs: {error}", err=True)
         except OSError as error:
             click.echo(f"wfsobs: {error.filename or 'file'}: {error.strerror or error}", err=True)
@@ -30,5 +69,6 @@ class Commands(click.Group):
 @click.version_option(__version__, prog_name="wfsobs")
 def main() -> None:
     """Disturbance observers for adaptive optics: turbulence and vibration from wavefront-sensor data."""
-    # One BLAS thread: at these sizes two are slower, and modes run side by side.
+    # One BLAS thread: at these sizes two are slower, and modes run side by side. The command and with it every library has
+    # been imported by now, as the limit needs.
     threadpool_limits(1, user_api="blas")

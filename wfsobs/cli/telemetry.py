@@ -39,7 +39,7 @@ def observe(
     stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
     record = loaded(record_file, scenario, stated, sha256)
     with progress_bar() as update:
-        result = observe_record(record, scenario, Watch(progress=update))
+        result = observe_record(record, scenario, watch=Watch(progress=update))
     warn(result)
     if out:
         save_arrays(out, {f"{e.observer}/{e.target}": e.values for e in result.estimates})

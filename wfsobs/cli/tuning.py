@@ -54,8 +54,8 @@ def tune(
     if out:
         check_writable(out)
     with progress_bar("evaluations") as update:
-        tuned = search(scenario, observer, settings or None, evaluations, Watch(progress=update), record,
-                       target=target, validation=validation)
+        tuned = search(scenario, observer, settings or None, evaluations=evaluations, record=record, target=target,
+                       validation=validation, watch=Watch(progress=update))
     if out:
         text = report.toml(tuned)
         write_whole(out, lambda file: file.write(text.encode()))

@@ -35,6 +35,7 @@ from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.settings import SettingError
 from wfsobs.signal.welch import rms
+from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import TrueSpectra, is_known, true_spectra
 from wfsobs.typing import Array
 
@@ -146,6 +147,15 @@ def _designed(controller: Controller, scenario: Scenario, mode: int, mirror: Mir
     predicted = None if spectra is None else float(np.sqrt(residual_variance(law, spectra, mirror)))
     return Designed(law, stable, predicted, margins(
         lambda omega: mirror.response(omega) * law.response(omega), frequencies(law.poles), scenario.dt))
+
+
+def close_loop(scenario: Scenario, *, controllers: Sequence[str] | None = None, watch: Watch = QUIET) -> ClosedLoop:
+    """Simulate a disturbance and close the loop on it with every controller (all unless named).
+
+    Raises SettingError where settings do not go together or a controller is unknown, Cancelled.
+    """
+    plan = design(scenario, controllers)
+    return closed_loop(simulate(scenario, watch=Watch(cancelled=watch.cancelled)), plan, watch)
 
 
 def closed_loop(record: Record, plan: Design, watch: Watch = QUIET) -> ClosedLoop:

@@ -9,6 +9,7 @@ import numpy as np
 
 from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.record import Record
+from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.welch import rms, welch_psd
 from wfsobs.typing import Array
 
@@ -67,6 +68,18 @@ def common_samples(known: Sequence[Array]) -> list[tuple[Array, bool]]:
         else:
             apart.add(i)
     return [(known[i] if i in apart else shared, i in apart) for i in range(len(known))]
+
+
+def score(
+    record: Record, estimates: Sequence[Estimate], *, warm_up: float = 0.0, mode_names: Sequence[str] | None = None
+) -> list[Score]:
+    """One Score per estimate and mode: the error where the record has a truth, else that of predicting the next measurement.
+
+    warm_up [s] : samples before it do not count;  mode_names : of the columns, those of Noll's order unless given
+    """
+    names = [m.name for m in modes_up_to(HIGHEST_ORDER)][: record.n_modes] if mode_names is None else list(mode_names)
+    known = record.turbulence is not None or record.vibration is not None
+    return (supervised_scores if known else unsupervised_scores)(record, estimates, warm_up, names)
 
 
 def supervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:

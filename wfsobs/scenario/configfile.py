@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import tomli_w
 from wfsobs.files import write_whole
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.scenario.settings import SettingError
+from wfsobs.scenario.settings import SettingError, leaves
 
 DEEPEST = 8
 """Tables and lists inside one another that a text may have; settings have four."""
@@ -149,7 +149,7 @@ def parse_assignment(text: str) -> tuple[str, Any]:
 
 def changes(scenario: Scenario, base: Scenario) -> dict[str, Any]:
     """Dotted path -> plain value of the settings that differ from those of `base`; lists as a whole."""
-    return dict(_leaves(scenario.difference(base)))
+    return dict(leaves(scenario.difference(base)))
 
 
 def written(value: Any) -> str:
@@ -167,14 +167,6 @@ def _inline(value: Any) -> str:
     if isinstance(value, list):
         return "[" + ", ".join(map(_inline, value)) + "]"
     return json.dumps(value)
-
-
-def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def scenario_from(

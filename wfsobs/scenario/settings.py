@@ -13,10 +13,15 @@ from typing import Any, Self, TypeVar, cast
 import numpy as np
 import param
 
+from wfsobs.notebook import html_table
 from wfsobs.scenario.parameters import allowed, hint
 
 Plain = dict[str, Any]
 """A tree as plain values: nested dictionaries, lists, numbers, strings and booleans."""
+
+
+SHOWN = 3
+"""Settings that the representation of a group names."""
 
 
 class SettingError(ValueError):
@@ -59,6 +64,24 @@ class Group(param.Parameterized):
     def idle(self) -> tuple[str, ...]:
         """Settings that mean nothing while the others are as they are."""
         return ()
+
+    def __repr__(self) -> str:
+        changed = self._changed()
+        shown = ", ".join(f"{path}={value}" for path, value in changed[:SHOWN])
+        return f"{type(self).__name__}({shown}{f', and {len(changed) - SHOWN} more' if len(changed) > SHOWN else ''})"
+
+    def __str__(self) -> str:
+        return repr(self)
+
+    def _repr_html_(self) -> str:
+        return html_table((type(self).__name__, "" if (changed := self._changed()) else "default settings"), changed)
+
+    def _changed(self) -> list[tuple[str, str]]:
+        """(dotted path, value, shortened) of the settings that are not at their defaults."""
+        def text(value: Any) -> str:
+            return f"[{len(value)} entries]" if isinstance(value, list) and len(value) > 3 else _short(value, 40)
+
+        return [(path, text(value)) for path, value in leaves(self.difference(type(self)()))]
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and self.to_dict() == other.to_dict()  # type: ignore[attr-defined]
@@ -192,6 +215,15 @@ def _plain(value: Any) -> Any:
     return value
 
 
+def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted path, value) of a (partial) dictionary of settings; lists as a whole."""
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
 def holds_groups(p: param.List) -> bool:
     """Whether a list's items are groups of settings."""
     return isinstance(p.item_type, type) and issubclass(p.item_type, Group)
@@ -255,6 +287,6 @@ _WORDS.maxlist = _WORDS.maxtuple = _WORDS.maxdict = 40
 _WORDS.maxstring = _WORDS.maxother = _WORDS.maxlong = 400
 
 
-def _short(value: Any) -> str:
+def _short(value: Any, most: int = 80) -> str:
     text = _WORDS.repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
+    return text if len(text) <= most else text[: most - 3] + "..."

@@ -12,7 +12,6 @@ from functools import lru_cache
 from math import gamma
 
 import numpy as np
-from scipy.special import jv
 
 from wfsobs.atmosphere.plane_waves import Footprint, Wave
 from wfsobs.typing import Array
@@ -51,6 +50,8 @@ def up_to_order(order: int) -> range:
 
 def over_argument(order: int, x: Array) -> Array:
     """J_order(x) / x for an order of 1 or more, its limit at 0."""
+    from scipy.special import jv  # here, since settings need the names of modes alone and SciPy takes long to import
+
     at_zero = 0.5 if order == 1 else 0.0
     return np.where(x > 0, jv(order, x) / np.where(x > 0, x, 1.0), at_zero)
 

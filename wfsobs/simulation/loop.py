@@ -41,7 +41,7 @@ def _holding_integrator(open_loop_y: Sequence[float], gain: float, leak: float) 
     return u
 
 
-def simulate(scenario: Scenario, rng: np.random.Generator | None = None, watch: Watch = QUIET) -> Record:
+def simulate(scenario: Scenario, *, rng: np.random.Generator | None = None, watch: Watch = QUIET) -> Record:
     """Run the loop over the scenario's duration and return its record, training record included.
 
     rng : source of every random number; by default one seeded with `scenario.run.seed`.

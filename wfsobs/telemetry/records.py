@@ -70,6 +70,22 @@ def load_record(
         raise RecordError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
+def load(
+    path: str | Path, *, scenario: Scenario | None = None, unit: str | None = None, command_sign: int | None = None,
+    command_delay: int | None = None, rate: float | None = None,
+) -> Record:
+    """Read the record of a file: .npz, .csv, .fits or AOT (docs/data.md).
+
+    scenario      : its telescope and modes, where the file needs them to be understood; the defaults unless given
+    unit          : of the signals where the file states none, one of `wfsobs.units.UNITS`; um unless given
+    command_sign  : +1 where a command adds to what the sensor sees, -1 where it is taken off
+    command_delay : steps from a command to the first measurement that sees it
+    rate          : of the rows where they have no time [Hz]
+    Raises RecordError with one line saying what, where and what is expected.
+    """
+    return load_record(path, scenario, Stated(unit, command_sign, command_delay, rate))
+
+
 def read_record(
     file: IO[bytes], name: str, scenario: Scenario | None = None, stated: Stated | None = None, most: int = MOST_BYTES
 ) -> Record:

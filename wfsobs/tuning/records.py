@@ -81,7 +81,7 @@ def simulated(scenario: Scenario, space: Space, target: str, duration: float | N
     largest = scenario.replace({a.path: int(a.high) for a in space.axes if a.path in LENGTHS})
     short = scenario if duration is None else scenario.replace({"run.duration": duration})
     short.validate()
-    validation = simulate(short, stream(scenario, VALIDATION), watch)
+    validation = simulate(short, rng=stream(scenario, VALIDATION), watch=watch)
     return Records(replace(validation, training=record_of(largest).training), record_of, target)
 
 

@@ -98,9 +98,9 @@ class Tuned:
 
 
 def tune(
-    scenario: Scenario, observer: str, names: Sequence[str] | None = None, evaluations: int = EVALUATIONS, watch: Watch = QUIET,
-    record: Record | None = None, *, target: str | None = None, validation: float | None = None,
-    told: Callable[[Evaluation], None] | None = None,
+    scenario: Scenario, observer: str, names: Sequence[str] | None = None, *, evaluations: int = EVALUATIONS,
+    record: Record | None = None, target: str | None = None, validation: float | None = None,
+    told: Callable[[Evaluation], None] | None = None, watch: Watch = QUIET,
 ) -> Tuned:
     """Search for the settings of an observer with the least error on a validation record; the test record is scored after that.
 

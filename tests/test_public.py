@@ -1,0 +1,143 @@
+"""What `import wfsobs` gives, how its objects look, and how little is imported for it."""
+
+import ast
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import wfsobs
+from wfsobs.cli.group import COMMANDS, main
+from wfsobs.control.closed_loop import closed_loop, design
+from wfsobs.telemetry.records import save_record
+
+FUNCTIONS = ("close_loop", "export", "identify", "load", "observe", "run", "score", "simulate", "tune")
+
+QUICK = {"run.duration": 2.0, "gpr_offline.training_size": 20, "gpr_online.training_size": 20}
+
+
+@pytest.fixture(scope="module")
+def result() -> wfsobs.Result:
+    return wfsobs.run(wfsobs.PRESETS["paper"]().replace(QUICK), observers=["kf-lgs", "zero"])
+
+
+def in_a_new_process(code: str) -> str:
+    return subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+
+
+def test_every_public_name_is_there_and_listed() -> None:
+    assert set(wfsobs.__all__) <= set(dir(wfsobs))
+    for name in wfsobs.__all__:
+        assert getattr(wfsobs, name) is not None
+    with pytest.raises(AttributeError, match=r"no attribute 'nothing'"):
+        wfsobs.nothing  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_the_names_that_a_type_checker_sees_are_those_that_are_imported() -> None:
+    tree = ast.parse(Path(inspect.getfile(wfsobs)).read_text())
+    seen = {alias.name: node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names
+            if node.module and node.module.startswith("wfsobs")}
+    assert seen == {name: f"wfsobs.{home}" for name, home in wfsobs._HOMES.items()}
+    assert set(seen) == set(wfsobs.__all__)
+
+
+def test_public_functions_stay_functions_whatever_is_imported() -> None:
+    """A submodule of the same name would take their place. main.py of the dashboard opens a session, so it is left out."""
+    code = (
+        "import importlib, inspect, pkgutil, warnings, wfsobs\n"
+        "warnings.simplefilter('ignore')\n"
+        "for m in pkgutil.walk_packages(wfsobs.__path__, 'wfsobs.'):\n"
+        "    if m.name not in ('wfsobs.app.main', 'wfsobs.__main__'): importlib.import_module(m.name)\n"
+        f"print([n for n in {FUNCTIONS} if not inspect.isfunction(getattr(wfsobs, n))])\n")
+    assert in_a_new_process(code).strip() == "[]"
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_options_are_keyword_only(name: str) -> None:
+    """All that has a default, but for the names of the settings that are tuned."""
+    parameters = inspect.signature(getattr(wfsobs, name)).parameters.values()
+    positional = {p.name for p in parameters if p.default is not p.empty and p.kind is not p.KEYWORD_ONLY}
+    assert positional <= {"names"}
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["presets"]])
+def test_help_and_presets_import_no_large_library(arguments: list[str]) -> None:
+    code = (
+        "import sys\nfrom wfsobs.cli import main\n"
+        f"main({arguments}, standalone_mode=False)\n"
+        "print('large:', sorted({'scipy', 'rich', 'panel', 'bokeh', 'astropy', 'pandas'} & set(sys.modules)))\n")
+    assert in_a_new_process(code).splitlines()[-1] == "large: []"
+
+
+def test_the_list_of_commands_says_what_each_says_of_itself() -> None:
+    for name, place in COMMANDS.items():
+        command = main.get_command(None, name)  # type: ignore[arg-type]
+        assert command is not None and command.name == name and command.help
+        assert re.sub(r" \([^)]*\)", "", command.help.splitlines()[0]) == place.help
+
+
+def test_every_library_is_imported_before_the_limit_of_threads_is_set() -> None:
+    """A BLAS library that comes later would use all processors."""
+    code = (
+        "import sys, threadpoolctl\nfrom wfsobs.cli import main\n"
+        "main(['run', '--set', 'run.duration=1.2', '--json'], standalone_mode=False)\n"
+        "print({i['num_threads'] for i in threadpoolctl.threadpool_info() if i['user_api'] == 'blas'})\n")
+    assert in_a_new_process(code).splitlines()[-1] == "{1}"
+
+
+def test_representations_are_one_line(result: wfsobs.Result) -> None:
+    assert repr(wfsobs.Scenario()) == "Scenario()"
+    assert repr(wfsobs.Scenario().replace({"run.duration": 2.0, "telescope.diameter": 4.0})) == (
+        "Scenario(telescope.diameter=4.0, run.duration=2.0)")
+    for made in (*(make() for make in wfsobs.PRESETS.values()), result, result.record):
+        assert "\n" not in repr(made) and len(repr(made)) < 200
+    assert "length 2 s, rate 1000 Hz, modes 2" in repr(result.record)
+    assert repr(result).startswith("Result(2 observers, 12 scores, Record(")
+
+
+def test_a_notebook_shows_tables(result: wfsobs.Result) -> None:
+    for made, cell in ((result, "kf-lgs"), (result.record, "1000 Hz"), (result.scenario, "run.duration")):
+        html = made._repr_html_()
+        assert html.startswith("<table>") and html.endswith("</table>") and f"<td>{cell}</td>" in html
+
+
+def test_a_data_frame_has_a_row_per_score(result: wfsobs.Result) -> None:
+    frame = result.to_dataframe()
+    assert list(frame["rms_um"]) == [s.rms for s in result.scores]
+    assert list(frame["observer"]) == [s.observer for s in result.scores]
+
+
+def test_scores_are_those_of_the_run(result: wfsobs.Result) -> None:
+    again = wfsobs.score(result.record, result.estimates, warm_up=result.scenario.run.warm_up)
+    assert set(again) == {s for s in result.scores if s.observer != "bound"}
+
+
+def test_a_record_is_loaded_from_its_file(result: wfsobs.Result, tmp_path: Path) -> None:
+    save_record(tmp_path / "night.npz", result.record)
+    np.testing.assert_array_equal(wfsobs.load(tmp_path / "night.npz").y_lgs, result.record.y_lgs)
+    bare = np.column_stack([result.record.y_lgs, result.record.u])
+    np.savez(tmp_path / "bare.npz", y_lgs=bare[:, :2], u=-bare[:, 2:])
+    turned = wfsobs.load(tmp_path / "bare.npz", rate=1000.0, unit="nm", command_sign=-1)
+    assert turned.dt == 1e-3
+    np.testing.assert_allclose(turned.u, 1e-3 * result.record.u, rtol=1e-12)  # the rounding of one product
+
+
+def test_the_loop_is_closed_on_what_is_simulated() -> None:
+    scenario = wfsobs.PRESETS["paper"]().replace(QUICK)
+    chosen = ["integrator", "lqg-kf-lgs"]
+    expected = closed_loop(wfsobs.simulate(scenario), design(scenario, chosen))
+    found = wfsobs.close_loop(scenario, controllers=chosen)
+    for one, other in zip(found.outcomes, expected.outcomes, strict=True):
+        assert one.controller == other.controller
+        np.testing.assert_array_equal(one.residual, other.residual)
+
+
+def test_a_report_is_written(tmp_path: Path) -> None:
+    done: list[wfsobs.Result] = []
+    wfsobs.export(tmp_path / "report.html", wfsobs.PRESETS["paper"]().replace(QUICK), done=done.append)
+    assert len(done) == 1
+    assert (tmp_path / "report.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")

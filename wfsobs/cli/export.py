@@ -1,0 +1,29 @@
+"""`wfsobs export`."""
+
+from __future__ import annotations
+
+import click
+
+from wfsobs.cli.options import scenario_options
+from wfsobs.cli.show import progress_bar, warn
+from wfsobs.progress import Watch
+from wfsobs.scenario import configfile
+from wfsobs.scenario.grid import MOST, parse_variation
+from wfsobs.scenario.settings import SettingError
+
+
+@click.command()
+@click.argument("out", metavar="OUT.html")
+@scenario_options
+@click.option("--vary", multiple=True, metavar="NAME=VALUE,VALUE,...",
+              help=f"Run for each of these values as well; several make every combination, at most {MOST}.")
+def export(out: str, preset: str | None, config: str | None, assignments: tuple[str, ...], vary: tuple[str, ...]) -> None:
+    """Write a report: one HTML file with figures and numbers that opens without a network."""
+    base = configfile.scenario_from(preset, config, assignments)
+    variations = [parse_variation(text) for text in vary]
+    try:
+        from wfsobs.app.report.export import export as write
+    except ModuleNotFoundError as error:
+        raise SettingError(f"export: a report needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
+    with progress_bar("runs") as update:
+        write(out, base, vary=variations, preset=configfile.preset_name(preset, config), watch=Watch(progress=update), done=warn)
