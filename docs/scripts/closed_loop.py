@@ -25,6 +25,9 @@ MATCHED = Scenario().replace({
 })
 """One turbulence of 530 nm, one line of 50 nm, 20 nm of noise, and a filter that knows them."""
 
+SEEDS = range(1, 11)
+"""Of the tables of presets."""
+
 NO_CONE = {"turbulence.source": "ar2", "turbulence.rms": 0.53, "sensors.lgs_low_frequency_rms": 0.0}
 """LGS that see what is on the axis."""
 
@@ -51,12 +54,12 @@ def two_frames() -> None:
 def presets() -> None:
     """Every preset with tip and tilt: medians of 10 seeds, and how much less than the integrator."""
     for name in ("paper", "ut4"):
-        _compare(f"`{name}`", PRESETS[name](), list(CONTROLLERS), range(1, 11))
+        _compare(f"`{name}`", PRESETS[name](), list(CONTROLLERS), SEEDS)
 
 
 def no_cone() -> None:
     """The lines of UT4 where the LGS see what is on the axis."""
-    _compare("The lines of `ut4`, no cone effect", PRESETS["ut4"]().replace(NO_CONE), LINEAR, range(1, 11))
+    _compare("The lines of `ut4`, no cone effect", PRESETS["ut4"]().replace(NO_CONE), LINEAR, SEEDS)
 
 
 def delays() -> None:
