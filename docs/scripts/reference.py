@@ -32,13 +32,16 @@ def pages() -> dict[str, str]:
 def commands() -> str:
     """Every command with its arguments and options, as `--help` has them."""
     out = ["# Command line\n\n[The command line](../command-line.md) is an introduction with examples.\n"]
-    for command in main.commands.values():
-        context = click.Context(command, info_name=command.name, parent=click.Context(main, info_name="wfsobs"))
+    whole = click.Context(main, info_name="wfsobs")
+    for name in main.list_commands(whole):
+        command = main.get_command(whole, name)
+        assert command is not None
+        context = click.Context(command, info_name=name, parent=whole)
         records = (p.get_help_record(context) for p in command.get_params(context))
         rows = ((f"`{option}`", linked(text)) for option, text in filter(None, records) if text)
         usage = command.get_usage(context).removeprefix("Usage: ")
         text = linked(inspect.cleandoc(command.help or ""))
-        out.append(f"## wfsobs {command.name}\n\n{text}\n\n    {usage}\n\n{table(('Option', 'Meaning'), rows)}\n")
+        out.append(f"## wfsobs {name}\n\n{text}\n\n    {usage}\n\n{table(('Option', 'Meaning'), rows)}\n")
     return "\n".join(out)
 
 
