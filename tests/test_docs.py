@@ -6,6 +6,7 @@ import ast
 import contextlib
 import doctest
 import importlib.util
+import inspect
 import io
 import re
 import shlex
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import wfsobs
 from wfsobs import RecordError
 from wfsobs.cli import main
 from wfsobs.control.controllers import CONTROLLERS
@@ -171,6 +173,15 @@ def test_python_of_readme_and_its_page(page: Path) -> None:
     with contextlib.redirect_stdout(said):
         exec(compile(code, page.name, "exec"), {})
     assert "gpr-online vibration tip" in said.getvalue()
+
+
+def test_page_of_python_names_the_public_functions() -> None:
+    """With their first arguments, by name and in order."""
+    listed = re.findall(r"^\| `wfsobs\.(\w+)\(([^)]*)\)`", prose(DOCS / "python.md"), flags=re.M)
+    functions = {name: getattr(wfsobs, name) for name in wfsobs.__all__ if inspect.isfunction(getattr(wfsobs, name))}
+    assert dict(listed).keys() == functions.keys()
+    for name, arguments in listed:
+        assert list(inspect.signature(functions[name]).parameters)[: arguments.count(",") + 1] == arguments.split(", "), name
 
 
 def test_settings_file_of_the_command_line() -> None:
