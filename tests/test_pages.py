@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterator
 from datetime import date
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -30,7 +30,7 @@ Table = dict[str, list[float]]
 """First cell of a row -> the numbers that stand alone in the others, or before a range in brackets."""
 
 
-def script(name: str) -> ModuleType:
+def script(name: str) -> Any:
     spec = importlib.util.spec_from_file_location(name, DOCS / "scripts" / f"{name}.py")
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)

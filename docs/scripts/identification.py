@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import ncx2
+from scipy.stats import binomtest, ncx2
 
 from wfsobs import PRESETS, Record, Scenario, observe, simulate
 from wfsobs.identification import Identified, identify
@@ -147,8 +147,10 @@ def lossy(seed: int, rate: float, duration: float, lost: float) -> Record:
 
 
 def coverage(seeds: range, rate: float, duration: float, lost: float) -> None:
-    """How many of the 95 % intervals, 1.96 stated standard deviations, hold the truth, by quantity; records with a peak more."""
+    """How many of the 95 % intervals, 1.96 stated standard deviations, hold the truth, by quantity, with the 95 % interval of the
+    share (Clopper and Pearson), and how many state none; records with a peak more."""
     inside: dict[str, list[bool]] = {}
+    silent: dict[str, int] = {}
     more = []
     for seed in seeds:
         mode = identify(lossy(seed, rate, duration, lost)).modes[0]
@@ -165,10 +167,13 @@ def coverage(seeds: range, rate: float, duration: float, lost: float) -> None:
                 pairs += [(f"{kind}, frequency", p.frequency, f), (f"{kind}, rms", p.rms, rms)]
                 pairs += [("resonance, damping", p.damping, xi)] if xi else []
         for name, number, true in pairs:
-            inside.setdefault(name, []).append(abs(number.value - true) < 1.96 * number.std)
+            held, stated = inside.setdefault(name, []), np.isfinite(number.std)
+            held += [abs(number.value - true) < 1.96 * number.std] * bool(stated)
+            silent[name] = silent.get(name, 0) + (not stated)
     print(f"{rate:g} Hz, {duration:g} s, {lost:.0%} lost, seeds {seeds[0]} to {seeds[-1]}; a peak more: {counted(more, seeds)}")
     for name, held in inside.items():
-        print(f"  {name}: {sum(held)} of {len(held)}, {np.mean(held):.1%}", flush=True)
+        share = binomtest(sum(held), len(held)).proportion_ci() if held else (0.0, 1.0)
+        print(f"  {name}: {sum(held)} of {len(held)} ({share[0]:.0%} - {share[1]:.0%}); none stated {silent[name]}", flush=True)
 
 
 def spread(scenario: Scenario, seeds: range) -> dict[str, Any]:
