@@ -33,7 +33,7 @@ define install
 endef
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: help run test setup check wheel wheel-check load container-check bench docs clean
+.PHONY: help run test setup check wheel wheel-check load container-check bench docs clean test-fast
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' Makefile
@@ -48,6 +48,9 @@ test: setup  ## run all tests, then the tutorials, then those in a browser
 	$(BIN)/python -m pytest -n auto --dist loadfile tests/browser || status=1; \
 	exit $$status
 
+test-fast: $(TEST)  ## the quick tests alone: no dashboard, no report, none that takes long (tests/slow.txt)
+	@$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" tests wfsobs --ignore=tests/app --ignore=tests/report --ignore=wfsobs/app
+
 setup: $(TEST)  ## install all that the tests need, the browser included
 	@scripts/need_browser.sh $(VENV)
 
@@ -60,7 +63,8 @@ wheel: $(TEST)  ## build dist/*.tar.gz, and from it dist/*.whl
 	rm -rf dist
 	$(BIN)/python -m build --no-isolation --outdir dist
 
-wheel-check: wheel  ## install that wheel in an empty environment elsewhere, run it and serve from it
+wheel-check: wheel  ## install that wheel in an empty environment elsewhere; build it from a zip, a clone without links and the sdist
+	scripts/check_sources.sh $(BIN)/python
 	scripts/check_wheel.sh "$(PYTHON)" dist/*.whl
 
 load: $(TEST)  ## a load and abuse run against the served dashboard, about four minutes

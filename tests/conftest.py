@@ -1,6 +1,22 @@
-"""One BLAS thread, set before numpy is imported."""
+"""One BLAS thread, set before numpy is imported; tests that take long are marked as slow."""
 
 import os
+from pathlib import Path
+
+import pytest
 
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(name, "1")
+
+HERE = Path(__file__).parent
+SLOW = tuple(line for line in (HERE / "slow.txt").read_text().splitlines() if line and not line.startswith("#"))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what tests/slow.txt names: whole files, or single tests with all their parameters."""
+    for item in items:
+        if HERE in item.path.parents:
+            file = item.path.relative_to(HERE).as_posix()
+            if file.startswith(tuple(s for s in SLOW if s.endswith("/"))) or file in SLOW or (
+                    f"{file}::{getattr(item, 'originalname', item.name)}" in SLOW):
+                item.add_marker(pytest.mark.slow)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from wfsobs.telemetry.records import load
     from wfsobs.tuning.tuning import tune
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "export": "app.report.export",
