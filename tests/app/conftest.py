@@ -8,6 +8,7 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
+import panel as pn
 import pytest
 
 from wfsobs.app.cache import frozen, key_of
@@ -48,6 +49,12 @@ class Loop:
     def finish(self, store: Store) -> None:
         """Do what is posted until the run is over."""
         self.until(lambda: store.run.state != RUNNING)
+
+
+@pytest.fixture(autouse=True)
+def light() -> None:
+    """Outside a session a page that turns dark turns all later ones dark."""
+    pn.config.theme = "default"
 
 
 @pytest.fixture
