@@ -9,7 +9,7 @@ import pytest
 from scipy.special import jv
 
 from wfsobs.atmosphere.von_karman import spectrum
-from wfsobs.observers.kalman.single import modelled_processes
+from wfsobs.priors_from.scenario import modelled_processes
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import noll_covariance
 from wfsobs.simulation import layers as atmosphere

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from wfsobs.evaluation.description import Description, describe
-from wfsobs.observers import OBSERVERS
-from wfsobs.progress import QUIET
+from wfsobs.pipeline import estimated
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -24,7 +23,7 @@ def impulse_response(observer: str, scenario: Scenario, steps: int, lgs: int | N
     if ngs is not None:
         y_ngs[ngs] = 1.0
     record = Record(y_lgs, np.zeros((steps, 2)), scenario.dt, y_ngs, n)
-    values = OBSERVERS[observer].run(record, scenario, QUIET)
+    values = estimated(observer, record, scenario)
     return np.column_stack([v[:, 0] for v in values.values()])
 
 

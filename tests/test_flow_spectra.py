@@ -7,8 +7,7 @@ import pytest
 from scipy.signal import csd, welch
 
 from wfsobs.evaluation.bound import bound, bounds
-from wfsobs.observers import OBSERVERS
-from wfsobs.progress import QUIET
+from wfsobs.pipeline import estimated
 from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import circle_mean
 from wfsobs.simulation.flow_spectra import flow_spectra
@@ -83,7 +82,7 @@ def test_on_frozen_flow_a_third_order_model_is_within_a_tenth_of_the_bound() -> 
         record = simulate(s.replace({"run.seed": seed}))
         assert record.turbulence is not None
         for order, found in errors.items():
-            values = OBSERVERS["kf-multi"].run(record, s.replace({"multipeak.turbulence_order": order}), QUIET)
+            values = estimated("kf-multi", record, s.replace({"multipeak.turbulence_order": order}))
             found.append(np.mean((values["turbulence"] - record.turbulence)[500:] ** 2))
     least = np.sqrt(np.mean([bound(s, mode)["turbulence"] ** 2 for mode in (0, 1)]))
     # 12 signals of 3.5 s, errors with a correlation time of about 50 ms: 4 % at one sigma.

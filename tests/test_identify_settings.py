@@ -18,10 +18,10 @@ from wfsobs.evaluation.bound import bound
 from wfsobs.identification import Identified, identify
 from wfsobs.identification.process import Number, Process, merged
 from wfsobs.identification.report import toml
-from wfsobs.observers.kalman.multi import prior
-from wfsobs.observers.kalman.single import modelled_peak, steady_filter
+from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import observe, run
-from wfsobs.prior.model import Prior
+from wfsobs.prior import Lines
+from wfsobs.priors_from.scenario import lines_of, modelled_peak
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
@@ -66,7 +66,7 @@ def saved(found: Identified) -> Scenario:
     return configfile.from_toml(toml(found, found.scenario(base)))
 
 
-def numbers(p: Prior) -> list[float]:
+def numbers(p: Lines) -> list[float]:
     """All of a model, processes in their order."""
     smooth = [x for q in p.turbulence for x in (q.omega, q.damping, q.rms, q.corner if isinstance(q, Ar3) else 0.0)]
     return [p.noise, *smooth, *(x for line in p.lines for x in line)]
@@ -75,7 +75,7 @@ def numbers(p: Prior) -> list[float]:
 def test_the_file_tells_the_filters_what_was_found(found: Identified, saved: Scenario) -> None:
     for i, mode in enumerate(found.modes):
         # A product and a quotient each: a few units in the last place.
-        assert numbers(prior(saved, i, DT)) == pytest.approx(numbers(mode.prior), rel=1e-14)
+        assert numbers(lines_of(saved, i, DT)) == pytest.approx(numbers(mode.prior), rel=1e-14)
     assert [len(m.prior.turbulence) for m in found.modes] == [1, 2]  # the second has a background
 
 
@@ -83,7 +83,7 @@ def test_the_file_predicts_a_new_record_as_what_was_found_does(found: Identified
     test = hump_and_line(2, 10_000)
     result = observe(test, saved, observers=["kf-multi"])
     for i, mode in enumerate(found.modes):
-        model = mode.prior.model(saved.multipeak.line_width)
+        model = mode.prior.disturbance(saved.multipeak.line_width)
         kalman, _ = steady_filter(model, mode.prior.noise, np.sum(list(model.outputs.values()), axis=0)[None])
         expected = kalman.run(test.z[:, None, i, None])[:, 0, 0]
         values = sum(e.values[:, i] for e in result.estimates)
@@ -105,7 +105,7 @@ def test_every_mode_has_its_own_in_a_simulation_and_in_the_bound(found: Identifi
         [np.sqrt(sum(p.rms**2 for p in m.prior.turbulence)) for m in found.modes], rel=1e-12)
     assert saved.sensors.lgs_noise_per_mode == pytest.approx([np.sqrt(2.0) * m.noise.value for m in found.modes], rel=1e-12)
     for i, mode in enumerate(found.modes):
-        model = mode.prior.model(saved.multipeak.line_width)
+        model = mode.prior.disturbance(saved.multipeak.line_width)
         row = np.sum(list(model.outputs.values()), axis=0)
         _, steady = steady_filter(model, mode.prior.noise)
         own = np.sqrt(row @ (steady.P - steady.L @ model.C[None] @ steady.P) @ row)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.observers.kalman.single import measurement_noise
 from wfsobs.pipeline import observe
+from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.record import delayed
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.disturbance import make_disturbance, vibration_variance

@@ -139,8 +139,9 @@ def test_a_single_mode_record() -> None:
     t = whole.training
     assert t.open_loop_y is not None and whole.open_loop_y is not None and whole.vibration is not None
     record = Record(
-        whole.y_lgs[:, :1], whole.u[:, :1], whole.dt, whole.y_ngs[:, :1], whole.ratio, whole.turbulence[:, :1],
-        whole.vibration[:, :1], whole.open_loop_y[:, :1], type(t)(t.y_lgs[:, :1], t.u[:, :1], t.open_loop_y[:, :1]),
+        whole.y_lgs[:, :1], whole.u[:, :1], whole.dt, whole.y_ngs[:, :1], whole.ratio, whole.open_loop_y[:, :1],
+        turbulence=whole.turbulence[:, :1], vibration=whole.vibration[:, :1],
+        training=type(t)(t.y_lgs[:, :1], t.u[:, :1], t.open_loop_y[:, :1]),
     )
     one, both = observe(record, scenario()), observe(whole, scenario())
     assert not one.failures and {s.mode for s in one.scores} == {"tip"}

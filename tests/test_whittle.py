@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import expit, logit
 
-from wfsobs.observers.kalman.single import measurement_noise, modelled_processes
+from wfsobs.priors_from.scenario import measurement_noise, modelled_processes
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar3 import TOLERANCE, Ar3, fitted_ar3
 from wfsobs.signal.whittle import information, whittle_fit

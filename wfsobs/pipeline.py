@@ -13,8 +13,8 @@ from wfsobs.evaluation.scores import Score, score
 from wfsobs.notebook import html_table
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Observer
-from wfsobs.observers.missing import bridged
-from wfsobs.progress import QUIET, Watch
+from wfsobs.priors_from.scenario import arguments
+from wfsobs.progress import QUIET, Watch, detached
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.settings import SettingError
@@ -119,12 +119,12 @@ def each_estimate(
     record: Record, scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | None = None,
     on_partial: Callable[[str, str, Array], None] | None = None,
 ) -> Iterator[Estimate | Failure]:
-    """Run the observers and yield each one's estimates as soon as they are done, the slow ones last.
+    """Run the observers and yield each one's estimates as soon as they are done, the slow ones last. Each receives
+    measurements, its prior and its settings: neither record nor scenario.
 
     on_partial : told (observer, target, values so far) by observers that deliver in blocks.
     """
     scenario = scenario.before_events  # no observer is told
-    record = bridged(record, scenario)
     unknown = set(observers or ()) - set(OBSERVERS)
     if unknown:
         raise SettingError(f"observer {sorted(unknown)[0]!r}: no such observer; there are {', '.join(OBSERVERS)}")
@@ -158,13 +158,21 @@ def _only_forward(tell: Callable[[float], None]) -> Callable[[float], None]:
     return told
 
 
+def estimated(name: str, record: Record, scenario: Scenario, watch: Watch = QUIET) -> dict[str, Array]:
+    """{target: (n_steps, n_modes) [um]} of one observer. Raises ValueError saying why there is none, Cancelled."""
+    with detached(watch) as alone:
+        return OBSERVERS[name].estimate(*arguments(OBSERVERS[name], record, scenario), alone)
+
+
 def _one(observer: Observer, record: Record, scenario: Scenario, watch: Watch) -> list[Estimate | Failure]:
     missing = observer.missing(record)
     if missing:
         return [Failure(observer.id, f"{observer.id} left out: the record has no {', '.join(missing)}")]
-    start = perf_counter()
     try:
-        values = observer.run(record, scenario, watch)
+        given = arguments(observer, record, scenario)
+        start = perf_counter()
+        with detached(watch) as alone:
+            values = observer.estimate(*given, alone)
     except ValueError as error:
         return [Failure(observer.id, f"{observer.id} left out: {error}")]
     seconds = (perf_counter() - start) / max(record.n_steps * record.n_modes, 1)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,3 +53,18 @@ class Watch:
 
 
 QUIET = Watch()
+
+_KEYS, _LISTENING = count(), dict[int, Watch]()
+
+
+@contextmanager
+def detached(watch: Watch) -> Iterator[Watch]:
+    """A watch that reports to another and holds no reference to it, nor to what its callbacks know of."""
+    key = next(_KEYS)
+    _LISTENING[key] = watch
+    try:
+        yield Watch(
+            lambda fraction: _LISTENING[key].progress(fraction), lambda: _LISTENING[key].cancelled(),
+            lambda target, values: _LISTENING[key].partial(target, values))
+    finally:
+        del _LISTENING[key]

@@ -1,4 +1,4 @@
-"""`Record`: what the sensors and the mirror tell of one run, and the truth where there is one."""
+"""`Measurements`: what the sensors and the mirror tell of one run. `Record`: the same, and the truth where there is one."""
 
 from __future__ import annotations
 
@@ -28,9 +28,13 @@ class Training:
     u: Array
     open_loop_y: Array | None = None
 
+    def copy(self) -> Training:
+        """The same in memory of its own."""
+        return Training(_own(self.y_lgs), _own(self.u), None if self.open_loop_y is None else _own(self.open_loop_y))
 
-@dataclass(frozen=True, repr=False)
-class Record:
+
+@dataclass(frozen=True)
+class Signals:
     """Measurements and commands, one row per fast (LGS) step.
 
     y_lgs       : (n_steps, n_modes) mean LGS measurement [um], y_lgs[k] = phi_res[k-1] + noise
@@ -38,14 +42,10 @@ class Record:
     dt          : fast step [s]
     y_ngs       : (n_steps, n_modes) NGS measurement [um], NaN in steps without a frame, or None
     ratio       : fast steps per NGS frame, or None where there is no NGS
-    turbulence, vibration : (n_steps, n_modes) truth [um], or None. For scores alone: no observer reads them.
     open_loop_y : (n_steps, n_modes) what the LGS would have measured with the mirror at rest [um], or None
-    training    : what the offline GPR learns from, or None
     delay       : steps from a command to the first measurement that sees it, y_lgs[k] = phi_dist[k-1] + u[k-delay] + noise
-    origin      : what a file said of unit, sign and timing before it was brought into this form, one line
 
-    NaN in y_lgs, u and the rest is a sample that is missing; `wfsobs.observers.missing.bridged` fills it for
-    observers.
+    NaN in y_lgs, u and the rest is a missing sample; `wfsobs.observers.missing.bridged` fills it.
     """
 
     y_lgs: Array
@@ -53,27 +53,8 @@ class Record:
     dt: float
     y_ngs: Array | None = None
     ratio: int | None = None
-    turbulence: Array | None = None
-    vibration: Array | None = None
     open_loop_y: Array | None = None
-    training: Training | None = None
     delay: int = DELAY
-    origin: str = ""
-
-    def __repr__(self) -> str:
-        return f"Record({', '.join(f'{what} {value}' for what, value in self._told())})"
-
-    def _repr_html_(self) -> str:
-        return html_table(("Record", ""), self._told())
-
-    def _told(self) -> list[tuple[str, str]]:
-        """What it is, in a few words."""
-        parts = [("turbulence", self.turbulence), ("vibration", self.vibration)]
-        return [
-            ("length", f"{self.n_steps * self.dt:g} s"), ("rate", f"{1.0 / self.dt:g} Hz"), ("modes", str(self.n_modes)),
-            ("NGS", "none" if self.ratio is None else f"every {self.ratio} steps"),
-            ("truth", " and ".join(name for name, x in parts if x is not None) or "none"), ("missing", str(self.missing)),
-        ]
 
     @property
     def n_steps(self) -> int:
@@ -103,9 +84,55 @@ class Record:
             raise RecordError("the record has no NGS measurement")
         return self.y_ngs - frame_mean(delayed(self.u, self.delay - 1), self.ratio)
 
+
+@dataclass(frozen=True)
+class Measurements(Signals):
+    """What an observer receives: signals in memory of their own, no truth, no training record."""
+
+
+@dataclass(frozen=True, repr=False)
+class Record(Signals):
+    """Signals, and what is known of them beside.
+
+    turbulence, vibration : (n_steps, n_modes) truth [um], or None. For scores alone: no observer receives them.
+    training : what the offline GPR learns from, or None
+    origin   : what a file said of unit, sign and timing before it was brought into this form, one line
+    """
+
+    turbulence: Array | None = None
+    vibration: Array | None = None
+    training: Training | None = None
+    origin: str = ""
+
+    def __repr__(self) -> str:
+        return f"Record({', '.join(f'{what} {value}' for what, value in self._told())})"
+
+    def _repr_html_(self) -> str:
+        return html_table(("Record", ""), self._told())
+
+    def _told(self) -> list[tuple[str, str]]:
+        """What it is, in a few words."""
+        parts = [("turbulence", self.turbulence), ("vibration", self.vibration)]
+        return [
+            ("length", f"{self.n_steps * self.dt:g} s"), ("rate", f"{1.0 / self.dt:g} Hz"), ("modes", str(self.n_modes)),
+            ("NGS", "none" if self.ratio is None else f"every {self.ratio} steps"),
+            ("truth", " and ".join(name for name, x in parts if x is not None) or "none"), ("missing", str(self.missing)),
+        ]
+
+    def measurements(self, open_loop: bool = False) -> Measurements:
+        """The signals alone, copied: no array is a view of one that may hold more. open_loop : with the open-loop twin."""
+        y_ngs, twin = self.y_ngs, self.open_loop_y if open_loop else None
+        return Measurements(
+            _own(self.y_lgs), _own(self.u), self.dt, None if y_ngs is None else _own(y_ngs), self.ratio,
+            None if twin is None else _own(twin), self.delay)
+
     def truth(self, target: str) -> Array | None:
         """The true signal of `target` ("turbulence" or "vibration"), or None."""
         return {"turbulence": self.turbulence, "vibration": self.vibration}[target]
+
+
+def _own(x: Array) -> Array:
+    return np.array(x, dtype=float, order="C", copy=True, subok=False)
 
 
 def delayed(x: Array, steps: int) -> Array:

@@ -17,7 +17,8 @@ import numpy as np
 
 import wfsobs
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman.single import by_target, measurement_noise, modelled_processes, steady_filter
+from wfsobs.observers.kalman.single import by_target, steady_filter
+from wfsobs.priors_from.scenario import measurement_noise, modelled_processes
 from wfsobs.record import Record, Training
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.bandpass import bandpass_bank, filter_causal, filter_zero_phase

@@ -18,7 +18,7 @@ from wfsobs.control.mirror import Mirror
 from wfsobs.control.prediction import gpr_offline_ahead
 from wfsobs.control.residual import residual_variance
 from wfsobs.observers.baselines import online_reference
-from wfsobs.observers.kalman.single import kalman_model, measurement_noise, modelled_processes
+from wfsobs.priors_from.scenario import bands_of, kalman_model, measurement_noise, modelled_processes
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
@@ -156,7 +156,7 @@ def test_a_vibration_that_is_predicted_is_not_corrected_twice(changes: dict[str,
     ahead = gpr_offline_ahead(record, scenario, plan.mirror, QUIET)[:, 0]
     known = ~np.isnan(ahead)
     ahead = np.where(known, ahead, 0.0)
-    f = np.where(known, online_reference(scenario, record.z, record.dt)[:, 0], 0.0)
+    f = np.where(known, online_reference(bands_of(scenario), record.z, record.dt)[:, 0], 0.0)
     commanded = plan.mirror.seen(ahead)  # vib_hat[k-1] with two frames of delay
     law = plan.laws["integrator+gpr-offline"][0].law
     assert law is not None and law.gain is not None

@@ -13,6 +13,7 @@ from wfsobs.control.prediction import VibrationPredictor, of_z
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.gpr.inputs import Scale, window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential
+from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario import Scenario
 from wfsobs.typing import Array
 
@@ -58,7 +59,7 @@ def test_the_vibration_is_predicted_for_the_time_that_the_command_acts(delay: fl
         "gpr_online.depth": depth, "gpr_online.training_size": m, "gpr_online.length_scale": 3.0, "gpr_online.signal_std": 1.0,
         "gpr_online.inputs_filter": inputs})
     z = np.random.default_rng(5).standard_normal(n)
-    f = online_reference(scenario, z[:, None], scenario.dt)[:, 0]
+    f = online_reference(bands_of(scenario), z[:, None], scenario.dt)[:, 0]
     taps = Mirror(delay).taps
     late = taps.size - 2
     targets = np.array([taps[1:] @ f[j + 1 : j + taps.size] for j in range(n - taps.size)])

@@ -13,8 +13,9 @@ from scipy.signal import butter, lfilter, sosfilt
 
 from wfsobs.evaluation.scores import lag
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
-from wfsobs.observers.gpr.offline import gpr_offline, train, training_targets
-from wfsobs.progress import QUIET
+from wfsobs.observers.gpr.offline import train, training_targets
+from wfsobs.pipeline import estimated
+from wfsobs.priors_from.scenario import bands_of
 from wfsobs.record import RecordError, Training
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -141,7 +142,7 @@ def test_pairs_of_window_and_target_on_a_record(inputs: str, twin: bool) -> None
     assert t is not None and t.open_loop_y is not None
     if not twin:
         record = replace(record, training=Training(t.y_lgs, t.u))
-    got = gpr_offline(record, s, QUIET)["vibration"]
+    got = estimated("gpr-offline", record, s)["vibration"]
     g = s.gpr_offline
     m, d = g.training_size, g.depth
     kernel = SquaredExponential(g.signal_std, g.length_scale, g.noise_std)
@@ -173,7 +174,7 @@ def test_targets_are_the_vibration_of_the_same_step() -> None:
     })
     t = simulate(s).training
     assert t is not None and t.open_loop_y is not None
-    targets = training_targets(t, s, 1e-3)
+    targets = training_targets(t, bands_of(s), 1e-3)
     assert np.isnan(targets[-1]).all() and np.isfinite(targets[:-1]).all()
     inside = slice(600, 1900)  # the band of 3 Hz has settled to exp(-5.6), its gain at 47.7 Hz is 1
     seen = t.open_loop_y[601:1901]
@@ -190,7 +191,7 @@ def test_the_estimate_of_step_k_is_the_vibration_of_step_k() -> None:
             "gpr_offline.inputs": inputs, "run.warm_up": 0.9,
         })
         record = simulate(s)
-        values = gpr_offline(record, s, QUIET)["vibration"][200:]
+        values = estimated("gpr-offline", record, s)["vibration"][200:]
         assert record.vibration is not None
         truth = record.vibration[200:]
         for mode in range(2):
@@ -205,4 +206,4 @@ def test_training_must_be_long_enough() -> None:
     assert record.training is not None
     short = Training(*(x[:109] for x in (record.training.y_lgs, record.training.u, record.training.open_loop_y)))  # type: ignore[index]
     with pytest.raises(RecordError, match="110"):
-        gpr_offline(replace(record, training=short), s, QUIET)
+        estimated("gpr-offline", replace(record, training=short), s)

@@ -14,8 +14,9 @@ from scipy.signal import butter, lfilter, sosfilt
 
 from wfsobs.evaluation.scores import lag
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
-from wfsobs.observers.gpr.online import gpr_online, predict_sliding
-from wfsobs.progress import QUIET, Cancelled, Watch
+from wfsobs.observers.gpr.online import predict_sliding
+from wfsobs.pipeline import estimated
+from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -265,7 +266,7 @@ def test_pairs_of_window_and_target_on_a_record(inputs: str) -> None:
     phi_dist[j] + noise; step k learns from the pairs k - m ... k - 1. All of it written out here."""
     s = scenario({"gpr_online.inputs": inputs})
     record = simulate(s)
-    got = gpr_online(record, s, QUIET)["vibration"]
+    got = estimated("gpr-online", record, s)["vibration"]
     g, b = s.gpr_online, s.butterworth
     m, d = g.training_size, g.depth
     kernel = SquaredExponential(g.signal_std, g.length_scale, g.noise_std)
@@ -295,7 +296,7 @@ def test_the_estimate_of_step_k_is_the_vibration_of_step_k() -> None:
         "run.duration": 3.5, "gpr_online.training_size": 200, "gpr_online.depth": 60, "gpr_online.noise_std": 0.01,
     })
     record = simulate(s)
-    values = gpr_online(record, s, QUIET)["vibration"][2500:]  # the band of 2 Hz has settled to exp(-15)
+    values = estimated("gpr-online", record, s)["vibration"][2500:]  # the band of 2 Hz has settled to exp(-15)
     assert record.vibration is not None
     truth = record.vibration[2500:]
     for mode in range(2):
@@ -307,7 +308,7 @@ def test_the_estimate_of_step_k_is_the_vibration_of_step_k() -> None:
 def test_too_short_a_record_says_so() -> None:
     s = scenario({"gpr_online.training_size": 990})
     with pytest.raises(RecordError, match="1015") as caught:
-        gpr_online(simulate(s), s, QUIET)
+        estimated("gpr-online", simulate(s), s)
     assert "\n" not in str(caught.value)
 
 
@@ -315,10 +316,10 @@ def test_cancelling_stops_it_and_partial_results_come_before() -> None:
     s = scenario({"run.duration": 3.0})
     record = simulate(s)
     partial: list[np.ndarray] = []
-    gpr_online(record, s, Watch(partial=lambda target, values: partial.append(values.copy())))
+    estimated("gpr-online", record, s, Watch(partial=lambda target, values: partial.append(values.copy())))
     counts = [int(np.isfinite(values).sum()) for values in partial]
     # the two modes tell on their own threads, in any order between them
     assert len(counts) > 10 and min(counts) < 500 and max(counts) == 2 * (3000 - 84)
     asked = iter([False] * 5 + [True] * 10_000)
     with pytest.raises(Cancelled):
-        gpr_online(record, s, Watch(cancelled=lambda: next(asked)))
+        estimated("gpr-online", record, s, Watch(cancelled=lambda: next(asked)))

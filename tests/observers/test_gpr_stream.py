@@ -6,9 +6,10 @@ from scipy.signal import lfilter
 
 from wfsobs.observers.gpr.inputs import scale_of
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
-from wfsobs.observers.gpr.online import gpr_online, predict_sliding
+from wfsobs.observers.gpr.online import predict_sliding
 from wfsobs.observers.gpr.stream import OnlineGprStream, SlidingRegression
-from wfsobs.progress import QUIET
+from wfsobs.pipeline import estimated
+from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
 
@@ -61,8 +62,9 @@ def test_the_stream_gives_the_numbers_of_the_record_version(inputs, kind):
         "run.duration": 1.5, "run.warm_up": 0.5, "gpr_online.training_size": 100, "gpr_online.depth": 40,
         "gpr_online.inputs": inputs, "gpr_online.inputs_filter": kind})
     record = simulate(scenario)
-    expected = gpr_online(record, scenario, QUIET)["vibration"][:, 1]
-    observer = OnlineGprStream(scenario, scale_of(scenario.gpr_online, record.training, record.delay, 1))
+    expected = estimated("gpr-online", record, scenario)["vibration"][:, 1]
+    scale = scale_of(scenario.gpr_online, record.training, record.delay, 1)
+    observer = OnlineGprStream(scenario.gpr_online, bands_of(scenario), scenario.dt, scale)
     got = np.array([observer.step(y, u) for y, u in zip(record.y_lgs[:, 1], record.u[:, 1], strict=True)])
     assert np.array_equal(np.isnan(got), np.isnan(expected))
     # Both round; cond is about 1e4 here, so 100 eps cond is 2e-10 of the spread.
@@ -73,7 +75,8 @@ def test_estimate_comes_before_update_and_z_windows_need_no_command():
     settings = {"gpr_online.training_size": 20, "gpr_online.depth": 5, "gpr_online.inputs": "z"}
     scenario = paper().replace(settings)
     record = simulate(scenario.replace({"run.duration": 1.2}))
-    together, apart = OnlineGprStream(scenario), OnlineGprStream(scenario)
+    given = scenario.gpr_online, bands_of(scenario), scenario.dt
+    together, apart = OnlineGprStream(*given), OnlineGprStream(*given)
     for y, u in zip(record.y_lgs[:200, 0], record.u[:200, 0], strict=True):
         value = apart.estimate(y)
         apart.update(u)
@@ -82,7 +85,7 @@ def test_estimate_comes_before_update_and_z_windows_need_no_command():
     with pytest.raises(RuntimeError, match="twice"):
         apart.estimate(0.0)
     with pytest.raises(ValueError, match="command"):
-        OnlineGprStream(paper()).estimate(0.0)
+        OnlineGprStream(paper().gpr_online, bands_of(paper()), paper().dt).estimate(0.0)
 
 
 @pytest.mark.parametrize("amplitude", [0.03, 0.3, 3.0])

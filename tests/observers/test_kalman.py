@@ -9,16 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.observers.kalman.single import (
-    between_frames,
-    kalman_model,
-    kf_lgs,
-    kf_ngs,
-    measurement_noise,
-    modelled_processes,
-    steady_filter,
-)
-from wfsobs.progress import QUIET
+from wfsobs.observers.kalman.single import between_frames, steady_filter
+from wfsobs.pipeline import estimated
+from wfsobs.priors_from.scenario import kalman_model, measurement_noise, modelled_processes
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -71,7 +64,7 @@ LGS_VARIANTS: list[dict[str, Any]] = [
 def test_lgs_filter_is_the_textbook_filter_of_six_states(changes: dict[str, Any]) -> None:
     s = scenario(changes)
     record = simulate(s)
-    got = kf_lgs(record, s, QUIET)
+    got = estimated("kf-lgs", record, s)
     r = 0.1**2 if "kalman.lgs_noise" in changes else s.sensors.lgs_noise**2 / s.sensors.lgs_count
     for mode in range(2):
         wanted = textbook_lgs(record, s, mode, r)
@@ -109,7 +102,7 @@ def test_ngs_filter_is_the_textbook_filter_held_between_frames(changes: dict[str
     s = scenario(changes)
     record = simulate(s)
     n = s.sensors.exposure_ratio
-    got = kf_ngs(record, s, QUIET)
+    got = estimated("kf-ngs", record, s)
     r = (0.05 if "kalman.ngs_noise" in changes else s.sensors.ngs_noise) ** 2
     for mode in range(2):
         states = textbook_ngs(record, s, mode, r)
@@ -153,7 +146,7 @@ def test_propagated_estimates_use_both_slow_states(ratio: int) -> None:
     """The previous slow mean as the newest frame shows it, not as it was estimated before that frame."""
     s = scenario({"kalman.ngs_between_frames": "propagate", "sensors.exposure_ratio": ratio, "run.duration": 1.003})
     record = simulate(s)
-    got = kf_ngs(record, s, QUIET)
+    got = estimated("kf-ngs", record, s)
     for mode in range(2):
         states = textbook_ngs(record, s, mode, s.sensors.ngs_noise**2)
         for i, (target, process) in enumerate(zip(got, modelled_processes(s, mode, record.dt), strict=True)):
@@ -176,7 +169,7 @@ def test_propagating_beats_holding_where_the_model_is_true() -> None:
             })
             record = simulate(s)
             assert record.turbulence is not None
-            found.append(np.nanstd(kf_ngs(record, s, QUIET)["turbulence"] - record.turbulence))
+            found.append(np.nanstd(estimated("kf-ngs", record, s)["turbulence"] - record.turbulence))
     assert (np.array(errors["propagate"]) < 0.98 * np.array(errors["hold"])).all()
 
 
@@ -193,7 +186,7 @@ def test_error_of_the_matched_filter_is_what_the_riccati_equation_says() -> None
     ratios = []
     for seed in range(16):
         record = simulate(s.replace({"run.seed": seed}))
-        values = kf_lgs(record, s, QUIET)
+        values = estimated("kf-lgs", record, s)
         one = []
         for mode in range(2):
             model = kalman_model(s, mode, record.dt)
@@ -237,8 +230,8 @@ def test_model_floors() -> None:
     assert modelled_processes(s, 0, 1e-3)[1].damping == 1e-4
     assert measurement_noise(s, 0) == (1e-6, 1e-6)
     record = simulate(s)
-    assert all(np.isfinite(v).all() for v in kf_lgs(record, s, QUIET).values())
-    assert all(np.isfinite(v[5:]).all() for v in kf_ngs(record, s, QUIET).values())
+    assert all(np.isfinite(v).all() for v in estimated("kf-lgs", record, s).values())
+    assert all(np.isfinite(v[5:]).all() for v in estimated("kf-ngs", record, s).values())
 
 
 def test_matched_and_manual() -> None:
@@ -251,7 +244,7 @@ def test_matched_and_manual() -> None:
     silent = s.replace({"turbulence.source": "none", "vibration.source": "none"})
     assert [p.rms for p in modelled_processes(silent, 1, 1e-3)] == [0.0, 0.0]
     record = simulate(silent)
-    assert not any(v.any() for v in kf_lgs(record, silent, QUIET).values())
+    assert not any(v.any() for v in estimated("kf-lgs", record, silent).values())
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -268,9 +261,9 @@ def test_records_shorter_than_a_frame(n_steps: int) -> None:
     record = simulate(s)
     assert record.y_ngs is not None
     short = Record(record.y_lgs[:n_steps], record.u[:n_steps], record.dt, record.y_ngs[:n_steps], record.ratio)
-    for observer, first in ((kf_lgs, 0), (kf_ngs, 5)):
-        whole = observer(record, s, QUIET)
-        for target, value in observer(short, s, QUIET).items():
+    for name, first in (("kf-lgs", 0), ("kf-ngs", 5)):
+        whole = estimated(name, record, s)
+        for target, value in estimated(name, short, s).items():
             assert value.shape == (n_steps, 2)
             assert np.isnan(value[:first]).all() and np.isfinite(value[first:]).all()
             assert np.allclose(value, whole[target][:n_steps], rtol=1e-9, atol=1e-13, equal_nan=True)

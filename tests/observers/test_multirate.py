@@ -7,15 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.observers.kalman.multirate import multirate, multirate_filter, multirate_noise
-from wfsobs.observers.kalman.multirate_optimal import multirate_optimal
-from wfsobs.observers.kalman.single import kalman_model, kf_lgs, kf_ngs, modelled_processes
-from wfsobs.pipeline import run
-from wfsobs.progress import QUIET
+from wfsobs.observers.kalman.multirate import UnstableCycle, multirate_filter, multirate_noise
+from wfsobs.pipeline import estimated, run
+from wfsobs.priors_from.scenario import kalman_model, model_of, modelled_processes
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.scenario.settings import SettingError
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.riccati import RiccatiError, steady_state
 from wfsobs.signal.statespace import disturbance_model, paper_matrices
@@ -73,8 +70,8 @@ def test_every_step_is_the_textbook_recursion(changes: dict[str, Any]) -> None:
     record = simulate(s)
     matched = (s.sensors.lgs_noise / np.sqrt(2), s.sensors.ngs_noise)
     noise = (0.03, 0.01) if "multirate.lgs_noise" in changes else matched
-    assert multirate_noise(s, 0) == pytest.approx(noise)
-    got = multirate(record, s, QUIET)
+    assert multirate_noise(s.multirate, model_of(s, 0)) == pytest.approx(noise)
+    got = estimated("multirate", record, s)
     assert list(got) == ["turbulence"] and got["turbulence"].shape == record.y_lgs.shape
     for mode in range(2):
         wanted = textbook(record, s, mode, *noise)
@@ -83,7 +80,7 @@ def test_every_step_is_the_textbook_recursion(changes: dict[str, Any]) -> None:
 
 
 def test_the_paper_weighs_ngs_over_lgs() -> None:
-    lgs, ngs = multirate_noise(scenario(), 0)
+    lgs, ngs = multirate_noise(scenario().multirate, model_of(scenario(), 0))
     assert ngs < lgs
 
 
@@ -107,7 +104,7 @@ def radius(lgs: float, ngs: float, ratio: int = 5) -> float:
 def test_two_stable_gains_can_make_an_unstable_cycle() -> None:
     """40 nm and 1 nm: the cycle of five steps grows; it is refused, naming both numbers. 20 nm and 1 nm is fine."""
     assert radius(0.040, 0.001) > 1.0 > radius(0.020, 0.001)
-    with pytest.raises(SettingError) as caught:
+    with pytest.raises(UnstableCycle) as caught:
         multirate_filter(paper_model(), 5, 0.040, 0.001)
     message = str(caught.value)
     assert "40 nm" in message and "1 nm" in message and "\n" not in message
@@ -176,8 +173,8 @@ def test_the_optimal_filter_is_the_time_varying_one_once_that_has_settled(ratio:
         "kalman.damping": 0.1, "turbulence.wind_speed": 40.0,
     })
     record = simulate(s)
-    got = multirate_optimal(record, s, QUIET)
-    wanted = time_varying(record, s, 0, *multirate_noise(s, 0), with_error)
+    got = estimated("multirate-optimal", record, s)
+    wanted = time_varying(record, s, 0, *multirate_noise(s.multirate, model_of(s, 0)), with_error)
     for i, target in enumerate(("turbulence", "vibration")):
         # the start (covariance 0 instead of the steady one) is forgotten after 2.5 s of a loop with 20 ms memory and,
         # with the slow error, 0.1 s: exp(-25)
@@ -188,8 +185,8 @@ def test_the_optimal_filter_is_the_time_varying_one_once_that_has_settled(ratio:
 def test_with_a_frame_at_every_step_both_multirate_filters_are_the_two_sensor_filter() -> None:
     s = scenario({"sensors.exposure_ratio": 1, "multirate.model_lgs_error": False})
     record = simulate(s)
-    lgs, ngs = multirate_noise(s, 0)
-    one, other = multirate(record, s, QUIET)["turbulence"], multirate_optimal(record, s, QUIET)["turbulence"]
+    lgs, ngs = multirate_noise(s.multirate, model_of(s, 0))
+    one, other = (estimated(name, record, s)["turbulence"] for name in ("multirate", "multirate-optimal"))
     # step 0 has no frame; the two differ in the gain there, forgotten after 0.5 s
     assert np.abs(one - other)[500:].max() < 1e-8 * one.std()
     model = kalman_model(s, 0, record.dt)
@@ -211,16 +208,16 @@ def test_the_optimal_filter_is_at_least_as_good_as_any_other_on_its_model() -> N
     record = simulate(s)
     assert record.turbulence is not None
     errors = {
-        observer.__name__: np.std((observer(record, s, QUIET)["turbulence"] - record.turbulence)[1000:])
-        for observer in (multirate_optimal, multirate, kf_lgs, kf_ngs)
+        name: np.std((estimated(name, record, s)["turbulence"] - record.turbulence)[1000:])
+        for name in ("multirate-optimal", "multirate", "kf-lgs", "kf-ngs")
     }
-    assert min(errors, key=lambda name: errors[name]) == "multirate_optimal"
+    assert min(errors, key=lambda name: errors[name]) == "multirate-optimal"
 
 
 def test_no_noise_at_all_still_has_a_filter() -> None:
     s = scenario({"sensors.lgs_noise": 0.0, "sensors.ngs_noise": 0.0})
     record = simulate(s)
-    got = multirate(record, s, QUIET)["turbulence"]
+    got = estimated("multirate", record, s)["turbulence"]
     assert np.isfinite(got).all()
 
 
@@ -236,7 +233,7 @@ def test_short_records(n_steps: int) -> None:
     record = simulate(s)
     assert record.y_ngs is not None
     short = Record(record.y_lgs[:n_steps], record.u[:n_steps], record.dt, record.y_ngs[:n_steps], record.ratio)
-    for observer in (multirate, multirate_optimal):
-        whole, part = observer(record, s, QUIET), observer(short, s, QUIET)
+    for name in ("multirate", "multirate-optimal"):
+        whole, part = estimated(name, record, s), estimated(name, short, s)
         for target, value in part.items():
             assert np.allclose(value, whole[target][:n_steps], rtol=1e-9, atol=1e-13)

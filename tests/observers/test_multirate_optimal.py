@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from wfsobs.observers.kalman.multirate_optimal import multirate_optimal, optimal_cycle, optimal_filter, optimal_model
-from wfsobs.observers.kalman.single import kalman_model, modelled_processes
-from wfsobs.progress import QUIET
+from wfsobs.observers.kalman.multirate_optimal import optimal_cycle, optimal_filter, optimal_model
+from wfsobs.pipeline import estimated
+from wfsobs.prior import LgsError, Model, Prior
+from wfsobs.priors_from.scenario import kalman_model, lgs_error_of, model_of, modelled_processes, prior_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.signal.ar2 import Ar2
@@ -22,6 +23,8 @@ TURBULENCE = Ar2(7.0686, 0.9, 0.5, DT)
 VIBRATION = Ar2(2 * np.pi * 47.4969, 0.03, 0.015, DT)
 MODEL = disturbance_model([TURBULENCE], [VIBRATION])
 OUTPUTS = MODEL.output_rows(["turbulence", "vibration"])
+
+PARTS = (Model, LgsError)
 
 
 def padded(rows, cycle):
@@ -140,9 +143,9 @@ def test_never_worse_than_the_better_single_sensor_filter(ratio, lgs, ngs, wind,
 def test_over_a_record_it_matches_its_textbook_recursion():
     scenario = paper().replace({"run.duration": 1.5})
     record = simulate(scenario)
-    got = multirate_optimal(record, scenario, QUIET)
+    got = estimated("multirate-optimal", record, scenario)
     for mode in range(2):
-        cycle, rows = optimal_model(scenario, mode, record.dt, 5)
+        cycle, rows = optimal_model(scenario.multirate, prior_of(scenario, record, PARTS), mode, 5)
         states = periodic_steady_state(cycle)
         x, expected = np.zeros(len(cycle[0][0])), []
         for k in range(record.n_steps):
@@ -165,9 +168,9 @@ def test_the_error_state_is_what_makes_it_useful_with_a_slow_lgs_error():
     for known in (True, False):
         scenario = base.replace({"multirate.model_lgs_error": known})
         record = simulate(scenario)
-        error = (multirate_optimal(record, scenario, QUIET)["turbulence"] - record.turbulence)[1000:]
+        error = (estimated("multirate-optimal", record, scenario)["turbulence"] - record.turbulence)[1000:]
         realised[known] = np.sqrt(np.mean(error**2))
-        cycle, rows = optimal_model(scenario, 0, record.dt, 5)
+        cycle, rows = optimal_model(scenario.multirate, prior_of(scenario, record, PARTS), 0, 5)
         predicted[known] = np.sqrt(np.mean([(rows @ s.filtered @ rows.T)[0, 0] for s in periodic_steady_state(cycle)]))
     # A minute of a process with a correlation time of 0.1 s: the rms is good to about 5 %.
     assert realised[True] == pytest.approx(predicted[True], rel=0.1)
@@ -177,7 +180,7 @@ def test_the_error_state_is_what_makes_it_useful_with_a_slow_lgs_error():
 
 def test_the_model_is_the_scenarios():
     scenario = paper()
-    cycle, _ = optimal_model(scenario, 0, 1e-3, 5)
+    cycle, _ = optimal_model(scenario.multirate, Prior((model_of(scenario, 0),), (lgs_error_of(scenario, 0),)), 0, 5)
     turbulence, vibration = modelled_processes(scenario, 0, 1e-3)
     assert len(cycle) == 5
     A, C, Q, R = cycle[4]

@@ -10,7 +10,7 @@ import pytest
 
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import BANDS, LINES, MODEL, TRAINING, Observer
-from wfsobs.progress import QUIET
+from wfsobs.pipeline import estimated
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -38,7 +38,7 @@ def _record() -> Record:
 
 
 def estimates(observer: Observer, record: Record, s: Scenario) -> np.ndarray:
-    return np.concatenate([values.ravel() for values in observer.run(record, s, QUIET).values()])
+    return np.concatenate([values.ravel() for values in estimated(observer.id, record, s).values()])
 
 
 @pytest.mark.parametrize("name", OBSERVERS)

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from scipy.signal import butter, freqz_sos, lfilter
 
 from wfsobs.evaluation.scores import lag
-from wfsobs.observers.baselines import butterworth_cl, butterworth_ol, open_loop_reference, zero
-from wfsobs.progress import QUIET
+from wfsobs.observers.baselines import open_loop_reference
+from wfsobs.pipeline import estimated
+from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.bandpass import bandpass_bank, filter_causal, filter_zero_phase
@@ -85,7 +86,7 @@ def test_open_loop_reference_is_moved_by_the_step_of_the_sensor() -> None:
     t = np.arange(4000) * 1e-3
     phi = 0.02 * np.cos(2 * np.pi * 47.7 * t)[:, None]
     y_open = np.vstack([[[0.0]], phi[:-1]])
-    got = open_loop_reference(s, y_open, 1e-3)
+    got = open_loop_reference(bands_of(s), y_open, 1e-3)
     assert got.shape == phi.shape and np.isnan(got[-1]).all()
     # The top of the band is at the geometric mean of its edges, 47.676 Hz, so that 47.7 Hz is off by x = 0.0158 of the
     # half width and passes with 1 / (1 + x^2) = 1 - 2.5e-4; the filter has settled to exp(-pi 3 1.5).
@@ -100,10 +101,10 @@ def test_both_references_on_a_record() -> None:
     r = simulate(s)
     assert r.open_loop_y is not None
     b = s.butterworth
-    ol = butterworth_ol(r, s, QUIET)["vibration"]
+    ol = estimated("butterworth-ol", r, s)["vibration"]
     assert np.array_equal(ol[:-1], filter_zero_phase(bandpass_bank(b.frequencies, 3.0, 1, 1e-3), r.open_loop_y)[1:])
     z = r.y_lgs - np.vstack([np.zeros((2, 2)), r.u[:-2]])
-    cl = butterworth_cl(r, s, QUIET)["vibration"]
+    cl = estimated("butterworth-cl", r, s)["vibration"]
     wanted = sum(lfilter(*one_band(f, 2.0, 1e-3), z, axis=0) for f in b.frequencies)
     assert np.abs(cl - wanted).max() < 1e-11
 
@@ -116,7 +117,7 @@ def test_the_causal_reference_is_one_step_late_on_a_settled_tone(f: float) -> No
     })
     r = simulate(s)
     assert r.vibration is not None
-    found = lag(r.vibration[3000:, 0], butterworth_cl(r, s, QUIET)["vibration"][3000:, 0], r.dt)
+    found = lag(r.vibration[3000:, 0], estimated("butterworth-cl", r, s)["vibration"][3000:, 0], r.dt)
     # the band's phase at its arithmetic centre (the geometric one has none) is below 2 (bandwidth / 8 f) rad
     assert found is not None and abs(found - 1e-3) < 2.0 / 8 / f / (np.pi * f) + 2e-5
 
@@ -136,6 +137,6 @@ def test_order_reaches_the_filter() -> None:
 
 def test_zero_is_zero_for_both_targets() -> None:
     r = simulate(scenario())
-    found = zero(r, scenario(), QUIET)
+    found = estimated("zero", r, scenario())
     assert sorted(found) == ["turbulence", "vibration"]
     assert all(v.shape == r.y_lgs.shape and not v.any() for v in found.values())

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from wfsobs.observers.kalman.multirate import multirate, multirate_noise
-from wfsobs.observers.kalman.single import kalman_model, kf_lgs, modelled_processes, steady_filter
-from wfsobs.progress import QUIET
+from wfsobs.observers.kalman.multirate import multirate_noise
+from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.pipeline import estimated
+from wfsobs.priors_from.scenario import kalman_model, model_of, modelled_processes
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
@@ -81,7 +82,7 @@ def test_printed_input_matrix_makes_the_filter_worse(case: tuple[Scenario, Recor
             x = A @ x + B_u * record.u[k, 0]
         assert record.turbulence is not None
         errors.append(np.std((out - record.turbulence[:, 0])[1000:]))
-    built = np.std((kf_lgs(record, s, QUIET)["turbulence"] - record.turbulence)[1000:, 0])
+    built = np.std((estimated("kf-lgs", record, s)["turbulence"] - record.turbulence)[1000:, 0])
     assert errors[0] == pytest.approx(built, rel=1e-6)
     assert errors[1] > 1.02 * errors[0]
 
@@ -110,7 +111,7 @@ def test_a_predicted_state_is_corrected_with_the_filter_gain(case: tuple[Scenari
     what is built; with K the error of turbulence grows."""
     s, record = case
     model = kalman_model(s, 0, record.dt)
-    lgs, ngs = multirate_noise(s, 0)
+    lgs, ngs = multirate_noise(s.multirate, model_of(s, 0))
     C = np.vstack([model.C, model.C])
     one = steady_state(model.A, model.C, model.Q, np.array(lgs**2))
     both = steady_state(model.A, C, model.Q, np.diag([lgs**2, ngs**2]))
@@ -129,7 +130,7 @@ def test_a_predicted_state_is_corrected_with_the_filter_gain(case: tuple[Scenari
         return out
 
     built = run(one.L, both.L)
-    assert np.abs(built - multirate(record, s, QUIET)["turbulence"][:, 0]).max() < 1e-9
+    assert np.abs(built - estimated("multirate", record, s)["turbulence"][:, 0]).max() < 1e-9
     printed = run(one.K, both.K)
     errors = [np.std((out - record.turbulence[:, 0])[1000:]) for out in (built, printed)]
     assert errors[1] > 1.01 * errors[0]
@@ -137,7 +138,7 @@ def test_a_predicted_state_is_corrected_with_the_filter_gain(case: tuple[Scenari
 
 def test_ngs_weighs_more_than_lgs() -> None:
     """r_NGS < r_LGS (section 2.2.1)."""
-    lgs, ngs = multirate_noise(paper(), 0)
+    lgs, ngs = multirate_noise(paper().multirate, model_of(paper(), 0))
     assert ngs < lgs
 
 

@@ -11,6 +11,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.offline import training_targets
+from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.tuning.likelihood import likelihood, log_marginal_likelihood
@@ -43,7 +44,7 @@ def test_of_the_offline_gpr_it_is_that_of_scikit_learn() -> None:
     got, g = likelihood("gpr-offline", record, s), s.gpr_offline
     assert got is not None
     kernel = ConstantKernel(g.signal_std**2, "fixed") * RBF(g.length_scale, "fixed") + WhiteKernel(g.noise_std**2, "fixed")
-    targets = training_targets(record.training, s, record.dt)
+    targets = training_targets(record.training, bands_of(s), record.dt)
     u = record.training.u
     z = record.training.y_lgs - np.vstack([np.zeros((2, 2)), u[:-2]])
     for mode in range(2):

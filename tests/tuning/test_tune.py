@@ -14,8 +14,9 @@ from click.testing import CliRunner
 
 from wfsobs.cli import main
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman.single import kalman_model, measurement_noise, steady_filter
+from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import observe, run
+from wfsobs.priors_from.scenario import kalman_model, measurement_noise
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario, configfile

@@ -11,6 +11,8 @@ from wfsobs.app.work import Shown
 from wfsobs.identification import Identified, identify
 from wfsobs.identification.result import IdentifiedMode
 from wfsobs.observers.missing import bridged
+from wfsobs.prior import Model
+from wfsobs.priors_from.scenario import prior_of
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.spectral.periodogram import fast_length, frequencies, periodogram, taper
@@ -53,7 +55,7 @@ class Fit:
 def measured(of: Shown, _watch: Watch, _tell: Tell) -> Measured:
     """The spectrum of the record shown, with the taper that identification uses. Raises RecordError."""
     record = of.result.record
-    z = bridged(record, of.result.scenario).z[record.delay :]
+    z = bridged(record, prior_of(of.result.scenario.before_events, record, (Model,))).z[record.delay :]
     z = z[: fast_length(len(z))]
     if len(z) < 100:
         raise RecordError(f"the record has {record.n_steps} samples, too few for a spectrum")

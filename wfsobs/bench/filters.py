@@ -13,7 +13,8 @@ from wfsobs.bench.sizes import Sizes
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.adaptive import adapting
 from wfsobs.observers.kalman.multirate import multirate_filter, multirate_noise
-from wfsobs.observers.kalman.single import kalman_model, measurement_noise, modelled_processes, steady_filter
+from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.priors_from.scenario import model_of, modelled_processes
 from wfsobs.record import pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.signal.riccati import steady_state
@@ -34,8 +35,9 @@ def kalman_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
     record = simulate(scenario)
     y, u, n = record.y_lgs[:, 0], record.u[:, 0], record.n_steps
     task, size = "kalman-record", f"{n} steps, 6 states"
-    noise = measurement_noise(scenario, 0)[0]
-    ours, _ = steady_filter(kalman_model(scenario, 0, record.dt), noise)
+    prior = model_of(scenario, 0)
+    noise = prior.lgs_noise
+    ours, _ = steady_filter(prior.disturbance(), noise)
     A, B, C, Q = paper_model(scenario, record.dt)
     steady = steady_state(A[:4, :4], C[:4], Q, np.array(noise**2))
     arguments = A, B, C, _with_mirror(steady.L[:, 0]), y, u
@@ -69,8 +71,9 @@ def multirate_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
     assert record.ratio is not None
     y, u, z_ngs, n = record.y_lgs[:, 0], record.u[:, 0], record.z_ngs[:, 0], record.n_steps
     task, size = "multirate-record", f"{n} steps, 6 states"
-    lgs, ngs = multirate_noise(scenario, 0)
-    ours = multirate_filter(kalman_model(scenario, 0, record.dt), record.ratio, lgs, ngs)
+    prior = model_of(scenario, 0)
+    lgs, ngs = multirate_noise(scenario.multirate, prior)
+    ours = multirate_filter(prior.disturbance(), record.ratio, lgs, ngs)
     A, B, C, Q = paper_model(scenario, record.dt)
     C_ngs = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 0.0])  # of z_ngs, from which the mirror's part has been taken
     L = steady_state(A[:4, :4], C[:4], Q, np.array(lgs**2)).L[:, 0]

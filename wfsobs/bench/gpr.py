@@ -20,6 +20,8 @@ from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.offline import train, training_targets
 from wfsobs.observers.gpr.online import gpr_online, kernel_of
 from wfsobs.observers.gpr.stream import OnlineGprStream
+from wfsobs.prior import Bands
+from wfsobs.priors_from.scenario import bands_of, prior_of
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, pseudo_open_loop
 from wfsobs.scenario import Scenario
@@ -56,7 +58,7 @@ def online_problem(record: Record, scenario: Scenario, mode: int, count: int) ->
     """The problem of one mode, with `count` rows for the others."""
     g = scenario.gpr_online
     X = textbook.windows(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt), g.depth)
-    f = np.append(online_reference(scenario, record.z, record.dt)[g.depth :, mode], 0.0)
+    f = np.append(online_reference(bands_of(scenario), record.z, record.dt)[g.depth :, mode], 0.0)
     rows = np.unique(np.linspace(g.training_size, len(X) - 1, count).astype(int))
     return Online(X, f, g.training_size, g.depth, kernel_of(g), rows)
 
@@ -88,7 +90,8 @@ def _online_record(
     ours = []
     for variant, n_modes in ((OURS, 1), ("ours-two-modes", 2)) if both else ((OURS, 1),):
         part = cut(record, record.n_steps, n_modes)
-        seconds, result = timed(lambda part=part: gpr_online(part, scenario, QUIET)[VIBRATION], sizes.repeats)
+        given = part.measurements(), prior_of(scenario, part, (Bands,)), g
+        seconds, result = timed(lambda given=given: gpr_online(*given, QUIET)[VIBRATION], sizes.repeats)
         ours.append((variant, seconds, result[:, 0]))
     problem = online_problem(record, scenario, 0, count)  # only now: much memory held slows down the allocation of more
     std = float(np.nanstd(ours[0][2]))
@@ -124,7 +127,7 @@ def online_stream(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
 
 def _stream(scenario: Scenario, record: Record) -> tuple[Array, Array]:
     """Estimates (n_steps,), and for every step that has one: sample to estimate, whole step [s]."""
-    stream = OnlineGprStream(scenario)
+    stream = OnlineGprStream(scenario.gpr_online, bands_of(scenario), scenario.dt)
     values, times = np.empty(record.n_steps), np.empty((record.n_steps, 2))
     for k, (y, u) in enumerate(zip(record.y_lgs[:, 0].tolist(), record.u[:, 0].tolist(), strict=True)):
         start = perf_counter()
@@ -165,7 +168,7 @@ def offline(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
     task, size = "offline-gpr-train", f"m={m} d={d}"
     learn = window_signals(g, training.y_lgs, training.u, pseudo_open_loop(training.y_lgs, training.u), 0, record.dt)
     signals = window_signals(g, record.y_lgs, record.u, record.z, 0, record.dt)
-    targets = training_targets(training, scenario, record.dt)[:, 0]
+    targets = training_targets(training, bands_of(scenario), record.dt)[:, 0]
     X, f, T = textbook.windows(learn, d)[:m], targets[d - 1 : d - 1 + m], textbook.windows(signals, d)
     exact, constant = textbook.exact_weights(X, f, kernel)
     some = slice(None, None, -(-len(T) // (50 * sizes.library_steps)))

@@ -30,6 +30,8 @@ from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.kalman.multirate import UnstableCycle
 from wfsobs.observers.missing import bridged
 from wfsobs.pipeline import as_stated
+from wfsobs.prior import Model
+from wfsobs.priors_from.scenario import bands_of, prior_of
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
@@ -164,7 +166,7 @@ def closed_loop(record: Record, plan: Design, watch: Watch = QUIET) -> ClosedLoo
     Raises RecordError if the record has no truth, Cancelled.
     """
     total = sum(CONTROLLERS[name].weight for name in plan.laws)
-    outcomes, done, given = [], 0.0, bridged(record, plan.scenario)
+    outcomes, done, given = [], 0.0, bridged(record, prior_of(plan.scenario, record, (Model,)))
     for name, weight in ((name, CONTROLLERS[name].weight) for name in plan.laws):
         inner = Watch(lambda f, at=done, w=weight: watch.progress((at + f * w) / total), watch.cancelled)
         outcomes += each_outcome(given, plan, inner, [name])
@@ -180,7 +182,7 @@ def each_outcome(
     Where measurements are missing they work on what takes their place (`gaps`).
     """
     disturbance = truth(record)
-    record = bridged(record, plan.scenario)
+    record = bridged(record, prior_of(plan.scenario, record, (Model,)))
     if as_stated(record, plan.scenario) is not plan.scenario:
         raise RecordError("the record was made with another rate or exposure ratio than the controllers")
     for name, designed in plan.laws.items():
@@ -227,7 +229,7 @@ def _commands(
         ahead = controller.predict(record, plan.scenario, mirror, watch)
         known = ~np.isnan(ahead)
         forward = -np.where(known, ahead, 0.0)
-        z = z - np.where(known, online_reference(plan.scenario, z, record.dt), 0.0)
+        z = z - np.where(known, online_reference(bands_of(plan.scenario), z, record.dt), 0.0)
     inputs = np.stack([z, np.nan_to_num(record.z_ngs)], axis=1) if controller.ngs else z[:, None]
     u, limited = np.empty_like(z), np.zeros(z.shape, dtype=bool)
     for mode, one in enumerate(designed):

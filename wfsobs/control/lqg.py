@@ -16,10 +16,11 @@ import numpy as np
 from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.multi import multi_model
 from wfsobs.observers.kalman.multirate import MultiRateFilter, multirate_filter, multirate_noise
 from wfsobs.observers.kalman.multirate_optimal import optimal_filter, optimal_model
-from wfsobs.observers.kalman.single import kalman_model, measurement_noise, steady_filter
+from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.prior import Prior
+from wfsobs.priors_from.scenario import kalman_model, lgs_error_of, measurement_noise, model_of, multi_model
 from wfsobs.scenario import Scenario
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
@@ -59,9 +60,9 @@ def lqg_kf_multi(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
 
 def lqg_multirate(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
     """With the paper's multi-rate filter. Raises SettingError where its cycle is unstable."""
-    model = kalman_model(scenario, mode, scenario.dt)
-    return _two_sensors(multirate_filter(
-        model, scenario.sensors.exposure_ratio, *multirate_noise(scenario, mode), _rows_of(model, mirror)))
+    prior = model_of(scenario, mode)
+    model, noise = prior.disturbance(), multirate_noise(scenario.multirate, prior)
+    return _two_sensors(multirate_filter(model, scenario.sensors.exposure_ratio, *noise, _rows_of(model, mirror)))
 
 
 def lqg_multirate_optimal(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
@@ -75,7 +76,8 @@ def lqg_multirate_multi(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
 
 
 def _optimal(scenario: Scenario, mode: int, mirror: Mirror, model: DisturbanceModel | None) -> Law:
-    cycle, rows = optimal_model(scenario, mode, scenario.dt, scenario.sensors.exposure_ratio, model)
+    prior = Prior((model_of(scenario, mode),), (lgs_error_of(scenario, mode),))
+    cycle, rows = optimal_model(scenario.multirate, prior, 0, scenario.sensors.exposure_ratio, model)
     return _two_sensors(optimal_filter(cycle, command_rows(cycle[0][0], rows.sum(axis=0), mirror))[0])
 
 

@@ -17,6 +17,7 @@ from wfsobs.observers.gpr.inputs import Scale, StreamingInputs, scale_of, window
 from wfsobs.observers.gpr.offline import train, training_targets
 from wfsobs.observers.gpr.online import kernel_of
 from wfsobs.observers.per_mode import over_modes
+from wfsobs.priors_from.scenario import bands_of
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
@@ -35,7 +36,7 @@ def gpr_offline_ahead(record: Record, scenario: Scenario, mirror: Mirror, watch:
         raise RecordError("the record has no training record")
     if record.n_steps < g.depth:
         raise RecordError(f"the record has {record.n_steps} steps; depth needs {g.depth}")
-    targets = _ahead(training_targets(training, scenario, record.dt, record.delay), mirror)
+    targets = _ahead(training_targets(training, bands_of(scenario), record.dt, record.delay), mirror)
     training_z = pseudo_open_loop(training.y_lgs, training.u, record.delay)
 
     def one(mode: int, watch: Watch) -> Array:

@@ -13,8 +13,11 @@ import numpy as np
 
 from wfsobs.observers.kalman.multirate import multirate_filter, multirate_noise
 from wfsobs.observers.kalman.multirate_optimal import optimal_filter, optimal_model
-from wfsobs.observers.kalman.single import kalman_model, measurement_noise, modelled_processes, steady_filter
+from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.prior import Model, Prior
+from wfsobs.priors_from.scenario import lgs_error_of, model_of
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.groups.observers import MultiRate
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import paper_matrices
@@ -81,13 +84,16 @@ class Description:
 def describe(scenario: Scenario, mode: int) -> Description:
     """The numbers of a scenario's observers for one mode; a filter that cannot be has its reason in place of numbers."""
     dt, ratio = scenario.dt, scenario.sensors.exposure_ratio
-    turbulence, vibration = modelled_processes(scenario, mode, dt)
-    lgs_noise, ngs_noise = measurement_noise(scenario, mode)
+    model, own = model_of(scenario, mode), scenario.multirate
+
+    def both() -> Prior:
+        return Prior((model,), (lgs_error_of(scenario, mode),))
+
     filters = {
-        "kf-lgs": _facts(dt, dt, lambda: _kalman(scenario, mode, dt, lgs_noise, "LGS")),
-        "kf-ngs": _facts(ratio * dt, ratio * dt, lambda: _kalman(scenario, mode, ratio * dt, ngs_noise, "NGS")),
-        "multirate": _facts(dt, ratio * dt, lambda: _multirate(scenario, mode)),
-        "multirate-optimal": _facts(dt, ratio * dt, lambda: _optimal(scenario, mode)),
+        "kf-lgs": _facts(dt, dt, lambda: _kalman(model, model.lgs_noise, "LGS")),
+        "kf-ngs": _facts(ratio * dt, ratio * dt, lambda: _kalman(model.at(ratio * dt), model.ngs_noise, "NGS")),
+        "multirate": _facts(dt, ratio * dt, lambda: _multirate(model, own, ratio)),
+        "multirate-optimal": _facts(dt, ratio * dt, lambda: _optimal(both(), own, ratio)),
     }
     gprs = {
         name: GprFacts((g.noise_std * g.length_scale / g.signal_std) ** 2, g.depth * dt, (g.training_size + g.depth - 1) * dt)
@@ -97,8 +103,8 @@ def describe(scenario: Scenario, mode: int) -> Description:
         kind.upper(): SensorFacts(float(noise_rms(scenario, kind)[mode]), float(aliasing_rms(scenario, kind)[mode]))
         for kind in ("lgs", "ngs")
     }
-    matrices = paper_matrices(turbulence, vibration)
-    return Description(scenario.modes[mode].name, ratio, turbulence, vibration, *matrices, filters, gprs, sensors)
+    matrices = paper_matrices(model.turbulence, model.vibration)
+    return Description(scenario.modes[mode].name, ratio, model.turbulence, model.vibration, *matrices, filters, gprs, sensors)
 
 
 Gains = dict[str, Array]
@@ -113,28 +119,28 @@ def _facts(step: float, period: float, make: Callable[[], tuple[Gains, Array]]) 
     return FilterFacts(step, period, gains, poles[np.argsort(-np.abs(poles), kind="stable")])
 
 
-def _kalman(scenario: Scenario, mode: int, dt: float, noise: float, sensor: str) -> tuple[Gains, Array]:
+def _kalman(prior: Model, noise: float, sensor: str) -> tuple[Gains, Array]:
     """Gain and A - K C of a single-rate filter."""
-    model = kalman_model(scenario, mode, dt)
+    model = prior.disturbance()
     kalman, steady = steady_filter(model, noise)
     return {sensor: model.pairs @ steady.L[:, 0]}, kalman.cycle_matrix()
 
 
-def _multirate(scenario: Scenario, mode: int) -> tuple[Gains, Array]:
+def _multirate(prior: Model, settings: MultiRate, ratio: int) -> tuple[Gains, Array]:
     """The paper's two gains (eq. 11), and the product of the A - K C of one cycle. Raises where that is unstable."""
-    model = kalman_model(scenario, mode, scenario.dt)
-    lgs, ngs = multirate_noise(scenario, mode)
-    cycle = multirate_filter(model, scenario.sensors.exposure_ratio, lgs, ngs).cycle
+    model = prior.disturbance()
+    lgs, ngs = multirate_noise(settings, prior)
+    cycle = multirate_filter(model, ratio, lgs, ngs).cycle
     alone = steady_state(model.A, model.C, model.Q, np.array(lgs**2)).L
     both = steady_state(model.A, np.vstack([model.C, model.C]), model.Q, np.diag([lgs**2, ngs**2])).L
     gains = {"LGS alone": alone[:, 0], "LGS with NGS": both[:, 0], "NGS": both[:, 1]}
     return {name: model.pairs @ gain for name, gain in gains.items()}, cycle.cycle_matrix()
 
 
-def _optimal(scenario: Scenario, mode: int) -> tuple[Gains, Array]:
+def _optimal(prior: Prior, settings: MultiRate, ratio: int) -> tuple[Gains, Array]:
     """Gains of the first step of a cycle and of the one with the frame, and the product of the A - K C of one cycle."""
-    model = kalman_model(scenario, mode, scenario.dt)
-    made, states = optimal_filter(*optimal_model(scenario, mode, scenario.dt, scenario.sensors.exposure_ratio))
+    model = prior.model[0].disturbance()
+    made, states = optimal_filter(*optimal_model(settings, prior, 0, ratio))
     n = len(model.A)
     gains = {"LGS with NGS": states[-1].L[:n, 0], "NGS": states[-1].L[:n, 1]}
     if len(states) > 1:

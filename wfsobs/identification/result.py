@@ -13,7 +13,7 @@ from wfsobs.identification.one_mode import OneMode
 from wfsobs.identification.process import Number, Peak, Process, known, mean, merged
 from wfsobs.identification.settings import fitting, told
 from wfsobs.identification.whiteness import Whiteness
-from wfsobs.prior.model import Line, Prior
+from wfsobs.prior import Line, Lines
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
@@ -46,7 +46,7 @@ class IdentifiedMode:
     peaks: tuple[Process, ...]
     broad: tuple[Process, ...]
     spectrum: Spectrum
-    prior: Prior
+    prior: Lines
     whiteness: Whiteness
 
 
@@ -135,7 +135,7 @@ def read_off(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> I
     peaks = sorted((p for p in found if p.frequency.value >= lowest), key=lambda p: p.frequency.value)
     s = mode.spectrum
     shapes = (p for p, is_smooth in zip(s.resonances, smooth, strict=True) if is_smooth)
-    prior = Prior(s.noise, s.dt, tuple(p for p in (s.turbulence, s.background, *shapes) if p is not None),
+    prior = Lines(s.noise, s.dt, tuple(p for p in (s.turbulence, s.background, *shapes) if p is not None),
                   tuple(Line(p.frequency.value, p.damping.value, p.rms.value) for p in peaks))
     return IdentifiedMode(name, known(noise), turbulence, background, tuple(peaks), tuple(broad), s, prior, whiteness)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from math import pi, sqrt
 from typing import Any
 
-from wfsobs.prior.model import Prior
+from wfsobs.prior import Lines
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
@@ -16,7 +16,7 @@ HIGHEST, LARGEST, LEAST = 50_000.0, 1e4, 1e-6
 WIDTHS = ("bandwidth_offline", "bandwidth_online")
 
 
-def told(priors: Sequence[Prior], scenario: Scenario) -> dict[str, Any]:
+def told(priors: Sequence[Lines], scenario: Scenario) -> dict[str, Any]:
     """Dotted path -> value of the settings from which the filters get these models, one per mode, of sensors as the scenario has
     them. No two modes share a process or a peak: as different as their numbers are they stay."""
     modes = len(priors)

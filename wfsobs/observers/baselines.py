@@ -10,46 +10,46 @@ from __future__ import annotations
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
+from wfsobs.prior import Bands, Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Record
-from wfsobs.scenario import Scenario
+from wfsobs.record import Measurements
 from wfsobs.signal.bandpass import bandpass_bank, filter_causal, filter_zero_phase
 from wfsobs.typing import Array
 
 
-def open_loop_reference(scenario: Scenario, open_loop_y: Array, dt: float) -> Array:
+def open_loop_reference(bands: Bands, open_loop_y: Array, dt: float) -> Array:
     """Vibration at step k from open-loop measurements around it, (n_steps, n_modes) [um]; NaN at the last step."""
-    b = scenario.butterworth
-    filtered = filter_zero_phase(bandpass_bank(b.frequencies, b.bandwidth_offline, b.order, dt), open_loop_y)
+    bank = bandpass_bank(bands.frequencies, bands.bandwidth_offline, bands.order, dt)
+    filtered = filter_zero_phase(bank, open_loop_y)
     return np.vstack([filtered[1:], np.full((1, filtered.shape[1]), np.nan)])
 
 
-def online_reference(scenario: Scenario, z: Array, dt: float) -> Array:
+def online_reference(bands: Bands, z: Array, dt: float) -> Array:
     """The causal bank on the pseudo-open-loop measurement z, (n_steps, n_modes) [um]."""
-    b = scenario.butterworth
-    return filter_causal(bandpass_bank(b.frequencies, b.bandwidth_online, b.order, dt), z)
+    return filter_causal(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, dt), z)
 
 
-def butterworth_ol(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+def butterworth_ol(measured: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
     """Zero-phase, on the open-loop twin of the record. Not causal."""
     watch.step(0.0)
-    assert record.open_loop_y is not None
-    return {VIBRATION: open_loop_reference(scenario, record.open_loop_y, record.dt)}
+    assert measured.open_loop_y is not None and prior.bands is not None
+    return {VIBRATION: open_loop_reference(prior.bands, measured.open_loop_y, measured.dt)}
 
 
-def butterworth_cl(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+def butterworth_cl(measured: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
     """Causal, on the record's own pseudo-open-loop measurement."""
     watch.step(0.0)
-    return {VIBRATION: online_reference(scenario, record.z, record.dt)}
+    assert prior.bands is not None
+    return {VIBRATION: online_reference(prior.bands, measured.z, measured.dt)}
 
 
-def persistence(record: Record, _scenario: Scenario, watch: Watch) -> dict[str, Array]:
+def persistence(measured: Measurements, _prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
     """The newest measurement taken for the turbulence: no model, all of the noise and the vibration, one step late."""
     watch.step(0.0)
-    return {TURBULENCE: record.z}
+    return {TURBULENCE: measured.z}
 
 
-def zero(record: Record, _scenario: Scenario, watch: Watch) -> dict[str, Array]:
+def zero(measured: Measurements, _prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
     """The trivial baseline: nothing disturbs."""
     watch.step(0.0)
-    return {target: np.zeros_like(record.y_lgs) for target in TARGETS}
+    return {target: np.zeros_like(measured.y_lgs) for target in TARGETS}

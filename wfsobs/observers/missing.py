@@ -1,54 +1,71 @@
 """Missing samples, bridged causally in one place, so that no observer needs to know of them.
 
-A lost measurement z[k] is replaced by what the Kalman filter of the scenario's model predicts for it. For that filter this
+A lost measurement z[k] is replaced by what the Kalman filter of the observer's own prior predicts for it. For that filter this
 is the exact answer: its correction vanishes, and it predicts through the gap. A lost NGS frame is replaced by what the NGS
-filter predicts. A lost command is held, as a mirror holds its position. Only samples before a gap fill it, so estimates stay
-causal, and what has been filled in counts in no score.
+filter predicts. An observer that is told no model holds the last value. A lost command is held, as a mirror holds its position.
+Only samples before a gap fill it, so estimates stay causal, and what has been filled in counts in no score.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from wfsobs.observers.kalman.single import kalman_model, measurement_noise
-from wfsobs.record import Record, delayed, frame_mean, held
-from wfsobs.scenario import Scenario
+from wfsobs.prior import Prior
+from wfsobs.record import Signals, delayed, frame_mean, held
 from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 
-LGS, NGS = 0, 1
-"""Which of the two of `measurement_noise`."""
+S = TypeVar("S", bound=Signals)
+
+LINE_WIDTH = 0.025
+"""Width at half maximum that lines of a prior have at least [Hz], for an observer that has no setting of its own for it."""
 
 
-def bridged(record: Record, scenario: Scenario) -> Record:
-    """The record without NaN, but in y_ngs at steps without a frame."""
-    u = held(record.u)
-    y_lgs, open_loop_y, y_ngs = record.y_lgs, record.open_loop_y, record.y_ngs
+class Predictor(NamedTuple):
+    """A model of a measurement of one mode, and the rms of its white noise [um]."""
+
+    model: DisturbanceModel
+    noise: float
+
+
+def bridged(signals: S, prior: Prior, line_width: float = LINE_WIDTH) -> S:
+    """The signals without NaN, but in y_ngs at steps without a frame. line_width : of lines, at least [Hz]"""
+    u = held(signals.u)
+    y_lgs, open_loop_y, y_ngs = signals.y_lgs, signals.open_loop_y, signals.y_ngs
     if np.isnan(y_lgs).any():
-        mirror = delayed(u, record.delay)
-        y_lgs = predicted(y_lgs - mirror, scenario, record.dt, LGS) + mirror
+        mirror = delayed(u, signals.delay)
+        y_lgs = predicted(y_lgs - mirror, _of_lgs(prior, line_width)) + mirror
     if open_loop_y is not None and np.isnan(open_loop_y).any():
-        open_loop_y = predicted(open_loop_y, scenario, record.dt, LGS)
-    if y_ngs is not None and record.ratio is not None and np.isnan(y_ngs[record.ratio :: record.ratio]).any():
-        n = record.ratio
-        mirror = frame_mean(delayed(u, record.delay - 1), n)[n::n]
+        open_loop_y = predicted(open_loop_y, _of_lgs(prior, line_width))
+    if y_ngs is not None and signals.ratio is not None and np.isnan(y_ngs[signals.ratio :: signals.ratio]).any():
+        n = signals.ratio
+        mirror = frame_mean(delayed(u, signals.delay - 1), n)[n::n]
         y_ngs = y_ngs.copy()
-        y_ngs[n::n] = predicted(y_ngs[n::n] - mirror, scenario, n * record.dt, NGS) + mirror
-    return replace(record, y_lgs=y_lgs, u=u, y_ngs=y_ngs, open_loop_y=open_loop_y)
+        frames = [Predictor(m.at(n * signals.dt).disturbance(), m.ngs_noise) for m in prior.model]
+        y_ngs[n::n] = predicted(y_ngs[n::n] - mirror, frames) + mirror
+    return replace(signals, y_lgs=y_lgs, u=u, y_ngs=y_ngs, open_loop_y=open_loop_y)
 
 
-def predicted(z: Array, scenario: Scenario, dt: float, star: int) -> Array:
-    """z (n, n_modes) with every NaN replaced by the prediction of the steady-state Kalman filter of the scenario's model;
-    star : LGS or NGS. Where the model has no such filter the last measurement is held."""
-    out = z.copy()
-    for mode in range(z.shape[1]):
-        model, noise = kalman_model(scenario, mode, dt), measurement_noise(scenario, mode)[star]
+def _of_lgs(prior: Prior, line_width: float) -> list[Predictor]:
+    """What the LGS measure, of every mode; nothing where the prior has no model."""
+    if prior.model:
+        return [Predictor(m.disturbance(), m.lgs_noise) for m in prior.model]
+    return [Predictor(m.disturbance(line_width), m.noise) for m in prior.lines]
+
+
+def predicted(z: Array, predictors: Sequence[Predictor]) -> Array:
+    """z (n, n_modes) with every NaN replaced by the prediction of the steady-state Kalman filter of that mode's model. Without
+    models, or where a model has no such filter, the last measurement is held."""
+    out = held(z).copy()
+    for mode, (model, noise) in enumerate(predictors):
         try:
             K = model.A @ steady_state(model.A, model.C, model.Q, np.array(noise**2)).L[:, 0]
         except ValueError:
-            out[:, mode] = held(z[:, [mode]])[:, 0]
             continue
         x = np.zeros(len(model.A))
         for k, gone in enumerate(np.isnan(z[:, mode])):

@@ -7,6 +7,8 @@ then is this with lambda = (sigma_n l / sigma_SE)^2 and a free constant.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import solve
@@ -16,11 +18,14 @@ from wfsobs.observers.gpr.inputs import scale_of, window_signals
 from wfsobs.observers.gpr.kernels import sliding_products, square_from_band
 from wfsobs.observers.gpr.offline import training_targets
 from wfsobs.observers.per_mode import over_modes
+from wfsobs.prior import Prior
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record, RecordError, pseudo_open_loop
-from wfsobs.scenario import Scenario
+from wfsobs.record import Measurements, RecordError, pseudo_open_loop
 from wfsobs.signal.linalg import eliminate, solved_rows
 from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.scenario.groups.observers import OfflineGpr
 
 TAPS = 30
 """Samples of z that the plain predictor sees."""
@@ -75,35 +80,35 @@ def predict(signals: Array, weights: Array, constant: float) -> Array:
     return out
 
 
-def ridge(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+def ridge(measured: Measurements, prior: Prior, settings: OfflineGpr, watch: Watch) -> dict[str, Array]:
     """The linear limit of the offline GPR: its windows, its training size, its penalty."""
-    g, training = scenario.gpr_offline, record.training
-    assert training is not None
-    targets = training_targets(training, scenario, record.dt, record.delay)
-    training_z = pseudo_open_loop(training.y_lgs, training.u, record.delay)
+    g, training, bands = settings, prior.training, prior.bands
+    assert training is not None and bands is not None
+    targets = training_targets(training, bands, measured.dt, measured.delay)
+    training_z = pseudo_open_loop(training.y_lgs, training.u, measured.delay)
     penalty = (g.noise_std * g.length_scale / g.signal_std) ** 2
 
     def one(mode: int, watch: Watch) -> Array:
         watch.check()
-        scale = scale_of(g, training, record.delay, mode)
-        known = window_signals(g, training.y_lgs, training.u, training_z, mode, record.dt, scale)
+        scale = scale_of(g, training, measured.delay, mode)
+        known = window_signals(g, training.y_lgs, training.u, training_z, mode, measured.dt, scale)
         fitted = fit(known, targets[:, mode], g.depth, g.training_size, penalty)
-        return predict(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt, scale), *fitted)
+        return predict(window_signals(g, measured.y_lgs, measured.u, measured.z, mode, measured.dt, scale), *fitted)
 
-    return {VIBRATION: over_modes(record.n_modes, one, watch)}
+    return {VIBRATION: over_modes(measured.n_modes, one, watch)}
 
 
-def ridge_30(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+def ridge_30(measured: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
     """Plain least squares on the last 30 measurements z, over all of the training record."""
-    training = record.training
-    assert training is not None
-    targets = training_targets(training, scenario, record.dt, record.delay)
-    training_z = pseudo_open_loop(training.y_lgs, training.u, record.delay)
+    training, bands = prior.training, prior.bands
+    assert training is not None and bands is not None
+    targets = training_targets(training, bands, measured.dt, measured.delay)
+    training_z = pseudo_open_loop(training.y_lgs, training.u, measured.delay)
     m = training_z.shape[0] - TAPS  # the last target has no reference
     columns = []
-    for mode in range(record.n_modes):
-        watch.step(mode / record.n_modes)
+    for mode in range(measured.n_modes):
+        watch.step(mode / measured.n_modes)
         z = training_z[:, [mode]]
         penalty = PLAIN * m * float(np.mean(z**2))
-        columns.append(predict(record.z[:, [mode]], *fit(z, targets[:, mode], TAPS, m, penalty)))
+        columns.append(predict(measured.z[:, [mode]], *fit(z, targets[:, mode], TAPS, m, penalty)))
     return {VIBRATION: np.column_stack(columns)}

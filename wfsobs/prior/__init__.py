@@ -1,1 +1,34 @@
 """What observers are told beside measurements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from wfsobs.prior.parts import Bands, LgsError, Line, Lines, Model
+from wfsobs.record import Training
+
+__all__ = ["PARTS", "Bands", "LgsError", "Line", "Lines", "Model", "Part", "Prior", "Training"]
+
+Part = type[Model] | type[LgsError] | type[Lines] | type[Bands] | type[Training]
+"""A kind of thing that an observer can ask for."""
+
+PARTS: dict[Part, tuple[str, ...]] = {
+    Model: ("model",), LgsError: ("model",), Lines: ("model", "true lines"), Bands: ("bands",), Training: ("training data",),
+}
+"""Part -> what it is called in the column "Needs"."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The parts that an observer asked for, empty or None where it did not.
+
+    model, lgs_error, lines : one per mode
+    bands                   : of all modes
+    training                : a record to learn from
+    """
+
+    model: tuple[Model, ...] = ()
+    lgs_error: tuple[LgsError, ...] = ()
+    lines: tuple[Lines, ...] = ()
+    bands: Bands | None = None
+    training: Training | None = None

@@ -5,7 +5,7 @@ The paper's eq. 1 (turbulence) and eq. 2 (vibration) are the same process with o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.signal import lfilter, lfiltic
@@ -34,6 +34,10 @@ class Ar2:
     damping: float
     rms: float
     dt: float
+
+    def at(self, dt: float) -> Ar2:
+        """The same process sampled every `dt` [s]."""
+        return replace(self, dt=dt)
 
     @property
     def a1(self) -> float:

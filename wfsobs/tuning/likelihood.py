@@ -17,6 +17,8 @@ from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_conditi
 from wfsobs.observers.gpr.offline import training_targets
 from wfsobs.observers.gpr.online import kernel_of, online_targets
 from wfsobs.observers.missing import bridged
+from wfsobs.prior import Bands
+from wfsobs.priors_from.scenario import bands_of, prior_of
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
@@ -53,21 +55,22 @@ def likelihood(observer: str, record: Record, scenario: Scenario, watch: Watch =
     if observer not in GPRS:
         return None
     try:
-        return tuple(_of_mode(observer, bridged(record, scenario), scenario, mode, watch) for mode in range(record.n_modes))
+        whole = bridged(record, prior_of(scenario, record, (Bands,)))
+        return tuple(_of_mode(observer, whole, scenario, mode, watch) for mode in range(record.n_modes))
     except ValueError:
         return None
 
 
 def _of_mode(observer: str, record: Record, scenario: Scenario, mode: int, watch: Watch) -> float:
     g = scenario.gpr_offline if observer == "gpr-offline" else scenario.gpr_online
-    scale = scale_of(g, record.training, record.delay, mode)
+    bands, scale = bands_of(scenario), scale_of(g, record.training, record.delay, mode)
     if observer == "gpr-offline":
         training = record.training
         assert training is not None
-        targets, first = training_targets(training, scenario, record.dt, record.delay), g.depth - 1
+        targets, first = training_targets(training, bands, record.dt, record.delay), g.depth - 1
         y, u, z = training.y_lgs, training.u, pseudo_open_loop(training.y_lgs, training.u, record.delay)
     else:
-        targets, first = online_targets(record, scenario), record.n_steps - 1 - g.training_size
+        targets, first = online_targets(record, bands), record.n_steps - 1 - g.training_size
         y, u, z = record.y_lgs, record.u, record.z
     if first < g.depth - 1 or first + g.training_size > targets.shape[0]:
         raise RecordError("the record is too short for the training set")

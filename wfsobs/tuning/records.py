@@ -17,6 +17,8 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.observers.baselines import open_loop_reference
 from wfsobs.observers.missing import bridged
+from wfsobs.prior import Model
+from wfsobs.priors_from.scenario import bands_of, prior_of
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError, Training, delayed, frame_mean
 from wfsobs.scenario import Scenario
@@ -154,6 +156,6 @@ def piece(record: Record, start: int, stop: int) -> Record:
 
 def reference(record: Record, scenario: Scenario) -> Array:
     """The zero-phase Butterworth reference of a record, (n_steps, n_modes) [um], NaN where a measurement is missing."""
-    whole = bridged(record, scenario)
+    whole = bridged(record, prior_of(scenario, record, (Model,)))
     twin = whole.z if whole.open_loop_y is None else whole.open_loop_y
-    return np.where(np.isnan(record.z), np.nan, open_loop_reference(scenario, twin, record.dt))
+    return np.where(np.isnan(record.z), np.nan, open_loop_reference(bands_of(scenario), twin, record.dt))

@@ -14,7 +14,7 @@ import numpy as np
 import param
 
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman.single import measurement_noise
+from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.settings import SettingError
 from wfsobs.simulation.disturbance import vibration_lines, vibration_variance

@@ -7,14 +7,16 @@ from rest at the first sample, and the means and deviations are those of the tra
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from wfsobs.record import RecordError, Training, pseudo_open_loop
-from wfsobs.scenario.groups.observers import OfflineGpr, OnlineGpr
 from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.scenario.groups.observers import OfflineGpr, OnlineGpr
 
 ORDER = 2
 """Of the high-pass."""

@@ -10,6 +10,7 @@ a, b, delta), a prediction is
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
@@ -28,11 +29,14 @@ from wfsobs.observers.gpr.kernels import (
 )
 from wfsobs.observers.gpr.online import kernel_of
 from wfsobs.observers.per_mode import over_modes
+from wfsobs.prior import Bands, Prior
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import DELAY, Record, RecordError, Training, pseudo_open_loop
-from wfsobs.scenario import Scenario
+from wfsobs.record import DELAY, Measurements, RecordError, Training, pseudo_open_loop
 from wfsobs.signal.linalg import eliminate, solved_rows
 from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.scenario.groups.observers import OfflineGpr
 
 ROWS = 256
 """Steps predicted at a time."""
@@ -91,26 +95,25 @@ def train(
     return TrainedGpr(signals[: first + m] / kernel.length_scale, depth, points, a - b * constant, float(constant), kernel)
 
 
-def training_targets(training: Training, scenario: Scenario, dt: float, delay: int = DELAY) -> Array:
+def training_targets(training: Training, bands: Bands, dt: float, delay: int = DELAY) -> Array:
     """The vibration reference of the training record, (n, n_modes) [um]; NaN at the last step."""
     twin = training.open_loop_y
-    return open_loop_reference(
-        scenario, pseudo_open_loop(training.y_lgs, training.u, delay) if twin is None else twin, dt)
+    return open_loop_reference(bands, pseudo_open_loop(training.y_lgs, training.u, delay) if twin is None else twin, dt)
 
 
-def gpr_offline(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
-    """Train on the record's training record and predict over the record, all modes at the same time."""
-    g, training = scenario.gpr_offline, record.training
-    assert training is not None
-    if record.n_steps < g.depth:
-        raise RecordError(f"the record has {record.n_steps} steps; depth needs {g.depth}")
-    targets = training_targets(training, scenario, record.dt, record.delay)
-    training_z = pseudo_open_loop(training.y_lgs, training.u, record.delay)
+def gpr_offline(measured: Measurements, prior: Prior, settings: OfflineGpr, watch: Watch) -> dict[str, Array]:
+    """Train on the training record and predict over the measurements, all modes at the same time."""
+    g, training, bands = settings, prior.training, prior.bands
+    assert training is not None and bands is not None
+    if measured.n_steps < g.depth:
+        raise RecordError(f"the record has {measured.n_steps} steps; depth needs {g.depth}")
+    targets = training_targets(training, bands, measured.dt, measured.delay)
+    training_z = pseudo_open_loop(training.y_lgs, training.u, measured.delay)
 
     def one(mode: int, watch: Watch) -> Array:
-        scale = scale_of(g, training, record.delay, mode)
-        signals = window_signals(g, training.y_lgs, training.u, training_z, mode, record.dt, scale)
+        scale = scale_of(g, training, measured.delay, mode)
+        signals = window_signals(g, training.y_lgs, training.u, training_z, mode, measured.dt, scale)
         model = train(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), watch)
-        return model.predict(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt, scale), watch)
+        return model.predict(window_signals(g, measured.y_lgs, measured.u, measured.z, mode, measured.dt, scale), watch)
 
-    return {VIBRATION: over_modes(record.n_modes, one, watch)}
+    return {VIBRATION: over_modes(measured.n_modes, one, watch)}

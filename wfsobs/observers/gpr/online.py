@@ -7,6 +7,7 @@ causal Butterworth bank on z, of which value j + 1 belongs to step j and is know
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,11 +17,13 @@ from wfsobs.observers.gpr.inputs import scale_of, window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
 from wfsobs.observers.gpr.sliding import finish, run_lengths, slide
 from wfsobs.observers.per_mode import over_modes
+from wfsobs.prior import Bands, Prior
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record, RecordError
-from wfsobs.scenario import Scenario
-from wfsobs.scenario.groups.observers import OfflineGpr, OnlineGpr
+from wfsobs.record import Measurements, RecordError, Signals
 from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.scenario.groups.observers import OfflineGpr, OnlineGpr
 
 BAND_ENTRIES, BAND_ROWS = 4_000_000, 8192
 """Covariances (32 MB) and windows at a time: enough to share the overlap of the runs, and soon done."""
@@ -31,33 +34,35 @@ def kernel_of(settings: OfflineGpr | OnlineGpr) -> SquaredExponential:
     return SquaredExponential(settings.signal_std, settings.length_scale, settings.noise_std)
 
 
-def online_targets(record: Record, scenario: Scenario) -> Array:
+def online_targets(record: Signals, bands: Bands) -> Array:
     """The vibration at every step, as far as the causal bank tells it one step later, (n, n_modes) [um]; 0 at the last step."""
-    f = online_reference(scenario, record.z, record.dt)
+    f = online_reference(bands, record.z, record.dt)
     return np.vstack([f[1:], np.zeros((1, record.n_modes))])
 
 
-def gpr_online(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+def gpr_online(measured: Measurements, prior: Prior, settings: OnlineGpr, watch: Watch) -> dict[str, Array]:
     """The online GPR over a record, all modes at the same time, delivered block by block."""
-    g = scenario.gpr_online
-    if record.n_steps < g.depth + g.training_size:
-        raise RecordError(f"the record has {record.n_steps} steps; depth + training size need {g.depth + g.training_size}")
-    targets = online_targets(record, scenario)
-    values = np.full((record.n_steps, record.n_modes), np.nan)
-    done = np.zeros(record.n_modes)
+    if measured.n_steps < settings.depth + settings.training_size:
+        needed = settings.depth + settings.training_size
+        raise RecordError(f"the record has {measured.n_steps} steps; depth + training size need {needed}")
+    assert prior.bands is not None
+    targets = online_targets(measured, prior.bands)
+    values = np.full((measured.n_steps, measured.n_modes), np.nan)
+    done = np.zeros(measured.n_modes)
 
     def one(mode: int, watch: Watch) -> Array:
         def deliver(start: int, stop: int, mean: Array) -> None:
             values[start:stop, mode] = mean
-            done[mode] = stop / record.n_steps
+            done[mode] = stop / measured.n_steps
             watch.step(float(done.mean()))
             watch.partial(VIBRATION, values)
 
-        scale = scale_of(g, record.training, record.delay, mode)
-        signals = window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt, scale)
-        return predict_sliding(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), deliver, watch.check)[0]
+        scale = scale_of(settings, prior.training, measured.delay, mode)
+        signals = window_signals(settings, measured.y_lgs, measured.u, measured.z, mode, measured.dt, scale)
+        return predict_sliding(
+            signals, targets[:, mode], settings.depth, settings.training_size, kernel_of(settings), deliver, watch.check)[0]
 
-    return {VIBRATION: over_modes(record.n_modes, one, watch)}
+    return {VIBRATION: over_modes(measured.n_modes, one, watch)}
 
 
 def predict_sliding(

@@ -19,15 +19,20 @@ number, for any length of stream: a replaced point takes its error with it, so n
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.linalg.blas import dsymv, dsyr2
 
 from wfsobs.observers.gpr.inputs import Scale, StreamingInputs
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential, restart_interval
 from wfsobs.observers.gpr.online import kernel_of
-from wfsobs.scenario import Scenario
+from wfsobs.prior import Bands
 from wfsobs.signal.bandpass import StreamingBank, bandpass_bank
 from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.scenario.groups.observers import OnlineGpr
 
 
 class SlidingRegression:
@@ -162,17 +167,18 @@ def _set_column(S: Array, s: int, values: Array) -> None:
 class OnlineGprStream:
     """The online GPR of one mode, one sample at a time, as a control loop calls it.
 
-    >>> stream = OnlineGprStream(Scenario().replace({"gpr_online.training_size": 3, "gpr_online.depth": 2}))
+    >>> from wfsobs.scenario.groups.observers import OnlineGpr
+    >>> settings = OnlineGpr(training_size=3, depth=2)
+    >>> stream = OnlineGprStream(settings, Bands((47.7,), 3.0, 2.0, 1), dt=1e-3)
     >>> [bool(np.isnan(stream.step(y, u=0.0))) for y in (0.0, 0.1, 0.0, -0.1, 0.0)]
     [True, True, True, True, False]
     """
 
-    def __init__(self, scenario: Scenario, scale: Scale | None = None):
-        """Scale: of standardised inputs, from `inputs.scale_of`."""
-        g, b = scenario.gpr_online, scenario.butterworth
-        bank = bandpass_bank(b.frequencies, b.bandwidth_online, b.order, scenario.dt)
-        self._inputs, self._prepared = g.inputs, StreamingInputs(g, scenario.dt, scale)
-        self._bank = StreamingBank(bank)
+    def __init__(self, settings: OnlineGpr, bands: Bands, dt: float, scale: Scale | None = None):
+        """dt: step [s]; scale: of standardised inputs, from `inputs.scale_of`."""
+        g = settings
+        self._inputs, self._prepared = g.inputs, StreamingInputs(g, dt, scale)
+        self._bank = StreamingBank(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, dt))
         self._regression = SlidingRegression(g.depth, g.training_size, 1 if g.inputs == "z" else 2, kernel_of(g))
         self._u = (0.0, 0.0)  # u[k-1], u[k-2]
         self._now: float | None = None

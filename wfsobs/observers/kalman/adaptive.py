@@ -1,49 +1,53 @@
 """The Kalman filter of a model that is identified anew from the last seconds of z, again and again.
 
 Nothing has to be known beforehand, and what changes is followed: noise, turbulence and peaks of every window are found
-(`identify.quick`), and the steady-state filter of that model runs until the next. A new filter starts at rest at the beginning of
-its window, so that its state has converged when it takes over, and what it says is kept from there on.
+(`wfsobs.spectral.quick`), and the steady-state filter of that model runs until the next. A new filter starts at rest at the
+beginning of its window, so that its state has converged when it takes over, and what it says is kept from there on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.single import MIN_NOISE, by_target, steady_filter
+from wfsobs.prior import Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Record, RecordError
-from wfsobs.scenario import Scenario
-from wfsobs.scenario.groups.observers import Adaptive
+from wfsobs.record import Measurements, RecordError
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.quick import SHORTEST, quick_spectrum
 from wfsobs.typing import Array
 
+if TYPE_CHECKING:
+    from wfsobs.scenario.groups.observers import Adaptive
+
 STILL = PeriodicFilter([(np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((2, 1)), np.zeros((2, 1)))])
 """The filter of white noise: nothing moves."""
 
 
-def kf_adaptive(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+def kf_adaptive(measured: Measurements, _prior: Prior, settings: Adaptive, watch: Watch) -> dict[str, Array]:
     """The filter on the LGS measurement, at every fast step; NaN until the first window is full. Raises RecordError for a
     record shorter than a window, or a window of too few samples."""
-    a = scenario.adaptive
-    window = round(a.window / record.dt)
+    window = round(settings.window / measured.dt)
     if window < SHORTEST:
-        raise RecordError(f"adaptive.window = {a.window:g}: takes {SHORTEST * record.dt:g} s or more, {SHORTEST} samples")
-    needed = window + record.delay
-    if record.n_steps < needed:
-        raise RecordError(f"the record has {record.n_steps} steps; adaptive.window = {a.window:g} s needs {needed}")
-    z = record.z[record.delay :]  # what the mirror did before the record is not known
+        least = SHORTEST * measured.dt
+        raise RecordError(f"adaptive.window = {settings.window:g}: takes {least:g} s or more, {SHORTEST} samples")
+    needed = window + measured.delay
+    if measured.n_steps < needed:
+        raise RecordError(f"the record has {measured.n_steps} steps; adaptive.window = {settings.window:g} s needs {needed}")
+    z = measured.z[measured.delay :]  # what the mirror did before the record is not known
     columns = []
-    for mode in range(record.n_modes):  # one after the other: steps as short as these leave a second thread no room
+    for mode in range(measured.n_modes):  # one after the other: steps as short as these leave a second thread no room
         def tell(fraction: float, mode: int = mode) -> None:
-            watch.step((mode + fraction) / record.n_modes)
+            watch.step((mode + fraction) / measured.n_modes)
 
-        columns.append(np.vstack([np.full((record.delay, len(TARGETS)), np.nan), adapting(z[:, mode], record.dt, a, tell)]))
+        before = np.full((measured.delay, len(TARGETS)), np.nan)
+        columns.append(np.vstack([before, adapting(z[:, mode], measured.dt, settings, tell)]))
     return by_target(columns)
 
 

@@ -12,29 +12,32 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE
-from wfsobs.observers.kalman.single import by_target, filter_step, kalman_model, measurement_noise
+from wfsobs.observers.kalman.single import by_target, filter_step
+from wfsobs.prior import Model, Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Record
-from wfsobs.scenario import Scenario
-from wfsobs.scenario.settings import SettingError
+from wfsobs.record import Measurements
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 
+if TYPE_CHECKING:
+    from wfsobs.scenario.groups.observers import MultiRate
 
-class UnstableCycle(SettingError):
+
+class UnstableCycle(ValueError):
     """Two gains, each stable, that make an unstable cycle."""
 
 
-def multirate_noise(scenario: Scenario, mode: int) -> tuple[float, float]:
-    """Square roots of r_LGS and r_NGS [um] in one mode."""
-    m = scenario.multirate
-    return (m.lgs_noise, m.ngs_noise) if m.measurement_noise == "manual" else measurement_noise(scenario, mode)
+def multirate_noise(settings: MultiRate, model: Model) -> tuple[float, float]:
+    """Square roots of r_LGS and r_NGS [um] in one mode: those of the settings, or of the model."""
+    own = settings.measurement_noise == "manual"
+    return (settings.lgs_noise, settings.ngs_noise) if own else (model.lgs_noise, model.ngs_noise)
 
 
 @dataclass(frozen=True)
@@ -74,21 +77,24 @@ def multirate_filter(
     return MultiRateFilter(alone, cycle)
 
 
-def run_modes(record: Record, watch: Watch, make: Callable[[int], MultiRateFilter]) -> list[Array]:
+def run_modes(measured: Measurements, watch: Watch, make: Callable[[int], MultiRateFilter]) -> list[Array]:
     """Run the filter that `make` gives for each mode; per mode (n_steps, n_targets)."""
-    z = np.stack([record.z, np.nan_to_num(record.z_ngs)], axis=1)
+    z = np.stack([measured.z, np.nan_to_num(measured.z_ngs)], axis=1)
     columns = []
-    for mode in range(record.n_modes):
-        watch.step(mode / record.n_modes)
+    for mode in range(measured.n_modes):
+        watch.step(mode / measured.n_modes)
         columns.append(make(mode).run(z[:, :, mode]))
     return columns
 
 
-def multirate(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+def multirate(measured: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> dict[str, Array]:
     """The multi-rate filter over a record, for turbulence."""
-    assert record.ratio is not None
-    ratio = record.ratio
-    columns = run_modes(
-        record, watch, lambda mode: multirate_filter(
-            kalman_model(scenario, mode, record.dt), ratio, *multirate_noise(scenario, mode)))
+    assert measured.ratio is not None
+    ratio = measured.ratio
+
+    def of_mode(mode: int) -> MultiRateFilter:
+        model = prior.model[mode]
+        return multirate_filter(model.disturbance(), ratio, *multirate_noise(settings, model))
+
+    columns = run_modes(measured, watch, of_mode)
     return {TURBULENCE: by_target(columns)[TURBULENCE]}

@@ -10,21 +10,25 @@ the periodic Riccati equation of the n steps. Optimal for its model only; the pa
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.multirate import MultiRateFilter, multirate_noise, run_modes
-from wfsobs.observers.kalman.single import by_target, filter_step, kalman_model
+from wfsobs.observers.kalman.single import by_target, filter_step
+from wfsobs.prior import Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Record
-from wfsobs.scenario import Scenario
+from wfsobs.record import Measurements
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import SteadyState, Step, periodic_steady_state
 from wfsobs.signal.statespace import DisturbanceModel, process_model
-from wfsobs.simulation.guide_stars import lgs_error_process
 from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.scenario.groups.observers import MultiRate
 
 
 def optimal_cycle(
@@ -69,22 +73,19 @@ def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[MultiRateFilter, 
 
 
 def optimal_model(
-    scenario: Scenario, mode: int, dt: float, ratio: int, model: DisturbanceModel | None = None
+    settings: MultiRate, prior: Prior, mode: int, ratio: int, model: DisturbanceModel | None = None
 ) -> tuple[list[Step], Array]:
-    """The cycle and output rows of one mode of a scenario; model: of the disturbance, that of `kalman` unless given."""
-    model = model or kalman_model(scenario, mode, dt)
-    error = None
-    if scenario.multirate.model_lgs_error:
-        error = lgs_error_process(scenario, mode, dt)
-    cycle = optimal_cycle(model, ratio, *multirate_noise(scenario, mode), error)
+    """The cycle and output rows of one mode; model: of the disturbance, that of one peak unless given."""
+    model = model or prior.model[mode].disturbance()
+    error = prior.lgs_error[mode].process if settings.model_lgs_error else None
+    cycle = optimal_cycle(model, ratio, *multirate_noise(settings, prior.model[mode]), error)
     rows = model.output_rows(TARGETS)
     return cycle, np.hstack([rows, np.zeros((len(rows), len(cycle[0][0]) - rows.shape[1]))])
 
 
-def multirate_optimal(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+def multirate_optimal(measured: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> dict[str, Array]:
     """The optimal multi-rate filter over a record."""
-    assert record.ratio is not None
-    ratio = record.ratio
-    columns = run_modes(
-        record, watch, lambda mode: optimal_filter(*optimal_model(scenario, mode, record.dt, ratio))[0])
+    assert measured.ratio is not None
+    ratio = measured.ratio
+    columns = run_modes(measured, watch, lambda mode: optimal_filter(*optimal_model(settings, prior, mode, ratio))[0])
     return by_target(columns)

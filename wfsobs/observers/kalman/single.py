@@ -8,62 +8,25 @@ y up to k - 1. Here phi_hat[k] uses y[k] too, like the GPR. The mirror's part is
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wfsobs.observers.base import TARGETS
+from wfsobs.prior import Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Record
-from wfsobs.scenario import Scenario
+from wfsobs.record import Measurements
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import SteadyState, steady_state
-from wfsobs.signal.statespace import MIN_MODEL_DAMPING, DisturbanceModel, disturbance_model
-from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
-from wfsobs.simulation.guide_stars import lgs_noise_rms
-from wfsobs.simulation.layers import relative_rms
-from wfsobs.simulation.sensor_noise import noise_rms
-from wfsobs.simulation.turbulence import turbulence_process
+from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.scenario.groups.observers import Kalman
 
 MIN_NOISE = 1e-6
 """Floor of a modelled measurement noise [um]: a filter for perfect measurements has no Riccati solution."""
-
-
-def modelled_processes(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2, Ar2]:
-    """The turbulence and the one vibration peak of the model, sampled every `dt` [s] (paper, Tables 1 and 2)."""
-    k, tip_tilt = scenario.kalman, scenario.modes[mode].radial_order == 1
-    manual = k.process_noise == "manual"
-    turbulence = turbulence_process(scenario, mode, dt)
-    if manual:
-        turbulence = replace(turbulence, rms=k.turbulence_rms * relative_rms(scenario, mode))
-    vibration_rms = k.vibration_rms if manual and tip_tilt else float(np.sqrt(vibration_variance(scenario, mode)))
-    frequency, damping = modelled_peak(scenario, mode)
-    return turbulence, Ar2(2.0 * np.pi * frequency, max(damping, MIN_MODEL_DAMPING), vibration_rms, dt)
-
-
-def modelled_peak(scenario: Scenario, mode: int) -> tuple[float, float]:
-    """Natural frequency [Hz] and damping of the one peak of the model."""
-    k, lines = scenario.kalman, vibration_lines(scenario, mode)
-    if k.peak == "manual" or not lines:
-        return k.frequency, k.damping
-    frequency, damping, _ = max(lines, key=lambda line: line[2])
-    return frequency, damping
-
-
-def kalman_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
-    """The state-space model of the two processes."""
-    turbulence, vibration = modelled_processes(scenario, mode, dt)
-    return disturbance_model([turbulence], [vibration])
-
-
-def measurement_noise(scenario: Scenario, mode: int) -> tuple[float, float]:
-    """Standard deviation of the modelled noise [um] of the LGS together and of an NGS frame in one mode."""
-    k = scenario.kalman
-    if k.measurement_noise == "manual":
-        return k.lgs_noise, k.ngs_noise
-    return max(lgs_noise_rms(scenario, mode), MIN_NOISE), max(noise_rms(scenario, "ngs")[mode], MIN_NOISE)
 
 
 def filter_step(A: Array, C: Array, L: Array, outputs: Array) -> tuple[Array, Array, Array, Array]:
@@ -85,37 +48,37 @@ def steady_filter(
     return PeriodicFilter([filter_step(model.A, np.atleast_2d(model.C), steady.L, rows)]), steady
 
 
-def kf_lgs(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+def kf_lgs(measured: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
     """The Kalman filter on the LGS measurement, at every fast step."""
-    z = record.z
+    z = measured.z
     columns = []
-    for mode in range(record.n_modes):
-        watch.step(mode / record.n_modes)
-        kalman, _ = steady_filter(kalman_model(scenario, mode, record.dt), measurement_noise(scenario, mode)[0])
+    for mode, model in enumerate(prior.model):
+        watch.step(mode / measured.n_modes)
+        kalman, _ = steady_filter(model.disturbance(), model.lgs_noise)
         columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
     return by_target(columns)
 
 
-def kf_ngs(record: Record, scenario: Scenario, watch: Watch) -> dict[str, Array]:
+def kf_ngs(measured: Measurements, prior: Prior, settings: Kalman, watch: Watch) -> dict[str, Array]:
     """The Kalman filter on NGS frames, with the coefficients for T_NGS.
 
     A frame at k = n i measures slow step i - 1 (fast steps k - n ... k - 1); the estimate is that of slow
     step i, the fast steps k ... k + n - 1. It is held over them, or spread by the fast model.
     """
-    assert record.ratio is not None
-    n = record.ratio
-    frames = record.z_ngs[n::n]
+    assert measured.ratio is not None
+    n = measured.ratio
+    frames = measured.z_ngs[n::n]
     columns = []
-    for mode in range(record.n_modes):
-        watch.step(mode / record.n_modes)
-        model = kalman_model(scenario, mode, n * record.dt)
-        kalman, _ = steady_filter(model, measurement_noise(scenario, mode)[1], model.pairs)
+    for mode, model in enumerate(prior.model):
+        watch.step(mode / measured.n_modes)
+        of_frames = model.at(n * measured.dt).disturbance()
+        kalman, _ = steady_filter(of_frames, model.ngs_noise, of_frames.pairs)
         slow = kalman.run(frames[:, None, mode, None])[:, :, 0]  # of each process, slow steps i and i - 1
-        fast = np.full((record.n_steps, len(TARGETS)), np.nan)
-        for target, process in enumerate(modelled_processes(scenario, mode, record.dt)):
-            spread = between_frames(process, n, scenario.kalman.ngs_between_frames)
+        fast = np.full((measured.n_steps, len(TARGETS)), np.nan)
+        for target, process in enumerate((model.turbulence, model.vibration)):
+            spread = between_frames(process, n, settings.ngs_between_frames)
             values = slow[:, 2 * target : 2 * target + 2] @ spread.T
-            fast[n:, target] = values.ravel()[: record.n_steps - n]
+            fast[n:, target] = values.ravel()[: measured.n_steps - n]
         columns.append(fast)
     return by_target(columns)
 

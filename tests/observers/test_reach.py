@@ -1,0 +1,128 @@
+"""What an observer can reach from its arguments: no scenario, no seed, no truth, and no array that holds one."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from types import BuiltinFunctionType, FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Observer
+from wfsobs.pipeline import each_estimate
+from wfsobs.priors_from import scenario as door
+from wfsobs.progress import Watch
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.groups.run import Run
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.loop import simulate
+
+SEED = 918_273_645
+
+
+def scenario(inputs_filter: str = "raw") -> Scenario:
+    own = {"training_size": 60, "depth": 25, "inputs_filter": inputs_filter}
+    return PRESETS["paper"]().replace({
+        "run.duration": 0.7, "run.warm_up": 0.2, "run.seed": SEED, "adaptive.window": 0.25,
+        **{f"{gpr}.{name}": value for gpr in ("gpr_offline", "gpr_online") for name, value in own.items()}})
+
+
+def together(record: Record) -> Record:
+    """The record with every signal a view of one array that also holds the truth, as a file that was read at once has it."""
+    assert record.y_ngs is not None and record.open_loop_y is not None
+    names = ("y_lgs", "u", "y_ngs", "open_loop_y", "turbulence", "vibration")
+    block = np.stack([getattr(record, name) for name in names])
+    return replace(record, **{name: block[i] for i, name in enumerate(names)})  # type: ignore[arg-type]
+
+
+def reached(*roots: Any) -> Iterator[Any]:
+    """Everything reachable from the roots, by references, bases of arrays, closures, defaults and partials. Classes and modules
+    are the program, and so are the globals of a function."""
+    seen, waiting = set[int](), list(roots)
+    while waiting:
+        x = waiting.pop()
+        if id(x) in seen or isinstance(x, (type, ModuleType, BuiltinFunctionType)):
+            continue
+        seen.add(id(x))
+        yield x
+        if isinstance(x, FunctionType):
+            waiting += [cell.cell_contents for cell in x.__closure__ or ()]
+            waiting += [x.__defaults__, x.__kwdefaults__, x.__dict__]
+        elif isinstance(x, partial):
+            waiting += [x.func, x.args, x.keywords]
+        else:
+            waiting += gc.get_referents(x)
+            if isinstance(x, np.ndarray):
+                waiting.append(x.base)
+
+
+def given_away(record: Record, *roots: Any) -> set[str]:
+    """What can be reached from the roots that should not."""
+    found = set()
+    for x in reached(*roots):
+        if isinstance(x, (Scenario, Run, Record)):
+            found.add(type(x).__name__)
+        elif isinstance(x, int) and x == SEED:
+            found.add("seed")
+        elif isinstance(x, np.ndarray) and x.dtype == float:
+            for name in ("turbulence", "vibration"):
+                truth = getattr(record, name)
+                if np.shares_memory(x, truth) or any(np.isin(column, x).all() for column in truth.T):
+                    found.add(name)
+    return found
+
+
+def leaks(record: Record, s: Scenario, monkeypatch: pytest.MonkeyPatch, only: str) -> set[str]:
+    """What the arguments of an observer give away when it runs in the pipeline, heard by someone who knows the truth."""
+    found: set[str] = set()
+
+    def run(*arguments: Any) -> dict[str, np.ndarray]:
+        found.update(given_away(record, *arguments))
+        return real(*arguments)
+
+    real = OBSERVERS[only].run
+    monkeypatch.setitem(OBSERVERS, only, replace(OBSERVERS[only], run=run))
+    heard: list[Any] = [record, s]
+    watch = Watch(lambda fraction: heard.append(fraction), lambda: not heard, lambda *args: heard.append(args))
+    (item, *_) = each_estimate(record, s, watch, [only], lambda *args: heard.append(args))
+    assert getattr(item, "values", None) is not None, item
+    return found
+
+
+@pytest.fixture(scope="module", name="record")
+def _record() -> Record:
+    return together(simulate(scenario()))
+
+
+@pytest.mark.parametrize("inputs_filter", ["raw", "standardised"])
+@pytest.mark.parametrize("name", OBSERVERS)
+def test_nothing_that_an_observer_reaches_is_truth(
+    name: str, inputs_filter: str, record: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert leaks(record, scenario(inputs_filter), monkeypatch, name) == set()
+
+
+def test_what_reached_the_truth_would_be_found(record: Record, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search itself: a view, a closure, a partial, the scenario."""
+    s = scenario()
+    assert given_away(record, record.y_lgs) >= {"turbulence", "vibration"}
+    assert given_away(record, lambda: record) >= {"Record"}
+    assert given_away(record, partial(print, s)) >= {"Scenario", "Run", "seed"}
+    monkeypatch.setattr("wfsobs.pipeline.arguments", lambda o, r, s: (record, *door.arguments(o, r, s)[1:]))
+    assert "turbulence" in leaks(record, s, monkeypatch, "persistence")
+
+
+@pytest.mark.parametrize("observer", OBSERVERS.values(), ids=OBSERVERS)
+def test_arguments_have_memory_of_their_own(observer: Observer, record: Record) -> None:
+    measured, prior, settings = door.arguments(observer, record, scenario())
+    arrays = [x for x in reached(measured, prior, settings) if isinstance(x, np.ndarray)]
+    assert len(arrays) >= 3
+    assert all(x.base is None and x.flags.owndata and x.flags.c_contiguous for x in arrays)
+    assert (measured.open_loop_y is None) == ("open_loop_y" not in observer.needs)
+    assert (prior.training is None) == ("training" not in observer.needs)

@@ -1,0 +1,90 @@
+"""What an observer may be told of a mode, or of all of them, beside measurements: numbers, and nothing that leads to where they
+come from.
+
+Made from a scenario (`wfsobs.priors_from.scenario`), or from telemetry (`IdentifiedMode.prior`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+from typing import NamedTuple
+
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
+
+
+@dataclass(frozen=True)
+class Model:
+    """The model of one mode with one vibration peak (paper, eq. 1, 2 and 7).
+
+    turbulence, vibration : the processes, sampled at the fast step unless moved by `at`
+    lgs_noise, ngs_noise  : rms of the white noise of the LGS together in a step, and of an NGS frame [um]
+    """
+
+    turbulence: Ar2
+    vibration: Ar2
+    lgs_noise: float
+    ngs_noise: float
+
+    def at(self, dt: float) -> Model:
+        """The same processes sampled every `dt` [s]."""
+        return Model(self.turbulence.at(dt), self.vibration.at(dt), self.lgs_noise, self.ngs_noise)
+
+    def disturbance(self) -> DisturbanceModel:
+        """The state-space model of the two processes."""
+        return disturbance_model([self.turbulence], [self.vibration])
+
+
+class LgsError(NamedTuple):
+    """The slow error of the LGS together in one mode, as a process at the fast step."""
+
+    process: Ar2
+
+
+class Line(NamedTuple):
+    """A vibration peak: natural frequency [Hz], damping (0 for a pure line), rms [um]."""
+
+    frequency: float
+    damping: float
+    rms: float
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The model of one mode with every line of the vibration.
+
+    noise      : rms of the white noise of its measurement [um]
+    turbulence : processes whose sum the turbulence is, sampled every `dt` [s]; a coloured background is one of them, as
+        measurements alone cannot tell the two apart
+    lines      : the peaks of the vibration
+    """
+
+    noise: float
+    dt: float
+    turbulence: tuple[Ar2 | Ar3, ...] = ()
+    lines: tuple[Line, ...] = ()
+
+    def disturbance(self, line_width: float) -> DisturbanceModel:
+        """The state-space model, every line at least `line_width` wide at half maximum [Hz]."""
+        least = pi * line_width  # as xi w
+        peaks = []
+        for frequency, damping, rms in self.lines:
+            omega = 2.0 * pi * frequency
+            peaks.append(Ar2(omega, min(max(damping, least / omega), 1.0), rms, self.dt))
+        return disturbance_model(self.turbulence, peaks)
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Where the vibration of every mode is: the Butterworth bank of the paper (section 2.3).
+
+    frequencies : centres [Hz]; bandwidth_offline, bandwidth_online : widths on open-loop and closed-loop data [Hz]
+    order       : of each band-pass
+    """
+
+    frequencies: tuple[float, ...]
+    bandwidth_offline: float
+    bandwidth_online: float
+    order: int

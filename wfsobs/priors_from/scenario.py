@@ -1,0 +1,146 @@
+"""What observers are told of a scenario: matched to it, or wrong on purpose where its settings say so."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from math import sqrt
+
+import numpy as np
+
+from wfsobs.observers.base import Observer
+from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
+from wfsobs.prior import Bands, LgsError, Line, Lines, Model, Part, Prior, Training
+from wfsobs.record import Measurements, Record
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.settings import Group
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3, fitted_ar3
+from wfsobs.signal.statespace import MIN_MODEL_DAMPING, DisturbanceModel
+from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
+from wfsobs.simulation.guide_stars import lgs_error_process, lgs_noise_rms
+from wfsobs.simulation.layers import relative_rms
+from wfsobs.simulation.sensor_noise import noise_rms
+from wfsobs.simulation.true_spectra import seen_turbulence
+from wfsobs.simulation.turbulence import processes, turbulence_process, turbulence_rms
+
+
+def arguments(observer: Observer, record: Record, scenario: Scenario) -> tuple[Measurements, Prior, Group | None]:
+    """All that an observer receives of a record and a scenario: measurements, prior and settings of its own.
+
+    Raises ValueError where the scenario has no such prior.
+    """
+    settings = None if observer.settings is None else getattr(scenario, observer.settings).copy()
+    prior = prior_of(scenario, record, (*observer.prior, *observer.asks(settings)))
+    return record.measurements(open_loop="open_loop_y" in observer.needs), prior, settings
+
+
+def prior_of(scenario: Scenario, record: Record, parts: Iterable[Part]) -> Prior:
+    """These parts of what a scenario tells of the modes of a record. Raises ValueError where it does not have one."""
+    asked, modes, dt = set(parts), range(record.n_modes), record.dt
+    return Prior(
+        model=tuple(model_of(scenario, mode, dt) for mode in modes) if Model in asked else (),
+        lgs_error=tuple(lgs_error_of(scenario, mode, dt) for mode in modes) if LgsError in asked else (),
+        lines=tuple(lines_of(scenario, mode, dt) for mode in modes) if Lines in asked else (),
+        bands=bands_of(scenario) if Bands in asked else None,
+        training=record.training.copy() if Training in asked and record.training is not None else None,
+    )
+
+
+def bands_of(scenario: Scenario) -> Bands:
+    """The bands that the vibration is looked for in."""
+    b = scenario.butterworth
+    return Bands(tuple(b.frequencies), b.bandwidth_offline, b.bandwidth_online, b.order)
+
+
+# ---------------------------------------------------------------------- one vibration peak
+
+
+def model_of(scenario: Scenario, mode: int, dt: float | None = None) -> Model:
+    """The model of one mode with one peak; dt [s]: that of the scenario unless given."""
+    return Model(*modelled_processes(scenario, mode, dt or scenario.dt), *measurement_noise(scenario, mode))
+
+
+def lgs_error_of(scenario: Scenario, mode: int, dt: float | None = None) -> LgsError:
+    """The slow error of the LGS together in one mode."""
+    return LgsError(lgs_error_process(scenario, mode, dt or scenario.dt))
+
+
+def modelled_processes(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2, Ar2]:
+    """The turbulence and the one vibration peak of the model, sampled every `dt` [s] (paper, Tables 1 and 2)."""
+    k, tip_tilt = scenario.kalman, scenario.modes[mode].radial_order == 1
+    manual = k.process_noise == "manual"
+    turbulence = turbulence_process(scenario, mode, dt)
+    if manual:
+        turbulence = replace(turbulence, rms=k.turbulence_rms * relative_rms(scenario, mode))
+    vibration_rms = k.vibration_rms if manual and tip_tilt else float(np.sqrt(vibration_variance(scenario, mode)))
+    frequency, damping = modelled_peak(scenario, mode)
+    return turbulence, Ar2(2.0 * np.pi * frequency, max(damping, MIN_MODEL_DAMPING), vibration_rms, dt)
+
+
+def modelled_peak(scenario: Scenario, mode: int) -> tuple[float, float]:
+    """Natural frequency [Hz] and damping of the one peak of the model."""
+    k, lines = scenario.kalman, vibration_lines(scenario, mode)
+    if k.peak == "manual" or not lines:
+        return k.frequency, k.damping
+    frequency, damping, _ = max(lines, key=lambda line: line[2])
+    return frequency, damping
+
+
+def kalman_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
+    """The state-space model of the two processes."""
+    return model_of(scenario, mode, dt).disturbance()
+
+
+def measurement_noise(scenario: Scenario, mode: int) -> tuple[float, float]:
+    """Standard deviation of the modelled noise [um] of the LGS together and of an NGS frame in one mode."""
+    k = scenario.kalman
+    if k.measurement_noise == "manual":
+        return k.lgs_noise, k.ngs_noise
+    return max(lgs_noise_rms(scenario, mode), MIN_NOISE), max(noise_rms(scenario, "ngs")[mode], MIN_NOISE)
+
+
+# ---------------------------------------------------------------------- every line
+
+
+def lines_of(scenario: Scenario, mode: int, dt: float | None = None) -> Lines:
+    """Noise, turbulence and all the lines of one mode. Raises ValueError where the vibration names no lines."""
+    if scenario.vibration.source == "psd":
+        raise ValueError("vibration.source = psd is a table, not lines that a model could have")
+    dt = dt or scenario.dt
+    return Lines(measurement_noise(scenario, mode)[0], dt, _turbulence(scenario, mode, dt),
+                 tuple(Line(*line) for line in vibration_lines(scenario, mode)))
+
+
+def multi_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
+    """The state-space model of that. Raises ValueError where the vibration names no lines."""
+    return lines_of(scenario, mode, dt).disturbance(scenario.multipeak.line_width)
+
+
+def _turbulence(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2 | Ar3, ...]:
+    """A scenario's own processes, in the strength that the model has; else one process."""
+    found = processes(scenario, mode, dt) if scenario.turbulence.source == "processes" else []
+    if not found:
+        return (modelled_turbulence(scenario, mode, dt),)
+    if scenario.kalman.process_noise == "matched":
+        return tuple(found)
+    factor = modelled_processes(scenario, mode, dt)[0].rms / turbulence_rms(scenario, mode)
+    return tuple(replace(p, rms=factor * p.rms) for p in found)
+
+
+def modelled_turbulence(scenario: Scenario, mode: int, dt: float) -> Ar2 | Ar3:
+    """The turbulence of the model: that of one peak, or of third order and nearest to the true spectrum that the LGS see."""
+    process, _ = modelled_processes(scenario, mode, dt)
+    if scenario.multipeak.turbulence_order == 2 or process.rms == 0:
+        return process
+    noise, _ = measurement_noise(scenario, mode)
+    start = Ar3(process.omega, process.damping, 5.0 * process.omega, process.rms, dt)
+    return fitted_ar3(seen_turbulence(scenario, mode), noise**2, start)
+
+
+def predicted_rms(scenario: Scenario, mode: int) -> float:
+    """What the filter of every line believes its error of the next phi_dist to be, rms [um]."""
+    model = multi_model(scenario, mode, scenario.dt)
+    row = np.sum(list(model.outputs.values()), axis=0)
+    _, steady = steady_filter(model, measurement_noise(scenario, mode)[0])
+    return sqrt(float(row @ steady.P @ row))

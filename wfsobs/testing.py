@@ -1,0 +1,138 @@
+"""A check of observers written elsewhere, in the manner of scikit-learn's `check_estimator`.
+
+    >>> from wfsobs.observers import OBSERVERS
+    >>> from wfsobs.testing import check_observer
+    >>> check_observer(OBSERVERS["persistence"], alone=False)
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pickle import PicklingError
+from typing import Any
+
+import numpy as np
+
+from wfsobs.observers.base import TARGETS, Observer
+from wfsobs.prior import Prior
+from wfsobs.priors_from.scenario import arguments
+from wfsobs.record import Measurements, held
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.loop import simulate
+from wfsobs.typing import Array
+
+SAME = 1e-9
+"""Difference over the rms of an estimate that is rounding: blocks of another length add up in another order."""
+
+QUICK: dict[str, Any] = {
+    "run.duration": 1.5, "run.warm_up": 0.2, "adaptive.window": 0.25, "gpr_offline.training_size": 60, "gpr_offline.depth": 25,
+    "gpr_online.training_size": 60, "gpr_online.depth": 25}
+
+Estimates = dict[str, Array]
+
+
+class CheckError(AssertionError):
+    """An observer that does not keep a rule: one line naming the observer and the rule."""
+
+
+def check_observer(observer: Observer, scenario: Scenario | None = None, alone: bool = True) -> None:
+    """Run an observer on a short simulated record and check what holds for all of them.
+
+    It gives every target it names, as numbers of the shape of the measurements; the same twice; unless it is marked as not
+    causal, nothing that comes after a step changes its estimate of the step; it leaves its arguments as they are; it gets over
+    missing samples; and in a fresh process, which has never seen the truth, it gives the same.
+
+    scenario : what is simulated, 1.5 s of the preset paper unless given
+    alone    : whether to start the fresh process; a script that does needs the guard `if __name__ == "__main__"`.
+
+    Raises CheckError, and ValueError where the observer has no estimate for the scenario.
+    """
+    s = scenario or PRESETS["paper"]().replace(QUICK)
+    record = simulate(s)
+    if missing := observer.missing(record):
+        raise CheckError(f"{observer.id}: needs {', '.join(missing)}, which no record has")
+    given = arguments(observer, record, s)
+    base = observer.estimate(*given)
+    _check_shapes(observer, base, given[0])
+    again = arguments(observer, record, s)
+    _compare(observer, observer.estimate(*again), base, "run twice on the same measurements it gives two results", exact=True)
+    _check_untouched(observer, given[0], record.measurements("open_loop_y" in observer.needs))
+    if observer.causal:
+        _check_causal(observer, given, base)
+    _check_gaps(observer, given)
+    if alone:
+        _compare(observer, _in_a_fresh_process(observer, again), base,
+                 "in a fresh process, with measurements and prior alone, it gives another result: it knows more than it is told")
+
+
+def _check_shapes(observer: Observer, base: Estimates, measured: Measurements) -> None:
+    for target in observer.targets:
+        if target not in TARGETS:
+            raise CheckError(f"{observer.id}: target {target!r} is none of {', '.join(TARGETS)}")
+        values = base.get(target)
+        if values is None:
+            raise CheckError(f"{observer.id}: gives no {target}")
+        if not isinstance(values, np.ndarray) or values.dtype != float or values.shape != measured.y_lgs.shape:
+            raise CheckError(f"{observer.id}: {target} takes numbers of shape {measured.y_lgs.shape}, (n_steps, n_modes)")
+        if np.isnan(values).all() or np.isinf(values).any():
+            raise CheckError(f"{observer.id}: {target} has no estimate or is infinite; NaN stands for steps without one")
+
+
+def _check_untouched(observer: Observer, measured: Measurements, fresh: Measurements) -> None:
+    for name in ("y_lgs", "u", "y_ngs", "open_loop_y"):
+        if not np.array_equal(getattr(measured, name), getattr(fresh, name), equal_nan=True):
+            raise CheckError(f"{observer.id}: changes its measurements ({name})")
+
+
+def _check_causal(observer: Observer, given: tuple[Measurements, Prior, Any], base: Estimates) -> None:
+    """phi_hat[k] may use y[0..k] and u[0..k], see `wfsobs.observers.base`."""
+    measured, n = given[0], given[0].n_steps
+    for k in (n // 2, n // 2 + 3, n - 5):
+        rng = np.random.default_rng(k)
+        later = replace(measured, y_lgs=_moved(measured.y_lgs, k + 1, rng), u=_moved(measured.u, k + 1, rng),
+                        y_ngs=None if measured.y_ngs is None else _moved(measured.y_ngs, k + 1, rng))
+        _compare(observer, observer.estimate(later, *given[1:]), base,
+                 f"looks ahead: measurements after step {k} change its estimate of earlier steps", stop=k + 1)
+
+
+def _check_gaps(observer: Observer, given: tuple[Measurements, Prior, Any]) -> None:
+    measured = given[0]
+    y, start = measured.y_lgs.copy(), measured.n_steps // 2
+    y[start : start + 7] = np.nan
+    for target, values in observer.estimate(replace(measured, y_lgs=y), *given[1:]).items():
+        if target in observer.targets and np.isnan(values[start + 1 :]).all():
+            raise CheckError(f"{observer.id}: {target} does not come back after missing samples")
+
+
+def _moved(x: Array, start: int, rng: np.random.Generator) -> Array:
+    out = x.copy()
+    out[start:] += 3.0 * np.std(held(x)) * rng.standard_normal(out[start:].shape)
+    return out
+
+
+def _compare(
+    observer: Observer, got: Estimates, base: Estimates, what: str, stop: int | None = None, exact: bool = False
+) -> None:
+    for target in observer.targets:
+        a, b = got[target][:stop], base[target][:stop]
+        bound = 0.0 if exact else SAME * float(np.nanstd(base[target]))
+        if not np.allclose(a, b, rtol=0.0, atol=bound, equal_nan=True):
+            raise CheckError(f"{observer.id}: {what} ({target})")
+
+
+def _in_a_fresh_process(observer: Observer, given: tuple[Measurements, Prior, Any]) -> Estimates:
+    """The estimates of a process that is started for it and receives the arguments, and the function by its name."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        try:
+            return pool.submit(_run, observer, *given).result()
+        except (PicklingError, AttributeError, TypeError) as error:
+            raise CheckError(f"{observer.id}: cannot run in a fresh process: {error}") from error
+
+
+def _run(observer: Observer, *given: Any) -> Estimates:
+    return observer.estimate(*given)
+
+
