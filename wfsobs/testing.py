@@ -83,7 +83,8 @@ def _check_shapes(observer: Observer, base: Estimates, measured: Measurements) -
 
 def _check_untouched(observer: Observer, measured: Measurements, fresh: Measurements) -> None:
     for name in ("y_lgs", "u", "y_ngs", "open_loop_y"):
-        if not np.array_equal(getattr(measured, name), getattr(fresh, name), equal_nan=True):
+        was = getattr(fresh, name)
+        if was is not None and not np.array_equal(getattr(measured, name), was, equal_nan=True):
             raise CheckError(f"{observer.id}: changes its measurements ({name})")
 
 
