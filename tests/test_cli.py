@@ -99,6 +99,7 @@ def test_the_record_overrides_the_scenario(tmp_path):
     (["run", "--seeds", "2", "--save", "x.npz"], "--save: saves one record"),
     (["run", *QUICK, "--save", "no/such/folder/x.npz"], "no/such/folder"),
     (["observe", "none.npz"], "none.npz: cannot be read"),
+    (["observe", "none.npz", "--prior", "none.toml"], "none.toml: cannot be read"),
     (["presets", "nope"], "preset = 'nope'"),
 ])
 def test_errors_are_one_line_and_status_2(arguments, message, tmp_path, monkeypatch):
@@ -149,3 +150,19 @@ def test_the_core_needs_numpy_scipy_and_param_alone():
 def test_loop_takes_seeds_or_a_record():
     result = call("loop", "--record", "r.npz", "--seeds", "2")
     assert result.exit_code == 2 and result.stderr == "wfsobs: --seeds: is for simulated records, leave it out with --record\n"
+
+
+def test_the_file_of_an_identification_is_all_that_telemetry_needs(tmp_path):
+    """As a prior it gives what it gives as settings; who is told nothing is as without it."""
+    record, found = str(tmp_path / "night.npz"), str(tmp_path / "found.toml")
+    light = [*QUICK, "--set", "run.duration=6", "--set", "run.warm_up=1"]
+    call("run", *light, "--save", record)
+    call("identify", record, *light, "--out", found)
+
+    def errors(*told):
+        return {(r["observer"], r["target"], r["mode"]): r["rms_um"] for r in json.loads(call("observe", record, *told, "--json").stdout)}
+
+    as_prior, without = errors("--prior", found, *light), errors(*light)
+    assert as_prior == errors("--config", found, *light) and as_prior.keys() == without.keys()
+    moved = {key[0] for key, value in as_prior.items() if value != without[key]}
+    assert moved == {"kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal"}

@@ -16,6 +16,7 @@ from wfsobs.identification import report as identified
 from wfsobs.identification.identification import LEVEL
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
+from wfsobs.priors_from.identification import told_by
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
 from wfsobs.spectral.search import LOWEST
@@ -27,15 +28,20 @@ from wfsobs.telemetry.records import save_arrays
 @click.argument("record_file", metavar="RECORD")
 @scenario_options
 @record_options
+@click.option("--prior", metavar="FOUND.toml", help="What observers are told: the file of `wfsobs identify --out`.")
 @click.option("--out", metavar="ESTIMATES.npz", help="Save every estimate under the key observer/target.")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def observe(
     record_file: str, preset: str | None, config: str | None, assignments: tuple[str, ...], unit: str | None,
-    command_sign: str | None, command_delay: int | None, rate: float | None, sha256: str | None, out: str | None,
-    as_json: bool,
+    command_sign: str | None, command_delay: int | None, rate: float | None, sha256: str | None, prior: str | None,
+    out: str | None, as_json: bool,
 ) -> None:
     """Run the observers on a record: .npz, .csv, .fits or AOT (preset paper unless told)."""
     scenario = configfile.scenario_from(preset, config, assignments)
+    if prior is not None:
+        scenario = told_by(configfile.load(prior), scenario)
+        for path, value in map(configfile.parse_assignment, assignments):
+            scenario.set(path, value)
     stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
     record = loaded(record_file, scenario, stated, sha256)
     with progress_bar() as update:
