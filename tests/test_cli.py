@@ -160,7 +160,8 @@ def test_the_file_of_an_identification_is_all_that_telemetry_needs(tmp_path):
     call("identify", record, *light, "--out", found)
 
     def errors(*told):
-        return {(r["observer"], r["target"], r["mode"]): r["rms_um"] for r in json.loads(call("observe", record, *told, "--json").stdout)}
+        said = json.loads(call("observe", record, *told, "--json").stdout)
+        return {(r["observer"], r["target"], r["mode"]): r["rms_um"] for r in said}
 
     as_prior, without = errors("--prior", found, *light), errors(*light)
     assert as_prior == errors("--config", found, *light) and as_prior.keys() == without.keys()
