@@ -108,7 +108,7 @@ def test_same_seed_same_record_other_seed_other_record() -> None:
     for name in ("y_lgs", "y_ngs", "u", "turbulence", "vibration", "open_loop_y"):
         assert np.array_equal(getattr(one, name), getattr(same, name), equal_nan=True)
         assert not np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True)
-    by_hand = simulate(scenario(), np.random.default_rng(1))
+    by_hand = simulate(scenario(), rng=np.random.default_rng(1))
     assert np.array_equal(by_hand.y_lgs, one.y_lgs)
 
 

@@ -140,4 +140,4 @@ def test_a_report_is_written(tmp_path: Path) -> None:
     done: list[wfsobs.Result] = []
     wfsobs.export(tmp_path / "report.html", wfsobs.PRESETS["paper"]().replace(QUICK), done=done.append)
     assert len(done) == 1
-    assert (tmp_path / "report.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert (tmp_path / "report.html").read_text(encoding="utf-8").startswith("<!doctype html>")

@@ -72,8 +72,10 @@ def written(n: Number) -> str:
     """A number to two digits of its standard deviation, to three of its own where it has none; the damping of a pure line, which
     is not estimated, as 0.
 
-    >>> written(Number(47.43812, 0.0264)), written(Number(502.3, 25.1)), written(Number(0.0, 0.0)), written(Number(0.1412, nan))
-    ('47.438 +- 0.026', '502 +- 25', '0', '0.141 +- -')
+    >>> written(Number(47.43812, 0.0264)), written(Number(502.3, 25.1)), written(Number(0.0, 0.0))
+    ('47.438 +- 0.026', '502 +- 25', '0')
+    >>> written(Number(0.1412, float("nan")))
+    '0.141 +- -'
     """
     if n == (0.0, 0.0):
         return "0"
