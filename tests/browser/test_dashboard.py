@@ -117,7 +117,7 @@ def test_a_bad_value_shows_inline_and_leaves_the_result(open_page: Any) -> None:
 def test_choosing_a_preset(open_page: Any) -> None:
     page = open_page()
     page.get_by_role("combobox", name="Preset").click()
-    page.get_by_role("menuitem", name="UT4", exact=True).click()
+    page.get_by_role("option", name="UT4", exact=True).click()
     expect(page.get_by_role("combobox", name="Source").first).to_have_text("measured")
     expect(page.get_by_role("combobox", name="Preset")).to_have_text("UT4")
     expect(page.locator('tr[data-observer="kf-lgs"][data-target="vibration"] td').first).not_to_have_text("–")

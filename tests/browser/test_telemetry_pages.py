@@ -45,7 +45,7 @@ def test_tune_stop_and_use_it(open_page: Any, server: Any) -> None:
     expect(page.get_by_text("Stopped")).to_be_visible()
     expect(page.get_by_role("button", name="Use it")).to_be_disabled()
     page.get_by_role("combobox", name="Observer").click()
-    page.get_by_role("menuitem", name="LGS KF", exact=True).click()
+    page.get_by_role("option", name="LGS KF", exact=True).click()
     evaluations.fill("12")
     evaluations.press("Enter")
     start.click()
