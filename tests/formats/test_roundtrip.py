@@ -48,8 +48,9 @@ def records(draw) -> Record:
     rows = draw(st.integers(1, 12))
     training = maybe(lambda: Training(signal(FINITE, rows), signal(FINITE, rows), maybe(lambda: signal(FINITE, rows))))
     return Record(
-        y, signal(), draw(st.floats(1e-5, 1.0)), y_ngs, None if y_ngs is None else ratio, maybe(signal), maybe(signal),
-        maybe(signal), training, draw(st.integers(1, 7)), draw(st.sampled_from(["", "unit nm, command sign -1"])))
+        y, signal(), draw(st.floats(1e-5, 1.0)), y_ngs, None if y_ngs is None else ratio, turbulence=maybe(signal),
+        vibration=maybe(signal), open_loop_y=maybe(signal), training=training, delay=draw(st.integers(1, 7)),
+        origin=draw(st.sampled_from(["", "unit nm, command sign -1"])))
 
 
 def same(a: Record, b: Record, leave: tuple[str, ...] = ()) -> None:

@@ -100,7 +100,7 @@ class Dashboard:
             # Tied to what all sessions do, each change walks all models of the page, and the page outlives its session.
             page.busy = Idle().param.busy
         page.param.watch(self._themed, "dark_theme")
-        self.frame.param.watch(lambda event: self._post(partial(page.param.update, dark_theme=event.new)), "wants_dark")
+        self.frame.param.watch(lambda event: self._post(partial(setattr, page, "dark_theme", event.new)), "wants_dark")
         return page
 
     def start(self) -> None:
