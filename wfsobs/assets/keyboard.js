@@ -12,6 +12,7 @@ export function render({model, el}) {
   // What moves the focus within one shadow root is not heard of out here: so every key is followed.
   let last = null
   on("pointerdown", tips.hide)
+  on("keyup", () => name(focused()))  // at once: the focus has moved by then
   on("keydown", (event) => setTimeout(() => {
     const at = focused()
     name(at)
