@@ -56,6 +56,7 @@ setup: $(TEST)  ## install all that the tests need, the browser included
 
 check: $(TEST)  ## ruff, pyright, and the walls between the rooms
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-logo --no-cache
 

@@ -29,10 +29,19 @@ QUERIES = {
     "a session of one's own choosing": "?bokeh-session-id=mine&bokeh-token=mine&turbulence.wind_speed=x",
 }
 PATHS = (
-    "/../../../etc/passwd", "/%2e%2e/%2e%2e/%2e%2e/etc/passwd", "/static/../../../../../../etc/passwd",
-    "/static/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd", "/static/extensions/panel/..%2f..%2f..%2f..%2fetc%2fpasswd",
-    "/component-resources/os/x/..%2f..%2fetc%2fpasswd", "/wfsobs/../pyproject.toml", "/app", "/admin", "/autoload.js",
-    "/metadata", "/ws", "/x" * 5000,
+    "/../../../etc/passwd",
+    "/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
+    "/static/../../../../../../etc/passwd",
+    "/static/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
+    "/static/extensions/panel/..%2f..%2f..%2f..%2fetc%2fpasswd",
+    "/component-resources/os/x/..%2f..%2fetc%2fpasswd",
+    "/wfsobs/../pyproject.toml",
+    "/app",
+    "/admin",
+    "/autoload.js",
+    "/metadata",
+    "/ws",
+    "/x" * 5000,
 )
 BOMB = gzip.compress(b"a = 1\n" * 10_000_000)
 UPLOADS: dict[str, tuple[object, object]] = {
@@ -52,16 +61,22 @@ UPLOADS: dict[str, tuple[object, object]] = {
 FRAMES: dict[str, list[str | bytes]] = {
     "no JSON": ["hello", "{", "{}"],
     "bytes that are none": [
-        '{"msgid": "1", "msgtype": "PATCH-DOC"}', "{}",
-        '{"events": [{"kind": "ModelChanged", "model": {"id": "p1001"}, "attr": "x", "new": {"type": "bytes"}}]}'],
+        '{"msgid": "1", "msgtype": "PATCH-DOC"}',
+        "{}",
+        '{"events": [{"kind": "ModelChanged", "model": {"id": "p1001"}, "attr": "x", "new": {"type": "bytes"}}]}',
+    ],
     "bytes where text belongs": [b"\x00\xff" * 100],
     "a message of no kind": ['{"msgid": "1", "msgtype": "NO-SUCH-KIND"}', "{}", "{}"],
     "a patch of a model that is not there": [
-        '{"msgid": "1", "msgtype": "PATCH-DOC"}', "{}",
-        '{"events": [{"kind": "ModelChanged", "model": {"id": "p999999"}, "attr": "value", "new": 1}]}'],
+        '{"msgid": "1", "msgtype": "PATCH-DOC"}',
+        "{}",
+        '{"events": [{"kind": "ModelChanged", "model": {"id": "p999999"}, "attr": "value", "new": 1}]}',
+    ],
     "a model that is no model": [
-        '{"msgid": "1", "msgtype": "PATCH-DOC"}', "{}",
-        '{"events": [{"kind": "RootAdded", "model": {"type": "object", "name": "os.system", "id": "x"}}]}'],
+        '{"msgid": "1", "msgtype": "PATCH-DOC"}',
+        "{}",
+        '{"events": [{"kind": "RootAdded", "model": {"type": "object", "name": "os.system", "id": "x"}}]}',
+    ],
     "JSON nested deeply": ['{"msgid": "1", "msgtype": "PATCH-DOC"}', "{}", "[" * 50_000],
     "more than a message may have": ["x" * 8_000_000],
 }
@@ -112,7 +127,8 @@ async def _paths(base: str, add: Add) -> None:
     for what, request in {
         "headers of 200 kB": f"GET / HTTP/1.1\r\nHost: {base}\r\nX: {'x' * 200_000}\r\n\r\n",
         "30,000 fields": f"GET /?{'a&' * 30_000} HTTP/1.1\r\nHost: {base}\r\nConnection: close\r\n\r\n",
-        "no HTTP": "hello\r\n\r\n", "a body on the page": f"POST / HTTP/1.1\r\nHost: {base}\r\nContent-Length: 5\r\n\r\nhello",
+        "no HTTP": "hello\r\n\r\n",
+        "a body on the page": f"POST / HTTP/1.1\r\nHost: {base}\r\nContent-Length: 5\r\n\r\nhello",
         "a body without end": f"POST / HTTP/1.1\r\nHost: {base}\r\nContent-Length: 99999999999\r\n\r\n",
     }.items():
         answer = await asyncio.to_thread(_plain, host, int(port), request)
@@ -202,5 +218,9 @@ async def crowd(base: str, most: int, add: Add) -> None:
     """More pages than may be open: turned away with 503."""
     codes = [code for code, _ in await asyncio.gather(*(_get(f"http://{base}/?run.seed={i}") for i in range(2 * most)))]
     health = json.loads((await _get(f"http://{base}/liveness"))[1])
-    add(f"{2 * most} pages at once, {most} allowed", f"{codes.count(200)} served, {codes.count(503)} turned away",
-        f"{most} served, {most} turned away", codes.count(200) == codes.count(503) == most == health["sessions"])
+    add(
+        f"{2 * most} pages at once, {most} allowed",
+        f"{codes.count(200)} served, {codes.count(503)} turned away",
+        f"{most} served, {most} turned away",
+        codes.count(200) == codes.count(503) == most == health["sessions"],
+    )

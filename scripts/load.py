@@ -38,8 +38,12 @@ from wfsobs.scenario import Scenario
 ROOT = Path(__file__).parents[1]
 LIFETIME = 3.0
 SHORT = {
-    "run.duration": 2.0, "run.warm_up": 0.5, "gpr_offline.training_size": 60, "gpr_offline.depth": 30,
-    "gpr_online.training_size": 60, "gpr_online.depth": 30,
+    "run.duration": 2.0,
+    "run.warm_up": 0.5,
+    "gpr_offline.training_size": 60,
+    "gpr_offline.depth": 30,
+    "gpr_online.training_size": 60,
+    "gpr_online.depth": 30,
 }
 LONG = {"run.duration": 110.0, "gpr_online.training_size": 1024, "gpr_offline.training_size": 1024}
 SETTINGS = 60
@@ -64,7 +68,8 @@ class Server:
         environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}", "OPENBLAS_NUM_THREADS": "1"}
         with self.log.open("w") as out:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "wfsobs", "serve", *flags], cwd=folder, env=environment, stdout=out, stderr=out)
+                [sys.executable, "-m", "wfsobs", "serve", *flags], cwd=folder, env=environment, stdout=out, stderr=out
+            )
 
     async def health(self) -> dict[str, Any]:
         """What /liveness says."""
@@ -139,7 +144,9 @@ def expected(settings: dict[str, Any]) -> dict[tuple[str, str], tuple[str, str]]
     mode = scenario.modes[0].name
     return {
         (s.observer, s.target): (number(s.rms * scale), number(s.truth_rms * scale))
-        for s in wfsobs.run(scenario).scores if s.mode == mode}
+        for s in wfsobs.run(scenario).scores
+        if s.mode == mode
+    }
 
 
 Seen = tuple[dict[str, Any], dict[tuple[str, str], tuple[str, ...]]]
@@ -162,8 +169,10 @@ async def session(base: str, changes: int, rng: random.Random, door: asyncio.Loc
         try:
             await visitor.until(lambda before=before: visitor.numbers != before and visitor.status.startswith("Done"))
         except TimeoutError:
-            raise TimeoutError(f"{speed:g} m/s asked for, the page says {visitor.status!r}, settings {visitor.query!r}, "
-                               f"table {'as before' if visitor.numbers == before else 'new'}") from None
+            raise TimeoutError(
+                f"{speed:g} m/s asked for, the page says {visitor.status!r}, settings {visitor.query!r}, "
+                f"table {'as before' if visitor.numbers == before else 'new'}"
+            ) from None
         await visitor.ask("SERVER-INFO-REQ", {})
         seconds.append(time.monotonic() - start)
         seen.append(({**SHORT, "turbulence.wind_speed": speed}, visitor.table()))
@@ -182,10 +191,13 @@ async def batch(server: Server, report: Report, name: str, sessions: int, change
     await server.until(lambda health: health["sessions"] == 0)
     await asyncio.sleep(LIFETIME)
     memory, processor = server.used()
-    report.add(f"{name}: {sessions} sessions, {changes} changes each",
-               f"{took:.0f} s ({processor - before} s of processor); a change {statistics.median(seconds):.2f} s, "
-               f"worst {max(seconds):.2f} s; then {memory:.0f} MB",
-               "no error", True)
+    report.add(
+        f"{name}: {sessions} sessions, {changes} changes each",
+        f"{took:.0f} s ({processor - before} s of processor); a change {statistics.median(seconds):.2f} s, "
+        f"worst {max(seconds):.2f} s; then {memory:.0f} MB",
+        "no error",
+        True,
+    )
     return [one for own, _ in done for one in own], memory
 
 
@@ -198,8 +210,12 @@ def check_results(report: Report, seen: list[Seen]) -> None:
         if key not in wanted:
             wanted[key] = expected(settings)
         wrong += {k: v for k, v in table.items() if v[0] not in ("", "–")} != wanted[key]
-    report.add("Tables against a direct computation", f"{len(seen)} tables of {len(wanted)} settings, {wrong} wrong",
-               "0 wrong", wrong == 0 and len(seen) > 0)
+    report.add(
+        "Tables against a direct computation",
+        f"{len(seen)} tables of {len(wanted)} settings, {wrong} wrong",
+        "0 wrong",
+        wrong == 0 and len(seen) > 0,
+    )
 
 
 async def long_runs(server: Server, count: int) -> list[Visitor]:
@@ -218,7 +234,8 @@ async def clicks(server: Server, report: Report, busy: int) -> None:
     await visitor.until(lambda: visitor.status.startswith("Done"))
     switches = [
         (visitor.find("RadioButtonGroup", value="Signal"), ("Error", "Signal")),
-        (visitor.find("RadioButtonGroup", value="Tip"), ("Tilt", "Tip"))]
+        (visitor.find("RadioButtonGroup", value="Tip"), ("Tilt", "Tip")),
+    ]
     drawings, seconds, quiet = [], [], []
     for which, values in switches:  # how much there is to draw, and how long it takes while nothing else goes on
         for value in values:
@@ -240,10 +257,13 @@ async def clicks(server: Server, report: Report, busy: int) -> None:
         one.close()
     first, whole = (sorted(column) for column in zip(*seconds, strict=True))
     p95 = whole[int(0.95 * len(whole))]
-    report.add(f"A visitor's {CLICKS} clicks beside {busy} long run(s), {still} still going after",
-               f"first figure after {statistics.median(first):.3f} s, all {statistics.median(whole):.3f} s, 95 % within "
-               f"{p95:.3f} s, worst {whole[-1]:.3f} s; {idle:.3f} s with nothing else going on",
-               f"95 % within {ANSWER} s", p95 <= ANSWER and still == busy)
+    report.add(
+        f"A visitor's {CLICKS} clicks beside {busy} long run(s), {still} still going after",
+        f"first figure after {statistics.median(first):.3f} s, all {statistics.median(whole):.3f} s, 95 % within "
+        f"{p95:.3f} s, worst {whole[-1]:.3f} s; {idle:.3f} s with nothing else going on",
+        f"95 % within {ANSWER} s",
+        p95 <= ANSWER and still == busy,
+    )
     await server.until(lambda health: health["sessions"] == health["running"] == 0)
 
 
@@ -256,8 +276,12 @@ async def dropped(server: Server, report: Report) -> None:
     start = time.monotonic()
     await server.until(lambda health: health["sessions"] == health["running"] == health["waiting"] == 0)
     seconds = time.monotonic() - start
-    report.add("5 sessions dropped mid-run", f"{len(places)} of them in the line; all gone after {seconds:.1f} s",
-               f"within {4 * LIFETIME:.0f} s", seconds < 4 * LIFETIME)
+    report.add(
+        "5 sessions dropped mid-run",
+        f"{len(places)} of them in the line; all gone after {seconds:.1f} s",
+        f"within {4 * LIFETIME:.0f} s",
+        seconds < 4 * LIFETIME,
+    )
 
 
 async def crowded(report: Report) -> None:
@@ -277,8 +301,12 @@ async def stopped(server: Server, report: Report) -> None:
     seconds, status = await server.stop()
     for visitor in visitors:
         visitor.close()
-    report.add("SIGTERM in the middle of 3 runs", f"ended after {seconds:.1f} s, status {status}", f"within {STOP} s, 0",
-               seconds <= STOP and status == 0)
+    report.add(
+        "SIGTERM in the middle of 3 runs",
+        f"ended after {seconds:.1f} s, status {status}",
+        f"within {STOP} s, 0",
+        seconds <= STOP and status == 0,
+    )
 
 
 async def everything(server: Server, report: Report, sessions: int, changes: int) -> None:
@@ -287,8 +315,12 @@ async def everything(server: Server, report: Report, sessions: int, changes: int
     await batch(server, report, "Warming up", 2, 2, 0)
     seen, first = await batch(server, report, "First batch", sessions, changes, 1000)
     more, second = await batch(server, report, "Second batch", sessions, changes, 2000)
-    report.add("Memory after the second batch over the first", f"{second:.0f} / {first:.0f} MB: {second / first - 1:+.0%}",
-               f"at most {GROWTH:+.0%}", second <= (1 + GROWTH) * first)
+    report.add(
+        "Memory after the second batch over the first",
+        f"{second:.0f} / {first:.0f} MB: {second / first - 1:+.0%}",
+        f"at most {GROWTH:+.0%}",
+        second <= (1 + GROWTH) * first,
+    )
     await asyncio.to_thread(check_results, report, seen + more)
     runs = os.cpu_count() or 1
     for busy in sorted({1, runs}):

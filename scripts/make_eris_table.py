@@ -66,8 +66,7 @@ def table(content: bytes) -> str:
         raise ValueError(f"{INSIDE}: its frequencies are not {FIRST} + {STEP} i")
     floor = FLOOR / frequency**2
     off = (np.abs(tip / floor - 1.0) > ON_FLOOR) | (np.abs(tilt / floor - 1.0) > ON_FLOOR)
-    head = HEAD.format(inside=INSIDE, wheel=WHEEL, first=FIRST, step=STEP, bins=frequency.size, floor=FLOOR,
-                       lines=LINES_FROM)
+    head = HEAD.format(inside=INSIDE, wheel=WHEEL, first=FIRST, step=STEP, bins=frequency.size, floor=FLOOR, lines=LINES_FROM)
     rows = zip(grid[off], tip[off], tilt[off], strict=True)
     return head + "".join(f"{f:.3f},{a:.6g},{b:.6g}\n" for f, a, b in rows)
 

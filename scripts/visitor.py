@@ -45,14 +45,28 @@ class Visitor:
         await self.connect(token.group(1))
         reply = await self.ask("PULL-DOC-REQ", {})
         assert reply in self.answered
-        await self.send("PATCH-DOC", {"events": [{"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": {
-            "type": "event", "name": "document_ready", "values": {"type": "map", "entries": []}}}]})
+        await self.send(
+            "PATCH-DOC",
+            {
+                "events": [
+                    {
+                        "kind": "MessageSent",
+                        "msg_type": "bokeh_event",
+                        "msg_data": {"type": "event", "name": "document_ready", "values": {"type": "map", "entries": []}},
+                    }
+                ]
+            },
+        )
         return self
 
     async def connect(self, token: str, origin: str = "") -> None:
         """Open the websocket."""
-        request = HTTPRequest(f"ws://{self.base}/ws", headers={"Origin": origin or f"http://{self.base}"},
-                              connect_timeout=WAIT, request_timeout=WAIT)
+        request = HTTPRequest(
+            f"ws://{self.base}/ws",
+            headers={"Origin": origin or f"http://{self.base}"},
+            connect_timeout=WAIT,
+            request_timeout=WAIT,
+        )
         self._socket = await websocket_connect(request, subprotocols=["bokeh", token], max_message_size=10**8)
         self._listening = asyncio.create_task(self._listen(self._socket))
         await self.until(lambda: "ACK" in self.answered)
@@ -89,10 +103,22 @@ class Visitor:
 
     async def message(self, model: str, data: Any) -> None:
         """Send what a component of the page sends."""
-        await self.send("PATCH-DOC", {"events": [{
-            "kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": {
-                "type": "event", "name": "data_event", "values": {"type": "map", "entries": [
-                    ["model", {"id": model}], ["data", data]]}}}]})
+        await self.send(
+            "PATCH-DOC",
+            {
+                "events": [
+                    {
+                        "kind": "MessageSent",
+                        "msg_type": "bokeh_event",
+                        "msg_data": {
+                            "type": "event",
+                            "name": "data_event",
+                            "values": {"type": "map", "entries": [["model", {"id": model}], ["data", data]]},
+                        },
+                    }
+                ]
+            },
+        )
 
     async def until(self, condition: Callable[[], bool], timeout: float = WAIT) -> None:
         """Wait for what the server says. Raises TimeoutError, ConnectionError."""
@@ -142,7 +168,8 @@ class Visitor:
         """(observer, target) -> error and truth [nm] as the table has them."""
         return {
             (observer, target): tuple(_number(cell) for cell in re.findall(r"<td>(.*?)</td>", cells)[:2])
-            for observer, target, cells in ROW.findall(self.numbers)}
+            for observer, target, cells in ROW.findall(self.numbers)
+        }
 
     # ------------------------------------------------------------------ what the server says
 

@@ -17,6 +17,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if HERE in item.path.parents:
             file = item.path.relative_to(HERE).as_posix()
-            if file.startswith(tuple(s for s in SLOW if s.endswith("/"))) or file in SLOW or (
-                    f"{file}::{getattr(item, 'originalname', item.name)}" in SLOW):
+            if (
+                file.startswith(tuple(s for s in SLOW if s.endswith("/")))
+                or file in SLOW
+                or (f"{file}::{getattr(item, 'originalname', item.name)}" in SLOW)
+            ):
                 item.add_marker(pytest.mark.slow)

@@ -114,7 +114,14 @@ def test_psd_integrates_to_the_variance(p: Ar2) -> None:
 
 
 SAMPLED = [  # omega dt, damping: the paper's two, slow and fast extremes, critical damping, nearly a line
-    (7.0686e-3, 0.9), (0.29843, 0.03), (1e-6, 0.9), (1e-5, 1e-6), (3.0, 0.5), (1.0, 1.0), (0.05, 1.0), (0.3, 1e-6),
+    (7.0686e-3, 0.9),
+    (0.29843, 0.03),
+    (1e-6, 0.9),
+    (1e-5, 1e-6),
+    (3.0, 0.5),
+    (1.0, 1.0),
+    (0.05, 1.0),
+    (0.3, 1e-6),
     (2.9, 1e-6),
 ]
 

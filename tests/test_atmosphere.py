@@ -20,9 +20,12 @@ from wfsobs.simulation.turbulence import turbulence_process, turbulence_rms
 
 FLOW: dict[str, Any] = {"turbulence.source": "frozen-flow", "sensors.kind": "zernike"}
 QUIET_SENSORS: dict[str, Any] = {"sensors.lgs_noise": 0.0, "sensors.ngs_noise": 0.0, "vibration.source": "none"}
-TWO_LAYERS: dict[str, Any] = {"turbulence.layers": [
-    {"height": 500.0, "fraction": 3.0, "wind_factor": 0.5, "wind_direction": 90.0},
-    {"height": 10_000.0, "fraction": 1.0, "wind_factor": 2.0}]}
+TWO_LAYERS: dict[str, Any] = {
+    "turbulence.layers": [
+        {"height": 500.0, "fraction": 3.0, "wind_factor": 0.5, "wind_direction": 90.0},
+        {"height": 10_000.0, "fraction": 1.0, "wind_factor": 2.0},
+    ]
+}
 
 
 def scenario(changes: dict[str, Any] | None = None) -> Scenario:
@@ -181,8 +184,14 @@ def test_higher_modes_leave_tip_and_tilt_alone(source: str) -> None:
 
 
 CHANGES: dict[str, Any] = {
-    "sensors.lgs_count": 5, "sensors.lgs_radius": 30.0, "sensors.ngs_direction": [10.0, 0.0], "sensors.lgs_noise": 0.3,
-    "vibration.source": "peaks", "loop.gain": 0.1, "sensors.lgs_altitude": 85_000.0, "turbulence.rms": 2.0,
+    "sensors.lgs_count": 5,
+    "sensors.lgs_radius": 30.0,
+    "sensors.ngs_direction": [10.0, 0.0],
+    "sensors.lgs_noise": 0.3,
+    "vibration.source": "peaks",
+    "loop.gain": 0.1,
+    "sensors.lgs_altitude": 85_000.0,
+    "turbulence.rms": 2.0,
 }
 
 

@@ -19,15 +19,38 @@ from wfsobs.observers.gpr.online import predict_sliding
 
 TINY = Sizes(
     settings={
-        "run.warm_up": 0.1, "gpr_online.training_size": 30, "gpr_online.depth": 12, "gpr_offline.training_size": 60,
-        "gpr_offline.depth": 20, "adaptive.window": 0.2,
+        "run.warm_up": 0.1,
+        "gpr_online.training_size": 30,
+        "gpr_online.depth": 12,
+        "gpr_offline.training_size": 60,
+        "gpr_offline.depth": 20,
+        "adaptive.window": 0.2,
     },
-    duration=0.4, filter_duration=1.0, repeats=1, textbook_steps=6, library_steps=2, exact_steps=3,
-    more_online=((40, 5),), more_steps=50, order=1, layers=2, longest_duration=0.3)
+    duration=0.4,
+    filter_duration=1.0,
+    repeats=1,
+    textbook_steps=6,
+    library_steps=2,
+    exact_steps=3,
+    more_online=((40, 5),),
+    more_steps=50,
+    order=1,
+    layers=2,
+    longest_duration=0.3,
+)
 
 KEYS = {
-    "task", "size", "variant", "steps", "median_s", "per_step_us", "p999_us", "ready_us", "ratio_to_ours",
-    "max_error_over_std", "peak_memory_mb",
+    "task",
+    "size",
+    "variant",
+    "steps",
+    "median_s",
+    "per_step_us",
+    "p999_us",
+    "ready_us",
+    "ratio_to_ours",
+    "max_error_over_std",
+    "peak_memory_mb",
 }
 REQUIRED = {
     "online-gpr-record": {OURS, "ours-two-modes", "gemm-cholesky"},
@@ -62,7 +85,10 @@ def test_rows_are_complete(rows):
         assert (r["max_error_over_std"] is None) == (r["task"] in ("adaptive-record", "frozen-flow", "whole-run"))
         assert r["variant"] != OURS or r["ratio_to_ours"] == 1.0
     assert {r["size"] for r in rows if r["peak_memory_mb"] is not None} == {
-        "0.3 s, 2 modes", "0.4 s, 2 modes, 1 layer", "0.4 s, 2 modes, 2 layers"}
+        "0.3 s, 2 modes",
+        "0.4 s, 2 modes, 1 layer",
+        "0.4 s, 2 modes, 2 layers",
+    }
     assert {r["size"] for r in rows if r["task"] == "online-gpr-record"} == {"m=30 d=12", "m=40 d=5"}
 
 
@@ -125,10 +151,14 @@ def test_error_sees_a_wrong_result():
 
 
 def test_ratios_are_per_step_and_per_size():
-    measured = with_ratios([
-        row("a", "s", OURS, 2.0, 1000), row("a", "s", "slow", 1.0, 10),
-        row("a", "t", OURS, 1.0), row("a", "t", "slow", 3.0),
-    ])
+    measured = with_ratios(
+        [
+            row("a", "s", OURS, 2.0, 1000),
+            row("a", "s", "slow", 1.0, 10),
+            row("a", "t", OURS, 1.0),
+            row("a", "t", "slow", 3.0),
+        ]
+    )
     assert [r["ratio_to_ours"] for r in measured] == [1.0, 50.0, 1.0, 3.0]
 
 
@@ -141,9 +171,12 @@ def test_timed_is_a_median_of_repeats():
 def test_libraries_compute_the_same():
     found = [r for r in bench.measure_all(TINY) if r["variant"] in external.LIBRARIES]
     assert {(r["task"], r["variant"]) for r in found} == {
-        ("online-gpr-record", "scikit-learn"), ("offline-gpr-train", "scikit-learn"),
+        ("online-gpr-record", "scikit-learn"),
+        ("offline-gpr-train", "scikit-learn"),
         ("offline-gpr-predict", "scikit-learn"),
-        ("kalman-record", "filterpy"), ("kalman-record", "statsmodels"), ("multirate-record", "filterpy"),
+        ("kalman-record", "filterpy"),
+        ("kalman-record", "statsmodels"),
+        ("multirate-record", "filterpy"),
     }
     assert all(math.isfinite(r["max_error_over_std"]) and r["max_error_over_std"] < 1e-5 for r in found)
 

@@ -19,22 +19,42 @@ from wfsobs.typing import Array
 
 RATE, SEEDS = 250.0, 100
 
-BASE = Scenario().replace({
-    "sensors.lgs_rate": RATE, "sensors.exposure_ratio": 5, "run.duration": 4.0, "turbulence.source": "ar2",
-    "sensors.lgs_low_frequency_rms": 0.0, "gpr_offline.training_size": 10, "gpr_offline.depth": 10, "loop.closed": False,
-    "vibration.cutoff": 60.0})
+BASE = Scenario().replace(
+    {
+        "sensors.lgs_rate": RATE,
+        "sensors.exposure_ratio": 5,
+        "run.duration": 4.0,
+        "turbulence.source": "ar2",
+        "sensors.lgs_low_frequency_rms": 0.0,
+        "gpr_offline.training_size": 10,
+        "gpr_offline.depth": 10,
+        "loop.closed": False,
+        "vibration.cutoff": 60.0,
+    }
+)
 
 TABLE = {"frequency": [5.0, 9.9, 10.0, 10.1, 30.0, 40.0, 50.0], "tip": [0.0, 0.0, 4e-3, 0.0, 0.0, 2e-5, 0.0], "tilt": [0.0] * 7}
 
 CASES: dict[str, dict[str, Any]] = {
-    "peaks": {"vibration.peaks": [{"frequency": 17.0, "damping": 0.02, "rms": [0.05]}, {"frequency": 31.0, "damping": 0.001,
-                                                                                      "rms": [0.02]}]},
-    "pure lines": {"vibration.peaks": [{"frequency": 21.3, "damping": 0.0, "rms": [0.05]},
-                                       {"frequency": 47.5, "damping": 0.0, "rms": [0.03]}]},
+    "peaks": {
+        "vibration.peaks": [
+            {"frequency": 17.0, "damping": 0.02, "rms": [0.05]},
+            {"frequency": 31.0, "damping": 0.001, "rms": [0.02]},
+        ]
+    },
+    "pure lines": {
+        "vibration.peaks": [
+            {"frequency": 21.3, "damping": 0.0, "rms": [0.05]},
+            {"frequency": 47.5, "damping": 0.0, "rms": [0.03]},
+        ]
+    },
     "psd": {"vibration.source": "psd", "vibration.psd": TABLE},
     "ar2": {"vibration.source": "ar2", "vibration.peaks": [{"frequency": 17.0, "damping": 0.0, "rms": [0.05]}]},
-    "turbulence of a table": {"turbulence.source": "psd", "turbulence.psd": {
-        "frequency": [0.0, 2.0, 30.0], "tip": [0.05, 0.05, 0.0], "tilt": [0.0] * 3}, "vibration.source": "none"},
+    "turbulence of a table": {
+        "turbulence.source": "psd",
+        "turbulence.psd": {"frequency": [0.0, 2.0, 30.0], "tip": [0.05, 0.05, 0.0], "tilt": [0.0] * 3},
+        "vibration.source": "none",
+    },
 }
 
 

@@ -14,10 +14,31 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import configfile
 from wfsobs.scenario.presets import paper
 
-QUICK = ["--set", "run.duration=2", "--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=50",
-         "--set", "adaptive.window=0.5"]
-KEYS = {"observer", "target", "mode", "rms_um", "truth_rms_um", "normalised_rms", "lag_s",
-        "start_s", "stop_s", "apart", "needs", "interval_um", "seed"}
+QUICK = [
+    "--set",
+    "run.duration=2",
+    "--set",
+    "gpr_online.training_size=20",
+    "--set",
+    "gpr_offline.training_size=50",
+    "--set",
+    "adaptive.window=0.5",
+]
+KEYS = {
+    "observer",
+    "target",
+    "mode",
+    "rms_um",
+    "truth_rms_um",
+    "normalised_rms",
+    "lag_s",
+    "start_s",
+    "stop_s",
+    "apart",
+    "needs",
+    "interval_um",
+    "seed",
+}
 SHORT = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50, "adaptive.window": 0.5}
 
 
@@ -72,7 +93,12 @@ def test_observers_that_lack_something_are_left_out_with_a_line(tmp_path):
     assert "gpr-offline left out: the record has no training" in result.stderr
     scored = json.loads(call("observe", str(tmp_path / "bare.npz"), *QUICK, "--json").stdout)
     assert {(r["observer"], r["target"]) for r in scored} == {
-        ("kf-lgs", "next z"), ("kf-multi", "next z"), ("kf-adaptive", "next z"), ("zero", "next z"), ("loop", "residual y")}
+        ("kf-lgs", "next z"),
+        ("kf-multi", "next z"),
+        ("kf-adaptive", "next z"),
+        ("zero", "next z"),
+        ("loop", "residual y"),
+    }
     assert "Recorded loop" in result.stdout and "error / z" in result.stdout
     with np.load(tmp_path / "e.npz") as file:
         assert "gpr-online/vibration" in file.files
@@ -89,19 +115,22 @@ def test_the_record_overrides_the_scenario(tmp_path):
     assert [r["rms_um"] for r in observed(second)] == [r["rms_um"] for r in observed(first)]
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["run", "--set", "turbulence.wind_speed=200"], "turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s"),
-    (["run", "--set", "turbulence.wind=2"], "turbulence.wind: no such setting"),
-    (["run", "--set", "wind"], "--set wind: takes name=value"),
-    (["run", "--preset", "nope"], "preset = 'nope': takes one of paper, "),
-    (["run", "--config", "none.toml"], "none.toml: cannot be read"),
-    (["run", "--set", "run.warm_up=10"], "run.warm_up = 10: must be below run.duration"),
-    (["run", "--seeds", "2", "--save", "x.npz"], "--save: saves one record"),
-    (["run", *QUICK, "--save", "no/such/folder/x.npz"], "no/such/folder"),
-    (["observe", "none.npz"], "none.npz: cannot be read"),
-    (["observe", "none.npz", "--prior", "none.toml"], "none.toml: cannot be read"),
-    (["presets", "nope"], "preset = 'nope'"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run", "--set", "turbulence.wind_speed=200"], "turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s"),
+        (["run", "--set", "turbulence.wind=2"], "turbulence.wind: no such setting"),
+        (["run", "--set", "wind"], "--set wind: takes name=value"),
+        (["run", "--preset", "nope"], "preset = 'nope': takes one of paper, "),
+        (["run", "--config", "none.toml"], "none.toml: cannot be read"),
+        (["run", "--set", "run.warm_up=10"], "run.warm_up = 10: must be below run.duration"),
+        (["run", "--seeds", "2", "--save", "x.npz"], "--save: saves one record"),
+        (["run", *QUICK, "--save", "no/such/folder/x.npz"], "no/such/folder"),
+        (["observe", "none.npz"], "none.npz: cannot be read"),
+        (["observe", "none.npz", "--prior", "none.toml"], "none.toml: cannot be read"),
+        (["presets", "nope"], "preset = 'nope'"),
+    ],
+)
 def test_errors_are_one_line_and_status_2(arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = call(*arguments)

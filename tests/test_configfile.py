@@ -27,8 +27,10 @@ def test_peaks_are_tables():
 
 @settings(deadline=None, derandomize=True, max_examples=50)
 @given(
-    frequency=st.floats(0.01, 5000), rms=st.lists(st.floats(0, 100), min_size=1, max_size=5),
-    wind=st.floats(0.1, 100), seed=st.integers(0, 2**32 - 1),
+    frequency=st.floats(0.01, 5000),
+    rms=st.lists(st.floats(0, 100), min_size=1, max_size=5),
+    wind=st.floats(0.1, 100),
+    seed=st.integers(0, 2**32 - 1),
 )
 def test_every_float_survives(frequency, rms, wind, seed):
     scenario = Scenario()
@@ -46,16 +48,19 @@ def test_a_partial_file_changes_only_what_it_names():
     assert on_top.vibration.peaks == [Peak(frequency=30.0)]
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("[turbulence]\nwind_speed = 500", r"^f.toml: turbulence.wind_speed = 500: takes a number from 0.1 to 100 m/s$"),
-    ("[turbulence]\nwind = 5", r"^f.toml: turbulence.wind: no such setting; 'wind' is not one of source, "),
-    ("[[vibration.peaks]]\nfrequency = -1", r"^f.toml: vibration.peaks.0.frequency = -1: takes a number from 0.01"),
-    ("[vibration]\npeaks = 3", r"^f.toml: vibration.peaks = 3: takes a list of tables$"),
-    ("turbulence = 3", r"^f.toml: turbulence = 3: "),
-    ("a = ", r"^f.toml: not TOML: "),
-    ('preset = "nope"', r"^f.toml: preset = 'nope': takes one of paper, "),
-    ("[run]\nseed = nan", r"^f.toml: run.seed = nan: takes a whole number"),
-])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[turbulence]\nwind_speed = 500", r"^f.toml: turbulence.wind_speed = 500: takes a number from 0.1 to 100 m/s$"),
+        ("[turbulence]\nwind = 5", r"^f.toml: turbulence.wind: no such setting; 'wind' is not one of source, "),
+        ("[[vibration.peaks]]\nfrequency = -1", r"^f.toml: vibration.peaks.0.frequency = -1: takes a number from 0.01"),
+        ("[vibration]\npeaks = 3", r"^f.toml: vibration.peaks = 3: takes a list of tables$"),
+        ("turbulence = 3", r"^f.toml: turbulence = 3: "),
+        ("a = ", r"^f.toml: not TOML: "),
+        ('preset = "nope"', r"^f.toml: preset = 'nope': takes one of paper, "),
+        ("[run]\nseed = nan", r"^f.toml: run.seed = nan: takes a whole number"),
+    ],
+)
 def test_bad_files_give_one_line(text, message):
     with pytest.raises(SettingError, match=message) as caught:
         configfile.from_toml(text, where="f.toml")
@@ -81,9 +86,17 @@ def test_what_is_nested_deep_is_refused_in_one_line(tmp_path, value):
         assert str(caught.value) == f"{where.rstrip()} tables or lists nested more than 8 deep"
 
 
-@pytest.mark.parametrize("text", [
-    f"butterworth.frequencies = [{'9' * 5000}]", f"turbulence.wind_speed.{'a.' * DEEP}a = 1", f"{'a . ' * DEEP}a = 1",
-    "[" + '"a".' * DEEP + "a]\nb = 1", f"a = {{{'1.' * DEEP}a = 1}}", f"a = {'b' * DEEP}"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"butterworth.frequencies = [{'9' * 5000}]",
+        f"turbulence.wind_speed.{'a.' * DEEP}a = 1",
+        f"{'a . ' * DEEP}a = 1",
+        "[" + '"a".' * DEEP + "a]\nb = 1",
+        f"a = {{{'1.' * DEEP}a = 1}}",
+        f"a = {'b' * DEEP}",
+    ],
+)
 def test_other_monsters_are_refused_in_one_line(text):
     with pytest.raises(SettingError, match=r"^TOML: .{10,200}$"):
         configfile.from_toml(text)
@@ -106,11 +119,19 @@ def test_unreadable_files_give_one_line(tmp_path):
         configfile.load(tmp_path / "binary.toml")
 
 
-@pytest.mark.parametrize(("text", "expected"), [
-    ("a.b=1", ("a.b", 1)), ("a=1e-3", ("a", 1e-3)), ("a = true", ("a", True)), ("a=word", ("a", "word")),
-    ('a="w=x"', ("a", "w=x")), ("a=[1, 2.5]", ("a", [1, 2.5])), ("a=[{rms=[1]}]", ("a", [{"rms": [1]}])),
-    ("a=1\nb=2", ("a", "1\nb=2")),
-])
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a.b=1", ("a.b", 1)),
+        ("a=1e-3", ("a", 1e-3)),
+        ("a = true", ("a", True)),
+        ("a=word", ("a", "word")),
+        ('a="w=x"', ("a", "w=x")),
+        ("a=[1, 2.5]", ("a", [1, 2.5])),
+        ("a=[{rms=[1]}]", ("a", [{"rms": [1]}])),
+        ("a=1\nb=2", ("a", "1\nb=2")),
+    ],
+)
 def test_typed_settings(text, expected):
     assert configfile.parse_assignment(text) == expected
 

@@ -44,11 +44,18 @@ def follows(values: Array, poles: Array) -> bool:
     return np.abs(windows @ recursion).max() < 1e-8 * np.abs(values).max() * np.abs(recursion).sum()
 
 
-@pytest.mark.parametrize(("observer", "gain", "at"), [
-    ("kf-lgs", "LGS", {"lgs": 0}), ("multirate", "LGS alone", {"lgs": 3}), ("multirate", "LGS with NGS", {"lgs": 5}),
-    ("multirate", "NGS", {"ngs": 5}), ("multirate-optimal", "LGS, step 1", {"lgs": 1}),
-    ("multirate-optimal", "LGS with NGS", {"lgs": 5}), ("multirate-optimal", "NGS", {"ngs": 5}),
-])
+@pytest.mark.parametrize(
+    ("observer", "gain", "at"),
+    [
+        ("kf-lgs", "LGS", {"lgs": 0}),
+        ("multirate", "LGS alone", {"lgs": 3}),
+        ("multirate", "LGS with NGS", {"lgs": 5}),
+        ("multirate", "NGS", {"ngs": 5}),
+        ("multirate-optimal", "LGS, step 1", {"lgs": 1}),
+        ("multirate-optimal", "LGS with NGS", {"lgs": 5}),
+        ("multirate-optimal", "NGS", {"ngs": 5}),
+    ],
+)
 def test_gains_are_first_answers(scenario: Scenario, told: Description, observer: str, gain: str, at: dict[str, int]) -> None:
     step = next(iter(at.values()))
     answer = impulse_response(observer, scenario, 20, **at)[step]
@@ -86,8 +93,9 @@ def test_gpr() -> None:
 
 
 def test_an_unstable_cycle_says_why() -> None:
-    s = PRESETS["paper"]().replace({
-        "multirate.measurement_noise": "manual", "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001})
+    s = PRESETS["paper"]().replace(
+        {"multirate.measurement_noise": "manual", "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001}
+    )
     told = describe(s, 0)
     assert "unstable" in told.filters["multirate"].reason and told.filters["multirate"].radius is None
     assert told.filters["kf-lgs"].reason == "" and told.filters["multirate-optimal"].radius is not None

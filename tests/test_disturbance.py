@@ -21,12 +21,19 @@ def made(changes: dict[str, Any] | None = None, n: int = N, seed: int = 5) -> Di
 
 def scenario(changes: dict[str, Any] | None = None) -> Scenario:
     base = Scenario()
-    base.update({"run": {"duration": N / 1000}, "vibration": {"peaks": [
-        {"frequency": 20.3, "damping": 0.01, "rms": [0.03, 0.01]},
-        {"frequency": 47.4969, "damping": 0.03, "rms": [0.02, 0.04]},
-        {"frequency": 33.3, "damping": 0.0, "rms": [0.005, 0.007]},
-        {"frequency": 61.7, "damping": 0.0, "rms": [0.011]},
-    ]}})
+    base.update(
+        {
+            "run": {"duration": N / 1000},
+            "vibration": {
+                "peaks": [
+                    {"frequency": 20.3, "damping": 0.01, "rms": [0.03, 0.01]},
+                    {"frequency": 47.4969, "damping": 0.03, "rms": [0.02, 0.04]},
+                    {"frequency": 33.3, "damping": 0.0, "rms": [0.005, 0.007]},
+                    {"frequency": 61.7, "damping": 0.0, "rms": [0.011]},
+                ]
+            },
+        }
+    )
     return base.replace(changes or {})
 
 
@@ -40,8 +47,13 @@ def powers(x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("n", [N, N - 1, 997])
 def test_damped_peaks_have_the_spectrum_of_the_scenario(n: int) -> None:
-    s = scenario({"vibration.peaks": [p.to_dict() for p in scenario().vibration.peaks[:2]], "run.duration": n / 1000,
-                  "vibration.synthesis": "random-phase"})
+    s = scenario(
+        {
+            "vibration.peaks": [p.to_dict() for p in scenario().vibration.peaks[:2]],
+            "run.duration": n / 1000,
+            "vibration.synthesis": "random-phase",
+        }
+    )
     x = make_disturbance(s, n, np.random.default_rng(1)).vibration
     f = np.fft.rfftfreq(n, 1e-3)
     df = f[1]
@@ -49,11 +61,18 @@ def test_damped_peaks_have_the_spectrum_of_the_scenario(n: int) -> None:
         # fine sums of the two densities over each bin, 400 midpoints; the peaks are 0.2 Hz wide and more
         offsets = (np.arange(400) + 0.5) / 400 - 0.5
         fine = f[1:-1, None] + df * offsets
-        wanted = sum(
-            peak.rms[mode] ** 2 * 4 * peak.damping * peak.frequency**3 / np.pi
-            / ((peak.frequency**2 - fine**2) ** 2 + (2 * peak.damping * peak.frequency * fine) ** 2)
-            for peak in s.vibration.peaks
-        ).mean(axis=1) * df
+        wanted = (
+            sum(
+                peak.rms[mode] ** 2
+                * 4
+                * peak.damping
+                * peak.frequency**3
+                / np.pi
+                / ((peak.frequency**2 - fine**2) ** 2 + (2 * peak.damping * peak.frequency * fine) ** 2)
+                for peak in s.vibration.peaks
+            ).mean(axis=1)
+            * df
+        )
         wanted[f[1:-1] > 80.0] = 0.0
         # midpoints of width df / 400 across a line of half width xi f: (df / 400 / xi f)^2 < 1e-4 of the bin
         assert np.allclose(powers(x)[1:-1, mode], wanted, rtol=2e-4, atol=1e-15)
@@ -90,8 +109,13 @@ def test_a_gaussian_record_has_the_covariance_of_its_spectrum_and_does_not_repea
     """Over records: at every lag that of the resonance, at the last one too, where an inverse DFT of the record's own length has
     all but its variance."""
     n, seeds, rms, f0, xi = 500, 400, 0.05, 30.0, 0.01
-    s = scenario({"vibration.peaks": [{"frequency": f0, "damping": xi, "rms": [rms, rms]}], "vibration.cutoff": 499.0,
-                  "run.duration": n / 1000})
+    s = scenario(
+        {
+            "vibration.peaks": [{"frequency": f0, "damping": xi, "rms": [rms, rms]}],
+            "vibration.cutoff": 499.0,
+            "run.duration": n / 1000,
+        }
+    )
     x = np.hstack([make_disturbance(s, n, np.random.default_rng(seed)).vibration for seed in range(seeds)])
     for lag in (0, 1, 17, 100, n - 1):
         # A resonance driven by white noise: exp(-a t) (cos b t + a / b sin b t), a = xi w, b = w sqrt(1 - xi^2).
@@ -101,9 +125,12 @@ def test_a_gaussian_record_has_the_covariance_of_its_spectrum_and_does_not_repea
         products = x[0] * x[lag]
         # 800 records of two modes: four standard errors of their mean.
         assert products.mean() == pytest.approx(wanted, abs=4 * products.std() / np.sqrt(products.size)), lag
-    repeated = np.hstack([
-        make_disturbance(s.replace({"vibration.synthesis": "random-phase"}), n, np.random.default_rng(seed)).vibration
-        for seed in range(20)])
+    repeated = np.hstack(
+        [
+            make_disturbance(s.replace({"vibration.synthesis": "random-phase"}), n, np.random.default_rng(seed)).vibration
+            for seed in range(20)
+        ]
+    )
     assert np.mean(repeated[0] * repeated[-1]) > 0.9 * rms**2
 
 
@@ -151,10 +178,14 @@ def test_a_psd_table_gives_its_variance(step: float, seconds: float) -> None:
     f = np.arange(1.0, 79.0, step)
     rng = np.random.default_rng(0)
     tip, tilt = 1e-6 * rng.exponential(size=(2, f.size))
-    s = scenario({
-        "vibration.source": "psd", "vibration.synthesis": "random-phase", "run.duration": seconds,
-        "vibration.psd": {"frequency": f.tolist(), "tip": tip.tolist(), "tilt": tilt.tolist()},
-    })
+    s = scenario(
+        {
+            "vibration.source": "psd",
+            "vibration.synthesis": "random-phase",
+            "run.duration": seconds,
+            "vibration.psd": {"frequency": f.tolist(), "tip": tip.tolist(), "tilt": tilt.tolist()},
+        }
+    )
     x = make_disturbance(s, s.n_steps, np.random.default_rng(3)).vibration
     for mode, density in enumerate((tip, tilt)):
         assert x[:, mode].var() == pytest.approx(np.trapezoid(density, f), rel=1e-10)
@@ -213,12 +244,24 @@ def test_modes_and_sources_are_independent() -> None:
 
 
 SAME_TURBULENCE: dict[str, Any] = {
-    "vibration.source": "none", "vibration.cutoff": 30.0, "vibration.peaks": [], "vibration.peaks.0.frequency": 21.0,
-    "sensors.lgs_noise": 0.1, "sensors.lgs_count": 4, "loop.gain": 0.1, "run.warm_up": 0.1, "gpr_offline.depth": 10,
+    "vibration.source": "none",
+    "vibration.cutoff": 30.0,
+    "vibration.peaks": [],
+    "vibration.peaks.0.frequency": 21.0,
+    "sensors.lgs_noise": 0.1,
+    "sensors.lgs_count": 4,
+    "loop.gain": 0.1,
+    "run.warm_up": 0.1,
+    "gpr_offline.depth": 10,
 }
 SAME_VIBRATION: dict[str, Any] = {
-    "turbulence.source": "none", "turbulence.rms": 1.0, "turbulence.wind_speed": 5.0, "telescope.diameter": 39.0,
-    "sensors.exposure_ratio": 2, "sensors.ngs_noise": 0.0, "loop.closed": False,
+    "turbulence.source": "none",
+    "turbulence.rms": 1.0,
+    "turbulence.wind_speed": 5.0,
+    "telescope.diameter": 39.0,
+    "sensors.exposure_ratio": 2,
+    "sensors.ngs_noise": 0.0,
+    "loop.closed": False,
 }
 
 
@@ -236,20 +279,24 @@ def test_strength_only_scales() -> None:
     assert np.allclose(made({"turbulence.rms": 1.0}).turbulence, 2.0 * made().turbulence, rtol=1e-12)
 
 
-@pytest.mark.parametrize("change", [
-    {"vibration.peaks.0.damping": 0.0},  # a damped peak before them becomes a line
-    {"vibration.peaks.2.rms": [0.0, 0.0]},  # a line before it goes silent
-    {"vibration.peaks.2.damping": 0.02},  # and becomes a resonance
-    {"vibration.peaks.4": {"frequency": 70.0, "damping": 0.0}},  # one more behind them
-    {"vibration.cutoff": 65.0},
-])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"vibration.peaks.0.damping": 0.0},  # a damped peak before them becomes a line
+        {"vibration.peaks.2.rms": [0.0, 0.0]},  # a line before it goes silent
+        {"vibration.peaks.2.damping": 0.02},  # and becomes a resonance
+        {"vibration.peaks.4": {"frequency": 70.0, "damping": 0.0}},  # one more behind them
+        {"vibration.cutoff": 65.0},
+    ],
+)
 def test_a_line_keeps_its_phase_when_other_peaks_change(change: dict[str, Any]) -> None:
     """The 61.7 Hz line of tip, found by its sine and cosine, is the same before and after."""
     t = np.arange(N) / 1000
 
     def line(changes: dict[str, Any]) -> np.ndarray:
-        silent = {f"vibration.peaks.{i}.rms": [0.0, 0.0] for i in range(3)} | ({"vibration.peaks.4.rms": [0.0]} if
-                                                                              "vibration.peaks.4" in changes else {})
+        silent = {f"vibration.peaks.{i}.rms": [0.0, 0.0] for i in range(3)} | (
+            {"vibration.peaks.4.rms": [0.0]} if "vibration.peaks.4" in changes else {}
+        )
         x = made(changes | silent).vibration[:, 0]
         basis = np.column_stack([np.cos(2 * np.pi * 61.7 * t), np.sin(2 * np.pi * 61.7 * t)])
         return np.linalg.lstsq(basis, x, rcond=None)[0]

@@ -35,8 +35,18 @@ DOCS = ROOT / "docs"
 PAGES = [README, *sorted(DOCS.glob("**/*.md"))]
 COMMANDS = [p for p in PAGES if p.parent.name != "tutorials" and p.stem != "read-your-telemetry"]
 """Pages whose commands stand alone; those of the others go with their code."""
-SHORT = ("--set", "run.duration=2", "--set", "run.warm_up=0.5", "--set", "events=[]", "--set", "gpr_online.training_size=50",
-         "--set", "gpr_offline.training_size=50")
+SHORT = (
+    "--set",
+    "run.duration=2",
+    "--set",
+    "run.warm_up=0.5",
+    "--set",
+    "events=[]",
+    "--set",
+    "gpr_online.training_size=50",
+    "--set",
+    "gpr_offline.training_size=50",
+)
 
 
 def script(name: str) -> ModuleType:
@@ -69,8 +79,9 @@ def anchors(page: Path) -> set[str]:
 
 
 def test_settings_page_is_what_the_script_gives() -> None:
-    assert script("settings_table").page() == (ROOT / "docs" / "settings.md").read_text(encoding="utf-8"), \
+    assert script("settings_table").page() == (ROOT / "docs" / "settings.md").read_text(encoding="utf-8"), (
         "run: python docs/scripts/settings_table.py"
+    )
 
 
 def test_settings_page_names_every_setting() -> None:
@@ -154,6 +165,7 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_output_on_the_page_of_the_command_line_is_real() -> None:
     """The errors and truths in the table under `wfsobs run` are those of that command."""
+
     def table(text: str) -> list[list[str]]:
         return [[cell.strip() for cell in line.strip("│").split("│")][:6] for line in text.splitlines() if line.startswith("│")]
 
@@ -267,9 +279,12 @@ def test_docstrings_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_plan_of_the_code_is_that_of_the_imports(tmp_path: Path) -> None:
     rooms = script("rooms")
     for name, code in {
-        "__init__.py": "", "units.py": "", "far.py": "from wfsobs.low import one\n", "low/__init__.py": '"""Low."""\n',
+        "__init__.py": "",
+        "units.py": "",
+        "far.py": "from wfsobs.low import one\n",
+        "low/__init__.py": '"""Low."""\n',
         "low/one.py": "from typing import TYPE_CHECKING\nimport numpy\nfrom wfsobs import units\n"
-                      "if TYPE_CHECKING:\n    from wfsobs.far import x\n",
+        "if TYPE_CHECKING:\n    from wfsobs.far import x\n",
         "top/__init__.py": "import wfsobs.far\nimport wfsobs.units\n\ndef later():\n    from wfsobs.low.one import x\n",
     }.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -286,6 +301,7 @@ def test_plan_of_the_code_is_that_of_the_imports(tmp_path: Path) -> None:
 
 def test_pins_of_the_documentation_are_those_of_the_tests() -> None:
     """They stand in two files, since the documentation is built without the dashboard; ruff's is that of the tests."""
+
     def pins(name: str) -> dict[str, str]:
         lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
         return dict(line.split("==") for line in lines if "==" in line)
@@ -307,8 +323,11 @@ def test_check_of_the_site_finds_what_is_wrong(tmp_path: Path) -> None:
     (tmp_path / "b.html").write_text(bad, "utf-8")
     (tmp_path / "s.css").write_text("@import 'https://example.org/font.css'", "utf-8")
     assert check.faults(tmp_path) == [
-        "a.html: b.html#here leads nowhere", "b.html: loads https://example.org/x.js", "b.html: none.html leads nowhere",
-        "s.css: loads https://example.org/font.css"]
+        "a.html: b.html#here leads nowhere",
+        "b.html: loads https://example.org/x.js",
+        "b.html: none.html leads nowhere",
+        "s.css: loads https://example.org/font.css",
+    ]
 
 
 def test_texts_of_the_command_line_are_what_the_program_says() -> None:
@@ -356,8 +375,10 @@ def test_reproduction_page_holds(capsys: pytest.CaptureFixture[str]) -> None:
     page = (ROOT / "docs" / "reproduction.md").read_text(encoding="utf-8")
     tables = re.split(r"^#+ .*$|^The paper shows tip only", page, flags=re.M)
     places = {
-        ("vibration", "tip"): r"Tip \| paper", ("vibration", "tilt"): r"Tilt \| here",
-        ("turbulence", "tip"): r"\| Tip \| Tip, matched", ("turbulence", "tilt"): r"\| Tip \| Tip, matched",
+        ("vibration", "tip"): r"Tip \| paper",
+        ("vibration", "tilt"): r"Tilt \| here",
+        ("turbulence", "tip"): r"\| Tip \| Tip, matched",
+        ("turbulence", "tilt"): r"\| Tip \| Tip, matched",
     }
     checked = 0
     for (target, mode), head in places.items():

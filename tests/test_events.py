@@ -36,11 +36,14 @@ def changed(*events: dict[str, Any], **more: Any) -> Scenario:
 
 # ---------------------------------------------------------------------- when what changes
 
+
 def test_changes_add_up_and_multiply() -> None:
     """Two ramps that overlap and a jump, against the definition integrated step by step."""
-    events = [Event(start=1.0, duration=2.0, frequency_shift=3.0, strength=0.5, wind_factor=2.0),
-              Event(start=2.0, duration=4.0, frequency_shift=-5.0, strength=3.0, wind_factor=0.25),
-              Event(start=2.5, frequency_shift=1.0, strength=2.0, wind_factor=3.0)]
+    events = [
+        Event(start=1.0, duration=2.0, frequency_shift=3.0, strength=0.5, wind_factor=2.0),
+        Event(start=2.0, duration=4.0, frequency_shift=-5.0, strength=3.0, wind_factor=0.25),
+        Event(start=2.5, frequency_shift=1.0, strength=2.0, wind_factor=3.0),
+    ]
     t = np.linspace(0.0, 8.0, 80_001)
     one, two, jump = np.interp(t, [1, 3], [0, 1]), np.interp(t, [2, 6], [0, 1]), (t >= 2.5).astype(float)
     df = 3.0 * one - 5.0 * two + jump
@@ -53,6 +56,7 @@ def test_changes_add_up_and_multiply() -> None:
 
 
 # ---------------------------------------------------------------------- a peak moves
+
 
 def test_a_jump_shifts_the_spectrum_bin_by_bin() -> None:
     """By a whole number of bins from the start: every bin has what the one below it had, times the strength."""
@@ -67,8 +71,10 @@ def test_a_jump_shifts_the_spectrum_bin_by_bin() -> None:
 @pytest.mark.parametrize("duration", [0.0, 0.7])
 def test_a_pure_line_keeps_its_phase(duration: float) -> None:
     """A line that drifts or jumps is a cosine of the phase integrated by hand, without a step."""
-    s = changed({"kind": "peak", "start": 1.0, "duration": duration, "frequency_shift": 4.0, "strength": 2.0},
-                **{"turbulence.source": "none", "vibration.peaks": [{"frequency": 30.0, "damping": 0.0, "rms": [0.1, 0.0]}]})
+    s = changed(
+        {"kind": "peak", "start": 1.0, "duration": duration, "frequency_shift": 4.0, "strength": 2.0},
+        **{"turbulence.source": "none", "vibration.peaks": [{"frequency": 30.0, "damping": 0.0, "rms": [0.1, 0.0]}]},
+    )
     x = make_disturbance(s, s.n_steps, np.random.default_rng(3)).vibration[:, 0]
     t = np.arange(s.n_steps) * s.dt
     grown = np.clip((t - 1.0) / duration, 0, 1) if duration else (t >= 1.0).astype(float)
@@ -111,18 +117,28 @@ def test_what_was_before_stays_and_so_do_the_others(source: str) -> None:
 
 # ---------------------------------------------------------------------- the wind changes
 
+
 @pytest.mark.parametrize("factor", [1.5, 2.0])
 def test_frozen_flow_at_a_factor_is_frozen_flow_at_that_wind(factor: float) -> None:
     """From the start: the same waves, since a layer is a sum over its lengths; every star's. What differs is interpolation and
     the time that a step averages over, 0.01 nm of 500 nm together."""
-    s = changed(**{"turbulence.source": "frozen-flow", "sensors.kind": "zernike", "vibration.source": "none",
-                   "turbulence.layers": [{"height": 4000.0}]})
+    s = changed(
+        **{
+            "turbulence.source": "frozen-flow",
+            "sensors.kind": "zernike",
+            "vibration.source": "none",
+            "turbulence.layers": [{"height": 4000.0}],
+        }
+    )
     warped = s.replace({"events": [{"kind": "wind", "start": 0.0, "wind_factor": factor}]})
     one = make_disturbance(warped, 3000, np.random.default_rng(5))
     other = make_disturbance(s.replace({"turbulence.wind_speed": 15.0 * factor}), 3000, np.random.default_rng(5))
     assert one.lgs_turbulence and other.lgs_turbulence and one.ngs_turbulence is not None
-    for a, b in zip((one.turbulence, one.ngs_turbulence, *one.lgs_turbulence),
-                    (other.turbulence, other.ngs_turbulence, *other.lgs_turbulence), strict=True):
+    for a, b in zip(
+        (one.turbulence, one.ngs_turbulence, *one.lgs_turbulence),
+        (other.turbulence, other.ngs_turbulence, *other.lgs_turbulence),
+        strict=True,
+    ):
         assert np.std(b) > 0.1 and np.sqrt(np.mean((a - b) ** 2)) < 1e-5
 
 
@@ -138,8 +154,10 @@ def test_reading_between_steps_errs_by_less_than_a_hundredth_of_the_noise() -> N
 
 
 def test_a_wind_that_falls_or_stays_leaves_what_was_before() -> None:
-    quiet, falls, stays = (simulate(changed(*e)) for e in (
-        [], [{"kind": "wind", "start": 2.0, "wind_factor": 0.3}], [{"kind": "wind", "start": 2.0}]))
+    quiet, falls, stays = (
+        simulate(changed(*e))
+        for e in ([], [{"kind": "wind", "start": 2.0, "wind_factor": 0.3}], [{"kind": "wind", "start": 2.0}])
+    )
     np.testing.assert_allclose(quiet.y_lgs[:2000], falls.y_lgs[:2000], atol=1e-12)
     np.testing.assert_allclose(quiet.y_lgs, stays.y_lgs, atol=1e-12)
     assert falls.turbulence is not None and quiet.turbulence is not None
@@ -158,12 +176,19 @@ def test_wind_that_grows_costs_what_its_turbulence_costs() -> None:
 # ---------------------------------------------------------------------- lasers and frames
 
 NOISE_ALONE = {
-    "turbulence.source": "none", "vibration.source": "none", "sensors.lgs_low_frequency_rms": 0.0, "loop.closed": False}
+    "turbulence.source": "none",
+    "vibration.source": "none",
+    "sensors.lgs_low_frequency_rms": 0.0,
+    "loop.closed": False,
+}
 
 
 def test_fewer_lasers_are_noisier_and_none_are_nothing() -> None:
-    r = simulate(changed({"kind": "laser", "start": 1.0, "duration": 1.0}, {"kind": "laser", "start": 1.5, "duration": 0.25},
-                         **NOISE_ALONE))
+    r = simulate(
+        changed(
+            {"kind": "laser", "start": 1.0, "duration": 1.0}, {"kind": "laser", "start": 1.5, "duration": 0.25}, **NOISE_ALONE
+        )
+    )
     both, one = r.y_lgs[:1000].std(), r.y_lgs[1000:1500].std()
     assert both == pytest.approx(0.02 / sqrt(2), rel=0.08) and one == pytest.approx(0.02, rel=0.08)  # 3.5 sigma of 1000, 2000
     assert np.flatnonzero(np.isnan(r.y_lgs[:, 0])).tolist() == list(range(1500, 1750)) and r.missing == 250
@@ -174,16 +199,26 @@ def test_fewer_lasers_are_noisier_and_none_are_nothing() -> None:
 
 def test_the_weights_of_those_left_are_those_of_so_many() -> None:
     """The first star stands where one alone would; of minimum variance."""
-    s = changed(**{"turbulence.source": "frozen-flow", "sensors.lgs_combination": "minimum-variance", "sensors.lgs_radius": 20.0,
-                   "sensors.kind": "zernike"})
+    s = changed(
+        **{
+            "turbulence.source": "frozen-flow",
+            "sensors.lgs_combination": "minimum-variance",
+            "sensors.lgs_radius": 20.0,
+            "sensors.kind": "zernike",
+        }
+    )
     np.testing.assert_allclose(lgs_weights(s, 1), lgs_weights(s.replace({"sensors.lgs_count": 1})), rtol=1e-9)
     r = simulate(s.replace({"events": [{"kind": "laser", "start": 1.0, "duration": 1.0}]}))
     assert not r.missing
 
 
 def test_frames_are_lost_at_random_in_their_time() -> None:
-    r = simulate(changed({"kind": "frames", "start": 1.0, "duration": 1.0, "share": 0.3},
-                         {"kind": "frames", "start": 0.5, "duration": 2.0, "share": 0.5, "sensor": "ngs"}))
+    r = simulate(
+        changed(
+            {"kind": "frames", "start": 1.0, "duration": 1.0, "share": 0.3},
+            {"kind": "frames", "start": 0.5, "duration": 2.0, "share": 0.5, "sensor": "ngs"},
+        )
+    )
     lost = np.isnan(r.y_lgs).any(axis=1)
     assert not lost[:1000].any() and not lost[2000:].any()
     assert abs(lost.sum() - 300) < 4 * sqrt(1000 * 0.3 * 0.7)
@@ -210,12 +245,21 @@ def test_the_integrator_holds_its_command_where_a_frame_is_lost() -> None:
 
 @pytest.mark.parametrize("rate", [10.0, 20.0])
 def test_a_record_of_a_step_or_two_may_have_events(rate: float) -> None:
-    s = Scenario.from_dict({
-        "run": {"duration": 0.1, "warm_up": 0.0}, "sensors": {"lgs_rate": rate}, "gpr_offline": {"training_size": 2, "depth": 1},
-        "vibration": {"source": "ar2", "peaks": [{"frequency": 2.0}]}, "kalman": {"frequency": 2.0},
-        "butterworth": {"frequencies": [2.0]}, "events": [
-            {"kind": "peak", "start": 0.0, "frequency_shift": 1.0}, {"kind": "wind", "start": 0.0, "wind_factor": 3.0},
-            {"kind": "laser", "start": 0.0, "duration": 1.0, "lasers": 2}]})
+    s = Scenario.from_dict(
+        {
+            "run": {"duration": 0.1, "warm_up": 0.0},
+            "sensors": {"lgs_rate": rate},
+            "gpr_offline": {"training_size": 2, "depth": 1},
+            "vibration": {"source": "ar2", "peaks": [{"frequency": 2.0}]},
+            "kalman": {"frequency": 2.0},
+            "butterworth": {"frequencies": [2.0]},
+            "events": [
+                {"kind": "peak", "start": 0.0, "frequency_shift": 1.0},
+                {"kind": "wind", "start": 0.0, "wind_factor": 3.0},
+                {"kind": "laser", "start": 0.0, "duration": 1.0, "lasers": 2},
+            ],
+        }
+    )
     record = simulate(s)
     assert record.n_steps == record.missing == round(rate / 10) and record.vibration is not None
     assert np.isfinite(record.vibration).all()
@@ -223,15 +267,20 @@ def test_a_record_of_a_step_or_two_may_have_events(rate: float) -> None:
 
 # ---------------------------------------------------------------------- who sees it, and who is not told
 
-BROKEN = ({"kind": "laser", "start": 1.0, "duration": 0.3, "lasers": 2},
-          {"kind": "frames", "start": 1.5, "duration": 1.0, "share": 0.3},
-          {"kind": "frames", "start": 1.5, "duration": 1.0, "share": 0.3, "sensor": "ngs"})
+BROKEN = (
+    {"kind": "laser", "start": 1.0, "duration": 0.3, "lasers": 2},
+    {"kind": "frames", "start": 1.5, "duration": 1.0, "share": 0.3},
+    {"kind": "frames", "start": 1.5, "duration": 1.0, "share": 0.3, "sensor": "ngs"},
+)
 
 
 @pytest.fixture(scope="module")
 def broken() -> tuple[Scenario, Record]:
-    s = changed(*BROKEN, {"kind": "wind", "start": 1.2, "wind_factor": 1.5},
-                {"kind": "peak", "peak": 14, "start": 1.2, "frequency_shift": 3.0})
+    s = changed(
+        *BROKEN,
+        {"kind": "wind", "start": 1.2, "wind_factor": 1.5},
+        {"kind": "peak", "peak": 14, "start": 1.2, "frequency_shift": 3.0},
+    )
     return s, simulate(s)
 
 
@@ -285,16 +334,24 @@ def test_a_record_with_lost_frames_can_be_identified() -> None:
 
 # ---------------------------------------------------------------------- what is refused
 
-@pytest.mark.parametrize(("event", "more", "says"), [
-    ({"start": 3.0}, {}, "events.0.start = 3: must be below run.duration = 3 s"),
-    ({"start": 1.0, "kind": "laser"}, {}, "events.0.duration = 0: takes a number above 0 s, for kind laser"),
-    ({"start": 1.0, "kind": "frames"}, {}, "events.0.duration = 0: takes a number above 0 s, for kind frames"),
-    ({"start": 1.0, "duration": 1.0, "kind": "laser", "lasers": 3}, {}, "events.0.lasers = 3: takes up to sensors.lgs_count = 2"),
-    ({"start": 1.0, "peak": 15}, {}, "events.0.peak = 15: vibration.peaks has 15 entries, numbered from 0"),
-    ({"start": 1.0}, {"vibration.source": "measured"}, "events.0.kind = peak: takes vibration.source = peaks or ar2, not"),
-    ({"start": 1.0, "peak": 14, "frequency_shift": -48.0}, {}, "events.0.frequency_shift = -48: moves peak 14 to -0.56 Hz"),
-    ({"start": 1.0, "peak": 14, "frequency_shift": 460.0}, {}, "it must stay between 0 and half the LGS rate, 500 Hz"),
-])
+
+@pytest.mark.parametrize(
+    ("event", "more", "says"),
+    [
+        ({"start": 3.0}, {}, "events.0.start = 3: must be below run.duration = 3 s"),
+        ({"start": 1.0, "kind": "laser"}, {}, "events.0.duration = 0: takes a number above 0 s, for kind laser"),
+        ({"start": 1.0, "kind": "frames"}, {}, "events.0.duration = 0: takes a number above 0 s, for kind frames"),
+        (
+            {"start": 1.0, "duration": 1.0, "kind": "laser", "lasers": 3},
+            {},
+            "events.0.lasers = 3: takes up to sensors.lgs_count = 2",
+        ),
+        ({"start": 1.0, "peak": 15}, {}, "events.0.peak = 15: vibration.peaks has 15 entries, numbered from 0"),
+        ({"start": 1.0}, {"vibration.source": "measured"}, "events.0.kind = peak: takes vibration.source = peaks or ar2, not"),
+        ({"start": 1.0, "peak": 14, "frequency_shift": -48.0}, {}, "events.0.frequency_shift = -48: moves peak 14 to -0.56 Hz"),
+        ({"start": 1.0, "peak": 14, "frequency_shift": 460.0}, {}, "it must stay between 0 and half the LGS rate, 500 Hz"),
+    ],
+)
 def test_what_cannot_be_is_refused_in_one_line(event: dict[str, Any], more: dict[str, Any], says: str) -> None:
     with pytest.raises(SettingError) as caught:
         changed(event, **more).validate()

@@ -16,17 +16,35 @@ from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import is_known, n_frequencies, true_spectra
 from wfsobs.simulation.turbulence import turbulence_rms
 
-FLOW = Scenario().replace({
-    "turbulence.source": "frozen-flow", "vibration.source": "none", "sensors.kind": "zernike", "sensors.lgs_noise": 0.02,
-    "run.duration": 4.0, "run.warm_up": 0.5, "multipeak.turbulence_order": 3,
-})
+FLOW = Scenario().replace(
+    {
+        "turbulence.source": "frozen-flow",
+        "vibration.source": "none",
+        "sensors.kind": "zernike",
+        "sensors.lgs_noise": 0.02,
+        "run.duration": 4.0,
+        "run.warm_up": 0.5,
+        "multipeak.turbulence_order": 3,
+    }
+)
 
 
-@pytest.mark.parametrize("changes", [
-    {}, {"turbulence.wind_speed": 3.0}, {"turbulence.wind_speed": 60.0}, {"turbulence.outer_scale": 5.0},
-    {"turbulence.outer_scale": 100.0}, {"telescope.diameter": 39.0}, {"sensors.lgs_radius": 64.0, "sensors.lgs_count": 4},
-    {"telescope.zenith_angle": 45.0}, {"turbulence.layers.0.wind_direction": 30.0}, {"telescope.radial_order": 3},
-], ids=str)
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"turbulence.wind_speed": 3.0},
+        {"turbulence.wind_speed": 60.0},
+        {"turbulence.outer_scale": 5.0},
+        {"turbulence.outer_scale": 100.0},
+        {"telescope.diameter": 39.0},
+        {"sensors.lgs_radius": 64.0, "sensors.lgs_count": 4},
+        {"telescope.zenith_angle": 45.0},
+        {"turbulence.layers.0.wind_direction": 30.0},
+        {"telescope.radial_order": 3},
+    ],
+    ids=str,
+)
 def test_the_integral_over_frequency_is_the_variance(changes: dict) -> None:
     s = FLOW.replace(changes)
     f = np.fft.rfftfreq(2**19, 1e-3)
@@ -39,8 +57,9 @@ def test_the_integral_over_frequency_is_the_variance(changes: dict) -> None:
 
 def test_simulated_records_have_these_spectra() -> None:
     """Above the resolution of the estimate and below the noise's floor; a lone guide star off the axis sees the layer later."""
-    s = FLOW.replace({"sensors.lgs_count": 1, "sensors.lgs_radius": 40.0, "sensors.lgs_noise": 0.0, "loop.closed": False,
-                      "run.duration": 20.0})
+    s = FLOW.replace(
+        {"sensors.lgs_count": 1, "sensors.lgs_radius": 40.0, "sensors.lgs_noise": 0.0, "loop.closed": False, "run.duration": 20.0}
+    )
     names, total = ("own", "seen", "shared"), np.zeros((3, 4097), complex)
     for seed in range(8):
         record = simulate(s.replace({"run.seed": seed}))
@@ -96,4 +115,5 @@ def test_too_slow_a_flow_has_no_bound_rather_than_a_wrong_one() -> None:
     assert is_known(FLOW) and n_frequencies(FLOW.replace({"turbulence.wind_speed": 1.0})) == 2**20
     # In slower air all is easier: at 2 m/s as little of the cone effect is left as at 1.
     assert bound(FLOW.replace({"turbulence.wind_speed": 1.0}), 0)["total"] == pytest.approx(
-        bound(FLOW.replace({"turbulence.wind_speed": 2.0}), 0)["total"], rel=0.05)
+        bound(FLOW.replace({"turbulence.wind_speed": 2.0}), 0)["total"], rel=0.05
+    )

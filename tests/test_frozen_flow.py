@@ -35,7 +35,12 @@ class Ones:
 
 
 def covariance(
-    layer: Layer, outer_scale: float, sensor: ZernikeProjection, footprints: list[Footprint], n_steps: int, dt: float,
+    layer: Layer,
+    outer_scale: float,
+    sensor: ZernikeProjection,
+    footprints: list[Footprint],
+    n_steps: int,
+    dt: float,
     lag: float = 0.0,
 ) -> np.ndarray:
     """Covariance [um^2] of every output of every footprint at `lag` [s], as the sums over the waves have it."""
@@ -80,9 +85,9 @@ def test_the_size_that_everyone_quotes() -> None:
     assert 1e3 * np.sqrt(np.diag(found)) == pytest.approx(529.3, abs=0.3)
 
 
-@pytest.mark.parametrize(("outer_scale", "speed", "duration"), [
-    (25.0, 15.0, 4.0), (25.0, 2.0, 1.0), (1000.0, 15.0, 4.0), (5.0, 40.0, 2.0)
-])
+@pytest.mark.parametrize(
+    ("outer_scale", "speed", "duration"), [(25.0, 15.0, 4.0), (25.0, 2.0, 1.0), (1000.0, 15.0, 4.0), (5.0, 40.0, 2.0)]
+)
 @pytest.mark.parametrize("fraction", [0.01, 0.2, 0.6, 1.0])
 def test_autocovariance_along_and_across_the_wind(outer_scale: float, speed: float, duration: float, fraction: float) -> None:
     """At lags up to the whole record: pi integral Phi |M|^2 (J0 -+ J2)(k v tau) k dk, to 1e-3 of the variance."""
@@ -92,7 +97,8 @@ def test_autocovariance_along_and_across_the_wind(outer_scale: float, speed: flo
     variance = np.pi * along_log_k(lambda k: tip_of(k) ** 2, STRENGTH, outer_scale)
     for i, sign in ((0, -1.0), (1, 1.0)):
         wanted = np.pi * along_log_k(
-            lambda k, s=sign: tip_of(k) ** 2 * (j0(k * speed * lag) + s * jv(2, k * speed * lag)), STRENGTH, outer_scale)
+            lambda k, s=sign: tip_of(k) ** 2 * (j0(k * speed * lag) + s * jv(2, k * speed * lag)), STRENGTH, outer_scale
+        )
         assert abs(found[i, i] - wanted) < 1e-3 * variance
 
 
@@ -112,7 +118,8 @@ def test_covariance_of_beams_beside_each_other(shift: tuple[float, float], angle
     d, b = np.hypot(*shift), np.arctan2(shift[1], shift[0])
     for i, sign in ((0, -1.0), (1, 1.0)):
         wanted = np.pi * along_log_k(
-            lambda k, s=sign: tip_of(k) ** 2 * (j0(k * d) + s * np.cos(2 * b) * jv(2, k * d)), STRENGTH, L0)
+            lambda k, s=sign: tip_of(k) ** 2 * (j0(k * d) + s * np.cos(2 * b) * jv(2, k * d)), STRENGTH, L0
+        )
         assert found[i, 2 + i] == pytest.approx(wanted, abs=1e-3 * found[0, 0])
 
 
@@ -138,7 +145,11 @@ def test_variances_up_to_radial_order_six() -> None:
 
 
 def sampled(
-    seed: int, n_steps: int, layers: list[Layer] | None = None, views: list[View] | None = None, dt: float = 1e-3,
+    seed: int,
+    n_steps: int,
+    layers: list[Layer] | None = None,
+    views: list[View] | None = None,
+    dt: float = 1e-3,
     outer_scale: float = L0,
 ) -> list[np.ndarray]:
     layers = layers or [Layer(STRENGTH, 8000.0, 15.0, 0.0)]

@@ -23,9 +23,14 @@ from wfsobs.signal.welch import rms
 
 def scenario() -> Scenario:
     s = PRESETS["paper"]()
-    s.update({
-        "run": {"duration": 1.5, "warm_up": 0.3}, "gpr_offline": {"training_size": 60, "depth": 25},
-        "gpr_online": {"training_size": 60, "depth": 25}, "adaptive": {"window": 0.25}})
+    s.update(
+        {
+            "run": {"duration": 1.5, "warm_up": 0.3},
+            "gpr_offline": {"training_size": 60, "depth": 25},
+            "gpr_online": {"training_size": 60, "depth": 25},
+            "adaptive": {"window": 0.25},
+        }
+    )
     return s
 
 

@@ -44,11 +44,15 @@ MODEL = Spectrum(0.014, DT, TURBULENCE, (Ar2(2 * pi * 30.0, 0.02, 0.004, DT),))
 def known(duration: float = 60.0, **more: object) -> Scenario:
     """A line and a resonance in tip and tilt, another line in tilt alone."""
     s = PRESETS["paper"]().replace({"run.duration": duration, "kalman.process_noise": "matched", **more})
-    return s.replace({"vibration.peaks": [
-        {"frequency": 24.3, "damping": 0.0, "rms": [0.0012, 0.0015]},
-        {"frequency": 47.5, "damping": 0.01, "rms": [0.004, 0.006]},
-        {"frequency": 61.7, "damping": 0.0, "rms": [0.0, 0.0015]},
-    ]})
+    return s.replace(
+        {
+            "vibration.peaks": [
+                {"frequency": 24.3, "damping": 0.0, "rms": [0.0012, 0.0015]},
+                {"frequency": 47.5, "damping": 0.01, "rms": [0.004, 0.006]},
+                {"frequency": 61.7, "damping": 0.0, "rms": [0.0, 0.0015]},
+            ]
+        }
+    )
 
 
 @pytest.fixture(scope="module")
@@ -134,8 +138,12 @@ def test_search_finds_nothing_in_white_noise_as_often_as_it_says(modes: int) -> 
     n, level, runs = 4000, 0.2, 150
     rng = np.random.default_rng(3)
     hits = sum(
-        search(np.sum([periodogram(rng.standard_normal(n), DT, PAD) for _ in range(modes)], axis=0) / (2.0 * DT),
-               n, DT, modes, level).best is not None for _ in range(runs))
+        search(
+            np.sum([periodogram(rng.standard_normal(n), DT, PAD) for _ in range(modes)], axis=0) / (2.0 * DT), n, DT, modes, level
+        ).best
+        is not None
+        for _ in range(runs)
+    )
     assert 0.2 * level * runs < hits < level * runs + 3.0 * sqrt(level * runs)  # a bound, near since the widths overlap
 
 
@@ -143,8 +151,9 @@ def test_whiteness_tests_are_uniform_on_white_noise_and_see_what_is_not() -> Non
     n, rng = 4000, np.random.default_rng(4)
     noise = [rng.standard_normal(n) for _ in range(60)]
     flat = Spectrum(1.0, DT)
-    p = np.array([
-        (cumulated_test(periodogram(x, DT) / (2 * DT), n), autocorrelation_test(innovations(x, flat), 1)) for x in noise])
+    p = np.array(
+        [(cumulated_test(periodogram(x, DT) / (2 * DT), n), autocorrelation_test(innovations(x, flat), 1)) for x in noise]
+    )
     assert min(kstest(column, "uniform").pvalue for column in p.T) > 1e-3
     coloured = Ar2(2 * pi * 100.0, 0.5, 0.5, DT).sample(n, rng) + noise[0]
     assert cumulated_test(periodogram(coloured, DT) / (2 * DT), n) < 1e-6 > autocorrelation_test(innovations(coloured, flat), 1)
@@ -217,8 +226,14 @@ def test_nothing_is_found_in_turbulence_and_noise_nor_turbulence_in_noise() -> N
 
 def test_third_order_and_background_are_found_where_they_are() -> None:
     """Turbulence that falls as f^-6, and coloured noise such as aliasing; a scenario holds both, and the means over the modes."""
-    s = known().replace({"vibration.source": "none", "turbulence.source": "ar3", "turbulence.third_corner": 3.0,
-                         "sensors.lgs_low_frequency_rms": 0.0})
+    s = known().replace(
+        {
+            "vibration.source": "none",
+            "turbulence.source": "ar3",
+            "turbulence.third_corner": 3.0,
+            "sensors.lgs_low_frequency_rms": 0.0,
+        }
+    )
     record, rng = simulate(s), np.random.default_rng(8)
     coloured = [Ar2(2 * pi * 30.0, 0.8, 0.004, DT).sample(record.n_steps, rng) for _ in range(2)]
     got = identify(replace(record, y_lgs=record.y_lgs + np.column_stack(coloured)))
@@ -327,13 +342,16 @@ T = np.arange(6000)[:, None] * DT
 NOISE = 0.01 * np.random.default_rng(9).standard_normal((6000, 1))
 
 
-@pytest.mark.parametrize(("z", "said"), [
-    (np.sin(2 * pi * 20.3 * T) + np.where((T > 2) & (T < 3), 0.0, NOISE), "not stationary"),  # held samples
-    (np.round(NOISE / 0.02) * 0.02, "is white"),  # counts
-    (NOISE + 3.0 * T, "NOT white"),  # drift
-    (NOISE + 5.0 * (np.arange(6000)[:, None] % 997 == 500), "further than 6 standard deviations"),  # outliers
-    (NOISE * (1.0 + (T > 3)), "not stationary"),
-])
+@pytest.mark.parametrize(
+    ("z", "said"),
+    [
+        (np.sin(2 * pi * 20.3 * T) + np.where((T > 2) & (T < 3), 0.0, NOISE), "not stationary"),  # held samples
+        (np.round(NOISE / 0.02) * 0.02, "is white"),  # counts
+        (NOISE + 3.0 * T, "NOT white"),  # drift
+        (NOISE + 5.0 * (np.arange(6000)[:, None] % 997 == 500), "further than 6 standard deviations"),  # outliers
+        (NOISE * (1.0 + (T > 3)), "not stationary"),
+    ],
+)
 def test_records_that_are_none_of_the_model_are_survived_and_told(z: np.ndarray, said: str) -> None:
     got = identify(Record(z, np.zeros_like(z), DT))
     assert said in verdict(got)[0]
@@ -341,12 +359,15 @@ def test_records_that_are_none_of_the_model_are_survived_and_told(z: np.ndarray,
     got.scenario().validate()
 
 
-@pytest.mark.parametrize(("change", "said"), [
-    ({"y_lgs": np.where(np.arange(4000)[:, None] == 7, np.inf, np.ones((4000, 2))), "u": np.zeros((4000, 2))}, "infinite"),
-    ({"y_lgs": np.zeros((900, 2)), "u": np.zeros((900, 2))}, "900 samples, to identify it takes"),
-    ({"y_lgs": np.zeros((4000, 2)), "u": np.zeros((4000, 2))}, "tip: z does not change"),
-    ({"y_lgs": np.ones((4000, 2)), "u": np.zeros((4000, 2)), "dt": 0.1}, "peaks from 5 Hz: .* 2.5 Hz"),
-])
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"y_lgs": np.where(np.arange(4000)[:, None] == 7, np.inf, np.ones((4000, 2))), "u": np.zeros((4000, 2))}, "infinite"),
+        ({"y_lgs": np.zeros((900, 2)), "u": np.zeros((900, 2))}, "900 samples, to identify it takes"),
+        ({"y_lgs": np.zeros((4000, 2)), "u": np.zeros((4000, 2))}, "tip: z does not change"),
+        ({"y_lgs": np.ones((4000, 2)), "u": np.zeros((4000, 2)), "dt": 0.1}, "peaks from 5 Hz: .* 2.5 Hz"),
+    ],
+)
 def test_unusable_records_are_refused(change: dict, said: str) -> None:
     with pytest.raises(RecordError, match=said):
         identify(Record(**{"dt": DT, **change}))
@@ -362,17 +383,20 @@ def test_cancel_and_progress(record: Record) -> None:
 
 def test_written_and_annotated() -> None:
     assert written(Number(0.00312, 0.00099)) == "0.00312 +- 0.00099"
-    text = annotated('[a]\nx = 1\n\n[[a.b]]\nx = 2\n\n[[a.b]]\nx = 3\n', {"a.x": "one", "a.b.1.x": "three"})
-    assert text == '[a]\nx = 1  # one\n\n[[a.b]]\nx = 2\n\n[[a.b]]\nx = 3  # three\n'
+    text = annotated("[a]\nx = 1\n\n[[a.b]]\nx = 2\n\n[[a.b]]\nx = 3\n", {"a.x": "one", "a.b.1.x": "three"})
+    assert text == "[a]\nx = 1  # one\n\n[[a.b]]\nx = 2\n\n[[a.b]]\nx = 3  # three\n"
 
 
-@pytest.mark.parametrize(("damping", "rms", "frequency", "smooth"), [
-    (0.15, 0.02, 8.0, True),  # on the slope of turbulence, where its density is as high: no maximum
-    (0.02, 0.02, 8.0, False),  # narrow
-    (0.15, 0.1, 8.0, False),  # stronger than turbulence by far: a maximum
-    (0.3, 0.02, 60.0, False),  # far above, where there is nothing but noise
-    (0.02, 0.02, 4.0, True),  # below what is looked at
-])
+@pytest.mark.parametrize(
+    ("damping", "rms", "frequency", "smooth"),
+    [
+        (0.15, 0.02, 8.0, True),  # on the slope of turbulence, where its density is as high: no maximum
+        (0.02, 0.02, 8.0, False),  # narrow
+        (0.15, 0.1, 8.0, False),  # stronger than turbulence by far: a maximum
+        (0.3, 0.02, 60.0, False),  # far above, where there is nothing but noise
+        (0.02, 0.02, 4.0, True),  # below what is looked at
+    ],
+)
 def test_a_resonance_without_a_maximum_is_of_the_continuum(damping: float, rms: float, frequency: float, smooth: bool) -> None:
     p = Ar2(2 * pi * frequency, damping, rms, DT)
     assert of_continuum(Spectrum(0.014, DT, TURBULENCE, (p,)), p, 5.0) == smooth

@@ -51,7 +51,10 @@ def hump_and_line(seed: int, n: int = 40_000) -> Record:
     rng = np.random.default_rng(seed)
     tip: list[Ar2 | Ar3] = [Ar2(7.0, 0.9, 0.5, DT), Ar2(2 * pi * 30.0, 0.091, 0.05, DT)]
     tilt: list[Ar2 | Ar3] = [
-        Ar3(3.0, 0.9, 12.0, 0.3, DT), Ar2(2 * pi * 30.0, 0.0011, 0.05, DT), Ar2(2 * pi * 120.0, 0.8, 0.01, DT)]
+        Ar3(3.0, 0.9, 12.0, 0.3, DT),
+        Ar2(2 * pi * 30.0, 0.0011, 0.05, DT),
+        Ar2(2 * pi * 120.0, 0.8, 0.01, DT),
+    ]
     return recorded(drawn(tip, 0.014, n, rng), drawn(tilt, 0.02, n, rng))
 
 
@@ -102,7 +105,8 @@ def test_a_filter_of_one_peak_has_that_of_its_mode(found: Identified, saved: Sce
 def test_every_mode_has_its_own_in_a_simulation_and_in_the_bound(found: Identified, saved: Scenario) -> None:
     """A record made from the file is like the one that was identified, and no filter of its own model beats the bound."""
     assert [turbulence_rms(saved, i) for i in (0, 1)] == pytest.approx(
-        [np.sqrt(sum(p.rms**2 for p in m.prior.turbulence)) for m in found.modes], rel=1e-12)
+        [np.sqrt(sum(p.rms**2 for p in m.prior.turbulence)) for m in found.modes], rel=1e-12
+    )
     assert saved.sensors.lgs_noise_per_mode == pytest.approx([np.sqrt(2.0) * m.noise.value for m in found.modes], rel=1e-12)
     for i, mode in enumerate(found.modes):
         model = mode.prior.disturbance(saved.multipeak.line_width)
@@ -126,16 +130,19 @@ def peak(f: float, xi: float, std: float = 0.01, xi_std: float | None = None) ->
     return Process(Number(f, std), Number(xi, 0.1 * xi if xi_std is None else xi_std), Number(0.01, 0.001))
 
 
-@pytest.mark.parametrize(("tip", "tilt", "one"), [
-    (peak(30.0, 0.02), peak(30.02, 0.022), True),
-    (peak(30.0, 0.02), peak(30.2, 0.02), False),  # ten standard deviations apart
-    (peak(30.0, 0.091), peak(30.0, 0.0011), False),  # of another width
-    (peak(30.0, 0.0), peak(30.0, 0.002), False),  # of another kind
-    (peak(30.0, 0.0), peak(30.01, 0.0), True),
-    (peak(300.0, 0.3, 200.0), peak(30.0, 0.3), False),  # could be anywhere
-    (peak(30.0, 0.3), peak(300.0, 0.3, 200.0), False),
-    (peak(30.0, 0.02, 0.01, 0.05), peak(30.0, 0.02), False),  # could be of any width
-])
+@pytest.mark.parametrize(
+    ("tip", "tilt", "one"),
+    [
+        (peak(30.0, 0.02), peak(30.02, 0.022), True),
+        (peak(30.0, 0.02), peak(30.2, 0.02), False),  # ten standard deviations apart
+        (peak(30.0, 0.091), peak(30.0, 0.0011), False),  # of another width
+        (peak(30.0, 0.0), peak(30.0, 0.002), False),  # of another kind
+        (peak(30.0, 0.0), peak(30.01, 0.0), True),
+        (peak(300.0, 0.3, 200.0), peak(30.0, 0.3), False),  # could be anywhere
+        (peak(30.0, 0.3), peak(300.0, 0.3, 200.0), False),
+        (peak(30.0, 0.02, 0.01, 0.05), peak(30.0, 0.02), False),  # could be of any width
+    ],
+)
 def test_peaks_are_one_that_agree_in_all_that_is_known_of_them(tip: Process, tilt: Process, one: bool) -> None:
     assert len(merged([(tip,), (tilt,)])) == (1 if one else 2)
 
@@ -164,8 +171,12 @@ def made(rate: float, modes: Modes, scale: float, turbulent: bool, seed: int) ->
 
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(
-    rate=RATES, modes=st.lists(PEAKS, min_size=1, max_size=2), scale=st.sampled_from([1e-3, 0.02, 50.0]),
-    turbulent=st.booleans(), seed=st.integers(0, 2**16), name=st.sampled_from(["paper", "ut4", "peak-jump"]),
+    rate=RATES,
+    modes=st.lists(PEAKS, min_size=1, max_size=2),
+    scale=st.sampled_from([1e-3, 0.02, 50.0]),
+    turbulent=st.booleans(),
+    seed=st.integers(0, 2**16),
+    name=st.sampled_from(["paper", "ut4", "peak-jump"]),
 )
 @example(rate=1000.0, modes=[[(0.97, 0.4, 30.0)]], scale=0.02, turbulent=True, seed=1, name="paper")  # a hump near half the rate
 @example(rate=100.0, modes=[[], []], scale=0.02, turbulent=True, seed=1, name="paper")  # bands beyond half the rate

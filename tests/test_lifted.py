@@ -38,8 +38,16 @@ def bound(steps: list[Step], v: np.ndarray, x0: np.ndarray) -> float:
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
-@given(st.integers(1, 9) | st.sampled_from([47, 48, 49, 100]), st.integers(1, 7), st.integers(1, 3), st.integers(1, 3),
-       st.integers(1, 3), st.floats(0.0, 0.4), st.integers(0, 2**31), st.data())
+@given(
+    st.integers(1, 9) | st.sampled_from([47, 48, 49, 100]),
+    st.integers(1, 7),
+    st.integers(1, 3),
+    st.integers(1, 3),
+    st.integers(1, 3),
+    st.floats(0.0, 0.4),
+    st.integers(0, 2**31),
+    st.data(),
+)
 def test_blocks_give_what_the_plain_loop_gives(
     cycle: int, n: int, m: int, p: int, columns: int, radius: float, seed: int, data: st.DataObject
 ) -> None:
@@ -60,15 +68,18 @@ def test_blocks_give_what_the_plain_loop_gives(
 
 
 @pytest.mark.parametrize("n_steps", [1, 47, 48, 49, 95, 2303, 2304, 2305, 5000])
-@pytest.mark.parametrize(("F", "tolerance"), [
-    ([[0.999, 1.0], [0.0, 0.999]], 1e-12),  # defective: one eigenvector
-    ([[0.999, 1.0], [1e-13, 0.999]], 1e-12),  # nearly so
-    # The paper's turbulence: companion form, both poles p near 0.994. A coefficient rounded by eps moves its output by
-    # eps / (1 - p)^2 = 6e-12, whoever computes it; the powers of a block round it some ten times.
-    ([[1.98732, -0.98736], [1.0, 0.0]], 1e-10),
-    ([[0.0, 1.0], [0.0, 0.0]], 1e-12),  # nilpotent
-    ([[0.0, 0.0], [0.0, 0.0]], 1e-12),
-])
+@pytest.mark.parametrize(
+    ("F", "tolerance"),
+    [
+        ([[0.999, 1.0], [0.0, 0.999]], 1e-12),  # defective: one eigenvector
+        ([[0.999, 1.0], [1e-13, 0.999]], 1e-12),  # nearly so
+        # The paper's turbulence: companion form, both poles p near 0.994. A coefficient rounded by eps moves its output by
+        # eps / (1 - p)^2 = 6e-12, whoever computes it; the powers of a block round it some ten times.
+        ([[1.98732, -0.98736], [1.0, 0.0]], 1e-10),
+        ([[0.0, 1.0], [0.0, 0.0]], 1e-12),  # nilpotent
+        ([[0.0, 0.0], [0.0, 0.0]], 1e-12),
+    ],
+)
 def test_defective_matrices_are_as_good_as_any(F: list[list[float]], tolerance: float, n_steps: int) -> None:
     rng = np.random.default_rng(2)
     step = (np.array(F), np.array([[0.3], [1.0]]), np.eye(2), np.array([[0.1], [0.0]]))

@@ -62,10 +62,16 @@ def test_lines_lose_no_power():
 def test_the_vibration_has_the_spectrum(part: str, seconds: float):
     """Its variance, and the share of it in each 2 Hz, whatever the record's own grid. A bin of the record that straddles
     a border (1 / seconds wide) may lie on either side, hence bands whose borders lie between lines at 10 s and more."""
-    s = Scenario().replace({
-        "vibration.source": "measured", "vibration.synthesis": "random-phase", "vibration.part": part, "vibration.cutoff": 100.0,
-        "run.duration": seconds,
-        "turbulence.source": "none"})
+    s = Scenario().replace(
+        {
+            "vibration.source": "measured",
+            "vibration.synthesis": "random-phase",
+            "vibration.part": part,
+            "vibration.cutoff": 100.0,
+            "run.duration": seconds,
+            "turbulence.source": "none",
+        }
+    )
     x = make_disturbance(s, s.n_steps, np.random.default_rng(5)).vibration
     power = np.abs(np.fft.rfft(x, axis=0)) ** 2 * 2.0 / len(x) ** 2
     f = np.fft.rfftfreq(len(x), 1e-3)
@@ -87,5 +93,6 @@ def test_presets_and_marks():
     marks = marked_peaks(PRESETS["ut4"]())
     assert [m.frequency for m in marks] == [line.frequency for line in ERIS.lines(0.004)]
     assert [m.frequency for m in marked_peaks(PRESETS["ut4"]().replace({"vibration.cutoff": 20.0}))] == [
-        m.frequency for m in marks if m.frequency <= 20]
+        m.frequency for m in marks if m.frequency <= 20
+    ]
     assert marked_peaks(PRESETS["ut4"]().replace({"vibration.source": "none"})) == []

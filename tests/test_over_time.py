@@ -78,7 +78,7 @@ def test_the_command_prints_rows_of_every_window() -> None:
 
 
 def test_the_table_says_who_is_back() -> None:
-    event = "events=[{peak=14, start=1.5, strength=3.0}, {kind=\"wind\", start=1.5}]"
+    event = 'events=[{peak=14, start=1.5, strength=3.0}, {kind="wind", start=1.5}]'
     words = ["run", "--over-time", "0.25", "--set", "run.duration=2", "--set", "run.warm_up=0.5", "--set", event]
     result = CliRunner().invoke(main, words, catch_exceptions=False)
     lines = [[cell.strip() for cell in line.strip("│").split("│")] for line in result.stdout.splitlines() if line.startswith("│")]
@@ -101,9 +101,15 @@ def test_after_a_jump_who_learns_is_back_and_who_is_fixed_is_not() -> None:
     adaptive filter's is later at most 1.04 times what it was, the online GPR's 1.07.
     """
     window, start, training, depth = 3.0, 7.0, 256, 170
-    s = PRESETS["peak-jump"]().replace({
-        "run.duration": 18.0, "events.0.start": start, "gpr_online.training_size": training, "gpr_online.depth": depth,
-        "gpr_offline.training_size": 400})
+    s = PRESETS["peak-jump"]().replace(
+        {
+            "run.duration": 18.0,
+            "events.0.start": start,
+            "gpr_online.training_size": training,
+            "gpr_online.depth": depth,
+            "gpr_offline.training_size": 400,
+        }
+    )
     adapt = {"gpr-online": (training + depth) * s.dt, "kf-adaptive": s.adaptive.window + s.adaptive.interval}
     fixed = ("kf-lgs", "kf-multi", "gpr-offline")
     pools = {name: Pooled() for name in (*fixed, *adapt)}

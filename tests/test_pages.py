@@ -20,7 +20,8 @@ import pytest
 DOCS = Path(__file__).parents[1] / "docs"
 MARKER = re.compile(
     r"^<!-- (\w+)\.py(?: ([\w -]+))?: (seeds \d+ to \d+|no random numbers), (\d{4}-\d\d-\d\d)(?:, checked to ([\d.]+) %)? -->$",
-    re.M)
+    re.M,
+)
 NUMBER = re.compile(r"([\d.]+)(?: \(.*\))?")
 MADE = ("closed_loop", "events", "higher-orders", "identification", "reproduction", "tuning")
 """Pages whose tables are made by scripts."""
@@ -80,9 +81,15 @@ def test_every_table_of_a_reproduction_has_a_marker() -> None:
 
 
 @pytest.mark.parametrize(
-    ("page", "name", "table", "tolerance", "shown"), [pytest.param(*c, id=f"{c[1]}-{c[2]}") for c in checked()])
+    ("page", "name", "table", "tolerance", "shown"), [pytest.param(*c, id=f"{c[1]}-{c[2]}") for c in checked()]
+)
 def test_a_page_shows_what_its_script_makes(
-    page: str, name: str, table: str, tolerance: float, shown: str, capsys: pytest.CaptureFixture[str],
+    page: str,
+    name: str,
+    table: str,
+    tolerance: float,
+    shown: str,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     module = script(name)
     module.SEEDS = (1,)

@@ -20,10 +20,14 @@ from wfsobs.signal.welch import rms
 
 def scenario(changes: dict[str, Any] | None = None) -> Scenario:
     base = PRESETS["paper"]()
-    base.update({
-        "run": {"duration": 0.8, "warm_up": 0.3}, "gpr_offline": {"training_size": 60, "depth": 25},
-        "gpr_online": {"training_size": 60, "depth": 25}, "adaptive": {"window": 0.25},
-    })
+    base.update(
+        {
+            "run": {"duration": 0.8, "warm_up": 0.3},
+            "gpr_offline": {"training_size": 60, "depth": 25},
+            "gpr_online": {"training_size": 60, "depth": 25},
+            "adaptive": {"window": 0.25},
+        }
+    )
     return base.replace(changes or {})
 
 
@@ -55,7 +59,7 @@ def test_scores_are_those_of_the_estimates() -> None:
         e, truth = result.estimate(s.observer, s.target), result.record.truth(s.target)
         assert e is not None and truth is not None
         mode = ("tip", "tilt").index(s.mode)
-        error = (e.values - truth)[300:799 if s.target == "vibration" else 800, mode]
+        error = (e.values - truth)[300 : 799 if s.target == "vibration" else 800, mode]
         assert s.rms == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
 
 
@@ -69,12 +73,15 @@ def test_the_late_adaptive_filter_is_scored_with_the_others_or_apart(window: flo
         assert s.start == pytest.approx(begins if own or not apart else 0.3)
 
 
-@pytest.mark.parametrize("changes", [
-    {"turbulence.source": "frozen-flow", "sensors.kind": "zernike", "telescope.radial_order": 3},
-    {"turbulence.source": "frozen-flow", "sensors.lgs_radius": 30.0, "sensors.lgs_combination": "minimum-variance"},
-    {"telescope.radial_order": 2, "sensors.tip_tilt_indetermination": True},
-    {"turbulence.source": "psd", "turbulence.psd": {"frequency": [0.5, 50.0], "tip": [1e-2, 1e-3], "tilt": [1e-2, 1e-3]}},
-])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"turbulence.source": "frozen-flow", "sensors.kind": "zernike", "telescope.radial_order": 3},
+        {"turbulence.source": "frozen-flow", "sensors.lgs_radius": 30.0, "sensors.lgs_combination": "minimum-variance"},
+        {"telescope.radial_order": 2, "sensors.tip_tilt_indetermination": True},
+        {"turbulence.source": "psd", "turbulence.psd": {"frequency": [0.5, 50.0], "tip": [1e-2, 1e-3], "tilt": [1e-2, 1e-3]}},
+    ],
+)
 def test_every_observer_on_every_turbulence_and_mode(changes: dict[str, Any]) -> None:
     s = scenario(changes)
     result = run(s)
@@ -100,11 +107,14 @@ def test_same_seed_same_result_and_a_subset_is_part_of_it() -> None:
     assert other is not None and mine is not None and not np.array_equal(other.values, mine.values)
 
 
-@pytest.mark.parametrize(("missing", "left_out"), [
-    ({"y_ngs": None, "ratio": None}, ["kf-ngs", "multirate", "multirate-optimal"]),
-    ({"open_loop_y": None}, ["butterworth-ol"]),
-    ({"training": None}, ["gpr-offline", "ridge", "ridge-30"]),
-])
+@pytest.mark.parametrize(
+    ("missing", "left_out"),
+    [
+        ({"y_ngs": None, "ratio": None}, ["kf-ngs", "multirate", "multirate-optimal"]),
+        ({"open_loop_y": None}, ["butterworth-ol"]),
+        ({"training": None}, ["gpr-offline", "ridge", "ridge-30"]),
+    ],
+)
 def test_what_a_record_lacks_is_one_line_per_observer(missing: dict[str, None], left_out: list[str]) -> None:
     record = replace(simulate(scenario()), **missing)
     result = observe(record, scenario())
@@ -121,7 +131,11 @@ def test_a_record_without_truth_is_scored_by_prediction_and_residual() -> None:
     result = observe(record, scenario(), observers=["kf-lgs", "kf-ngs", "multirate-optimal", "zero"])
     assert len(result.estimates) == 7
     assert {(s.observer, s.target) for s in result.scores} == {
-        ("kf-lgs", PREDICTION), ("multirate-optimal", PREDICTION), ("zero", PREDICTION), (LOOP, RESIDUAL)}
+        ("kf-lgs", PREDICTION),
+        ("multirate-optimal", PREDICTION),
+        ("zero", PREDICTION),
+        (LOOP, RESIDUAL),
+    }
     z, start = record.z, round(scenario().run.warm_up / record.dt)
     for mode, name in enumerate(("tip", "tilt")):
         found = {s.observer: s for s in result.scores if s.mode == name}
@@ -139,8 +153,14 @@ def test_a_single_mode_record() -> None:
     t = whole.training
     assert t.open_loop_y is not None and whole.open_loop_y is not None and whole.vibration is not None
     record = Record(
-        whole.y_lgs[:, :1], whole.u[:, :1], whole.dt, whole.y_ngs[:, :1], whole.ratio, whole.open_loop_y[:, :1],
-        turbulence=whole.turbulence[:, :1], vibration=whole.vibration[:, :1],
+        whole.y_lgs[:, :1],
+        whole.u[:, :1],
+        whole.dt,
+        whole.y_ngs[:, :1],
+        whole.ratio,
+        whole.open_loop_y[:, :1],
+        turbulence=whole.turbulence[:, :1],
+        vibration=whole.vibration[:, :1],
         training=type(t)(t.y_lgs[:, :1], t.u[:, :1], t.open_loop_y[:, :1]),
     )
     one, both = observe(record, scenario()), observe(whole, scenario())
@@ -204,8 +224,14 @@ def test_a_record_too_slow_for_the_settings_is_refused() -> None:
 
 
 def test_an_observer_that_cannot_work_is_left_out_with_its_reason() -> None:
-    s = scenario({"gpr_online.training_size": 2000, "multirate.measurement_noise": "manual",
-                  "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001})
+    s = scenario(
+        {
+            "gpr_online.training_size": 2000,
+            "multirate.measurement_noise": "manual",
+            "multirate.lgs_noise": 0.04,
+            "multirate.ngs_noise": 0.001,
+        }
+    )
     result = run(s)
     assert [f.observer for f in result.failures] == ["multirate", "gpr-online"]
     assert all(isinstance(f, Failure) and "\n" not in f.reason and len(f.reason) < 250 for f in result.failures)

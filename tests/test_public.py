@@ -39,8 +39,13 @@ def test_every_public_name_is_there_and_listed() -> None:
 
 def test_the_names_that_a_type_checker_sees_are_those_that_are_imported() -> None:
     tree = ast.parse(Path(inspect.getfile(wfsobs)).read_text())
-    seen = {alias.name: node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names
-            if node.module and node.module.startswith("wfsobs")}
+    seen = {
+        alias.name: node.module
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        if node.module and node.module.startswith("wfsobs")
+    }
     assert seen == {name: f"wfsobs.{home}" for name, home in wfsobs._HOMES.items()}
     assert set(seen) == set(wfsobs.__all__)
 
@@ -52,7 +57,8 @@ def test_public_functions_stay_functions_whatever_is_imported() -> None:
         "warnings.simplefilter('ignore')\n"
         "for m in pkgutil.walk_packages(wfsobs.__path__, 'wfsobs.'):\n"
         "    if m.name not in ('wfsobs.app.main', 'wfsobs.__main__'): importlib.import_module(m.name)\n"
-        f"print([n for n in {FUNCTIONS} if not inspect.isfunction(getattr(wfsobs, n))])\n")
+        f"print([n for n in {FUNCTIONS} if not inspect.isfunction(getattr(wfsobs, n))])\n"
+    )
     assert in_a_new_process(code).strip() == "[]"
 
 
@@ -69,7 +75,8 @@ def test_help_and_presets_import_no_large_library(arguments: list[str]) -> None:
     code = (
         "import sys\nfrom wfsobs.cli import main\n"
         f"main({arguments}, standalone_mode=False)\n"
-        "print('large:', sorted({'scipy', 'rich', 'panel', 'bokeh', 'astropy', 'pandas'} & set(sys.modules)))\n")
+        "print('large:', sorted({'scipy', 'rich', 'panel', 'bokeh', 'astropy', 'pandas'} & set(sys.modules)))\n"
+    )
     assert in_a_new_process(code).splitlines()[-1] == "large: []"
 
 
@@ -85,14 +92,16 @@ def test_every_library_is_imported_before_the_limit_of_threads_is_set() -> None:
     code = (
         "import sys, threadpoolctl\nfrom wfsobs.cli import main\n"
         "main(['run', '--set', 'run.duration=1.2', '--json'], standalone_mode=False)\n"
-        "print({i['num_threads'] for i in threadpoolctl.threadpool_info() if i['user_api'] == 'blas'})\n")
+        "print({i['num_threads'] for i in threadpoolctl.threadpool_info() if i['user_api'] == 'blas'})\n"
+    )
     assert in_a_new_process(code).splitlines()[-1] == "{1}"
 
 
 def test_representations_are_one_line(result: wfsobs.Result) -> None:
     assert repr(wfsobs.Scenario()) == "Scenario()"
     assert repr(wfsobs.Scenario().replace({"run.duration": 2.0, "telescope.diameter": 4.0})) == (
-        "Scenario(telescope.diameter=4.0, run.duration=2.0)")
+        "Scenario(telescope.diameter=4.0, run.duration=2.0)"
+    )
     for made in (*(make() for make in wfsobs.PRESETS.values()), result, result.record):
         assert "\n" not in repr(made) and len(repr(made)) < 200
     assert "length 2 s, rate 1000 Hz, modes 2" in repr(result.record)

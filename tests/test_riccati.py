@@ -30,8 +30,12 @@ def models(draw: st.DrawFn, peaks: int = 12, unit: tuple[float, float] = (1e-6, 
     turbulence = Ar2(corner, draw(st.floats(0.1, 1.0)), scale * draw(log_floats(0.03, 10.0)), dt)
     count = draw(st.integers(1, peaks))
     vibration = [
-        Ar2(2 * np.pi * draw(log_floats(3.0, min(200.0, 0.45 / dt))), draw(st.just(1e-4) | log_floats(1e-4, 1.0)),
-            scale * draw(log_floats(1e-3, 0.3)), dt)
+        Ar2(
+            2 * np.pi * draw(log_floats(3.0, min(200.0, 0.45 / dt))),
+            draw(st.just(1e-4) | log_floats(1e-4, 1.0)),
+            scale * draw(log_floats(1e-3, 0.3)),
+            dt,
+        )
         for _ in range(count)
     ]
     return disturbance_model([turbulence], vibration), scale * draw(log_floats(1e-4, 10.0))
@@ -118,9 +122,13 @@ def test_scipy_is_often_there_to_compare_with() -> None:
 
 
 @pytest.mark.parametrize("noise", [1e-3, 0.0141, 1.0])
-@pytest.mark.parametrize("peaks", [
-    [(47.4969, 0.03, 0.015)], [(17.2, 0.01, 0.007), (47.4, 0.004, 0.008), (24.0, 5e-3, 0.004)],
-])
+@pytest.mark.parametrize(
+    "peaks",
+    [
+        [(47.4969, 0.03, 0.015)],
+        [(17.2, 0.01, 0.007), (47.4, 0.004, 0.008), (24.0, 5e-3, 0.004)],
+    ],
+)
 def test_long_iteration_ends_at_the_solution(noise: float, peaks: list[tuple[float, float, float]]) -> None:
     """P[k+1] = A P A' - ... + Q from P = 0, until nothing moves any more: the plain way. The slowest closed loop
     here has radius 1 - 7.5e-4, so that 25,000 steps leave exp(-37) of the start."""
@@ -160,18 +168,33 @@ def test_against_sixty_digits() -> None:
 
 @settings(max_examples=80, deadline=None, derandomize=True)
 @given(
-    st.floats(-5.0, -1.0), log_floats(0.1, 100.0), log_floats(0.1, 100.0), log_floats(0.01, 1.0), st.floats(0.0, 1.0),
-    log_floats(1e-4, 1.0), log_floats(1e-6, 100.0), log_floats(1e-6, 100.0), log_floats(1e-6, 100.0),
+    st.floats(-5.0, -1.0),
+    log_floats(0.1, 100.0),
+    log_floats(0.1, 100.0),
+    log_floats(0.01, 1.0),
+    st.floats(0.0, 1.0),
+    log_floats(1e-4, 1.0),
+    log_floats(1e-6, 100.0),
+    log_floats(1e-6, 100.0),
+    log_floats(1e-6, 100.0),
 )
 def test_whatever_can_be_set_gives_a_filter_or_says_why(
-    log_dt: float, wind: float, diameter: float, xi: float, share: float, damping: float, strong: float, weak: float,
+    log_dt: float,
+    wind: float,
+    diameter: float,
+    xi: float,
+    share: float,
+    damping: float,
+    strong: float,
+    weak: float,
     noise: float,
 ) -> None:
     """The whole range of the settings, corners as slow as 1e-8 of the frame rate included."""
     dt = 10**log_dt
     frequency = 10 ** (-2 + share * (np.log10(min(5000.0, 0.499 / dt)) + 2))
     model = disturbance_model(
-        [Ar2(turbulence_corner(wind, diameter, 1), xi, strong, dt)], [Ar2(2 * np.pi * frequency, damping, weak, dt)])
+        [Ar2(turbulence_corner(wind, diameter, 1), xi, strong, dt)], [Ar2(2 * np.pi * frequency, damping, weak, dt)]
+    )
     found = None
     try:
         found = steady_state(model.A, model.C, model.Q, np.array(noise**2))

@@ -19,25 +19,28 @@ FLOW: dict[str, Any] = {"turbulence.source": "frozen-flow"}
 PSD: dict[str, Any] = {"vibration.source": "psd"}
 
 
-@pytest.mark.parametrize(("changes", "named", "limit"), [
-    ({"run.duration": 2.0, "run.warm_up": 2.0}, "run.warm_up = 2", "2 s"),
-    ({"vibration.peaks.1": {"frequency": 500.0}}, "vibration.peaks.1.frequency = 500", "500 Hz"),
-    ({"sensors.lgs_rate": 90.0}, "vibration.peaks.0.frequency = 47.4969", "45 Hz"),
-    ({"kalman.frequency": 600.0}, "kalman.frequency = 600", "500 Hz"),
-    ({"butterworth.frequencies": [30.0, 1.0]}, "butterworth.frequencies.1 = 1", "500 Hz"),
-    ({"butterworth.frequencies": [499.0]}, "butterworth.frequencies.0 = 499", "500 Hz"),
-    ({"butterworth.bandwidth_online": 40.0}, "butterworth.frequencies.0 = 17.1", "20 Hz"),
-    (PSD, "vibration.psd.frequency", "two frequencies"),
-    (PSD | {"vibration.psd": TABLE | {"frequency": [1.0, 1.0, 3.0]}}, "vibration.psd.frequency", "increasing"),
-    (PSD | {"vibration.psd": TABLE | {"tilt": [1.0]}}, "vibration.psd.tilt", "1 numbers"),
-    ({"turbulence.source": "psd"}, "turbulence.psd.frequency", "two frequencies"),
-    ({"turbulence.source": "psd", "turbulence.psd": TABLE | {"tip": []}}, "turbulence.psd.tip", "0 numbers"),
-    (FLOW | {"turbulence.layers": []}, "turbulence.layers", "above 0"),
-    (FLOW | {"turbulence.layers.0.fraction": 0.0}, "turbulence.layers", "above 0"),
-    (FLOW | {"sensors.lgs_altitude": 8500.0}, "turbulence.layers.0.height = 8000", "7650 m"),
-    (FLOW | {"turbulence.outer_scale": 2.0, "telescope.diameter": 39.0}, "turbulence.outer_scale = 2", "9.75 m"),
-    (FLOW | {"turbulence.wind_speed": 0.1, "sensors.lgs_rate": 1e5}, "turbulence.layers.0.wind_factor = 1", "40 s"),
-])
+@pytest.mark.parametrize(
+    ("changes", "named", "limit"),
+    [
+        ({"run.duration": 2.0, "run.warm_up": 2.0}, "run.warm_up = 2", "2 s"),
+        ({"vibration.peaks.1": {"frequency": 500.0}}, "vibration.peaks.1.frequency = 500", "500 Hz"),
+        ({"sensors.lgs_rate": 90.0}, "vibration.peaks.0.frequency = 47.4969", "45 Hz"),
+        ({"kalman.frequency": 600.0}, "kalman.frequency = 600", "500 Hz"),
+        ({"butterworth.frequencies": [30.0, 1.0]}, "butterworth.frequencies.1 = 1", "500 Hz"),
+        ({"butterworth.frequencies": [499.0]}, "butterworth.frequencies.0 = 499", "500 Hz"),
+        ({"butterworth.bandwidth_online": 40.0}, "butterworth.frequencies.0 = 17.1", "20 Hz"),
+        (PSD, "vibration.psd.frequency", "two frequencies"),
+        (PSD | {"vibration.psd": TABLE | {"frequency": [1.0, 1.0, 3.0]}}, "vibration.psd.frequency", "increasing"),
+        (PSD | {"vibration.psd": TABLE | {"tilt": [1.0]}}, "vibration.psd.tilt", "1 numbers"),
+        ({"turbulence.source": "psd"}, "turbulence.psd.frequency", "two frequencies"),
+        ({"turbulence.source": "psd", "turbulence.psd": TABLE | {"tip": []}}, "turbulence.psd.tip", "0 numbers"),
+        (FLOW | {"turbulence.layers": []}, "turbulence.layers", "above 0"),
+        (FLOW | {"turbulence.layers.0.fraction": 0.0}, "turbulence.layers", "above 0"),
+        (FLOW | {"sensors.lgs_altitude": 8500.0}, "turbulence.layers.0.height = 8000", "7650 m"),
+        (FLOW | {"turbulence.outer_scale": 2.0, "telescope.diameter": 39.0}, "turbulence.outer_scale = 2", "9.75 m"),
+        (FLOW | {"turbulence.wind_speed": 0.1, "sensors.lgs_rate": 1e5}, "turbulence.layers.0.wind_factor = 1", "40 s"),
+    ],
+)
 def test_settings_that_do_not_go_together(changes: dict[str, Any], named: str, limit: str) -> None:
     s = Scenario().replace(changes)
     with pytest.raises(SettingError, match=re.escape(named)) as caught:
@@ -90,9 +93,19 @@ def test_the_paper_preset_has_the_numbers_of_the_tables() -> None:
     assert (b.bandwidth_offline, b.bandwidth_online, b.order) == (3.0, 2.0, 1)
     offline, online = s.gpr_offline, s.gpr_online
     assert (offline.signal_std, offline.length_scale, offline.training_size, offline.depth, offline.noise_std) == (
-        10.0, 300.0, 1000, 407, 0.13)
+        10.0,
+        300.0,
+        1000,
+        407,
+        0.13,
+    )
     assert (online.signal_std, online.length_scale, online.training_size, online.depth, online.noise_std) == (
-        30.0, 300.0, 511, 170, 0.1)
+        30.0,
+        300.0,
+        511,
+        170,
+        0.1,
+    )
     assert offline.inputs == online.inputs == "u-y"
     # stated in the preset's docstring: vibration of 15.5 nm on tip, r_NGS < r_LGS / 2
     assert np.sqrt(vibration_variance(s, 0)) == pytest.approx(0.0155, abs=0.0001)

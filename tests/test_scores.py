@@ -115,11 +115,18 @@ def test_predictions_and_the_residual_are_scored_on_common_samples_too() -> None
     rough = np.where(np.arange(1000) < 500, 3.0, 1.0)
     y = np.outer(rough, [1.0, 1.0])
     without_truth = Record(y, np.zeros((1000, 2)), 1e-3)
-    estimates = [late(name, np.zeros(1000), start, target)
-                 for name, start in (("all", 0), ("late", 499), ("apart", 900)) for target in ("turbulence", "vibration")]
+    estimates = [
+        late(name, np.zeros(1000), start, target)
+        for name, start in (("all", 0), ("late", 499), ("apart", 900))
+        for target in ("turbulence", "vibration")
+    ]
     found = {s.observer: s for s in unsupervised_scores(without_truth, estimates, 0.1, NAMES) if s.mode == "tip"}
     assert {name: (s.start, s.apart) for name, s in found.items()} == {
-        "all": (0.5, False), "late": (0.5, False), "apart": (pytest.approx(0.901), True), "loop": (0.5, False)}
+        "all": (0.5, False),
+        "late": (0.5, False),
+        "apart": (pytest.approx(0.901), True),
+        "loop": (0.5, False),
+    }
     assert all(s.rms == s.truth_rms == pytest.approx(1.0) for s in found.values())
 
 

@@ -103,10 +103,16 @@ def test_indetermination_takes_turbulence_from_the_lgs_alone() -> None:
     assert np.array_equal(blind.ngs, measure(sensors(), d, np.random.default_rng(0)).ngs, equal_nan=True)
 
 
-@pytest.mark.parametrize(("change", "lgs_same"), [
-    ({"lgs_noise": 0.5}, False), ({"lgs_count": 7}, False), ({"lgs_low_frequency_rms": 0.3}, False),
-    ({"ngs_noise": 0.5}, True), ({"exposure_ratio": 3}, True),
-])
+@pytest.mark.parametrize(
+    ("change", "lgs_same"),
+    [
+        ({"lgs_noise": 0.5}, False),
+        ({"lgs_count": 7}, False),
+        ({"lgs_low_frequency_rms": 0.3}, False),
+        ({"ngs_noise": 0.5}, True),
+        ({"exposure_ratio": 3}, True),
+    ],
+)
 def test_a_change_of_one_sensor_leaves_the_noise_of_the_other(change: dict[str, Any], lgs_same: bool) -> None:
     base = {"lgs_noise": 0.02, "ngs_noise": 0.01, "lgs_low_frequency_rms": 0.05, "lgs_count": 2}
     before = measure(sensors(**base), QUIET, np.random.default_rng(4))

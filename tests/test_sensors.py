@@ -62,14 +62,27 @@ def test_aliasing_needs_layers_and_lenslets() -> None:
     assert (aliasing_rms(whole, "lgs") < aliasing_rms(whole, "ngs")).all()  # the cone is narrower, and passes less
 
 
-@pytest.mark.parametrize("changes", [
-    {"sensors.lgs_noise": 0.03, "sensors.ngs_noise": 0.05},
-    {"sensors.noise_from": "photons", "sensors.spots.read_noise": 2.0, "sensors.spots.ngs_photons": 30.0},
-])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"sensors.lgs_noise": 0.03, "sensors.ngs_noise": 0.05},
+        {"sensors.noise_from": "photons", "sensors.spots.read_noise": 2.0, "sensors.spots.ngs_photons": 30.0},
+    ],
+)
 def test_noise_of_a_record_is_what_the_filters_reckon_with(changes: dict) -> None:
     """Nothing but noise, 8 s of 1 kHz: covariances of the LGS' mean to 5 %, of 1600 NGS frames to 12 %."""
-    s = scenario({**changes, "turbulence.source": "none", "vibration.source": "none", "loop.closed": False, "run.duration": 8.0,
-                  "sensors.lgs_low_frequency_rms": 0.0, "telescope.radial_order": 3, "sensors.lenslets.ngs_subapertures": 5})
+    s = scenario(
+        {
+            **changes,
+            "turbulence.source": "none",
+            "vibration.source": "none",
+            "loop.closed": False,
+            "run.duration": 8.0,
+            "sensors.lgs_low_frequency_rms": 0.0,
+            "telescope.radial_order": 3,
+            "sensors.lenslets.ngs_subapertures": 5,
+        }
+    )
     record = simulate(s)
     assert record.y_ngs is not None
     seen = {"lgs": record.y_lgs[1:] * np.sqrt(s.sensors.lgs_count), "ngs": record.y_ngs[5::5]}
@@ -89,13 +102,20 @@ def test_more_light_less_noise() -> None:
     assert noise_rms(few, "ngs") == pytest.approx(noise_rms(many, "ngs"))
 
 
-@pytest.mark.parametrize(("changes", "told"), [
-    ({"sensors.lenslets.ngs_subapertures": 2, "telescope.radial_order": 3},
-     "sensors.lenslets.ngs_subapertures = 2: .* up to radial order 2, fewer than telescope.radial_order = 3"),
-    ({"sensors.lenslets.fitted_order": 1, "telescope.radial_order": 2}, "fitted_order = 1 .* radial order 1"),
-    ({"sensors.lenslets.lgs_subapertures": 2, "sensors.lenslets.illumination": 0.9},
-     "sensors.lenslets.lgs_subapertures = 2: no subaperture of 2 x 2 is lit to 0.9"),
-])
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        (
+            {"sensors.lenslets.ngs_subapertures": 2, "telescope.radial_order": 3},
+            "sensors.lenslets.ngs_subapertures = 2: .* up to radial order 2, fewer than telescope.radial_order = 3",
+        ),
+        ({"sensors.lenslets.fitted_order": 1, "telescope.radial_order": 2}, "fitted_order = 1 .* radial order 1"),
+        (
+            {"sensors.lenslets.lgs_subapertures": 2, "sensors.lenslets.illumination": 0.9},
+            "sensors.lenslets.lgs_subapertures = 2: no subaperture of 2 x 2 is lit to 0.9",
+        ),
+    ],
+)
 def test_settings_that_do_not_go_together(changes: dict, told: str) -> None:
     with pytest.raises(SettingError, match=told) as error:
         scenario(changes).validate()

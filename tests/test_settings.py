@@ -40,7 +40,7 @@ def refused(p: param.Parameter) -> Iterator[Any]:
         if shortest:
             yield [item] * (shortest - 1)
         for bad in (math.nextafter(low, -math.inf), math.nextafter(high, math.inf), *NOT_A_NUMBER):
-            yield [item, bad][-max(longest, 1):]
+            yield [item, bad][-max(longest, 1) :]
     elif isinstance(p, param.Integer):
         low, high = p.bounds
         yield from (low - 1, high + 1, low + 0.5, *NOT_A_NUMBER)
@@ -135,9 +135,31 @@ def test_every_number_states_its_unit_or_has_none(path: str) -> None:
     p = next(p for found, _, p in full().walk() if found == path)
     assert p.doc and p.label
     pure = {
-        "damping", "fraction", "wind_factor", "radial_order", "gain", "leak", "order", "seed", "training_size", "depth",
-        "lgs_count", "exposure_ratio", "lgs_subapertures", "ngs_subapertures", "fitted_order", "illumination", "obscuration",
-        "pixels", "turbulence_order", "peak", "peak_count", "strength", "lasers", "share", "third_corner",
+        "damping",
+        "fraction",
+        "wind_factor",
+        "radial_order",
+        "gain",
+        "leak",
+        "order",
+        "seed",
+        "training_size",
+        "depth",
+        "lgs_count",
+        "exposure_ratio",
+        "lgs_subapertures",
+        "ngs_subapertures",
+        "fitted_order",
+        "illumination",
+        "obscuration",
+        "pixels",
+        "turbulence_order",
+        "peak",
+        "peak_count",
+        "strength",
+        "lasers",
+        "share",
+        "third_corner",
     }
     is_quantity = isinstance(p, (param.Number, Reals)) and path.rsplit(".", 1)[-1] not in pure
     assert bool(unit_of(p)) == is_quantity
@@ -158,11 +180,24 @@ def test_all_ways_in_are_equally_strict(path: str, value: Any) -> None:
         setattr(getattr(Scenario(), group), name, value)
 
 
-@pytest.mark.parametrize("path", [
-    "x", "telescope.x", "telescope.diameter.x", "vibration.peaks.0.x", "vibration.peaks.2.frequency", "", ".", "name",
-    "vibration.peaks.-1.frequency", "vibration.peaks.first", "telescope.name", "vibration.peaks.0.rms.0.x",
-    "run.to_dict",
-])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "x",
+        "telescope.x",
+        "telescope.diameter.x",
+        "vibration.peaks.0.x",
+        "vibration.peaks.2.frequency",
+        "",
+        ".",
+        "name",
+        "vibration.peaks.-1.frequency",
+        "vibration.peaks.first",
+        "telescope.name",
+        "vibration.peaks.0.rms.0.x",
+        "run.to_dict",
+    ],
+)
 def test_unknown_names_are_refused(path: str) -> None:
     scenario = Scenario()
     with pytest.raises(SettingError) as caught:
@@ -234,8 +269,9 @@ def test_numbers_of_numpy_in_peaks_and_events() -> None:
     peak = {"frequency": np.float64(45), "damping": np.float32(0.5), "rms": [np.float64(0.01), np.float64(0.02)]}
     event = {"kind": np.str_("peak"), "start": np.float64(1), "peak": np.int64(0)}
     scenario = Scenario().replace({"vibration.peaks": [peak], "events": [event]})
-    assert scenario == Scenario().replace({
-        "vibration.peaks": [{"frequency": 45.0, "damping": 0.5, "rms": [0.01, 0.02]}], "events": [{"start": 1.0}]})
+    assert scenario == Scenario().replace(
+        {"vibration.peaks": [{"frequency": 45.0, "damping": 0.5, "rms": [0.01, 0.02]}], "events": [{"start": 1.0}]}
+    )
     assert types_in(scenario.to_dict()) <= {float, int, bool, str}
     assert types_in(Peak(frequency=np.float64(45), rms=[np.float64(1)]).to_dict()) == {float}
 

@@ -92,8 +92,15 @@ def test_polynomials_are_orthonormal_and_noll_s() -> None:
     assert gram == pytest.approx(np.eye(44), abs=1e-12)
     x, y = np.array([0.3, 1.02]), np.array([-0.5, 0.4])
     s = x**2 + y**2
-    printed = [2 * x, 2 * y, np.sqrt(3) * (2 * s - 1), np.sqrt(6) * 2 * x * y, np.sqrt(6) * (x**2 - y**2),
-               np.sqrt(8) * (3 * s - 2) * y, np.sqrt(8) * (3 * s - 2) * x]
+    printed = [
+        2 * x,
+        2 * y,
+        np.sqrt(3) * (2 * s - 1),
+        np.sqrt(6) * 2 * x * y,
+        np.sqrt(6) * (x**2 - y**2),
+        np.sqrt(8) * (3 * s - 2) * y,
+        np.sqrt(8) * (3 * s - 2) * x,
+    ]
     assert polynomials(3, x, y)[:7] == pytest.approx(np.array(printed), rel=1e-12)
 
 
@@ -130,10 +137,15 @@ def test_tip_through_the_sensor() -> None:
     assert modes[1:] == pytest.approx(0.0, abs=1e-10)
 
 
-@pytest.mark.parametrize(("across", "order", "illumination", "told"), [
-    (2, 3, 0.5, "hardly tell|cannot tell"), (1, 2, 0.5, "1 subapertures cannot tell the 5 modes"), (4, 5, 0.5, "condition"),
-    (2, 1, 0.9, "no subaperture of 2 x 2 is lit to 0.9"),
-])
+@pytest.mark.parametrize(
+    ("across", "order", "illumination", "told"),
+    [
+        (2, 3, 0.5, "hardly tell|cannot tell"),
+        (1, 2, 0.5, "1 subapertures cannot tell the 5 modes"),
+        (4, 5, 0.5, "condition"),
+        (2, 1, 0.9, "no subaperture of 2 x 2 is lit to 0.9"),
+    ],
+)
 def test_slopes_that_do_not_determine_the_modes(across: int, order: int, illumination: float, told: str) -> None:
     with pytest.raises(ValueError, match=told) as error:
         reconstructor(Lenslets(D, across, illumination), order)
@@ -210,6 +222,7 @@ def test_mean_gradient_is_166_nm_away_from_the_tip() -> None:
         def integrand(log_k: float) -> float:
             k = np.exp(log_k)
             return np.pi * k**2 * weight(k * D / 2) * float(spectrum(np.array(k**2), STRENGTH, L0))
+
         return 1e3 * math.sqrt(quad(integrand, np.log(1e-4), np.log(500.0), limit=3000)[0])
 
     assert integral(lambda x: (4 * jv(2, x) / x) ** 2) == pytest.approx(529.3, abs=0.5)
@@ -275,8 +288,10 @@ def test_sensor_and_projection_see_the_same_turbulence() -> None:
     """They differ by the aliasing and no more, in a record of ten frames of a millisecond: between 0.4 and 2 of its rms."""
     sensor, ideal = ShackHartmann(Lenslets(D, 40), (2, 3), 8), ZernikeProjection(D, (2, 3))
     layers, beam = [Layer(STRENGTH, 5000.0, 15.0, 0.5)], (Footprint(0.94),)
-    runs = [frozen_flow(layers, L0, D, [View(sensor, beam), View(ideal, beam)], 10, 1e-3, np.random.default_rng(seed))
-            for seed in range(5)]
+    runs = [
+        frozen_flow(layers, L0, D, [View(sensor, beam), View(ideal, beam)], 10, 1e-3, np.random.default_rng(seed))
+        for seed in range(5)
+    ]
     off = np.sqrt(np.mean([(seen - true) ** 2 for seen, true in runs]))
     wanted = np.sqrt(Aliasing(sensor).covariance(STRENGTH, L0, 0.94)[0, 0])
     assert 0.4 * wanted < off < 2 * wanted
@@ -285,10 +300,13 @@ def test_sensor_and_projection_see_the_same_turbulence() -> None:
 # ---------------------------------------------------------------------- noise
 
 
-@pytest.mark.parametrize("spots", [
-    Spots(photons=200.0, read_noise=0.0, fwhm=1.5, pixel_scale=0.6, pixels=12),
-    Spots(photons=200.0, read_noise=3.0, fwhm=1.5, pixel_scale=0.6, pixels=8),
-])
+@pytest.mark.parametrize(
+    "spots",
+    [
+        Spots(photons=200.0, read_noise=0.0, fwhm=1.5, pixel_scale=0.6, pixels=12),
+        Spots(photons=200.0, read_noise=3.0, fwhm=1.5, pixel_scale=0.6, pixels=8),
+    ],
+)
 def test_slope_noise_against_simulated_spots(spots: Spots) -> None:
     """4000 spots, photon by photon, on a noisy detector: 4 % is two standard errors of a variance; the mean is taken with
     the number of photons known, as the formula does."""

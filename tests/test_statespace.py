@@ -44,11 +44,17 @@ def test_matrices_are_those_printed() -> None:
     """Paper, eq. 7, all but B_u."""
     A, B, C = paper_matrices(TURBULENCE, VIBRATION)
     t, v = TURBULENCE, VIBRATION
-    assert np.array_equal(A, [
-        [t.a1, t.a2, 0, 0, 0, 0], [1, 0, 0, 0, 0, 0],
-        [0, 0, v.a1, v.a2, 0, 0], [0, 0, 1, 0, 0, 0],
-        [0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0],
-    ])
+    assert np.array_equal(
+        A,
+        [
+            [t.a1, t.a2, 0, 0, 0, 0],
+            [1, 0, 0, 0, 0, 0],
+            [0, 0, v.a1, v.a2, 0, 0],
+            [0, 0, 1, 0, 0, 0],
+            [0, 0, 0, 0, 0, 0],
+            [0, 0, 0, 0, 1, 0],
+        ],
+    )
     assert np.array_equal(B, [0, 0, 0, 0, 1, 0]) and np.array_equal(C, [0, 1, 0, 1, 0, 1])
 
 

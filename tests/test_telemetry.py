@@ -21,7 +21,11 @@ def arrays(record):
     """A small valid record as plain arrays."""
     n = 40
     return {
-        "y_lgs": record.y_lgs[:n], "u": record.u[:n], "dt": np.array(1e-3), "y_ngs": record.y_ngs[:n], "ratio": np.array(5),
+        "y_lgs": record.y_lgs[:n],
+        "u": record.u[:n],
+        "dt": np.array(1e-3),
+        "y_ngs": record.y_ngs[:n],
+        "ratio": np.array(5),
     }
 
 

@@ -68,11 +68,18 @@ def test_ours_are_the_same_in_a_fresh_process(name: str) -> None:
     check_observer(OBSERVERS[name])
 
 
-@pytest.mark.parametrize(("run", "reason"), [
-    (mean_of_three, "looks ahead: measurements after step 750"), (of_the_truth, "knows more than it is told"),
-    (different_every_time, "two results"), (one_column, r"shape \(1500, 2\)"), (in_place, r"changes its measurements \(y_lgs\)"),
-    (never_again, "come back after missing"), (lambda m, p, s, w: {VIBRATION: m.z}, "cannot run in a fresh process"),
-])
+@pytest.mark.parametrize(
+    ("run", "reason"),
+    [
+        (mean_of_three, "looks ahead: measurements after step 750"),
+        (of_the_truth, "knows more than it is told"),
+        (different_every_time, "two results"),
+        (one_column, r"shape \(1500, 2\)"),
+        (in_place, r"changes its measurements \(y_lgs\)"),
+        (never_again, "come back after missing"),
+        (lambda m, p, s, w: {VIBRATION: m.z}, "cannot run in a fresh process"),
+    ],
+)
 def test_what_breaks_a_rule_is_refused_with_the_reason(run: Any, reason: str) -> None:
     with pytest.raises(CheckError, match=f"^mine: .*{reason}"):
         check_observer(observer(run))

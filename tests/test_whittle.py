@@ -49,8 +49,9 @@ def test_variance_of_the_drive_in_long_arithmetic(p: Ar3) -> None:
     with mp.workdps(50):
         poles = [mp.exp(-mp.mpc(a.real, a.imag)) for a in p.decays]
         weight = [q**2 / mp.fprod(q - other for other in poles if other is not q) for q in poles]
-        variance = mp.fsum(v * w / (1 - q * r) for v, q in zip(weight, poles, strict=True)
-                           for w, r in zip(weight, poles, strict=True))
+        variance = mp.fsum(
+            v * w / (1 - q * r) for v, q in zip(weight, poles, strict=True) for w, r in zip(weight, poles, strict=True)
+        )
         assert p.unit_drive_variance == pytest.approx(float(1 / variance.real), rel=1e-13)  # some fifty roundings
         f = np.array([0.01, 1.0, 30.0, 450.0])
         turns = [mp.expjpi(-2 * mp.mpf(x) * p.dt) for x in f]

@@ -21,11 +21,17 @@ from wfsobs.simulation.true_spectra import TrueSpectra, line_width, n_frequencie
 from wfsobs.typing import Array
 
 # The loop of one 530 nm turbulence, one 50 nm line at 47.5 Hz, 20 nm of noise.
-MATCHED = Scenario().replace({
-    "turbulence.rms": 0.53, "vibration.source": "ar2", "kalman.frequency": 47.5,
-    "vibration.peaks": [{"frequency": 47.5, "damping": 0.03, "rms": [0.05, 0.05]}],
-    "sensors.lgs_count": 1, "sensors.lgs_noise": 0.02, "sensors.lgs_low_frequency_rms": 0.0,
-})
+MATCHED = Scenario().replace(
+    {
+        "turbulence.rms": 0.53,
+        "vibration.source": "ar2",
+        "kalman.frequency": 47.5,
+        "vibration.peaks": [{"frequency": 47.5, "damping": 0.03, "rms": [0.05, 0.05]}],
+        "sensors.lgs_count": 1,
+        "sensors.lgs_noise": 0.02,
+        "sensors.lgs_low_frequency_rms": 0.0,
+    }
+)
 
 
 def riccati_errors(scenario: Scenario) -> tuple[dict[str, float], dict[str, float]]:
@@ -76,16 +82,28 @@ def test_the_bound_of_the_two_frame_loop() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(
-    wind=st.floats(2.0, 60.0), rms=st.floats(0.05, 2.0), frequency=st.floats(5.0, 80.0), damping=st.floats(0.005, 0.5),
-    vibration=st.floats(0.002, 0.2), noise=st.floats(0.002, 0.2), duration=st.floats(1.0, 3.0),
+    wind=st.floats(2.0, 60.0),
+    rms=st.floats(0.05, 2.0),
+    frequency=st.floats(5.0, 80.0),
+    damping=st.floats(0.005, 0.5),
+    vibration=st.floats(0.002, 0.2),
+    noise=st.floats(0.002, 0.2),
+    duration=st.floats(1.0, 3.0),
 )
 def test_where_the_truth_is_ar2_it_is_the_riccati_covariance(
     wind: float, rms: float, frequency: float, damping: float, vibration: float, noise: float, duration: float
 ) -> None:
-    scenario = MATCHED.replace({
-        "turbulence.wind_speed": wind, "turbulence.rms": rms, "vibration.peaks.0.frequency": frequency,
-        "kalman.frequency": frequency, "vibration.peaks.0.rms": [vibration], "sensors.lgs_noise": noise, "run.duration": duration,
-    })
+    scenario = MATCHED.replace(
+        {
+            "turbulence.wind_speed": wind,
+            "turbulence.rms": rms,
+            "vibration.peaks.0.frequency": frequency,
+            "kalman.frequency": frequency,
+            "vibration.peaks.0.rms": [vibration],
+            "sensors.lgs_noise": noise,
+            "run.duration": duration,
+        }
+    )
     floor = 4 * line_width(scenario) / (2 * frequency)  # a bound takes no line for narrower than a quarter of this
     scenario = scenario.replace({"vibration.peaks.0.damping": max(damping, floor), "kalman.damping": max(damping, floor)})
     filtered, predicted = riccati_errors(scenario)

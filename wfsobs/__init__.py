@@ -33,8 +33,11 @@ _HOMES = {
     "close_loop": "control.closed_loop",
     "score": "evaluation.scores",
     "identify": "identification.identification",
-    "Result": "pipeline", "observe": "pipeline", "run": "pipeline",
-    "Record": "record", "RecordError": "record",
+    "Result": "pipeline",
+    "observe": "pipeline",
+    "run": "pipeline",
+    "Record": "record",
+    "RecordError": "record",
     "Scenario": "scenario",
     "PRESETS": "scenario.presets",
     "SettingError": "scenario.settings",
@@ -45,8 +48,21 @@ _HOMES = {
 """Public name -> the module below wfsobs that defines it."""
 
 __all__ = [
-    "PRESETS", "Record", "RecordError", "Result", "Scenario", "SettingError", "close_loop", "export", "identify", "load",
-    "observe", "run", "score", "simulate", "tune",
+    "PRESETS",
+    "Record",
+    "RecordError",
+    "Result",
+    "Scenario",
+    "SettingError",
+    "close_loop",
+    "export",
+    "identify",
+    "load",
+    "observe",
+    "run",
+    "score",
+    "simulate",
+    "tune",
 ]
 
 

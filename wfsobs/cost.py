@@ -56,7 +56,8 @@ def frozen_flow_seconds(scenario: Scenario, n_steps: int) -> float:
     duration, diameter = n_steps / s.lgs_rate, scenario.telescope.diameter
     widths = sum(
         (1.0 + duration * t.wind_speed * layer.wind_factor / diameter) * 0.5 * (1.0 + FIELD * layer.height / diameter)
-        for layer in t.layers)
+        for layer in t.layers
+    )
     beams = 2 + (s.lgs_count if s.lgs_radius > 0 else 1)
     finest = max(40, s.lenslets.lgs_subapertures, s.lenslets.ngs_subapertures)
     each = 0.1 if s.kind == "zernike" else (finest / 40) ** 2

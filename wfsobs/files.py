@@ -32,10 +32,14 @@ def check_writable(path: str | Path) -> None:
     path = Path(path)
     folder = path.parent
     number, where = (
-        (errno.EISDIR, path) if path.is_dir()
-        else (errno.ENOENT, folder) if not folder.exists()
-        else (errno.ENOTDIR, folder) if not folder.is_dir()
-        else (errno.EACCES, folder) if not os.access(folder, os.W_OK | os.X_OK)
+        (errno.EISDIR, path)
+        if path.is_dir()
+        else (errno.ENOENT, folder)
+        if not folder.exists()
+        else (errno.ENOTDIR, folder)
+        if not folder.is_dir()
+        else (errno.EACCES, folder)
+        if not os.access(folder, os.W_OK | os.X_OK)
         else (0, path)
     )
     if number:

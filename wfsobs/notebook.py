@@ -12,6 +12,7 @@ def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     >>> html_table(("Mode", "rms"), [("tip", "< 1 nm")])
     '<table><thead><tr><th>Mode</th><th>rms</th></tr></thead><tbody><tr><td>tip</td><td>&lt; 1 nm</td></tr></tbody></table>'
     """
+
     def row(cells: Sequence[str], tag: str) -> str:
         return f"<tr>{''.join(f'<{tag}>{escape(cell)}</{tag}>' for cell in cells)}</tr>"
 

@@ -99,7 +99,11 @@ def as_stated(record: Record, scenario: Scenario) -> Scenario:
 
 
 def collect(
-    scenario: Scenario, record: Record, estimates: Sequence[Estimate], failures: Sequence[Failure], watch: Watch = QUIET,
+    scenario: Scenario,
+    record: Record,
+    estimates: Sequence[Estimate],
+    failures: Sequence[Failure],
+    watch: Watch = QUIET,
     least: Sequence[Bound] = (),
 ) -> Result:
     """A Result with its scores, everything in the order of the registry, the bounds last. Raises Cancelled."""
@@ -116,7 +120,10 @@ def collect(
 
 
 def each_estimate(
-    record: Record, scenario: Scenario, watch: Watch = QUIET, observers: Sequence[str] | None = None,
+    record: Record,
+    scenario: Scenario,
+    watch: Watch = QUIET,
+    observers: Sequence[str] | None = None,
     on_partial: Callable[[str, str, Array], None] | None = None,
 ) -> Iterator[Estimate | Failure]:
     """Run the observers and yield each one's estimates as soon as they are done, the slow ones last. Each receives

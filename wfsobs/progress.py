@@ -64,7 +64,9 @@ def detached(watch: Watch) -> Iterator[Watch]:
     _LISTENING[key] = watch
     try:
         yield Watch(
-            lambda fraction: _LISTENING[key].progress(fraction), lambda: _LISTENING[key].cancelled(),
-            lambda target, values: _LISTENING[key].partial(target, values))
+            lambda fraction: _LISTENING[key].progress(fraction),
+            lambda: _LISTENING[key].cancelled(),
+            lambda target, values: _LISTENING[key].partial(target, values),
+        )
     finally:
         del _LISTENING[key]

@@ -114,17 +114,26 @@ class Record(Signals):
         """What it is, in a few words."""
         parts = [("turbulence", self.turbulence), ("vibration", self.vibration)]
         return [
-            ("length", f"{self.n_steps * self.dt:g} s"), ("rate", f"{1.0 / self.dt:g} Hz"), ("modes", str(self.n_modes)),
+            ("length", f"{self.n_steps * self.dt:g} s"),
+            ("rate", f"{1.0 / self.dt:g} Hz"),
+            ("modes", str(self.n_modes)),
             ("NGS", "none" if self.ratio is None else f"every {self.ratio} steps"),
-            ("truth", " and ".join(name for name, x in parts if x is not None) or "none"), ("missing", str(self.missing)),
+            ("truth", " and ".join(name for name, x in parts if x is not None) or "none"),
+            ("missing", str(self.missing)),
         ]
 
     def measurements(self, open_loop: bool = False) -> Measurements:
         """The signals alone, copied: no array is a view of one that may hold more. open_loop : with the open-loop twin."""
         y_ngs, twin = self.y_ngs, self.open_loop_y if open_loop else None
         return Measurements(
-            _own(self.y_lgs), _own(self.u), self.dt, None if y_ngs is None else _own(y_ngs), self.ratio,
-            None if twin is None else _own(twin), self.delay)
+            _own(self.y_lgs),
+            _own(self.u),
+            self.dt,
+            None if y_ngs is None else _own(y_ngs),
+            self.ratio,
+            None if twin is None else _own(twin),
+            self.delay,
+        )
 
     def truth(self, target: str) -> Array | None:
         """The true signal of `target` ("turbulence" or "vibration"), or None."""

@@ -1,8 +1,8 @@
 """A check of observers written elsewhere, in the manner of scikit-learn's `check_estimator`.
 
-    >>> from wfsobs.observers import OBSERVERS
-    >>> from wfsobs.testing import check_observer
-    >>> check_observer(OBSERVERS["persistence"], alone=False)
+>>> from wfsobs.observers import OBSERVERS
+>>> from wfsobs.testing import check_observer
+>>> check_observer(OBSERVERS["persistence"], alone=False)
 """
 
 from __future__ import annotations
@@ -28,8 +28,14 @@ SAME = 1e-9
 """Difference over the rms of an estimate that is rounding: blocks of another length add up in another order."""
 
 QUICK: dict[str, Any] = {
-    "run.duration": 1.5, "run.warm_up": 0.2, "adaptive.window": 0.25, "gpr_offline.training_size": 60, "gpr_offline.depth": 25,
-    "gpr_online.training_size": 60, "gpr_online.depth": 25}
+    "run.duration": 1.5,
+    "run.warm_up": 0.2,
+    "adaptive.window": 0.25,
+    "gpr_offline.training_size": 60,
+    "gpr_offline.depth": 25,
+    "gpr_online.training_size": 60,
+    "gpr_online.depth": 25,
+}
 
 Estimates = dict[str, Array]
 
@@ -64,8 +70,12 @@ def check_observer(observer: Observer, scenario: Scenario | None = None, alone: 
         _check_causal(observer, given, base)
     _check_gaps(observer, given)
     if alone:
-        _compare(observer, _in_a_fresh_process(observer, again), base,
-                 "in a fresh process, with measurements and prior alone, it gives another result: it knows more than it is told")
+        _compare(
+            observer,
+            _in_a_fresh_process(observer, again),
+            base,
+            "in a fresh process, with measurements and prior alone, it gives another result: it knows more than it is told",
+        )
 
 
 def _check_shapes(observer: Observer, base: Estimates, measured: Measurements) -> None:
@@ -93,10 +103,19 @@ def _check_causal(observer: Observer, given: tuple[Measurements, Prior, Any], ba
     measured, n = given[0], given[0].n_steps
     for k in (n // 2, n // 2 + 3, n - 5):
         rng = np.random.default_rng(k)
-        later = replace(measured, y_lgs=_moved(measured.y_lgs, k + 1, rng), u=_moved(measured.u, k + 1, rng),
-                        y_ngs=None if measured.y_ngs is None else _moved(measured.y_ngs, k + 1, rng))
-        _compare(observer, observer.estimate(later, *given[1:]), base,
-                 f"looks ahead: measurements after step {k} change its estimate of earlier steps", stop=k + 1)
+        later = replace(
+            measured,
+            y_lgs=_moved(measured.y_lgs, k + 1, rng),
+            u=_moved(measured.u, k + 1, rng),
+            y_ngs=None if measured.y_ngs is None else _moved(measured.y_ngs, k + 1, rng),
+        )
+        _compare(
+            observer,
+            observer.estimate(later, *given[1:]),
+            base,
+            f"looks ahead: measurements after step {k} change its estimate of earlier steps",
+            stop=k + 1,
+        )
 
 
 def _check_gaps(observer: Observer, given: tuple[Measurements, Prior, Any]) -> None:
@@ -135,5 +154,3 @@ def _in_a_fresh_process(observer: Observer, given: tuple[Measurements, Prior, An
 
 def _run(observer: Observer, *given: Any) -> Estimates:
     return observer.estimate(*given)
-
-

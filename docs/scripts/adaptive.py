@@ -47,7 +47,7 @@ def against_knowledge(seeds: int) -> None:
         found: dict[tuple[str, str], list[np.ndarray]] = {}
         for s, record in records(PRESETS[preset]().replace({"adaptive.window": window}), seeds):
             for target in ("vibration", "turbulence"):
-                error = {name: rms(errors(s, name, record, target)[round(START / s.dt):]) for name in NAMES}
+                error = {name: rms(errors(s, name, record, target)[round(START / s.dt) :]) for name in NAMES}
                 for name in NAMES:
                     found.setdefault((target, name), []).append(error[name] / error[KNOWING])
         cells = [f"{np.median(x):.2f} ({np.max(x):.2f})" for (_, name), x in found.items() if name != KNOWING]
@@ -56,10 +56,16 @@ def against_knowledge(seeds: int) -> None:
 
 def after_a_jump(seeds: int) -> None:
     """Rms of the error of the vibration over half seconds, all seeds and modes together, over that before the jump."""
-    s = PRESETS["paper"]().replace({
-        "vibration.source": "ar2", "vibration.peaks": [PEAK], "kalman.process_noise": "matched",
-        "kalman.frequency": PEAK["frequency"], "kalman.damping": PEAK["damping"],
-        "events": [{"kind": "peak", "peak": 0, "start": WHEN, "frequency_shift": JUMP}]})
+    s = PRESETS["paper"]().replace(
+        {
+            "vibration.source": "ar2",
+            "vibration.peaks": [PEAK],
+            "kalman.process_noise": "matched",
+            "kalman.frequency": PEAK["frequency"],
+            "kalman.damping": PEAK["damping"],
+            "events": [{"kind": "peak", "peak": 0, "start": WHEN, "frequency_shift": JUMP}],
+        }
+    )
     squares: dict[str, list[np.ndarray]] = {name: [] for name in NAMES}
     for its, record in records(s, seeds):
         for name in NAMES:

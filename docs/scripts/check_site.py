@@ -38,8 +38,11 @@ class Page(HTMLParser):
 def faults(site: Path) -> list[str]:
     """One line per fault."""
     pages = {file.resolve(): Page(file.read_text(encoding="utf-8")) for file in site.rglob("*.html")}
-    out = [f"{file.name}: loads {url}" for file in site.rglob("*.css")
-           for url in re.findall(r"(?:url\(['\"]?|@import ['\"])(https?:[^)'\"]*)", file.read_text(encoding="utf-8"))]
+    out = [
+        f"{file.name}: loads {url}"
+        for file in site.rglob("*.css")
+        for url in re.findall(r"(?:url\(['\"]?|@import ['\"])(https?:[^)'\"]*)", file.read_text(encoding="utf-8"))
+    ]
     for file, page in pages.items():
         if file.name == "404.html":
             continue  # its links are those of a server's root

@@ -18,11 +18,17 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 
-MATCHED = Scenario().replace({
-    "turbulence.rms": 0.53, "vibration.source": "ar2", "kalman.frequency": 47.5,
-    "vibration.peaks": [{"frequency": 47.5, "damping": 0.03, "rms": [0.05, 0.05]}],
-    "sensors.lgs_count": 1, "sensors.lgs_noise": 0.02, "sensors.lgs_low_frequency_rms": 0.0,
-})
+MATCHED = Scenario().replace(
+    {
+        "turbulence.rms": 0.53,
+        "vibration.source": "ar2",
+        "kalman.frequency": 47.5,
+        "vibration.peaks": [{"frequency": 47.5, "damping": 0.03, "rms": [0.05, 0.05]}],
+        "sensors.lgs_count": 1,
+        "sensors.lgs_noise": 0.02,
+        "sensors.lgs_low_frequency_rms": 0.0,
+    }
+)
 """One turbulence of 530 nm, one line of 50 nm, 20 nm of noise, and a filter that knows them."""
 
 SEEDS = range(1, 11)
@@ -39,8 +45,10 @@ def two_frames() -> None:
     half = {"control.integrator": "manual", "control.gain": 0.5}
     print("| Controller | Theory, nm | Simulated, nm | over theory |\n|---|---|---|---|")
     cases = (
-        ("Integrator, g = 0.5", "integrator", half), ("Integrator, best gain", "integrator", {}),
-        ("LQG, LGS KF", "lqg-kf-lgs", {}))
+        ("Integrator, g = 0.5", "integrator", half),
+        ("Integrator, best gain", "integrator", {}),
+        ("LQG, LGS KF", "lqg-kf-lgs", {}),
+    )
     for name, controller, changes in cases:
         left = _left(MATCHED.replace({"run.duration": 60.0, **changes}), [controller], range(1, 21))[controller]
         plan = design(MATCHED.replace(changes), [controller])

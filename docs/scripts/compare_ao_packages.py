@@ -114,8 +114,9 @@ def specula(screens: list[Screen], pixels: int) -> Array:
     from specula.data_objects.electric_field import ElectricField
     from specula.processing_objects.modal_analysis import ModalAnalysis
 
-    analysis = ModalAnalysis(type_str="zernike", npixels=pixels, obsratio=0.0, diaratio=1.0,
-                             nmodes=len(zernike.up_to_order(ORDER)))
+    analysis = ModalAnalysis(
+        type_str="zernike", npixels=pixels, obsratio=0.0, diaratio=1.0, nmodes=len(zernike.up_to_order(ORDER))
+    )
     field = ElectricField(pixels, pixels, DIAMETER / pixels)
     analysis.inputs["in_ef"].set(field)
     out = []
@@ -141,8 +142,9 @@ def main() -> None:
     kx, ky = np.broadcast_arrays(screens[0].kx, screens[0].ky)
     transforms = np.array([zernike.transform(j, DIAMETER / 2.0 * kx, DIAMETER / 2.0 * ky) for j in nolls])
     ideal = np.array([s.modes(transforms) for s in screens])
-    print(f"{SCREENS} screens, {len(nolls)} modes; numpy {np.__version__}, OOPAO {version('OOPAO')}, "
-          f"SPECULA {version('specula')}")
+    print(
+        f"{SCREENS} screens, {len(nolls)} modes; numpy {np.__version__}, OOPAO {version('OOPAO')}, SPECULA {version('specula')}"
+    )
     rows = []
     for pixels in PIXELS:
         lenslets = Lenslets(DIAMETER, ACROSS, cells=pixels)
@@ -151,17 +153,21 @@ def main() -> None:
         if pixels == PIXELS[0]:
             transforms = ShackHartmann(lenslets, nolls, FITTED).transform(kx, ky)
             direct = np.array([s.modes(transforms) for s in screens])
-            print(f"this package, by transform and by slopes: {1e3 * rms(direct - modes):.2g} nm apart; sensor less Zernike "
-                  f"coefficients {1e3 * rms((modes - ideal)[:, :2]):.2f} nm in tip and tilt, {1e3 * rms(modes - ideal):.2f} nm "
-                  f"in all, of {1e3 * rms(ideal[:, :2]):.0f} and {1e3 * rms(ideal):.0f} nm")
+            print(
+                f"this package, by transform and by slopes: {1e3 * rms(direct - modes):.2g} nm apart; sensor less Zernike "
+                f"coefficients {1e3 * rms((modes - ideal)[:, :2]):.2f} nm in tip and tilt, {1e3 * rms(modes - ideal):.2f} nm "
+                f"in all, of {1e3 * rms(ideal[:, :2]):.0f} and {1e3 * rms(ideal):.0f} nm"
+            )
         their_slopes, their_modes = oopao(screens, lenslets)
         analysed = specula(screens, pixels)
         inner = np.tile(lenslets.fraction[lenslets.valid] == 1.0, 2)
         off = their_modes[:, : len(nolls)] - modes
         apart = analysed * np.sign(np.sum(analysed * ideal, axis=0)) - ideal  # an orthonormal basis has no signs
-        rows.append(f"| {pixels} | {rms((their_slopes - slopes)[:, inner]) / rms(slopes[:, inner]):.2%} "
-                    f"| {rms(their_slopes - slopes) / rms(slopes):.2%} | {1e3 * rms(off[:, :2]):.2f} nm "
-                    f"| {1e3 * rms(off):.2f} nm | {1e3 * rms(apart[:, :2]):.2f} nm | {1e3 * rms(apart):.2f} nm |")
+        rows.append(
+            f"| {pixels} | {rms((their_slopes - slopes)[:, inner]) / rms(slopes[:, inner]):.2%} "
+            f"| {rms(their_slopes - slopes) / rms(slopes):.2%} | {1e3 * rms(off[:, :2]):.2f} nm "
+            f"| {1e3 * rms(off):.2f} nm | {1e3 * rms(apart[:, :2]):.2f} nm | {1e3 * rms(apart):.2f} nm |"
+        )
     print("| Pixels across | OOPAO: slopes, inner | slopes, all | tip and tilt | all modes | SPECULA: tip and tilt | all modes |")
     print("|---|---|---|---|---|---|---|", *rows, sep="\n")
 

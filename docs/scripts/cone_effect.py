@@ -54,5 +54,7 @@ if __name__ == "__main__":
     print(f"tip, full aperture: {np.sqrt(integral_nm2(lambda k: tip(k, DIAMETER) ** 2)):.1f} nm rms per axis")
     for height in (4.0, 8.0, 10.0, 12.0):
         rms, share, rest = cone_error(height)
-        print(f"layer at {height:4.1f} km: NGS - LGS {rms:.1f} nm rms per axis = "
-              f"{share:.3f} times the NGS tip, and {rest:.1f} nm besides")
+        print(
+            f"layer at {height:4.1f} km: NGS - LGS {rms:.1f} nm rms per axis = "
+            f"{share:.3f} times the NGS tip, and {rest:.1f} nm besides"
+        )

@@ -12,8 +12,12 @@ from wfsobs.pipeline import run
 from wfsobs.scenario.presets import PRESETS
 
 CASES = {
-    "peak-jump": TARGETS[1:], "peak-drift": TARGETS[1:], "wind-change": TARGETS, "laser-dropout": TARGETS,
-    "lost-frames": TARGETS}
+    "peak-jump": TARGETS[1:],
+    "peak-drift": TARGETS[1:],
+    "wind-change": TARGETS,
+    "laser-dropout": TARGETS,
+    "lost-frames": TARGETS,
+}
 """Preset -> the targets that are worth a table."""
 WINDOW = 2.0
 LEFT_OUT = ("zero", "ridge", "persistence")
@@ -26,8 +30,7 @@ def tables(preset: str, seeds: int) -> str:
     for seed in range(1, seeds + 1):
         history.add(run(scenario.replace({"run.seed": seed})), seed)
     out = [f"`{preset}`, tip, rms over {WINDOW:g} s, {seeds} seeds together:\n"]
-    lines = [
-        line for line in history.recoveries() if line[0] in CASES[preset] and line[1] == "tip" and line[3] not in LEFT_OUT]
+    lines = [line for line in history.recoveries() if line[0] in CASES[preset] and line[1] == "tip" and line[3] not in LEFT_OUT]
     for (target, _, event), group in groupby(lines, key=lambda line: line[:3]):
         out.append(f"| {target}, {event} | before, nm | worst after | at the end | back after, s |\n|---|---|---|---|---|")
         out += [f"| {label_of(name)} | {' | '.join(recovery_texts(r))} |" for *_, name, r in group]

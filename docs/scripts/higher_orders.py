@@ -11,14 +11,20 @@ from wfsobs import PRESETS, run
 
 SEEDS = range(1, 11)
 OBSERVERS = {
-    "kf-lgs": "LGS KF", "kf-ngs": "NGS KF", "multirate": "Multi-rate KF", "multirate-optimal": "Optimal multi-rate KF",
+    "kf-lgs": "LGS KF",
+    "kf-ngs": "NGS KF",
+    "multirate": "Multi-rate KF",
+    "multirate-optimal": "Optimal multi-rate KF",
     "zero": "Zero",
 }
 CASES: dict[str, dict[str, Any]] = {
     "two LGS on the axis, their mean": {},
     'four LGS at 17.5", their mean': {"sensors.lgs_count": 4, "sensors.lgs_radius": 17.5},
     'four LGS at 17.5", minimum variance': {
-        "sensors.lgs_count": 4, "sensors.lgs_radius": 17.5, "sensors.lgs_combination": "minimum-variance"},
+        "sensors.lgs_count": 4,
+        "sensors.lgs_radius": 17.5,
+        "sensors.lgs_combination": "minimum-variance",
+    },
     "two LGS on the axis, NGS noise 50 nm": {"sensors.ngs_noise": 0.05},
     "two LGS on the axis, AR(2) turbulence": {"turbulence.source": "ar2"},
 }

@@ -44,9 +44,11 @@ def floor(scenario: Scenario, f: float) -> float:
 def power(level: float, density: Callable[[float], float], duration: float) -> float:
     """Probability that a search of this level, `density` of it per Hz, sees a line of IN_ONE_BIN at its own frequency or beside
     it; mean over LINES. Over the frequencies beside it 2 I / S is noncentral chi squared of three degrees of freedom."""
+
     def passed(f: float) -> float:
         u = brentq(lambda u: np.exp(-u) * (1.0 + sqrt(pi * u / 3.0)) - level * density(f) / duration, 1.0, 60.0)
         return float(ncx2.sf(2.0 * u, 3, 2.0 * IN_ONE_BIN))
+
     return float(np.mean([passed(f) for f in LINES]))
 
 
@@ -54,8 +56,12 @@ def theory(duration: float) -> str:
     """What can be had: the search as it is in one of two modes and in a single mode; and one that looks for nothing but lines
     below STRUCTURES, at 5 %, in two modes and in one."""
     below = 1.0 / np.log(STRUCTURES / LOWEST)
-    levels = {"as it is": ALONE * OF_LINES * LEVEL / 2 * BELOW, "as it is, one mode": OF_LINES * LEVEL * BELOW,
-              "lines alone, all at 5 %": 0.025, "lines alone, one mode, at 5 %": 0.05}
+    levels = {
+        "as it is": ALONE * OF_LINES * LEVEL / 2 * BELOW,
+        "as it is, one mode": OF_LINES * LEVEL * BELOW,
+        "lines alone, all at 5 %": 0.025,
+        "lines alone, one mode, at 5 %": 0.05,
+    }
     return "; ".join(f"{name} {power(level, lambda f: below / f, duration):.1%}" for name, level in levels.items())
 
 
@@ -67,8 +73,7 @@ def known_peaks(duration: float, modes: int = 2, level: float = IN_ONE_BIN) -> S
     shapes = [Ar2(2.0 * pi * f, xi, rms, s.dt) for f, xi, rms in peaks]
     skirts = {f: sum(float(p.psd(np.array([f]))[0]) for p in shapes) for f in LINES}
     peaks += [(f, 0.0, sqrt(level * (floor(s, f) + skirts[f]) / duration)) for f in LINES]
-    return s.replace({"vibration.peaks": [
-        {"frequency": f, "damping": xi, "rms": [rms] * modes} for f, xi, rms in sorted(peaks)]})
+    return s.replace({"vibration.peaks": [{"frequency": f, "damping": xi, "rms": [rms] * modes} for f, xi, rms in sorted(peaks)]})
 
 
 def hits(result: Identified, scenario: Scenario) -> tuple[list[tuple[float, bool, bool]], int]:
@@ -157,8 +162,11 @@ def coverage(seeds: range, rate: float, duration: float, lost: float) -> None:
         omega, damping, rms = TURBULENCE
         pairs = [("noise", mode.noise, NOISE)]
         if t := mode.turbulence:
-            pairs += [("turbulence, corner", t.frequency, omega / (2.0 * pi)), ("turbulence, damping", t.damping, damping),
-                      ("turbulence, rms", t.rms, rms)]
+            pairs += [
+                ("turbulence, corner", t.frequency, omega / (2.0 * pi)),
+                ("turbulence, damping", t.damping, damping),
+                ("turbulence, rms", t.rms, rms),
+            ]
         more += [seed] * (len(mode.peaks) > len(WITH))
         for f, xi, rms in WITH:
             near = [p for p in mode.peaks if p.pure == (xi == 0) and abs(p.frequency.value - f) < max(0.3, 4.0 * p.frequency.std)]
@@ -184,8 +192,10 @@ def spread(scenario: Scenario, seeds: range) -> dict[str, Any]:
         m = identify(simulate(scenario.replace({"run.seed": seed}))).modes[0]
         pairs = [("noise", m.noise, scenario.sensors.lgs_noise / sqrt(scenario.sensors.lgs_count))]
         if m.turbulence:
-            pairs += [("corner", m.turbulence.frequency, truth.omega / (2 * pi)),
-                      ("damping of turbulence", m.turbulence.damping, truth.damping)]
+            pairs += [
+                ("corner", m.turbulence.frequency, truth.omega / (2 * pi)),
+                ("damping of turbulence", m.turbulence.damping, truth.damping),
+            ]
         for peak in scenario.vibration.peaks:
             for p in m.peaks:
                 if abs(p.frequency.value - peak.frequency) <= THRESHOLD * 5 and p.pure == (peak.damping == 0):
@@ -210,7 +220,9 @@ def filters(scenario: Scenario, seeds: range) -> str:
             values.append(max(errors[0][key] / errors[1][key] for key in errors[1] if key[0] == target))
     return "; ".join(
         f"{target} {np.median(r):.3f} (up to {max(r):.3f}), {np.mean(np.array(r) < 1.05):.0%} below 1.05, by seed "
-        + " ".join(f"{x:.3f}" for x in r) for target, r in ratios.items())
+        + " ".join(f"{x:.3f}" for x in r)
+        for target, r in ratios.items()
+    )
 
 
 def twin(record: Record) -> Record:
@@ -228,8 +240,11 @@ def twins(scenario: Scenario, seeds: range) -> str:
         for one, other in zip(a.modes, b.modes, strict=True):
             same &= len(one.peaks) == len(other.peaks)
             for p, q in zip(one.peaks, other.peaks, strict=False):
-                worst = max(worst, abs(p.frequency.value - q.frequency.value) / p.frequency.std,
-                            abs(p.rms.value - q.rms.value) / p.rms.std)
+                worst = max(
+                    worst,
+                    abs(p.frequency.value - q.frequency.value) / p.frequency.std,
+                    abs(p.rms.value - q.rms.value) / p.rms.std,
+                )
     return f"{worst:.1e} standard deviations; the same peaks: {'yes' if same else 'no'}"
 
 

@@ -35,10 +35,19 @@ def convert(folder: Path, out: Path) -> None:
         difference = np.abs(np.load(path, allow_pickle=False) - commands[:-1] - centroid[1:]).max()
         print(f"{path.name}: Commands[k] + Centroid[k+1] to {difference:.1e} arcsec")
     n = round(TRAINING * RATE)
-    save_arrays(out, {
-        "y_lgs": centroid[n:], "u": commands[n:], "training_y": centroid[:n], "training_u": commands[:n],
-        "dt": np.array(1.0 / RATE), "unit": np.array("arcsec"), "command_sign": np.array(-1), "delay": np.array(1),
-    })
+    save_arrays(
+        out,
+        {
+            "y_lgs": centroid[n:],
+            "u": commands[n:],
+            "training_y": centroid[:n],
+            "training_u": commands[:n],
+            "dt": np.array(1.0 / RATE),
+            "unit": np.array("arcsec"),
+            "command_sign": np.array(-1),
+            "delay": np.array(1),
+        },
+    )
     print(f"{out}: {len(centroid) - n} steps, and {n} for training")
 
 

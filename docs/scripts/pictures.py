@@ -38,8 +38,10 @@ PICTURES = {
     "screenshot": Picture(size=(1400, 1420), drawer=True),
     "pictures/peak-jump": Picture("?preset=peak-jump", ("Run", "Running rms"), size=(1400, 1000)),
     "pictures/identify": Picture(
-        "?preset=paper&run.duration=20&gpr_online.training_size=50", ("Run", "Identify", "Identify the record"),
-        "text=/is white|not white/"),
+        "?preset=paper&run.duration=20&gpr_online.training_size=50",
+        ("Run", "Identify", "Identify the record"),
+        "text=/is white|not white/",
+    ),
     "pictures/closed-loop": Picture("", ("Closed loop",), 'tr[data-controller="integrator+gpr-online"] td', (1400, 1100)),
 }
 
@@ -51,8 +53,9 @@ def server() -> Iterator[str]:
         s.bind(("127.0.0.1", 0))
         port = s.getsockname()[1]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
-    process = subprocess.Popen([sys.executable, "-m", "wfsobs", "serve", "--port", str(port), "--log-level", "error"],
-                               cwd=ROOT, env=environment)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "wfsobs", "serve", "--port", str(port), "--log-level", "error"], cwd=ROOT, env=environment
+    )
     try:
         end = time.monotonic() + 120
         while time.monotonic() < end:

@@ -25,8 +25,13 @@ APART = ("app", "assets")
 
 def pages() -> dict[str, str]:
     """Path of a page in the site -> its Markdown."""
-    return {**api(), "reference/presets.md": presets(), "reference/observers.md": observers(),
-            "reference/controllers.md": controllers(), "reference/command-line.md": commands()}
+    return {
+        **api(),
+        "reference/presets.md": presets(),
+        "reference/observers.md": observers(),
+        "reference/controllers.md": controllers(),
+        "reference/command-line.md": commands(),
+    }
 
 
 def commands() -> str:
@@ -52,9 +57,11 @@ def linked(text: str) -> str:
 
 def api() -> dict[str, str]:
     """The public names, a page per package with all its modules, and the list of both for the navigation."""
-    out = {"reference/api/index.md": "# Public names\n\nWhat `import wfsobs` gives.\n\n"
-           "::: wfsobs\n    options:\n      show_root_heading: false\n      show_root_toc_entry: false\n      heading_level: 2\n"
-           "      members_order: [__all__]\n"}
+    out = {
+        "reference/api/index.md": "# Public names\n\nWhat `import wfsobs` gives.\n\n"
+        "::: wfsobs\n    options:\n      show_root_heading: false\n      show_root_toc_entry: false\n      heading_level: 2\n"
+        "      members_order: [__all__]\n"
+    }
     links = ["* [Public names](index.md)"]
     for package in packages(ROOT / "wfsobs"):
         name = ".".join(package.relative_to(ROOT).parts)
@@ -85,9 +92,11 @@ def package_page(name: str, package: Path) -> str:
 
 def presets() -> str:
     """Every preset: what it is, and what it changes."""
-    out = ["# Presets\n\nA preset is a scenario to start from: `wfsobs run --preset NAME`, or `wfsobs.PRESETS[NAME]()` in "
-           "Python. `wfsobs presets NAME` prints one in full. The tables list the settings in which a preset differs from the "
-           "[defaults](../settings.md).\n"]
+    out = [
+        "# Presets\n\nA preset is a scenario to start from: `wfsobs run --preset NAME`, or `wfsobs.PRESETS[NAME]()` in "
+        "Python. `wfsobs presets NAME` prints one in full. The tables list the settings in which a preset differs from the "
+        "[defaults](../settings.md).\n"
+    ]
     for name, make in PRESETS.items():
         rows = ([f"`{path}`", value] for path, value in changes(make(), Scenario()))
         out.append(f"## {name}\n\n{inspect.getdoc(make)}\n\n{table(('Setting', 'Value'), rows)}\n")
@@ -96,15 +105,21 @@ def presets() -> str:
 
 def observers() -> str:
     """Every observer: what it needs and costs, and what its function says."""
-    out = ["# Observers\n\nThe registry of observers. [Observers](../observers.md) has a line on what each one is, "
-           "[Model](../model.md#observers) the equations.\n"]
+    out = [
+        "# Observers\n\nThe registry of observers. [Observers](../observers.md) has a line on what each one is, "
+        "[Model](../model.md#observers) the equations.\n"
+    ]
     for o in OBSERVERS.values():
         tuned = TUNABLE[o.id].usual if o.id in TUNABLE else ()
-        rows = (("Estimates", ", ".join(o.targets)), ("Needs beside measurements", o.told),
-                ("Needs of a record", listed(("y_lgs", "u", *o.needs) if o.id != "zero" else ())),
-                ("Causal", "yes" if o.causal else "no: a reference that looks ahead"),
-                ("Computing time, Kalman filter = 1", f"{o.weight:g}"),
-                ("Settings that are tuned", listed(tuned)), ("Function", reference(o.run)))
+        rows = (
+            ("Estimates", ", ".join(o.targets)),
+            ("Needs beside measurements", o.told),
+            ("Needs of a record", listed(("y_lgs", "u", *o.needs) if o.id != "zero" else ())),
+            ("Causal", "yes" if o.causal else "no: a reference that looks ahead"),
+            ("Computing time, Kalman filter = 1", f"{o.weight:g}"),
+            ("Settings that are tuned", listed(tuned)),
+            ("Function", reference(o.run)),
+        )
         out.append(f"## {o.label} (`{o.id}`)\n\n{table(('Property', 'Value'), rows)}\n\n{inspect.getdoc(o.run)}\n")
     return "\n".join(out)
 
@@ -113,8 +128,10 @@ def controllers() -> str:
     """Every controller: what it needs and costs."""
     rows = ((f"`{c.id}`", c.label, c.needed(Scenario()), "yes" if c.ngs else "no", f"{c.weight:g}") for c in CONTROLLERS.values())
     head = ("Id", "Name", "Needs beside measurements", "Uses the NGS", "Computing time, linear law = 1")
-    about = ("The registry of controllers, which `wfsobs loop` compares. [Closed loop](../closed_loop.md) has the method and the "
-             "results. What the integrators need is that of `control.integrator` = optimised.")
+    about = (
+        "The registry of controllers, which `wfsobs loop` compares. [Closed loop](../closed_loop.md) has the method and the "
+        "results. What the integrators need is that of `control.integrator` = optimised."
+    )
     return f"# Controllers\n\n{about}\n\n{table(head, rows)}\n"
 
 

@@ -29,9 +29,15 @@ SEEDS = range(1, 21)
 PRINTED = {"butterworth-ol": 7.66, "butterworth-cl": 13.4, "kf-lgs": 16.6, "gpr-offline": 12.4, "gpr-online": 13.3}
 TURBULENCE = ("kf-lgs", "kf-ngs", "multirate", "multirate-optimal")
 NAMES = {
-    "butterworth-ol": "Butterworth, open loop", "butterworth-cl": "Butterworth, closed loop", "kf-lgs": "LGS KF",
-    "kf-ngs": "NGS KF", "multirate": "Multi-rate KF", "multirate-optimal": "Optimal multi-rate KF",
-    "gpr-offline": "Offline GPR", "gpr-online": "Online GPR", "zero": "Zero",
+    "butterworth-ol": "Butterworth, open loop",
+    "butterworth-cl": "Butterworth, closed loop",
+    "kf-lgs": "LGS KF",
+    "kf-ngs": "NGS KF",
+    "multirate": "Multi-rate KF",
+    "multirate-optimal": "Optimal multi-rate KF",
+    "gpr-offline": "Offline GPR",
+    "gpr-online": "Online GPR",
+    "zero": "Zero",
 }
 Errors = dict[tuple[str, str, str], list[float]]
 """(observer, target, mode) -> RMS error [nm] of every seed; observer "truth" -> rms of the truth."""
@@ -76,9 +82,18 @@ def vibration() -> None:
     for mode in ("tip", "tilt"):
         here = {name: fitted[name, "vibration", mode] for name in order}
         best, truth = matched["kf-lgs", "vibration", mode], fitted["truth", "vibration", mode]
-        rows = [(NAMES[n], PRINTED.get(n, "-"), middle(v), ratio(v, truth),
-                 f"{PRINTED[n] / 16.6:.2f}" if n in PRINTED else "-", ratio(v, here["kf-lgs"]), ratio(v, best))
-                for n, v in here.items()]
+        rows = [
+            (
+                NAMES[n],
+                PRINTED.get(n, "-"),
+                middle(v),
+                ratio(v, truth),
+                f"{PRINTED[n] / 16.6:.2f}" if n in PRINTED else "-",
+                ratio(v, here["kf-lgs"]),
+                ratio(v, best),
+            )
+            for n, v in here.items()
+        ]
         rows.insert(3, ("LGS KF, matched", "-", middle(best), ratio(best, truth), "-", ratio(best, here["kf-lgs"]), "1.00"))
         table((f"{mode}", "paper", "here", "here / truth", "paper / KF", "here / KF", "here / matched KF"), rows)
 
@@ -109,8 +124,10 @@ def butterworth() -> None:
                     found.setdefault((name, how, width), []).append(rms(error) * 1e3)
     names = dict.fromkeys(name for name, *_ in found)
     columns = [(how, width) for how in ("zero-phase", "causal") for width in (3.0, 2.0)]
-    table(("tip", *(f"{how}, {width:g} Hz" for how, width in columns)),
-          [(name, *(middle(found[name, how, width], False) for how, width in columns)) for name in names])
+    table(
+        ("tip", *(f"{how}, {width:g} Hz" for how, width in columns)),
+        [(name, *(middle(found[name, how, width], False) for how, width in columns)) for name in names],
+    )
 
 
 def training() -> None:
@@ -118,8 +135,7 @@ def training() -> None:
     cases: dict[str, Callable[[Record], Training]] = {
         "closed loop (u, y), target from the open-loop twin": lambda r: r.training,
         "closed loop (u, y), target from z": lambda r: Training(r.training.y_lgs, r.training.u),
-        "open loop (0, y)": lambda r: Training(
-            r.training.open_loop_y, np.zeros_like(r.training.u), r.training.open_loop_y),
+        "open loop (0, y)": lambda r: Training(r.training.open_loop_y, np.zeros_like(r.training.u), r.training.open_loop_y),
     }
     rows = []
     for name, make in cases.items():
@@ -146,8 +162,11 @@ def all_peaks() -> None:
         columns = []
         for mode in range(2):
             turbulence, _ = modelled_processes(scenario, mode, record.dt)
-            peaks = [Ar2(2.0 * np.pi * p.frequency, p.damping, p.rms[mode], record.dt)
-                     for p in scenario.vibration.peaks if p.rms[mode] > 0]
+            peaks = [
+                Ar2(2.0 * np.pi * p.frequency, p.damping, p.rms[mode], record.dt)
+                for p in scenario.vibration.peaks
+                if p.rms[mode] > 0
+            ]
             kalman, _ = steady_filter(disturbance_model([turbulence], peaks), measurement_noise(scenario, mode)[0])
             columns.append(kalman.run(record.z[:, None, mode, None])[:, :, 0])
         start = round(scenario.run.warm_up / record.dt)
@@ -162,8 +181,16 @@ def gpr_turbulence() -> None:
     rows = []
     for strength in (0.0, 0.25, 0.4, 0.5, 0.6, 0.7, 1.0, 2.0):
         e = errors({"turbulence.rms": strength}, ("gpr-offline", "gpr-online"))
-        rows.append((f"{strength:g}", *(middle(e[name, "vibration", mode], False)
-                                        for mode in ("tip", "tilt") for name in ("gpr-offline", "gpr-online"))))
+        rows.append(
+            (
+                f"{strength:g}",
+                *(
+                    middle(e[name, "vibration", mode], False)
+                    for mode in ("tip", "tilt")
+                    for name in ("gpr-offline", "gpr-online")
+                ),
+            )
+        )
     table(("turbulence [um]", "offline, tip", "online, tip", "offline, tilt", "online, tilt"), rows)
 
 
@@ -172,8 +199,11 @@ def gpr_inputs() -> None:
     rows = []
     kinds = (("raw", "raw", 300.0), ("high-pass, 10 Hz", "high-pass", 300.0), ("standardised, l = 1000", "standardised", 1000.0))
     for name, kind, length in kinds:
-        changes: dict[str, object] = {f"{gpr}.{key}": value for gpr in ("gpr_offline", "gpr_online")
-                                      for key, value in (("inputs_filter", kind), ("length_scale", length))}
+        changes: dict[str, object] = {
+            f"{gpr}.{key}": value
+            for gpr in ("gpr_offline", "gpr_online")
+            for key, value in (("inputs_filter", kind), ("length_scale", length))
+        }
         e = errors(changes, ("gpr-offline", "gpr-online", "kf-multi", "zero"), "strong-turbulence")
         rows.append((name, *(middle(e[n, "vibration", "tip"], False) for n in ("gpr-offline", "gpr-online", "kf-multi", "zero"))))
     table(("inputs", "offline", "online", "multi-peak KF", "zero"), rows)
@@ -183,8 +213,10 @@ def turbulence() -> None:
     """The turbulence comparison at the preset."""
     e = errors({}, (*TURBULENCE, "zero"))
     m = errors({"kalman.process_noise": "matched"}, TURBULENCE)
-    rows = [(NAMES[n], *(middle(runs[n, "turbulence", mode], runs is e) for mode in ("tip", "tilt") for runs in (e, m)))
-            for n in TURBULENCE]
+    rows = [
+        (NAMES[n], *(middle(runs[n, "turbulence", mode], runs is e) for mode in ("tip", "tilt") for runs in (e, m)))
+        for n in TURBULENCE
+    ]
     table(("turbulence", "tip", "tip, matched", "tilt", "tilt, matched"), rows)
 
 
@@ -195,8 +227,13 @@ def sweep(setting: str, values: Sequence[float], label: str, fixed: dict[str, ob
         e = errors(fixed | {setting: value}, TURBULENCE)
         numbers = {n: e[n, "turbulence", "tip"] for n in TURBULENCE}
         order = sorted(TURBULENCE[:3], key=lambda n: median(numbers[n]))
-        rows.append((f"{value * 1e3:g}", *(middle(v, spread) for v in numbers.values()),
-                     " < ".join(NAMES[n].removesuffix(" KF") for n in order)))
+        rows.append(
+            (
+                f"{value * 1e3:g}",
+                *(middle(v, spread) for v in numbers.values()),
+                " < ".join(NAMES[n].removesuffix(" KF") for n in order),
+            )
+        )
     table((label, *(NAMES[n] for n in TURBULENCE), "order of the paper's three"), rows)
 
 
@@ -234,8 +271,10 @@ def lgs_model() -> None:
     """The optimal filter with and without the slow LGS error in its model."""
     rows = []
     for low in LOW:
-        e = {on: errors({"sensors.lgs_low_frequency_rms": low, "multirate.model_lgs_error": on}, ("multirate-optimal",))
-             for on in (True, False)}
+        e = {
+            on: errors({"sensors.lgs_low_frequency_rms": low, "multirate.model_lgs_error": on}, ("multirate-optimal",))
+            for on in (True, False)
+        }
         rows.append((f"{low * 1e3:g}", *(middle(e[on]["multirate-optimal", "turbulence", "tip"], False) for on in (True, False))))
     table(("LGS slow error [nm]", "in the model", "not in the model"), rows)
 
@@ -244,17 +283,39 @@ def ut4() -> None:
     """Frozen flow and the ERIS spectrum of UT4, its lines alone and with its floor."""
     names = dict.fromkeys((*TURBULENCE, *PRINTED, "kf-multi", "ridge-30", "zero"))
     runs = [errors({}, tuple(names), preset) for preset in ("ut4", "ut4-floor")]
-    for target, names in (("turbulence", (*TURBULENCE, "kf-multi")),
-                          ("vibration", (*PRINTED, "multirate-optimal", "kf-multi", "ridge-30"))):
-        rows = [(OBSERVERS[name].label if name in OBSERVERS else "Truth", *(
-            middle(e[name, target, mode], e is runs[0]) for mode in ("tip", "tilt") for e in runs)) for name in (*names, "truth")]
+    for target, names in (
+        ("turbulence", (*TURBULENCE, "kf-multi")),
+        ("vibration", (*PRINTED, "multirate-optimal", "kf-multi", "ridge-30")),
+    ):
+        rows = [
+            (
+                OBSERVERS[name].label if name in OBSERVERS else "Truth",
+                *(middle(e[name, target, mode], e is runs[0]) for mode in ("tip", "tilt") for e in runs),
+            )
+            for name in (*names, "truth")
+        ]
         table((target, "tip, lines", "tip, all", "tilt, lines", "tilt, all"), rows)
 
 
-TABLES: dict[str, Callable[[], None]] = {f.__name__: f for f in (
-    vibration, fit, butterworth, training, all_peaks, gpr_turbulence, gpr_inputs, turbulence, lgs_error, indetermination,
-    ngs_noise, weights, lgs_model, ut4,
-)}
+TABLES: dict[str, Callable[[], None]] = {
+    f.__name__: f
+    for f in (
+        vibration,
+        fit,
+        butterworth,
+        training,
+        all_peaks,
+        gpr_turbulence,
+        gpr_inputs,
+        turbulence,
+        lgs_error,
+        indetermination,
+        ngs_noise,
+        weights,
+        lgs_model,
+        ut4,
+    )
+}
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or TABLES:

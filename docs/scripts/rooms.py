@@ -97,8 +97,10 @@ def reachable(graph: Graph) -> dict[str, set[str]]:
 def reduced(graph: Graph) -> dict[str, set[str]]:
     """Without the arrows that others imply."""
     below = reachable(graph)
-    return {room: {o for o in others if not any(o in below[p] and room not in below[p] for p in others - {o})}
-            for room, others in graph.items()}
+    return {
+        room: {o for o in others if not any(o in below[p] and room not in below[p] for p in others - {o})}
+        for room, others in graph.items()
+    }
 
 
 def rows(graph: Graph) -> list[list[str]]:
@@ -120,16 +122,23 @@ def svg(told: Plan) -> str:
     lines = rows(told.imports)
     broad = max(map(len, lines)) * (WIDTH + GAP) + GAP
     tall = len(lines) * FLOOR
-    spot = {room: ((i + 0.5) * broad / len(line), tall - (n + 0.5) * FLOOR)
-            for n, line in enumerate(lines) for i, room in enumerate(line)}
-    out = [f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {broad} {tall}" role="img" '
-           'aria-label="Packages of wfsobs on floors, each above what it imports" font-family="inherit" font-size="15">']
+    spot = {
+        room: ((i + 0.5) * broad / len(line), tall - (n + 0.5) * FLOOR)
+        for n, line in enumerate(lines)
+        for i, room in enumerate(line)
+    }
+    out = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {broad} {tall}" role="img" '
+        'aria-label="Packages of wfsobs on floors, each above what it imports" font-family="inherit" font-size="15">'
+    ]
     for kind, dashes in ((reduced(told.imports), ""), (told.later, ' stroke-dasharray="4 4"')):
         out += [_arrow(spot[room], spot[other], dashes) for room in spot for other in sorted(kind[room])]
     for room, (x, y) in spot.items():
-        out.append(f'<g><title>{escape(told.says[room])}</title><rect x="{x - WIDTH / 2:.0f}" y="{y - HEIGHT / 2:.0f}" '
-                   f'width="{WIDTH}" height="{HEIGHT}" rx="6" fill="var(--md-default-bg-color, #fff)" stroke="currentColor"/>'
-                   f'<text x="{x:.0f}" y="{y + 5:.0f}" text-anchor="middle" fill="currentColor">{escape(room)}</text></g>')
+        out.append(
+            f'<g><title>{escape(told.says[room])}</title><rect x="{x - WIDTH / 2:.0f}" y="{y - HEIGHT / 2:.0f}" '
+            f'width="{WIDTH}" height="{HEIGHT}" rx="6" fill="var(--md-default-bg-color, #fff)" stroke="currentColor"/>'
+            f'<text x="{x:.0f}" y="{y + 5:.0f}" text-anchor="middle" fill="currentColor">{escape(room)}</text></g>'
+        )
     return "".join([*out, "</svg>"])
 
 
@@ -138,8 +147,10 @@ def _arrow(start: tuple[float, float], end: tuple[float, float], dashes: str) ->
     down = 1 if y2 >= y1 else -1
     y1, y2 = y1 + down * HEIGHT / 2, y2 - (down if y2 != y1 else -1) * HEIGHT / 2
     bend = (y1 + y2) / 2 if y2 != y1 else y1 + 0.8 * (FLOOR - HEIGHT)  # beside each other: a bow below
-    return (f'<path d="M{x1:.0f} {y1:.0f}C{x1:.0f} {bend:.0f} {x2:.0f} {bend:.0f} {x2:.0f} {y2:.0f}" fill="none" '
-            f'stroke="currentColor" stroke-opacity="0.45"{dashes}/>')
+    return (
+        f'<path d="M{x1:.0f} {y1:.0f}C{x1:.0f} {bend:.0f} {x2:.0f} {bend:.0f} {x2:.0f} {y2:.0f}" fill="none" '
+        f'stroke="currentColor" stroke-opacity="0.45"{dashes}/>'
+    )
 
 
 def table(told: Plan) -> str:

@@ -42,10 +42,18 @@ def sections(group: Group, prefix: str) -> list[str]:
         else:
             rows.append(f"| `{prefix}{name}` | {shown(value)} | {span(p)} | {unit_of(p) or '-'} | {meaning(p)} |")
     if rows:
-        out.append("\n".join([
-            f"## {prefix.rstrip('.')}\n", f"{type(group).__doc__}\n",
-            "| Path | Default | Range | Unit | Meaning |", "|---|---|---|---|---|", *rows, "",
-        ]))
+        out.append(
+            "\n".join(
+                [
+                    f"## {prefix.rstrip('.')}\n",
+                    f"{type(group).__doc__}\n",
+                    "| Path | Default | Range | Unit | Meaning |",
+                    "|---|---|---|---|---|",
+                    *rows,
+                    "",
+                ]
+            )
+        )
     return out + inner
 
 

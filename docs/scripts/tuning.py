@@ -20,6 +20,7 @@ RMS = Callable[[Tuned], float]
 
 def row(name: str, tuned: list[Tuned]) -> str:
     """Medians over seeds and, of the ratios, the range; in how many seeds the test error fell."""
+
     def column(of: RMS, scale: float = 1e3) -> list[float]:
         return [of(t) * scale for t in tuned]
 
@@ -87,9 +88,12 @@ def likelihoods() -> None:
             for name, kernel in kernels.items():
                 g, record = kernel.gpr_offline, simulate(kernel)
                 errors = [x.rms for x in observe(record, kernel, observers=["gpr-offline"]).scores]
-                print(f"| {preset} | {seed} | {name} | {g.length_scale:.4g} | {g.signal_std:.3g} | {g.noise_std:.3g} | "
-                      f"{sum(likelihood('gpr-offline', record, kernel) or ()):.0f} | "
-                      f"{1e3 * np.sqrt(np.mean(np.square(errors))):.2f} |", flush=True)
+                print(
+                    f"| {preset} | {seed} | {name} | {g.length_scale:.4g} | {g.signal_std:.3g} | {g.noise_std:.3g} | "
+                    f"{sum(likelihood('gpr-offline', record, kernel) or ()):.0f} | "
+                    f"{1e3 * np.sqrt(np.mean(np.square(errors))):.2f} |",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

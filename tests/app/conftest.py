@@ -24,8 +24,13 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 
 SHORT = {
-    "run.duration": 2.0, "run.warm_up": 0.5, "gpr_offline.training_size": 40, "gpr_offline.depth": 20,
-    "gpr_online.training_size": 40, "gpr_online.depth": 20, "adaptive.window": 0.5,
+    "run.duration": 2.0,
+    "run.warm_up": 0.5,
+    "gpr_offline.training_size": 40,
+    "gpr_offline.depth": 20,
+    "gpr_online.training_size": 40,
+    "gpr_online.depth": 20,
+    "adaptive.window": 0.5,
 }
 
 
@@ -90,6 +95,7 @@ def make_store(loop: Loop, short: Scenario, enter: Callable[..., Session]) -> Ca
         store = Store(loop.queue.put, enter(work), short)
         loop.closing.append(store)
         return store
+
     return make
 
 

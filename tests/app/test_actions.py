@@ -41,9 +41,16 @@ def actions(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> Actions:
 
 @pytest.fixture(scope="module")
 def shown() -> Shown:
-    scenario = PRESETS["paper"]().replace({
-        "run.duration": 1.0, "run.warm_up": 0.2, "gpr_offline.training_size": 40, "gpr_offline.depth": 20,
-        "gpr_online.training_size": 40, "gpr_online.depth": 20})
+    scenario = PRESETS["paper"]().replace(
+        {
+            "run.duration": 1.0,
+            "run.warm_up": 0.2,
+            "gpr_offline.training_size": 40,
+            "gpr_offline.depth": 20,
+            "gpr_online.training_size": 40,
+            "gpr_online.depth": 20,
+        }
+    )
     return compute(scenario, QUIET, lambda **_: None)
 
 
@@ -118,7 +125,9 @@ def test_data_is_made_aside_and_sent(actions: Actions, loop: Any, action: str, m
 
 
 def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
-    actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch,
+    actions: Actions,
+    loop: Any,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[tuple[Any, str]] = []
     monkeypatch.setattr(module, "make", lambda shown, preset, *_: asked.append((shown, preset)) or b"<!doctype html>")
@@ -132,10 +141,15 @@ def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
     assert shown is not None and asked == [(shown, "paper")]
 
 
-@pytest.mark.parametrize(("error", "line"), [
-    (ReportError("no room"), "Report: no room"), (KeyError("x"), "Report: KeyError: 'x'")])
+@pytest.mark.parametrize(
+    ("error", "line"), [(ReportError("no room"), "Report: no room"), (KeyError("x"), "Report: KeyError: 'x'")]
+)
 def test_a_report_that_fails_is_one_line(
-    actions: Actions, loop: Any, monkeypatch: pytest.MonkeyPatch, error: Exception, line: str,
+    actions: Actions,
+    loop: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+    line: str,
 ) -> None:
     def fail(*_: object) -> None:
         raise error
@@ -168,14 +182,19 @@ def test_csv(shown: Shown) -> None:
     text = data_csv(shown).decode()
     head = [line for line in text.splitlines() if line.startswith("#")]
     assert from_toml("\n".join(line[1:].strip() for line in head)) == shown.scenario
-    names, *lines = text.splitlines()[len(head):]
+    names, *lines = text.splitlines()[len(head) :]
     columns = np.loadtxt(io.StringIO("\n".join(lines)), delimiter=",", unpack=True)
     table = dict(zip(names.split(","), columns, strict=True))
     record, estimate = shown.result.record, shown.result.estimate("gpr-online", "vibration")
     assert estimate is not None and columns.shape == (1 + 2 * (5 + len(shown.result.estimates)), record.n_steps)
     np.testing.assert_allclose(table["time_s"], np.arange(record.n_steps) * 1e-3, rtol=1e-8)
-    for name, values in (("truth/turbulence", record.turbulence), ("y_lgs", record.y_lgs), ("y_ngs", record.y_ngs),
-                         ("u", record.u), ("gpr-online/vibration", estimate.values)):
+    for name, values in (
+        ("truth/turbulence", record.turbulence),
+        ("y_lgs", record.y_lgs),
+        ("y_ngs", record.y_ngs),
+        ("u", record.u),
+        ("gpr-online/vibration", estimate.values),
+    ):
         assert values is not None
         for i, mode in enumerate(("tip", "tilt")):
             np.testing.assert_allclose(table[f"{name}/{mode}_um"], values[:, i], rtol=1e-8)

@@ -81,6 +81,7 @@ def make_service() -> Iterator[Callable[..., Service]]:
 
 # ---------------------------------------------------------------------- what is kept
 
+
 class Model:
     """The textbook version: a list in order of use."""
 
@@ -137,21 +138,37 @@ def test_every_array_of_a_run_is_found(short: Scenario) -> None:
     shown = compute(short, QUIET, lambda **_: None)
     found = {id(array) for array in arrays_in(shown)}
     record = shown.result.record
-    own = [record.y_lgs, record.u, record.y_ngs, record.turbulence, record.vibration, record.open_loop_y,
-           *(e.values for e in shown.result.estimates), *(s.error for s in shown.spectra.values())]
+    own = [
+        record.y_lgs,
+        record.u,
+        record.y_ngs,
+        record.turbulence,
+        record.vibration,
+        record.open_loop_y,
+        *(e.values for e in shown.result.estimates),
+        *(s.error for s in shown.spectra.values()),
+    ]
     assert record.training is not None
     assert {id(array) for array in (*own, record.training.u) if array is not None} <= found
 
 
-@pytest.mark.parametrize("changes", [
-    {"turbulence.wind_speed": 15.000001}, {"run.seed": 2}, {"loop.closed": False}, {"vibration.peaks": []},
-    {"kalman.process_noise": "manual"}, {"butterworth.frequencies": [17.1]},
-])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"turbulence.wind_speed": 15.000001},
+        {"run.seed": 2},
+        {"loop.closed": False},
+        {"vibration.peaks": []},
+        {"kalman.process_noise": "manual"},
+        {"butterworth.frequencies": [17.1]},
+    ],
+)
 def test_other_settings_have_another_key(changes: dict[str, Any]) -> None:
     assert key_of(Scenario().replace(changes)) != key_of(Scenario())
 
 
 # ---------------------------------------------------------------------- one run for all who want it
+
 
 def test_the_same_settings_are_computed_once_at_the_same_time(make_service: Any, short: Scenario) -> None:
     work = Gated()

@@ -137,9 +137,7 @@ def test_more_modes_than_tip_and_tilt(page: ClosedLoopPage, dashboard: Dashboard
     assert len(page.whole.sources["integrator"].data["x"]) > 100
 
 
-def test_what_would_take_minutes_is_left_out(
-    dashboard: Dashboard, loop: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_would_take_minutes_is_left_out(dashboard: Dashboard, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     long = dashboard.store.scenario.replace({"run.duration": 60.0, "gpr_online.training_size": 2048})
     assert loop_work.seconds("integrator+gpr-online", long) > loop_work.PATIENCE
     assert loop_work.seconds("integrator+gpr-online", dashboard.store.scenario) < 1.0

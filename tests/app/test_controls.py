@@ -131,10 +131,16 @@ def test_a_whole_number_stays_whole(controls: Controls, loop: Any) -> None:
     loop.finish(controls.store)
 
 
-@pytest.mark.parametrize(("path", "text", "value"), [
-    ("turbulence.wind_speed", "12.5", 12.5), ("run.seed", " 7 ", 7), ("gpr_online.noise_std", "1e-2", 0.01),
-    ("butterworth.frequencies", "20, 30; 40", [20.0, 30.0, 40.0]), ("telescope.diameter", "39", 39.0),
-])
+@pytest.mark.parametrize(
+    ("path", "text", "value"),
+    [
+        ("turbulence.wind_speed", "12.5", 12.5),
+        ("run.seed", " 7 ", 7),
+        ("gpr_online.noise_std", "1e-2", 0.01),
+        ("butterworth.frequencies", "20, 30; 40", [20.0, 30.0, 40.0]),
+        ("telescope.diameter", "39", 39.0),
+    ],
+)
 def test_a_typed_value_runs(controls: Controls, loop: Any, path: str, text: str, value: Any) -> None:
     field_of(controls, path).widgets[-1].value = text
     assert controls.store.value(path) == value and error_of(controls, path) == ""
@@ -142,13 +148,20 @@ def test_a_typed_value_runs(controls: Controls, loop: Any, path: str, text: str,
     assert controls.store.run.result.scenario == controls.store.scenario
 
 
-@pytest.mark.parametrize(("path", "text", "says"), [
-    ("turbulence.wind_speed", "200", "Wind speed V₀ = 200: takes a number from 0.1 to 100 m/s"),
-    ("turbulence.wind_speed", "15,5", "use a point: 15.5"), ("turbulence.wind_speed", "fast", "a number"),
-    ("turbulence.wind_speed", "", "a number"), ("run.seed", "1.5", "a whole number"),
-    ("gpr_online.length_scale", "nan", "0.1"), ("butterworth.frequencies", "20, x", "a list of"),
-    ("kalman.frequency", "900", "half the LGS rate"), ("run.warm_up", "3", "Duration"),
-])
+@pytest.mark.parametrize(
+    ("path", "text", "says"),
+    [
+        ("turbulence.wind_speed", "200", "Wind speed V₀ = 200: takes a number from 0.1 to 100 m/s"),
+        ("turbulence.wind_speed", "15,5", "use a point: 15.5"),
+        ("turbulence.wind_speed", "fast", "a number"),
+        ("turbulence.wind_speed", "", "a number"),
+        ("run.seed", "1.5", "a whole number"),
+        ("gpr_online.length_scale", "nan", "0.1"),
+        ("butterworth.frequencies", "20, x", "a list of"),
+        ("kalman.frequency", "900", "half the LGS rate"),
+        ("run.warm_up", "3", "Duration"),
+    ],
+)
 def test_a_bad_value_shows_beside_its_setting(controls: Controls, path: str, text: str, says: str) -> None:
     shown, scenario = controls.store.run.result, controls.store.scenario
     field = field_of(controls, path)
@@ -245,9 +258,15 @@ class TestPeaks:
         loop.finish(controls.store)
         assert controls.store.run.state == "done"
 
-    @pytest.mark.parametrize(("key", "text", "expected"), [
-        ("frequency", "33.3", 33.3), ("damping", "0", 0.0), ("rms.0", "0.02", 0.02), ("rms.1", "2e-3", 0.002),
-    ])
+    @pytest.mark.parametrize(
+        ("key", "text", "expected"),
+        [
+            ("frequency", "33.3", 33.3),
+            ("damping", "0", 0.0),
+            ("rms.0", "0.02", 0.02),
+            ("rms.1", "2e-3", 0.002),
+        ],
+    )
     def test_edit_in_place(self, controls: Controls, loop: Any, key: str, text: str, expected: float) -> None:
         before = controls.store.run.result
         controls.lists[PATH].table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
@@ -257,11 +276,16 @@ class TestPeaks:
         assert controls.store.run.result is not before
         assert controls.store.run.result.scenario == controls.store.scenario
 
-    @pytest.mark.parametrize(("key", "text", "says"), [
-        ("frequency", "-3", "from 0.01"), ("frequency", "600", "half the LGS rate"),
-        ("damping", "two", "Peak 3: ξ = 'two': takes a number"),
-        ("rms.1", "-1", "Peak 3: rms = [0.0025, -1]: takes"), ("rms.1", "0,5", "use a point: 0.5"),
-    ])
+    @pytest.mark.parametrize(
+        ("key", "text", "says"),
+        [
+            ("frequency", "-3", "from 0.01"),
+            ("frequency", "600", "half the LGS rate"),
+            ("damping", "two", "Peak 3: ξ = 'two': takes a number"),
+            ("rms.1", "-1", "Peak 3: rms = [0.0025, -1]: takes"),
+            ("rms.1", "0,5", "use a point: 0.5"),
+        ],
+    )
     def test_bad_cell(self, controls: Controls, key: str, text: str, says: str) -> None:
         shown, rows = controls.store.run.result, controls.lists[PATH].table.rows
         controls.lists[PATH].table._handle_msg({"action": "edit", "row": 2, "key": key, "text": text})
@@ -292,9 +316,13 @@ def test_what_did_not_arrive_is_done_again(controls: Controls, loop: Any) -> Non
     controls.take({"setting": "loop.gain", "value": 0.4})
     controls.take({"setting": PATH, "message": {"action": "edit", "row": 0, "key": "frequency", "text": "6.5"}})
     for nonsense in (
-        {}, {"setting": 3}, {"setting": "run.x", "value": 1}, {"setting": "preset", "value": "x"},
+        {},
+        {"setting": 3},
+        {"setting": "run.x", "value": 1},
+        {"setting": "preset", "value": "x"},
         {"setting": PATH, "message": 1},
-        {"setting": PATH, "message": {"action": "remove", "row": 99}}, {"setting": "run.duration", "value": None},
+        {"setting": PATH, "message": {"action": "remove", "row": 99}},
+        {"setting": "run.duration", "value": None},
     ):
         controls.take(nonsense)
     store = controls.store

@@ -83,8 +83,12 @@ def shell(dashboard: Dashboard) -> Any:
     """What the command that is copied prints as JSON."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     done = subprocess.run(
-        f"{dashboard.actions.toolbar.command} --json", shell=True, capture_output=True, text=True,
-        env={**os.environ, "PATH": path})
+        f"{dashboard.actions.toolbar.command} --json",
+        shell=True,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PATH": path},
+    )
     assert done.returncode == 0, f"{dashboard.actions.toolbar.command}\n{done.stderr}"
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -137,7 +141,8 @@ def test_identify(board: Dashboard, loop: Any) -> None:
     expected = identified.plain(page.work.result[0])
     for found in (shell(board), identified.plain(script(board)["found"])):
         assert [[p["frequency"] for p in m["peaks"]] for m in found["modes"]] == [
-            pytest.approx([p["frequency"] for p in m["peaks"]], rel=CLOSE) for m in expected["modes"]]
+            pytest.approx([p["frequency"] for p in m["peaks"]], rel=CLOSE) for m in expected["modes"]
+        ]
         assert [m["noise"] for m in found["modes"]] == pytest.approx([m["noise"] for m in expected["modes"]], rel=CLOSE)
 
 
@@ -235,7 +240,8 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
     files = saved(dashboard, loop, sent)
     table = [*csv.DictReader(io.StringIO(files["wfsobs-controllers.csv"].decode()))]
     assert [(r["controller"], r["mode"], r["residual_rms_nm"]) for r in table] == [
-        (r["controller"], r["mode"], "" if r["residual_rms_nm"] is None else str(r["residual_rms_nm"])) for r in page.shown.rows]
+        (r["controller"], r["mode"], "" if r["residual_rms_nm"] is None else str(r["residual_rms_nm"])) for r in page.shown.rows
+    ]
     outcomes = {o.controller: o.residual for o in page.shown.result.outcomes if o.residual is not None}
     with np.load(io.BytesIO(files["wfsobs-residuals.npz"]), allow_pickle=False) as arrays:
         assert {n for n in arrays.files if "/" in n} == {f"residual/{name}" for name in outcomes}

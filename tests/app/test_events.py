@@ -49,8 +49,7 @@ def test_running_rms_and_marks(dashboard: Dashboard, loop: Any) -> None:
     estimate = shown.result.estimate("kf-lgs", "vibration")
     assert estimate is not None and at[0] == pytest.approx(1.15)
     steps = np.round(at / shown.result.record.dt).astype(int)
-    np.testing.assert_allclose(
-        trace.source.data["kf-lgs"], running_rms(shown.result.record, estimate, 1.0)[steps, 1], rtol=1e-6)
+    np.testing.assert_allclose(trace.source.data["kf-lgs"], running_rms(shown.result.record, estimate, 1.0)[steps, 1], rtol=1e-6)
     the_marks_are_those_of_the_scenario(dashboard)
     dashboard.display.pinned = pin(shown)  # of a pinned run, extremes are kept, of which there is no rms
     assert trace.faint.source is None

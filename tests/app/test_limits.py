@@ -32,16 +32,21 @@ def refused(limits: Limits, changes: dict[str, Any]) -> str:
     return ""
 
 
-@pytest.mark.parametrize(("changes", "line"), [
-    ({"run.duration": 121}, "run.duration = 121: at most 120 s on this server"),
-    ({"run.duration": 61, "sensors.lgs_rate": 2000},
-     "run.duration = 61: 122000 steps at sensors.lgs_rate = 2000 Hz; at most 120000 on this server"),
-    ({"gpr_offline.training_size": 1025}, "gpr_offline.training_size = 1025: at most 1024 on this server"),
-    ({"gpr_online.training_size": 2048}, "gpr_online.training_size = 2048: at most 1024 on this server"),
-    ({"gpr_online.depth": 1001}, "gpr_online.depth = 1001: at most 1000 on this server"),
-    ({"vibration.psd.tip": [0.0] * 101}, "vibration.psd.tip: 101 entries, at most 100 on this server"),
-    ({"turbulence.psd.frequency": [0.0] * 101}, "turbulence.psd.frequency: 101 entries, at most 100 on this server"),
-])
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"run.duration": 121}, "run.duration = 121: at most 120 s on this server"),
+        (
+            {"run.duration": 61, "sensors.lgs_rate": 2000},
+            "run.duration = 61: 122000 steps at sensors.lgs_rate = 2000 Hz; at most 120000 on this server",
+        ),
+        ({"gpr_offline.training_size": 1025}, "gpr_offline.training_size = 1025: at most 1024 on this server"),
+        ({"gpr_online.training_size": 2048}, "gpr_online.training_size = 2048: at most 1024 on this server"),
+        ({"gpr_online.depth": 1001}, "gpr_online.depth = 1001: at most 1000 on this server"),
+        ({"vibration.psd.tip": [0.0] * 101}, "vibration.psd.tip: 101 entries, at most 100 on this server"),
+        ({"turbulence.psd.frequency": [0.0] * 101}, "turbulence.psd.frequency: 101 entries, at most 100 on this server"),
+    ],
+)
 def test_one_line_says_what_and_how_much(changes: dict[str, Any], line: str) -> None:
     assert refused(PUBLIC, changes) == line
     assert refused(NONE, changes) == ""
@@ -54,18 +59,29 @@ def test_the_presets_are_allowed(preset: str) -> None:
 
 @settings(deadline=None)
 @given(
-    st.floats(2.0, 3600.0), st.sampled_from([10.0, 500.0, 1000.0, 20_000.0, 100_000.0]), st.integers(2, 2048),
-    st.integers(1, 2000), st.integers(2, 2048),
+    st.floats(2.0, 3600.0),
+    st.sampled_from([10.0, 500.0, 1000.0, 20_000.0, 100_000.0]),
+    st.integers(2, 2048),
+    st.integers(1, 2000),
+    st.integers(2, 2048),
 )
 def test_what_is_allowed_is_within_every_bound(duration: float, rate: float, m: int, depth: int, offline: int) -> None:
     changes = {
-        "run.duration": duration, "sensors.lgs_rate": rate, "gpr_online.training_size": m, "gpr_online.depth": depth,
-        "gpr_offline.training_size": offline}
+        "run.duration": duration,
+        "sensors.lgs_rate": rate,
+        "gpr_online.training_size": m,
+        "gpr_online.depth": depth,
+        "gpr_offline.training_size": offline,
+    }
     scenario = paper().replace(changes)
     within = (
-        duration <= PUBLIC.duration and round(duration * rate) <= PUBLIC.steps
-        and max(m, offline) <= PUBLIC.training_size and depth <= PUBLIC.depth
-        and run_seconds(scenario) <= PUBLIC.seconds and run_bytes(scenario) <= 1e6 * PUBLIC.megabytes)
+        duration <= PUBLIC.duration
+        and round(duration * rate) <= PUBLIC.steps
+        and max(m, offline) <= PUBLIC.training_size
+        and depth <= PUBLIC.depth
+        and run_seconds(scenario) <= PUBLIC.seconds
+        and run_bytes(scenario) <= 1e6 * PUBLIC.megabytes
+    )
     line = refused(PUBLIC, changes)
     assert (line == "") == within and "\n" not in line
 
@@ -82,6 +98,7 @@ def test_a_loaded_record_is_bounded() -> None:
 
 
 # ---------------------------------------------------------------------- every way in
+
 
 @pytest.fixture
 def store(loop: Any, short: Scenario, enter: Any) -> Store:
@@ -130,6 +147,7 @@ def test_a_service_refuses_what_has_passed_by_the_page(short: Scenario) -> None:
 
 # ---------------------------------------------------------------------- the server
 
+
 def test_no_more_sessions_than_may_be(caplog: Any) -> None:
     caplog.set_level(logging.INFO, "wfsobs.serve")
     service = Service(Limits(sessions=2), 1, 0)
@@ -149,11 +167,19 @@ def test_no_more_sessions_than_may_be(caplog: Any) -> None:
     assert "&lt;b&gt;" in full_html("<b>")
 
 
-@pytest.mark.parametrize(("given", "limited"), [
-    ({}, False), ({"address": "127.0.0.1"}, False), ({"address": "::1"}, False), ({"address": "0.0.0.0"}, True),
-    ({"address": "ao.example.org"}, True), ({"origins": ("ao.example.org",)}, True),
-    ({"address": "0.0.0.0", "public": False}, False), ({"public": True}, True),
-])
+@pytest.mark.parametrize(
+    ("given", "limited"),
+    [
+        ({}, False),
+        ({"address": "127.0.0.1"}, False),
+        ({"address": "::1"}, False),
+        ({"address": "0.0.0.0"}, True),
+        ({"address": "ao.example.org"}, True),
+        ({"origins": ("ao.example.org",)}, True),
+        ({"address": "0.0.0.0", "public": False}, False),
+        ({"public": True}, True),
+    ],
+)
 def test_limits_are_on_unless_only_this_machine_reaches_the_page(given: dict[str, Any], limited: bool) -> None:
     assert options(**given).limits == (PUBLIC if limited else NONE)
 
@@ -162,12 +188,28 @@ def test_every_limit_has_a_flag() -> None:
     flags = {"max_duration": 1, "max_training_size": 2, "max_depth": 3, "max_seconds": 4, "max_memory": 5, "max_sessions": 6}
     limits = options(**flags).limits
     assert (limits.duration, limits.training_size, limits.depth, limits.seconds, limits.megabytes, limits.sessions) == (
-        1, 2, 3, 4, 5, 6)
+        1,
+        2,
+        3,
+        4,
+        5,
+        6,
+    )
     assert {f.name for f in fields(Limits)} - {"steps", "items"} == {
-        "duration", "training_size", "depth", "seconds", "megabytes", "sessions"}
+        "duration",
+        "training_size",
+        "depth",
+        "seconds",
+        "megabytes",
+        "sessions",
+    }
 
 
 def test_pages_come_from_where_the_server_is_reached() -> None:
     assert origins(Options(port=5007)) == ["127.0.0.1:5007", "localhost:5007"]
     assert origins(Options(address="10.0.0.5", origins=["ao.example.org"])) == [
-        "10.0.0.5:5006", "127.0.0.1:5006", "ao.example.org", "localhost:5006"]
+        "10.0.0.5:5006",
+        "127.0.0.1:5006",
+        "ao.example.org",
+        "localhost:5006",
+    ]

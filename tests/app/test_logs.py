@@ -26,8 +26,10 @@ LINE = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (INFO|WARNING|ERROR) ")
 def written() -> Iterator[io.StringIO]:
     """The log, as it would be written; all loggers as they were afterwards."""
     names = ["", "wfsobs", "panel", "bokeh", "tornado.access"]
-    before = {name: (logging.getLogger(name).handlers[:], logging.getLogger(name).level, logging.getLogger(name).propagate)
-              for name in names}
+    before = {
+        name: (logging.getLogger(name).handlers[:], logging.getLogger(name).level, logging.getLogger(name).propagate)
+        for name in names
+    }
     root = logging.getLogger()
     root.handlers[:] = []  # which to_stream would close
     stream = io.StringIO()
@@ -62,10 +64,14 @@ def test_a_run_from_beginning_to_end(written: io.StringIO, short: Scenario) -> N
     said = [LINE.sub("", line) for line in written.getvalue().splitlines() if LINE.match(line) and " failed" not in line]
     shapes = [re.sub(r"=[\d.a-f]+\b", "=#", line) for line in said]
     assert shapes == [
-        "session-start session=# sessions=#", "result session=# key=# cache=miss",
-        "run-start run=# session=# wait=# estimate=#", "run-end run=# state=failed seconds=#",
-        "identify-start identify=# session=# wait=# estimate=#", "identify-end identify=# state=done seconds=#",
-        "session-end session=# seconds=# sessions=#"]
+        "session-start session=# sessions=#",
+        "result session=# key=# cache=miss",
+        "run-start run=# session=# wait=# estimate=#",
+        "run-end run=# state=failed seconds=#",
+        "identify-start identify=# session=# wait=# estimate=#",
+        "identify-end identify=# state=done seconds=#",
+        "session-end session=# seconds=# sessions=#",
+    ]
     assert " ERROR run-end" in written.getvalue()
 
 
@@ -77,12 +83,15 @@ def test_what_visitors_send_stays_out(written: io.StringIO) -> None:
         bokeh.error("Unhandled exception receiving a message: %r: %r", error, "my secret", exc_info=True)
     bokeh.error("Token for session %r had invalid signature", "x" * 44)
     logging.getLogger("tornado.application").error(
-        "Uncaught exception GET /ws (10.0.0.7)\nHTTPServerRequest(remote_ip='10.0.0.7')")
+        "Uncaught exception GET /ws (10.0.0.7)\nHTTPServerRequest(remote_ip='10.0.0.7')"
+    )
     logging.getLogger("tornado.access").warning("404 GET /mine (10.0.0.7) 0.3ms")
     said = [LINE.sub(r"\1 ", line) for line in written.getvalue().splitlines()]
     assert said == [
-        "WARNING Unhandled exception receiving a message", "WARNING Token for session '...' had invalid signature",
-        "WARNING Uncaught exception GET /ws"]
+        "WARNING Unhandled exception receiving a message",
+        "WARNING Token for session '...' had invalid signature",
+        "WARNING Uncaught exception GET /ws",
+    ]
 
 
 def test_faults_of_our_own_keep_their_traceback(written: io.StringIO) -> None:

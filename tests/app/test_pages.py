@@ -146,9 +146,18 @@ class TestModel:
         assert "mode tilt" in words(page.pane.object)
 
     def test_an_unstable_cycle_says_why(self) -> None:
-        told = describe(Scenario().replace({
-            "kalman.process_noise": "manual", "kalman.vibration_rms": 0.06, "multirate.measurement_noise": "manual",
-            "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001}), 0)
+        told = describe(
+            Scenario().replace(
+                {
+                    "kalman.process_noise": "manual",
+                    "kalman.vibration_rms": 0.06,
+                    "multirate.measurement_noise": "manual",
+                    "multirate.lgs_noise": 0.04,
+                    "multirate.ngs_noise": 0.001,
+                }
+            ),
+            0,
+        )
         assert "is unstable" in words(model.html(told, dark=False))
 
     def test_nothing_is_fetched(self) -> None:

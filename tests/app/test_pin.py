@@ -90,11 +90,22 @@ class TestPin:
 class TestWords:
     def test_differences(self) -> None:
         one = Scenario()
-        other = one.replace({"turbulence.damping": 0.8, "loop.closed": False, "kalman.process_noise": "manual",
-                             "turbulence.rms": 0.4, "butterworth.frequencies": [20.0]})
+        other = one.replace(
+            {
+                "turbulence.damping": 0.8,
+                "loop.closed": False,
+                "kalman.process_noise": "manual",
+                "turbulence.rms": 0.4,
+                "butterworth.frequencies": [20.0],
+            }
+        )
         assert differences(one, other) == [
-            "Turbulence: Damping ξ 0.9 → 0.8", "Strength, rms 0.5 → 0.4 µm", "Closed loop on → off",
-            "Process noise Q matched → manual", "Centre frequencies changed"]
+            "Turbulence: Damping ξ 0.9 → 0.8",
+            "Strength, rms 0.5 → 0.4 µm",
+            "Closed loop on → off",
+            "Process noise Q matched → manual",
+            "Centre frequencies changed",
+        ]
         assert name_of(one, other).endswith("and 2 more")
         assert name_of(one, one.copy()) == "the same settings"
         assert "Peaks changed" in differences(PRESETS["paper"](), PRESETS["ut4"]())
@@ -105,8 +116,9 @@ class TestWords:
 
 class TestTable:
     def test_best_first(self, dashboard: Dashboard) -> None:
-        rms_of = {s.observer: s.rms for s in dashboard.store.run.result.result.scores
-                  if (s.target, s.mode) == ("vibration", "tip")}
+        rms_of = {
+            s.observer: s.rms for s in dashboard.store.run.result.result.scores if (s.target, s.mode) == ("vibration", "tip")
+        }
         assert order(dashboard, "vibration") == sorted(rms_of, key=lambda name: rms_of[name])
         dashboard.display.best_first = False
         assert order(dashboard, "vibration") == list(rms_of)
@@ -114,8 +126,11 @@ class TestTable:
     def test_marks(self, dashboard: Dashboard) -> None:
         html = dashboard.explore.table.pane.object
         assert html.count(">best<") == 2, "one causal observer per target"
-        worse = [s for s in dashboard.store.run.result.result.scores
-                 if s.mode == "tip" and s.normalised_rms is not None and s.normalised_rms > 1]
+        worse = [
+            s
+            for s in dashboard.store.run.result.result.scores
+            if s.mode == "tip" and s.normalised_rms is not None and s.normalised_rms > 1
+        ]
         assert html.count(">above truth<") == len(worse) > 0
 
     def test_real_time_factor(self, dashboard: Dashboard) -> None:

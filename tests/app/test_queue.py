@@ -174,8 +174,7 @@ def test_what_takes_too_long_is_stopped_counted_from_its_turn(make_queue: Any) -
     time.sleep(0.1)
     first.gate.set()
     assert limited.over.wait(WAIT) and log.started == ["a", "b"]
-    assert limited.known == {
-        "place": 0, "state": FAILED, "message": "It took more than 0.05 s, which is what this server allows"}
+    assert limited.known == {"place": 0, "state": FAILED, "message": "It took more than 0.05 s, which is what this server allows"}
 
 
 def test_who_leaves_is_not_waited_for(make_queue: Any) -> None:
@@ -224,6 +223,7 @@ def test_a_closed_queue_starts_nothing(make_queue: Any) -> None:
 
 
 # ---------------------------------------------------------------------- in a session
+
 
 @pytest.fixture
 def service() -> Iterator[Service]:

@@ -34,6 +34,7 @@ def test_only_its_own_thread_touches_the_document(monkeypatch: pytest.MonkeyPatc
 
     async def main() -> None:
         post = session.post_to_session()
+
         def many(i: int) -> None:
             for k in range(100):
                 post(partial(done.append, (i, k)))

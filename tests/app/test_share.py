@@ -26,8 +26,12 @@ from wfsobs.scenario.settings import Group, SettingError
 from wfsobs.simulation.loop import simulate
 
 QUICK = {
-    "run.duration": 1.0, "run.warm_up": 0.5, "gpr_online.training_size": 20, "gpr_offline.training_size": 50,
-    "adaptive.window": 0.4}
+    "run.duration": 1.0,
+    "run.warm_up": 0.5,
+    "gpr_online.training_size": 20,
+    "gpr_offline.training_size": 50,
+    "adaptive.window": 0.4,
+}
 LEAVES = [(path, p) for path, _, p in Scenario().walk() if not path.startswith("vibration.peaks")]
 
 
@@ -79,8 +83,9 @@ def test_every_setting_survives_a_link_and_a_file(path: str, p: Any, data: st.Da
 def test_lists_of_groups_survive_a_link(
     peaks: list[dict[str, Any]], layers: list[dict[str, Any]], processes: list[dict[str, Any]]
 ) -> None:
-    scenario = Scenario().replace({
-        "vibration.peaks": peaks, "turbulence.layers": layers, "turbulence.processes": processes, "sensors.lgs_rate": 100_000.0})
+    scenario = Scenario().replace(
+        {"vibration.peaks": peaks, "turbulence.layers": layers, "turbulence.processes": processes, "sensors.lgs_rate": 100_000.0}
+    )
     if not usable(scenario):
         return
     query = to_query(scenario, "ut4")
@@ -94,12 +99,18 @@ def test_events_survive_a_link() -> None:
 
 
 def test_a_link_holds_what_differs_and_can_be_read() -> None:
-    scenario = PRESETS["ut4"]().replace({
-        "turbulence.wind_speed": 20, "loop.closed": False, "butterworth.frequencies": [17, 20.5],
-        "vibration.peaks": [{"frequency": 45, "damping": 0.03, "rms": [0.01, 0.02]}] * 2})
+    scenario = PRESETS["ut4"]().replace(
+        {
+            "turbulence.wind_speed": 20,
+            "loop.closed": False,
+            "butterworth.frequencies": [17, 20.5],
+            "vibration.peaks": [{"frequency": 45, "damping": 0.03, "rms": [0.01, 0.02]}] * 2,
+        }
+    )
     assert to_query(scenario, "ut4") == (
         "preset=ut4&turbulence.wind_speed=20&vibration.peaks=45,0.03,0.01,0.02;45,0.03,0.01,0.02&loop.closed=false"
-        "&butterworth.frequencies=17,20.5")
+        "&butterworth.frequencies=17,20.5"
+    )
     assert to_query(PRESETS["paper"](), "paper") == ""
     assert to_query(PRESETS["ut4"](), "ut4") == "preset=ut4"
 
@@ -112,15 +123,39 @@ def test_a_bad_field_is_named_and_the_rest_applies() -> None:
     assert second.startswith("nonsense: no such setting")
 
 
-@pytest.mark.parametrize("query", [
-    "preset=other", "preset=", "run.seed=", "run.seed=__import__('os')", "run.duration=/etc/passwd", "telescope=1",
-    "loop.closed=yes", "vibration.peaks=1,2",
-    "turbulence.layers=1,1,1", "turbulence.layers=1,1,1,1,1",
-    "vibration.peaks=a,b,c", "vibration.peaks=1,0,nan", "run.duration=nan",
-    "run.seed=1.5", "turbulence.wind_speed=1e999", f"run.seed={'9' * 5000}", "loop.=1", ".=1", "=1", "vibration.peaks.x=1",
-    "vibration.peaks.999.frequency=3", "turbulence.wind_speed=%FF%00", "_refused=1", "name=x", "turbulence.name=x",
-    "kalman.frequency=600", "run.warm_up=20", f"x={'a' * LONGEST}",
-])
+@pytest.mark.parametrize(
+    "query",
+    [
+        "preset=other",
+        "preset=",
+        "run.seed=",
+        "run.seed=__import__('os')",
+        "run.duration=/etc/passwd",
+        "telescope=1",
+        "loop.closed=yes",
+        "vibration.peaks=1,2",
+        "turbulence.layers=1,1,1",
+        "turbulence.layers=1,1,1,1,1",
+        "vibration.peaks=a,b,c",
+        "vibration.peaks=1,0,nan",
+        "run.duration=nan",
+        "run.seed=1.5",
+        "turbulence.wind_speed=1e999",
+        f"run.seed={'9' * 5000}",
+        "loop.=1",
+        ".=1",
+        "=1",
+        "vibration.peaks.x=1",
+        "vibration.peaks.999.frequency=3",
+        "turbulence.wind_speed=%FF%00",
+        "_refused=1",
+        "name=x",
+        "turbulence.name=x",
+        "kalman.frequency=600",
+        "run.warm_up=20",
+        f"x={'a' * LONGEST}",
+    ],
+)
 def test_what_cannot_be_used_changes_nothing_and_has_one_line(query: str) -> None:
     link = from_query(query)
     assert link.scenario == PRESETS["paper"]() and link.preset == "paper"
@@ -137,8 +172,7 @@ def test_fields_that_only_go_together_in_any_order_beside_one_that_never_does() 
 
 def test_settings_too_long_for_a_link_travel_as_a_file() -> None:
     frequencies = [float(f) for f in np.linspace(1, 80, 2000)]
-    scenario = PRESETS["paper"]().replace({
-        "vibration.psd": {"frequency": frequencies, "tip": frequencies, "tilt": frequencies}})
+    scenario = PRESETS["paper"]().replace({"vibration.psd": {"frequency": frequencies, "tip": frequencies, "tilt": frequencies}})
     assert to_query(scenario, "paper") is None
     assert to_command(scenario, "paper") == "wfsobs run --config wfsobs.toml"
     assert 'configfile.load("wfsobs.toml")' in to_python(scenario, "paper")
@@ -146,8 +180,13 @@ def test_settings_too_long_for_a_link_travel_as_a_file() -> None:
 
 
 CHANGED = {
-    **QUICK, "turbulence.wind_speed": 22.5, "loop.gain": 0.25, "kalman.measurement_noise": "manual",
-    "multirate.model_lgs_error": False, "butterworth.frequencies": [24.3, 47.7], "vibration.source": "ar2",
+    **QUICK,
+    "turbulence.wind_speed": 22.5,
+    "loop.gain": 0.25,
+    "kalman.measurement_noise": "manual",
+    "multirate.model_lgs_error": False,
+    "butterworth.frequencies": [24.3, 47.7],
+    "vibration.source": "ar2",
     "vibration.peaks": [{"frequency": 47, "damping": 0.01, "rms": [0.02, 1e-5]}],
     "events": [{"kind": "peak", "start": 0.7, "frequency_shift": 2.0}],
 }
@@ -187,12 +226,20 @@ def test_settings_from_an_identification_are_written_in_plain_numbers(capsys: py
     assert made["scenario"] == found and capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("text", "reason"), [
-    ("a =", "not TOML"), ("loop.gain = 9", "loop.gain = 9"), ("nonsense = 1", "no such setting"),
-    ("run.warm_up = 20", "run.warm_up = 20"), (f"run.seed = {'9' * 5000}", "not TOML"),
-    (f"a = {'[' * 5000}", "nested more than 8 deep"),
-    ("preset = [1]", "preset = [1]"), ('preset = "../x"', "preset = '../x'"), ("\0", "not TOML"),
-])
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("a =", "not TOML"),
+        ("loop.gain = 9", "loop.gain = 9"),
+        ("nonsense = 1", "no such setting"),
+        ("run.warm_up = 20", "run.warm_up = 20"),
+        (f"run.seed = {'9' * 5000}", "not TOML"),
+        (f"a = {'[' * 5000}", "nested more than 8 deep"),
+        ("preset = [1]", "preset = [1]"),
+        ('preset = "../x"', "preset = '../x'"),
+        ("\0", "not TOML"),
+    ],
+)
 def test_a_bad_file_says_why_in_one_line(text: str, reason: str) -> None:
     with pytest.raises(SettingError) as caught:
         from_file(text)

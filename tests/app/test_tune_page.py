@@ -117,8 +117,7 @@ def test_a_loaded_record_is_cut(page: TunePage, dashboard: Dashboard, loop: Any,
 def test_progress_cancel_and_errors(page: TunePage, dashboard: Dashboard, loop: Any) -> None:
     page.evaluations.value = "0"
     page.start()
-    assert (page.work.state, page.starter.status.note) == (
-        FAILED, "Evaluations = '0': takes a whole number from 1 to 1000")
+    assert (page.work.state, page.starter.status.note) == (FAILED, "Evaluations = '0': takes a whole number from 1 to 1000")
     page.evaluations.value = "1000"
     page.observer.value = "gpr-online"
     page.start()

@@ -60,7 +60,8 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     assert not dashboard.store.stale and not dashboard.upload.room.visible
     expected = observe(read_record(io.BytesIO(content), "night.csv"), scenario)
     assert [(s.observer, s.target, s.mode, s.rms) for s in shown.result.scores] == [
-        (s.observer, s.target, s.mode, s.rms) for s in expected.scores]
+        (s.observer, s.target, s.mode, s.rms) for s in expected.scores
+    ]
     table = dashboard.explore.table.html()
     assert "one step ahead: the record has no truth" in table and "Recorded loop, residual" in table and "error / z" in table
     assert "nan" not in table
@@ -133,7 +134,8 @@ def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     dashboard.upload.unit.value = "nm"
     loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
     assert "4 frequencies from 29.4 to 30.6 Hz" in dashboard.upload.text.object and "3.317 nm rms of tip, 0 nm" in (
-        dashboard.upload.text.object)
+        dashboard.upload.text.object
+    )
     assert dashboard.upload.use.label == "Use this spectrum"
     dashboard.upload.confirm()
     loop.finish(dashboard.store)
@@ -148,8 +150,10 @@ def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
 def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
     before = dashboard.store.run.result
     for content, name, line in (
-        (b"hello", "a.npz", "a.npz: not an .npz file"), (b"", "a.csv", "a.csv: is empty"),
-        (b"# nothing", "a.csv", "a.csv: holds no table"), (b"x", "<b>.exe", "_b_.exe: its name ends in none of"),
+        (b"hello", "a.npz", "a.npz: not an .npz file"),
+        (b"", "a.csv", "a.csv: is empty"),
+        (b"# nothing", "a.csv", "a.csv: holds no table"),
+        (b"x", "<b>.exe", "_b_.exe: its name ends in none of"),
     ):
         previewed(dashboard, loop, content, name)
         assert dashboard.upload.picker.said.startswith(line)
@@ -161,8 +165,11 @@ def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
 def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
     upload = dashboard.upload
     for msg in (
-        {"index": 0, "count": 0, "data": "AAAA"}, {"index": 0, "count": "x", "data": ""}, {"index": 0, "count": 1, "data": "%%%"},
-        {"index": 0, "count": 1, "data": None}, {"index": 0},
+        {"index": 0, "count": 0, "data": "AAAA"},
+        {"index": 0, "count": "x", "data": ""},
+        {"index": 0, "count": 1, "data": "%%%"},
+        {"index": 0, "count": 1, "data": None},
+        {"index": 0},
     ):
         upload.handle({"action": "part", "name": "a.csv", **msg})
         assert upload.picker.said == "The file did not arrive whole." and upload._content == b""

@@ -80,8 +80,10 @@ class TestTraces:
         assert (dashboard.explore.traces.x_range.start, dashboard.explore.traces.x_range.end) == (0.0, 2.0)
 
     def test_figures_share_their_crosshair(self, dashboard: Dashboard) -> None:
-        spans = [{id(tool.overlay) for tool in t.figure.tools if isinstance(tool, CrosshairTool)}
-                 for t in dashboard.explore.traces.traces.values()]
+        spans = [
+            {id(tool.overlay) for tool in t.figure.tools if isinstance(tool, CrosshairTool)}
+            for t in dashboard.explore.traces.traces.values()
+        ]
         assert len(spans) == 2 and spans[0] == spans[1] and len(spans[0]) == 1
 
     def test_a_zoom_sends_the_samples_of_its_window(self, dashboard: Dashboard) -> None:
@@ -135,8 +137,7 @@ class TestSpectra:
     def test_unit(self, dashboard: Dashboard) -> None:
         dashboard.display.unit = "um"
         view = dashboard.explore.spectra.spectra["vibration"]
-        assert np.allclose(
-            view.sources[TRUTH].data["y"], dashboard.store.run.result.spectra[TRUTH, "vibration"].signal[1:, 0])
+        assert np.allclose(view.sources[TRUTH].data["y"], dashboard.store.run.result.spectra[TRUTH, "vibration"].signal[1:, 0])
         assert "µm²/Hz" in view.figure.yaxis.axis_label
 
     def test_peaks_are_marked(self, dashboard: Dashboard, loop: Any) -> None:
@@ -183,8 +184,11 @@ class TestNumbers:
 
     def test_cards(self, dashboard: Dashboard) -> None:
         cards = {c["name"]: c for c in dashboard.explore.strips["vibration"].cards.items}
-        score = next(s for s in dashboard.store.run.result.result.scores
-                     if (s.observer, s.target, s.mode) == ("gpr-online", "vibration", "tip"))
+        score = next(
+            s
+            for s in dashboard.store.run.result.result.scores
+            if (s.observer, s.target, s.mode) == ("gpr-online", "vibration", "tip")
+        )
         assert cards["gpr-online"]["value"] == number(1e3 * score.rms) and cards["gpr-online"]["unit"] == "nm"
         assert cards["gpr-online"]["colour"] == "#004B00"
         assert cards[TRUTH]["value"] == number(1e3 * score.truth_rms)
@@ -196,10 +200,20 @@ class TestNumbers:
         assert all(c["value"] == "–" for c in dashboard.explore.strips["vibration"].cards.items)
         assert dashboard.explore.table.pane.object.count("–") > 20
 
-    @pytest.mark.parametrize(("value", "text"), [
-        (None, "–"), (0.0, "0"), (15.723, "15.7"), (406.4, "406"), (1234.5, "1234"), (0.0616, "0.0616"),
-        (-0.05, "−0.0500"), (2e-5, "2.00e-05"), (100.0, "100"),
-    ])
+    @pytest.mark.parametrize(
+        ("value", "text"),
+        [
+            (None, "–"),
+            (0.0, "0"),
+            (15.723, "15.7"),
+            (406.4, "406"),
+            (1234.5, "1234"),
+            (0.0616, "0.0616"),
+            (-0.05, "−0.0500"),
+            (2e-5, "2.00e-05"),
+            (100.0, "100"),
+        ],
+    )
     def test_number(self, value: float | None, text: str) -> None:
         assert number(value) == text
 

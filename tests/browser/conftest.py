@@ -21,8 +21,13 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 ROOT = Path(__file__).parents[2]
 FLAGS = [
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
 ]
 CLOSED_MID_UPDATE = ("WebSocketClosedError", "StreamClosedError", "self.connection.session.notify_connection_lost()")
 """What a page that closes during an update, or (the last, Bokeh's own) before its session is there, leaves in the log;
@@ -46,8 +51,12 @@ class Server:
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
         with log.open("w") as out:
             self.process = subprocess.Popen(
-                [sys.executable, *(part.format(port=port) for part in command)], cwd=ROOT, env=environment,
-                stdout=out, stderr=subprocess.STDOUT)
+                [sys.executable, *(part.format(port=port) for part in command)],
+                cwd=ROOT,
+                env=environment,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+            )
         self._wait(f"http://localhost:{port}/liveness")
 
     def _wait(self, url: str) -> None:

@@ -45,8 +45,12 @@ def shot(page: Page, directory: Path, name: str) -> None:
 
 def test_first_paint(open_page: Any, tmp_path: Path) -> None:
     page = open_page()
-    for observer, target in (("kf-lgs", "turbulence"), ("multirate", "turbulence"), ("gpr-offline", "vibration"),
-                             ("gpr-online", "vibration")):
+    for observer, target in (
+        ("kf-lgs", "turbulence"),
+        ("multirate", "turbulence"),
+        ("gpr-offline", "vibration"),
+        ("gpr-online", "vibration"),
+    ):
         value, truth, relative, needs, lag, seconds, factor = row(page, observer, target)
         value, relative = value.split()[-1], relative.split()[-1]
         assert float(factor) > 0 and needs

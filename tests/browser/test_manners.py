@@ -7,8 +7,7 @@ from typing import Any
 
 from playwright.sync_api import Locator, Page, expect
 
-QUICK = (
-    "?run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5")
+QUICK = "?run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5"
 
 
 def place(it: Locator) -> tuple[float, float]:
@@ -21,7 +20,8 @@ def becomes(page: Page, expected: bool) -> None:
     """Wait for the theme."""
     sign = "<" if expected else ">="
     page.wait_for_function(
-        f"() => getComputedStyle(document.body).backgroundColor.match(/\\d+/g).slice(0, 3).reduce((a, b) => +a + +b) {sign} 300")
+        f"() => getComputedStyle(document.body).backgroundColor.match(/\\d+/g).slice(0, 3).reduce((a, b) => +a + +b) {sign} 300"
+    )
 
 
 def test_nothing_moves_under_the_pointer(open_page: Any, server: Any) -> None:

@@ -14,16 +14,20 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-ALLOWED: Mapping[str, tuple[str, int, str]] = MappingProxyType({
-    "aria-prohibited-attr": (
-        r'^<span aria-label="[^"]*" sx=|aria-label="Resize sidebar"', 24,
-        "panel-material-ui: a tooltip's span and the drawer's edge have labels but no role"),
-    "aria-progressbar-name": ("MuiLinearProgress-root", 1, "panel-material-ui: the busy line has no name and stays"),
-    "empty-heading": ("<h5[^>]*>&nbsp;</h5>", 2, "panel-material-ui: a heading keeps room below the bar"),
-    "heading-order": ("<h5[^>]*>&nbsp;</h5>", 2, "the same heading"),
-    "region": ("data-pmui-layer", 1, "panel-material-ui: the layer of its menus lies outside of the landmarks"),
-    "aria-dialog-name": ("MuiPaper-root", 1, "panel-material-ui: the drawer of a phone is a dialog without a name"),
-})
+ALLOWED: Mapping[str, tuple[str, int, str]] = MappingProxyType(
+    {
+        "aria-prohibited-attr": (
+            r'^<span aria-label="[^"]*" sx=|aria-label="Resize sidebar"',
+            24,
+            "panel-material-ui: a tooltip's span and the drawer's edge have labels but no role",
+        ),
+        "aria-progressbar-name": ("MuiLinearProgress-root", 1, "panel-material-ui: the busy line has no name and stays"),
+        "empty-heading": ("<h5[^>]*>&nbsp;</h5>", 2, "panel-material-ui: a heading keeps room below the bar"),
+        "heading-order": ("<h5[^>]*>&nbsp;</h5>", 2, "the same heading"),
+        "region": ("data-pmui-layer", 1, "panel-material-ui: the layer of its menus lies outside of the landmarks"),
+        "aria-dialog-name": ("MuiPaper-root", 1, "panel-material-ui: the drawer of a phone is a dialog without a name"),
+    }
+)
 """Rule -> pattern of what breaks it, how often at most, whose fault."""
 
 VIOLATIONS = """async () => (await axe.run(document, {resultTypes: ["violations"]})).violations
@@ -94,8 +98,13 @@ def test_accessibility(open_page: Any, width: int, dark: bool) -> None:
     page.evaluate(files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8"))
     accessible(page)
     for name, start, done in (
-        ("Identify", "Identify the record", "Identified in tip"), ("Tune", "Start tuning", "Before and after"),
-    ) if dark or width < 1000 else ():
+        (
+            ("Identify", "Identify the record", "Identified in tip"),
+            ("Tune", "Start tuning", "Before and after"),
+        )
+        if dark or width < 1000
+        else ()
+    ):
         page.get_by_role("button", name=name, exact=True).click()
         if name == "Tune":
             page.get_by_role("textbox", name="Evaluations").fill("2")

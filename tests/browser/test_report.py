@@ -26,8 +26,13 @@ from wfsobs.evaluation.scores import cumulative_rms, spectra
 from wfsobs.observers.base import TARGETS
 
 SETTINGS = {
-    "run.duration": 2.0, "run.warm_up": 0.5, "gpr_online.training_size": 20, "gpr_offline.training_size": 50,
-    "gpr_online.depth": 20, "gpr_offline.depth": 20, "adaptive.window": 0.5,
+    "run.duration": 2.0,
+    "run.warm_up": 0.5,
+    "gpr_online.training_size": 20,
+    "gpr_offline.training_size": 50,
+    "gpr_online.depth": 20,
+    "gpr_offline.depth": 20,
+    "adaptive.window": 0.5,
 }
 SHORT = [word for path, value in SETTINGS.items() for word in ("--set", f"{path}={value}")]
 SPEEDS, GAINS = (5, 15), (0.2, 0.3)
@@ -112,8 +117,11 @@ def test_every_state_shows_the_numbers_of_its_run(open_report: Any) -> None:
     diameter = scenario(5, 0.2).telescope.diameter
     for (i, speed), (j, gain) in product(enumerate(SPEEDS), enumerate(GAINS)):
         slide(page, i, j)
-        said = CliRunner().invoke(main, [
-            "run", *SHORT, "--set", f"turbulence.wind_speed={speed}", "--set", f"loop.gain={gain}", "--json"]).stdout
+        said = (
+            CliRunner()
+            .invoke(main, ["run", *SHORT, "--set", f"turbulence.wind_speed={speed}", "--set", f"loop.gain={gain}", "--json"])
+            .stdout
+        )
         rows = json.loads(said)
         embedded = json.loads(page.locator("#rows").text_content())[i * len(GAINS) + j]["rows"]
         assert [{k: v for k, v in row.items() if k in rows[0]} for row in embedded] == rows
@@ -249,7 +257,8 @@ def test_by_keyboard(open_report: Any) -> None:
     expect(page.get_by_role("radio", name="Tilt", exact=True)).to_be_checked()
     stretch = r", 0\.50 to 2\.00 s"
     expect(page.locator("#table th.target").filter(visible=True)).to_have_text(
-        [re.compile(f"^Turbulence, tilt{stretch}$"), re.compile(f"^Vibration, tilt{stretch}$")])
+        [re.compile(f"^Turbulence, tilt{stretch}$"), re.compile(f"^Vibration, tilt{stretch}$")]
+    )
 
 
 def test_without_javascript_the_numbers_are_there(open_report: Any) -> None:

@@ -111,7 +111,7 @@ def test_a_page_of_elsewhere_cannot_connect(visit: Callable[..., Page], serve: A
     """A page of another origin, which has got hold of a session's token, opens a websocket with it."""
     page = visit()
     status(page, "Done in")
-    token = page.evaluate("() => document.documentElement.innerHTML.match(/\"token\":\"([^\"]+)\"/)[1]")
+    token = page.evaluate('() => document.documentElement.innerHTML.match(/"token":"([^"]+)"/)[1]')
     connect = """([url, token]) => new Promise((done) => {
         const socket = new WebSocket(url, ["bokeh", token])
         socket.onmessage = () => done("connected")

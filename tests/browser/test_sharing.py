@@ -20,8 +20,10 @@ SHORT = "run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.
 @pytest.fixture
 def open_short(open_page: Any, server: Any) -> Callable[..., Page]:
     """The dashboard on a short record, by a link."""
+
     def open_it(more: str = "", **options: Any) -> Page:
         return open_page(url=f"{server.url}?{SHORT}{more}", **options)
+
     return open_it
 
 

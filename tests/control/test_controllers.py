@@ -32,13 +32,25 @@ from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.typing import Array
 
 # The loop of one 530 nm turbulence, one 50 nm line at 47.5 Hz, 20 nm of noise, and a model that is the truth.
-MATCHED = Scenario().replace({
-    "turbulence.rms": 0.53, "vibration.source": "ar2", "kalman.frequency": 47.5,
-    "vibration.peaks": [{"frequency": 47.5, "damping": 0.03, "rms": [0.05, 0.05]}],
-    "sensors.lgs_count": 1, "sensors.lgs_noise": 0.02, "sensors.lgs_low_frequency_rms": 0.0,
-})
-QUICK = {"run.duration": 1.5, "run.warm_up": 0.5, "gpr_offline.training_size": 60, "gpr_offline.depth": 20,
-         "gpr_online.training_size": 40, "gpr_online.depth": 20}
+MATCHED = Scenario().replace(
+    {
+        "turbulence.rms": 0.53,
+        "vibration.source": "ar2",
+        "kalman.frequency": 47.5,
+        "vibration.peaks": [{"frequency": 47.5, "damping": 0.03, "rms": [0.05, 0.05]}],
+        "sensors.lgs_count": 1,
+        "sensors.lgs_noise": 0.02,
+        "sensors.lgs_low_frequency_rms": 0.0,
+    }
+)
+QUICK = {
+    "run.duration": 1.5,
+    "run.warm_up": 0.5,
+    "gpr_offline.training_size": 60,
+    "gpr_offline.depth": 20,
+    "gpr_online.training_size": 40,
+    "gpr_online.depth": 20,
+}
 
 
 def run(changes: dict[str, Any], controllers: tuple[str, ...] | None = None, base: Scenario = MATCHED) -> ClosedLoop:
@@ -210,8 +222,9 @@ def test_what_is_rejected_is_what_the_rejection_function_says(controller: str) -
     scenario = MATCHED.replace({"run.duration": 200.0, "turbulence.rms": 0.01})
     record, plan = simulate(scenario), design(scenario, (controller,))
     phi = np.random.default_rng(2).standard_normal((record.n_steps, 2))
-    white = Record(np.vstack([np.zeros((1, 2)), phi[:-1]]), np.zeros_like(phi), record.dt, turbulence=phi,
-                   vibration=np.zeros_like(phi))
+    white = Record(
+        np.vstack([np.zeros((1, 2)), phi[:-1]]), np.zeros_like(phi), record.dt, turbulence=phi, vibration=np.zeros_like(phi)
+    )
     residual = outcome(closed_loop(white, plan), controller).residual
     assert residual is not None
     frequency, density = welch_psd(residual, record.dt, 1.0)
@@ -228,7 +241,11 @@ def test_what_is_rejected_is_what_the_rejection_function_says(controller: str) -
 
 def test_the_gain_is_the_best_of_all() -> None:
     changes: tuple[dict[str, Any], ...] = (
-        {}, {"sensors.lgs_noise": 0.1}, {"turbulence.wind_speed": 3.0}, {"sensors.lgs_low_frequency_rms": 0.05})
+        {},
+        {"sensors.lgs_noise": 0.1},
+        {"turbulence.wind_speed": 3.0},
+        {"sensors.lgs_low_frequency_rms": 0.05},
+    )
     # with a delay of 3 and of 4 there are two minima, the better one once at the higher gain, once at the lower
     for delay, change in [*((2.0, c) for c in changes), (3.0, {}), (4.0, {})]:
         mirror = Mirror(delay)
@@ -251,9 +268,14 @@ def test_no_controller_of_the_lgs_beats_the_bound(delay: float, noise: float) ->
         assert lqg == pytest.approx(plan.bound[0], rel=1e-5)
 
 
-@pytest.mark.parametrize("changes", [
-    {"control.gain": 1.2}, {"control.gain": 0.6, "control.delay": 4.0}, {"control.gain": 5.0, "control.stroke": 1.0},
-])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"control.gain": 1.2},
+        {"control.gain": 0.6, "control.delay": 4.0},
+        {"control.gain": 5.0, "control.stroke": 1.0},
+    ],
+)
 def test_an_unstable_loop_is_said_to_be_one(changes: dict[str, Any]) -> None:
     result = run(QUICK | {"control.integrator": "manual"} | changes)
     for one in result.outcomes:
@@ -275,7 +297,9 @@ def test_what_cannot_run_says_why() -> None:
     record, plan = simulate(scenario), design(scenario, ("lqg-multirate", "integrator+gpr-offline"))
     bare = replace(record, y_ngs=None, ratio=None, training=None)
     assert [o.note for o in closed_loop(bare, plan).outcomes] == [
-        "the record has no NGS measurement", "the record has no training record"]
+        "the record has no NGS measurement",
+        "the record has no training record",
+    ]
     with pytest.raises(RecordError, match="no truth"):
         closed_loop(replace(record, turbulence=None), plan)
     with pytest.raises(RecordError, match="another rate"):

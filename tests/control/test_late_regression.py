@@ -50,14 +50,21 @@ def test_one_without_a_known_target_is_refused() -> None:
         LateRegression(2, 3, 1, SquaredExponential(1.0, 1.0, 0.1), 3)
 
 
-@pytest.mark.parametrize(("delay", "inputs"), [
-    (1.0, "raw"), (2.0, "raw"), (2.5, "raw"), (3.0, "raw"), (2.0, "high-pass"), (2.0, "standardised")])
+@pytest.mark.parametrize(
+    ("delay", "inputs"), [(1.0, "raw"), (2.0, "raw"), (2.5, "raw"), (3.0, "raw"), (2.0, "high-pass"), (2.0, "standardised")]
+)
 def test_the_vibration_is_predicted_for_the_time_that_the_command_acts(delay: float, inputs: str) -> None:
     """Window j learns sum_i taps[i] f[j + i], f the causal bank on z, once that is known."""
     depth, m, n = 4, 9, 80
-    scenario = Scenario().replace({
-        "gpr_online.depth": depth, "gpr_online.training_size": m, "gpr_online.length_scale": 3.0, "gpr_online.signal_std": 1.0,
-        "gpr_online.inputs_filter": inputs})
+    scenario = Scenario().replace(
+        {
+            "gpr_online.depth": depth,
+            "gpr_online.training_size": m,
+            "gpr_online.length_scale": 3.0,
+            "gpr_online.signal_std": 1.0,
+            "gpr_online.inputs_filter": inputs,
+        }
+    )
     z = np.random.default_rng(5).standard_normal(n)
     f = online_reference(bands_of(scenario), z[:, None], scenario.dt)[:, 0]
     taps = Mirror(delay).taps

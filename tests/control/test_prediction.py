@@ -15,15 +15,27 @@ from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 
-LINE = Scenario().replace({  # one pure line in the middle of its band-pass, next to no noise
-    "turbulence.source": "none", "vibration.source": "peaks",
-    "vibration.peaks": [{"frequency": 40.0, "damping": 0.0, "rms": [0.05, 0.05]}],
-    "butterworth.frequencies": [40.0], "butterworth.bandwidth_offline": 20.0, "butterworth.bandwidth_online": 5.0,
-    "sensors.lgs_count": 1, "sensors.lgs_noise": 1e-4, "sensors.lgs_low_frequency_rms": 0.0,
-    "run.duration": 1.0, "run.warm_up": 0.3,
-    "gpr_offline.training_size": 300, "gpr_offline.depth": 30, "gpr_offline.noise_std": 1e-3,
-    "gpr_online.training_size": 100, "gpr_online.depth": 30, "gpr_online.noise_std": 1e-3,
-})
+LINE = Scenario().replace(
+    {  # one pure line in the middle of its band-pass, next to no noise
+        "turbulence.source": "none",
+        "vibration.source": "peaks",
+        "vibration.peaks": [{"frequency": 40.0, "damping": 0.0, "rms": [0.05, 0.05]}],
+        "butterworth.frequencies": [40.0],
+        "butterworth.bandwidth_offline": 20.0,
+        "butterworth.bandwidth_online": 5.0,
+        "sensors.lgs_count": 1,
+        "sensors.lgs_noise": 1e-4,
+        "sensors.lgs_low_frequency_rms": 0.0,
+        "run.duration": 1.0,
+        "run.warm_up": 0.3,
+        "gpr_offline.training_size": 300,
+        "gpr_offline.depth": 30,
+        "gpr_offline.noise_std": 1e-3,
+        "gpr_online.training_size": 100,
+        "gpr_online.depth": 30,
+        "gpr_online.noise_std": 1e-3,
+    }
+)
 
 
 @pytest.fixture(scope="module", name="record")
@@ -34,7 +46,8 @@ def _record() -> Record:
 @pytest.mark.parametrize("delay", [1.0, 2.0, 2.5])
 @pytest.mark.parametrize("predict", [gpr_offline_ahead, gpr_online_ahead])
 def test_a_prediction_is_the_vibration_while_the_command_acts(
-    predict: Callable[..., Array], delay: float, record: Record) -> None:
+    predict: Callable[..., Array], delay: float, record: Record
+) -> None:
     """A command held for a frame acts from `delay` - 1 to `delay` steps after its own: the mean of a line over that time."""
     assert record.vibration is not None
     mirror = Mirror(delay)

@@ -30,7 +30,8 @@ def test_json_is_the_rows_of_every_controller_mode_and_seed() -> None:
     rows = json.loads(result.stdout, parse_constant=pytest.fail)
     assert all(row.keys() >= ASKED for row in rows)
     assert [(r["seed"], r["controller"], r["mode"]) for r in rows] == [
-        (seed, name, mode) for seed in (4, 5) for name in (*CONTROLLERS, BOUND) for mode in ("tip", "tilt")]
+        (seed, name, mode) for seed in (4, 5) for name in (*CONTROLLERS, BOUND) for mode in ("tip", "tilt")
+    ]
     for row in rows:
         assert row["stable"] is True and 0 < row["strehl"] < 1
         assert row["residual_rms_mas"] == pytest.approx(row["residual_rms_nm"] * 0.103133, rel=1e-4)  # 10.3133 mas in 100 nm
@@ -100,7 +101,12 @@ def test_higher_modes_have_no_angle() -> None:
     order = ["--set", "telescope.radial_order=2", "--controller", "integrator", "--json"]
     rows = json.loads(call(*QUICK, *order).stdout)
     assert {r["mode"]: r["residual_rms_mas"] is None for r in rows if r["controller"] == "integrator"} == {
-        "tip": False, "tilt": False, "defocus": True, "oblique astigmatism": True, "vertical astigmatism": True}
+        "tip": False,
+        "tilt": False,
+        "defocus": True,
+        "oblique astigmatism": True,
+        "vertical astigmatism": True,
+    }
 
 
 def test_a_controller_that_is_not_there_is_refused_in_one_line() -> None:

@@ -32,12 +32,18 @@ NONE = np.array(None, dtype=object)
 # ---------------------------------------------------------------------- units and signs
 
 
-@pytest.mark.parametrize(("unit", "factor"), [
-    ("um", 1.0), ("nm", 1e-3), ("rad", 2e6), ("arcsec", 2e6 * math.pi / 648_000), ("mas", 2e3 * math.pi / 648_000)])
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [("um", 1.0), ("nm", 1e-3), ("rad", 2e6), ("arcsec", 2e6 * math.pi / 648_000), ("mas", 2e3 * math.pi / 648_000)],
+)
 def test_units_by_statement_by_file_and_by_signal(unit: str, factor: float) -> None:
     """On 8 m an angle is 4 / 8 of the tip over the aperture: 2 m of tip in one radian."""
-    for record in (taken(Stated(unit=unit)), taken(unit=unit), taken(units={"y_lgs": unit, "u": unit}),
-                   taken(Stated(unit=unit), units={"y_lgs": unit})):
+    for record in (
+        taken(Stated(unit=unit)),
+        taken(unit=unit),
+        taken(units={"y_lgs": unit, "u": unit}),
+        taken(Stated(unit=unit), units={"y_lgs": unit}),
+    ):
         np.testing.assert_allclose(record.y_lgs, Y * factor, rtol=1e-12)
         np.testing.assert_allclose(record.u, U * factor, rtol=1e-12)
         assert (f"unit {unit}" in record.origin) == (unit != "um")
@@ -158,11 +164,14 @@ def test_frames_with_a_clock_of_their_own(phase: int) -> None:
     assert np.isnan(record.y_ngs[15]).all()
 
 
-@pytest.mark.parametrize(("steps", "message"), [
-    ([5, 10, 17, 20, 25], "frame in row 2 is not a whole number of 5 steps"),
-    ([5, 10, 15.5, 20, 25], "time_ngs is 0.0155 s in row 2, which is no step"),
-    ([5, 10, 10, 15, 20], "time_ngs goes backwards or stands still at row 2"),
-])
+@pytest.mark.parametrize(
+    ("steps", "message"),
+    [
+        ([5, 10, 17, 20, 25], "frame in row 2 is not a whole number of 5 steps"),
+        ([5, 10, 15.5, 20, 25], "time_ngs is 0.0155 s in row 2, which is no step"),
+        ([5, 10, 10, 15, 20], "time_ngs goes backwards or stands still at row 2"),
+    ],
+)
 def test_frames_off_their_clock(steps: list[float], message: str) -> None:
     with pytest.raises(RecordError, match=message):
         taken(time=0.001 * np.arange(N), time_ngs=0.001 * np.array(steps), y_ngs=np.zeros((5, 2)))
@@ -179,16 +188,19 @@ def test_a_frame_that_lacks_a_mode_is_lost() -> None:
 # ---------------------------------------------------------------------- one line
 
 
-@pytest.mark.parametrize(("arrays", "message"), [
-    ({"unit": "V"}, "unit is 'V', which is no unit"),
-    ({"command_sign": 0}, "command_sign takes 1 or -1, not 0"),
-    ({"delay": 0}, "delay takes a whole number from 1, not 0"),
-    ({"delay": 1.5}, "delay takes a whole number, not 1.5"),
-    ({"dt": NONE}, "has no dt and no time"),
-    ({"y_ngs": np.zeros((N, 2))}, "y_ngs needs ratio"),
-    ({"y_ngs": np.zeros((N, 1)), "ratio": 1}, r"y_ngs has shape \(40, 1\); expected \(40, 2\)"),
-    ({"u": U * 1j}, "u holds complex128, not numbers"),
-])
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"unit": "V"}, "unit is 'V', which is no unit"),
+        ({"command_sign": 0}, "command_sign takes 1 or -1, not 0"),
+        ({"delay": 0}, "delay takes a whole number from 1, not 0"),
+        ({"delay": 1.5}, "delay takes a whole number, not 1.5"),
+        ({"dt": NONE}, "has no dt and no time"),
+        ({"y_ngs": np.zeros((N, 2))}, "y_ngs needs ratio"),
+        ({"y_ngs": np.zeros((N, 1)), "ratio": 1}, r"y_ngs has shape \(40, 1\); expected \(40, 2\)"),
+        ({"u": U * 1j}, "u holds complex128, not numbers"),
+    ],
+)
 def test_wrong_contents(arrays: dict, message: str) -> None:
     with pytest.raises(RecordError, match=message) as caught:
         taken(**arrays)

@@ -42,9 +42,19 @@ def test_the_record_of_a_keck_like_loop(tmp_path, capsys) -> None:
     um_per_arcsec = 1e6 * np.deg2rad(1 / 3600) * 10.0 / 4.0
     assert (record.n_steps, record.delay, record.training.y_lgs.shape) == (3000, 1, (5000, 2))
     np.testing.assert_allclose(record.z[1:], disturbance[5001:] * um_per_arcsec, atol=1e-5)
-    done = CliRunner().invoke(main, [
-        "observe", str(tmp_path / "keck.npz"), "--config", str(DOCS / "keck.toml"), "--set", "gpr_online.training_size=20",
-        "--set", "gpr_offline.training_size=50"])
+    done = CliRunner().invoke(
+        main,
+        [
+            "observe",
+            str(tmp_path / "keck.npz"),
+            "--config",
+            str(DOCS / "keck.toml"),
+            "--set",
+            "gpr_online.training_size=20",
+            "--set",
+            "gpr_offline.training_size=50",
+        ],
+    )
     assert done.exit_code == 0 and "next z" in done.stdout, done.stderr
     assert "keck.npz: read as unit arcsec, aperture 10 m, command sign -1\n" in done.stderr
 

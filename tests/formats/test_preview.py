@@ -64,11 +64,18 @@ def test_what_is_stated_and_what_is_missing() -> None:
     y, ngs = RECORD.y_lgs.copy(), RECORD.y_ngs.copy()
     y[100:110], ngs[20] = np.nan, np.nan
     found = preview(
-        content(".csv", replace(RECORD, y_lgs=y, y_ngs=ngs, turbulence=None, vibration=None)), "a.csv",
-        Scenario().replace({"telescope.diameter": 10.0}), Stated(command_delay=2))
+        content(".csv", replace(RECORD, y_lgs=y, y_ngs=ngs, turbulence=None, vibration=None)),
+        "a.csv",
+        Scenario().replace({"telescope.diameter": 10.0}),
+        Stated(command_delay=2),
+    )
     assert found.lines() == [
-        "1500 steps at 1000 Hz, 1.5 s, 10 missing", "2 modes, read as um rms", "a command is seen 2 steps later",
-        "NGS: 200 Hz, 1 frames missing", "truth: none, scored by prediction of the next measurement"]
+        "1500 steps at 1000 Hz, 1.5 s, 10 missing",
+        "2 modes, read as um rms",
+        "a command is seen 2 steps later",
+        "NGS: 200 Hz, 1 frames missing",
+        "truth: none, scored by prediction of the next measurement",
+    ]
     assert np.isfinite(found.spectrum).all()
 
 
@@ -102,8 +109,12 @@ def test_the_wrong_kind(ending: str) -> None:
 def test_any_byte_changed(ending: str) -> None:
     """Read or refused: no other error, whatever becomes of a byte."""
     rng = np.random.default_rng(3)
-    small = content(ending, replace(RECORD, **{k: getattr(RECORD, k)[:60] for k in (
-        "y_lgs", "u", "y_ngs", "turbulence", "vibration", "open_loop_y")}))
+    small = content(
+        ending,
+        replace(
+            RECORD, **{k: getattr(RECORD, k)[:60] for k in ("y_lgs", "u", "y_ngs", "turbulence", "vibration", "open_loop_y")}
+        ),
+    )
     for _ in range(12 if ending == ".aot.fits" else 60):
         data = bytearray(small)
         for place in rng.integers(0, min(len(data), 12_000), size=rng.integers(1, 6)):
@@ -212,7 +223,8 @@ def test_fits_of_all_kinds() -> None:
     y = np.linspace(-1.0, 1.0, 40).reshape(20, 2).astype("<f4")
     y[3] = np.nan
     commands = fits.BinTableHDU.from_columns(
-        [fits.Column("U", "2E", unit="nm", array=1000 * np.ones((20, 2))), fits.Column("NOTE", "4A", array=["abcd"] * 20)])
+        [fits.Column("U", "2E", unit="nm", array=1000 * np.ones((20, 2))), fits.Column("NOTE", "4A", array=["abcd"] * 20)]
+    )
     image = fits.ImageHDU(y, name="y_lgs")
     image.header["BUNIT"] = "micron"
     commands.header["DT"] = 0.002
@@ -266,9 +278,16 @@ def test_aot_opens_nothing_else(tmp_path, monkeypatch) -> None:
         mirror = aotpy.TipTiltMirror(uid="M", telescope=telescope)
         loop = aotpy.ControlLoop(uid="L", commanded_corrector=mirror, input_sensor=sensor, framerate=1000.0)
         file = io.BytesIO()
-        aotpy.AOTFITSWriter(aotpy.AOSystem(
-            ao_mode="SCAO", main_telescope=telescope, sources=[star], wavefront_sensors=[sensor], wavefront_correctors=[mirror],
-            loops=[loop])).get_hdulist().writeto(file)
+        aotpy.AOTFITSWriter(
+            aotpy.AOSystem(
+                ao_mode="SCAO",
+                main_telescope=telescope,
+                sources=[star],
+                wavefront_sensors=[sensor],
+                wavefront_correctors=[mirror],
+                loops=[loop],
+            )
+        ).get_hdulist().writeto(file)
         with monkeypatch.context() as patch:
             opened: list[object] = []
             patch.setattr("aotpy.io.fits._file.fits.open", partial(noted, opened, fits.open))

@@ -16,7 +16,8 @@ from wfsobs.telemetry.formats.psd import load_psd, read_psd
 
 F, TIP, TILT = np.array([5.0, 10.0, 20.0]), np.array([1.0, 4.0, 2.0]), np.array([0.0, 3.0, 1.5])
 CSV = "# measured\nfrequency [Hz],tip [{u}],extra,tilt [{u}]\n" + "".join(
-    f"{f},{a},x,{b}\n" for f, a, b in zip(F, TIP, TILT, strict=True))
+    f"{f},{a},x,{b}\n" for f, a, b in zip(F, TIP, TILT, strict=True)
+)
 
 
 def fits_image(unit: str | None) -> bytes:
@@ -29,15 +30,20 @@ def fits_image(unit: str | None) -> bytes:
 
 
 def fits_table(unit: str | None) -> bytes:
-    columns = [fits.Column("FREQUENCY", "D", unit="Hz", array=F),
-               *(fits.Column(n, "D", unit=unit, array=x) for n, x in (("TIP", TIP), ("TILT", TILT)))]
+    columns = [
+        fits.Column("FREQUENCY", "D", unit="Hz", array=F),
+        *(fits.Column(n, "D", unit=unit, array=x) for n, x in (("TIP", TIP), ("TILT", TILT))),
+    ]
     file = io.BytesIO()
     fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns)]).writeto(file)
     return file.getvalue()
 
 
-MAKE = {"a.csv": lambda unit: CSV.replace(" [{u}]", f" [{unit}]" if unit else "").encode(), "image.fits": fits_image,
-        "table.fits": fits_table}
+MAKE = {
+    "a.csv": lambda unit: CSV.replace(" [{u}]", f" [{unit}]" if unit else "").encode(),
+    "image.fits": fits_image,
+    "table.fits": fits_table,
+}
 
 
 @pytest.mark.parametrize("name", MAKE)
@@ -62,13 +68,16 @@ def test_a_unit_is_never_guessed(name: str) -> None:
         read_psd(io.BytesIO(MAKE[name]("nm/Hz")), name)
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("", "holds no table"),
-    ("f,tip,tilt\n1,2,3\n", "has no column frequency"),
-    ("frequency [kHz],tip [nm^2/Hz],tilt [nm^2/Hz]\n1,2,3\n", "frequency is in 'kHz'; it takes Hz"),
-    ("frequency,tip,tilt\n1,2\n", "line 2: tilt is not a number"),
-    ("frequency,tip,tilt\n1,nan,2\n", "tip does not hold one finite number per row"),
-])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "holds no table"),
+        ("f,tip,tilt\n1,2,3\n", "has no column frequency"),
+        ("frequency [kHz],tip [nm^2/Hz],tilt [nm^2/Hz]\n1,2,3\n", "frequency is in 'kHz'; it takes Hz"),
+        ("frequency,tip,tilt\n1,2\n", "line 2: tilt is not a number"),
+        ("frequency,tip,tilt\n1,nan,2\n", "tip does not hold one finite number per row"),
+    ],
+)
 def test_wrong_tables(text: str, message: str) -> None:
     with pytest.raises(RecordError, match=message):
         read_psd(io.BytesIO(text.encode()), "a.csv", "nm")
@@ -81,8 +90,22 @@ def test_the_command_runs_on_it(tmp_path) -> None:
     table = load_psd(path)
     quick = ["--set", "run.duration=2", "--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=50"]
     done = CliRunner().invoke(
-        main, ["run", "--vibration-psd", str(path), *quick, "--set", "run.warm_up=0", "--set", "vibration.cutoff=100",
-               "--set", "vibration.synthesis=random-phase", "--save", str(tmp_path / "record.npz")])
+        main,
+        [
+            "run",
+            "--vibration-psd",
+            str(path),
+            *quick,
+            "--set",
+            "run.warm_up=0",
+            "--set",
+            "vibration.cutoff=100",
+            "--set",
+            "vibration.synthesis=random-phase",
+            "--save",
+            str(tmp_path / "record.npz"),
+        ],
+    )
     assert done.exit_code == 0, done.stderr
     with np.load(tmp_path / "record.npz") as saved:
         rms = np.sqrt(np.mean(saved["vibration"] ** 2, axis=0))

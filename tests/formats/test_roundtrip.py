@@ -48,9 +48,18 @@ def records(draw) -> Record:
     rows = draw(st.integers(1, 12))
     training = maybe(lambda: Training(signal(FINITE, rows), signal(FINITE, rows), maybe(lambda: signal(FINITE, rows))))
     return Record(
-        y, signal(), draw(st.floats(1e-5, 1.0)), y_ngs, None if y_ngs is None else ratio, turbulence=maybe(signal),
-        vibration=maybe(signal), open_loop_y=maybe(signal), training=training, delay=draw(st.integers(1, 7)),
-        origin=draw(st.sampled_from(["", "unit nm, command sign -1"])))
+        y,
+        signal(),
+        draw(st.floats(1e-5, 1.0)),
+        y_ngs,
+        None if y_ngs is None else ratio,
+        turbulence=maybe(signal),
+        vibration=maybe(signal),
+        open_loop_y=maybe(signal),
+        training=training,
+        delay=draw(st.integers(1, 7)),
+        origin=draw(st.sampled_from(["", "unit nm, command sign -1"])),
+    )
 
 
 def same(a: Record, b: Record, leave: tuple[str, ...] = ()) -> None:
@@ -119,8 +128,9 @@ def test_fits_of_any_number_type(kind: str, as_table: bool) -> None:
     y = np.arange(-6, 6, dtype=f"<{kind}").reshape(6, 2)
     if as_table:
         names = ("y_lgs", "u")
-        table = fits.BinTableHDU.from_columns([fits.Column(n, f"2{ {'f8': 'D', 'f4': 'E', 'i4': 'J', 'i2': 'I'}[kind]}", array=y)
-                                               for n in names])
+        table = fits.BinTableHDU.from_columns(
+            [fits.Column(n, f"2{ {'f8': 'D', 'f4': 'E', 'i4': 'J', 'i2': 'I'}[kind] }", array=y) for n in names]
+        )
         hdus = [fits.PrimaryHDU(), table]
     else:
         hdus = [fits.PrimaryHDU(), fits.ImageHDU(y, name="Y_LGS"), fits.ImageHDU(y, name="U")]
@@ -170,14 +180,27 @@ def test_aot_from_slopes_and_commands() -> None:
     star = aotpy.NaturalGuideStar(uid="S")
     stamps = 1.6e9 + 0.002 * np.delete(np.arange(21), 7)
     time = aotpy.Time(uid="t", timestamps=list(stamps))
-    sensor = aotpy.ShackHartmann(uid="W", source=star, n_valid_subapertures=5,
-                                 measurements=aotpy.Image("slopes", slopes, unit="pix", time=time))
+    sensor = aotpy.ShackHartmann(
+        uid="W", source=star, n_valid_subapertures=5, measurements=aotpy.Image("slopes", slopes, unit="pix", time=time)
+    )
     mirror = aotpy.DeformableMirror(uid="M", telescope=telescope, n_valid_actuators=4)
     loop = aotpy.ControlLoop(
-        uid="L", commanded_corrector=mirror, input_sensor=sensor, commands=aotpy.Image("cmd", commands, unit="m"),
-        measurements_to_modes=aotpy.Image("s2m", to_modes), commands_to_modes=aotpy.Image("c2m", to_tilt), delay=1.3)
-    system = aotpy.AOSystem(ao_mode="SCAO", main_telescope=telescope, sources=[star], wavefront_sensors=[sensor],
-                            wavefront_correctors=[mirror], loops=[loop])
+        uid="L",
+        commanded_corrector=mirror,
+        input_sensor=sensor,
+        commands=aotpy.Image("cmd", commands, unit="m"),
+        measurements_to_modes=aotpy.Image("s2m", to_modes),
+        commands_to_modes=aotpy.Image("c2m", to_tilt),
+        delay=1.3,
+    )
+    system = aotpy.AOSystem(
+        ao_mode="SCAO",
+        main_telescope=telescope,
+        sources=[star],
+        wavefront_sensors=[sensor],
+        wavefront_correctors=[mirror],
+        loops=[loop],
+    )
     file = io.BytesIO()
     aotpy.AOTFITSWriter(system).get_hdulist().writeto(file)
     record = read_record(file, "night.fits")

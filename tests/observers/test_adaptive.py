@@ -65,10 +65,17 @@ def test_densities_are_those_of_the_process_and_slopes_their_derivatives(frequen
         np.testing.assert_allclose(slopes[0, i], slope, rtol=1e-4, atol=1e-3 * np.abs(slope).max())
 
 
-@pytest.mark.parametrize(("n", "peaks"), [
-    (2000, [PEAK]), (4000, []), (4000, [PEAK]), (4000, [PEAK, Ar2(2 * pi * 52.0, 0.01, 0.01, DT)]),
-    (4000, [Ar2(2 * pi * 52.0, 0.05, 0.02, DT)]), (8000, [PEAK]),
-])
+@pytest.mark.parametrize(
+    ("n", "peaks"),
+    [
+        (2000, [PEAK]),
+        (4000, []),
+        (4000, [PEAK]),
+        (4000, [PEAK, Ar2(2 * pi * 52.0, 0.01, 0.01, DT)]),
+        (4000, [Ar2(2 * pi * 52.0, 0.05, 0.02, DT)]),
+        (8000, [PEAK]),
+    ],
+)
 def test_the_spectrum_of_a_window_is_near_the_true_one(n: int, peaks: list[Ar2]) -> None:
     """The expected loss of log-likelihood, sum log S / S0 + S0 / S - 1 over all bins, is p / 2 for the best of p numbers (half of
     a chi squared of p). Here there are not only those: a wide peak is taken for several, each of three numbers."""
@@ -224,9 +231,17 @@ def test_progress_and_cancelling() -> None:
         estimated("kf-adaptive", record, with_window(1.0, 0.25), Watch(cancelled=lambda: True))
 
 
-@pytest.mark.parametrize("changes", [
-    {"scale": 1e-6}, {"scale": 1e3}, {"noise": 0.0}, {"noise": 100.0}, {"offset": 1e3}, {"line": 0.5},
-])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"scale": 1e-6},
+        {"scale": 1e3},
+        {"noise": 0.0},
+        {"noise": 100.0},
+        {"offset": 1e3},
+        {"line": 0.5},
+    ],
+)
 def test_estimates_are_sensible_whatever_the_record_is_like(changes: dict[str, float]) -> None:
     """In any unit, without noise, buried in it, far from zero, with a pure line: finite, and no worse than no estimate."""
     record = made(3000, 1, 9, PEAK)

@@ -25,13 +25,15 @@ CAUSAL = [name for name, observer in OBSERVERS.items() if observer.causal]
 
 def scenario(inputs: str = "u-y") -> Scenario:
     s = PRESETS["paper"]()
-    s.update({
-        "run": {"duration": 0.7, "warm_up": 0.2},
-        "gpr_offline": {"training_size": 60, "depth": 25, "inputs": inputs},
-        "gpr_online": {"training_size": 60, "depth": 25, "inputs": inputs},
-        "adaptive": {"window": 0.2, "interval": 0.25},  # which holds 18 periods of a peak
-        "vibration": {"source": "ar2", "peaks": [{"frequency": 90.0, "damping": 0.01, "rms": [0.1, 0.1]}]},
-    })
+    s.update(
+        {
+            "run": {"duration": 0.7, "warm_up": 0.2},
+            "gpr_offline": {"training_size": 60, "depth": 25, "inputs": inputs},
+            "gpr_online": {"training_size": 60, "depth": 25, "inputs": inputs},
+            "adaptive": {"window": 0.2, "interval": 0.25},  # which holds 18 periods of a peak
+            "vibration": {"source": "ar2", "peaks": [{"frequency": 90.0, "damping": 0.01, "rms": [0.1, 0.1]}]},
+        }
+    )
     return s
 
 
@@ -52,8 +54,12 @@ def changed_after(record: Record, k: int) -> Record:
         return out
 
     return replace(
-        record, y_lgs=other(record.y_lgs, k + 1), u=other(record.u, k), y_ngs=other(record.y_ngs, k + 1),
-        turbulence=other(record.turbulence, 0), vibration=other(record.vibration, 0),
+        record,
+        y_lgs=other(record.y_lgs, k + 1),
+        u=other(record.u, k),
+        y_ngs=other(record.y_ngs, k + 1),
+        turbulence=other(record.turbulence, 0),
+        vibration=other(record.vibration, 0),
         open_loop_y=other(record.open_loop_y, 0),
     )
 
@@ -98,9 +104,7 @@ def test_the_change_is_seen_afterwards(name: str, record: Record) -> None:
 
 @pytest.mark.parametrize("inputs", ["u-y", "z"])
 @pytest.mark.parametrize("name", CAUSAL)
-def test_the_command_of_the_step_itself_is_used_only_where_the_paper_has_it(
-    name: str, inputs: str, record: Record
-) -> None:
+def test_the_command_of_the_step_itself_is_used_only_where_the_paper_has_it(name: str, inputs: str, record: Record) -> None:
     """u[k] is computed once y[k] is known: the estimate of step k is without it, but for GPR windows of (u, y)."""
     s, k = scenario(inputs), 500
     u = record.u.copy()
@@ -119,15 +123,18 @@ def test_no_observer_reads_the_truth(name: str, record: Record) -> None:
     base = estimated(name, record, s)
     poison = np.full_like(record.y_lgs, np.nan)
     for other in (
-        replace(record, turbulence=poison, vibration=poison), replace(record, turbulence=None, vibration=None),
+        replace(record, turbulence=poison, vibration=poison),
+        replace(record, turbulence=None, vibration=None),
     ):
         found = estimated(name, other, s)
         assert all(np.array_equal(found[target], values, equal_nan=True) for target, values in base.items())
 
 
 NEEDED: dict[str, Callable[[Record], Record]] = {
-    "y_ngs": lambda r: replace(r, y_ngs=None), "ratio": lambda r: replace(r, ratio=None),
-    "open_loop_y": lambda r: replace(r, open_loop_y=None), "training": lambda r: replace(r, training=None),
+    "y_ngs": lambda r: replace(r, y_ngs=None),
+    "ratio": lambda r: replace(r, ratio=None),
+    "open_loop_y": lambda r: replace(r, open_loop_y=None),
+    "training": lambda r: replace(r, training=None),
 }
 
 
@@ -149,8 +156,13 @@ def test_a_record_that_ends_early_gives_the_same_beginning(name: str, record: Re
     assert record.y_ngs is not None and record.open_loop_y is not None
     n = 333
     short = replace(
-        record, y_lgs=record.y_lgs[:n], u=record.u[:n], y_ngs=record.y_ngs[:n], open_loop_y=record.open_loop_y[:n],
-        turbulence=None, vibration=None,
+        record,
+        y_lgs=record.y_lgs[:n],
+        u=record.u[:n],
+        y_ngs=record.y_ngs[:n],
+        open_loop_y=record.open_loop_y[:n],
+        turbulence=None,
+        vibration=None,
     )
     base, found = estimated(name, record, s), estimated(name, short, s)
     for target, values in base.items():

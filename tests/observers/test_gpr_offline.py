@@ -46,8 +46,9 @@ def split_solve(X: np.ndarray, f: np.ndarray, tests: np.ndarray, kernel: Squared
         distance = norms - 2.0 * g
         if norms.max() > 1.0:  # differences of large numbers
             distance = np.array([np.sum((q - row) ** 2, axis=1) for row in p]) / l2
-        return s2 * np.where(g > 0, -np.exp(-0.5 * distance) * np.expm1(-np.abs(g)),
-                             np.exp(-0.5 * norms) * np.expm1(np.minimum(g, 0.0)))
+        return s2 * np.where(
+            g > 0, -np.exp(-0.5 * distance) * np.expm1(-np.abs(g)), np.exp(-0.5 * norms) * np.expm1(np.minimum(g, 0.0))
+        )
 
     T = split(X, X) + kernel.noise_std**2 * np.eye(len(X))
     delta, delta_t = (np.exp(-0.5 * np.sum(p**2, axis=1) / l2) for p in (X, tests))
@@ -58,8 +59,14 @@ def split_solve(X: np.ndarray, f: np.ndarray, tests: np.ndarray, kernel: Squared
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(
-    st.floats(-1.0, 2.5), st.floats(-1.0, 5.0), st.floats(-3.0, 0.5), st.integers(2, 150),
-    st.sampled_from([1, 2]) | st.integers(1, 60), st.integers(1, 2), st.floats(-1.5, 0.5), st.integers(0, 600),
+    st.floats(-1.0, 2.5),
+    st.floats(-1.0, 5.0),
+    st.floats(-3.0, 0.5),
+    st.integers(2, 150),
+    st.sampled_from([1, 2]) | st.integers(1, 60),
+    st.integers(1, 2),
+    st.floats(-1.5, 0.5),
+    st.integers(0, 600),
     st.integers(0, 2**31),
 )
 @example(1.0, 2.477, -0.886, 150, 60, 2, -0.5, 600, 0)
@@ -148,6 +155,7 @@ def test_pairs_of_window_and_target_on_a_record(inputs: str, twin: bool) -> None
     kernel = SquaredExponential(g.signal_std, g.length_scale, g.noise_std)
     assert np.isnan(got[: d - 1]).all() and np.isfinite(got[d - 1 :]).all()
     for mode in range(2):
+
         def z_of(y: np.ndarray, u: np.ndarray, mode: int = mode) -> np.ndarray:
             return y[:, mode] - np.concatenate([[0.0, 0.0], u[:-2, mode]])
 
@@ -167,11 +175,16 @@ def test_pairs_of_window_and_target_on_a_record(inputs: str, twin: bool) -> None
 def test_targets_are_the_vibration_of_the_same_step() -> None:
     """One tone in the middle of the one band and nothing else: after the zero-phase filter has settled the target of
     step j is what the twin sees at j + 1, without lag."""
-    s = scenario({
-        "turbulence.source": "none", "vibration.peaks": [{"frequency": 47.7, "damping": 0.0, "rms": [0.02, 0.02]}],
-        "sensors.lgs_noise": 0.0, "sensors.lgs_low_frequency_rms": 0.0, "butterworth.frequencies": [47.7],
-        "gpr_offline.training_size": 2000,
-    })
+    s = scenario(
+        {
+            "turbulence.source": "none",
+            "vibration.peaks": [{"frequency": 47.7, "damping": 0.0, "rms": [0.02, 0.02]}],
+            "sensors.lgs_noise": 0.0,
+            "sensors.lgs_low_frequency_rms": 0.0,
+            "butterworth.frequencies": [47.7],
+            "gpr_offline.training_size": 2000,
+        }
+    )
     t = simulate(s).training
     assert t is not None and t.open_loop_y is not None
     targets = training_targets(t, bands_of(s), 1e-3)
@@ -184,12 +197,20 @@ def test_targets_are_the_vibration_of_the_same_step() -> None:
 def test_the_estimate_of_step_k_is_the_vibration_of_step_k() -> None:
     """The same tone in a closed loop with a little noise: no lag, small error, for u-y windows and z windows."""
     for inputs in ("u-y", "z"):
-        s = scenario({
-            "turbulence.source": "none", "vibration.peaks": [{"frequency": 47.7, "damping": 0.0, "rms": [0.02, 0.02]}],
-            "sensors.lgs_noise": 0.001, "sensors.lgs_low_frequency_rms": 0.0, "butterworth.frequencies": [47.7],
-            "gpr_offline.training_size": 800, "gpr_offline.depth": 60, "gpr_offline.noise_std": 0.01,
-            "gpr_offline.inputs": inputs, "run.warm_up": 0.9,
-        })
+        s = scenario(
+            {
+                "turbulence.source": "none",
+                "vibration.peaks": [{"frequency": 47.7, "damping": 0.0, "rms": [0.02, 0.02]}],
+                "sensors.lgs_noise": 0.001,
+                "sensors.lgs_low_frequency_rms": 0.0,
+                "butterworth.frequencies": [47.7],
+                "gpr_offline.training_size": 800,
+                "gpr_offline.depth": 60,
+                "gpr_offline.noise_std": 0.01,
+                "gpr_offline.inputs": inputs,
+                "run.warm_up": 0.9,
+            }
+        )
         record = simulate(s)
         values = estimated("gpr-offline", record, s)["vibration"][200:]
         assert record.vibration is not None

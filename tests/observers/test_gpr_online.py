@@ -56,8 +56,9 @@ def split_solve(
         distance = np.array([np.sum((Z - z) ** 2, axis=1) for z in Z]) / l2
     delta = np.exp(-0.5 * norm)
     # s2 (exp(-distance / 2) - delta delta'), the second taken out of the first where the exponent allows
-    M = s2 * np.where(g > 0, -np.exp(-0.5 * distance) * np.expm1(-np.abs(g)),
-                      np.outer(delta, delta) * np.expm1(np.minimum(g, 0.0)))
+    M = s2 * np.where(
+        g > 0, -np.exp(-0.5 * distance) * np.expm1(-np.abs(g)), np.outer(delta, delta) * np.expm1(np.minimum(g, 0.0))
+    )
     T = M[:m, :m] + kernel.noise_std**2 * np.eye(m)
     kappa, d_m, d_t = M[m:, :m], delta[:m], delta[m:]
     a, b, c = np.linalg.solve(T, f), np.linalg.solve(T, d_m), np.linalg.solve(T, kappa.T)
@@ -77,6 +78,7 @@ def split_sliding(
 
 def naive_solve(X: np.ndarray, f: np.ndarray, tests: np.ndarray, kernel: SquaredExponential) -> tuple[np.ndarray, float]:
     """The formula as printed: k' (K + sigma_n^2 I)^-1 f, and the condition number."""
+
     def k(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         distance = np.sum((p[:, None] - q[None]) ** 2, axis=2)
         return kernel.signal_std**2 * np.exp(-0.5 * distance / kernel.length_scale**2)
@@ -104,7 +106,9 @@ def long_solve(X: np.ndarray, f: np.ndarray, tests: np.ndarray, kernel: SquaredE
 
 kernels = st.builds(
     lambda s, length, noise: SquaredExponential(10**s, 10**length, 10**noise),
-    st.floats(-1.0, 2.5), st.floats(-1.0, 5.0), st.floats(-3.0, 0.5),
+    st.floats(-1.0, 2.5),
+    st.floats(-1.0, 5.0),
+    st.floats(-3.0, 0.5),
 )
 PAPER = SquaredExponential(30.0, 300.0, 0.1)
 
@@ -155,7 +159,10 @@ def test_where_the_printed_formula_is_well_conditioned_all_three_agree(
 @given(
     kernels | st.just(PAPER),
     st.sampled_from([2, 3, 4, 7, 8, 9, 15, 16, 17, 31, 32, 33, 63, 64, 65, 127, 128, 129]) | st.integers(2, 140),
-    st.sampled_from([1, 2, 3]) | st.integers(1, 60), st.integers(1, 2), st.floats(-1.5, 0.5), st.integers(1, 300),
+    st.sampled_from([1, 2, 3]) | st.integers(1, 60),
+    st.integers(1, 2),
+    st.floats(-1.5, 0.5),
+    st.integers(1, 300),
     st.integers(0, 2**31),
 )
 @example(SquaredExponential(30.0, 0.1, 0.1), 40, 30, 2, 0.5, 100, 0)
@@ -253,10 +260,13 @@ def test_what_double_precision_cannot_serve_is_refused() -> None:
 
 def scenario(changes: dict[str, Any] | None = None) -> Scenario:
     base = PRESETS["paper"]()
-    base.update({
-        "run": {"duration": 1.0, "warm_up": 0.2}, "gpr_offline": {"training_size": 50, "depth": 20},
-        "gpr_online": {"training_size": 60, "depth": 25},
-    })
+    base.update(
+        {
+            "run": {"duration": 1.0, "warm_up": 0.2},
+            "gpr_offline": {"training_size": 50, "depth": 20},
+            "gpr_online": {"training_size": 60, "depth": 25},
+        }
+    )
     return base.replace(changes or {})
 
 
@@ -274,8 +284,9 @@ def test_pairs_of_window_and_target_on_a_record(inputs: str) -> None:
     for mode in range(2):
         z = np.array([record.y_lgs[k, mode] - (record.u[k - 2, mode] if k > 1 else 0.0) for k in range(record.n_steps)])
         filtered = sum(
-            sosfilt(butter(b.order, [f - b.bandwidth_online / 2, f + b.bandwidth_online / 2], "bandpass", fs=1000,
-                           output="sos"), z)
+            sosfilt(
+                butter(b.order, [f - b.bandwidth_online / 2, f + b.bandwidth_online / 2], "bandpass", fs=1000, output="sos"), z
+            )
             for f in b.frequencies
         )
         x = z[:, None] if inputs == "z" else np.column_stack([record.u[:, mode], record.y_lgs[:, mode]])
@@ -290,11 +301,19 @@ def test_pairs_of_window_and_target_on_a_record(inputs: str) -> None:
 def test_the_estimate_of_step_k_is_the_vibration_of_step_k() -> None:
     """A vibration that is known, one tone in the middle of the one band, nothing else: the filtered z of step j + 1 is
     the vibration of step j, and the estimate comes without lag. Off by one step it would lag by 1 ms, 30 % error."""
-    s = scenario({
-        "turbulence.source": "none", "vibration.peaks": [{"frequency": 47.7, "damping": 0.0, "rms": [0.02, 0.02]}],
-        "sensors.lgs_noise": 0.001, "sensors.lgs_low_frequency_rms": 0.0, "butterworth.frequencies": [47.7],
-        "run.duration": 3.5, "gpr_online.training_size": 200, "gpr_online.depth": 60, "gpr_online.noise_std": 0.01,
-    })
+    s = scenario(
+        {
+            "turbulence.source": "none",
+            "vibration.peaks": [{"frequency": 47.7, "damping": 0.0, "rms": [0.02, 0.02]}],
+            "sensors.lgs_noise": 0.001,
+            "sensors.lgs_low_frequency_rms": 0.0,
+            "butterworth.frequencies": [47.7],
+            "run.duration": 3.5,
+            "gpr_online.training_size": 200,
+            "gpr_online.depth": 60,
+            "gpr_online.noise_std": 0.01,
+        }
+    )
     record = simulate(s)
     values = estimated("gpr-online", record, s)["vibration"][2500:]  # the band of 2 Hz has settled to exp(-15)
     assert record.vibration is not None

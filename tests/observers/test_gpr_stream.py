@@ -58,9 +58,16 @@ def split_direct(signals, targets, depth, m, kernel, steps):
 @pytest.mark.parametrize("kind", ["raw", "high-pass", "standardised"])
 @pytest.mark.parametrize("inputs", ["u-y", "z"])
 def test_the_stream_gives_the_numbers_of_the_record_version(inputs, kind):
-    scenario = paper().replace({
-        "run.duration": 1.5, "run.warm_up": 0.5, "gpr_online.training_size": 100, "gpr_online.depth": 40,
-        "gpr_online.inputs": inputs, "gpr_online.inputs_filter": kind})
+    scenario = paper().replace(
+        {
+            "run.duration": 1.5,
+            "run.warm_up": 0.5,
+            "gpr_online.training_size": 100,
+            "gpr_online.depth": 40,
+            "gpr_online.inputs": inputs,
+            "gpr_online.inputs_filter": kind,
+        }
+    )
     record = simulate(scenario)
     expected = estimated("gpr-online", record, scenario)["vibration"][:, 1]
     scale = scale_of(scenario.gpr_online, record.training, record.delay, 1)

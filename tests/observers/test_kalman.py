@@ -92,7 +92,9 @@ def textbook_ngs(record: Record, s: Scenario, mode: int, r: float) -> np.ndarray
 
 
 NGS_VARIANTS: list[dict[str, Any]] = [
-    {"sensors.exposure_ratio": 5}, {"sensors.exposure_ratio": 1}, {"sensors.exposure_ratio": 7, "run.duration": 1.203},
+    {"sensors.exposure_ratio": 5},
+    {"sensors.exposure_ratio": 1},
+    {"sensors.exposure_ratio": 7, "run.duration": 1.203},
     {"kalman.process_noise": "matched", "kalman.measurement_noise": "manual", "kalman.ngs_noise": 0.05},
 ]
 
@@ -163,10 +165,16 @@ def test_propagating_beats_holding_where_the_model_is_true() -> None:
     errors = {"hold": [], "propagate": []}
     for seed in range(4):
         for how, found in errors.items():
-            s = scenario({
-                "kalman.ngs_between_frames": how, "vibration.source": "none", "turbulence.wind_speed": 40.0,
-                "kalman.process_noise": "matched", "run.duration": 6.0, "run.seed": seed,
-            })
+            s = scenario(
+                {
+                    "kalman.ngs_between_frames": how,
+                    "vibration.source": "none",
+                    "turbulence.wind_speed": 40.0,
+                    "kalman.process_noise": "matched",
+                    "run.duration": 6.0,
+                    "run.seed": seed,
+                }
+            )
             record = simulate(s)
             assert record.turbulence is not None
             found.append(np.nanstd(estimated("kf-ngs", record, s)["turbulence"] - record.turbulence))
@@ -179,10 +187,14 @@ def test_propagating_beats_holding_where_the_model_is_true() -> None:
 def test_error_of_the_matched_filter_is_what_the_riccati_equation_says() -> None:
     """Where the truth is the model, AR(2) turbulence and one AR(2) peak in white noise, the error is `filtered`."""
     s = Scenario()
-    s.update({
-        "vibration": {"source": "ar2", "peaks": [{"rms": [0.015, 0.03]}]}, "sensors": {"lgs_low_frequency_rms": 0.0},
-        "run": {"duration": 60.0}, "gpr_offline": {"training_size": 2, "depth": 1},
-    })
+    s.update(
+        {
+            "vibration": {"source": "ar2", "peaks": [{"rms": [0.015, 0.03]}]},
+            "sensors": {"lgs_low_frequency_rms": 0.0},
+            "run": {"duration": 60.0},
+            "gpr_offline": {"training_size": 2, "depth": 1},
+        }
+    )
     ratios = []
     for seed in range(16):
         record = simulate(s.replace({"run.seed": seed}))
@@ -204,10 +216,14 @@ def test_error_of_the_matched_filter_is_what_the_riccati_equation_says() -> None
 
 def test_innovations_of_the_matched_filter_are_white() -> None:
     s = Scenario()
-    s.update({
-        "vibration": {"source": "ar2", "peaks": [{}]}, "sensors": {"lgs_low_frequency_rms": 0.0},
-        "run": {"duration": 30.0}, "gpr_offline": {"training_size": 2, "depth": 1},
-    })
+    s.update(
+        {
+            "vibration": {"source": "ar2", "peaks": [{}]},
+            "sensors": {"lgs_low_frequency_rms": 0.0},
+            "run": {"duration": 30.0},
+            "gpr_offline": {"training_size": 2, "depth": 1},
+        }
+    )
     record = simulate(s)
     model, noise = kalman_model(s, 0, record.dt), measurement_noise(s, 0)[0]
     kalman, steady = steady_filter(model, noise, np.eye(4))

@@ -30,8 +30,15 @@ def window(x: np.ndarray, end: int, depth: int) -> np.ndarray:
 
 
 @EXAMPLES
-@given(st.integers(1, 40), st.integers(1, 60), st.integers(1, 50), st.integers(1, 2), st.integers(-10, 60),
-       st.integers(-60, 60), st.integers(0, 2**31))
+@given(
+    st.integers(1, 40),
+    st.integers(1, 60),
+    st.integers(1, 50),
+    st.integers(1, 2),
+    st.integers(-10, 60),
+    st.integers(-60, 60),
+    st.integers(0, 2**31),
+)
 def test_sliding_products_are_inner_products(
     depth: int, rows: int, offsets: int, channels: int, i0: int, shift: int, seed: int
 ) -> None:

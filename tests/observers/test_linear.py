@@ -25,8 +25,9 @@ from wfsobs.simulation.sensor_noise import noise_covariance
 
 
 def small(changes: dict | None = None) -> Scenario:
-    return PRESETS["paper"]().replace({
-        "run.duration": 1.5, "run.warm_up": 0.4, "gpr_offline.training_size": 120, "gpr_offline.depth": 30, **(changes or {})})
+    return PRESETS["paper"]().replace(
+        {"run.duration": 1.5, "run.warm_up": 0.4, "gpr_offline.training_size": 120, "gpr_offline.depth": 30, **(changes or {})}
+    )
 
 
 @settings(max_examples=25)
@@ -116,9 +117,14 @@ def test_the_fit_finds_a_process_as_good_as_the_truth(truth: Ar3) -> None:
 
 def lines(scenario: Scenario, count: int) -> Scenario:
     peaks = [{"frequency": 17.0 + 11.0 * i, "damping": 0.02, "rms": [0.02, 0.01]} for i in range(count)]
-    return scenario.replace({
-        "vibration.source": "ar2", "vibration.peaks": peaks, "sensors.lgs_low_frequency_rms": 0.0,
-        "kalman.process_noise": "matched"})
+    return scenario.replace(
+        {
+            "vibration.source": "ar2",
+            "vibration.peaks": peaks,
+            "sensors.lgs_low_frequency_rms": 0.0,
+            "kalman.process_noise": "matched",
+        }
+    )
 
 
 def test_where_the_truth_is_its_model_the_filter_reaches_the_bound() -> None:
@@ -138,16 +144,24 @@ def test_where_the_truth_is_its_model_the_filter_reaches_the_bound() -> None:
 def test_more_peaks_in_the_model_than_the_papers_one_help() -> None:
     s = lines(small(), 4)
     record = simulate(s)
-    errors = [np.std((estimated(name, record, s)["vibration"] - record.vibration)[400:, 0])
-              for name in ("kf-multi", "kf-lgs")]
+    errors = [np.std((estimated(name, record, s)["vibration"] - record.vibration)[400:, 0]) for name in ("kf-multi", "kf-lgs")]
     assert errors[0] < 0.8 * errors[1]
 
 
 def test_every_mode_is_filtered_for_its_own_noise() -> None:
     """Oracle: the textbook filter of each mode, noise from the sensor's own covariance."""
-    s = lines(small({
-        "turbulence.source": "frozen-flow", "telescope.radial_order": 2, "sensors.kind": "shack-hartmann",
-        "sensors.noise_from": "photons", "multipeak.turbulence_order": 2}), 3)
+    s = lines(
+        small(
+            {
+                "turbulence.source": "frozen-flow",
+                "telescope.radial_order": 2,
+                "sensors.kind": "shack-hartmann",
+                "sensors.noise_from": "photons",
+                "multipeak.turbulence_order": 2,
+            }
+        ),
+        3,
+    )
     noise = np.sqrt(np.diagonal(noise_covariance(s, "lgs")) / s.sensors.lgs_count)
     assert noise.max() > 1.2 * noise.min()  # else the test would say nothing
     record = simulate(s)
@@ -175,7 +189,13 @@ def test_the_third_order_is_an_option() -> None:
 
 
 def test_a_table_of_a_spectrum_names_no_lines() -> None:
-    s = small({"vibration.source": "psd", "vibration.psd.frequency": [1.0, 50.0], "vibration.psd.tip": [1e-6, 1e-6],
-               "vibration.psd.tilt": [1e-6, 1e-6]})
+    s = small(
+        {
+            "vibration.source": "psd",
+            "vibration.psd.frequency": [1.0, 50.0],
+            "vibration.psd.tip": [1e-6, 1e-6],
+            "vibration.psd.tilt": [1e-6, 1e-6],
+        }
+    )
     with pytest.raises(ValueError, match=r"vibration\.source = psd"):
         multi_model(s, 0, s.dt)

@@ -59,7 +59,10 @@ def textbook(record: Record, s: Scenario, mode: int, lgs: float, ngs: float) -> 
 
 
 VARIANTS: list[dict[str, Any]] = [
-    {}, {"sensors.exposure_ratio": 2}, {"sensors.exposure_ratio": 1}, {"sensors.exposure_ratio": 8},
+    {},
+    {"sensors.exposure_ratio": 2},
+    {"sensors.exposure_ratio": 1},
+    {"sensors.exposure_ratio": 8},
     {"multirate.measurement_noise": "manual", "multirate.lgs_noise": 0.03, "multirate.ngs_noise": 0.01},
 ]
 
@@ -115,9 +118,13 @@ def test_two_stable_gains_can_make_an_unstable_cycle() -> None:
 
 
 def test_an_unstable_cycle_is_a_failure_of_that_observer_alone() -> None:
-    s = scenario({
-        "multirate.measurement_noise": "manual", "multirate.lgs_noise": 0.04, "multirate.ngs_noise": 0.001,
-    })
+    s = scenario(
+        {
+            "multirate.measurement_noise": "manual",
+            "multirate.lgs_noise": 0.04,
+            "multirate.ngs_noise": 0.001,
+        }
+    )
     result = run(s, observers=["kf-lgs", "multirate"])
     assert [f.observer for f in result.failures] == ["multirate"] and "40 nm" in result.failures[0].reason
     assert {e.observer for e in result.estimates} == {"kf-lgs"}
@@ -168,10 +175,15 @@ def time_varying(record: Record, s: Scenario, mode: int, lgs: float, ngs: float,
 @pytest.mark.parametrize("with_error", [True, False])
 @pytest.mark.parametrize("ratio", [1, 2, 5])
 def test_the_optimal_filter_is_the_time_varying_one_once_that_has_settled(ratio: int, with_error: bool) -> None:
-    s = scenario({
-        "sensors.exposure_ratio": ratio, "multirate.model_lgs_error": with_error, "run.duration": 4.0,
-        "kalman.damping": 0.1, "turbulence.wind_speed": 40.0,
-    })
+    s = scenario(
+        {
+            "sensors.exposure_ratio": ratio,
+            "multirate.model_lgs_error": with_error,
+            "run.duration": 4.0,
+            "kalman.damping": 0.1,
+            "turbulence.wind_speed": 40.0,
+        }
+    )
     record = simulate(s)
     got = estimated("multirate-optimal", record, s)
     wanted = time_varying(record, s, 0, *multirate_noise(s.multirate, model_of(s, 0)), with_error)
@@ -201,10 +213,15 @@ def test_with_a_frame_at_every_step_both_multirate_filters_are_the_two_sensor_fi
 
 
 def test_the_optimal_filter_is_at_least_as_good_as_any_other_on_its_model() -> None:
-    s = scenario({
-        "run.duration": 20.0, "run.warm_up": 1.0, "kalman.process_noise": "matched", "vibration.source": "ar2",
-        "vibration.peaks": [{"rms": [0.03, 0.03]}],
-    })
+    s = scenario(
+        {
+            "run.duration": 20.0,
+            "run.warm_up": 1.0,
+            "kalman.process_noise": "matched",
+            "vibration.source": "ar2",
+            "vibration.peaks": [{"rms": [0.03, 0.03]}],
+        }
+    )
     record = simulate(s)
     assert record.turbulence is not None
     errors = {

@@ -120,13 +120,20 @@ def test_with_ratio_one_it_is_the_filter_of_two_sensors():
 
 @settings(deadline=None, derandomize=True, max_examples=40)
 @given(
-    ratio=st.integers(1, 20), lgs=st.floats(-4, 0), ngs=st.floats(-4, 0), wind=st.floats(1, 60), rms=st.floats(-3, 0),
-    error=st.one_of(st.none(), st.floats(-3, -0.5)), frequency=st.floats(5, 200), damping=st.floats(-3, -0.5),
+    ratio=st.integers(1, 20),
+    lgs=st.floats(-4, 0),
+    ngs=st.floats(-4, 0),
+    wind=st.floats(1, 60),
+    rms=st.floats(-3, 0),
+    error=st.one_of(st.none(), st.floats(-3, -0.5)),
+    frequency=st.floats(5, 200),
+    damping=st.floats(-3, -0.5),
 )
 def test_never_worse_than_the_better_single_sensor_filter(ratio, lgs, ngs, wind, rms, error, frequency, damping):
     """In the covariance it predicts for its own model, mean over the cycle, for both targets."""
     model = disturbance_model(
-        [Ar2(0.6 * np.pi * 2 * wind / 8, 0.9, 0.5, DT)], [Ar2(2 * np.pi * frequency, 10**damping, 10**rms, DT)])
+        [Ar2(0.6 * np.pi * 2 * wind / 8, 0.9, 0.5, DT)], [Ar2(2 * np.pi * frequency, 10**damping, 10**rms, DT)]
+    )
     slow = None if error is None else Ar2(0.6 * np.pi * 2 * wind / 8, 0.9, 10**error, DT)
     cycle = optimal_cycle(model, ratio, 10**lgs, 10**ngs, slow)
     rows = padded(OUTPUTS, cycle)

@@ -17,8 +17,13 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 
 OTHER: dict[str, dict[str, Any]] = {
-    MODEL: {"turbulence.wind_speed": 40.0, "kalman.frequency": 31.0, "kalman.turbulence_rms": 0.1, "sensors.lgs_noise": 0.1,
-            "sensors.ngs_noise": 0.1},
+    MODEL: {
+        "turbulence.wind_speed": 40.0,
+        "kalman.frequency": 31.0,
+        "kalman.turbulence_rms": 0.1,
+        "sensors.lgs_noise": 0.1,
+        "sensors.ngs_noise": 0.1,
+    },
     LINES: {"vibration.peaks.0.frequency": 33.0, "vibration.peaks.0.rms": [0.05, 0.05]},
     BANDS: {"butterworth.frequencies": [33.0]},
 }
@@ -27,9 +32,17 @@ OTHER: dict[str, dict[str, Any]] = {
 
 def scenario() -> Scenario:
     """Short, with a Kalman model set by hand, so that no line is in it but those of the multi-peak one."""
-    return PRESETS["paper"]().replace({
-        "run.duration": 6.0, "run.warm_up": 0.2, "kalman.process_noise": "manual", "gpr_offline.training_size": 60,
-        "gpr_offline.depth": 25, "gpr_online.training_size": 60, "gpr_online.depth": 25})
+    return PRESETS["paper"]().replace(
+        {
+            "run.duration": 6.0,
+            "run.warm_up": 0.2,
+            "kalman.process_noise": "manual",
+            "gpr_offline.training_size": 60,
+            "gpr_offline.depth": 25,
+            "gpr_online.training_size": 60,
+            "gpr_online.depth": 25,
+        }
+    )
 
 
 @pytest.fixture(scope="module", name="record")
@@ -45,8 +58,11 @@ def estimates(observer: Observer, record: Record, s: Scenario) -> np.ndarray:
 def test_an_observer_depends_on_what_it_is_said_to_need(name: str, record: Record) -> None:
     observer = OBSERVERS[name]
     base = estimates(observer, record, scenario())
-    depends = {what for what, changes in OTHER.items()
-               if not np.array_equal(estimates(observer, record, scenario().replace(changes)), base, equal_nan=True)}
+    depends = {
+        what
+        for what, changes in OTHER.items()
+        if not np.array_equal(estimates(observer, record, scenario().replace(changes)), base, equal_nan=True)
+    }
     assert record.training is not None
     learnt = replace(record, training=replace(record.training, y_lgs=record.training.y_lgs[::-1].copy()))
     if not np.array_equal(estimates(observer, learnt, scenario()), base, equal_nan=True):

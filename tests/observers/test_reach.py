@@ -28,9 +28,15 @@ SEED = 918_273_645
 
 def scenario(inputs_filter: str = "raw") -> Scenario:
     own = {"training_size": 60, "depth": 25, "inputs_filter": inputs_filter}
-    return PRESETS["paper"]().replace({
-        "run.duration": 0.7, "run.warm_up": 0.2, "run.seed": SEED, "adaptive.window": 0.25,
-        **{f"{gpr}.{name}": value for gpr in ("gpr_offline", "gpr_online") for name, value in own.items()}})
+    return PRESETS["paper"]().replace(
+        {
+            "run.duration": 0.7,
+            "run.warm_up": 0.2,
+            "run.seed": SEED,
+            "adaptive.window": 0.25,
+            **{f"{gpr}.{name}": value for gpr in ("gpr_offline", "gpr_online") for name, value in own.items()},
+        }
+    )
 
 
 def together(record: Record) -> Record:

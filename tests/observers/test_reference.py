@@ -111,10 +111,16 @@ def test_both_references_on_a_record() -> None:
 
 @pytest.mark.parametrize("f", [17.1, 34.1, 61.5])
 def test_the_causal_reference_is_one_step_late_on_a_settled_tone(f: float) -> None:
-    s = scenario({
-        "butterworth.frequencies": [f], "turbulence.source": "none", "sensors.lgs_noise": 0.0, "run.duration": 4.0,
-        "sensors.lgs_low_frequency_rms": 0.0, "vibration.peaks": [{"frequency": f, "damping": 0.0, "rms": [0.02, 0.02]}],
-    })
+    s = scenario(
+        {
+            "butterworth.frequencies": [f],
+            "turbulence.source": "none",
+            "sensors.lgs_noise": 0.0,
+            "run.duration": 4.0,
+            "sensors.lgs_low_frequency_rms": 0.0,
+            "vibration.peaks": [{"frequency": f, "damping": 0.0, "rms": [0.02, 0.02]}],
+        }
+    )
     r = simulate(s)
     assert r.vibration is not None
     found = lag(r.vibration[3000:, 0], estimated("butterworth-cl", r, s)["vibration"][3000:, 0], r.dt)
@@ -125,9 +131,7 @@ def test_the_causal_reference_is_one_step_late_on_a_settled_tone(f: float) -> No
 def test_order_reaches_the_filter() -> None:
     """Fourth order falls off faster: outside a band of 3 Hz, at twice its width, 24 dB per octave and more."""
     x = np.sin(2 * np.pi * 53.0 * np.arange(4000) * 1e-3)[:, None]
-    first, fourth = (
-        np.abs(filter_causal(bandpass_bank([47.0], 3.0, order, 1e-3), x)[3000:]).max() for order in (1, 4)
-    )
+    first, fourth = (np.abs(filter_causal(bandpass_bank([47.0], 3.0, order, 1e-3), x)[3000:]).max() for order in (1, 4))
     analog = [1 / np.sqrt(1 + ((53**2 - 47**2) / (53 * 3.0)) ** (2 * order)) for order in (1, 4)]
     # warping and the two centres count for some percent of the attenuation, to the fourth power
     assert first == pytest.approx(analog[0], rel=0.1) and fourth == pytest.approx(analog[1], rel=0.4)

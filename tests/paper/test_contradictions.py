@@ -30,10 +30,14 @@ from wfsobs.simulation.loop import simulate
 def _case() -> tuple[Scenario, Record]:
     """The paper's parameters where the truth is the filters' model: a fault is not hidden under other errors."""
     s = paper()
-    s.update({
-        "run": {"duration": 12.0}, "gpr_offline": {"training_size": 2, "depth": 1},
-        "vibration": {"source": "ar2", "peaks": [{"rms": [0.06, 0.06]}]}, "sensors": {"lgs_low_frequency_rms": 0.0},
-    })
+    s.update(
+        {
+            "run": {"duration": 12.0},
+            "gpr_offline": {"training_size": 2, "depth": 1},
+            "vibration": {"source": "ar2", "peaks": [{"rms": [0.06, 0.06]}]},
+            "sensors": {"lgs_low_frequency_rms": 0.0},
+        }
+    )
     return s, simulate(s)
 
 
@@ -202,9 +206,7 @@ def test_the_mirror_is_taken_off_with_its_delay() -> None:
     b = s.butterworth
     bank = bandpass_bank(b.frequencies, b.bandwidth_online, b.order, record.dt)
     assert record.vibration is not None
-    built, printed = (
-        np.std((filter_causal(bank, x) - record.vibration)[1000:, 0]) for x in (record.z, record.y_lgs - record.u)
-    )
+    built, printed = (np.std((filter_causal(bank, x) - record.vibration)[1000:, 0]) for x in (record.z, record.y_lgs - record.u))
     assert printed > 1.03 * built
 
 

@@ -25,7 +25,8 @@ def tip_only(record: Record) -> Record:
     t = record.training
     assert t is not None and t.open_loop_y is not None
     return replace(
-        record, **{name: getattr(record, name)[:, :1] for name in names},
+        record,
+        **{name: getattr(record, name)[:, :1] for name in names},
         training=Training(t.y_lgs[:, :1], t.u[:, :1], t.open_loop_y[:, :1]),
     )
 
@@ -43,9 +44,15 @@ def _errors() -> dict[tuple[str, str], np.ndarray]:
     return {key: np.array(values) for key, values in found.items()}
 
 
-@pytest.mark.parametrize(("observer", "low", "high"), [
-    ("gpr-offline", 0.60, 0.92), ("gpr-online", 0.65, 0.97), ("butterworth-ol", 0.35, 0.60), ("butterworth-cl", 0.65, 1.0),
-])
+@pytest.mark.parametrize(
+    ("observer", "low", "high"),
+    [
+        ("gpr-offline", 0.60, 0.92),
+        ("gpr-online", 0.65, 0.97),
+        ("butterworth-ol", 0.35, 0.60),
+        ("butterworth-cl", 0.65, 1.0),
+    ],
+)
 def test_vibration_relative_to_the_kalman_filter(
     errors: dict[tuple[str, str], np.ndarray], observer: str, low: float, high: float
 ) -> None:
@@ -83,10 +90,15 @@ def test_without_the_slow_error_the_order_turns_round() -> None:
     """The order is that of the sensors' errors, not of the observers: perfect guide stars make the LGS filter best."""
     errors = []
     for seed in SEEDS:
-        s = PRESETS["paper"]().replace({
-            "run.seed": seed, "run.duration": 6.0, "sensors.lgs_low_frequency_rms": 0.0,
-            "gpr_offline.training_size": 2, "gpr_offline.depth": 1,
-        })
+        s = PRESETS["paper"]().replace(
+            {
+                "run.seed": seed,
+                "run.duration": 6.0,
+                "sensors.lgs_low_frequency_rms": 0.0,
+                "gpr_offline.training_size": 2,
+                "gpr_offline.depth": 1,
+            }
+        )
         scores = observe(simulate(s), s, observers=["kf-lgs", "kf-ngs"]).scores
         errors.append([row.rms for row in scores if row.mode == "tip" and row.target == "turbulence"])
     lgs, ngs = np.median(errors, axis=0)
@@ -97,10 +109,15 @@ def test_a_matched_kalman_filter_does_better_than_zero() -> None:
     """The same filter with the vibration's own rms in place of the fitted 60 nm."""
     ratios = []
     for seed in SEEDS:
-        s = PRESETS["paper"]().replace({
-            "run.seed": seed, "run.duration": 6.0, "kalman.process_noise": "matched",
-            "gpr_offline.training_size": 2, "gpr_offline.depth": 1,
-        })
+        s = PRESETS["paper"]().replace(
+            {
+                "run.seed": seed,
+                "run.duration": 6.0,
+                "kalman.process_noise": "matched",
+                "gpr_offline.training_size": 2,
+                "gpr_offline.depth": 1,
+            }
+        )
         scores = observe(simulate(s), s, observers=["kf-lgs"]).scores
         ratios.append(next(r.normalised_rms for r in scores if r.mode == "tip" and r.target == "vibration"))
     assert 0.85 < np.median(ratios) < 1.0

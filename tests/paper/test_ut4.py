@@ -12,8 +12,17 @@ from wfsobs.evaluation.scores import Score
 from wfsobs.observers import OBSERVERS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reproduction.md").read_text(encoding="utf-8").partition("## UT4")[2]
-QUICK = ("kf-lgs", "kf-ngs", "multirate", "multirate-optimal", "butterworth-ol", "butterworth-cl", "gpr-offline",
-         "kf-multi", "ridge-30")
+QUICK = (
+    "kf-lgs",
+    "kf-ngs",
+    "multirate",
+    "multirate-optimal",
+    "butterworth-ol",
+    "butterworth-cl",
+    "gpr-offline",
+    "kf-multi",
+    "ridge-30",
+)
 
 
 @pytest.fixture(scope="module", params=[1, 2], name="scores")

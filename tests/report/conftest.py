@@ -13,8 +13,13 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 
 SHORT = {
-    "run.duration": 2.0, "run.warm_up": 0.5, "gpr_offline.training_size": 40, "gpr_offline.depth": 20,
-    "gpr_online.training_size": 40, "gpr_online.depth": 20, "adaptive.window": 0.5,
+    "run.duration": 2.0,
+    "run.warm_up": 0.5,
+    "gpr_offline.training_size": 40,
+    "gpr_offline.depth": 20,
+    "gpr_online.training_size": 40,
+    "gpr_online.depth": 20,
+    "adaptive.window": 0.5,
 }
 VOID = {"meta", "link", "br", "input", "use", "line", "img", "hr"}
 

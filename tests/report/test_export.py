@@ -21,9 +21,22 @@ from wfsobs.evaluation.rows import TIME, rows
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.scenario import Scenario
 
-QUICK = ["--set", "run.duration=1.5", "--set", "run.warm_up=0.5", "--set", "gpr_online.training_size=20",
-         "--set", "gpr_offline.training_size=50", "--set", "gpr_online.depth=20", "--set", "gpr_offline.depth=20",
-         "--set", "adaptive.window=0.5"]
+QUICK = [
+    "--set",
+    "run.duration=1.5",
+    "--set",
+    "run.warm_up=0.5",
+    "--set",
+    "gpr_online.training_size=20",
+    "--set",
+    "gpr_offline.training_size=50",
+    "--set",
+    "gpr_online.depth=20",
+    "--set",
+    "gpr_offline.depth=20",
+    "--set",
+    "adaptive.window=0.5",
+]
 
 
 def call(*arguments: str) -> Result:
@@ -36,14 +49,29 @@ def untimed(given: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def test_every_state_has_the_numbers_of_its_own_run(tmp_path: Path, parse: Any) -> None:
     path = tmp_path / "r.html"
-    done = call("export", str(path), *QUICK, "--set", "loop.gain=0.4", "--vary", "turbulence.wind_speed=8,20",
-                "--vary", "run.seed=1,7")
+    done = call(
+        "export", str(path), *QUICK, "--set", "loop.gain=0.4", "--vary", "turbulence.wind_speed=8,20", "--vary", "run.seed=1,7"
+    )
     assert (done.exit_code, done.output) == (0, "")
     assert [p.name for p in tmp_path.iterdir()] == ["r.html"]
     states = parse(path.read_text(encoding="utf-8")).data("rows")
     alone = [
-        json.loads(call("run", *QUICK, "--set", "loop.gain=0.4", "--set", f"turbulence.wind_speed={speed}",
-                        "--set", f"run.seed={seed}", "--json").stdout) for speed in (8, 20) for seed in (1, 7)]
+        json.loads(
+            call(
+                "run",
+                *QUICK,
+                "--set",
+                "loop.gain=0.4",
+                "--set",
+                f"turbulence.wind_speed={speed}",
+                "--set",
+                f"run.seed={seed}",
+                "--json",
+            ).stdout
+        )
+        for speed in (8, 20)
+        for seed in (1, 7)
+    ]
     assert [untimed(state["rows"]) for state in states] == alone
 
 
@@ -55,18 +83,24 @@ def test_settings_from_a_file_are_compared_with_its_preset(tmp_path: Path, parse
     assert "--preset ut4 --set loop.gain=0.2 " in it.text and "Preset ut4, 8 settings changed" in it.text
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["r.html", "--vary", "turbulence.wind_speed=5,200"], "turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s"),
-    (["r.html", "--vary", "wind"], "--vary wind: takes name=value,value"),
-    (["r.html", "--vary", "run.seed=1,2,3,4,5,6,7,8", "--vary", "loop.gain=0.1,0.2,0.3,0.4,0.5,0.6,0.7,0.8"], "8 x 8 = 64"),
-    (["r.html", "--vary", "run.warm_up=1,10"], "run.warm_up = 10: must be below run.duration"),
-    (["r.html", "--preset", "nope"], "preset = 'nope'"),
-    (["no/such/r.html"], "no/such: No such file or directory"),
-    (["."], ".: Is a directory"),
-    (["file/r.html"], "file: Not a directory"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["r.html", "--vary", "turbulence.wind_speed=5,200"], "turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s"),
+        (["r.html", "--vary", "wind"], "--vary wind: takes name=value,value"),
+        (["r.html", "--vary", "run.seed=1,2,3,4,5,6,7,8", "--vary", "loop.gain=0.1,0.2,0.3,0.4,0.5,0.6,0.7,0.8"], "8 x 8 = 64"),
+        (["r.html", "--vary", "run.warm_up=1,10"], "run.warm_up = 10: must be below run.duration"),
+        (["r.html", "--preset", "nope"], "preset = 'nope'"),
+        (["no/such/r.html"], "no/such: No such file or directory"),
+        (["."], ".: Is a directory"),
+        (["file/r.html"], "file: Not a directory"),
+    ],
+)
 def test_what_cannot_be_is_said_before_anything_runs(
-    arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("file").touch()

@@ -88,9 +88,14 @@ def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any)
             spread = "" if row["interval_um"] is None else " " + " – ".join(number(1e3 * x) for x in row["interval_um"])
             assert (spread == "") == (row["observer"] != "bound")
             want[f"{row['target'].capitalize()}, {row['mode']}", name] = [
-                number(1e3 * row["rms_um"]) + spread, number(1e3 * row["truth_rms_um"]), number(row["normalised_rms"]),
-                row["needs"], lag,
-                number(row[TIME]), "–" if row[TIME] is None else number(row[TIME] / 1000.0, 2)]
+                number(1e3 * row["rms_um"]) + spread,
+                number(1e3 * row["truth_rms_um"]),
+                number(row["normalised_rms"]),
+                row["needs"],
+                lag,
+                number(row[TIME]),
+                "–" if row[TIME] is None else number(row[TIME] / 1000.0, 2),
+            ]
         plain = {key: [re.sub(r"^(best|above truth) ", "", cell) for cell in cells] for key, cells in got.items()}
         assert plain == want
         for key in {title for title, _ in want}:

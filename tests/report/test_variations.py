@@ -15,9 +15,12 @@ from wfsobs.scenario.grid import MOST, Variation, parse_variation, scenarios
 from wfsobs.scenario.settings import SettingError
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False) | st.integers(-(2**53), 2**53)
-VALUES = st.one_of(*(
-    st.lists(of, min_size=1, max_size=6) for of in
-    (NUMBERS, st.sampled_from(["peaks", "ar2", "none"]), st.lists(st.floats(0, 100), max_size=3))))
+VALUES = st.one_of(
+    *(
+        st.lists(of, min_size=1, max_size=6)
+        for of in (NUMBERS, st.sampled_from(["peaks", "ar2", "none"]), st.lists(st.floats(0, 100), max_size=3))
+    )
+)
 
 
 def distinct(values: list[Any]) -> bool:
@@ -67,7 +70,7 @@ def test_every_combination_or_a_refusal(counts: list[int]) -> None:
         return
     got = [(s.turbulence.wind_speed, s.loop.gain, s.run.seed) for s in scenarios(Scenario(), variations)]
     defaults = [(15.0,), (0.3,), (1,)]
-    of = [v.values for v in variations] + defaults[len(variations):]
+    of = [v.values for v in variations] + defaults[len(variations) :]
     assert got == list(product(*of)), "the last one runs fastest"
 
 
@@ -77,14 +80,17 @@ def test_counts_are_checked_before_anything_is_made() -> None:
         scenarios(Scenario(), many)
 
 
-@pytest.mark.parametrize(("lists", "message"), [
-    (["turbulence.wind_speed=5,200"], r"turbulence\.wind_speed = 200: takes a number from 0\.1 to 100"),
-    (["turbulence.wind=5"], r"turbulence\.wind: no such setting"),
-    (["run.warm_up=1,10"], r"run\.warm_up = 10: must be below"),
-    (["run.seed=1,,2"], r"run\.seed = ''"),
-    (["run.seed=1,2", "run.seed=3,4"], r"--vary run\.seed: is given twice"),
-    (["vibration.peaks.0.frequency=20,30", "vibration.peaks=[],[{frequency = 9.0}]"], "the same settings"),
-])
+@pytest.mark.parametrize(
+    ("lists", "message"),
+    [
+        (["turbulence.wind_speed=5,200"], r"turbulence\.wind_speed = 200: takes a number from 0\.1 to 100"),
+        (["turbulence.wind=5"], r"turbulence\.wind: no such setting"),
+        (["run.warm_up=1,10"], r"run\.warm_up = 10: must be below"),
+        (["run.seed=1,,2"], r"run\.seed = ''"),
+        (["run.seed=1,2", "run.seed=3,4"], r"--vary run\.seed: is given twice"),
+        (["vibration.peaks.0.frequency=20,30", "vibration.peaks=[],[{frequency = 9.0}]"], "the same settings"),
+    ],
+)
 def test_what_cannot_run_is_refused(lists: list[str], message: str) -> None:
     with pytest.raises(SettingError, match=message) as caught:
         scenarios(Scenario(), [parse_variation(text) for text in lists])

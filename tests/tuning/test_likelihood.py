@@ -21,9 +21,15 @@ def windows(signals: np.ndarray, depth: int, first: int, m: int) -> np.ndarray:
     return sliding_window_view(signals, depth, axis=0)[first - depth + 1 : first - depth + 1 + m].reshape(m, -1)
 
 
-@pytest.mark.parametrize("kernel", [
-    SquaredExponential(3.0, 2.0, 0.5), SquaredExponential(0.7, 20.0, 0.1), SquaredExponential(10.0, 300.0, 0.13),
-], ids=["curved", "in between", "all but linear"])
+@pytest.mark.parametrize(
+    "kernel",
+    [
+        SquaredExponential(3.0, 2.0, 0.5),
+        SquaredExponential(0.7, 20.0, 0.1),
+        SquaredExponential(10.0, 300.0, 0.13),
+    ],
+    ids=["curved", "in between", "all but linear"],
+)
 def test_it_is_the_log_density_of_the_targets(kernel: SquaredExponential) -> None:
     rng = np.random.default_rng(1)
     signals, f, depth, first, m = rng.standard_normal((80, 2)), rng.standard_normal(80), 5, 11, 60
@@ -36,9 +42,17 @@ def test_it_is_the_log_density_of_the_targets(kernel: SquaredExponential) -> Non
 
 
 def test_of_the_offline_gpr_it_is_that_of_scikit_learn() -> None:
-    s = PRESETS["paper"]().replace({
-        "run.duration": 2.0, "gpr_offline.training_size": 120, "gpr_offline.depth": 30, "gpr_offline.inputs": "z",
-        "gpr_offline.length_scale": 5.0, "gpr_offline.signal_std": 0.05, "gpr_offline.noise_std": 0.01})
+    s = PRESETS["paper"]().replace(
+        {
+            "run.duration": 2.0,
+            "gpr_offline.training_size": 120,
+            "gpr_offline.depth": 30,
+            "gpr_offline.inputs": "z",
+            "gpr_offline.length_scale": 5.0,
+            "gpr_offline.signal_std": 0.05,
+            "gpr_offline.noise_std": 0.01,
+        }
+    )
     record = simulate(s)
     assert record.training is not None
     got, g = likelihood("gpr-offline", record, s), s.gpr_offline

@@ -58,18 +58,21 @@ def test_saved_settings_give_the_tuned_scenario(tuned) -> None:
     assert f"frequency = {tuned.scenario.kalman.frequency}  # tuned, 47.4969 before" in text
 
 
-@pytest.mark.parametrize(("observer", "names", "says"), [
-    ("kf-lgs", ["kalman.frequenc"], "no such setting"),
-    ("kf-lgs", ["kalman.process_noise"], "not one number"),
-    ("kf-lgs", ["butterworth.frequencies"], "not one number"),
-    ("kf-lgs", ["gpr_online.depth"], "not a setting of kf-lgs"),
-    ("kf-lgs", ["turbulence.wind_speed"], "not a setting of kf-lgs"),
-    ("kf-lgs", ["kalman.damping", "kalman.damping"], "twice"),
-    ("kf-lgs", [], "one setting at least"),
-    ("gpr-online", ["gpr_online.highpass"], "is not read while"),
-    ("zero", None, "no settings to tune"),
-    ("kf", None, "no such observer"),
-])
+@pytest.mark.parametrize(
+    ("observer", "names", "says"),
+    [
+        ("kf-lgs", ["kalman.frequenc"], "no such setting"),
+        ("kf-lgs", ["kalman.process_noise"], "not one number"),
+        ("kf-lgs", ["butterworth.frequencies"], "not one number"),
+        ("kf-lgs", ["gpr_online.depth"], "not a setting of kf-lgs"),
+        ("kf-lgs", ["turbulence.wind_speed"], "not a setting of kf-lgs"),
+        ("kf-lgs", ["kalman.damping", "kalman.damping"], "twice"),
+        ("kf-lgs", [], "one setting at least"),
+        ("gpr-online", ["gpr_online.highpass"], "is not read while"),
+        ("zero", None, "no settings to tune"),
+        ("kf", None, "no such observer"),
+    ],
+)
 def test_what_cannot_be_tuned_is_refused(observer: str, names: list[str] | None, says: str) -> None:
     with pytest.raises(SettingError, match=says):
         tune(short(), observer, names)
@@ -87,21 +90,41 @@ def test_every_evaluation_is_told_until_it_is_cancelled() -> None:
 
 def linear(**more: Any) -> Scenario:
     """All AR(2), the LGS without slow errors: the Kalman filter with the right numbers is the best there is."""
-    s = PRESETS["paper"]().replace({
-        "run.duration": 20.0, "vibration.source": "ar2", "sensors.lgs_low_frequency_rms": 0.0, "loop.closed": False,
-        "vibration.peaks": [{"frequency": 40.0, "damping": 0.02, "rms": [0.03, 0.03]}],
-        "kalman.process_noise": "matched", "kalman.frequency": 40.0, "kalman.damping": 0.02})
+    s = PRESETS["paper"]().replace(
+        {
+            "run.duration": 20.0,
+            "vibration.source": "ar2",
+            "sensors.lgs_low_frequency_rms": 0.0,
+            "loop.closed": False,
+            "vibration.peaks": [{"frequency": 40.0, "damping": 0.02, "rms": [0.03, 0.03]}],
+            "kalman.process_noise": "matched",
+            "kalman.frequency": 40.0,
+            "kalman.damping": 0.02,
+        }
+    )
     return s.replace(more)
 
 
 def test_a_filter_of_wrong_numbers_is_tuned_to_the_error_of_the_right_one() -> None:
     right = linear()
-    wrong = linear(**{"kalman.process_noise": "manual", "kalman.turbulence_rms": 0.5, "kalman.vibration_rms": 0.1,
-                      "kalman.frequency": 46.0, "kalman.damping": 0.1})
+    wrong = linear(
+        **{
+            "kalman.process_noise": "manual",
+            "kalman.turbulence_rms": 0.5,
+            "kalman.vibration_rms": 0.1,
+            "kalman.frequency": 46.0,
+            "kalman.damping": 0.1,
+        }
+    )
     tuned = tune(wrong, "kf-lgs", evaluations=50)
     assert tuned.before.test and tuned.after.test
-    best = float(np.sqrt(np.mean([s.rms**2 for s in run(right, observers=["kf-lgs"]).scores if s.observer == "kf-lgs"
-                                  and s.target == "vibration"])))
+    best = float(
+        np.sqrt(
+            np.mean(
+                [s.rms**2 for s in run(right, observers=["kf-lgs"]).scores if s.observer == "kf-lgs" and s.target == "vibration"]
+            )
+        )
+    )
     model = kalman_model(right, 0, right.dt)
     _, steady = steady_filter(model, measurement_noise(right, 0)[0])
     row = model.outputs["vibration"]
@@ -199,12 +222,23 @@ def test_a_gpr_knows_the_ratio_of_noise_and_signal_only(observer: str) -> None:
 
 def test_every_tunable_setting_is_read() -> None:
     """Each changes the estimate of its observer, once nothing is "matched" and a line is narrow."""
-    gprs = {f"{gpr}.{name}": value for gpr in ("gpr_offline", "gpr_online") for name, value in (
-        ("training_size", 60), ("depth", 20), ("length_scale", 20.0), ("inputs_filter", "high-pass"))}
-    base = Scenario().replace(gprs | {
-        "run.duration": 3.2, "run.warm_up": 0.1, "vibration.peaks.0.damping": 0.0, "kalman.process_noise": "manual",
-        "adaptive.window": 2.5,  # and the record holds two of them, half a second apart
-        "kalman.measurement_noise": "manual", "multirate.measurement_noise": "manual"})
+    gprs = {
+        f"{gpr}.{name}": value
+        for gpr in ("gpr_offline", "gpr_online")
+        for name, value in (("training_size", 60), ("depth", 20), ("length_scale", 20.0), ("inputs_filter", "high-pass"))
+    }
+    base = Scenario().replace(
+        gprs
+        | {
+            "run.duration": 3.2,
+            "run.warm_up": 0.1,
+            "vibration.peaks.0.damping": 0.0,
+            "kalman.process_noise": "manual",
+            "adaptive.window": 2.5,  # and the record holds two of them, half a second apart
+            "kalman.measurement_noise": "manual",
+            "multirate.measurement_noise": "manual",
+        }
+    )
     record = simulate(base)
 
     def estimate(observer: str, scenario: Scenario) -> np.ndarray:
@@ -229,16 +263,25 @@ def test_command_line(tmp_path: Path) -> None:
     assert configfile.load(out).kalman.damping == said["settings"].get("kalman.damping", 0.03)
     shown = call("--observer", "gpr-offline", "--evaluations", "1", "--set", "gpr_offline.training_size=50").stdout
     assert "test, before" in shown and "marginal likelihood" in shown and "nothing that was tried is better" in shown
-    for wrong in (["--observer", "kf-lgs", "--out", str(tmp_path / "no" / "x.toml")],
-                  ["--observer", "kf-lgs", "--setting", "x.y"], ["--observer", "multirate", "--target", "vibration"]):
+    for wrong in (
+        ["--observer", "kf-lgs", "--out", str(tmp_path / "no" / "x.toml")],
+        ["--observer", "kf-lgs", "--setting", "x.y"],
+        ["--observer", "multirate", "--target", "vibration"],
+    ):
         result = call(*wrong)
         assert result.exit_code == 2 and len(result.stderr.splitlines()) == 1, result.output
 
 
 def test_a_noise_set_by_hand_starts_from_that_of_all_modes() -> None:
     """Tuned it is one number for modes whose noise differs: their root mean square, from the sensors' own covariances."""
-    s = linear(**{"turbulence.source": "frozen-flow", "telescope.radial_order": 2, "sensors.kind": "shack-hartmann",
-                  "sensors.noise_from": "photons"})
+    s = linear(
+        **{
+            "turbulence.source": "frozen-flow",
+            "telescope.radial_order": 2,
+            "sensors.kind": "shack-hartmann",
+            "sensors.noise_from": "photons",
+        }
+    )
     for observer, switch, group in (("kf-multi", "kalman", "kalman"), ("multirate", "multirate", "multirate")):
         by_hand = space(s, observer, [f"{group}.lgs_noise"]).by_hand
         assert by_hand[f"{switch}.measurement_noise"] == "manual"

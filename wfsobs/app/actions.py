@@ -66,8 +66,7 @@ class Actions:
 
     def __init__(self, store: Store):
         self.store = store
-        self.toolbar = Toolbar(
-            labels={name: it.label for name, it in LOOKS.items()}, sizing_mode="stretch_width", margin=0)
+        self.toolbar = Toolbar(labels={name: it.label for name, it in LOOKS.items()}, sizing_mode="stretch_width", margin=0)
         self.toolbar.on_action = self.handle
         self._tasks: dict[str, BackgroundTask] = {}
         self._under_way: dict[str, tuple[str, Callable[[Any], None]]] = {}
@@ -196,8 +195,11 @@ class Actions:
         query = to_query(scenario, preset, source.simulation if source else None)
         task = self._offers.task if self._offers else EXPLORED
         self.toolbar.param.update(
-            linked=query is not None, query=query or "", command=to_command(scenario, preset, source, task),
-            python=to_python(scenario, preset, source, task))
+            linked=query is not None,
+            query=query or "",
+            command=to_command(scenario, preset, source, task),
+            python=to_python(scenario, preset, source, task),
+        )
 
     def _refresh_ready(self, *_: object) -> None:
         self.toolbar.ready = self.store.run.result is not None

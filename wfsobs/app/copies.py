@@ -31,6 +31,7 @@ EXPLORED = Task()
 
 # ---------------------------------------------------------------------- command lines
 
+
 def to_command(scenario: Scenario, preset: str, source: Source | None = None, task: Task = EXPLORED) -> str:
     """The command that prints what a page shows; two where the record has to be simulated first."""
     given = _options(scenario, preset, FILE)
@@ -59,12 +60,18 @@ def _said(source: Loaded) -> list[str]:
     """What was said of a file, and what tells it from another."""
     stated = source.stated
     sign = None if stated.command_sign is None else f"{stated.command_sign:+d}"
-    named = {"unit": stated.unit, "command-sign": sign, "command-delay": stated.command_delay, "rate": stated.rate,
-             "sha256": source.sha256 or None}
+    named = {
+        "unit": stated.unit,
+        "command-sign": sign,
+        "command-delay": stated.command_delay,
+        "rate": stated.rate,
+        "sha256": source.sha256 or None,
+    }
     return [word for name, value in named.items() if value is not None for word in (f"--{name}", str(value))]
 
 
 # ---------------------------------------------------------------------- Python
+
 
 def to_python(scenario: Scenario, preset: str, source: Source | None = None, task: Task = EXPLORED) -> str:
     """A script that computes and prints what a page shows."""
@@ -102,14 +109,16 @@ def _observe(recorded: bool, _arguments: Mapping[str, Any]) -> Lines:
     return set(), [
         f"result = {'wfsobs.observe(record, scenario)' if recorded else 'wfsobs.run(scenario)'}",
         "for s in result.scores:",
-        '    print(f"{s.target:10} {s.mode:4} {s.observer:17} {1e3 * s.rms:8.2f} nm")']
+        '    print(f"{s.target:10} {s.mode:4} {s.observer:17} {1e3 * s.rms:8.2f} nm")',
+    ]
 
 
 def _loop(_recorded: bool, _arguments: Mapping[str, Any]) -> Lines:
     return {"from wfsobs.control.rows import rows", "from wfsobs.control.closed_loop import closed_loop, design"}, [
         "result = closed_loop(record, design(scenario))",
         "for row in rows(result, None):",
-        '    print(row["controller"], row["mode"], row["residual_rms_nm"], "nm")']
+        '    print(row["controller"], row["mode"], row["residual_rms_nm"], "nm")',
+    ]
 
 
 def _identify(_recorded: bool, arguments: Mapping[str, Any]) -> Lines:
@@ -118,7 +127,8 @@ def _identify(_recorded: bool, arguments: Mapping[str, Any]) -> Lines:
         "for mode in found.modes:",
         "    for what, frequency, damping, rms in report.rows(mode):",
         "        print(mode.name, what, *(n.value for n in (frequency, damping, rms) if n is not None))",
-        'print("\\n".join(report.verdict(found)))']
+        'print("\\n".join(report.verdict(found)))',
+    ]
 
 
 def _tune(recorded: bool, arguments: Mapping[str, Any]) -> Lines:
@@ -128,7 +138,8 @@ def _tune(recorded: bool, arguments: Mapping[str, Any]) -> Lines:
         f"tuned = tune(scenario, {arguments['observer']!r}, {_arguments(named)}{record})",
         "for path, before, after in report.settings(tuned):",
         "    print(path, before, after)",
-        'print("validation rms [um]", *(s.validation.rms if s.validation else None for s in (tuned.before, tuned.after)))']
+        'print("validation rms [um]", *(s.validation.rms if s.validation else None for s in (tuned.before, tuned.after)))',
+    ]
 
 
 def _arguments(arguments: Mapping[str, Any]) -> str:

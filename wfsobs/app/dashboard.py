@@ -76,11 +76,8 @@ class Dashboard:
         self.connection = Connection(self.controls.take, width=0, height=0, margin=0)
         self.frame = Frame(width=0, height=0, margin=0)
         self.keyboard = Keyboard(width=0, height=0, margin=0, styles={"position": "absolute"})
-        self.alert = pmui.Alert(
-            object="", severity="error", visible=False, **WIDE)
-        self.stale = pmui.Alert(
-            object=STALE, severity="warning", visible=False,
-            **WIDE)
+        self.alert = pmui.Alert(object="", severity="error", visible=False, **WIDE)
+        self.stale = pmui.Alert(object=STALE, severity="warning", visible=False, **WIDE)
         self.store.run.param.watch(self._refresh, ["state", "message"])
         self.store.param.watch(self._refresh, ["stale", "waiting"])
 
@@ -89,11 +86,28 @@ class Dashboard:
         self.pages = Pages(self.explore, self.store, self.display)
         self.actions.attach(self.pages)
         page = pmui.Page(
-            title="wfsobs", sidebar=[self.controls.view()], sidebar_width=340, theme_config=theme(), favicon=None,
-            main=[_title(), pn.Column(
-                self._top(), self._row_of_actions(), self.upload.room, self.alert, self.stale, self.keyboard,
-                self.pages.view, self.frame, self.connection,
-                sizing_mode="stretch_width", margin=12, stylesheets=[":host { gap: 10px; }"])],
+            title="wfsobs",
+            sidebar=[self.controls.view()],
+            sidebar_width=340,
+            theme_config=theme(),
+            favicon=None,
+            main=[
+                _title(),
+                pn.Column(
+                    self._top(),
+                    self._row_of_actions(),
+                    self.upload.room,
+                    self.alert,
+                    self.stale,
+                    self.keyboard,
+                    self.pages.view,
+                    self.frame,
+                    self.connection,
+                    sizing_mode="stretch_width",
+                    margin=12,
+                    stylesheets=[":host { gap: 10px; }"],
+                ),
+            ],
         )
         self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")
         with edit_readonly(page):
@@ -117,9 +131,7 @@ class Dashboard:
 
     def _top(self) -> pn.FlexBox:
         """The pages, and what holds on all of them."""
-        return pn.FlexBox(
-            self.pages.switch, *self.modes.view(), *self.units.view(),
-            gap="12px", align_items="center", **WIDE)
+        return pn.FlexBox(self.pages.switch, *self.modes.view(), *self.units.view(), gap="12px", align_items="center", **WIDE)
 
     def _row_of_actions(self) -> pn.Row:
         return pn.Row(self.actions.toolbar, self.upload.picker, **WIDE, stylesheets=[ACTIONS])
@@ -137,8 +149,11 @@ class Dashboard:
 
 def _title() -> pn.pane.HTML:
     """The heading of the page, for those who hear it."""
-    return pn.pane.HTML("<h1>wfsobs: disturbance observers for adaptive optics</h1>", margin=0, styles={
-        "position": "absolute", "width": "1px", "height": "1px", "overflow": "hidden", "clip-path": "inset(50%)"})
+    return pn.pane.HTML(
+        "<h1>wfsobs: disturbance observers for adaptive optics</h1>",
+        margin=0,
+        styles={"position": "absolute", "width": "1px", "height": "1px", "overflow": "hidden", "clip-path": "inset(50%)"},
+    )
 
 
 def _open_drawer(page: pmui.Page, width: int) -> None:

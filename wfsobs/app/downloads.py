@@ -68,7 +68,10 @@ def residuals_csv(shown: LoopShown) -> bytes:
     modes = [m.name for m in scenario.modes][: record.n_modes]
     columns = {"time_s": np.asarray(np.arange(record.n_steps) * record.dt, dtype=np.float64)} | {
         f"{o.controller}/{mode}_um": o.residual[:, i]
-        for o in shown.result.outcomes if o.residual is not None for i, mode in enumerate(modes)}
+        for o in shown.result.outcomes
+        if o.residual is not None
+        for i, mode in enumerate(modes)
+    }
     return _csv([f"# {line}".rstrip() for line in to_toml(scenario).splitlines()], columns)
 
 
@@ -110,5 +113,7 @@ def _check(shown: Shown) -> None:
     result = shown.result
     numbers = result.record.n_steps * (1 + result.record.n_modes * (5 + len(result.estimates)))
     if numbers > MOST:
-        raise TooLarge(f"{numbers / 1e6:.0f} million numbers, at most {MOST // 1_000_000} million can be downloaded: "
-                       "shorten the record, or use wfsobs run --save")
+        raise TooLarge(
+            f"{numbers / 1e6:.0f} million numbers, at most {MOST // 1_000_000} million can be downloaded: "
+            "shorten the record, or use wfsobs run --save"
+        )

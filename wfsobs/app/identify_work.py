@@ -64,8 +64,12 @@ def measured(of: Shown, _watch: Watch, _tell: Tell) -> Measured:
     count = np.diff(start, append=len(f))
     density = np.column_stack([periodogram(column - column.mean(), record.dt) for column in z.T])
     return Measured(
-        record, np.add.reduceat(f, start) / count, np.add.reduceat(density, start) / count[:, None],
-        np.maximum.reduceat(density, start), len(z) * record.dt)
+        record,
+        np.add.reduceat(f, start) / count,
+        np.add.reduceat(density, start) / count[:, None],
+        np.maximum.reduceat(density, start),
+        len(z) * record.dt,
+    )
 
 
 def fit(mode: IdentifiedMode, result: Identified) -> Fit:
@@ -92,8 +96,12 @@ def seconds(record: Record) -> float:
 def same(one: Record, other: Record) -> bool:
     """Whether two records hold the same measurements."""
     return one is other or (
-        one.y_lgs.shape == other.y_lgs.shape and one.dt == other.dt and one.delay == other.delay
-        and np.array_equal(one.y_lgs, other.y_lgs, equal_nan=True) and np.array_equal(one.u, other.u, equal_nan=True))
+        one.y_lgs.shape == other.y_lgs.shape
+        and one.dt == other.dt
+        and one.delay == other.delay
+        and np.array_equal(one.y_lgs, other.y_lgs, equal_nan=True)
+        and np.array_equal(one.u, other.u, equal_nan=True)
+    )
 
 
 def compute(of: Shown, level: float, lowest: float, watch: Watch, _tell: Tell) -> tuple[Identified, Record]:

@@ -39,8 +39,10 @@ class Limits:
         """Raises SettingError, one line, where a run of this scenario is more than the server allows."""
         _most("run.duration", scenario.run.duration, self.duration, " s")
         if scenario.n_steps > self.steps:
-            raise SettingError(f"run.duration = {scenario.run.duration:g}: {scenario.n_steps} steps at sensors.lgs_rate = "
-                               f"{scenario.sensors.lgs_rate:g} Hz; at most {self.steps:g} on this server")
+            raise SettingError(
+                f"run.duration = {scenario.run.duration:g}: {scenario.n_steps} steps at sensors.lgs_rate = "
+                f"{scenario.sensors.lgs_rate:g} Hz; at most {self.steps:g} on this server"
+            )
         for name in ("gpr_offline", "gpr_online"):
             group = getattr(scenario, name)
             _most(f"{name}.training_size", group.training_size, self.training_size)
@@ -68,7 +70,8 @@ NONE = Limits()
 """For those who serve themselves."""
 
 PUBLIC = Limits(
-    duration=120.0, steps=120_000, training_size=1024, depth=1000, items=100, seconds=20.0, megabytes=600.0, sessions=100)
+    duration=120.0, steps=120_000, training_size=1024, depth=1000, items=100, seconds=20.0, megabytes=600.0, sessions=100
+)
 """For a server that strangers reach."""
 
 
@@ -79,6 +82,8 @@ def _most(path: str, value: float, most: float, unit: str = "") -> None:
 
 def _whole(value: float, most: float, what: str) -> None:
     if value > most:
-        raise SettingError(f"The run would take about {value:.0f} {what}, at most {most:g} on this server: lower "
-                           "run.duration, sensors.lgs_rate, gpr_online.training_size or gpr_offline.training_size, or raise "
-                           "adaptive.interval")
+        raise SettingError(
+            f"The run would take about {value:.0f} {what}, at most {most:g} on this server: lower "
+            "run.duration, sensors.lgs_rate, gpr_online.training_size or gpr_offline.training_size, or raise "
+            "adaptive.interval"
+        )

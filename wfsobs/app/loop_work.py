@@ -47,7 +47,9 @@ def compute(of: Shown, watch: Watch, tell: Tell) -> LoopShown | None:
     plan = design(of.scenario, [name for name in CONTROLLERS if seconds(name, of.scenario) <= PATIENCE])
     linear = {
         name: tuple(curves(d.law, plan.mirror, record.dt) for d in laws if d.law)
-        for name, laws in plan.laws.items() if all(d.margins for d in laws)}
+        for name, laws in plan.laws.items()
+        if all(d.margins for d in laws)
+    }
     outcomes: list[Any] = []
     spectra: dict[str, tuple[Array, Array]] = {}
     start = round(of.scenario.run.warm_up / record.dt)

@@ -94,8 +94,13 @@ def serve(options: Options) -> None:
     loop = server.io_loop
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: loop.add_callback_from_signal(loop.stop))
-    event("serving", url=f"http://{options.address}:{server.port}{server.prefix}/", runs=service.queue.workers,
-          cache_mb=options.cache_mb, limits="on" if options.limits != NONE else "off")
+    event(
+        "serving",
+        url=f"http://{options.address}:{server.port}{server.prefix}/",
+        runs=service.queue.workers,
+        cache_mb=options.cache_mb,
+        limits="on" if options.limits != NONE else "off",
+    )
     server.start()
     loop.start()
     server.stop(wait=False)
@@ -151,11 +156,20 @@ def new_page(service: Service) -> Any:
 def make_server(options: Options, service: Service) -> Server:
     """A server that listens but has not started."""
     server = get_server(
-        {"/": lambda: new_page(service)}, port=options.port, address=options.address, show=options.open_browser,
-        prefix=options.prefix, title="wfsobs", websocket_origin=origins(options),
-        websocket_max_message_size=MESSAGE_BYTES, use_xheaders=bool(options.origins),
+        {"/": lambda: new_page(service)},
+        port=options.port,
+        address=options.address,
+        show=options.open_browser,
+        prefix=options.prefix,
+        title="wfsobs",
+        websocket_origin=origins(options),
+        websocket_max_message_size=MESSAGE_BYTES,
+        use_xheaders=bool(options.origins),
         # A session is reached by a name that this server has signed, and keeps nothing of who the visitor is.
-        sign_sessions=True, secret_key=generate_secret_key(), include_headers=[], include_cookies=[],
+        sign_sessions=True,
+        secret_key=generate_secret_key(),
+        include_headers=[],
+        include_cookies=[],
         session_token_expiration=TOKEN,  # a page that was open for days may come back as well
         unused_session_lifetime_milliseconds=round(1000 * options.lifetime),
         check_unused_sessions_milliseconds=round(250 * options.lifetime),
@@ -224,4 +238,3 @@ class Liveness(RequestHandler):
 def full_html(line: str) -> str:
     """What is shown to one visitor too many."""
     return f"<!doctype html><title>wfsobs</title><h1>wfsobs is full</h1><p>{escape(line)}</p>"
-

@@ -96,5 +96,7 @@ def error_page(error: Exception) -> pn.Column:
     return pn.Column(
         pn.pane.HTML(
             "<h1>wfsobs could not start</h1><p>The page could not be built. The server's log has the details.</p>"
-            f"<pre>{escape(line)}</pre>"),
-        margin=40)
+            f"<pre>{escape(line)}</pre>"
+        ),
+        margin=40,
+    )

@@ -63,6 +63,7 @@ def changes(scenario: Scenario, preset: str) -> dict[str, Any]:
 
 # ---------------------------------------------------------------------- links
 
+
 def to_query(scenario: Scenario, preset: str, simulation: Scenario | None = None) -> str | None:
     """The query of a link to these settings, without "?"; None where it would be too long.
 
@@ -87,8 +88,11 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
     check : raises SettingError where settings do not go together
     """
     if len(query) > LONGEST:
-        return Link(PRESETS[SHORTEST_NAME](), SHORTEST_NAME, (
-            f"The link has {len(query)} characters, at most {LONGEST} are read: nothing of it was used.",))
+        return Link(
+            PRESETS[SHORTEST_NAME](),
+            SHORTEST_NAME,
+            (f"The link has {len(query)} characters, at most {LONGEST} are read: nothing of it was used.",),
+        )
     pairs = parse_qsl(query.removeprefix("?").replace("+", "%2B"), keep_blank_values=True)
     fields = {key: text for key, text in pairs[:MOST] if key not in PASSED_OVER}
     name = fields.pop("preset", SHORTEST_NAME)
@@ -106,8 +110,9 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
 def written(path: str, value: Any) -> str:
     """A setting's plain value as a link has it."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
-        return ";".join(written(path, [v for one in item.values() for v in (one if isinstance(one, list) else [one])])
-                        for item in value)
+        return ";".join(
+            written(path, [v for one in item.values() for v in (one if isinstance(one, list) else [one])]) for item in value
+        )
     if isinstance(value, list):
         return ",".join(map(_word, value))
     return _word(value)
@@ -190,6 +195,7 @@ def _word(value: Any) -> str:
 
 
 # ---------------------------------------------------------------------- files
+
 
 def to_file(scenario: Scenario, preset: str) -> str:
     """Every setting as TOML, with the preset that they are compared with."""

@@ -160,8 +160,13 @@ class Store(param.Parameterized):
         self._refused = refused
         errors = {path: reason for path, reason in self.errors.items() if path in refused}
         self.param.update(
-            scenario=self.scenario if unchanged else scenario, source=self.source if stays else source, errors=errors,
-            preset=preset, can_undo=bool(self._past), can_redo=bool(self._future))
+            scenario=self.scenario if unchanged else scenario,
+            source=self.source if stays else source,
+            errors=errors,
+            preset=preset,
+            can_undo=bool(self._past),
+            can_redo=bool(self._future),
+        )
         if unchanged and stays:
             return
         self.follow()  # first, so that a warning of stale results does not come and go
@@ -174,8 +179,10 @@ class Store(param.Parameterized):
 
 def _of_one_file(steps: list[Step], source: Source | None) -> list[Step]:
     """Without those on another file than the one that is loaded: a session holds one."""
+
     def other(step: Step) -> bool:
         return isinstance(step[2], Loaded) and isinstance(source, Loaded) and not same(step[2], source)
+
     return [step for step in steps if not other(step)]
 
 

@@ -19,7 +19,8 @@ from wfsobs.tuning.report import settings
 from wfsobs.tuning.space import TUNABLE
 
 CHOICES: Mapping[str, str] = MappingProxyType(
-    {o.label: name for name, o in OBSERVERS.items() if name in TUNABLE and TUNABLE[name].usual})
+    {o.label: name for name, o in OBSERVERS.items() if name in TUNABLE and TUNABLE[name].usual}
+)
 """Label -> observer, of those that have something to tune."""
 
 MOST = 1000
@@ -45,9 +46,7 @@ def measure(of: Shown, observer: str, target: str) -> str:
     return MEASURES[judged_by(of.result.record, observer, target)[1] if of.recorded else TRUTH]
 
 
-def compute(
-    of: Shown, scenario: Scenario, observer: str, target: str, evaluations: int, watch: Watch, tell: Tell
-) -> Tuned:
+def compute(of: Shown, scenario: Scenario, observer: str, target: str, evaluations: int, watch: Watch, tell: Tell) -> Tuned:
     """Tune on simulated records, or on the pieces of a record that was loaded; tells of all evaluations so far.
 
     Raises SettingError, RecordError, Cancelled.
@@ -63,8 +62,7 @@ def compute(
             tell(latest=tuple(history))
 
     record = of.result.record if of.recorded else None
-    return tune(
-        scenario, observer, evaluations=evaluations, record=record, target=target, told=told, watch=watch)
+    return tune(scenario, observer, evaluations=evaluations, record=record, target=target, told=told, watch=watch)
 
 
 def best_so_far(history: Sequence[Evaluation]) -> list[float]:
@@ -80,7 +78,8 @@ def rows(tuned: Tuned) -> Rows:
     out: Rows = [(SETTING, *row) for row in settings(tuned)]
     stages = tuned.before, tuned.after
     for section, before, after in (
-        (VALIDATION, *(s.validation for s in stages)), (TEST, *(s.test for s in stages)),
+        (VALIDATION, *(s.validation for s in stages)),
+        (TEST, *(s.test for s in stages)),
     ):
         out += [(section, name, _error(before, name), _error(after, name)) for name in (*_modes(stages), TOGETHER)]
     if any(s.other for s in stages):

@@ -114,6 +114,7 @@ class Upload:
 
     def stated(self) -> Stated:
         """What the fields say. Raises RecordError where one holds no number."""
+
         def number(field: Any, kind: type, least: float) -> Any:
             text = str(field.value or "").strip()
             if not text:
@@ -125,6 +126,7 @@ class Upload:
             if not least <= value < 1e6:
                 raise RecordError(f"{field.label}: takes a number from {least:g}, not {text[:40]!r}{hint(text)}")
             return value
+
         unit = None if self.unit.value == SILENT else self.unit.value
         return Stated(unit, self.sign.value or None, number(self.delay, int, 1), number(self.rate, float, 1e-3))
 
@@ -172,8 +174,11 @@ class Upload:
             send(source, {"x": x[x > 0], "y": y[x > 0]})
         if not len(self.room):
             self.room[:] = [
-                self.text, pn.FlexBox(self.unit, self.sign, self.delay, self.rate, gap="8px", margin=0),
-                pn.pane.Bokeh(self.figure, sizing_mode="stretch_width", margin=0), pn.Row(self.use, self.drop, margin=0)]
+                self.text,
+                pn.FlexBox(self.unit, self.sign, self.delay, self.rate, gap="8px", margin=0),
+                pn.pane.Bokeh(self.figure, sizing_mode="stretch_width", margin=0),
+                pn.Row(self.use, self.drop, margin=0),
+            ]
         self.room.visible = True
 
     def confirm(self) -> None:
@@ -188,7 +193,8 @@ class Upload:
         key = hashlib.sha256(repr((digest, stated, self.store.scenario.telescope.diameter)).encode()).hexdigest()
         try:
             self.store.run_on(
-                Loaded(record, found.name, key, found.lines()[0], stated, digest), fitting(record, self.store.scenario))
+                Loaded(record, found.name, key, found.lines()[0], stated, digest), fitting(record, self.store.scenario)
+            )
         except SettingError as error:
             self._say(f"{found.name}: {error}")
         else:
@@ -231,5 +237,8 @@ def fitting(record: Any, scenario: Scenario) -> Scenario:
     order = next((n for n in range(1, 7) if (n + 1) * (n + 2) // 2 - 1 >= record.n_modes), 6)
     duration = record.n_steps * record.dt
     changes = {
-        "telescope.radial_order": order, "run.duration": duration, "run.warm_up": min(scenario.run.warm_up, 0.2 * duration)}
+        "telescope.radial_order": order,
+        "run.duration": duration,
+        "run.warm_up": min(scenario.run.warm_up, 0.2 * duration),
+    }
     return as_stated(record, scenario).replace(changes)

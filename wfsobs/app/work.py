@@ -91,8 +91,6 @@ class Shown:
         return estimate.values if estimate else self.partial.get((observer, target))
 
 
-
-
 def one_blas_thread() -> None:
     """Let BLAS use one thread: the observers bring their own, and sessions share the processors."""
     threadpool_limits(limits=1, user_api="blas")

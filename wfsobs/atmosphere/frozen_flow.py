@@ -55,8 +55,14 @@ class View:
 
 
 def frozen_flow(
-    layers: Sequence[Layer], outer_scale: float, diameter: float, views: Sequence[View], n_steps: int, dt: float,
-    rng: np.random.Generator, watch: Watch = QUIET,
+    layers: Sequence[Layer],
+    outer_scale: float,
+    diameter: float,
+    views: Sequence[View],
+    n_steps: int,
+    dt: float,
+    rng: np.random.Generator,
+    watch: Watch = QUIET,
 ) -> list[Array]:
     """What each view sees, [(n_steps, n_outputs) um], every sample the mean over its step of `dt` [s].
 
@@ -79,8 +85,14 @@ def frozen_flow(
 
 
 def layer_signals(
-    layer: Layer, outer_scale: float, diameter: float, beams: Sequence[tuple[Sensor, Footprint]], n_steps: int, dt: float,
-    rng: np.random.Generator, watch: Watch = QUIET,
+    layer: Layer,
+    outer_scale: float,
+    diameter: float,
+    beams: Sequence[tuple[Sensor, Footprint]],
+    n_steps: int,
+    dt: float,
+    rng: np.random.Generator,
+    watch: Watch = QUIET,
 ) -> list[Array]:
     """What each beam sees of one layer, [(n_outputs, n_steps) um]."""
     grid = Grid.of(layer, outer_scale, diameter, n_steps, dt)

@@ -53,6 +53,7 @@ def fine_rule(height: float, diameter: float) -> tuple[float, float]:
 
 def across(q: float, end: float, delta: float, h: float) -> tuple[Array, Array]:
     """Nodes k_y, symmetric about 0, and weights [rad/m] of the rule above, out to about `end`."""
+
     def u(k: Array) -> Array:
         return np.arcsinh(k / q) / h + k / delta
 

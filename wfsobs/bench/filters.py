@@ -51,8 +51,9 @@ def kalman_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
         seconds, states = timed(lambda: external.filterpy_kalman(*arguments), sizes.repeats)
         yield row(task, size, FILTERPY, seconds, n, error=_error(states[:, PHI], exact))
     if STATSMODELS in libraries:
-        seconds, states = timed(lambda: external.statsmodels_kalman(
-            A[:4, :4], C[:4], Q, noise**2, steady.P, pseudo_open_loop(y, u)), sizes.repeats)
+        seconds, states = timed(
+            lambda: external.statsmodels_kalman(A[:4, :4], C[:4], Q, noise**2, steady.P, pseudo_open_loop(y, u)), sizes.repeats
+        )
         yield row(task, size, STATSMODELS, seconds, n, error=_error(states[:, PHI], exact))
 
 

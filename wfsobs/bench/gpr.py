@@ -155,8 +155,17 @@ def _textbook_stream(problem: Online) -> tuple[Array, Array]:
 def _stream_row(task: str, size: str, variant: str, runs: list[Array], error: float) -> Row:
     ready, whole = np.concatenate(runs).T * 1e6
     p999 = float(np.percentile(whole, 99.9)) if len(whole) >= ENOUGH_FOR_P999 else None
-    return row(task, size, variant, median(times[:, 1].sum() for times in runs), len(runs[0]), error=error,
-               per_step_us=float(np.median(whole)), p999_us=p999, ready_us=float(np.median(ready)))
+    return row(
+        task,
+        size,
+        variant,
+        median(times[:, 1].sum() for times in runs),
+        len(runs[0]),
+        error=error,
+        per_step_us=float(np.median(whole)),
+        p999_us=p999,
+        ready_us=float(np.median(ready)),
+    )
 
 
 def offline(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:

@@ -49,16 +49,32 @@ def timed(work: Callable[[], T], repeats: int) -> tuple[float, T]:
 
 
 def row(
-    task: str, size: str, variant: str, seconds: float, steps: int | None = None, *,
-    per_step_us: float | None = None, p999_us: float | None = None, ready_us: float | None = None,
-    error: float | None = None, peak_memory_mb: float | None = None,
+    task: str,
+    size: str,
+    variant: str,
+    seconds: float,
+    steps: int | None = None,
+    *,
+    per_step_us: float | None = None,
+    p999_us: float | None = None,
+    ready_us: float | None = None,
+    error: float | None = None,
+    peak_memory_mb: float | None = None,
 ) -> Row:
     """A measurement, its ratio still open."""
     if per_step_us is None and steps is not None:
         per_step_us = seconds / steps * 1e6
     return {
-        "task": task, "size": size, "variant": variant, "steps": steps, "median_s": seconds, "per_step_us": per_step_us,
-        "p999_us": p999_us, "ready_us": ready_us, "ratio_to_ours": None, "max_error_over_std": error,
+        "task": task,
+        "size": size,
+        "variant": variant,
+        "steps": steps,
+        "median_s": seconds,
+        "per_step_us": per_step_us,
+        "p999_us": p999_us,
+        "ready_us": ready_us,
+        "ratio_to_ours": None,
+        "max_error_over_std": error,
         "peak_memory_mb": peak_memory_mb,
     }
 

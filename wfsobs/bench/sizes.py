@@ -46,5 +46,4 @@ class Sizes:
 
 
 QUICK = Sizes()
-FULL = Sizes(
-    more_online=((511, 1000), (1024, 170), (1024, 1000), (2048, 170), (2048, 1000)), longest_duration=60.0)
+FULL = Sizes(more_online=((511, 1000), (1024, 170), (1024, 1000), (2048, 170), (2048, 1000)), longest_duration=60.0)

@@ -49,9 +49,15 @@ def _length(duration: float) -> str:
 
 
 TASKS = (
-    Task(longest_run, 1.0), Task(online_record, 5.0), Task(online_stream, 4.0), Task(offline, 3.0),
-    Task(kalman_record, 2.0), Task(multirate_record, 2.0), Task(adaptive_record, 2.0),
-    Task(frozen, 20.0), Task(whole_run, 3.0),
+    Task(longest_run, 1.0),
+    Task(online_record, 5.0),
+    Task(online_stream, 4.0),
+    Task(offline, 3.0),
+    Task(kalman_record, 2.0),
+    Task(multirate_record, 2.0),
+    Task(adaptive_record, 2.0),
+    Task(frozen, 20.0),
+    Task(whole_run, 3.0),
 )
 """In the order of the table, but for the longest run."""
 

@@ -65,9 +65,7 @@ def predict(X: Array, trained_on: Array, weights: Array, kernel: SquaredExponent
 
 def predict_online(X: Array, f: Array, rows: Array, m: int, kernel: SquaredExponential) -> Array:
     """Mean at some rows of X (n, p), each trained anew on the m rows before it and their targets in f (n,)."""
-    return np.array([
-        predict(X[r : r + 1], X[r - m : r], train(X[r - m : r], f[r - m : r], kernel), kernel)[0] for r in rows
-    ])
+    return np.array([predict(X[r : r + 1], X[r - m : r], train(X[r - m : r], f[r - m : r], kernel), kernel)[0] for r in rows])
 
 
 class OnlineStream:
@@ -135,9 +133,7 @@ def exact_predict(X: Array, trained_on: Array, w: Array, c: float, kernel: Squar
 def exact_online(X: Array, f: Array, rows: Array, m: int, kernel: SquaredExponential) -> Array:
     """What `predict_online` approximates."""
     trained = [exact_weights(X[r - m : r], f[r - m : r], kernel) for r in rows]
-    return np.array([
-        exact_predict(X[r : r + 1], X[r - m : r], w, c, kernel)[0] for r, (w, c) in zip(rows, trained, strict=True)
-    ])
+    return np.array([exact_predict(X[r : r + 1], X[r - m : r], w, c, kernel)[0] for r, (w, c) in zip(rows, trained, strict=True)])
 
 
 def _delta(X: Array, kernel: SquaredExponential) -> Array:

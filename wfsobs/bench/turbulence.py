@@ -20,11 +20,14 @@ ONE_LAYER: dict[str, Any] = {"turbulence.source": "frozen-flow"}
 def many_layers(sizes: Sizes) -> dict[str, Any]:
     """Modes up to the order and layers as the sizes say, four LGS beside the axis and an NGS."""
     return {
-        "turbulence.source": "frozen-flow", "telescope.radial_order": sizes.order,
-        "sensors.lgs_count": 4, "sensors.lgs_radius": 64.0,
+        "turbulence.source": "frozen-flow",
+        "telescope.radial_order": sizes.order,
+        "sensors.lgs_count": 4,
+        "sensors.lgs_radius": 64.0,
         "turbulence.layers": [
             {"height": 2000.0 * i, "wind_factor": 0.4 + 0.2 * i, "wind_direction": 36.0 * i, "fraction": 0.1}
-            for i in range(sizes.layers)],
+            for i in range(sizes.layers)
+        ],
     }
 
 

@@ -25,9 +25,15 @@ def bench_table(rows: Sequence[Row], markdown: bool = False) -> Table:
             table.add_section()
         last = r["task"]
         table.add_row(
-            r["task"], r["size"], r["variant"],
-            "-" if r["steps"] is None else str(r["steps"]), _number(r["median_s"] * 1e3), _number(r["per_step_us"]),
-            _number(r["p999_us"]), _number(r["ready_us"]), _number(r["ratio_to_ours"]),
+            r["task"],
+            r["size"],
+            r["variant"],
+            "-" if r["steps"] is None else str(r["steps"]),
+            _number(r["median_s"] * 1e3),
+            _number(r["per_step_us"]),
+            _number(r["p999_us"]),
+            _number(r["ready_us"]),
+            _number(r["ratio_to_ours"]),
             "-" if r["max_error_over_std"] is None else f"{r['max_error_over_std']:.0e}",
             *((_number(r["peak_memory_mb"]),) if memory else ()),
         )

@@ -15,8 +15,12 @@ from wfsobs.scenario.settings import SettingError
 @click.command()
 @click.argument("out", metavar="OUT.html")
 @scenario_options
-@click.option("--vary", multiple=True, metavar="NAME=VALUE,VALUE,...",
-              help=f"Run for each of these values as well; several make every combination, at most {MOST}.")
+@click.option(
+    "--vary",
+    multiple=True,
+    metavar="NAME=VALUE,VALUE,...",
+    help=f"Run for each of these values as well; several make every combination, at most {MOST}.",
+)
 def export(out: str, preset: str | None, config: str | None, assignments: tuple[str, ...], vary: tuple[str, ...]) -> None:
     """Write a report: one HTML file with figures and numbers that opens without a network."""
     base = configfile.scenario_from(preset, config, assignments)

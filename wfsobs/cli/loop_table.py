@@ -32,10 +32,17 @@ def loop_table(rows: Sequence[Row]) -> Table:
         if all(r["stable"] is None for r in same):
             shown = "none"
         out.add_row(
-            mode, label(controller), same[0]["needs"], shown,
+            mode,
+            label(controller),
+            same[0]["needs"],
+            shown,
             *((f"{min(left):.2f} - {max(left):.2f}" if left else "-",) if several else ()),
-            _number(same, "residual_rms_mas", 3), _number(same, "strehl", 4), linear(same, _number(same, "predicted_rms_nm", 2)),
-            _number(same, "gain", 3), linear(same, _margins(same[0])), linear(same, _number(same, "delay_margin_ms", 2)),
+            _number(same, "residual_rms_mas", 3),
+            _number(same, "strehl", 4),
+            linear(same, _number(same, "predicted_rms_nm", 2)),
+            _number(same, "gain", 3),
+            linear(same, _margins(same[0])),
+            linear(same, _number(same, "delay_margin_ms", 2)),
             _share(same),
         )
     if any(r["limited"] for r in rows):

@@ -17,8 +17,13 @@ from wfsobs.units import UNITS
 def scenario_options(command: Callable) -> Callable:
     """--preset, --config and --set."""
     for option in (
-        click.option("--set", "assignments", multiple=True, metavar="NAME=VALUE",
-                     help="Change one setting, such as turbulence.wind_speed=20; can be given many times."),
+        click.option(
+            "--set",
+            "assignments",
+            multiple=True,
+            metavar="NAME=VALUE",
+            help="Change one setting, such as turbulence.wind_speed=20; can be given many times.",
+        ),
         click.option("--config", metavar="F.toml", help="Settings from a TOML file, on top of the preset."),
         click.option("--preset", metavar="NAME", help=f"Start from {', '.join(PRESETS)}; paper unless told."),
     ):
@@ -30,12 +35,20 @@ def record_options(command: Callable) -> Callable:
     """--unit, --command-sign, --command-delay and --rate, what a record does not say of itself; --sha256, which one it is."""
     for option in (
         click.option("--sha256", metavar="HEX", help="Refuse the record unless its file has this SHA-256."),
-        click.option("--rate", type=click.FloatRange(0, min_open=True), metavar="HZ",
-                     help="Rate of the rows where they have no time."),
-        click.option("--command-delay", type=click.IntRange(1, 100), metavar="N",
-                     help=f"Steps from a command to the first measurement that sees it; {DELAY} unless told."),
-        click.option("--command-sign", type=click.Choice(["+1", "-1"]),
-                     help="+1 where a command adds to what the sensor sees (the default), -1 where it is taken off."),
+        click.option(
+            "--rate", type=click.FloatRange(0, min_open=True), metavar="HZ", help="Rate of the rows where they have no time."
+        ),
+        click.option(
+            "--command-delay",
+            type=click.IntRange(1, 100),
+            metavar="N",
+            help=f"Steps from a command to the first measurement that sees it; {DELAY} unless told.",
+        ),
+        click.option(
+            "--command-sign",
+            type=click.Choice(["+1", "-1"]),
+            help="+1 where a command adds to what the sensor sees (the default), -1 where it is taken off.",
+        ),
         click.option("--unit", type=click.Choice(UNITS), help="Unit of the record where it states none; um unless told."),
     ):
         command = option(command)
@@ -48,6 +61,9 @@ def loaded(record_file: str, scenario: Scenario, stated: Stated, sha256: str | N
     if record.origin:
         click.echo(f"wfsobs: {record_file}: read as {record.origin}", err=True)
     if record.missing:
-        click.echo(f"wfsobs: {record_file}: {record.missing} of {record.n_steps} frames are missing; they are bridged by "
-                   "prediction and count in no score of one", err=True)
+        click.echo(
+            f"wfsobs: {record_file}: {record.missing} of {record.n_steps} frames are missing; they are bridged by "
+            "prediction and count in no score of one",
+            err=True,
+        )
     return record

@@ -27,8 +27,10 @@ class OverTime:
 
     def __init__(self, scenario: Scenario, window: float):
         if not scenario.dt <= window < scenario.run.duration:
-            raise SettingError(f"--over-time {window:g}: takes a number of seconds from {scenario.dt:g}, one step, to below "
-                               f"run.duration = {scenario.run.duration:g}")
+            raise SettingError(
+                f"--over-time {window:g}: takes a number of seconds from {scenario.dt:g}, one step, to below "
+                f"run.duration = {scenario.run.duration:g}"
+            )
         self.scenario, self.window = scenario, window
         self.rows: list[Row] = []
         self._pooled: dict[tuple[str, str], Pooled] = {}
@@ -41,10 +43,16 @@ class OverTime:
             self._pooled.setdefault((e.observer, e.target), Pooled()).add(running)
             for mode, column in zip(self.scenario.modes, running[every - 1 :: every].T, strict=False):
                 self.rows += [
-                    {"observer": e.observer, "target": e.target, "mode": mode.name,
-                     "time_s": round((i + 1) * every * result.record.dt, 9),
-                     "rms_um": None if np.isnan(value) else float(value), "seed": seed}
-                    for i, value in enumerate(column)]
+                    {
+                        "observer": e.observer,
+                        "target": e.target,
+                        "mode": mode.name,
+                        "time_s": round((i + 1) * every * result.record.dt, 9),
+                        "rms_um": None if np.isnan(value) else float(value),
+                        "seed": seed,
+                    }
+                    for i, value in enumerate(column)
+                ]
 
     def table(self) -> Table:
         """What every event did to every observer; the error at some times where there is no event."""
@@ -54,7 +62,9 @@ class OverTime:
         """(target, mode, observer, pooled running rms (n_steps,)) in the order of targets and modes."""
         found = [
             (target, i, observer, pool.rms[:, i])
-            for (observer, target), pool in self._pooled.items() for i in range(pool.rms.shape[1])]
+            for (observer, target), pool in self._pooled.items()
+            for i in range(pool.rms.shape[1])
+        ]
         modes = self.scenario.modes
         return [(target, modes[i].name, observer, x) for target, i, observer, x in sorted(found, key=lambda f: f[:2])]
 

@@ -27,17 +27,29 @@ from wfsobs.units import UNITS
 
 @click.command()
 @scenario_options
-@click.option("--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N",
-              help="Repeat with seeds run.seed ... run.seed + N - 1.")
+@click.option(
+    "--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N", help="Repeat with seeds run.seed ... run.seed + N - 1."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 @click.option("--save", metavar="RECORD", help="Also save the record of the (one) run: .npz, .csv, .fits or .aot.fits.")
 @click.option("--vibration-psd", metavar="FILE", help="Vibration with the spectrum of a CSV or FITS file (docs/data.md).")
-@click.option("--over-time", type=click.FloatRange(0, min_open=True), metavar="SECONDS",
-              help="Print the error over the last so many seconds against time in place of the one number (docs/events.md).")
+@click.option(
+    "--over-time",
+    type=click.FloatRange(0, min_open=True),
+    metavar="SECONDS",
+    help="Print the error over the last so many seconds against time in place of the one number (docs/events.md).",
+)
 @click.option("--psd-unit", type=click.Choice(UNITS), help="Its unit, squared per Hz, where it states none.")
 def run(
-    preset: str | None, config: str | None, assignments: tuple[str, ...], seeds: int, as_json: bool, save: str | None,
-    vibration_psd: str | None, over_time: float | None, psd_unit: str | None,
+    preset: str | None,
+    config: str | None,
+    assignments: tuple[str, ...],
+    seeds: int,
+    as_json: bool,
+    save: str | None,
+    vibration_psd: str | None,
+    over_time: float | None,
+    psd_unit: str | None,
 ) -> None:
     """Simulate the loop, run every observer and print the RMS table."""
     if save and seeds > 1:
@@ -67,17 +79,28 @@ def run(
 
 @click.command()
 @scenario_options
-@click.option("--controller", "controllers", multiple=True, metavar="NAME",
-              help="Run this controller alone; can be given many times.")
-@click.option("--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N",
-              help="Repeat with seeds run.seed ... run.seed + N - 1.")
+@click.option(
+    "--controller", "controllers", multiple=True, metavar="NAME", help="Run this controller alone; can be given many times."
+)
+@click.option(
+    "--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N", help="Repeat with seeds run.seed ... run.seed + N - 1."
+)
 @click.option("--record", "record_file", metavar="RECORD", help="On the disturbance and noise of a record with its truth.")
 @record_options
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def loop(
-    preset: str | None, config: str | None, assignments: tuple[str, ...], controllers: tuple[str, ...], seeds: int,
-    record_file: str | None, unit: str | None, command_sign: str | None, command_delay: int | None, rate: float | None,
-    sha256: str | None, as_json: bool,
+    preset: str | None,
+    config: str | None,
+    assignments: tuple[str, ...],
+    controllers: tuple[str, ...],
+    seeds: int,
+    record_file: str | None,
+    unit: str | None,
+    command_sign: str | None,
+    command_delay: int | None,
+    rate: float | None,
+    sha256: str | None,
+    as_json: bool,
 ) -> None:
     """Close the loop with every controller on the same disturbance and print what is left of it (docs/closed_loop.md)."""
     scenario, record = configfile.scenario_from(preset, config, assignments), None

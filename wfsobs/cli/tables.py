@@ -33,12 +33,17 @@ def score_table(rows: Sequence[Row]) -> Table:
             table.add_section()
         last = (target, mode)
         table.add_row(
-            target, mode, label_of(observer) + (" (looks ahead)" if looks_ahead(observer) else "") + _own(same),
-            needs_of(observer), f"{median(errors):.2f}",
+            target,
+            mode,
+            label_of(observer) + (" (looks ahead)" if looks_ahead(observer) else "") + _own(same),
+            needs_of(observer),
+            f"{median(errors):.2f}",
             *((f"{min(errors):.2f} - {max(errors):.2f}",) if several else ()),
             *((interval_text(same[0]["interval_um"], 1e3),) if bounded else ()),
-            f"{median(r['truth_rms_um'] for r in same) * 1e3:.2f}", _number(same, "normalised_rms", 1.0, 3),
-            _number(same, "lag_s", 1e3, 2), _number(same, TIME, 1.0, 2),
+            f"{median(r['truth_rms_um'] for r in same) * 1e3:.2f}",
+            _number(same, "normalised_rms", 1.0, 3),
+            _number(same, "lag_s", 1e3, 2),
+            _number(same, TIME, 1.0, 2),
         )
     return table
 

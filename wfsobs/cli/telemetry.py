@@ -32,9 +32,18 @@ from wfsobs.telemetry.records import save_arrays
 @click.option("--out", metavar="ESTIMATES.npz", help="Save every estimate under the key observer/target.")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def observe(
-    record_file: str, preset: str | None, config: str | None, assignments: tuple[str, ...], unit: str | None,
-    command_sign: str | None, command_delay: int | None, rate: float | None, sha256: str | None, prior: str | None,
-    out: str | None, as_json: bool,
+    record_file: str,
+    preset: str | None,
+    config: str | None,
+    assignments: tuple[str, ...],
+    unit: str | None,
+    command_sign: str | None,
+    command_delay: int | None,
+    rate: float | None,
+    sha256: str | None,
+    prior: str | None,
+    out: str | None,
+    as_json: bool,
 ) -> None:
     """Run the observers on a record: .npz, .csv, .fits or AOT (preset paper unless told)."""
     scenario = configfile.scenario_from(preset, config, assignments)
@@ -59,16 +68,38 @@ def observe(
 @click.argument("record_file", metavar="RECORD")
 @scenario_options
 @record_options
-@click.option("--level", type=click.FloatRange(0, 0.5, min_open=True), default=LEVEL, show_default=True, metavar="P",
-              help="Probability of finding any peak where there is none.")
-@click.option("--lowest", type=click.FloatRange(0, min_open=True), default=LOWEST, show_default=True, metavar="HZ",
-              help="Frequency from which peaks are looked for.")
+@click.option(
+    "--level",
+    type=click.FloatRange(0, 0.5, min_open=True),
+    default=LEVEL,
+    show_default=True,
+    metavar="P",
+    help="Probability of finding any peak where there is none.",
+)
+@click.option(
+    "--lowest",
+    type=click.FloatRange(0, min_open=True),
+    default=LOWEST,
+    show_default=True,
+    metavar="HZ",
+    help="Frequency from which peaks are looked for.",
+)
 @click.option("--out", metavar="F.toml", help="Save what was found as settings, on top of the preset.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 def identify(
-    record_file: str, preset: str | None, config: str | None, assignments: tuple[str, ...], unit: str | None,
-    command_sign: str | None, command_delay: int | None, rate: float | None, sha256: str | None, level: float, lowest: float,
-    out: str | None, as_json: bool,
+    record_file: str,
+    preset: str | None,
+    config: str | None,
+    assignments: tuple[str, ...],
+    unit: str | None,
+    command_sign: str | None,
+    command_delay: int | None,
+    rate: float | None,
+    sha256: str | None,
+    level: float,
+    lowest: float,
+    out: str | None,
+    as_json: bool,
 ) -> None:
     """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
     scenario = configfile.scenario_from(preset, config, assignments)

@@ -27,22 +27,49 @@ NAMES = [name for name in OBSERVERS if name in TUNABLE and TUNABLE[name].usual]
 @click.command()
 @click.option("--observer", required=True, type=click.Choice(NAMES), help="What is tuned.")
 @scenario_options
-@click.option("--setting", "settings", multiple=True, metavar="NAME",
-              help="Tune this setting in the place of the usual ones; can be given many times.")
+@click.option(
+    "--setting",
+    "settings",
+    multiple=True,
+    metavar="NAME",
+    help="Tune this setting in the place of the usual ones; can be given many times.",
+)
 @click.option("--target", type=click.Choice(TARGETS), help="Whose error counts; vibration where the observer estimates it.")
-@click.option("--evaluations", type=click.IntRange(1, 10_000), default=EVALUATIONS, show_default=True, metavar="N",
-              help="Runs of the observer at most.")
-@click.option("--validation", type=click.FloatRange(0, min_open=True), metavar="S",
-              help="Length of the validation record, that of the scenario unless told.")
+@click.option(
+    "--evaluations",
+    type=click.IntRange(1, 10_000),
+    default=EVALUATIONS,
+    show_default=True,
+    metavar="N",
+    help="Runs of the observer at most.",
+)
+@click.option(
+    "--validation",
+    type=click.FloatRange(0, min_open=True),
+    metavar="S",
+    help="Length of the validation record, that of the scenario unless told.",
+)
 @click.option("--record", "record_file", metavar="RECORD", help="Tune on telemetry, cut in three, not on simulated records.")
 @record_options
 @click.option("--out", metavar="F.toml", help="Save all settings, the tuned ones with a comment.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 def tune(
-    observer: str, preset: str | None, config: str | None, assignments: tuple[str, ...], settings: tuple[str, ...],
-    target: str | None, evaluations: int, validation: float | None, record_file: str | None, unit: str | None,
-    command_sign: str | None, command_delay: int | None, rate: float | None, sha256: str | None,
-    out: str | None, as_json: bool,
+    observer: str,
+    preset: str | None,
+    config: str | None,
+    assignments: tuple[str, ...],
+    settings: tuple[str, ...],
+    target: str | None,
+    evaluations: int,
+    validation: float | None,
+    record_file: str | None,
+    unit: str | None,
+    command_sign: str | None,
+    command_delay: int | None,
+    rate: float | None,
+    sha256: str | None,
+    out: str | None,
+    as_json: bool,
 ) -> None:
     """Search for the settings of an observer that are best on a validation record (docs/tuning.md)."""
     scenario, record = configfile.scenario_from(preset, config, assignments), None
@@ -54,8 +81,16 @@ def tune(
     if out:
         check_writable(out)
     with progress_bar("evaluations") as update:
-        tuned = search(scenario, observer, settings or None, evaluations=evaluations, record=record, target=target,
-                       validation=validation, watch=Watch(progress=update))
+        tuned = search(
+            scenario,
+            observer,
+            settings or None,
+            evaluations=evaluations,
+            record=record,
+            target=target,
+            validation=validation,
+            watch=Watch(progress=update),
+        )
     if out:
         text = report.toml(tuned)
         write_whole(out, lambda file: file.write(text.encode()))

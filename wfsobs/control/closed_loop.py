@@ -147,8 +147,12 @@ def _designed(controller: Controller, scenario: Scenario, mode: int, mirror: Mir
     if not stable or controller.predict is not None or not law.time_invariant:
         return Designed(law, stable)
     predicted = None if spectra is None else float(np.sqrt(residual_variance(law, spectra, mirror)))
-    return Designed(law, stable, predicted, margins(
-        lambda omega: mirror.response(omega) * law.response(omega), frequencies(law.poles), scenario.dt))
+    return Designed(
+        law,
+        stable,
+        predicted,
+        margins(lambda omega: mirror.response(omega) * law.response(omega), frequencies(law.poles), scenario.dt),
+    )
 
 
 def close_loop(scenario: Scenario, *, controllers: Sequence[str] | None = None, watch: Watch = QUIET) -> ClosedLoop:
@@ -242,7 +246,8 @@ def _commands(
             u[:, mode] = mirror.follow(wanted)
         else:
             u[:, mode], wanted = limited_integrator(
-                mirror, one.law.gain, plan.scenario.control.leak, z[:, mode], forward[:, mode])
+                mirror, one.law.gain, plan.scenario.control.leak, z[:, mode], forward[:, mode]
+            )
         limited[:, mode] = u[:, mode] != wanted
     return u, limited
 

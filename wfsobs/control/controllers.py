@@ -55,8 +55,10 @@ def _integrator(scenario: Scenario, mode: int, mirror: Mirror, spectra: TrueSpec
     if c.integrator == "manual":
         return integrator_law(mirror, c.gain, c.leak)
     if spectra is None:
-        raise ValueError(f"the spectrum of turbulence from {scenario.turbulence.source} is not known: set control.integrator "
-                         "to manual, and control.gain")
+        raise ValueError(
+            f"the spectrum of turbulence from {scenario.turbulence.source} is not known: set control.integrator "
+            "to manual, and control.gain"
+        )
     return integrator_law(mirror, best_gain(spectra, mirror, c.leak), c.leak)
 
 
@@ -64,16 +66,20 @@ def _lqg(id_: str) -> MakeLaw:
     return lambda scenario, mode, mirror, _spectra: LQG[id_](scenario, mode, mirror)
 
 
-CONTROLLERS: dict[str, Controller] = {c.id: c for c in (
-    Controller("none", "No control", weight=0.1),
-    Controller("integrator", "Integrator", law=_integrator),
-    Controller("lqg-kf-lgs", "LQG, LGS KF", (MODEL,), _lqg("lqg-kf-lgs")),
-    Controller("lqg-kf-multi", "LQG, multi-peak KF", (MODEL, LINES), _lqg("lqg-kf-multi")),
-    Controller("lqg-multirate", "LQG, multi-rate KF", (MODEL,), _lqg("lqg-multirate"), ngs=True),
-    Controller("lqg-multirate-optimal", "LQG, optimal multi-rate KF", (MODEL,), _lqg("lqg-multirate-optimal"), ngs=True),
-    Controller("lqg-multirate-multi", "LQG, multi-rate multi-peak KF", (MODEL, LINES), _lqg("lqg-multirate-multi"), ngs=True),
-    Controller("integrator+gpr-offline", "Integrator and offline GPR", (TRAINING, BANDS), _integrator, gpr_offline_ahead,
-               weight=20.0),
-    Controller("integrator+gpr-online", "Integrator and online GPR", (BANDS,), _integrator, gpr_online_ahead, weight=200.0),
-)}
+CONTROLLERS: dict[str, Controller] = {
+    c.id: c
+    for c in (
+        Controller("none", "No control", weight=0.1),
+        Controller("integrator", "Integrator", law=_integrator),
+        Controller("lqg-kf-lgs", "LQG, LGS KF", (MODEL,), _lqg("lqg-kf-lgs")),
+        Controller("lqg-kf-multi", "LQG, multi-peak KF", (MODEL, LINES), _lqg("lqg-kf-multi")),
+        Controller("lqg-multirate", "LQG, multi-rate KF", (MODEL,), _lqg("lqg-multirate"), ngs=True),
+        Controller("lqg-multirate-optimal", "LQG, optimal multi-rate KF", (MODEL,), _lqg("lqg-multirate-optimal"), ngs=True),
+        Controller("lqg-multirate-multi", "LQG, multi-rate multi-peak KF", (MODEL, LINES), _lqg("lqg-multirate-multi"), ngs=True),
+        Controller(
+            "integrator+gpr-offline", "Integrator and offline GPR", (TRAINING, BANDS), _integrator, gpr_offline_ahead, weight=20.0
+        ),
+        Controller("integrator+gpr-online", "Integrator and online GPR", (BANDS,), _integrator, gpr_online_ahead, weight=200.0),
+    )
+}
 """Every controller, in the order of tables and legends."""

@@ -1,8 +1,8 @@
 """What a time-invariant loop does at every frequency.
 
-    rejection       E = 1 / (1 + L) = 1 - P F       from the disturbance to the residual
-    noise transfer  N = P F = L / (1 + L)           from the measurement's noise to the residual, its sign and delay aside
-    loop gain       L = P F / (1 - P F)
+rejection       E = 1 / (1 + L) = 1 - P F       from the disturbance to the residual
+noise transfer  N = P F = L / (1 + L)           from the measurement's noise to the residual, its sign and delay aside
+loop gain       L = P F / (1 - P F)
 """
 
 from __future__ import annotations

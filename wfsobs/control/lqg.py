@@ -86,7 +86,10 @@ def _two_sensors(filter_: MultiRateFilter) -> Law:
 
 
 LQG: dict[str, Callable[[Scenario, int, Mirror], Law]] = {
-    "lqg-kf-lgs": lqg_kf_lgs, "lqg-kf-multi": lqg_kf_multi, "lqg-multirate": lqg_multirate,
-    "lqg-multirate-optimal": lqg_multirate_optimal, "lqg-multirate-multi": lqg_multirate_multi,
+    "lqg-kf-lgs": lqg_kf_lgs,
+    "lqg-kf-multi": lqg_kf_multi,
+    "lqg-multirate": lqg_multirate,
+    "lqg-multirate-optimal": lqg_multirate_optimal,
+    "lqg-multirate-multi": lqg_multirate_multi,
 }
 """Controller -> its law in one mode."""

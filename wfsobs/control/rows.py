@@ -36,14 +36,21 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
     wavelength = result.scenario.control.wavelength
 
     def row(controller: str, needs: str, mode: int, stable: bool | None, left: Sequence[float] | None, **more: Any) -> Row:
-        known = {name: more.get(name) for name in (
-            "predicted_rms_nm", "gain", "gain_margin_db", "phase_margin_deg", "delay_margin_ms", "limited")}
+        known = {
+            name: more.get(name)
+            for name in ("predicted_rms_nm", "gain", "gain_margin_db", "phase_margin_deg", "delay_margin_ms", "limited")
+        }
         return {
-            "controller": controller, "mode": modes[mode].name, "needs": needs, "stable": stable,
+            "controller": controller,
+            "mode": modes[mode].name,
+            "needs": needs,
+            "stable": stable,
             "residual_rms_nm": None if left is None else left[mode] * 1e3,
             "residual_rms_mas": None if left is None or modes[mode].radial_order > 1 else left[mode] / mas,
             "strehl": None if left is None else strehl(left, wavelength),
-            **known, "note": more.get("note", ""), "seed": seed,
+            **known,
+            "note": more.get("note", ""),
+            "seed": seed,
         }
 
     out = []
@@ -54,15 +61,22 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
             if limited:
                 designed = replace(designed, predicted=None, margins=None)
             m = designed.margins
-            out.append(row(
-                outcome.controller, CONTROLLERS[outcome.controller].needed(result.scenario), mode, outcome.stable[mode], left,
-                predicted_rms_nm=None if designed.predicted is None else designed.predicted * 1e3,
-                gain=designed.law.gain if designed.law else None,
-                gain_margin_db=20 * log10(m.gain) if m and m.gain else None,
-                phase_margin_deg=degrees(m.phase) if m and m.phase is not None else None,
-                delay_margin_ms=m.delay * 1e3 if m and m.delay is not None else None,
-                limited=limited, note=outcome.note or (LIMITED if limited else ""),
-            ))
+            out.append(
+                row(
+                    outcome.controller,
+                    CONTROLLERS[outcome.controller].needed(result.scenario),
+                    mode,
+                    outcome.stable[mode],
+                    left,
+                    predicted_rms_nm=None if designed.predicted is None else designed.predicted * 1e3,
+                    gain=designed.law.gain if designed.law else None,
+                    gain_margin_db=20 * log10(m.gain) if m and m.gain else None,
+                    phase_margin_deg=degrees(m.phase) if m and m.phase is not None else None,
+                    delay_margin_ms=m.delay * 1e3 if m and m.delay is not None else None,
+                    limited=limited,
+                    note=outcome.note or (LIMITED if limited else ""),
+                )
+            )
     if plan.bound is not None:
         out += [row(BOUND, SPECTRA, mode, True, plan.bound) for mode in range(len(modes))]
     return out

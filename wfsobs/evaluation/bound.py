@@ -93,17 +93,22 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
     wanted[TOTAL] = known.total[0], advanced(known.total[1], 1 + ahead)
     lines = spectra.line_covariance(past + 1 + ahead)
     of_lines = {"vibration": 1.0, TOTAL: 1.0}
-    cross = np.array([
-        np.fft.irfft(shared, whitener.n)[:past] + of_lines.get(name, 0.0) * spectra.gain * lines[1 + ahead :]
-        for name, (_, shared) in wanted.items()])
+    cross = np.array(
+        [
+            np.fft.irfft(shared, whitener.n)[:past] + of_lines.get(name, 0.0) * spectra.gain * lines[1 + ahead :]
+            for name, (_, shared) in wanted.items()
+        ]
+    )
     measured = np.fft.irfft(known.measured, whitener.n)[:past] + spectra.gain**2 * lines[:past]
     gained = np.hstack([np.zeros((len(wanted), 1)), explained(measured, cross)])
     return {
         name: LeastError(
             np.fft.irfft(error_spectrum(own, shared, whitener), whitener.n)[: min(n_steps, whitener.n // 2)],
             circle_mean(own) + of_lines.get(name, 0.0) * lines[0] - gained[i],
-            len(spectra.pure))
-        for i, (name, (own, shared)) in enumerate(wanted.items())}
+            len(spectra.pure),
+        )
+        for i, (name, (own, shared)) in enumerate(wanted.items())
+    }
 
 
 def bound(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:
@@ -142,7 +147,19 @@ def bound_scores(bounds: Sequence[Bound], record: Record, scores: Sequence[Score
         truth = record.truth(it.target)
         if truth is not None and first < last:
             scale = rms(truth[first:last, it.column])
-            out.append(Score(
-                BOUND, it.target, it.mode, it.error.rms, scale, it.error.rms / scale if scale > 0 else None, None, 0.0,
-                first * record.dt, last * record.dt, interval=it.error.interval(first, last)))
+            out.append(
+                Score(
+                    BOUND,
+                    it.target,
+                    it.mode,
+                    it.error.rms,
+                    scale,
+                    it.error.rms / scale if scale > 0 else None,
+                    None,
+                    0.0,
+                    first * record.dt,
+                    last * record.dt,
+                    interval=it.error.interval(first, last),
+                )
+            )
     return out

@@ -22,9 +22,19 @@ def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
     """One plain dictionary per score: the keys of `wfsobs run --json`, and TIME."""
     return [
         {
-            "observer": s.observer, "target": s.target, "mode": s.mode, "rms_um": s.rms, "truth_rms_um": s.truth_rms,
-            "normalised_rms": s.normalised_rms, "lag_s": s.lag, "start_s": s.start, "stop_s": s.stop, "apart": s.apart,
-            "needs": needs_of(s.observer), "interval_um": None if s.interval is None else list(s.interval), "seed": seed,
+            "observer": s.observer,
+            "target": s.target,
+            "mode": s.mode,
+            "rms_um": s.rms,
+            "truth_rms_um": s.truth_rms,
+            "normalised_rms": s.normalised_rms,
+            "lag_s": s.lag,
+            "start_s": s.start,
+            "stop_s": s.stop,
+            "apart": s.apart,
+            "needs": needs_of(s.observer),
+            "interval_um": None if s.interval is None else list(s.interval),
+            "seed": seed,
             TIME: None if s.observer in NOT_OBSERVERS else s.seconds_per_step * 1e6,
         }
         for s in scores

@@ -98,9 +98,20 @@ def supervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: fl
                 if not samples.any():
                     continue
                 t, value = true[samples], e.values[samples, mode]
-                out.append(Score(
-                    e.observer, target, name, rms(value - t), rms(t), _ratio(value - t, t), lag(t, value, record.dt),
-                    e.seconds_per_step, *_stretch(samples, record.dt), apart))
+                out.append(
+                    Score(
+                        e.observer,
+                        target,
+                        name,
+                        rms(value - t),
+                        rms(t),
+                        _ratio(value - t, t),
+                        lag(t, value, record.dt),
+                        e.seconds_per_step,
+                        *_stretch(samples, record.dt),
+                        apart,
+                    )
+                )
     return out
 
 
@@ -127,13 +138,35 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
         scored = common_samples([measured & ~np.isnan(error) for error in errors])
         for (observer, parts), error, (samples, apart) in zip(both.items(), errors, scored, strict=True):
             if samples.any():
-                out.append(Score(
-                    observer, PREDICTION, name, rms(error[samples]), rms(z[samples]), _ratio(error[samples], z[samples]), None,
-                    max(e.seconds_per_step for e in parts), *_stretch(samples, record.dt), apart))
+                out.append(
+                    Score(
+                        observer,
+                        PREDICTION,
+                        name,
+                        rms(error[samples]),
+                        rms(z[samples]),
+                        _ratio(error[samples], z[samples]),
+                        None,
+                        max(e.seconds_per_step for e in parts),
+                        *_stretch(samples, record.dt),
+                        apart,
+                    )
+                )
         samples = next((s for s, apart in scored if not apart and s.any()), measured) & ~np.isnan(left)
         if samples.any():
-            out.append(Score(LOOP, RESIDUAL, name, rms(left[samples]), rms(z[samples]), _ratio(left[samples], z[samples]), None,
-                             0.0, *_stretch(samples, record.dt)))
+            out.append(
+                Score(
+                    LOOP,
+                    RESIDUAL,
+                    name,
+                    rms(left[samples]),
+                    rms(z[samples]),
+                    _ratio(left[samples], z[samples]),
+                    None,
+                    0.0,
+                    *_stretch(samples, record.dt),
+                )
+            )
     return out
 
 

@@ -59,7 +59,8 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     for name, column in zip(names, z.T, strict=False):
         if (count := np.count_nonzero(np.isfinite(column))) < max(SHORTEST, LEAST * len(z)):
             raise RecordError(
-                f"{name}: {count} of {len(z)} samples are measured, to identify it takes {SHORTEST}, and {LEAST:.0%}")
+                f"{name}: {count} of {len(z)} samples are measured, to identify it takes {SHORTEST}, and {LEAST:.0%}"
+            )
         if not np.nanstd(column) > RESTING * np.nanmax(np.abs(column)):
             raise RecordError(f"{name}: z does not change, there is nothing to identify")
     modes = []
@@ -69,7 +70,8 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     grow(modes, level, lowest, watch)
     left = unexplained(modes, level, lowest)
     found = tuple(
-        read_off(name, mode, lowest, tested(mode, count)) for name, mode, count in zip(names, modes, left, strict=False))
+        read_off(name, mode, lowest, tested(mode, count)) for name, mode, count in zip(names, modes, left, strict=False)
+    )
     watch.step(1.0)
     return Identified(found, record.dt, len(z), level)
 

@@ -77,8 +77,13 @@ def merged(modes: list[tuple[Process, ...]]) -> list[Peak]:
     for group in groups:
         pure = next(iter(group.values())).pure
         damping = Number(0.0, 0.0) if pure else mean([p.damping for p in group.values()])
-        out.append(Peak(mean([p.frequency for p in group.values()]), damping,
-                        tuple(group[i].rms if i in group else None for i in range(len(modes)))))
+        out.append(
+            Peak(
+                mean([p.frequency for p in group.values()]),
+                damping,
+                tuple(group[i].rms if i in group else None for i in range(len(modes))),
+            )
+        )
     return sorted(out, key=lambda p: p.frequency.value)
 
 

@@ -59,8 +59,10 @@ def in_time(e: Array, dt: float) -> list[str]:
     scale = np.median(np.abs(e - np.median(e))) / 0.6745
     far = np.abs(e - np.median(e)) > FAR * scale
     if far.any():
-        out.append(f"{far.sum()} samples are further than {FAR:g} standard deviations from what was to be expected, the first at "
-                   f"{np.argmax(far) * dt:.1f} s after the filter has settled")
+        out.append(
+            f"{far.sum()} samples are further than {FAR:g} standard deviations from what was to be expected, the first at "
+            f"{np.argmax(far) * dt:.1f} s after the filter has settled"
+        )
     parts = np.array([np.var(part) for part in np.array_split(e[~far], PARTS)])
     statistic = 0.5 * len(e) / PARTS * np.sum((parts / parts.mean() - 1.0) ** 2)
     if chi2.sf(statistic, PARTS - 1) < LEVEL:

@@ -18,6 +18,7 @@ Row = tuple[str, Number | None, Number | None, Number | None]
 def plain(result: Identified) -> dict[str, Any]:
     """What `wfsobs identify --json` prints: every number with its standard deviation as `_std`, null where it has none; rms in
     um, frequencies in Hz."""
+
     def numbers(**named: Number) -> dict[str, float | None]:
         std = {f"{name}_std": None if isnan(n.std) else n.std for name, n in named.items()}
         return {key: (n.value if key == name else std[key]) for name, n in named.items() for key in (name, f"{name}_std")}
@@ -26,17 +27,24 @@ def plain(result: Identified) -> dict[str, Any]:
         return numbers(**{name: n for name, n in vars(p).items() if n is not None})
 
     return {
-        "duration": result.duration, "level": result.level, "white": result.white,
+        "duration": result.duration,
+        "level": result.level,
+        "white": result.white,
         "modes": [
             {
-                "mode": m.name, **numbers(noise=m.noise),
+                "mode": m.name,
+                **numbers(noise=m.noise),
                 "turbulence": None if m.turbulence is None else of(m.turbulence),
                 "background": None if m.background is None else of(m.background),
                 "broad": [of(p) for p in m.broad],
                 "peaks": [{**of(p), "pure": p.pure} for p in m.peaks],
-                "whiteness": {"cumulated_p": m.whiteness.cumulated, "innovations_p": m.whiteness.innovations,
-                              "unexplained": m.whiteness.left, "white": m.whiteness.white,
-                              "remarks": list(m.whiteness.remarks)},
+                "whiteness": {
+                    "cumulated_p": m.whiteness.cumulated,
+                    "innovations_p": m.whiteness.innovations,
+                    "unexplained": m.whiteness.left,
+                    "white": m.whiteness.white,
+                    "remarks": list(m.whiteness.remarks),
+                },
             }
             for m in result.modes
         ],

@@ -88,13 +88,23 @@ class Identified:
             room for. Wind, damping and strength of turbulence become the means over the modes, for who goes on from there.
         """
         out = (base or Scenario()).before_events.replace(
-            {"telescope.radial_order": _order(len(self.modes)), "sensors.lgs_rate": 1.0 / self.dt})
+            {"telescope.radial_order": _order(len(self.modes)), "sensors.lgs_rate": 1.0 / self.dt}
+        )
         changes: dict[str, Any] = {path: number.value for path, number in self.shared(out).items()}
-        return out.replace(changes | fitting(out, 0.5 / self.dt) | told([mode.prior for mode in self.modes], out) | {
-            "sensors.noise_from": "nm", "sensors.lgs_combination": "mean", "sensors.lgs_low_frequency_rms": 0.0,
-            "sensors.tip_tilt_indetermination": False,
-            "kalman.process_noise": "matched", "kalman.measurement_noise": "matched", "kalman.peak": "matched",
-        })
+        return out.replace(
+            changes
+            | fitting(out, 0.5 / self.dt)
+            | told([mode.prior for mode in self.modes], out)
+            | {
+                "sensors.noise_from": "nm",
+                "sensors.lgs_combination": "mean",
+                "sensors.lgs_low_frequency_rms": 0.0,
+                "sensors.tip_tilt_indetermination": False,
+                "kalman.process_noise": "matched",
+                "kalman.measurement_noise": "matched",
+                "kalman.peak": "matched",
+            }
+        )
 
     def shared(self, scenario: Scenario) -> dict[str, Number]:
         """Dotted path -> number of the settings that all modes share, and their errors; within what the settings allow."""
@@ -135,8 +145,12 @@ def read_off(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> I
     peaks = sorted((p for p in found if p.frequency.value >= lowest), key=lambda p: p.frequency.value)
     s = mode.spectrum
     shapes = (p for p, is_smooth in zip(s.resonances, smooth, strict=True) if is_smooth)
-    prior = Lines(s.noise, s.dt, tuple(p for p in (s.turbulence, s.background, *shapes) if p is not None),
-                  tuple(Line(p.frequency.value, p.damping.value, p.rms.value) for p in peaks))
+    prior = Lines(
+        s.noise,
+        s.dt,
+        tuple(p for p in (s.turbulence, s.background, *shapes) if p is not None),
+        tuple(Line(p.frequency.value, p.damping.value, p.rms.value) for p in peaks),
+    )
     return IdentifiedMode(name, known(noise), turbulence, background, tuple(peaks), tuple(broad), s, prior, whiteness)
 
 
@@ -146,9 +160,12 @@ def _process(p: Ar2 | Ar3, std: Array) -> Process:
     at_bound = p.damping > HIGHEST - 1e-4
     beyond = p.corner / p.omega - 1.0 if isinstance(p, Ar3) else 0.0
     third = Number(1.0 + beyond, max(beyond, NO_NEARER - 1.0) * float(std[3])) if isinstance(p, Ar3) else None
-    return Process(known(_scaled(Number(1.0, float(std[0])), p.omega / (2 * pi))),
-                   known(Number(p.damping, nan if at_bound else float(std[1]))),
-                   known(_scaled(Number(1.0, float(std[2])), p.rms)), third and known(third))
+    return Process(
+        known(_scaled(Number(1.0, float(std[0])), p.omega / (2 * pi))),
+        known(Number(p.damping, nan if at_bound else float(std[1]))),
+        known(_scaled(Number(1.0, float(std[2])), p.rms)),
+        third and known(third),
+    )
 
 
 def _scaled(n: Number, factor: float) -> Number:

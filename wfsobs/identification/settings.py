@@ -24,14 +24,19 @@ def told(priors: Sequence[Lines], scenario: Scenario) -> dict[str, Any]:
     lines = sorted((line, i) for i, prior in enumerate(priors) for line in prior.lines)
     peaks = [{"frequency": line.frequency, "damping": line.damping, "rms": _alone(line.rms, i, modes)} for line, i in lines]
     changes: dict[str, Any] = {
-        "turbulence.source": "processes" if smooth else "none", "turbulence.processes": smooth,
-        "vibration.source": "peaks" if peaks else "none", "vibration.peaks": peaks,
+        "turbulence.source": "processes" if smooth else "none",
+        "turbulence.processes": smooth,
+        "vibration.source": "peaks" if peaks else "none",
+        "vibration.peaks": peaks,
         "sensors.lgs_noise_per_mode": [min(p.noise * sqrt(scenario.sensors.lgs_count), LARGEST) for p in priors],
     }
     if lines:
         strongest, highest = max((line for line, _ in lines), key=lambda line: line.rms), lines[-1][0].frequency
-        changes |= {"vibration.cutoff": min(max(scenario.vibration.cutoff, 1.2 * highest), HIGHEST),
-                    "kalman.frequency": strongest.frequency, "kalman.damping": strongest.damping}
+        changes |= {
+            "vibration.cutoff": min(max(scenario.vibration.cutoff, 1.2 * highest), HIGHEST),
+            "kalman.frequency": strongest.frequency,
+            "kalman.damping": strongest.damping,
+        }
     return changes
 
 
@@ -50,8 +55,12 @@ def fitting(scenario: Scenario, nyquist: float) -> dict[str, Any]:
 
 
 def _process(p: Ar2 | Ar3, rms: list[float]) -> dict[str, Any]:
-    return {"frequency": p.omega / (2 * pi), "damping": max(p.damping, LEAST), "rms": rms,
-            "third_corner": p.corner / p.omega if isinstance(p, Ar3) else 0.0}
+    return {
+        "frequency": p.omega / (2 * pi),
+        "damping": max(p.damping, LEAST),
+        "rms": rms,
+        "third_corner": p.corner / p.omega if isinstance(p, Ar3) else 0.0,
+    }
 
 
 def _alone(rms: float, mode: int, modes: int) -> list[float]:

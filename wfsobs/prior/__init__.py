@@ -13,7 +13,11 @@ Part = type[Model] | type[LgsError] | type[Lines] | type[Bands] | type[Training]
 """A kind of thing that an observer can ask for."""
 
 PARTS: dict[Part, tuple[str, ...]] = {
-    Model: ("model",), LgsError: ("model",), Lines: ("model", "true lines"), Bands: ("bands",), Training: ("training data",),
+    Model: ("model",),
+    LgsError: ("model",),
+    Lines: ("model", "true lines"),
+    Bands: ("bands",),
+    Training: ("training data",),
 }
 """Part -> what it is called in the column "Needs"."""
 

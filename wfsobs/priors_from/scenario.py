@@ -108,8 +108,12 @@ def lines_of(scenario: Scenario, mode: int, dt: float | None = None) -> Lines:
     if scenario.vibration.source == "psd":
         raise ValueError("vibration.source = psd is a table, not lines that a model could have")
     dt = dt or scenario.dt
-    return Lines(measurement_noise(scenario, mode)[0], dt, _turbulence(scenario, mode, dt),
-                 tuple(Line(*line) for line in vibration_lines(scenario, mode)))
+    return Lines(
+        measurement_noise(scenario, mode)[0],
+        dt,
+        _turbulence(scenario, mode, dt),
+        tuple(Line(*line) for line in vibration_lines(scenario, mode)),
+    )
 
 
 def multi_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:

@@ -44,8 +44,12 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise NotToml(f"not TOML: {error}") from None
     level: list[Any] = [values]
     for _ in range(DEEPEST + 1):  # level by level: a recursion would end where the parser's did
-        level = [child for node in level if isinstance(node, (dict, list))
-                 for child in (node.values() if isinstance(node, dict) else node)]
+        level = [
+            child
+            for node in level
+            if isinstance(node, (dict, list))
+            for child in (node.values() if isinstance(node, dict) else node)
+        ]
     if level:
         raise too_deep
     return values

@@ -23,6 +23,8 @@ def fit(settings: LensletArrays, kind: Kind, diameter: float, wanted: int) -> tu
     except ValueError as error:
         raise SettingError(f"{name}: {error}") from None
     if order < wanted:
-        raise SettingError(f"{name}: with sensors.lenslets.fitted_order = {settings.fitted_order} these fit modes up to radial "
-                           f"order {order}, fewer than telescope.radial_order = {wanted}")
+        raise SettingError(
+            f"{name}: with sensors.lenslets.fitted_order = {settings.fitted_order} these fit modes up to radial "
+            f"order {order}, fewer than telescope.radial_order = {wanted}"
+        )
     return lenslets, order

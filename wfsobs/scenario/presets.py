@@ -71,12 +71,15 @@ def paper() -> Scenario:
       regularly" as the paper says of it. The reproduction page shows both.
     """
     s = Scenario()
-    s.update({
-        "vibration": {"synthesis": "random-phase", "peaks": [
-            {"frequency": f, "damping": xi, "rms": [tip, tilt]} for f, xi, tip, tilt in MAVIS_PEAKS
-        ]},
-        "kalman": {"process_noise": "manual", "turbulence_rms": 0.5, "vibration_rms": 0.06},
-    })
+    s.update(
+        {
+            "vibration": {
+                "synthesis": "random-phase",
+                "peaks": [{"frequency": f, "damping": xi, "rms": [tip, tilt]} for f, xi, tip, tilt in MAVIS_PEAKS],
+            },
+            "kalman": {"process_noise": "manual", "turbulence_rms": 0.5, "vibration_rms": 0.06},
+        }
+    )
     return s
 
 
@@ -90,12 +93,14 @@ def ut4() -> Scenario:
       the multi-peak one with turbulence of third order.
     """
     s = Scenario()
-    s.update({
-        "turbulence": {"source": "frozen-flow"},
-        "vibration": {"source": "measured", "spectrum": "eris-ut4", "part": "lines", "cutoff": 100.0},
-        "kalman": {"frequency": 48.31, "damping": 0.001},
-        "multipeak": {"turbulence_order": 3},
-    })
+    s.update(
+        {
+            "turbulence": {"source": "frozen-flow"},
+            "vibration": {"source": "measured", "spectrum": "eris-ut4", "part": "lines", "cutoff": 100.0},
+            "kalman": {"frequency": 48.31, "damping": 0.001},
+            "multipeak": {"turbulence_order": 3},
+        }
+    )
     return s
 
 
@@ -127,14 +132,21 @@ def galacsi_nfm() -> Scenario:
     layer's wind is a multiple of `turbulence.wind_speed` = 10 m/s. Noise is the default, vibration that of `ut4`.
     """
     s = ut4()
-    s.update({
-        "telescope": {"zenith_angle": 24.0},
-        "turbulence": {"r0": 0.151, "outer_scale": 27.44, "wind_speed": 10.0, "layers": [
-            {"height": h, "fraction": share, "wind_factor": wind / 10.0, "wind_direction": to}
-            for h, share, wind, to in MUSE_LAYERS
-        ]},
-        "sensors": {"lgs_count": 4, "lgs_radius": 7.5},
-    })
+    s.update(
+        {
+            "telescope": {"zenith_angle": 24.0},
+            "turbulence": {
+                "r0": 0.151,
+                "outer_scale": 27.44,
+                "wind_speed": 10.0,
+                "layers": [
+                    {"height": h, "fraction": share, "wind_factor": wind / 10.0, "wind_direction": to}
+                    for h, share, wind, to in MUSE_LAYERS
+                ],
+            },
+            "sensors": {"lgs_count": 4, "lgs_radius": 7.5},
+        }
+    )
     return s
 
 
@@ -169,17 +181,21 @@ def peak_jump() -> Scenario:
       band, and what jumps out of it is lost to it (docs/events.md).
     """
     s = _system()
-    s.update({
-        "vibration": {"peaks": [
-            {"frequency": 17.25, "damping": 0.013, "rms": [0.003, 0.003]},
-            {"frequency": 23.87, "damping": 0.011, "rms": [0.002, 0.003]},
-            {"frequency": 47.5, "damping": 0.0, "rms": [0.03, 0.02]},
-        ]},
-        "kalman": {"frequency": 47.5, "damping": 0.003, "process_noise": "matched"},
-        "butterworth": {"frequencies": [50.0], "bandwidth_offline": 20.0, "bandwidth_online": 20.0},
-        "run": {"duration": 20.0},
-        "events": [{"kind": "peak", "start": 8.0, "peak": 2, "frequency_shift": 3.0}],
-    })
+    s.update(
+        {
+            "vibration": {
+                "peaks": [
+                    {"frequency": 17.25, "damping": 0.013, "rms": [0.003, 0.003]},
+                    {"frequency": 23.87, "damping": 0.011, "rms": [0.002, 0.003]},
+                    {"frequency": 47.5, "damping": 0.0, "rms": [0.03, 0.02]},
+                ]
+            },
+            "kalman": {"frequency": 47.5, "damping": 0.003, "process_noise": "matched"},
+            "butterworth": {"frequencies": [50.0], "bandwidth_offline": 20.0, "bandwidth_online": 20.0},
+            "run": {"duration": 20.0},
+            "events": [{"kind": "peak", "start": 8.0, "peak": 2, "frequency_shift": 3.0}],
+        }
+    )
     return s
 
 
@@ -206,29 +222,46 @@ def laser_dropout() -> Scenario:
     With one LGS its noise and its slow error are no longer halved; without any there are NGS frames alone.
     """
     s = _system()
-    s.update({
-        "kalman": {"process_noise": "matched"}, "run": {"duration": 20.0}, "events": [
-            {"kind": "laser", "start": 6.0, "duration": 4.0, "lasers": 1},
-            {"kind": "laser", "start": 15.0, "duration": 1.0, "lasers": 2},
-        ]})
+    s.update(
+        {
+            "kalman": {"process_noise": "matched"},
+            "run": {"duration": 20.0},
+            "events": [
+                {"kind": "laser", "start": 6.0, "duration": 4.0, "lasers": 1},
+                {"kind": "laser", "start": 15.0, "duration": 1.0, "lasers": 2},
+            ],
+        }
+    )
     return s
 
 
 def lost_frames() -> Scenario:
     """The paper's system; it loses half the LGS frames for 5 s, later half the NGS frames."""
     s = _system()
-    s.update({
-        "kalman": {"process_noise": "matched"}, "run": {"duration": 20.0}, "events": [
-            {"kind": "frames", "start": 5.0, "duration": 5.0, "sensor": "lgs", "share": 0.5},
-            {"kind": "frames", "start": 13.0, "duration": 5.0, "sensor": "ngs", "share": 0.5},
-        ]})
+    s.update(
+        {
+            "kalman": {"process_noise": "matched"},
+            "run": {"duration": 20.0},
+            "events": [
+                {"kind": "frames", "start": 5.0, "duration": 5.0, "sensor": "lgs", "share": 0.5},
+                {"kind": "frames", "start": 13.0, "duration": 5.0, "sensor": "ngs", "share": 0.5},
+            ],
+        }
+    )
     return s
 
 
 PRESETS: dict[str, Callable[[], Scenario]] = {
-    "paper": paper, "strong-turbulence": strong_turbulence, "ut4": ut4, "ut4-floor": ut4_floor,
-    "galacsi-nfm": galacsi_nfm, "galacsi-wfm": galacsi_wfm,
+    "paper": paper,
+    "strong-turbulence": strong_turbulence,
+    "ut4": ut4,
+    "ut4-floor": ut4_floor,
+    "galacsi-nfm": galacsi_nfm,
+    "galacsi-wfm": galacsi_wfm,
     "higher-orders": higher_orders,
-    "peak-jump": peak_jump, "peak-drift": peak_drift, "wind-change": wind_change, "laser-dropout": laser_dropout,
+    "peak-jump": peak_jump,
+    "peak-drift": peak_drift,
+    "wind-change": wind_change,
+    "laser-dropout": laser_dropout,
     "lost-frames": lost_frames,
 }

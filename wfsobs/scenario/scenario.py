@@ -94,8 +94,9 @@ class Scenario(Group):
             raise SettingError(f"run.warm_up = {self.run.warm_up:g}: must be below run.duration = {self.run.duration:g} s")
         for i, peak in enumerate(self.vibration.peaks):
             if peak.frequency >= nyquist:
-                raise SettingError(f"vibration.peaks.{i}.frequency = {peak.frequency:g}: must be below half the "
-                                   f"LGS rate, {nyquist:g} Hz")
+                raise SettingError(
+                    f"vibration.peaks.{i}.frequency = {peak.frequency:g}: must be below half the LGS rate, {nyquist:g} Hz"
+                )
         if self.kalman.frequency >= nyquist:
             raise SettingError(f"kalman.frequency = {self.kalman.frequency:g}: must be below half the LGS rate, {nyquist:g} Hz")
         if self.vibration.source == "psd":
@@ -105,15 +106,18 @@ class Scenario(Group):
         if self.turbulence.source == "frozen-flow":
             self._validate_layers()
         if self.sensors.noise_from == "photons" or (
-                self.turbulence.source == "frozen-flow" and self.sensors.kind == "shack-hartmann"):
+            self.turbulence.source == "frozen-flow" and self.sensors.kind == "shack-hartmann"
+        ):
             for kind in ("lgs", "ngs"):
                 fit(self.sensors.lenslets, kind, self.telescope.diameter, self.telescope.radial_order)
         self._validate_events()
         widest = max(self.butterworth.bandwidth_offline, self.butterworth.bandwidth_online) / 2
         for i, f in enumerate(self.butterworth.frequencies):
             if not (f - widest > 0 and f + widest < nyquist):
-                raise SettingError(f"butterworth.frequencies.{i} = {f:g}: the band of +- {widest:g} Hz around it must lie "
-                                   f"between 0 and half the LGS rate, {nyquist:g} Hz")
+                raise SettingError(
+                    f"butterworth.frequencies.{i} = {f:g}: the band of +- {widest:g} Hz around it must lie "
+                    f"between 0 and half the LGS rate, {nyquist:g} Hz"
+                )
 
     def _validate_events(self) -> None:
         stars = self.sensors.lgs_count
@@ -127,8 +131,10 @@ class Scenario(Group):
             if event.kind == PEAK:
                 self._validate_moving_peak(i, event)
         if self.air > (MOST_AIR + 1e-9) * self.run.duration:
-            raise SettingError(f"events: the wind carries {self.air:.3g} s of turbulence past in {self.run.duration:g} s; at "
-                               f"most {MOST_AIR:g} times as much as the record is long")
+            raise SettingError(
+                f"events: the wind carries {self.air:.3g} s of turbulence past in {self.run.duration:g} s; at "
+                f"most {MOST_AIR:g} times as much as the record is long"
+            )
 
     def _validate_moving_peak(self, i: int, event: Event) -> None:
         v, nyquist = self.vibration, self.sensors.lgs_rate / 2
@@ -141,24 +147,32 @@ class Scenario(Group):
         reached = v.peaks[event.peak].frequency + shift(own, np.minimum(turning, self.run.duration))
         for f in reached:
             if not 0 < f < nyquist:
-                raise SettingError(f"events.{i}.frequency_shift = {event.frequency_shift:g}: moves peak {event.peak} to {f:g} "
-                                   f"Hz; it must stay between 0 and half the LGS rate, {nyquist:g} Hz")
+                raise SettingError(
+                    f"events.{i}.frequency_shift = {event.frequency_shift:g}: moves peak {event.peak} to {f:g} "
+                    f"Hz; it must stay between 0 and half the LGS rate, {nyquist:g} Hz"
+                )
 
     def _validate_layers(self) -> None:
         layers, smallest = self.turbulence.layers, SMALLEST * self.telescope.diameter
         if self.turbulence.outer_scale < smallest:
-            raise SettingError(f"turbulence.outer_scale = {self.turbulence.outer_scale:g}: frozen flow takes {SMALLEST:g} of "
-                               f"telescope.diameter or more, {smallest:g} m")
+            raise SettingError(
+                f"turbulence.outer_scale = {self.turbulence.outer_scale:g}: frozen flow takes {SMALLEST:g} of "
+                f"telescope.diameter or more, {smallest:g} m"
+            )
         if not sum(layer.fraction for layer in layers) > 0:
             raise SettingError("turbulence.layers: needs a layer of a fraction above 0, for turbulence.source = frozen-flow")
         for i, layer in enumerate(layers):
             if layer.height > HIGHEST * self.sensors.lgs_altitude:
-                raise SettingError(f"turbulence.layers.{i}.height = {layer.height:g}: takes up to {HIGHEST:g} of "
-                                   f"sensors.lgs_altitude, {HIGHEST * self.sensors.lgs_altitude:g} m")
+                raise SettingError(
+                    f"turbulence.layers.{i}.height = {layer.height:g}: takes up to {HIGHEST:g} of "
+                    f"sensors.lgs_altitude, {HIGHEST * self.sensors.lgs_altitude:g} m"
+                )
             crossing = self.telescope.diameter / (self.turbulence.wind_speed * layer.wind_factor)
             if crossing * self.sensors.lgs_rate > SLOWEST:
-                raise SettingError(f"turbulence.layers.{i}.wind_factor = {layer.wind_factor:g}: it takes {crossing:.3g} s to "
-                                   f"cross the aperture, at most {SLOWEST / self.sensors.lgs_rate:.3g} s at this LGS rate")
+                raise SettingError(
+                    f"turbulence.layers.{i}.wind_factor = {layer.wind_factor:g}: it takes {crossing:.3g} s to "
+                    f"cross the aperture, at most {SLOWEST / self.sensors.lgs_rate:.3g} s at this LGS rate"
+                )
 
 
 def _validate_psd(psd: PsdTable, group: str) -> None:

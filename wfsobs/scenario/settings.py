@@ -78,6 +78,7 @@ class Group(param.Parameterized):
 
     def _changed(self) -> list[tuple[str, str]]:
         """(dotted path, value, shortened) of the settings that are not at their defaults."""
+
         def text(value: Any) -> str:
             return f"[{len(value)} entries]" if isinstance(value, list) and len(value) > 3 else _short(value, 40)
 

@@ -23,13 +23,16 @@ def reconstructor(lenslets: Lenslets, order: int) -> Array:
         raise ValueError(f"no subaperture of {lenslets.across} x {lenslets.across} is lit to {lenslets.illumination:g}")
     matrix = interaction(lenslets, order)
     if 2 * lenslets.count < matrix.shape[1]:
-        raise ValueError(f"{lenslets.count} subapertures cannot tell the {matrix.shape[1]} modes up to radial order {order} "
-                         "apart")
+        raise ValueError(
+            f"{lenslets.count} subapertures cannot tell the {matrix.shape[1]} modes up to radial order {order} apart"
+        )
     size = np.linalg.norm(matrix, axis=0)
     condition = np.linalg.cond(matrix / size)
     if not condition <= MAX_CONDITION:
-        raise ValueError(f"{lenslets.count} subapertures hardly tell the modes up to radial order {order} apart "
-                         f"(condition {condition:.2g}, at most {MAX_CONDITION:g})")
+        raise ValueError(
+            f"{lenslets.count} subapertures hardly tell the modes up to radial order {order} apart "
+            f"(condition {condition:.2g}, at most {MAX_CONDITION:g})"
+        )
     out = np.linalg.pinv(matrix / size) / size[:, None]
     out.setflags(write=False)
     return out

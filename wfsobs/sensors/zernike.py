@@ -17,8 +17,17 @@ from wfsobs.atmosphere.plane_waves import Footprint, Wave
 from wfsobs.typing import Array
 
 NAMES = {
-    1: "piston", 2: "tip", 3: "tilt", 4: "defocus", 5: "oblique astigmatism", 6: "vertical astigmatism", 7: "vertical coma",
-    8: "horizontal coma", 9: "vertical trefoil", 10: "oblique trefoil", 11: "spherical",
+    1: "piston",
+    2: "tip",
+    3: "tilt",
+    4: "defocus",
+    5: "oblique astigmatism",
+    6: "vertical astigmatism",
+    7: "vertical coma",
+    8: "horizontal coma",
+    9: "vertical trefoil",
+    10: "oblique trefoil",
+    11: "spherical",
 }
 
 
@@ -88,8 +97,13 @@ def noll_covariance(j: int, i: int) -> float:
         return 0.0
     numeric = gamma(14 / 3) * (4.8 * gamma(6 / 5)) ** (5 / 6) * gamma(11 / 6) ** 2 / (2.0 ** (8 / 3) * math.pi)
     sign = (-1) ** ((n + p - 2 * abs(m)) // 2)
-    return numeric * sign * math.sqrt((n + 1.0) * (p + 1.0)) * gamma((n + p - 5 / 3) / 2) / (
-        gamma((n - p + 17 / 3) / 2) * gamma((p - n + 17 / 3) / 2) * gamma((n + p + 23 / 3) / 2))
+    return (
+        numeric
+        * sign
+        * math.sqrt((n + 1.0) * (p + 1.0))
+        * gamma((n + p - 5 / 3) / 2)
+        / (gamma((n - p + 17 / 3) / 2) * gamma((p - n + 17 / 3) / 2) * gamma((n + p + 23 / 3) / 2))
+    )
 
 
 TABLE_STEP, TABLE_END = 0.005, 1024.0

@@ -13,10 +13,7 @@ from wfsobs.typing import Array
 
 def bandpass_bank(frequencies: Sequence[float], bandwidth: float, order: int, dt: float) -> list[Array]:
     """Second-order sections of one digital Butterworth band-pass per centre, edges centre +- bandwidth / 2 [Hz]."""
-    return [
-        butter(order, [f - bandwidth / 2.0, f + bandwidth / 2.0], "bandpass", fs=1.0 / dt, output="sos")
-        for f in frequencies
-    ]
+    return [butter(order, [f - bandwidth / 2.0, f + bandwidth / 2.0], "bandpass", fs=1.0 / dt, output="sos") for f in frequencies]
 
 
 def filter_causal(bank: Sequence[Array], x: Array) -> Array:

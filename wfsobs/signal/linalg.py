@@ -88,6 +88,17 @@ def _eliminate_panel(S: Array, n: int) -> None:
 def solved_rows(S: Array, n: int) -> Array:
     """S21 S11^-1, (N - n, n), from what `eliminate` left of S; in place, over what was S21."""
     size, lead, here = S.shape[0], _int(S.strides[1] // S.itemsize), S.ctypes.data
-    _trsm(_char(b"R"), _char(b"L"), _char(b"N"), _char(b"N"), _int(size - n), _int(n), _real(1.0), here, lead,
-          here + n * S.itemsize, lead)
+    _trsm(
+        _char(b"R"),
+        _char(b"L"),
+        _char(b"N"),
+        _char(b"N"),
+        _int(size - n),
+        _int(n),
+        _real(1.0),
+        here,
+        lead,
+        here + n * S.itemsize,
+        lead,
+    )
     return S[n:, :n]

@@ -65,8 +65,10 @@ def periodic_steady_state(cycle: Sequence[Step]) -> list[SteadyState]:
         found = _refined(cycle, _without_measurements(cycle))
     residual = found[0].residual
     if not residual <= RESIDUAL:
-        raise RiccatiError(f"no accurate steady-state filter: the Riccati equation is met to {residual:.1e} only; "
-                           "measurement noise and process noise are too far apart")
+        raise RiccatiError(
+            f"no accurate steady-state filter: the Riccati equation is met to {residual:.1e} only; "
+            "measurement noise and process noise are too far apart"
+        )
     radius = np.abs(np.linalg.eigvals(_closed_loop(cycle, found))).max()
     if radius >= 1.0:
         raise RiccatiError(f"the steady-state filter is not stable: spectral radius {radius:.6f}")

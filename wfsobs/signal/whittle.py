@@ -37,8 +37,9 @@ def information(log_slopes: Array, count: Array) -> Array:
     return (log_slopes * count) @ log_slopes.T
 
 
-def whittle_fit(density: Density, log_slopes: LogSlopes, start: Array, bounds: Array, mean: Array, count: Array,
-                tolerance: float, steps: int) -> Array:
+def whittle_fit(
+    density: Density, log_slopes: LogSlopes, start: Array, bounds: Array, mean: Array, count: Array, tolerance: float, steps: int
+) -> Array:
     """Find the parameters (p,) of the least - log L near a start.
 
     start : (p,); bounds : least and greatest value of each, (p, 2); mean, count : I and m at the frequencies of `density`, (n,);
@@ -77,6 +78,12 @@ def whittle_fit(density: Density, log_slopes: LogSlopes, start: Array, bounds: A
         move = scale * half * np.cos(t)
         return information(d, count) * np.outer(move, move) + np.diag(1e-9 - scale**2 * half * np.sin(t) * by_x)
 
-    found = minimize(value, np.zeros(len(start)), jac=gradient, hess=curvature, method="trust-exact",
-                     options={"maxiter": steps, "gtol": tolerance, "initial_trust_radius": 3.0, "max_trust_radius": 1e4})
+    found = minimize(
+        value,
+        np.zeros(len(start)),
+        jac=gradient,
+        hess=curvature,
+        method="trust-exact",
+        options={"maxiter": steps, "gtol": tolerance, "initial_trust_radius": 3.0, "max_trust_radius": 1e4},
+    )
     return at(found.x.tobytes())[1]

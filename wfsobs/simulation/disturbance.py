@@ -46,9 +46,7 @@ class Disturbance:
         return self.turbulence + self.vibration
 
 
-def make_disturbance(
-    scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch = QUIET
-) -> Disturbance:
+def make_disturbance(scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch = QUIET) -> Disturbance:
     """Both disturbances over `n_steps`. Every source and mode has a random stream of its own, so
     changing one setting leaves the others' numbers as they were."""
     turbulence_rng, vibration_rng = rng.spawn(2)
@@ -56,8 +54,11 @@ def make_disturbance(
     air = SOURCES[scenario.turbulence.source](scenario, events.steps_of_air(at, n_steps), turbulence_rng, watch)
     vibration = columns(VIBRATION[scenario.vibration.source], scenario, n_steps, vibration_rng, watch)
     return Disturbance(
-        events.read(air.on_axis, at), vibration, None if air.ngs is None else events.read(air.ngs, at),
-        None if air.lgs is None else tuple(events.read(x, at) for x in air.lgs))
+        events.read(air.on_axis, at),
+        vibration,
+        None if air.ngs is None else events.read(air.ngs, at),
+        None if air.lgs is None else tuple(events.read(x, at) for x in air.lgs),
+    )
 
 
 def peak_rms(peak_rms_list: list[float], mode: int) -> float:
@@ -184,5 +185,9 @@ def _below_cutoff(scenario: Scenario, power: Array, n: int) -> Array:
 
 
 VIBRATION: dict[str, ModeSource] = {
-    "peaks": _dft_vibration, "psd": _dft_vibration, "measured": _dft_vibration, "ar2": _ar2_vibration, "none": _no_vibration,
+    "peaks": _dft_vibration,
+    "psd": _dft_vibration,
+    "measured": _dft_vibration,
+    "ar2": _ar2_vibration,
+    "none": _no_vibration,
 }

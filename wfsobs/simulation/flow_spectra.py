@@ -57,9 +57,14 @@ def _frequencies(scenario: Scenario, speed: float, highest: float) -> Array:
     """Where the densities are computed: by ratio, then by the width of the ripples of the slowest layer, then by ratio again."""
     ripple = speed / scenario.telescope.diameter
     lowest = min(LOWEST * speed / scenario.turbulence.outer_scale, 0.01 * ripple)
-    f = np.concatenate([
-        np.geomspace(lowest, ripple / 40, 32, endpoint=False), ripple / 40 * np.arange(1, 160),
-        ripple / 12 * np.arange(48, 12 * RIPPLES), np.geomspace(RIPPLES * ripple, max(highest, 2 * RIPPLES * ripple), 48)])
+    f = np.concatenate(
+        [
+            np.geomspace(lowest, ripple / 40, 32, endpoint=False),
+            ripple / 40 * np.arange(1, 160),
+            ripple / 12 * np.arange(48, 12 * RIPPLES),
+            np.geomspace(RIPPLES * ripple, max(highest, 2 * RIPPLES * ripple), 48),
+        ]
+    )
     return f[: int(np.searchsorted(f, highest)) + 1]
 
 
@@ -89,8 +94,11 @@ def _block(scenario: Scenario, mode: int, layer: Layer, kx: Array, front: float)
         ky, weight = across(q0, front, *fine_rule(layer.height, diameter))
     else:
         ky, weight = across(float(np.hypot(q0, kx[0])), 4.0 * kx[-1], np.inf, 0.25)
-    density = (4.0 * np.pi / layer.speed) * weight[:, None] * spectrum(
-        kx**2 + ky[:, None] ** 2, layer.strength, scenario.turbulence.outer_scale)
+    density = (
+        (4.0 * np.pi / layer.speed)
+        * weight[:, None]
+        * spectrum(kx**2 + ky[:, None] ** 2, layer.strength, scenario.turbulence.outer_scale)
+    )
     c, s = np.cos(layer.angle), np.sin(layer.angle)
     x, y = c * kx - s * ky[:, None], s * kx + c * ky[:, None]
     own = _of_mode(scenario, mode, x, y, Footprint())

@@ -42,9 +42,14 @@ def layers(scenario: Scenario) -> tuple[Layer, ...]:
     total = sum(layer.fraction for layer in t.layers)
     strength = t.r0 ** (-5.0 / 3.0) * way
     return tuple(
-        Layer(strength * layer.fraction / total, layer.height * way, t.wind_speed * layer.wind_factor, float(np.radians(
-            layer.wind_direction)))
-        for layer in t.layers)
+        Layer(
+            strength * layer.fraction / total,
+            layer.height * way,
+            t.wind_speed * layer.wind_factor,
+            float(np.radians(layer.wind_direction)),
+        )
+        for layer in t.layers
+    )
 
 
 def effective_wind(scenario: Scenario) -> float:
@@ -78,8 +83,7 @@ def laser_stars(scenario: Scenario) -> list[Star]:
 def view(sensor: Sensor, star: Star, of: tuple[Layer, ...]) -> View:
     """A sensor on a star, through these layers."""
     (x, y), distance = star
-    return View(sensor, tuple(
-        Footprint(1.0 - layer.height / distance, (layer.height * x, layer.height * y)) for layer in of))
+    return View(sensor, tuple(Footprint(1.0 - layer.height / distance, (layer.height * x, layer.height * y)) for layer in of))
 
 
 def ideal_sensor(scenario: Scenario) -> ZernikeProjection:
@@ -128,7 +132,8 @@ def frozen_flow_variance(scenario: Scenario, mode: int) -> float:
     """Variance [um^2] of one mode on the axis."""
     strength = sum(layer.strength for layer in layers(scenario))
     return mode_variance(
-        scenario.modes[mode].radial_order, scenario.telescope.diameter, strength, scenario.turbulence.outer_scale)
+        scenario.modes[mode].radial_order, scenario.telescope.diameter, strength, scenario.turbulence.outer_scale
+    )
 
 
 def star_covariance(scenario: Scenario) -> Array:
@@ -145,7 +150,8 @@ def _covariance(sensor: ZernikeProjection, of: tuple[Layer, ...], outer_scale: f
     total = np.zeros((n, n))
     for i, layer in enumerate(of):
         nodes, weights = across(
-            2.0 * np.pi / outer_scale, CORE / (0.5 * sensor.diameter), *fine_rule(layer.height, sensor.diameter))
+            2.0 * np.pi / outer_scale, CORE / (0.5 * sensor.diameter), *fine_rule(layer.height, sensor.diameter)
+        )
         half = nodes.size // 2
         kx, ky = nodes[half:], nodes[:, None]
         power = 2.0 * weights[half:] * weights[:, None] * spectrum(kx**2 + ky**2, layer.strength, outer_scale)

@@ -26,9 +26,7 @@ class OpenLoop:
     ngs: Array
 
 
-def measure(
-    scenario: Scenario, disturbance: Disturbance, rng: np.random.Generator, watch: Watch = QUIET
-) -> OpenLoop:
+def measure(scenario: Scenario, disturbance: Disturbance, rng: np.random.Generator, watch: Watch = QUIET) -> OpenLoop:
     """LGS at every step, NGS at every n-th, both of the wavefront up to the step before.
 
     LGS: the mean over the guide stars of phi_dist[k-1] + error (paper, eq. 3), or their combination of minimum variance, each

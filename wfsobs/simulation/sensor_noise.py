@@ -80,7 +80,8 @@ def aliasing_rms(scenario: Scenario, kind: Kind) -> Array:
     star = atmosphere.laser_stars(scenario)[0] if kind == "lgs" else atmosphere.natural_star(scenario)
     variance = sum(
         np.diag(error.covariance(layer.strength, outer_scale, footprint.scale))
-        for layer, footprint in zip(layers, atmosphere.view(error.sensor, star, layers).footprints, strict=True))
+        for layer, footprint in zip(layers, atmosphere.view(error.sensor, star, layers).footprints, strict=True)
+    )
     return np.sqrt(variance)
 
 

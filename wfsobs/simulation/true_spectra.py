@@ -60,7 +60,6 @@ class TrueSpectra:
         """(signal, shared) of the whole disturbance; turbulence and vibration are independent."""
         return sum(self.signal.values(), np.zeros(1)), sum(self.shared.values(), np.zeros(1))
 
-
     @property
     def without_lines(self) -> TrueSpectra:
         """What is left to be estimated once the pure lines are known."""
@@ -69,8 +68,8 @@ class TrueSpectra:
         return TrueSpectra(
             self.measured - self.gain**2 * self.lines,
             self.signal | {"vibration": self.signal["vibration"] - self.lines},
-            self.shared | {"vibration": self.shared["vibration"] - self.gain * self.lines})
-
+            self.shared | {"vibration": self.shared["vibration"] - self.gain * self.lines},
+        )
 
     def line_covariance(self, n: int) -> Array:
         """Autocovariance of the pure lines at the lags 0 to n - 1, (n,)."""
@@ -90,7 +89,9 @@ def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
         measured=seen + gain**2 * vibration + max(lgs_noise_rms(scenario, mode), FLOOR) ** 2,
         signal={"turbulence": turbulence, "vibration": vibration},
         shared={"turbulence": shared, "vibration": gain * vibration},
-        lines=lines, gain=float(gain), pure=tuple((f * scenario.dt, variance) for f, variance in pure_lines(scenario, mode)),
+        lines=lines,
+        gain=float(gain),
+        pure=tuple((f * scenario.dt, variance) for f, variance in pure_lines(scenario, mode)),
     )
 
 
@@ -201,7 +202,11 @@ def _pure_lines(scenario: Scenario, mode: int, n: int) -> Array | None:
 
 
 TURBULENCE_SPECTRA: dict[str, Callable[[Scenario, int, int], Looks]] = {
-    "ar2": _ar2_turbulence, "ar3": _ar3_turbulence, "processes": _sum_of_processes,
-    "frozen-flow": _frozen_flow, "psd": _table, "none": _no_turbulence,
+    "ar2": _ar2_turbulence,
+    "ar3": _ar3_turbulence,
+    "processes": _sum_of_processes,
+    "frozen-flow": _frozen_flow,
+    "psd": _table,
+    "none": _no_turbulence,
 }
 """How the turbulence of each source looks to `true_spectra`."""

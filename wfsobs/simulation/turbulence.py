@@ -52,7 +52,8 @@ def turbulence_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
         strongest = max(found, key=lambda p: p.rms)
         return Ar2(strongest.omega, strongest.damping, rms, dt)
     corner = turbulence_corner(
-        atmosphere.effective_wind(scenario), scenario.telescope.diameter, scenario.modes[mode].radial_order)
+        atmosphere.effective_wind(scenario), scenario.telescope.diameter, scenario.modes[mode].radial_order
+    )
     return Ar2(corner, scenario.turbulence.damping, rms, dt)
 
 
@@ -128,8 +129,10 @@ def _ar3(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Arr
 
 def _processes(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
     found = processes(scenario, mode, scenario.dt)
-    parts = [sampled(p, n, own) if isinstance(p, Ar3) else p.sample(n, own)
-             for p, own in zip(found, rng.spawn(len(found)), strict=True)]
+    parts = [
+        sampled(p, n, own) if isinstance(p, Ar3) else p.sample(n, own)
+        for p, own in zip(found, rng.spawn(len(found)), strict=True)
+    ]
     return np.sum(parts, axis=0) if parts else np.zeros(n)
 
 
@@ -147,11 +150,16 @@ def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Wa
     looking += [(on_lgs, star) for star in atmosphere.laser_stars(scenario)]
     views = [atmosphere.view(what, star, layers) for what, star in looking]
     on_axis, ngs, *lgs = frozen_flow(
-        layers, scenario.turbulence.outer_scale, scenario.telescope.diameter, views, n, scenario.dt, rng, watch)
+        layers, scenario.turbulence.outer_scale, scenario.telescope.diameter, views, n, scenario.dt, rng, watch
+    )
     return Turbulence(on_axis, ngs, tuple(lgs))
 
 
 SOURCES: dict[str, Source] = {
-    "ar2": _mode_by_mode(_ar2), "ar3": _mode_by_mode(_ar3), "processes": _mode_by_mode(_processes),
-    "frozen-flow": _frozen_flow, "psd": _mode_by_mode(_psd), "none": _mode_by_mode(_none),
+    "ar2": _mode_by_mode(_ar2),
+    "ar3": _mode_by_mode(_ar3),
+    "processes": _mode_by_mode(_processes),
+    "frozen-flow": _frozen_flow,
+    "psd": _mode_by_mode(_psd),
+    "none": _mode_by_mode(_none),
 }

@@ -49,8 +49,7 @@ def nearest_line(x: Array, dt: float, near: float, within: float) -> Line:
         return complex(np.vdot(_turning(f, n, dt), tapered))
 
     low, high = max(near - within, 0.1 / (n * dt)), min(near + within, 0.5 / dt)
-    best = minimize_scalar(lambda f: -abs(transform(f)), bounds=(low, high), method="bounded",
-                           options={"xatol": 1e-4 / (n * dt)})
+    best = minimize_scalar(lambda f: -abs(transform(f)), bounds=(low, high), method="bounded", options={"xatol": 1e-4 / (n * dt)})
     return Line(float(best.x), 2.0 * transform(float(best.x)) / total)
 
 

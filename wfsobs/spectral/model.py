@@ -64,8 +64,9 @@ class Spectrum:
         """The spectrum with these numbers as its `vector`."""
         processes = [_process(vector[a:b], self.dt) for a, b in pairwise(self.starts)]
         turbulence, background = (None if p is None else processes.pop(0) for p in (self.turbulence, self.background))
-        return replace(self, noise=float(np.exp(vector[0])), turbulence=turbulence, background=background,
-                       resonances=tuple(processes))
+        return replace(
+            self, noise=float(np.exp(vector[0])), turbulence=turbulence, background=background, resonances=tuple(processes)
+        )
 
     def slopes(self, f: Array, wanted: Sequence[int]) -> Array:
         """Derivatives of the density by the wanted numbers of `vector`, in their order, (len(wanted), len(f)) [um^2/Hz]."""

@@ -61,8 +61,14 @@ class Cells:
     measured (`missing`), all of it unless told
     """
 
-    def __init__(self, f: Array, I: Array, keep: Array, resonances: Iterable[float] = (),  # noqa: E741
-                 share: Array | float = 1.0):
+    def __init__(
+        self,
+        f: Array,
+        I: Array,  # noqa: E741
+        keep: Array,
+        resonances: Iterable[float] = (),
+        share: Array | float = 1.0,
+    ):
         j = np.arange(1.0, len(f) + 1.0)
         size = np.maximum(j / FINE, 1.0)
         for centre in resonances:

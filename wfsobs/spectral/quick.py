@@ -58,8 +58,13 @@ def quick_spectrum(z: Array, dt: float, most: int, lowest: float = LOWEST, befor
     if np.ptp(z) == 0:
         return Spectrum(float(np.finfo(float).tiny), dt)
     z = z - z.mean()
-    fit = _Fit(z, dt, first_guess(frequencies(len(z), dt), periodogram(z, dt), dt, STARTS)
-               if before is None or before.turbulence is None else before)
+    fit = _Fit(
+        z,
+        dt,
+        first_guess(frequencies(len(z), dt), periodogram(z, dt), dt, STARTS)
+        if before is None or before.turbulence is None
+        else before,
+    )
     fit.background()
     for again in (False, True):
         more = fit.add(fit.maxima(lowest, most - len(fit.resonances)))
@@ -92,8 +97,10 @@ class _Fit:
     @property
     def spectrum(self) -> Spectrum:
         """As processes."""
-        found = [Ar2(float(np.exp(w)), float(1.0 / (1.0 + np.exp(-d))), float(np.exp(rms)), self.dt)
-                 for w, d, rms in self.x[1:].reshape(-1, 3)]
+        found = [
+            Ar2(float(np.exp(w)), float(1.0 / (1.0 + np.exp(-d))), float(np.exp(rms)), self.dt)
+            for w, d, rms in self.x[1:].reshape(-1, 3)
+        ]
         turbulence = found.pop(0) if self.first > 1 else None
         return Spectrum(float(np.exp(self.x[0])), self.dt, turbulence, tuple(found))
 

@@ -100,8 +100,9 @@ def first_guess(f: Array, I: Array, dt: float, starts: int = 4) -> Spectrum:  # 
     found = []
     for corner in np.geomspace(max(3 * f[0], 0.1), 0.02 / dt, 4)[:starts]:
         shape = Spectrum(noise, dt, Ar2(2.0 * np.pi * corner, 0.7, rms, dt))
-        fit = least_squares(misfit, shape.vector, args=(shape,), loss="soft_l1", max_nfev=60,
-                            bounds=(shape.vector - 12.0, shape.vector + 12.0))
+        fit = least_squares(
+            misfit, shape.vector, args=(shape,), loss="soft_l1", max_nfev=60, bounds=(shape.vector - 12.0, shape.vector + 12.0)
+        )
         found.append((fit.cost, shape.moved(fit.x)))
     cost, best = min(found, key=lambda pair: pair[0])
     nothing = least_squares(misfit, alone.vector, args=(alone,), loss="soft_l1")

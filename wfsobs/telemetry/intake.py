@@ -80,9 +80,7 @@ def _signal(name: str, raw: Array) -> Array:
     return out
 
 
-def _into_micrometres(
-    signals: dict[str, Array], contents: Contents, stated: Stated, diameter: float
-) -> tuple[str, int]:
+def _into_micrometres(signals: dict[str, Array], contents: Contents, stated: Stated, diameter: float) -> tuple[str, int]:
     """Scale every signal to um; returns (what to keep of unit, sign and aperture as one line, sign of the commands)."""
     arrays, own = contents.arrays, contents.units
     if "unit" in arrays:
@@ -208,6 +206,8 @@ def _frames(y_ngs: Array, ratio: int) -> Array:
     due = (steps % ratio == 0) & (steps >= ratio)
     wrong = ~due & ~np.isnan(y_ngs).all(axis=1) & (steps > 0)
     if wrong.any():
-        raise RecordError(f"y_ngs has a frame at step {int(np.argmax(wrong))}; with ratio = {ratio} "
-                          f"frames are at steps {ratio}, {2 * ratio}, ... and NaN elsewhere")
+        raise RecordError(
+            f"y_ngs has a frame at step {int(np.argmax(wrong))}; with ratio = {ratio} "
+            f"frames are at steps {ratio}, {2 * ratio}, ... and NaN elsewhere"
+        )
     return np.where((due & ~np.isnan(y_ngs).any(axis=1))[:, None], y_ngs, np.nan)

@@ -71,8 +71,13 @@ def load_record(
 
 
 def load(
-    path: str | Path, *, scenario: Scenario | None = None, unit: str | None = None, command_sign: int | None = None,
-    command_delay: int | None = None, rate: float | None = None,
+    path: str | Path,
+    *,
+    scenario: Scenario | None = None,
+    unit: str | None = None,
+    command_sign: int | None = None,
+    command_delay: int | None = None,
+    rate: float | None = None,
 ) -> Record:
     """Read the record of a file: .npz, .csv, .fits or AOT (docs/data.md).
 

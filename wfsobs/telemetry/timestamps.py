@@ -32,8 +32,10 @@ def steps_of(time: Array, dt: float | None = None) -> tuple[Array, float]:
     back = np.flatnonzero(difference <= 0)
     if back.size:
         row = back[0] + 1
-        raise RecordError(f"time {'stands still' if difference[row - 1] == 0 else 'goes backwards'} at row {row}, "
-                          f"from {time[row - 1]:.9g} to {time[row]:.9g} s")
+        raise RecordError(
+            f"time {'stands still' if difference[row - 1] == 0 else 'goes backwards'} at row {row}, "
+            f"from {time[row - 1]:.9g} to {time[row]:.9g} s"
+        )
     jump = np.rint(difference / np.median(difference))
     steps = np.concatenate([[0.0], np.cumsum(np.maximum(jump, 1.0))])
     step = _rounded((time[-1] - time[0]) / steps[-1])

@@ -39,8 +39,11 @@ SHORTEST = 1.0
 TRUTH, NEXT, REFERENCE = "the truth", "the next measurement of the LGS", "the zero-phase Butterworth reference"
 """What an estimate is compared with."""
 
-MEASURES = {TRUTH: "RMS error", NEXT: "RMS one-step prediction error of z",
-            REFERENCE: "RMS distance to the zero-phase Butterworth reference"}
+MEASURES = {
+    TRUTH: "RMS error",
+    NEXT: "RMS one-step prediction error of z",
+    REFERENCE: "RMS distance to the zero-phase Butterworth reference",
+}
 """What the numbers of a tuning are, by what an estimate is compared with."""
 
 LENGTHS = ("gpr_offline.training_size", "gpr_offline.depth")
@@ -150,8 +153,14 @@ def piece(record: Record, start: int, stop: int) -> Record:
         return None if x is None else x[start:stop]
 
     return replace(
-        record, y_lgs=record.z[start:stop] + delayed(u, record.delay), u=u, y_ngs=y_ngs, turbulence=part(record.turbulence),
-        vibration=part(record.vibration), open_loop_y=part(record.open_loop_y))
+        record,
+        y_lgs=record.z[start:stop] + delayed(u, record.delay),
+        u=u,
+        y_ngs=y_ngs,
+        turbulence=part(record.turbulence),
+        vibration=part(record.vibration),
+        open_loop_y=part(record.open_loop_y),
+    )
 
 
 def reference(record: Record, scenario: Scenario) -> Array:

@@ -15,17 +15,25 @@ from wfsobs.tuning.tuning import Stage, Tuned
 
 def plain(tuned: Tuned) -> dict[str, Any]:
     """What `wfsobs tune --json` prints: errors in um, null where the observer failed; likelihoods in nats, null for no GPR."""
+
     def stage(s: Stage) -> dict[str, Any]:
         return {
-            "validation_rms_um": s.validation.rms if s.validation else None, "validation_um": _modes(s.validation),
-            "test_rms_um": s.test.rms if s.test else None, "test_um": _modes(s.test), "other_target_test_um": _modes(s.other),
+            "validation_rms_um": s.validation.rms if s.validation else None,
+            "validation_um": _modes(s.validation),
+            "test_rms_um": s.test.rms if s.test else None,
+            "test_um": _modes(s.test),
+            "other_target_test_um": _modes(s.other),
             "log_marginal_likelihood": list(s.likelihood) if s.likelihood else None,
         }
 
     return {
-        "observer": tuned.observer, "target": tuned.target, "against": tuned.against,
-        "settings": changes(tuned.scenario, tuned.before.scenario), "start": tuned.start,
-        "before": stage(tuned.before), "after": stage(tuned.after),
+        "observer": tuned.observer,
+        "target": tuned.target,
+        "against": tuned.against,
+        "settings": changes(tuned.scenario, tuned.before.scenario),
+        "start": tuned.start,
+        "before": stage(tuned.before),
+        "after": stage(tuned.after),
         "evaluations": [
             {"settings": e.changes, "rms_um": e.errors.rms if e.errors else None, "reason": e.reason or None}
             for e in tuned.history
@@ -81,11 +89,20 @@ def remarks(tuned: Tuned) -> list[str]:
 def toml(tuned: Tuned) -> str:
     """The tuned scenario as TOML, with what was changed beside its settings."""
     base = tuned.before.scenario
-    notes = {path: f"{'tuned' if path in tuned.paths else 'with it'}, {_before(tuned, path)} before"
-             for path in changes(tuned.scenario, base)}
-    head = [f"{label_of(tuned.observer)} tuned for {tuned.target}, against {tuned.against}, in {len(tuned.history)} evaluations.",
-            *(f"{tuned.measure}, {name}: {_of(before)} before, {_of(after)} after" for name, before, after in (
-                ("validation", tuned.before.validation, tuned.after.validation), ("test", tuned.before.test, tuned.after.test)))]
+    notes = {
+        path: f"{'tuned' if path in tuned.paths else 'with it'}, {_before(tuned, path)} before"
+        for path in changes(tuned.scenario, base)
+    }
+    head = [
+        f"{label_of(tuned.observer)} tuned for {tuned.target}, against {tuned.against}, in {len(tuned.history)} evaluations.",
+        *(
+            f"{tuned.measure}, {name}: {_of(before)} before, {_of(after)} after"
+            for name, before, after in (
+                ("validation", tuned.before.validation, tuned.after.validation),
+                ("test", tuned.before.test, tuned.after.test),
+            )
+        ),
+    ]
     return "\n".join(f"# {line}" for line in head) + "\n\n" + annotated(to_toml(tuned.scenario), notes)
 
 

@@ -34,8 +34,13 @@ def search(f: Callable[[Array], float], start: Array, evaluations: int, rng: np.
             i = int(np.argmin(values))
             if not np.isfinite(values[i]):
                 return
-            found = minimize(f, points[i], method="Nelder-Mead", bounds=[(0.0, 1.0)] * len(start), options={
-                "initial_simplex": _simplex(points[i], size), "xatol": CLOSE, "fatol": LEVEL * values[i]})
+            found = minimize(
+                f,
+                points[i],
+                method="Nelder-Mead",
+                bounds=[(0.0, 1.0)] * len(start),
+                options={"initial_simplex": _simplex(points[i], size), "xatol": CLOSE, "fatol": LEVEL * values[i]},
+            )
             points.append(found.x)
             values.append(float(found.fun))
     except Spent:

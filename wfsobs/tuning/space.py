@@ -38,7 +38,8 @@ class Tunable(NamedTuple):
 _MODEL = ("kalman.frequency", "kalman.damping", "kalman.turbulence_rms", "kalman.vibration_rms")
 _RATES = ("multirate.lgs_noise", "multirate.ngs_noise")
 _OFFLINE, _ONLINE = (
-    tuple(f"{group}.{name}" for name in ("signal_std", "training_size", "highpass")) for group in ("gpr_offline", "gpr_online"))
+    tuple(f"{group}.{name}" for name in ("signal_std", "training_size", "highpass")) for group in ("gpr_offline", "gpr_online")
+)
 
 TUNABLE: dict[str, Tunable] = {
     # The gain depends on the ratios of turbulence, vibration and noise. Turbulence tuned for vibration would be no turbulence.
@@ -52,14 +53,20 @@ TUNABLE: dict[str, Tunable] = {
     "butterworth-ol": Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
     "butterworth-cl": Tunable(("butterworth.bandwidth_online",), ("butterworth.order",)),
     # The mean depends on sigma_n / sigma_SE and l only: sigma_SE stays.
-    "gpr-offline": Tunable(("gpr_offline.length_scale", "gpr_offline.noise_std", "gpr_offline.depth"),
-                           (*_OFFLINE, "butterworth.bandwidth_offline", "butterworth.order")),
+    "gpr-offline": Tunable(
+        ("gpr_offline.length_scale", "gpr_offline.noise_std", "gpr_offline.depth"),
+        (*_OFFLINE, "butterworth.bandwidth_offline", "butterworth.order"),
+    ),
     # Its targets are what the causal band-passes make of turbulence, too.
-    "gpr-online": Tunable(("gpr_online.noise_std", "gpr_online.depth", "butterworth.bandwidth_online"),
-                          ("gpr_online.length_scale", *_ONLINE, "butterworth.order")),
+    "gpr-online": Tunable(
+        ("gpr_online.noise_std", "gpr_online.depth", "butterworth.bandwidth_online"),
+        ("gpr_online.length_scale", *_ONLINE, "butterworth.order"),
+    ),
     # The penalty (sigma_n l / sigma_SE)^2 is one number.
-    "ridge": Tunable(("gpr_offline.noise_std", "gpr_offline.depth"),
-                     ("gpr_offline.length_scale", *_OFFLINE, "butterworth.bandwidth_offline", "butterworth.order")),
+    "ridge": Tunable(
+        ("gpr_offline.noise_std", "gpr_offline.depth"),
+        ("gpr_offline.length_scale", *_OFFLINE, "butterworth.bandwidth_offline", "butterworth.order"),
+    ),
     "ridge-30": Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
     "persistence": Tunable(()),
     "zero": Tunable(()),

@@ -98,9 +98,16 @@ class Tuned:
 
 
 def tune(
-    scenario: Scenario, observer: str, names: Sequence[str] | None = None, *, evaluations: int = EVALUATIONS,
-    record: Record | None = None, target: str | None = None, validation: float | None = None,
-    told: Callable[[Evaluation], None] | None = None, watch: Watch = QUIET,
+    scenario: Scenario,
+    observer: str,
+    names: Sequence[str] | None = None,
+    *,
+    evaluations: int = EVALUATIONS,
+    record: Record | None = None,
+    target: str | None = None,
+    validation: float | None = None,
+    told: Callable[[Evaluation], None] | None = None,
+    watch: Watch = QUIET,
 ) -> Tuned:
     """Search for the settings of an observer with the least error on a validation record; the test record is scored after that.
 
@@ -131,8 +138,16 @@ def tune(
     before, after = (trials.stage(e) for e in (first, best))
     watch.step(1.0)
     start = {path: v for path, v in {**searched.by_hand, **searched.values(scenario)}.items() if not isinstance(v, str)}
-    return Tuned(observer, records.target, records.against, tuple(a.path for a in searched.axes), start, before, after,
-                 tuple(trials.history))
+    return Tuned(
+        observer,
+        records.target,
+        records.against,
+        tuple(a.path for a in searched.axes),
+        start,
+        before,
+        after,
+        tuple(trials.history),
+    )
 
 
 @dataclass
@@ -187,7 +202,8 @@ class _Trials:
             self.warm_up = max(self.warm_up, begins)
         if begins > self.warm_up:
             raise RecordError(
-                f"{self.judge.observer} has its first estimate after {begins:g} s; the scores begin at {self.warm_up:g} s")
+                f"{self.judge.observer} has its first estimate after {begins:g} s; the scores begin at {self.warm_up:g} s"
+            )
         return self.judge.errors(record, scenario, estimates, self.warm_up)
 
     def stage(self, evaluation: Evaluation) -> Stage:

@@ -25,7 +25,8 @@ NUMBER_WIDTH = 92
 
 UNNAMED = {
     "& .MuiInputLabel-root": {"clipPath": "inset(50%)", "overflow": "hidden", "width": "1px", "height": "1px"},
-    "& legend": {"display": "none"}, "& fieldset": {"top": 0},
+    "& legend": {"display": "none"},
+    "& fieldset": {"top": 0},
 }
 """A box whose name is heard but not seen: the slider beside it has the same."""
 
@@ -93,7 +94,10 @@ class Field:
 
     def _names(self) -> dict[str, Any]:
         return {
-            "label": label_of(self.parameter), "description": written_unit(self.parameter.doc or ""), "tags": [TAG + self.path]}
+            "label": label_of(self.parameter),
+            "description": written_unit(self.parameter.doc or ""),
+            "tags": [TAG + self.path],
+        }
 
 
 class ChoiceField(Field):
@@ -180,12 +184,20 @@ class SliderField(TextField):
         names = self._names()
         kind = pmui.IntSlider if whole else pmui.FloatSlider
         slider = kind(
-            start=low, end=high, value=low, step=p.step or (1 if whole else _step(low, high)), show_value=False,
-            size="small", **names, **ROOM)
+            start=low,
+            end=high,
+            value=low,
+            step=p.step or (1 if whole else _step(low, high)),
+            show_value=False,
+            size="small",
+            **names,
+            **ROOM,
+        )
         slider._debounce = SOON  # type: ignore[misc]
         slider.param.watch(self._released, "value_throttled")
         text = self._text(
-            label=names["label"], tags=[TAG + self.path], width=NUMBER_WIDTH, margin=(4, 0, 4, 8), align="end", sx=UNNAMED)
+            label=names["label"], tags=[TAG + self.path], width=NUMBER_WIDTH, margin=(4, 0, 4, 8), align="end", sx=UNNAMED
+        )
         return [slider, text]
 
     def _row(self) -> Any:

@@ -13,7 +13,12 @@ from wfsobs.scenario.settings import Group, holds_groups
 from wfsobs.sensors.modes import TIP_TILT
 
 SHORT = {
-    "frequency": "f", "damping": "ξ", "height": "h", "fraction": "share", "wind_factor": "V / V₀", "wind_direction": "wind to",
+    "frequency": "f",
+    "damping": "ξ",
+    "height": "h",
+    "fraction": "share",
+    "wind_factor": "V / V₀",
+    "wind_direction": "wind to",
     "frequency_shift": "shift",
 }
 """Setting -> its name above a narrow column; any other has its own."""

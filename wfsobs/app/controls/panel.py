@@ -63,13 +63,20 @@ class Controls:
         self.lists: dict[str, RowEditor] = {}
         self.parts: list[tuple[str, Any]] = []
         self.preset = pmui.Select(
-            label="Preset", tags=[TAG + PRESET], value=store.preset, options={_title(name): name for name in PRESETS},
-            helper_text=NO_CHANGES, size="small", stylesheets=[TWO_LINES], **ROOM)
-        self.reset = pmui.Button(
-            label="Reset", icon="restart_alt", variant="text", size="small", margin=(4, 0))
+            label="Preset",
+            tags=[TAG + PRESET],
+            value=store.preset,
+            options={_title(name): name for name in PRESETS},
+            helper_text=NO_CHANGES,
+            size="small",
+            stylesheets=[TWO_LINES],
+            **ROOM,
+        )
+        self.reset = pmui.Button(label="Reset", icon="restart_alt", variant="text", size="small", margin=(4, 0))
         self.undo, self.redo = (
             pmui.Button(label=name, icon=name.lower(), variant="text", size="small", margin=(4, 4, 4, 0), disabled=True)
-            for name in ("Undo", "Redo"))
+            for name in ("Undo", "Redo")
+        )
         self.run = pmui.Button(label="Run", icon="play_arrow", color="primary", **ROOM)
         self.cancel = pmui.Button(label="Cancel", icon="stop", variant="outlined", margin=(4, 0, 4, 8))
         self.status = Status(sizing_mode="stretch_width", margin=(4, 0))
@@ -77,8 +84,12 @@ class Controls:
         self.rooms = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
         self.accordion = pmui.Accordion(
             *((title, self.rooms[name]) for name, title in self.topics.items()),
-            title_variant="body2", variant="outlined", disable_gutters=True, dynamic=True,
-            sizing_mode="stretch_width", margin=(8, 0),
+            title_variant="body2",
+            variant="outlined",
+            disable_gutters=True,
+            dynamic=True,
+            sizing_mode="stretch_width",
+            margin=(8, 0),
         )
         self._watch()
         self.accordion.active = [0]
@@ -89,10 +100,14 @@ class Controls:
         """What goes into the drawer."""
         first = [self._field(path) for path in FIRST]
         return pn.Column(
-            self.preset, pn.Row(self.undo, self.redo, self.reset, sizing_mode="stretch_width", margin=0),
+            self.preset,
+            pn.Row(self.undo, self.redo, self.reset, sizing_mode="stretch_width", margin=0),
             pn.Row(self.run, self.cancel, sizing_mode="stretch_width", margin=0),
-            self.status, *(f.view for f in first), self.accordion,
-            sizing_mode="stretch_width", margin=(8, 14),
+            self.status,
+            *(f.view for f in first),
+            self.accordion,
+            sizing_mode="stretch_width",
+            margin=(8, 14),
         )
 
     def open_topic(self, name: str) -> None:

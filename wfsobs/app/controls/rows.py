@@ -45,8 +45,12 @@ class RowEditor:
         self._kind: type[Group] = p.item_type  # type: ignore[assignment]
         self._texts: dict[str, str] = {}
         self.table = RowTable(
-            columns=_columns(self._kind), noun=self._kind.__name__.lower(), tags=[TAG + path],
-            sizing_mode="stretch_width", margin=(0, 0, 8, 0))
+            columns=_columns(self._kind),
+            noun=self._kind.__name__.lower(),
+            tags=[TAG + path],
+            sizing_mode="stretch_width",
+            margin=(0, 0, 8, 0),
+        )
         self.table.on_edit = self.handle
         self.view = pn.Column(self.table, sizing_mode="stretch_width", margin=0)
         self.refresh()
@@ -104,8 +108,11 @@ def _columns(kind: type[Group]) -> list[dict[str, Any]]:
             keys = [f"{setting}.{i}" for i, _ in enumerate(TIP_TILT)]
         unit = written_unit(unit_of(p))
         choices = list(p.objects) if isinstance(p, param.Selector) else []
-        out += [{"key": key, "name": f"{name} [{unit}]" if unit else name, "doc": p.doc or "", "choices": choices}
-                for key in keys for name in [column_of(key)]]
+        out += [
+            {"key": key, "name": f"{name} [{unit}]" if unit else name, "doc": p.doc or "", "choices": choices}
+            for key in keys
+            for name in [column_of(key)]
+        ]
     return out
 
 

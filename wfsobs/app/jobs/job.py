@@ -51,8 +51,16 @@ class Job:
     numbers = itertools.count(1)
 
     def __init__(
-        self, kind: str, work: Work, *, key: str = "", cost: float = 0.0, priority: int | None = None,
-        time_limit: float = math.inf, wait_limit: float = math.inf, refusal: type[Exception] = ValueError,
+        self,
+        kind: str,
+        work: Work,
+        *,
+        key: str = "",
+        cost: float = 0.0,
+        priority: int | None = None,
+        time_limit: float = math.inf,
+        wait_limit: float = math.inf,
+        refusal: type[Exception] = ValueError,
     ):
         self.kind, self.key, self.cost = kind, key, cost
         self.priority = (CLICK if cost <= LONG else SWEEP) if priority is None else priority

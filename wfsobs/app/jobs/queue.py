@@ -41,8 +41,7 @@ class JobQueue:
         self._turn = 0  # the latest that has begun
         self._changed = threading.Condition()
         self._timers: dict[Job, threading.Timer] = {}
-        self._threads = [
-            threading.Thread(target=self._work, name=f"wfsobs-work-{i}", daemon=True) for i in range(workers)]
+        self._threads = [threading.Thread(target=self._work, name=f"wfsobs-work-{i}", daemon=True) for i in range(workers)]
         for thread in self._threads:
             thread.start()
 

@@ -31,11 +31,13 @@ GRID = """
 """
 INTRO = (
     "The disturbance and the noise are those of the results shown, the same for every controller, with the delay and the "
-    "limits of the mirror set under Controllers. Strehl counts the simulated modes alone.")
+    "limits of the mirror set under Controllers. Strehl counts the simulated modes alone."
+)
 ABOUT = (
     "Rejection |E| bold, noise transfer faint. L is the loop gain: how far it stays from −1 is how far the loop is from "
     "instability; ○ marks the gain margin, □ the phase margin. Multi-rate loops change from step to step, and a GPR is not "
-    "linear: they have neither.")
+    "linear: they have neither."
+)
 
 
 class ClosedLoopPage(Offers):
@@ -60,18 +62,31 @@ class ClosedLoopPage(Offers):
     def view(self) -> pn.Column:
         """What is shown."""
         figures = pn.Column(
-            *(captioned(title, drawn.figure) for title, drawn in (
-                ("Residual, whole record", self.whole), ("Spectrum of the residual", self.spectrum),
-                ("Residual, zoomed", self.zoomed), ("Rejection and noise transfer", self.response))),
-            **WIDE, stylesheets=[GRID])
+            *(
+                captioned(title, drawn.figure)
+                for title, drawn in (
+                    ("Residual, whole record", self.whole),
+                    ("Spectrum of the residual", self.spectrum),
+                    ("Residual, zoomed", self.zoomed),
+                    ("Rejection and noise transfer", self.response),
+                )
+            ),
+            **WIDE,
+            stylesheets=[GRID],
+        )
         stability = pn.Column(
-            captioned("Loop gain L, unit circle", self.nyquist.figure), pn.Column(text(ABOUT), self.margins, **WIDE),
-            **WIDE, stylesheets=[GRID])
+            captioned("Loop gain L, unit circle", self.nyquist.figure),
+            pn.Column(text(ABOUT), self.margins, **WIDE),
+            **WIDE,
+            stylesheets=[GRID],
+        )
         return pn.Column(
             box("Residual in closed loop", text(INTRO), self.note, self.cards, figures),
             box("Controllers", self.table),
             box("Stability", stability),
-            **WIDE, stylesheets=[":host { gap: 10px; }"])
+            **WIDE,
+            stylesheets=[":host { gap: 10px; }"],
+        )
 
     def show(self, visible: bool) -> None:
         """Compute what has changed meanwhile, and go on while visible."""
@@ -92,7 +107,8 @@ class ClosedLoopPage(Offers):
         return {
             "Controllers as CSV": Save("wfsobs-controllers.csv", "text/csv", lambda: table_csv(shown.rows)),
             "Residuals as CSV": Save("wfsobs-residuals.csv", "text/csv", lambda: residuals_csv(shown)),
-            "Residuals as NPZ": Save("wfsobs-residuals.npz", "application/octet-stream", lambda: residuals_npz(shown))}
+            "Residuals as NPZ": Save("wfsobs-residuals.npz", "application/octet-stream", lambda: residuals_npz(shown)),
+        }
 
     def _follow(self, *_: object) -> None:
         """Start the loop of the results shown, once their run is over; stop where the page is hidden."""
@@ -159,7 +175,15 @@ class ClosedLoopPage(Offers):
             else:
                 value, unit = number(row["residual_rms_nm"] * scale), self.display.unit_label
                 note = f"Strehl {row['strehl']:.3f}"
-            out.append({
-                "name": name, "label": it.label, "colour": it.colour(self.display.dark), "dash": list(it.dash),
-                "note": note, "value": value, "unit": unit})
+            out.append(
+                {
+                    "name": name,
+                    "label": it.label,
+                    "colour": it.colour(self.display.dark),
+                    "dash": list(it.dash),
+                    "note": note,
+                    "value": value,
+                    "unit": unit,
+                }
+            )
         return out

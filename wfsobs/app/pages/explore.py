@@ -48,8 +48,11 @@ class Explore:
     def view(self) -> pn.Column:
         """What is shown."""
         body = pn.Column(
-            *(self._section(target) for target in TARGETS), box("RMS errors", self._best_first(), self.table.pane),
-            **WIDE, stylesheets=[GAP])
+            *(self._section(target) for target in TARGETS),
+            box("RMS errors", self._best_first(), self.table.pane),
+            **WIDE,
+            stylesheets=[GAP],
+        )
         return pn.Column(self._switches(), body, **WIDE, stylesheets=[GAP])
 
     def show(self, visible: bool) -> None:
@@ -61,7 +64,12 @@ class Explore:
         return pn.FlexBox(
             group(self.display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS}),
             group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
-            self._zoom_buttons(), *self.pinning.view(), gap="12px", align_items="center", **WIDE)
+            self._zoom_buttons(),
+            *self.pinning.view(),
+            gap="12px",
+            align_items="center",
+            **WIDE,
+        )
 
     def _best_first(self) -> pmui.Checkbox:
         return pmui.Checkbox.from_param(self.display.param.best_first, size="small", margin=(0, 0, 4, 0))
@@ -69,8 +77,7 @@ class Explore:
     def _zoom_buttons(self) -> pn.Row:
         buttons = []
         for label, seconds in ZOOMS.items():
-            button = pmui.Button(
-                label=label, size="small", variant="text", margin=0, description=f"Time window: {label.lower()}")
+            button = pmui.Button(label=label, size="small", variant="text", margin=0, description=f"Time window: {label.lower()}")
             button.on_click(lambda _event, seconds=seconds: self.traces.zoom(seconds))
             buttons.append(button)
         return pn.Row(*buttons, margin=0)
@@ -85,7 +92,9 @@ class Explore:
         figures = pn.Column(
             pn.Column(_caption("Time trace"), self.traces.pane(target), **WIDE),
             pn.Column(_caption("Spectrum", marks), self.spectra.pane(target), **WIDE),
-            **WIDE, stylesheets=[GRID])
+            **WIDE,
+            stylesheets=[GRID],
+        )
         return box(target.capitalize(), cards, figures)
 
     def _hide(self, target: str, names: list[str]) -> None:
@@ -95,12 +104,16 @@ class Explore:
 def group(display: Display, name: str, options: Any) -> pmui.RadioButtonGroup:
     """The buttons of one switch of the display."""
     widget = pmui.RadioButtonGroup.from_param(
-        display.param[name], options=options, size="small", margin=0, variant="outlined", stylesheets=[HEARD])
+        display.param[name], options=options, size="small", margin=0, variant="outlined", stylesheets=[HEARD]
+    )
     widget._debounce = SOON  # type: ignore[misc]
     return widget
 
 
 def _caption(text: str, marks: str = "") -> pn.pane.HTML:
     return pn.pane.HTML(
-        f'<div class="caption">{escape(text)}{marks}</div>', sizing_mode="stretch_width", margin=(8, 0, 0, 0),
-        stylesheets=[asset("style.css")])
+        f'<div class="caption">{escape(text)}{marks}</div>',
+        sizing_mode="stretch_width",
+        margin=(8, 0, 0, 0),
+        stylesheets=[asset("style.css")],
+    )

@@ -52,19 +52,34 @@ FIGURES = (
     PaperFigure(
         "Butterworth reference, open loop",
         "Figure 4a of the paper: vibration filtered from open-loop data, bottom plot zoomed; tip only.",
-        VIBRATION, ("butterworth-ol",), (Plot(WHOLE), Plot(ZOOMED)), "The paper: 7.66e-3, taken as µm."),
+        VIBRATION,
+        ("butterworth-ol",),
+        (Plot(WHOLE), Plot(ZOOMED)),
+        "The paper: 7.66e-3, taken as µm.",
+    ),
     PaperFigure(
         "Butterworth reference, closed loop",
         "Figure 4b of the paper: vibration filtered from closed-loop data, bottom plot zoomed; tip only.",
-        VIBRATION, ("butterworth-cl",), (Plot(WHOLE), Plot(ZOOMED)), "The paper: 13.4e-3, taken as µm."),
+        VIBRATION,
+        ("butterworth-cl",),
+        (Plot(WHOLE), Plot(ZOOMED)),
+        "The paper: 13.4e-3, taken as µm.",
+    ),
     PaperFigure(
-        "Estimation of the atmospheric turbulence", "Figure 5 of the paper: tip above, tilt below.",
-        TURBULENCE, ("kf-lgs", "kf-ngs", "multirate"), (Plot(WHOLE, 0), Plot(WHOLE, 1))),
+        "Estimation of the atmospheric turbulence",
+        "Figure 5 of the paper: tip above, tilt below.",
+        TURBULENCE,
+        ("kf-lgs", "kf-ngs", "multirate"),
+        (Plot(WHOLE, 0), Plot(WHOLE, 1)),
+    ),
     PaperFigure(
         "Estimation of structural vibrations",
         "Figure 6 of the paper: traces, a zoom into them, and their power spectra; tip only.",
-        VIBRATION, ("kf-lgs", "gpr-offline", "gpr-online"), (Plot(WHOLE), Plot(ZOOMED), Plot(SPECTRUM)),
-        "The paper: LGS KF 16.6e-3, offline GPR 12.4e-3, online GPR 13.3e-3, taken as µm."),
+        VIBRATION,
+        ("kf-lgs", "gpr-offline", "gpr-online"),
+        (Plot(WHOLE), Plot(ZOOMED), Plot(SPECTRUM)),
+        "The paper: LGS KF 16.6e-3, offline GPR 12.4e-3, online GPR 13.3e-3, taken as µm.",
+    ),
 )
 
 
@@ -81,8 +96,8 @@ class Figures:
     def view(self) -> pn.Column:
         """The figures, one below the other."""
         return pn.Column(
-            *(sheet.view() for sheet in self.sheets), sizing_mode="stretch_width", margin=0,
-            stylesheets=[":host { gap: 10px; }"])
+            *(sheet.view() for sheet in self.sheets), sizing_mode="stretch_width", margin=0, stylesheets=[":host { gap: 10px; }"]
+        )
 
     def show(self, visible: bool) -> None:
         """Draw what has come meanwhile, and go on while visible."""
@@ -119,7 +134,8 @@ class _Sheet:
         """Every plot and the texts."""
         legend = "".join(
             f'<span class="mark">{swatch(n, display.dark, dashed=_dashed(n, self.figure))}{escape(_label(n))}</span>'
-            for n in self.names)
+            for n in self.names
+        )
         self.head.object = f'<h2 class="title">{escape(self.figure.title)}</h2><div class="caption legend">{legend}</div>'
         self.caption.object = f'<p class="text">{escape(self.figure.caption)} {escape(self._errors(shown, display))}</p>'
         for drawn in self.plots:
@@ -145,7 +161,8 @@ class _Drawn:
         self.plot, self.of = plot, of
         if plot.what == SPECTRUM:
             self.figure: figure = new_figure(
-                x_range=Range1d(start=0.0, end=PSD_TOP_HZ), y_range=Range1d(start=1e-3, end=1.0), y_axis_type="log")
+                x_range=Range1d(start=0.0, end=PSD_TOP_HZ), y_range=Range1d(start=1e-3, end=1.0), y_axis_type="log"
+            )
         else:
             self.figure = new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=DataRange1d())
         self.figure.xaxis.axis_label = "frequency [Hz]" if plot.what == SPECTRUM else "time [s]"
@@ -153,8 +170,10 @@ class _Drawn:
         self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
         self.lines: dict[str, GlyphRenderer] = {
             name: self.figure.line(
-                "x", "y", source=source, line_width=1.6, line_dash=list(look(name).dash) if _dashed(name, of) else [], name=name)
-            for name, source in self.sources.items()}
+                "x", "y", source=source, line_width=1.6, line_dash=list(look(name).dash) if _dashed(name, of) else [], name=name
+            )
+            for name, source in self.sources.items()
+        }
         self.window = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.15, line_width=0, level="underlay")
         if plot.what == WHOLE and any(p.what == ZOOMED for p in of.plots):
             self.figure.add_layout(self.window)

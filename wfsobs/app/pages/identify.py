@@ -35,15 +35,18 @@ INTRO = (
     "From the pseudo-open-loop measurement z of the record shown, simulated or loaded: white noise, turbulence, then "
     "vibration peaks one at a time until nothing is left that the tests see. “Filters only” keeps the record and tells the "
     "filters this model. “As a new simulation” replaces the record by a simulation of this model, which the filters then know "
-    "exactly.")
+    "exactly."
+)
 ABOUT = (
     "± is one standard deviation. What is left is called white where, in a mode, two tests of level 1 % pass and no candidate "
     "remains unexplained: Bartlett's on the cumulated ratio of the measured to the fitted spectrum, and Ljung and Box's on the "
-    "innovations of the Kalman filter that the model gives. p is how likely white noise is to look less white than what is left.")
+    "innovations of the Kalman filter that the model gives. p is how likely white noise is to look less white than what is left."
+)
 EARLIER = "This model is of an earlier record than the one shown now."
 REPLACED = (
     "The record that this model was identified from is replaced by a simulation of the model. Errors are now those of filters "
-    "that know the simulated spectra, and cannot be compared with errors on the record before. Undo brings it back.")
+    "that know the simulated spectra, and cannot be compared with errors on the record before. Undo brings it back."
+)
 
 
 class IdentifyPage(Offers):
@@ -52,8 +55,9 @@ class IdentifyPage(Offers):
     def __init__(self, store: Store, display: Display):
         self.store, self.run, self.display = store, store.run, display
         self.work = BackgroundTask(store.session)
-        self.starter = Starter(self.work, "Identify the record", "Progress of the identification",
-            uses=("Filters only", "As a new simulation"))
+        self.starter = Starter(
+            self.work, "Identify the record", "Progress of the identification", uses=("Filters only", "As a new simulation")
+        )
         self.level, self.lowest = _number("Level", LEVEL), _number("Lowest peak [Hz]", LOWEST)
         self.inputs = (self.level, self.lowest)
         self.figure = SpectrumFigure()
@@ -78,7 +82,10 @@ class IdentifyPage(Offers):
         return pn.Column(
             box("Identification", text(INTRO), row, self.starter.status, self.stale, self.verdict),
             box("Spectrum", self.legend, self.note, pn.pane.Bokeh(self.figure.figure, **WIDE)),
-            box("Model", self.table, text(ABOUT)), **WIDE, stylesheets=[":host { gap: 10px; }"])
+            box("Model", self.table, text(ABOUT)),
+            **WIDE,
+            stylesheets=[":host { gap: 10px; }"],
+        )
 
     def show(self, visible: bool) -> None:
         """Draw what has changed meanwhile, and go on while visible."""
@@ -183,5 +190,6 @@ def _read(field: pmui.TextInput, low: float, high: float) -> float:
     value = parsed(str(field.value))
     if isinstance(value, str) or not low <= value <= high:
         raise SettingError(
-            f"{field.label} = {str(field.value)[:40]!r}: takes a number from {low:g} to {high:g}{hint(str(field.value))}")
+            f"{field.label} = {str(field.value)[:40]!r}: takes a number from {low:g} to {high:g}{hint(str(field.value))}"
+        )
     return float(value)

@@ -13,7 +13,10 @@ from wfsobs.identification.result import IdentifiedMode
 
 HEIGHT = 400
 NAMES = {
-    "measured": "measured, mean", "highest": "and highest of every bin", "fitted": "model", "parts": "its processes and noise",
+    "measured": "measured, mean",
+    "highest": "and highest of every bin",
+    "fitted": "model",
+    "parts": "its processes and noise",
     "found": "peaks, and the height of pure lines",
 }
 """Look -> what it is called in the legend."""
@@ -24,7 +27,8 @@ class SpectrumFigure:
 
     def __init__(self) -> None:
         self.figure = new_figure(
-            x_range=Range1d(start=0.1, end=500.0), y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log")
+            x_range=Range1d(start=0.1, end=500.0), y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log"
+        )
         self.figure.height = HEIGHT
         call(self.figure, "Spectrum of z and its model")
         self.figure.xaxis.axis_label = "frequency [Hz]"
@@ -68,14 +72,18 @@ class SpectrumFigure:
         self.total.data = {"x": of.frequency, "y": scale * of.total}
         self.parts.data = {"xs": [of.frequency] * len(of.parts), "ys": [scale * part for part in of.parts]}
         self.spikes.data = {
-            "x": [f for f, _, _ in of.lines], "low": [scale * low for _, low, _ in of.lines],
-            "high": [scale * high for *_, high in of.lines]}
+            "x": [f for f, _, _ in of.lines],
+            "low": [scale * low for _, low, _ in of.lines],
+            "high": [scale * high for *_, high in of.lines],
+        }
         tops = {f: high for f, _, high in of.lines}
         at = [p.frequency.value for p in mode.peaks]
         height = [tops.get(f) or float(np.interp(f, of.frequency, of.total)) for f in at]
         self.peaks.data = {
-            "x": at, "y": [1.6 * scale * y for y in height],
-            "text": [f"{'line' if p.pure else 'resonance'} {p.frequency.value:.5g} Hz" for p in mode.peaks]}
+            "x": at,
+            "y": [1.6 * scale * y for y in height],
+            "text": [f"{'line' if p.pure else 'resonance'} {p.frequency.value:.5g} Hz" for p in mode.peaks],
+        }
 
     def restyle(self, dark: bool) -> None:
         """The colours of the mode."""

@@ -18,7 +18,9 @@ def table_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
     """Noise, turbulence and peaks of a mode, each number with its standard deviation."""
     scale = per_micrometre(display.unit, diameter)
     columns = {
-        "What": "by frequency", "Frequency [Hz]": "natural frequency; of turbulence the corner", "Damping": "0 is a pure line",
+        "What": "by frequency",
+        "Frequency [Hz]": "natural frequency; of turbulence the corner",
+        "Damping": "0 is a pure line",
         f"Rms [{display.unit_label}]": "standard deviation of it in z",
     }
     head = "".join(f'<th scope=col title="{why}">{name}</th>' for name, why in columns.items())
@@ -27,8 +29,10 @@ def table_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
         scaled = None if rms is None else Number(rms.value * scale, rms.std * scale)
         cells = ["" if n is None else spoken(n) for n in (frequency, damping, scaled)]
         body += f"<tr><th scope=row>{what}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
-    return (f'<div class="scroll" tabindex=0 role=region aria-label="Identified in {mode.name}">'
-            f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')
+    return (
+        f'<div class="scroll" tabindex=0 role=region aria-label="Identified in {mode.name}">'
+        f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    )
 
 
 def spoken(number: Number) -> str:
@@ -44,5 +48,6 @@ def verdict_html(result: Identified) -> str:
     """Whether anything is left, mode by mode."""
     lines = "".join(
         f'<p class="text">{WHITE if mode.whiteness.white else COLOURED}{escape(line)}.</p>'
-        for mode, line in zip(result.modes, verdict(result), strict=True))
+        for mode, line in zip(result.modes, verdict(result), strict=True)
+    )
     return f'<div role="status">{lines}</div>'

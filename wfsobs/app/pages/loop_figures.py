@@ -50,7 +50,8 @@ class Trace(Lines):
     def __init__(self, what: str):
         super().__init__(
             new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=Range1d(start=-1.0, end=1.0)),
-            tuple(name for name in CONTROLLERS if name != NONE))
+            tuple(name for name in CONTROLLERS if name != NONE),
+        )
         self.what = what
         self.figure.xaxis.axis_label = "time [s]"
 
@@ -61,8 +62,11 @@ class Trace(Lines):
         times = envelope_times(first, last, BINS, dt)
         for name, source in self.sources.items():
             residual = shown.residual(name)
-            source.data = {"x": [], "y": []} if residual is None else {
-                "x": times, "y": (scale * envelope(residual[first:last, display.column], BINS)).astype(np.float32)}
+            source.data = (
+                {"x": [], "y": []}
+                if residual is None
+                else {"x": times, "y": (scale * envelope(residual[first:last, display.column], BINS)).astype(np.float32)}
+            )
         self.figure.x_range.update(start=first * dt, end=last * dt, reset_start=first * dt, reset_end=last * dt)
         self.figure.yaxis.axis_label = f"residual {display.mode_label} [{display.unit_label}]"
 
@@ -79,8 +83,10 @@ class Spectrum(Lines):
     def __init__(self) -> None:
         super().__init__(
             new_figure(
-                x_range=Range1d(start=0.5, end=500.0), y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log",
-                y_axis_type="log"), tuple(CONTROLLERS))
+                x_range=Range1d(start=0.5, end=500.0), y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log"
+            ),
+            tuple(CONTROLLERS),
+        )
         self.figure.xaxis.axis_label = "frequency [Hz]"
 
     def draw(self, shown: LoopShown, display: Display) -> None:
@@ -135,8 +141,7 @@ class Nyquist(Lines):
     """The loop gain in the complex plane, the unit circle, and where the margins are measured."""
 
     def __init__(self) -> None:
-        fig = new_figure(
-            x_range=Range1d(start=-NYQUIST, end=NYQUIST), y_range=Range1d(start=-NYQUIST, end=NYQUIST))
+        fig = new_figure(x_range=Range1d(start=-NYQUIST, end=NYQUIST), y_range=Range1d(start=-NYQUIST, end=NYQUIST))
         fig.update(height=None, aspect_ratio=1.0, max_width=480)
         turn = np.linspace(0.0, 2.0 * np.pi, 181)
         fig.line(np.cos(turn), np.sin(turn), line_color="#888888", line_dash=[4, 3])
@@ -166,8 +171,15 @@ class Nyquist(Lines):
     def restyle(self, dark: bool, hidden: list[str]) -> None:
         """The marks too."""
         super().restyle(dark, hidden)
-        shown = [(point, marker, look(name).colour(dark)) for name, at in self._at.items() if name not in hidden
-                 for point, marker in at]
+        shown = [
+            (point, marker, look(name).colour(dark))
+            for name, at in self._at.items()
+            if name not in hidden
+            for point, marker in at
+        ]
         self.marks.data = {
-            "x": [p.real for p, *_ in shown], "y": [p.imag for p, *_ in shown], "colour": [c for *_, c in shown],
-            "marker": [m for _, m, _ in shown]}
+            "x": [p.real for p, *_ in shown],
+            "y": [p.imag for p, *_ in shown],
+            "colour": [c for *_, c in shown],
+            "marker": [m for _, m, _ in shown],
+        }

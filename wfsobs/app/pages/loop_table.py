@@ -25,10 +25,12 @@ def table_html(shown: LoopShown, display: Display) -> str:
     """Residual and Strehl of every controller, and the bound."""
     unit = display.unit_label
     columns = {
-        "Controller": "and its line in the figures", f"Residual [{unit}]": "rms after the warm-up",
+        "Controller": "and its line in the figures",
+        f"Residual [{unit}]": "rms after the warm-up",
         f"Theory [{unit}]": "by the true spectra, for an endless record",
         f"Strehl at {shown.result.scenario.control.wavelength:g} µm": "of all simulated modes together, of nothing else",
-        "Gain": "of the integrator", "At a limit [%]": "steps in which a limit of the mirror changed the command",
+        "Gain": "of the integrator",
+        "At a limit [%]": "steps in which a limit of the mirror changed the command",
         "Needs": "what it must be given beside measurements",
     }
     rows = of_mode(shown, display)
@@ -56,9 +58,12 @@ def _row(row: Row, display: Display, scale: float, best: bool) -> str:
 
     residual = UNSTABLE if row["stable"] is False else scaled("residual_rms_nm")
     cells = [
-        (BEST if best else "") + residual, unlimited(row, scaled("predicted_rms_nm")),
-        NOTHING if row["strehl"] is None else f"{row['strehl']:.4f}", number(row["gain"]),
-        NOTHING if row["limited"] is None else number(100.0 * row["limited"], 2), escape(row["needs"]),
+        (BEST if best else "") + residual,
+        unlimited(row, scaled("predicted_rms_nm")),
+        NOTHING if row["strehl"] is None else f"{row['strehl']:.4f}",
+        number(row["gain"]),
+        NOTHING if row["limited"] is None else number(100.0 * row["limited"], 2),
+        escape(row["needs"]),
     ]
     return _line(row, display, cells)
 
@@ -66,12 +71,15 @@ def _row(row: Row, display: Display, scale: float, best: bool) -> str:
 def margins_html(shown: LoopShown, display: Display) -> str:
     """Margins of the loops that have a transfer function."""
     columns = {
-        "Controller": "", "Gain margin [dB]": "by which the loop gain may rise", "Phase margin [°]": "by which it may turn",
+        "Controller": "",
+        "Gain margin [dB]": "by which the loop gain may rise",
+        "Phase margin [°]": "by which it may turn",
         "Delay margin [ms]": "by which it may come later",
     }
     rows = [r for r in of_mode(shown, display) if r["phase_margin_deg"] is not None]
     body = "".join(
-        _line(r, display, [number(r[key]) for key in ("gain_margin_db", "phase_margin_deg", "delay_margin_ms")]) for r in rows)
+        _line(r, display, [number(r[key]) for key in ("gain_margin_db", "phase_margin_deg", "delay_margin_ms")]) for r in rows
+    )
     return _table("Margins", columns, body)
 
 
@@ -84,5 +92,7 @@ def _line(row: Row, display: Display, cells: list[str]) -> str:
 
 def _table(name: str, columns: dict[str, str], body: str) -> str:
     head = "".join(f'<th scope=col title="{escape(why)}">{escape(column)}</th>' for column, why in columns.items())
-    return (f'<div class="scroll" tabindex=0 role=region aria-label="{name}">'
-            f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')
+    return (
+        f'<div class="scroll" tabindex=0 role=region aria-label="{name}">'
+        f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    )

@@ -21,7 +21,8 @@ from wfsobs.app.style import HEARD
 
 EXPLORE, IDENTIFY, TUNE, LOOP, FIGURES, MODEL = "explore", "identify", "tune", "loop", "figures", "model"
 TITLES: Mapping[str, str] = MappingProxyType(
-    {"Explore": EXPLORE, "Identify": IDENTIFY, "Tune": TUNE, "Closed loop": LOOP, "Paper figures": FIGURES, "Model": MODEL})
+    {"Explore": EXPLORE, "Identify": IDENTIFY, "Tune": TUNE, "Closed loop": LOOP, "Paper figures": FIGURES, "Model": MODEL}
+)
 
 WRAPPED = {"flexWrap": "wrap", "& .MuiToggleButton-root": {"width": "auto"}}
 """As many lines of buttons as a narrow window takes."""
@@ -45,14 +46,20 @@ class Pages(param.Parameterized):
     def __init__(self, explore: Page, store: Store, display: Display):
         super().__init__()
         self._makers: dict[str, Callable[[], Page]] = {
-            IDENTIFY: lambda: IdentifyPage(store, display), TUNE: lambda: TunePage(store, display),
-            LOOP: lambda: ClosedLoopPage(store.run, display), FIGURES: lambda: Figures(store.run, display),
-            MODEL: lambda: Model(store, display)}
+            IDENTIFY: lambda: IdentifyPage(store, display),
+            TUNE: lambda: TunePage(store, display),
+            LOOP: lambda: ClosedLoopPage(store.run, display),
+            FIGURES: lambda: Figures(store.run, display),
+            MODEL: lambda: Model(store, display),
+        }
         self.made: dict[str, Page] = {EXPLORE: explore}
-        self.rooms = {EXPLORE: explore.view(), **{
-            name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers}}
+        self.rooms = {
+            EXPLORE: explore.view(),
+            **{name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers},
+        }
         self.switch = pmui.RadioButtonGroup.from_param(
-            self.param.current, options=dict(TITLES), size="small", margin=0, color="primary", sx=WRAPPED, stylesheets=[HEARD])
+            self.param.current, options=dict(TITLES), size="small", margin=0, color="primary", sx=WRAPPED, stylesheets=[HEARD]
+        )
         self.view = pn.Column(*self.rooms.values(), sizing_mode="stretch_width", margin=0)
         self.param.watch(self._turn, "current")
 

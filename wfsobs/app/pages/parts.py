@@ -81,14 +81,16 @@ def legend(names: Mapping[str, str], dark: bool) -> str:
 class Starter:
     """The buttons that start, cancel and use something long, and the line on how it is going."""
 
-    def __init__(self, work: BackgroundTask, start: str, label: str, detail: Callable[[], str] = str,
-                 uses: Sequence[str] = ("Use it",)):
+    def __init__(
+        self, work: BackgroundTask, start: str, label: str, detail: Callable[[], str] = str, uses: Sequence[str] = ("Use it",)
+    ):
         """detail : what to add to the line while the work goes on;  uses : what can be done with the result."""
         self.work, self._detail = work, detail
         self.start = pmui.Button(label=start, icon="play_arrow", color="primary", size="small", margin=0)
         self.cancel = pmui.Button(label="Stop", icon="stop", variant="outlined", size="small", margin=0, disabled=True)
         self.uses = [
-            pmui.Button(label=use, icon="check", variant="outlined", size="small", margin=0, disabled=True) for use in uses]
+            pmui.Button(label=use, icon="check", variant="outlined", size="small", margin=0, disabled=True) for use in uses
+        ]
         self.status = Status(label=label, sizing_mode="stretch_width", margin=(4, 0), visible=False)
         self.cancel.on_click(lambda _event: work.cancel())
         work.param.watch(self.refresh, ["state", "progress", "place", "message", "latest", "result"])
@@ -106,4 +108,5 @@ class Starter:
         for use in self.uses:
             use.disabled = running or work.result is None
         self.status.param.update(
-            progress=work.progress, text=said + self._detail(), note=named(work.message), visible=work.state != IDLE)
+            progress=work.progress, text=said + self._detail(), note=named(work.message), visible=work.state != IDLE
+        )

@@ -35,7 +35,8 @@ INTRO = (
     "Searches the settings of one observer for the least RMS error on a validation record, which is neither the training nor the "
     "test record, and scores the settings before and after on the test record, which the search never sees. From settings the "
     "records are simulated; a loaded record is cut into pieces, and without truth the least is sought of the one-step prediction "
-    "error of z, or of the distance to a Butterworth reference. “Use it” takes the tuned settings into the drawer.")
+    "error of z, or of the distance to a Butterworth reference. “Use it” takes the tuned settings into the drawer."
+)
 EARLIER = "The settings of the drawer have changed since: this was tuned for others."
 START = "gpr-online"
 COLUMNS: tuple[str, ...] = ("section", "name", "before", "after")
@@ -48,8 +49,7 @@ class TunePage(Offers):
         self.store, self.run, self.display = store, store.run, display
         self.work = BackgroundTask(store.session)
         self.starter = Starter(self.work, "Start tuning", "Progress of the tuning", self._so_far)
-        self.observer = pmui.Select(
-            label="Observer", options=dict(CHOICES), value=START, size="small", width=190, margin=0)
+        self.observer = pmui.Select(label="Observer", options=dict(CHOICES), value=START, size="small", width=190, margin=0)
         self.target = pmui.Select(label="Error of", options=[], size="small", width=130, margin=0)
         self.evaluations = pmui.TextInput(label="Evaluations", value=str(EVALUATIONS), size="small", width=110, margin=0)
         self.inputs = (self.observer, self.target, self.evaluations)
@@ -73,8 +73,12 @@ class TunePage(Offers):
         """What is shown."""
         row = line(self.observer, self.target, self.evaluations, *self.starter.view())
         return pn.Column(
-            box("Tuning", text(INTRO), row, self.searched, self.starter.status, self.stale), self.history, self.outcome,
-            **WIDE, stylesheets=[":host { gap: 10px; }"])
+            box("Tuning", text(INTRO), row, self.searched, self.starter.status, self.stale),
+            self.history,
+            self.outcome,
+            **WIDE,
+            stylesheets=[":host { gap: 10px; }"],
+        )
 
     def show(self, visible: bool) -> None:
         """Draw what has come meanwhile, and go on while visible."""
@@ -110,8 +114,10 @@ class TunePage(Offers):
     @property
     def task(self) -> Task:
         """To tune the chosen observer."""
-        return Task(TUNE, {
-            "observer": self.observer.value, "target": self.target.value, "evaluations": parsed(str(self.evaluations.value))})
+        return Task(
+            TUNE,
+            {"observer": self.observer.value, "target": self.target.value, "evaluations": parsed(str(self.evaluations.value))},
+        )
 
     def saves(self) -> Mapping[str, Save | None]:
         """The table, errors [um], and the settings as `wfsobs tune --out` writes them."""
@@ -120,7 +126,8 @@ class TunePage(Offers):
         table = [dict(zip(COLUMNS, row, strict=True)) for row in rows(tuned)]
         return {
             "Tuning table as CSV": Save("wfsobs-tuning.csv", "text/csv", lambda: table_csv(table)),
-            "Tuned settings as TOML": Save("wfsobs-tuned.toml", "application/toml", toml(tuned).encode)}
+            "Tuned settings as TOML": Save("wfsobs-tuned.toml", "application/toml", toml(tuned).encode),
+        }
 
     def _choose(self, *_: object) -> None:
         """Offer what the observer estimates, and say what is searched."""
@@ -175,5 +182,6 @@ def _whole(field: pmui.TextInput, most: int) -> int:
     value = parsed(str(field.value))
     if not isinstance(value, int) or not 1 <= value <= most:
         raise SettingError(
-            f"{field.label} = {str(field.value)[:40]!r}: takes a whole number from 1 to {most}{hint(str(field.value))}")
+            f"{field.label} = {str(field.value)[:40]!r}: takes a whole number from 1 to {most}{hint(str(field.value))}"
+        )
     return value

@@ -19,7 +19,8 @@ from wfsobs.tuning.records import MEASURES, NEXT, REFERENCE, TRUTH
 from wfsobs.tuning.report import remarks
 
 TITLES = {
-    SETTING: "Settings", VALIDATION: "{measure} on the validation record, which the search sees [{unit}]",
+    SETTING: "Settings",
+    VALIDATION: "{measure} on the validation record, which the search sees [{unit}]",
     TEST: "{measure} on the test record, which it does not [{unit}]",
     OTHER: "The same of what it was not tuned for, turbulence or vibration [{unit}]",
     LIKELIHOOD: "Log marginal likelihood of the training targets, for information",
@@ -46,8 +47,10 @@ class HistoryFigure:
         scale = per_micrometre(unit, diameter)
         tried, best = (scale * np.array(y, dtype=float) for y in ([e.rms for e in history], best_so_far(history)))
         self.source.data = {
-            "x": np.arange(1, len(history) + 1), "tried": np.where(np.isfinite(tried), tried, np.nan),
-            "best": np.where(np.isfinite(best), best, np.nan)}
+            "x": np.arange(1, len(history) + 1),
+            "tried": np.where(np.isfinite(tried), tried, np.nan),
+            "best": np.where(np.isfinite(best), best, np.nan),
+        }
         self.figure.yaxis.axis_label = f"{AXES[measure]}, validation [{UNITS[unit]}]"
 
     def restyle(self, dark: bool) -> None:
@@ -81,8 +84,10 @@ def table_html(tuned: Tuned, display: Display, diameter: float) -> str:
         body += f'<tr data-section="{section}"><th scope=row>{shown}</th>{"".join(f"<td>{c}</td>" for c in cells)}</tr>'
     head = "".join(f"<th scope=col>{name}</th>" for name in ("What", "Before", "After", "Change [%]"))
     notes = "".join(f'<p class="text">{escape(line)}.</p>' for line in remarks(tuned) if "likelihood" not in line)
-    return (f'<div class="scroll" tabindex=0 role=region aria-label="Before and after">'
-            f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>{notes}')
+    return (
+        f'<div class="scroll" tabindex=0 role=region aria-label="Before and after">'
+        f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>{notes}'
+    )
 
 
 def _cell(value: float | str | None, scale: float, digits: int) -> str:

@@ -84,8 +84,7 @@ class Grid:
 
     def times(self) -> Array:
         """Times [s] of the points kept."""
-        return np.concatenate([
-            envelope_times(a, b, bins or b - a, self.dt) for a, b, bins in self._parts()])
+        return np.concatenate([envelope_times(a, b, bins or b - a, self.dt) for a, b, bins in self._parts()])
 
     def thin(self, x: Array) -> Floats:
         """The points kept of a signal (n,)."""
@@ -203,6 +202,7 @@ def _spaced(n: int) -> NDArray[np.int64]:
 
 
 # ---------------------------------------------------------------------- into the file
+
 
 class Pool:
     """Arrays in the file, each once however many states share it."""

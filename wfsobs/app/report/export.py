@@ -16,7 +16,12 @@ from wfsobs.scenario.grid import Variation, scenarios
 
 
 def export(
-    path: str | Path, scenario: Scenario, *, vary: Sequence[Variation] = (), preset: str = "paper", watch: Watch = QUIET,
+    path: str | Path,
+    scenario: Scenario,
+    *,
+    vary: Sequence[Variation] = (),
+    preset: str = "paper",
+    watch: Watch = QUIET,
     done: Callable[[Result], None] = lambda result: None,
 ) -> None:
     """Run a scenario and write the report: one HTML file with figures and numbers that opens without a network.

@@ -19,7 +19,7 @@ SHADES = {WARM_UP: "#808080", WINDOW: "#2B8AB3"}
 
 
 def all_figures(sweeps: bool) -> dict[str, figure]:
-    """"trace-turbulence" and the like -> figure; the traces share their time axis, the spectra their frequencies.
+    """ "trace-turbulence" and the like -> figure; the traces share their time axis, the spectra their frequencies.
 
     sweeps : with those of errors over a setting that varies
     """
@@ -41,8 +41,9 @@ def _trace(target: str, times: Range1d, crosshair: CrosshairTool) -> figure:
     fig.xaxis.axis_label = "time [s]"
     fig.add_tools(crosshair)
     for name, colour in SHADES.items():
-        fig.add_layout(BoxAnnotation(
-            left=0, right=0, fill_color=colour, fill_alpha=0.10, line_width=0, level="underlay", name=name))
+        fig.add_layout(
+            BoxAnnotation(left=0, right=0, fill_color=colour, fill_alpha=0.10, line_width=0, level="underlay", name=name)
+        )
     source = ColumnDataSource({"x": [], **{name: [] for name in _names(target)}})
     for name in _names(target):
         add_line(fig, name, source, name)
@@ -51,15 +52,16 @@ def _trace(target: str, times: Range1d, crosshair: CrosshairTool) -> figure:
 
 def _spectrum(target: str, frequencies: Range1d) -> figure:
     """Spectra, log-log, the peaks of the vibration and of the Kalman filters' model marked."""
-    fig = new_figure(
-        x_range=frequencies, y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log")
+    fig = new_figure(x_range=frequencies, y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log")
     fig.xaxis.axis_label = "frequency [Hz]"
     if target == VIBRATION:
         marks: list[DataRenderer] = [
             fig.add_glyph(ColumnDataSource({"x": [], "text": []}), VSpan(x="x", **look), name=name)
             for name, look in (
                 ("peaks", {"line_color": PEAKS, "line_alpha": 0.4, "line_width": 1.5}),
-                ("model", {"line_color": MODEL, "line_dash": [4, 3], "line_width": 1.5}))]
+                ("model", {"line_color": MODEL, "line_dash": [4, 3], "line_width": 1.5}),
+            )
+        ]
         fig.add_tools(HoverTool(renderers=marks, tooltips="@text"))
     source = ColumnDataSource({"x": [], **{name: [] for name in _names(target)}})
     for name in _names(target):

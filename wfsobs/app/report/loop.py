@@ -14,28 +14,43 @@ from wfsobs.evaluation.rows import Row
 INTRO = (
     "The same disturbance and noise under every controller, with the delay and the limits of the mirror that the settings under "
     "<code>control</code> say. Strehl counts the simulated modes alone; theory is by the true spectra, for an endless record. "
-    "Multi-rate loops have no frequency response, and so no margins. " + f"{NOT_APPLICABLE}: {LIMITED}.")
+    "Multi-rate loops have no frequency response, and so no margins. " + f"{NOT_APPLICABLE}: {LIMITED}."
+)
 
 
 def loop_section(report: Report) -> str:
     """A table per state, that of the settings as they were unfolded."""
     names = [state_name(report, state, i) or "All modes" for i, state in enumerate(report.states)]
     tables = "".join(
-        f'<details{" open" * (i == report.start)}><summary>{escape(name)}</summary>{_table(state, name)}</details>'
-        for i, (name, state) in enumerate(zip(names, report.states, strict=True)))
+        f"<details{' open' * (i == report.start)}><summary>{escape(name)}</summary>{_table(state, name)}</details>"
+        for i, (name, state) in enumerate(zip(names, report.states, strict=True))
+    )
     return f'<p class="text">{INTRO}</p>{tables}'
 
 
 def _table(state: State, name: str) -> str:
     columns = (
-        "Controller", "Residual [nm]", "Residual [mas]", f"Strehl at {state.scenario.control.wavelength:g} µm", "Theory [nm]",
-        "Gain", "Gain margin [dB]", "Phase margin [°]", "Delay margin [ms]", "At a limit [%]", "Needs")
+        "Controller",
+        "Residual [nm]",
+        "Residual [mas]",
+        f"Strehl at {state.scenario.control.wavelength:g} µm",
+        "Theory [nm]",
+        "Gain",
+        "Gain margin [dB]",
+        "Phase margin [°]",
+        "Delay margin [ms]",
+        "At a limit [%]",
+        "Needs",
+    )
     head = "".join(f"<th scope=col>{column}</th>" for column in columns)
-    bodies = "".join(_body(mode, list(rows), len(columns)) for mode, rows in groupby(
-        sorted(state.loop, key=_order(state)), key=lambda row: row["mode"]))
+    bodies = "".join(
+        _body(mode, list(rows), len(columns))
+        for mode, rows in groupby(sorted(state.loop, key=_order(state)), key=lambda row: row["mode"])
+    )
     return (
         f'<div class="scroll" tabindex=0 role=region aria-label="Closed loop: {escape(name)}">'
-        f'<table class="rms"><thead><tr>{head}</tr></thead>{bodies}</table></div>')
+        f'<table class="rms"><thead><tr>{head}</tr></thead>{bodies}</table></div>'
+    )
 
 
 def _order(state: State):

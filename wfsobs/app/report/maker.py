@@ -33,8 +33,11 @@ def make(shown: Shown, preset: str, watch: Watch, _tell: object = None) -> bytes
     root = str(Path(wfsobs.__file__).parents[1])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}
     with subprocess.Popen(
-        [sys.executable, "-m", "wfsobs.app.report"], env=environment,
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        [sys.executable, "-m", "wfsobs.app.report"],
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
     ) as process:
         try:
             while True:

@@ -15,12 +15,20 @@ from wfsobs.scenario.grid import Variation
 def packed(report: Report) -> bytes:
     """A report as a file of plain arrays and text."""
     words = {
-        "preset": report.preset, "base": to_toml(report.base), "recorded": report.recorded,
+        "preset": report.preset,
+        "base": to_toml(report.base),
+        "recorded": report.recorded,
         "variations": [[v.path, v.values] for v in report.variations],
         "states": [
-            {"toml": to_toml(s.scenario), "rows": s.rows, "reasons": s.reasons, "grid": [s.grid.n, s.grid.dt, s.grid.bins],
-             "loop": list(s.loop)}
-            for s in report.states],
+            {
+                "toml": to_toml(s.scenario),
+                "rows": s.rows,
+                "reasons": s.reasons,
+                "grid": [s.grid.n, s.grid.dt, s.grid.bins],
+                "loop": list(s.loop),
+            }
+            for s in report.states
+        ],
     }
     arrays = {f"{i}/{name}": line for i, s in enumerate(report.states) for name, line in s.lines.items()}
     file = io.BytesIO()
@@ -39,6 +47,7 @@ def unpacked(content: bytes) -> Report:
                 lines[int(number)][name] = file[key]
     states = tuple(
         State(from_toml(s["toml"]), s["rows"], tuple(s["reasons"]), Grid(*s["grid"]), of, s["loop"])
-        for s, of in zip(words["states"], lines, strict=True))
+        for s, of in zip(words["states"], lines, strict=True)
+    )
     variations = tuple(Variation(path, tuple(values)) for path, values in words["variations"])
     return Report(words["preset"], from_toml(words["base"]), variations, states, words["recorded"])

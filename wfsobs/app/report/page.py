@@ -67,10 +67,12 @@ def page(report: Report, made: datetime) -> str:
         f"<script>{START}</script>\n</head>\n<body>\n{_symbols()}\n"
         f"<header><h1>wfsobs report</h1><p>{summary(report, made)}</p></header>\n<main>\n{_body(report, made)}</main>\n"
         f"{_embedded('rows', _rows(report))}{_embedded('data', _data(report))}{_embedded('figures', figures)}"
-        f'<script>{bokeh}</script>\n<script type="module">{script}</script>\n</body>\n</html>\n')
+        f'<script>{bokeh}</script>\n<script type="module">{script}</script>\n</body>\n</html>\n'
+    )
 
 
 # ---------------------------------------------------------------------- sections
+
 
 def _body(report: Report, made: datetime) -> str:
     """The sections from the top."""
@@ -97,13 +99,19 @@ def _controls(report: Report) -> str:
     sliders = "".join(
         f'<div class="slider"><label for="vary-{i}">{escape(name_of(report.base, v.path))} <code>{escape(v.path)}</code></label>'
         f'<input type="range" id="vary-{i}" min="0" max="{len(v.values) - 1}" value="0" step="1" autocomplete="off">'
-        f'<output for="vary-{i}"></output></div>' for i, v in enumerate(report.variations))
+        f'<output for="vary-{i}"></output></div>'
+        for i, v in enumerate(report.variations)
+    )
     modes = {name: name[0].upper() + name[1:] for name in _modes(report)}
-    switches = "".join((
-        (_switch if len(modes) <= len(TIP_TILT) else _list)("mode", "Mode", modes), _switch("unit", "Unit", UNITS),
-        _switch("show", "Show", {SIGNAL: "Signal", ERROR: "Error"}),
-        _switch("spectrum", "Spectrum", {PSD: "PSD", CUMULATIVE: "Cumulative rms"}),
-        _switch("zoom", "Time window", {"whole": "Whole record", "2": "2 s", "0.5": "0.5 s"})))
+    switches = "".join(
+        (
+            (_switch if len(modes) <= len(TIP_TILT) else _list)("mode", "Mode", modes),
+            _switch("unit", "Unit", UNITS),
+            _switch("show", "Show", {SIGNAL: "Signal", ERROR: "Error"}),
+            _switch("spectrum", "Spectrum", {PSD: "PSD", CUMULATIVE: "Cumulative rms"}),
+            _switch("zoom", "Time window", {"whole": "Whole record", "2": "2 s", "0.5": "0.5 s"}),
+        )
+    )
     sliders = f'<div class="sliders">{sliders}</div>' if sliders else ""
     return f'{sliders}<div class="switches">{switches}</div><p id="fault" role="alert" hidden></p>'
 
@@ -111,7 +119,9 @@ def _controls(report: Report) -> str:
 def _switch(name: str, title: str, options: Any) -> str:
     buttons = "".join(
         f'<label><input type="radio" name="{name}" value="{escape(value)}" autocomplete="off"{" checked" * (i == 0)}>'
-        f"<span>{escape(label)}</span></label>" for i, (value, label) in enumerate(options.items()))
+        f"<span>{escape(label)}</span></label>"
+        for i, (value, label) in enumerate(options.items())
+    )
     return f'<fieldset class="switch"><legend class="hidden">{title}</legend>{buttons}</fieldset>'
 
 
@@ -130,8 +140,8 @@ def _target(report: Report, target: str) -> str:
     shades = _shade("warm-up", WARM_UP) + (_shade("every sample", WINDOW) if window_of(report.states) else "")
     figures = "".join(
         f'<figure><figcaption class="caption">{title}{marks}</figcaption><div id="{kind}-{target}"></div></figure>'
-        for kind, title, marks in (
-            (TRACE, "Time trace", shades), (SPECTRUM, "Spectrum", MARKS if target == VIBRATION else "")))
+        for kind, title, marks in ((TRACE, "Time trace", shades), (SPECTRUM, "Spectrum", MARKS if target == VIBRATION else ""))
+    )
     return f'<div id="cards-{target}"></div><div class="figures">{figures}</div>'
 
 
@@ -141,7 +151,8 @@ def _sweep(report: Report) -> str:
     choice = f'<div class="switches">{_list("over", "Over", paths)}</div>' if len(paths) > 1 else ""
     figures = "".join(
         f'<figure><figcaption class="caption">{target.capitalize()}</figcaption><div id="{SWEEP}-{target}"></div></figure>'
-        for target in TARGETS)
+        for target in TARGETS
+    )
     return f'{choice}<div class="figures even">{figures}</div>'
 
 
@@ -163,16 +174,19 @@ def _tables(report: Report) -> str:
     several = len(report.states) > 1
     names = [state_name(report, state, i) or "All modes" for i, state in enumerate(report.states)]
     tables = "".join(
-        f'<details{" open" * (i == report.start)}><summary>{escape(name)}</summary>'
+        f"<details{' open' * (i == report.start)}><summary>{escape(name)}</summary>"
         f'<div data-state="{i}">{state_table(state, name)}</div></details>'
-        for i, (name, state) in enumerate(zip(names, report.states, strict=True)))
+        for i, (name, state) in enumerate(zip(names, report.states, strict=True))
+    )
     heading = f"<h3>Every variation</h3>{tables}" if several else tables
     return (
         '<p class="no-script">The figures need JavaScript; the numbers are here.</p>'
-        f'<div id="table" class="script-only"></div><div{"" if several else " class=no-script"}>{heading}</div>')
+        f'<div id="table" class="script-only"></div><div{"" if several else " class=no-script"}>{heading}</div>'
+    )
 
 
 # ---------------------------------------------------------------------- for the script
+
 
 def _rows(report: Report) -> list[dict[str, Any]]:
     """What varies and the rows of every state: those of `wfsobs run --json`, with the computing time."""
@@ -184,13 +198,20 @@ def _data(report: Report) -> dict[str, Any]:
     pool = Pool()
     states = [_state(state, pool) for state in report.states]
     return {
-        "looks": {name: {"label": look(name).label, "light": look(name).light, "dark": look(name).dark,
-                         "dash": look(name).dash} for name in _drawn()},
+        "looks": {
+            name: {"label": look(name).label, "light": look(name).light, "dark": look(name).dark, "dash": look(name).dash}
+            for name in _drawn()
+        },
         "names": {target: [TRUTH, *observers_of(target)] for target in TARGETS},
-        "modes": _modes(report), "tilts": [m.name for m in TIP_TILT], "angles": NO_ANGLE, "units": UNITS, "start": report.start,
+        "modes": _modes(report),
+        "tilts": [m.name for m in TIP_TILT],
+        "angles": NO_ANGLE,
+        "units": UNITS,
+        "start": report.start,
         "variations": [[value_of(value) for value in v.values] for v in report.variations],
         "sweeps": {i: [name_of(report.base, report.variations[i].path), report.variations[i].values] for i in _sweeps(report)},
-        "window": window_of(report.states), "states": states,
+        "window": window_of(report.states),
+        "states": states,
         "arrays": [base64.b64encode(array).decode() for array in pool.all()],
     }
 
@@ -199,11 +220,16 @@ def _state(state: State, pool: Pool) -> dict[str, Any]:
     scenario, grid = state.scenario, state.grid
     lines = {
         name: coded(line, pool, logarithmic=name.startswith(("psd", "cumulative")))
-        for name, line in state.lines.items() if "/" in name}
+        for name, line in state.lines.items()
+        if "/" in name
+    }
     axes = {"time": grid.times(), **{name: line for name, line in state.lines.items() if "/" not in name}}
     return {
         "scale": {unit: per_micrometre(unit, scenario.telescope.diameter) for unit in UNITS},
-        "dt": grid.dt, "length": grid.n * grid.dt, "warm_up": scenario.run.warm_up, "lines": lines,
+        "dt": grid.dt,
+        "length": grid.n * grid.dt,
+        "warm_up": scenario.run.warm_up,
+        "lines": lines,
         "axes": {name: pool.add(axis.astype("<f4").tobytes()) for name, axis in axes.items()},
         "peaks": [[p.frequency, f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}"] for p in marked_peaks(scenario)],
         "model": [[scenario.kalman.frequency, f"model of the Kalman filters {scenario.kalman.frequency:.5g} Hz"]],
@@ -218,25 +244,32 @@ def _embedded(name: str, content: Any) -> str:
 
 # ---------------------------------------------------------------------- head
 
+
 def _policy(*scripts: str) -> str:
     """What the page may do: show itself and run these scripts."""
     sums = " ".join(f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'" for s in scripts)
-    return (f"default-src 'none'; script-src {sums}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; "
-            "form-action 'none'")
+    return (
+        f"default-src 'none'; script-src {sums}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; "
+        "form-action 'none'"
+    )
 
 
 def _colours() -> str:
     """The colour of every line in light and dark mode, as variables."""
+
     def of(dark: bool) -> str:
         return "".join(f"--line-{name}:{look(name).colour(dark)};" for name in _drawn())
-    return (f":root{{--primary:{PRIMARY};{of(False)}}}\n@media screen and (prefers-color-scheme:dark){{:root{{{of(True)}}}}}\n")
+
+    return f":root{{--primary:{PRIMARY};{of(False)}}}\n@media screen and (prefers-color-scheme:dark){{:root{{{of(True)}}}}}\n"
 
 
 def _symbols() -> str:
     """The lines' swatches, each once."""
     lines = "".join(
         f'<symbol id="line-{name}" viewBox="0 0 26 8"><line x1="0" y1="4" x2="26" y2="4" stroke="var(--line-{name})" '
-        f'stroke-width="2.5" stroke-dasharray="{" ".join(map(str, look(name).dash))}"/></symbol>' for name in _drawn())
+        f'stroke-width="2.5" stroke-dasharray="{" ".join(map(str, look(name).dash))}"/></symbol>'
+        for name in _drawn()
+    )
     return f'<svg width="0" height="0" class="symbols" aria-hidden="true">{lines}</svg>'
 
 

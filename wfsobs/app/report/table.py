@@ -24,7 +24,8 @@ COLUMNS = {
 """Heading -> explanation."""
 
 WITHOUT_TRUTH = {name.replace("truth", "z"): why for name, why in COLUMNS.items()} | {
-    'RMS error [<span class="unit">nm</span>]': "of z one step ahead, on samples that all have, or what the loop left"}
+    'RMS error [<span class="unit">nm</span>]': "of z one step ahead, on samples that all have, or what the loop left"
+}
 """The same where there is no truth."""
 
 BEST, ABOVE = '<span class="tag best">best</span> ', '<span class="tag above">above truth</span> '
@@ -39,7 +40,8 @@ def state_table(state: State, name: str) -> str:
     why = "".join(f'<p class="failure">{escape(reason)}</p>' for reason in state.reasons)
     return (
         f'<div class="scroll" tabindex=0 role=region aria-label="RMS errors: {escape(name)}">'
-        f'<table class="rms"><thead><tr>{head}</tr></thead>{bodies}</table></div>{why}')
+        f'<table class="rms"><thead><tr>{head}</tr></thead>{bodies}</table></div>{why}'
+    )
 
 
 def _group(row: Row) -> tuple[str, str]:
@@ -59,7 +61,8 @@ def _body(state: State, rows: list[Row]) -> str:
     title = f'<tr><th colspan={len(COLUMNS)} class="target" scope=rowgroup>{name}</th></tr>'
     return (
         f'<tbody data-target="{target}" data-mode="{escape(mode)}">{title}'
-        f'{"".join(_row(state, row, row["rms_um"] == best and competes(row["observer"], row["apart"])) for row in rows)}</tbody>')
+        f"{''.join(_row(state, row, row['rms_um'] == best and competes(row['observer'], row['apart'])) for row in rows)}</tbody>"
+    )
 
 
 def _row(state: State, row: Row, best: bool) -> str:
@@ -72,7 +75,8 @@ def _row(state: State, row: Row, best: bool) -> str:
         f"<td>{ABOVE if (row['normalised_rms'] or 0.0) > 1.0 else ''}{number(row['normalised_rms'])}</td>",
         f"<td class=words>{row['needs']}</td>",
         f"<td>{lag}</td>",
-        f"<td>{number(time)}</td>", f"<td>{number(None if time is None else 1e-6 * time / state.grid.dt, 2)}</td>",
+        f"<td>{number(time)}</td>",
+        f"<td>{number(None if time is None else 1e-6 * time / state.grid.dt, 2)}</td>",
     ]
     return f'<tr data-observer="{name}"><th scope=row>{swatch(name)}{label}</th>{"".join(cells)}</tr>'
 

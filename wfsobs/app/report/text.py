@@ -39,6 +39,7 @@ def summary(report: Report, made: datetime) -> str:
 
 # ---------------------------------------------------------------------- settings in words
 
+
 def name_of(scenario: Scenario, path: str) -> str:
     """A setting's label, its unit in [brackets]; the path itself of what has none."""
     p = {known: p for known, _, p in scenario.walk()}.get(path)
@@ -73,27 +74,36 @@ def values_of(report: Report, index: int) -> list[Any]:
 
 # ---------------------------------------------------------------------- sections
 
+
 def scenario_section(report: Report) -> str:
     """What differs from the preset, what varies, and every setting folded away."""
     preset = pristine(report.preset)
     rows = [
         f"<tr><th scope=row>{escape(name_of(report.base, path))}<br><code>{escape(path)}</code></th>"
         f"<td>{escape(value_of(_at(preset, path)))}</td><td>{escape(value_of(value))}</td></tr>"
-        for path, value in changes(report.base, preset).items()]
+        for path, value in changes(report.base, preset).items()
+    ]
     changed = (
-        '<div class="scroll" tabindex=0 role=region aria-label="Settings changed"><table class="settings"><thead><tr>'
-        f"<th scope=col>Setting</th><th scope=col>Preset {escape(report.preset)}</th><th scope=col>Here</th></tr></thead>"
-        f"<tbody>{''.join(rows)}</tbody></table></div>"
-    ) if rows else f"<p>Every setting is that of the preset {escape(report.preset)}.</p>"
+        (
+            '<div class="scroll" tabindex=0 role=region aria-label="Settings changed"><table class="settings"><thead><tr>'
+            f"<th scope=col>Setting</th><th scope=col>Preset {escape(report.preset)}</th><th scope=col>Here</th></tr></thead>"
+            f"<tbody>{''.join(rows)}</tbody></table></div>"
+        )
+        if rows
+        else f"<p>Every setting is that of the preset {escape(report.preset)}.</p>"
+    )
     varied = "".join(
         f"<li>{escape(name_of(report.states[0].scenario, v.path))} (<code>{escape(v.path)}</code>): "
-        f"{escape(', '.join(map(value_of, v.values)))}</li>" for v in report.variations)
+        f"{escape(', '.join(map(value_of, v.values)))}</li>"
+        for v in report.variations
+    )
     text = f'preset = "{report.preset}"\n{to_toml(report.base)}'
     link = f"data:application/toml;base64,{base64.b64encode(text.encode()).decode()}"
     return (
         f"{changed}{f'<p>Varied:</p><ul>{varied}</ul>' if varied else ''}"
-        f"<details><summary>Every setting, as TOML</summary><p><a download={FILE} href=\"{link}\">Save as {FILE}</a></p>"
-        f"<pre tabindex=0><code>{escape(text)}</code></pre></details>")
+        f'<details><summary>Every setting, as TOML</summary><p><a download={FILE} href="{link}">Save as {FILE}</a></p>'
+        f"<pre tabindex=0><code>{escape(text)}</code></pre></details>"
+    )
 
 
 def meaning_section(report: Report) -> str:
@@ -106,7 +116,9 @@ def meaning_section(report: Report) -> str:
         "seed gives other numbers (<code>wfsobs run --seeds 20</code> shows how much).",
         "<b>No truth</b>: in place of the error of an estimate there is that of its prediction of the next measurement z, noise "
         "included, of whoever estimates both turbulence and vibration; and the residual, what the recorded loop left of z. "
-        "Both are divided by the rms of z." if _truthless(report) else "",
+        "Both are divided by the rms of z."
+        if _truthless(report)
+        else "",
         "<b>error / truth</b> (normalised error): that error over the rms of the truth in the same steps. At 1 an observer does "
         "no better than answering zero, which is the row <b>Zero</b>, a baseline and not an observer; above 1 it does harm.",
         "<b>Looks ahead</b>: the open-loop Butterworth runs forward and backward over measurements with the mirror at rest. It "
@@ -114,17 +126,22 @@ def meaning_section(report: Report) -> str:
         "a step uses nothing measured after it.",
         "<b>Bound, mean of the LGS</b>: the least error that any causal observer of the mean of the LGS could have with the true "
         "spectra of the scenario, after an endless record; no observer, and never marked best. Beside it where the error of an "
-        "optimal observer that starts with the record lies in 95 % of records." if _bounded(report) else "",
+        "optimal observer that starts with the record lies in 95 % of records."
+        if _bounded(report)
+        else "",
         "<b>Lag</b>: the delay at which an estimate is most like the truth; positive is late. Of signals with a strong line it "
         "can be negative without any look ahead.",
         "<b>Time per step</b>: measured once on the machine named below, per mode; the one column that is not reproducible.",
         "<b>Units</b>: Noll-normalised Zernike coefficients, rms over the pupil; tip and tilt in mas are 4 a / D on the sky, "
         "with the aperture diameter D.",
-        _matched(base), _points(report),
+        _matched(base),
+        _points(report),
     ]
     if len(report.states) > 1:
-        points.append("Variations of the same seed and length share their random numbers, so that differences come from the "
-                      "settings and not from chance.")
+        points.append(
+            "Variations of the same seed and length share their random numbers, so that differences come from the "
+            "settings and not from chance."
+        )
     return f"<ul>{''.join(f'<li>{point}</li>' for point in points if point)}</ul>"
 
 
@@ -138,11 +155,19 @@ def _bounded(report: Report) -> bool:
 
 def _matched(base: Scenario) -> str:
     """What the filters are told that a real one is not."""
-    told = [what for what, how in (("disturbances", base.kalman.process_noise), ("sensor noise", base.kalman.measurement_noise))
-            if how == "matched"]
+    told = [
+        what
+        for what, how in (("disturbances", base.kalman.process_noise), ("sensor noise", base.kalman.measurement_noise))
+        if how == "matched"
+    ]
     return (
-        f"The Kalman filters are told the strength of the simulated {' and '.join(told)} (<code>matched</code>); a real one has "
-        "to estimate it. The RMS errors are thus those of a well-tuned filter.") if told else ""
+        (
+            f"The Kalman filters are told the strength of the simulated {' and '.join(told)} (<code>matched</code>); a real one "
+            "has to estimate it. The RMS errors are thus those of a well-tuned filter."
+        )
+        if told
+        else ""
+    )
 
 
 def _points(report: Report) -> str:
@@ -156,15 +181,18 @@ def _points(report: Report) -> str:
         many = " to ".join(f"{n}" for n in (counts[0], counts[-1])[: len(counts)])
         kept = f"Each trace keeps {many} points: the lowest and the highest sample of equal bins"
         kept += f", but every sample from {window[0]:.3f} to {window[1]:.3f} s (shaded)" if window else ""
-    return (f"{kept}. Zooming in shows no more than these; spectra (Welch, Hann windows of 2 s) and tables come from all "
-            "samples. Lines are drawn to 1/65000 of their range.")
+    return (
+        f"{kept}. Zooming in shows no more than these; spectra (Welch, Hann windows of 2 s) and tables come from all "
+        "samples. Lines are drawn to 1/65000 of their range."
+    )
 
 
 def origin_section(report: Report, made: datetime) -> str:
     """Versions, date, seed, and the command that makes the report again."""
     command, by_file = command_of(report)
     facts = {
-        "Program": f"wfsobs {__version__}, {machine(('bokeh',))}", "Made": f"{made:%Y-%m-%d %H:%M:%S %Z}".rstrip(),
+        "Program": f"wfsobs {__version__}, {machine(('bokeh',))}",
+        "Made": f"{made:%Y-%m-%d %H:%M:%S %Z}".rstrip(),
         **({} if report.recorded else {"Seed": str(report.base.run.seed)}),
     }
     if report.recorded:

@@ -70,8 +70,7 @@ class EventMarks:
         self.words = ColumnDataSource({"x": [], "y": [], "text": [], "below": []})
         self._line = VSpan(x="x", line_width=1.5, line_dash=[6, 3])
         self._strip = VStrip(x0="start", x1="end", fill_alpha=0.13, line_width=0)
-        self._text = Text(
-            x="x", y="y", text="text", x_offset=4, y_offset="below", text_baseline="top", text_font_size="11px")
+        self._text = Text(x="x", y="y", text="text", x_offset=4, y_offset="below", text_baseline="top", text_font_size="11px")
         fig.add_glyph(self.spans, self._strip, level="underlay")
         fig.add_glyph(self.jumps, self._line)
         fig.add_glyph(self.words, self._text, level="overlay")
@@ -83,9 +82,15 @@ class EventMarks:
         send(self.jumps, {"x": [e.start for e in events if not e.duration > 0]})
         send(self.spans, {"start": [e.start for e in lasting], "end": [e.start + e.duration for e in lasting]})
         top = float(self.figure.y_range.end)  # type: ignore[attr-defined]
-        send(self.words, {
-            "x": [e.start for e in events], "y": [top] * len(events), "text": [word(e, shown.scenario) for e in events],
-            "below": [2 + LINE_PX * level for level in levels(shown)]})
+        send(
+            self.words,
+            {
+                "x": [e.start for e in events],
+                "y": [top] * len(events),
+                "text": [word(e, shown.scenario) for e in events],
+                "below": [2 + LINE_PX * level for level in levels(shown)],
+            },
+        )
         self.restyle(dark)
 
     def restyle(self, dark: bool) -> None:

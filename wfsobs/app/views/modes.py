@@ -22,9 +22,11 @@ class ModeSwitch:
         self.run, self.display = run, display
         options = {_title(mode): mode.name for mode in TIP_TILT}
         self.buttons = pmui.RadioButtonGroup(
-            label="Mode", options=options, value=display.mode, size="small", margin=0, variant="outlined", stylesheets=[HEARD])
+            label="Mode", options=options, value=display.mode, size="small", margin=0, variant="outlined", stylesheets=[HEARD]
+        )
         self.list = pmui.Select(
-            label="Mode", options=options, value=display.mode, size="small", margin=0, width=190, visible=False)
+            label="Mode", options=options, value=display.mode, size="small", margin=0, width=190, visible=False
+        )
         for widget in (self.buttons, self.list):
             widget.param.watch(self._chosen, "value")
         run.param.watch(self._fit, "result")
@@ -70,8 +72,14 @@ class UnitSwitch:
     def __init__(self, display: Display):
         self.display = display
         self.buttons = pmui.RadioButtonGroup(
-            label="Unit", options=self._options(), value=display.unit, size="small", margin=0, variant="outlined",
-            stylesheets=[HEARD])
+            label="Unit",
+            options=self._options(),
+            value=display.unit,
+            size="small",
+            margin=0,
+            variant="outlined",
+            stylesheets=[HEARD],
+        )
         self.buttons._debounce = SOON  # type: ignore[misc]
         self.note = pn.pane.HTML(NO_MAS, visible=False, margin=0)
         self.buttons.param.watch(self._chosen, "value")

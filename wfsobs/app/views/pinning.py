@@ -21,8 +21,8 @@ class Pinning:
     def __init__(self, run: BackgroundTask, display: Display):
         self.run, self.display = run, display
         self.button = pmui.Button(
-            label="Pin", icon="push_pin", size="small", variant="outlined", margin=0, disabled=True,
-            description=PIN)
+            label="Pin", icon="push_pin", size="small", variant="outlined", margin=0, disabled=True, description=PIN
+        )
         self.note = pn.pane.HTML("", margin=0, visible=False, stylesheets=[asset("style.css")])
         self.button.on_click(self._pressed)
         run.param.watch(self._refresh, "result")
@@ -41,8 +41,7 @@ class Pinning:
     def _refresh(self, *_: object) -> None:
         kept, shown = self.display.pinned, self.run.result
         if (self.button.label == "Unpin") != (kept is not None):
-            self.button.param.update(
-                label="Pin" if kept is None else "Unpin", description=PIN if kept is None else UNPIN)
+            self.button.param.update(label="Pin" if kept is None else "Unpin", description=PIN if kept is None else UNPIN)
             self.note.visible = kept is not None
         self.button.disabled = shown is None
         if kept is not None and shown is not None:

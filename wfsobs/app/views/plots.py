@@ -26,8 +26,15 @@ MARKED_LINE = 0.004
 def new_figure(**options: Any) -> figure:
     """An empty figure as wide as its room, the scroll wheel left to the page until chosen."""
     fig = figure(
-        height=HEIGHT, sizing_mode="stretch_width", min_width=240, tools="xbox_zoom,xpan,xwheel_zoom,reset,save",
-        active_drag="xbox_zoom", toolbar_location="above", min_border_right=10, min_border_left=70, **options,
+        height=HEIGHT,
+        sizing_mode="stretch_width",
+        min_width=240,
+        tools="xbox_zoom,xpan,xwheel_zoom,reset,save",
+        active_drag="xbox_zoom",
+        toolbar_location="above",
+        min_border_right=10,
+        min_border_left=70,
+        **options,
     )
     fig.toolbar.logo = None
     fig.toolbar.autohide = True
@@ -92,9 +99,17 @@ class Faint:
                 return
             self.source = ColumnDataSource({"xs": [], "ys": [], "colour": []})
             self.figure.multi_line(
-                "xs", "ys", line_color="colour", line_alpha=0.4, line_width=1.0, source=self.source, name="pinned",
-                level="underlay")
+                "xs",
+                "ys",
+                line_color="colour",
+                line_alpha=0.4,
+                line_width=1.0,
+                source=self.source,
+                name="pinned",
+                level="underlay",
+            )
         self.source.data = {
-            "xs": [x for x, _ in lines.values()], "ys": [y for _, y in lines.values()],
+            "xs": [x for x, _ in lines.values()],
+            "ys": [y for _, y in lines.values()],
             "colour": [look(name).colour(dark) for name in lines],
         }

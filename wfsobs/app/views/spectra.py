@@ -67,7 +67,10 @@ class _Spectrum:
     def __init__(self, target: str, x_range: Range1d):
         self.target = target
         self.figure = new_figure(
-            x_range=x_range, y_range=Range1d(start=1e-6, end=1.0), x_axis_type="log", y_axis_type="log",
+            x_range=x_range,
+            y_range=Range1d(start=1e-6, end=1.0),
+            x_axis_type="log",
+            y_axis_type="log",
         )
         self.figure.xaxis.axis_label = "frequency [Hz]"
         if target == VIBRATION:
@@ -81,8 +84,7 @@ class _Spectrum:
         self.peaks = ColumnDataSource({"x": [], "text": []})
         self.model = ColumnDataSource({"x": [], "text": []})
         peaks = self.figure.add_glyph(self.peaks, VSpan(x="x", line_color=PEAKS, line_alpha=0.4, line_width=1.5))
-        model = self.figure.add_glyph(
-            self.model, VSpan(x="x", line_color=MODEL, line_dash=[4, 3], line_width=1.5))
+        model = self.figure.add_glyph(self.model, VSpan(x="x", line_color=MODEL, line_dash=[4, 3], line_width=1.5))
         self.figure.add_tools(HoverTool(renderers=[peaks, model], tooltips="@text"))
 
     def draw(self, shown: Shown, display: Display) -> None:
@@ -100,7 +102,8 @@ class _Spectrum:
         self._fit(drawn + self.draw_pinned(display), display.cumulative)
         of = " of error" if display.error else ""
         what, unit = (
-            (f"cumulative rms{of}", display.unit_label) if display.cumulative else (f"PSD{of}", f"{display.unit_label}²/Hz"))
+            (f"cumulative rms{of}", display.unit_label) if display.cumulative else (f"PSD{of}", f"{display.unit_label}²/Hz")
+        )
         self.figure.yaxis.axis_label = f"{what}, {display.mode_label} [{unit}]"
         if self.target == VIBRATION:
             self._draw_marks(shown)
@@ -128,13 +131,20 @@ class _Spectrum:
     def _draw_marks(self, shown: Shown) -> None:
         simulated = shown.result.record.vibration is not None  # peaks of the settings are not those of a record
         drawn, kalman = marked_peaks(shown.scenario) if simulated else [], shown.scenario.kalman
-        send(self.peaks, {
-            "x": [p.frequency for p in drawn],
-            "text": [f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}" for p in drawn],
-        })
-        send(self.model, {
-            "x": [kalman.frequency], "text": [f"model of the Kalman filters {kalman.frequency:.5g} Hz"],
-        })
+        send(
+            self.peaks,
+            {
+                "x": [p.frequency for p in drawn],
+                "text": [f"peak {p.frequency:.5g} Hz, damping {p.damping:.3g}" for p in drawn],
+            },
+        )
+        send(
+            self.model,
+            {
+                "x": [kalman.frequency],
+                "text": [f"model of the Kalman filters {kalman.frequency:.5g} Hz"],
+            },
+        )
 
 
 def _curve(spectrum: Spectrum, name: str, display: Display, diameter: float) -> Array:

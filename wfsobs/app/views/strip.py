@@ -81,7 +81,11 @@ class Strip:
     def _card(self, name: str, value: float | None, note: str) -> dict[str, Any]:
         it = look(name)
         return {
-            "name": name, "label": it.label, "colour": it.colour(self.display.dark), "dash": list(it.dash),
-            "note": note, "value": NOTHING if value is None else number(value),
+            "name": name,
+            "label": it.label,
+            "colour": it.colour(self.display.dark),
+            "dash": list(it.dash),
+            "note": note,
+            "value": NOTHING if value is None else number(value),
             "unit": "" if value is None else self.display.unit_label,
         }

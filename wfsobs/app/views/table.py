@@ -48,16 +48,24 @@ class Table:
     def _columns(self) -> dict[str, str]:
         """Heading -> explanation."""
         unit = self.display.unit_label
-        pinned = {
-            f"Pinned [{unit}]": "RMS error in the pinned run", "Change [%]": "from the pinned run to this one",
-        } if self.display.pinned else {}
+        pinned = (
+            {
+                f"Pinned [{unit}]": "RMS error in the pinned run",
+                "Change [%]": "from the pinned run to this one",
+            }
+            if self.display.pinned
+            else {}
+        )
         base = "z" if self._without_truth() else "truth"
         return {
             "Observer": "and its line in the figures",
-            f"RMS error [{unit}]": "of the estimate, after the warm-up, on samples that all have", **pinned,
-            f"RMS {base} [{unit}]": "the error of answering zero", f"error / {base}": "above 1 is worse than answering zero",
+            f"RMS error [{unit}]": "of the estimate, after the warm-up, on samples that all have",
+            **pinned,
+            f"RMS {base} [{unit}]": "the error of answering zero",
+            f"error / {base}": "above 1 is worse than answering zero",
             "Needs": "what has to be given beside measurements",
-            "Lag [ms]": "how late the estimate is", "Time per step [µs]": "computing time per step and mode",
+            "Lag [ms]": "how late the estimate is",
+            "Time per step [µs]": "computing time per step and mode",
             "Real-time factor": "time per step over the step of the loop; below 1 keeps up with it",
         }
 
@@ -79,11 +87,20 @@ class Table:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             loop = score.observer == LOOP
             is_best = score.rms == best and competes(score.observer, score.apart)
-            cells = [(BEST if is_best else "") + number(score.rms * scale),
-                     *self._pinned(score.observer, score.target, score), number(score.truth_rms * scale),
-                     number(score.normalised_rms), needs_of(score.observer), NOTHING, *_times(score, shown.result.record.dt)]
-            label = "Recorded loop, residual" if loop else (
-                f"{swatch(score.observer, self.display.dark)}{escape(label_of(score.observer))}{_own(score)}")
+            cells = [
+                (BEST if is_best else "") + number(score.rms * scale),
+                *self._pinned(score.observer, score.target, score),
+                number(score.truth_rms * scale),
+                number(score.normalised_rms),
+                needs_of(score.observer),
+                NOTHING,
+                *_times(score, shown.result.record.dt),
+            ]
+            label = (
+                "Recorded loop, residual"
+                if loop
+                else (f"{swatch(score.observer, self.display.dark)}{escape(label_of(score.observer))}{_own(score)}")
+            )
             values = "".join(f"<td>{c}</td>" for c in cells)
             head = f"<th scope=row>{label}</th>"
             out.append(f'<tr data-observer="{score.observer}" data-target="{score.target}">{head}{values}</tr>')
@@ -96,7 +113,8 @@ class Table:
         shown = self.run.result
         scores = {
             name: find(shown, name, target, self.display.mode) if shown else None
-            for name in (*observers_of(target, hidden=True), BOUND)}
+            for name in (*observers_of(target, hidden=True), BOUND)
+        }
         best = min((s.rms for n, s in scores.items() if s and competes(n, s.apart)), default=None)
         order = list(scores.items())
         if self.display.best_first:
@@ -113,7 +131,8 @@ class Table:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             is_best = score.rms == best and competes(name, score.apart)
             cells = [
-                (BEST if is_best else "") + number(score.rms * scale) + interval_html(score.interval, scale), *pinned,
+                (BEST if is_best else "") + number(score.rms * scale) + interval_html(score.interval, scale),
+                *pinned,
                 number(score.truth_rms * scale),
                 (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
                 needs_of(name),

@@ -116,8 +116,7 @@ class _Trace:
         self.figure = new_figure(x_range=x_range, y_range=Range1d(start=-1.0, end=1.0))
         self.figure.xaxis.axis_label = "time [s]"
         self.figure.add_tools(crosshair)
-        self.warm_up = BoxAnnotation(
-            left=0, right=0, fill_color="#808080", fill_alpha=0.10, line_width=0, level="underlay")
+        self.warm_up = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.10, line_width=0, level="underlay")
         self.figure.add_layout(self.warm_up)
         self.lines = {name: add_line(self.figure, name, self.source, name) for name in self.names}
         self.faint = Faint(self.figure)

@@ -110,7 +110,8 @@ def check_condition(S: Array, kernel: SquaredExponential) -> None:
     if not condition <= MAX_CONDITION:
         raise ConditionError(
             f"the covariance has condition {condition:.1e}, above {MAX_CONDITION:.0e}: raise noise_std "
-            f"({kernel.noise_std:g}) or length_scale ({kernel.length_scale:g}), or lower signal_std ({kernel.signal_std:g})")
+            f"({kernel.noise_std:g}) or length_scale ({kernel.length_scale:g}), or lower signal_std ({kernel.signal_std:g})"
+        )
 
 
 def _largest_eigenvalue(apply: Callable[[Array], Array], n: int) -> float:
@@ -147,9 +148,7 @@ def restart_interval(depth: int) -> int:
     return max(16, depth)
 
 
-def sliding_products(
-    a: Array, b: Array, depth: int, i0: int, j0: int, rows: int, offsets: int, triangle: bool = False
-) -> Array:
+def sliding_products(a: Array, b: Array, depth: int, i0: int, j0: int, rows: int, offsets: int, triangle: bool = False) -> Array:
     """Inner products of windows of `a` with windows of `b` along diagonals, shape (rows, offsets).
 
     out[r, c] = <window of a ending at i0 + r, window of b ending at j0 + r + c>; a, b (n, channels), samples
@@ -172,8 +171,10 @@ def sliding_products(
             if r % interval:
                 out[r, :wide] += out[r - 1, :wide]
             else:
-                out[r, :wide] = sum(np.correlate(other[r + 1 : r + depth + wide], one[r + 1 : r + depth + 1], "valid")
-                                    for one, other in zip(ones, others, strict=True))
+                out[r, :wide] = sum(
+                    np.correlate(other[r + 1 : r + depth + wide], one[r + 1 : r + depth + 1], "valid")
+                    for one, other in zip(ones, others, strict=True)
+                )
     return out
 
 

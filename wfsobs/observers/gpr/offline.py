@@ -73,9 +73,7 @@ class TrainedGpr:
         return out
 
 
-def train(
-    signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential, watch: Watch = QUIET
-) -> TrainedGpr:
+def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential, watch: Watch = QUIET) -> TrainedGpr:
     """Fit the first m windows of signals (n, channels) to targets (n,), one per step.
 
     Raises RecordError where the record is too short, ConditionError where the precision is not enough.

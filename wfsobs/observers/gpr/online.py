@@ -60,14 +60,20 @@ def gpr_online(measured: Measurements, prior: Prior, settings: OnlineGpr, watch:
         scale = scale_of(settings, prior.training, measured.delay, mode)
         signals = window_signals(settings, measured.y_lgs, measured.u, measured.z, mode, measured.dt, scale)
         return predict_sliding(
-            signals, targets[:, mode], settings.depth, settings.training_size, kernel_of(settings), deliver, watch.check)[0]
+            signals, targets[:, mode], settings.depth, settings.training_size, kernel_of(settings), deliver, watch.check
+        )[0]
 
     return {VIBRATION: over_modes(measured.n_modes, one, watch)}
 
 
 def predict_sliding(
-    signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential,
-    deliver: Callable[[int, int, Array], None] | None = None, check: Callable[[], None] = QUIET.check,
+    signals: Array,
+    targets: Array,
+    depth: int,
+    m: int,
+    kernel: SquaredExponential,
+    deliver: Callable[[int, int, Array], None] | None = None,
+    check: Callable[[], None] = QUIET.check,
 ) -> tuple[Array, Array]:
     """Predict at every step from the m windows before it.
 

@@ -25,6 +25,7 @@ from wfsobs.typing import Array
 LEAF = 8
 """Runs of this many steps are finished together."""
 
+
 def _go_on() -> None:
     return None
 
@@ -61,9 +62,7 @@ def slide(
         slide(reduced, targets, b - 1, rest, leaves, at + start, check)
 
 
-def _eliminate_common(
-    S: Array, f: Array, window: int, start: int, b: int, check: Callable[[], None]
-) -> tuple[Array, Array]:
+def _eliminate_common(S: Array, f: Array, window: int, start: int, b: int, check: Callable[[], None]) -> tuple[Array, Array]:
     """The sliding problem of steps start ... start + b - 1 with the training points they share eliminated."""
     n = window - b + 1
     common = slice(start + b - 1, start + window)
@@ -100,11 +99,13 @@ def _gather_leaves(S: Array, f: Array, window: int, steps: int, out: Array) -> N
 def _leaf_indices(size: int, window: int, steps: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """Where the leaves of a matrix of `size` are in its lower triangle, and which targets belong to them."""
     step = np.arange(steps)
-    order = np.vstack([
-        step + np.arange(window + 1)[:, None],
-        np.full((1, steps), size - 2),
-        np.full((1, steps), size - 1),
-    ])
+    order = np.vstack(
+        [
+            step + np.arange(window + 1)[:, None],
+            np.full((1, steps), size - 2),
+            np.full((1, steps), size - 1),
+        ]
+    )
     return np.maximum(order[:, None], order[None]), np.minimum(order[:, None], order[None]), order[:window]
 
 

@@ -121,8 +121,9 @@ class SlidingRegression:
         gamma = self.kernel.own(self._newest)[0] + self.kernel.noise_std**2
         sigma = gamma - v @ r
         if not sigma > 0.0:
-            raise ConditionError("the covariance is no longer positive definite: raise noise_std or length_scale, "
-                                 "or lower signal_std")
+            raise ConditionError(
+                "the covariance is no longer positive definite: raise noise_std or length_scale, or lower signal_std"
+            )
         t = r
         t[s] = -1.0
         a += ((v @ a) / sigma) * t

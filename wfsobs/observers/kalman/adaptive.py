@@ -43,6 +43,7 @@ def kf_adaptive(measured: Measurements, _prior: Prior, settings: Adaptive, watch
     z = measured.z[measured.delay :]  # what the mirror did before the record is not known
     columns = []
     for mode in range(measured.n_modes):  # one after the other: steps as short as these leave a second thread no room
+
         def tell(fraction: float, mode: int = mode) -> None:
             watch.step((mode + fraction) / measured.n_modes)
 

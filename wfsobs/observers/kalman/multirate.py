@@ -73,7 +73,8 @@ def multirate_filter(
     if radius >= 1.0:
         raise UnstableCycle(
             f"multi-rate filter: the cycle of {ratio} steps is unstable (spectral radius {radius:.3g}) with LGS noise "
-            f"{lgs_noise * 1e3:.4g} nm and NGS noise {ngs_noise * 1e3:.4g} nm; bring the two closer together")
+            f"{lgs_noise * 1e3:.4g} nm and NGS noise {ngs_noise * 1e3:.4g} nm; bring the two closer together"
+        )
     return MultiRateFilter(alone, cycle)
 
 

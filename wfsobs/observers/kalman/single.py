@@ -36,9 +36,7 @@ def filter_step(A: Array, C: Array, L: Array, outputs: Array) -> tuple[Array, Ar
     return A @ reduced, A @ L, outputs @ reduced, outputs @ L
 
 
-def steady_filter(
-    model: DisturbanceModel, noise: float, outputs: Array | None = None
-) -> tuple[PeriodicFilter, SteadyState]:
+def steady_filter(model: DisturbanceModel, noise: float, outputs: Array | None = None) -> tuple[PeriodicFilter, SteadyState]:
     """The steady-state filter of z (1 input), and its covariances; noise [um].
 
     outputs : rows wanted of the state x_hat[k], (p, n); every target by default.
@@ -103,4 +101,3 @@ def by_target(columns: list[Array]) -> dict[str, Array]:
     """Per-mode results (n_steps, n_targets) as {target: (n_steps, n_modes)}."""
     stacked = np.stack(columns, axis=-1)
     return {target: stacked[:, i] for i, target in enumerate(TARGETS)}
-

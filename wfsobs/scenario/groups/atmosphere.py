@@ -12,79 +12,181 @@ from wfsobs.sensors.modes import HIGHEST_ORDER
 class Telescope(Group):
     """The aperture, where it points, and the modes that are looked at."""
 
-    diameter = Real(8.0, bounds=(0.1, 100.0), label="Aperture diameter D",
-                    doc="Diameter of the aperture [m] (paper, Table 1).")
-    radial_order = Whole(1, bounds=(1, HIGHEST_ORDER), softbounds=(1, HIGHEST_ORDER), label="Highest radial order",
-                         doc="Zernike modes up to this radial order, piston left out: 1 is tip and tilt (paper), 2 to 6 are 5, "
-                             "9, 14, 20 and 27 modes.")
-    zenith_angle = Real(0.0, bounds=(0.0, 70.0), softbounds=(0.0, 60.0), step=1.0, label="Zenith angle",
-                        doc="Angle of the line of sight to the zenith [deg]; of frozen flow, the airmass 1 / cos strengthens the "
-                            "turbulence and lengthens the way to layers and guide stars.")
+    diameter = Real(8.0, bounds=(0.1, 100.0), label="Aperture diameter D", doc="Diameter of the aperture [m] (paper, Table 1).")
+    radial_order = Whole(
+        1,
+        bounds=(1, HIGHEST_ORDER),
+        softbounds=(1, HIGHEST_ORDER),
+        label="Highest radial order",
+        doc="Zernike modes up to this radial order, piston left out: 1 is tip and tilt (paper), 2 to 6 are 5, "
+        "9, 14, 20 and 27 modes.",
+    )
+    zenith_angle = Real(
+        0.0,
+        bounds=(0.0, 70.0),
+        softbounds=(0.0, 60.0),
+        step=1.0,
+        label="Zenith angle",
+        doc="Angle of the line of sight to the zenith [deg]; of frozen flow, the airmass 1 / cos strengthens the "
+        "turbulence and lengthens the way to layers and guide stars.",
+    )
 
 
 class PsdTable(Group):
     """A one-sided power spectral density given as a table."""
 
-    frequency = Reals([], item_bounds=(0.0, 5000.0), bounds=(0, 100_000), label="Frequencies",
-                      doc="Frequencies [Hz], increasing.")
-    tip = Reals([], item_bounds=(0.0, 1e6), bounds=(0, 100_000), label="PSD of tip",
-                doc="One-sided power spectral density of tip [um^2/Hz], one number per frequency.")
-    tilt = Reals([], item_bounds=(0.0, 1e6), bounds=(0, 100_000), label="PSD of tilt",
-                 doc="One-sided power spectral density of tilt [um^2/Hz], one number per frequency.")
+    frequency = Reals(
+        [], item_bounds=(0.0, 5000.0), bounds=(0, 100_000), label="Frequencies", doc="Frequencies [Hz], increasing."
+    )
+    tip = Reals(
+        [],
+        item_bounds=(0.0, 1e6),
+        bounds=(0, 100_000),
+        label="PSD of tip",
+        doc="One-sided power spectral density of tip [um^2/Hz], one number per frequency.",
+    )
+    tilt = Reals(
+        [],
+        item_bounds=(0.0, 1e6),
+        bounds=(0, 100_000),
+        label="PSD of tilt",
+        doc="One-sided power spectral density of tilt [um^2/Hz], one number per frequency.",
+    )
 
 
 class Layer(Group):
     """One layer of frozen flow."""
 
-    height = Real(8000.0, bounds=(0.0, 40_000.0), softbounds=(0.0, 20_000.0), step=100.0, label="Height h",
-                  doc="Height above the telescope [m].")
-    fraction = Real(1.0, bounds=(0.0, 100.0), softbounds=(0.0, 1.0), step=0.01, label="Share of the turbulence",
-                    doc="Share of the turbulence, of r0^(-5/3); the shares of all layers are divided by their sum.")
-    wind_factor = Real(1.0, bounds=(0.05, 20.0), softbounds=(0.2, 4.0), step=0.05, label="Wind over V₀",
-                       doc="The layer's wind speed as a multiple of turbulence.wind_speed.")
-    wind_direction = Real(0.0, bounds=(-360.0, 360.0), softbounds=(-180.0, 180.0), step=5.0, label="Wind to",
-                          doc="Direction that the wind blows to [deg], from the axis of tip to that of tilt.")
+    height = Real(
+        8000.0,
+        bounds=(0.0, 40_000.0),
+        softbounds=(0.0, 20_000.0),
+        step=100.0,
+        label="Height h",
+        doc="Height above the telescope [m].",
+    )
+    fraction = Real(
+        1.0,
+        bounds=(0.0, 100.0),
+        softbounds=(0.0, 1.0),
+        step=0.01,
+        label="Share of the turbulence",
+        doc="Share of the turbulence, of r0^(-5/3); the shares of all layers are divided by their sum.",
+    )
+    wind_factor = Real(
+        1.0,
+        bounds=(0.05, 20.0),
+        softbounds=(0.2, 4.0),
+        step=0.05,
+        label="Wind over V₀",
+        doc="The layer's wind speed as a multiple of turbulence.wind_speed.",
+    )
+    wind_direction = Real(
+        0.0,
+        bounds=(-360.0, 360.0),
+        softbounds=(-180.0, 180.0),
+        step=5.0,
+        label="Wind to",
+        doc="Direction that the wind blows to [deg], from the axis of tip to that of tilt.",
+    )
 
 
 class Process(Group):
     """One coloured noise in the turbulence of some modes."""
 
-    frequency = Real(1.1, bounds=(1e-9, 1e6), softbounds=(0.1, 10.0), step=0.1, label="Corner",
-                     doc="Corner of the AR(2) process, its omega over 2 pi [Hz].")
-    damping = Real(0.9, bounds=(1e-6, 1.0), softbounds=(0.1, 1.0), step=0.01, label="Damping ξ",
-                   doc="Damping factor of the process.")
-    third_corner = Real(0.0, bounds=(0.0, 1e6), softbounds=(0.0, 10.0), step=0.1, label="Third corner / first",
-                        doc="Corner beyond which the spectrum falls as f^-6 in the place of f^-4, over the frequency; 0 is none.")
-    rms = Reals([0.5, 0.5], item_bounds=(0.0, 1e4), bounds=(1, 64), label="Strength per mode, rms",
-                doc="Standard deviation of the process [um], one number per mode: tip, tilt; modes beyond the list have none.")
+    frequency = Real(
+        1.1,
+        bounds=(1e-9, 1e6),
+        softbounds=(0.1, 10.0),
+        step=0.1,
+        label="Corner",
+        doc="Corner of the AR(2) process, its omega over 2 pi [Hz].",
+    )
+    damping = Real(
+        0.9, bounds=(1e-6, 1.0), softbounds=(0.1, 1.0), step=0.01, label="Damping ξ", doc="Damping factor of the process."
+    )
+    third_corner = Real(
+        0.0,
+        bounds=(0.0, 1e6),
+        softbounds=(0.0, 10.0),
+        step=0.1,
+        label="Third corner / first",
+        doc="Corner beyond which the spectrum falls as f^-6 in the place of f^-4, over the frequency; 0 is none.",
+    )
+    rms = Reals(
+        [0.5, 0.5],
+        item_bounds=(0.0, 1e4),
+        bounds=(1, 64),
+        label="Strength per mode, rms",
+        doc="Standard deviation of the process [um], one number per mode: tip, tilt; modes beyond the list have none.",
+    )
 
 
 class Turbulence(Group):
     """Atmospheric turbulence."""
 
     source = param.Selector(
-        default="ar2", objects=["ar2", "ar3", "processes", "frozen-flow", "psd", "none"], label="Source",
+        default="ar2",
+        objects=["ar2", "ar3", "processes", "frozen-flow", "psd", "none"],
+        label="Source",
         doc="How turbulence is made: the AR(2) process of the paper, eq. 1; the same with a third corner; a sum of such in "
-            "every mode; von Karman layers that the wind carries along, every guide star with a view of its own; "
-            "inverse DFT of the PSD table; or none.")
-    wind_speed = Real(15.0, bounds=(0.1, 100.0), softbounds=(1.0, 40.0), step=0.5, label="Wind speed V₀",
-                      doc="Wind speed [m/s]; sets the corner w0 = 0.6 pi (n + 1) V0 / D (paper, eq. 1d and Table 1), and "
-                          "scales the wind of every layer of frozen flow.")
-    damping = Real(0.9, bounds=(0.01, 1.0), step=0.01, label="Damping ξ",
-                   doc="Damping factor of the AR(2) process (paper, Table 1).")
-    third_corner = Real(3.0, bounds=(1.0, 1000.0), softbounds=(1.0, 10.0), step=0.1, label="Third corner / w₀",
-                        doc="Corner beyond which the spectrum falls as f^-6 in the place of f^-4, over the corner w0, for source "
-                            "ar3; not in the paper.")
-    rms = Real(0.5, bounds=(0.0, 100.0), softbounds=(0.0, 2.0), step=0.01, label="Strength, rms",
-               doc="Standard deviation of tip and of tilt [um], for ar2 and ar3; the paper gives none, r0 = 0.157 m, L0 = 25 m "
-                   "on 8 m give 0.529 um. A higher order has it in the ratio that r0 and L0 give.")
-    r0 = Real(0.157, bounds=(0.01, 5.0), softbounds=(0.05, 0.4), step=0.001, label="Fried parameter r₀",
-              doc="r0 at 500 nm at the zenith [m], for source frozen-flow. The seeing is 0.98 x 500 nm / r0: 0.64 arcsec.")
-    outer_scale = Real(25.0, bounds=(1.0, 1e6), softbounds=(5.0, 100.0), step=1.0, label="Outer scale L₀",
-                       doc="Outer scale of the von Karman spectrum [m].")
+        "every mode; von Karman layers that the wind carries along, every guide star with a view of its own; "
+        "inverse DFT of the PSD table; or none.",
+    )
+    wind_speed = Real(
+        15.0,
+        bounds=(0.1, 100.0),
+        softbounds=(1.0, 40.0),
+        step=0.5,
+        label="Wind speed V₀",
+        doc="Wind speed [m/s]; sets the corner w0 = 0.6 pi (n + 1) V0 / D (paper, eq. 1d and Table 1), and "
+        "scales the wind of every layer of frozen flow.",
+    )
+    damping = Real(
+        0.9, bounds=(0.01, 1.0), step=0.01, label="Damping ξ", doc="Damping factor of the AR(2) process (paper, Table 1)."
+    )
+    third_corner = Real(
+        3.0,
+        bounds=(1.0, 1000.0),
+        softbounds=(1.0, 10.0),
+        step=0.1,
+        label="Third corner / w₀",
+        doc="Corner beyond which the spectrum falls as f^-6 in the place of f^-4, over the corner w0, for source "
+        "ar3; not in the paper.",
+    )
+    rms = Real(
+        0.5,
+        bounds=(0.0, 100.0),
+        softbounds=(0.0, 2.0),
+        step=0.01,
+        label="Strength, rms",
+        doc="Standard deviation of tip and of tilt [um], for ar2 and ar3; the paper gives none, r0 = 0.157 m, L0 = 25 m "
+        "on 8 m give 0.529 um. A higher order has it in the ratio that r0 and L0 give.",
+    )
+    r0 = Real(
+        0.157,
+        bounds=(0.01, 5.0),
+        softbounds=(0.05, 0.4),
+        step=0.001,
+        label="Fried parameter r₀",
+        doc="r0 at 500 nm at the zenith [m], for source frozen-flow. The seeing is 0.98 x 500 nm / r0: 0.64 arcsec.",
+    )
+    outer_scale = Real(
+        25.0,
+        bounds=(1.0, 1e6),
+        softbounds=(5.0, 100.0),
+        step=1.0,
+        label="Outer scale L₀",
+        doc="Outer scale of the von Karman spectrum [m].",
+    )
     layers = param.List([Layer()], item_type=Layer, bounds=(0, 40), label="Layers", doc="The layers of frozen flow.")
-    processes = param.List([Process()], item_type=Process, bounds=(0, 500), label="Processes",
-                           doc="Whose sum the turbulence of a mode is, for source processes.")
+    processes = param.List(
+        [Process()],
+        item_type=Process,
+        bounds=(0, 500),
+        label="Processes",
+        doc="Whose sum the turbulence of a mode is, for source processes.",
+    )
     psd = section(PsdTable, "PSD table", "The spectrum of turbulence as a table, for source psd.")
 
     def idle(self) -> tuple[str, ...]:

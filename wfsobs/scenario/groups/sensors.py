@@ -12,49 +12,111 @@ from wfsobs.scenario.settings import Group, section
 class Sensors(Group):
     """Wavefront sensors: a natural guide star (NGS) and laser guide stars (LGS)."""
 
-    lgs_rate = Real(1000.0, bounds=(10.0, 100_000.0), label="LGS rate 1/T",
-                    doc="Frame rate of the LGS sensors and of the loop [Hz] (paper, Table 3: 1000 Hz).")
-    exposure_ratio = Whole(5, bounds=(1, 100), softbounds=(1, 20), label="Exposure ratio n",
-                           doc="NGS exposure over LGS exposure, n = T_NGS / T_LGS (paper: 5 ms over 1 ms).")
+    lgs_rate = Real(
+        1000.0,
+        bounds=(10.0, 100_000.0),
+        label="LGS rate 1/T",
+        doc="Frame rate of the LGS sensors and of the loop [Hz] (paper, Table 3: 1000 Hz).",
+    )
+    exposure_ratio = Whole(
+        5,
+        bounds=(1, 100),
+        softbounds=(1, 20),
+        label="Exposure ratio n",
+        doc="NGS exposure over LGS exposure, n = T_NGS / T_LGS (paper: 5 ms over 1 ms).",
+    )
     lgs_count = Whole(2, bounds=(1, 16), label="Number of LGS", doc="Laser guide stars (paper: 2).")
     lgs_combination = param.Selector(
-        default="mean", objects=["mean", "minimum-variance"], label="LGS combined by",
+        default="mean",
+        objects=["mean", "minimum-variance"],
+        label="LGS combined by",
         doc="mean: the plain mean over the LGS (paper); minimum-variance: the linear combination of all their modes that is "
-            "nearest to the disturbance on the axis, from the covariances of the model.")
+        "nearest to the disturbance on the axis, from the covariances of the model.",
+    )
     kind = param.Selector(
-        default="shack-hartmann", objects=["shack-hartmann", "zernike"], label="Kind",
+        default="shack-hartmann",
+        objects=["shack-hartmann", "zernike"],
+        label="Kind",
         doc="What sees frozen flow: shack-hartmann, modes fitted to slopes; zernike, the modes themselves. Turbulence that is "
-            "made mode by mode is seen as it is.")
+        "made mode by mode is seen as it is.",
+    )
     noise_from = param.Selector(
-        default="nm", objects=["nm", "photons"], label="Noise from",
+        default="nm",
+        objects=["nm", "photons"],
+        label="Noise from",
         doc="nm: white noise of the rms below in every mode; photons: the noise that photons and read noise have in the slopes "
-            "of the Shack-Hartmann sensors, correlated between modes.")
-    lgs_noise = Real(0.02, bounds=(0.0, 10.0), softbounds=(0.0, 0.2), step=0.001, label="LGS noise",
-                     doc="White measurement noise of each LGS and mode, rms [um], for noise from nm; not given in the paper.")
+        "of the Shack-Hartmann sensors, correlated between modes.",
+    )
+    lgs_noise = Real(
+        0.02,
+        bounds=(0.0, 10.0),
+        softbounds=(0.0, 0.2),
+        step=0.001,
+        label="LGS noise",
+        doc="White measurement noise of each LGS and mode, rms [um], for noise from nm; not given in the paper.",
+    )
     lgs_noise_per_mode = Reals(
-        [], item_bounds=(0.0, 1e4), bounds=(0, 64), label="LGS noise per mode",
-        doc="The same where modes differ, rms [um]: a number per mode, modes beyond the list have the one above.")
-    ngs_noise = Real(0.01, bounds=(0.0, 10.0), softbounds=(0.0, 0.2), step=0.001, label="NGS noise",
-                     doc="White measurement noise of an NGS frame and mode, rms [um], for noise from nm; not given in the "
-                         "paper.")
+        [],
+        item_bounds=(0.0, 1e4),
+        bounds=(0, 64),
+        label="LGS noise per mode",
+        doc="The same where modes differ, rms [um]: a number per mode, modes beyond the list have the one above.",
+    )
+    ngs_noise = Real(
+        0.01,
+        bounds=(0.0, 10.0),
+        softbounds=(0.0, 0.2),
+        step=0.001,
+        label="NGS noise",
+        doc="White measurement noise of an NGS frame and mode, rms [um], for noise from nm; not given in the paper.",
+    )
     lgs_low_frequency_rms = Real(
-        0.049, bounds=(0.0, 10.0), softbounds=(0.0, 0.2), step=0.005, label="LGS low-frequency error",
+        0.049,
+        bounds=(0.0, 10.0),
+        softbounds=(0.0, 0.2),
+        step=0.005,
+        label="LGS low-frequency error",
         doc="Slow tip-tilt error of each LGS, rms [um], independent between LGS: the stand-in for cone effect and "
-            "uplink turbulence where turbulence is not frozen flow. 0.049 um is the cone effect of one layer at 8 km and a "
-            "guide star at 90 km.")
-    lgs_altitude = Real(90_000.0, bounds=(1000.0, 1e6), softbounds=(80_000.0, 100_000.0), step=1000.0, label="LGS altitude H",
-                        doc="Height of the laser guide stars above the telescope [m], for frozen flow: they see a layer at "
-                            "height h through a beam narrower by 1 - h / H.")
-    lgs_radius = Real(0.0, bounds=(0.0, 120.0), softbounds=(0.0, 70.0), step=0.5, label="LGS asterism, radius",
-                      doc="Angle between each LGS and the axis [arcsec], for frozen flow; 0 puts all on the axis.")
-    lgs_angle = Real(0.0, bounds=(-360.0, 360.0), softbounds=(-180.0, 180.0), step=5.0, label="LGS asterism, first at",
-                     doc="Direction of the first LGS from the axis of tip to that of tilt [deg]; the others follow evenly.")
-    ngs_direction = Reals([0.0, 0.0], item_bounds=(-120.0, 120.0), bounds=(2, 2), label="NGS direction",
-                          doc="Direction of the NGS along the axes of tip and tilt [arcsec], for frozen flow; the truth is on "
-                              "the axis.")
+        "uplink turbulence where turbulence is not frozen flow. 0.049 um is the cone effect of one layer at 8 km and a "
+        "guide star at 90 km.",
+    )
+    lgs_altitude = Real(
+        90_000.0,
+        bounds=(1000.0, 1e6),
+        softbounds=(80_000.0, 100_000.0),
+        step=1000.0,
+        label="LGS altitude H",
+        doc="Height of the laser guide stars above the telescope [m], for frozen flow: they see a layer at "
+        "height h through a beam narrower by 1 - h / H.",
+    )
+    lgs_radius = Real(
+        0.0,
+        bounds=(0.0, 120.0),
+        softbounds=(0.0, 70.0),
+        step=0.5,
+        label="LGS asterism, radius",
+        doc="Angle between each LGS and the axis [arcsec], for frozen flow; 0 puts all on the axis.",
+    )
+    lgs_angle = Real(
+        0.0,
+        bounds=(-360.0, 360.0),
+        softbounds=(-180.0, 180.0),
+        step=5.0,
+        label="LGS asterism, first at",
+        doc="Direction of the first LGS from the axis of tip to that of tilt [deg]; the others follow evenly.",
+    )
+    ngs_direction = Reals(
+        [0.0, 0.0],
+        item_bounds=(-120.0, 120.0),
+        bounds=(2, 2),
+        label="NGS direction",
+        doc="Direction of the NGS along the axes of tip and tilt [arcsec], for frozen flow; the truth is on the axis.",
+    )
     tip_tilt_indetermination = param.Boolean(
-        False, label="Tip-tilt indetermination",
+        False,
+        label="Tip-tilt indetermination",
         doc="An LGS that cannot see turbulent tip and tilt at all, as in reality; off in the paper, whose "
-            "simulator does not model it.")
+        "simulator does not model it.",
+    )
     lenslets = section(LensletArrays, "Shack-Hartmann", "Lenslets of the Shack-Hartmann sensors, and the fit to their slopes.")
     spots = section(Spots, "Spots", "Light and detectors of the Shack-Hartmann sensors, for noise from photons.")

@@ -15,39 +15,78 @@ PAPER_PEAK_HZ = 47.4969
 class Peak(Group):
     """One line of the vibration spectrum: a damped resonance, or a pure line at damping 0."""
 
-    frequency = Real(PAPER_PEAK_HZ, bounds=(0.01, 50_000.0), softbounds=(5.0, 80.0), step=0.1, label="Frequency f",
-                     doc="Natural frequency [Hz]. The paper's dominant one is 47.4969 Hz (Table 2).")
-    damping = Real(0.03, bounds=(0.0, 1.0), softbounds=(0.0, 0.1), step=0.001, label="Damping ξ",
-                   doc="Damping ratio; 0 is a pure line. The paper has 0.03 (Table 2).")
-    rms = Reals([0.01, 0.01], item_bounds=(0.0, 1e4), bounds=(1, 64), label="Strength per mode, rms",
-                doc="Standard deviation of the line [um], one number per mode: tip, tilt; modes beyond "
-                    "the list have none.")
+    frequency = Real(
+        PAPER_PEAK_HZ,
+        bounds=(0.01, 50_000.0),
+        softbounds=(5.0, 80.0),
+        step=0.1,
+        label="Frequency f",
+        doc="Natural frequency [Hz]. The paper's dominant one is 47.4969 Hz (Table 2).",
+    )
+    damping = Real(
+        0.03,
+        bounds=(0.0, 1.0),
+        softbounds=(0.0, 0.1),
+        step=0.001,
+        label="Damping ξ",
+        doc="Damping ratio; 0 is a pure line. The paper has 0.03 (Table 2).",
+    )
+    rms = Reals(
+        [0.01, 0.01],
+        item_bounds=(0.0, 1e4),
+        bounds=(1, 64),
+        label="Strength per mode, rms",
+        doc="Standard deviation of the line [um], one number per mode: tip, tilt; modes beyond the list have none.",
+    )
 
 
 class Vibration(Group):
     """Structural vibration of the telescope."""
 
-    source = param.Selector(default="peaks", objects=["peaks", "psd", "measured", "ar2", "none"], label="Source",
-                            doc="How vibration is made: inverse DFT of the peak list (paper, Algorithm 4), of the PSD table or "
-                                "of a measured spectrum, each peak as an AR(2) process (paper, eq. 2), or none.")
+    source = param.Selector(
+        default="peaks",
+        objects=["peaks", "psd", "measured", "ar2", "none"],
+        label="Source",
+        doc="How vibration is made: inverse DFT of the peak list (paper, Algorithm 4), of the PSD table or "
+        "of a measured spectrum, each peak as an AR(2) process (paper, eq. 2), or none.",
+    )
     synthesis = param.Selector(
-        default="gaussian", objects=["gaussian", "random-phase"], label="Synthesis",
+        default="gaussian",
+        objects=["gaussian", "random-phase"],
+        label="Synthesis",
         doc="How an inverse DFT makes a record. gaussian: a piece of a stationary Gaussian process, cut from a period many times "
-            "as long; random-phase: fixed amplitudes and random phases, as long as the record and periodic with it (paper, "
-            "Algorithm 4).")
-    spectrum = param.Selector(default="eris-ut4", objects=["eris-ut4"], label="Measured spectrum",
-                              doc="For source measured: eris-ut4, measured at VLT UT4 with ERIS (astro-tiptop/TIPTOP, MIT).")
-    part = param.Selector(default="lines", objects=["lines", "all"], label="Part of the spectrum",
-                          doc="For source measured: the lines that stand above its synthetic floor 4e4 / f^2 nm^2/Hz, from "
-                              "7.5 Hz up, or all of it.")
-    cutoff = Real(80.0, bounds=(0.1, 50_000.0), softbounds=(10.0, 200.0), label="Cut-off f_c",
-                  doc="Nothing above this frequency in an inverse DFT [Hz] (paper, section 2.4).")
-    peaks = param.List([Peak()], item_type=Peak, bounds=(0, 2000), label="Peaks",
-                       doc="The lines of the spectrum.")
+        "as long; random-phase: fixed amplitudes and random phases, as long as the record and periodic with it (paper, "
+        "Algorithm 4).",
+    )
+    spectrum = param.Selector(
+        default="eris-ut4",
+        objects=["eris-ut4"],
+        label="Measured spectrum",
+        doc="For source measured: eris-ut4, measured at VLT UT4 with ERIS (astro-tiptop/TIPTOP, MIT).",
+    )
+    part = param.Selector(
+        default="lines",
+        objects=["lines", "all"],
+        label="Part of the spectrum",
+        doc="For source measured: the lines that stand above its synthetic floor 4e4 / f^2 nm^2/Hz, from "
+        "7.5 Hz up, or all of it.",
+    )
+    cutoff = Real(
+        80.0,
+        bounds=(0.1, 50_000.0),
+        softbounds=(10.0, 200.0),
+        label="Cut-off f_c",
+        doc="Nothing above this frequency in an inverse DFT [Hz] (paper, section 2.4).",
+    )
+    peaks = param.List([Peak()], item_type=Peak, bounds=(0, 2000), label="Peaks", doc="The lines of the spectrum.")
     psd = section(PsdTable, "PSD table", "The spectrum as a table, for source psd.")
 
     def idle(self) -> tuple[str, ...]:
         """What other sources are made of."""
-        uses = {"peaks": ("synthesis", "peaks"), "ar2": ("peaks",), "psd": ("synthesis", "psd"),
-                "measured": ("synthesis", "spectrum", "part")}.get(self.source, ())
+        uses = {
+            "peaks": ("synthesis", "peaks"),
+            "ar2": ("peaks",),
+            "psd": ("synthesis", "psd"),
+            "measured": ("synthesis", "spectrum", "part"),
+        }.get(self.source, ())
         return tuple(name for name in ("synthesis", "spectrum", "part", "peaks", "psd") if name not in uses)

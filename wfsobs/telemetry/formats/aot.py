@@ -43,7 +43,8 @@ def read(file: IO[bytes], most: int) -> Contents:
     critical = AOTFITSErrorLevel.CRITICAL
     try:
         reader = aotpy.AOTFITSReader(
-            io.BytesIO(read_whole(file)), externals="disallow", exception_level=critical, log_level=critical)
+            io.BytesIO(read_whole(file)), externals="disallow", exception_level=critical, log_level=critical
+        )
         return _contents(reader.get_system(), aotpy)
     except RecordError:
         raise
@@ -63,8 +64,11 @@ def _check_lists(hdu: Any, most: int) -> None:
 
 
 def _contents(system: Any, aotpy: Any) -> Contents:
-    loops = [loop for loop in system.loops if isinstance(loop, aotpy.ControlLoop) and loop.input_sensor is not None
-             and loop.input_sensor.measurements is not None]
+    loops = [
+        loop
+        for loop in system.loops
+        if isinstance(loop, aotpy.ControlLoop) and loop.input_sensor is not None and loop.input_sensor.measurements is not None
+    ]
     if not loops:
         raise RecordError("has no control loop with measurements")
     loop = loops[0]
@@ -75,8 +79,14 @@ def _contents(system: Any, aotpy: Any) -> Contents:
         _take(contents, "u", loop.modal_coefficients, None)
     elif loop.commands is not None:
         _take(contents, "u", loop.commands, None if loop.commands_to_modes is None else loop.commands_to_modes.data)
-    other = next((s for s in system.wavefront_sensors if s is not sensor and s.measurements is not None
-                  and isinstance(s.source, aotpy.NaturalGuideStar)), None)
+    other = next(
+        (
+            s
+            for s in system.wavefront_sensors
+            if s is not sensor and s.measurements is not None and isinstance(s.source, aotpy.NaturalGuideStar)
+        ),
+        None,
+    )
     if other is not None:
         _take(contents, "y_ngs", other.measurements, None)
     for name, clock in (("time", measured.time or loop.time), ("time_ngs", other and other.measurements.time)):
@@ -89,7 +99,7 @@ def _contents(system: Any, aotpy: Any) -> Contents:
         contents.arrays["delay"] = np.array(max(1, round(float(loop.delay))))
     for entry in system.metadata:
         if entry.key.upper().startswith(PREFIX):
-            name = entry.key[len(PREFIX):].lower()
+            name = entry.key[len(PREFIX) :].lower()
             contents.arrays[name] = np.array(float(entry.value) if name in NUMBERS else entry.value)
     return contents
 
@@ -118,8 +128,9 @@ def write(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
     def sensor(uid: str, source: Any, name: str) -> Any:
         # one signal per mode; for tip and tilt that is a sensor of a single subaperture
         measurements = image(name, (-1, 1, n_modes))
-        return aotpy.Pyramid(uid=uid, source=source, dimensions=1, n_valid_subapertures=n_modes, n_sides=4,
-                             measurements=measurements)
+        return aotpy.Pyramid(
+            uid=uid, source=source, dimensions=1, n_valid_subapertures=n_modes, n_sides=4, measurements=measurements
+        )
 
     laser = aotpy.SodiumLaserGuideStar(uid="LGS")
     lgs = sensor("LGS WFS", laser, "y_lgs")
@@ -130,11 +141,23 @@ def write(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
         sensors.append(sensor("NGS WFS", star, "y_ngs"))
     mirror = aotpy.DeformableMirror(uid="mirror", telescope=telescope, n_valid_actuators=n_modes)
     loop = aotpy.ControlLoop(
-        uid="loop", commanded_corrector=mirror, input_sensor=lgs, modal_coefficients=image("u", (-1, n_modes)),
-        framerate=1.0 / float(plain["dt"]), delay=float(plain.get("delay", DELAY)))
+        uid="loop",
+        commanded_corrector=mirror,
+        input_sensor=lgs,
+        modal_coefficients=image("u", (-1, n_modes)),
+        framerate=1.0 / float(plain["dt"]),
+        delay=float(plain.get("delay", DELAY)),
+    )
     system = aotpy.AOSystem(
-        ao_mode="LTAO", name="wfsobs", main_telescope=telescope, sources=sources, wavefront_sensors=sensors,
-        wavefront_correctors=[mirror], loops=[loop], config="; ".join(str(plain.get("scenario", "")).splitlines()) or None,
+        ao_mode="LTAO",
+        name="wfsobs",
+        main_telescope=telescope,
+        sources=sources,
+        wavefront_sensors=sensors,
+        wavefront_correctors=[mirror],
+        loops=[loop],
+        config="; ".join(str(plain.get("scenario", "")).splitlines()) or None,
         # as texts: a number in a header has sixteen digits, one less than dt may need
-        metadata=[aotpy.Metadatum(PREFIX + key.upper(), str(plain[key])) for key in (*NUMBERS, "origin") if key in plain])
+        metadata=[aotpy.Metadatum(PREFIX + key.upper(), str(plain[key])) for key in (*NUMBERS, "origin") if key in plain],
+    )
     aotpy.AOTFITSWriter(system).get_hdulist().writeto(file)

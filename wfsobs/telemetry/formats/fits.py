@@ -77,8 +77,20 @@ def opened(file: IO[bytes], most: int) -> Iterator[HDUList]:
                 yield hdus
     except RecordError:
         raise
-    except (OSError, ValueError, TypeError, KeyError, IndexError, EOFError, AttributeError, MemoryError, OverflowError,
-            AssertionError, ZeroDivisionError, fits.VerifyError):
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        KeyError,
+        IndexError,
+        EOFError,
+        AttributeError,
+        MemoryError,
+        OverflowError,
+        AssertionError,
+        ZeroDivisionError,
+        fits.VerifyError,
+    ):
         raise RecordError(DAMAGED) from None
 
 
