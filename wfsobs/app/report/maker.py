@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import wfsobs
 from wfsobs.app.report.data import Report, state_of
@@ -29,28 +30,35 @@ class ReportError(Exception):
 
 def make(shown: Shown, preset: str, watch: Watch, _tell: object = None) -> bytes:
     """The file of the results shown; blocks, so that it belongs into a job. Raises ReportError, Cancelled."""
-    content: bytes | None = packed(Report(preset, shown.scenario, (), (state_of(shown.result),), shown.recorded))
+    content = packed(Report(preset, shown.scenario, (), (state_of(shown.result),), shown.recorded))
     root = str(Path(wfsobs.__file__).parents[1])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}
-    with subprocess.Popen(
-        [sys.executable, "-m", "wfsobs.app.report"],
-        env=environment,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    ) as process:
-        try:
-            while True:
-                try:
-                    page, said = process.communicate(content, timeout=POLL)
-                    break
-                except subprocess.TimeoutExpired:
-                    content = None  # it is on its way
-                    watch.check()
-        except BaseException:
-            process.kill()
-            raise
+    # A file, not a pipe: what a pipe has not taken when `communicate` times out is never sent.
+    with TemporaryFile() as packet:
+        packet.write(content)
+        packet.seek(0)
+        with subprocess.Popen(
+            [sys.executable, "-m", "wfsobs.app.report"],
+            env=environment,
+            stdin=packet,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        ) as process:
+            page, said = _output(process, watch)
     if process.returncode:
         log.error("the report could not be made:\n%s", said.decode(errors="replace"))
         raise ReportError("it could not be made; the server's log has the details")
     return page
+
+
+def _output(process: subprocess.Popen[bytes], watch: Watch) -> tuple[bytes, bytes]:
+    """Standard output and error of a process once it has ended; it is killed where the report is no longer wanted."""
+    try:
+        while True:
+            try:
+                return process.communicate(timeout=POLL)
+            except subprocess.TimeoutExpired:
+                watch.check()
+    except BaseException:
+        process.kill()
+        raise
