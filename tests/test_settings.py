@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.vibration import Peak
-from wfsobs.scenario.parameters import Reals, allowed, unit_of
-from wfsobs.scenario.settings import Group, SettingError
+from wfsobs.settings.group import Group, SettingError
+from wfsobs.settings.parameters import Reals, allowed, unit_of
 
 EXAMPLES = settings(max_examples=30, deadline=None, derandomize=True)
 HUGE = 10**400

@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     from wfsobs.identification.identification import identify
     from wfsobs.pipeline import Result, observe, run
     from wfsobs.record import Record, RecordError
+    from wfsobs.registry import register
     from wfsobs.scenario import Scenario
     from wfsobs.scenario.presets import PRESETS
-    from wfsobs.scenario.settings import SettingError
+    from wfsobs.settings.group import SettingError
     from wfsobs.simulation.loop import simulate
     from wfsobs.telemetry.records import load
     from wfsobs.tuning.tuning import tune
@@ -38,9 +39,10 @@ _HOMES = {
     "run": "pipeline",
     "Record": "record",
     "RecordError": "record",
+    "register": "registry",
     "Scenario": "scenario",
     "PRESETS": "scenario.presets",
-    "SettingError": "scenario.settings",
+    "SettingError": "settings.group",
     "simulate": "simulation.loop",
     "load": "telemetry.records",
     "tune": "tuning.tuning",
@@ -59,6 +61,7 @@ __all__ = [
     "identify",
     "load",
     "observe",
+    "register",
     "run",
     "score",
     "simulate",

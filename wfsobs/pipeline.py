@@ -17,7 +17,7 @@ from wfsobs.priors_from.scenario import arguments
 from wfsobs.progress import QUIET, Watch, detached
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.settings import SettingError
+from wfsobs.settings.group import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import param
 
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.parameters import Reals, unit_of
-from wfsobs.scenario.settings import Group, holds_groups
+from wfsobs.settings.group import Group, holds_groups
+from wfsobs.settings.parameters import Reals, unit_of
 
 PAGE = Path(__file__).parents[1] / "settings.md"
 

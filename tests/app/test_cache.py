@@ -22,7 +22,7 @@ from wfsobs.pipeline import Result
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.settings import SettingError
+from wfsobs.settings.group import SettingError
 
 WAIT = 20.0
 

@@ -22,7 +22,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.atmosphere import Layer, Process
 from wfsobs.scenario.groups.vibration import Peak
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.scenario.settings import Group, SettingError
+from wfsobs.settings.group import Group, SettingError
 from wfsobs.simulation.loop import simulate
 
 QUICK = {

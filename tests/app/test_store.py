@@ -15,7 +15,7 @@ from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.scenario.settings import SettingError
+from wfsobs.settings.group import SettingError
 
 
 def answer(scenario: Scenario) -> Shown:

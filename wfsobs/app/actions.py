@@ -22,7 +22,7 @@ from wfsobs.app.sources import Kept
 from wfsobs.app.store import Store
 from wfsobs.app.style import LOOKS, asset
 from wfsobs.app.work import Shown
-from wfsobs.scenario.settings import SettingError
+from wfsobs.settings.group import SettingError
 
 LARGEST = 2_000_000
 """Of a scenario file that is opened [bytes]."""

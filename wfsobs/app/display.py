@@ -8,8 +8,8 @@ import re
 import param
 
 from wfsobs.app.pin import Pin
-from wfsobs.scenario.parameters import unit_of
 from wfsobs.sensors.modes import HIGHEST_ORDER, TIP_TILT, Mode, modes_up_to
+from wfsobs.settings.parameters import unit_of
 
 SIGNAL, ERROR, RUNNING_RMS = "signal", "error", "running rms"
 PSD, CUMULATIVE = "psd", "cumulative"

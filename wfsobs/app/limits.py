@@ -8,8 +8,8 @@ from functools import reduce
 
 from wfsobs.cost import run_bytes, run_seconds
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.parameters import Reals
-from wfsobs.scenario.settings import SettingError
+from wfsobs.settings.group import SettingError
+from wfsobs.settings.parameters import Reals
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from wfsobs.app.work import TRUTH, Key, Shown, Spectrum
 from wfsobs.evaluation.scores import Score
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.parameters import unit_of
-from wfsobs.scenario.settings import Group
+from wfsobs.settings.group import Group
+from wfsobs.settings.parameters import unit_of
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from wfsobs.app.work import Shown, compute
 from wfsobs.cost import run_seconds
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.settings import SettingError
+from wfsobs.settings.group import SettingError
 
 Compute = Callable[[Scenario, Watch, Tell, Source | None], Shown]
 Post = Callable[[Callable[[], None]], None]

@@ -20,7 +20,7 @@ from wfsobs.app.controls.fields import parsed
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.configfile import from_toml, parse_toml, pristine, to_toml
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.scenario.settings import SettingError, holds_groups, settings_of
+from wfsobs.settings.group import SettingError, holds_groups, settings_of
 
 Check = Callable[[Scenario], None]
 

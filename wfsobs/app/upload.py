@@ -26,9 +26,9 @@ from wfsobs.pipeline import as_stated
 from wfsobs.progress import Watch
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.parameters import hint
-from wfsobs.scenario.settings import SettingError
 from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.settings.group import SettingError
+from wfsobs.settings.parameters import hint
 from wfsobs.telemetry.intake import Stated
 from wfsobs.telemetry.preview import Preview, SpectrumPreview, preview_any, safe_name
 from wfsobs.units import UNITS

@@ -55,7 +55,7 @@ class Commands(click.Group):
             return super().invoke(ctx)
         except ValueError as error:
             from wfsobs.record import RecordError
-            from wfsobs.scenario.settings import SettingError
+            from wfsobs.settings.group import SettingError
 
             if not isinstance(error, (SettingError, RecordError)):
                 raise

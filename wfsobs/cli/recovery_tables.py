@@ -13,7 +13,7 @@ from wfsobs.evaluation.recovery import Pooled, Recovery, recovery, running_rms
 from wfsobs.evaluation.rows import Row, label_of
 from wfsobs.pipeline import Result
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.settings import SettingError
+from wfsobs.settings.group import SettingError
 
 MOST_TIMES = 8
 """Columns of times in a table."""

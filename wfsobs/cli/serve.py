@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from wfsobs.scenario.settings import SettingError
+from wfsobs.settings.group import SettingError
 
 
 @click.command()

@@ -17,7 +17,7 @@ from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
-from wfsobs.scenario.settings import SettingError
+from wfsobs.settings.group import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats.psd import load_psd
 from wfsobs.telemetry.intake import Stated

@@ -35,7 +35,7 @@ from wfsobs.priors_from.scenario import bands_of, prior_of
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.settings import SettingError
+from wfsobs.settings.group import SettingError
 from wfsobs.signal.welch import rms
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import TrueSpectra, is_known, true_spectra

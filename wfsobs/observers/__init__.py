@@ -1,9 +1,10 @@
-"""The observers, by id. A new one is a function and one entry here."""
+"""The observers, by id."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from wfsobs import registry
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Observer
 from wfsobs.observers.baselines import butterworth_cl, butterworth_ol, persistence, zero
 from wfsobs.observers.gpr.offline import gpr_offline
@@ -15,6 +16,7 @@ from wfsobs.observers.kalman.multirate_optimal import multirate_optimal
 from wfsobs.observers.kalman.single import kf_lgs, kf_ngs
 from wfsobs.observers.ridge import ridge, ridge_30
 from wfsobs.prior import Bands, LgsError, Lines, Model, Part, Training
+from wfsobs.registry import Registry
 
 _NGS = ("y_ngs", "ratio")
 
@@ -24,9 +26,10 @@ def _standardised(settings: Any) -> tuple[Part, ...]:
     return (Training,) if settings.inputs_filter == "standardised" else ()
 
 
-OBSERVERS: dict[str, Observer] = {
-    o.id: o
-    for o in (
+OBSERVERS = Registry(
+    Observer,
+    registry.OBSERVERS,
+    (
         Observer("kf-lgs", "LGS KF", TARGETS, kf_lgs, (Model,)),
         Observer("kf-multi", "Multi-peak KF", TARGETS, kf_multi, (Lines,), "multipeak"),
         Observer("kf-adaptive", "Adaptive KF", TARGETS, kf_adaptive, (), "adaptive", weight=50.0),
@@ -51,6 +54,7 @@ OBSERVERS: dict[str, Observer] = {
         Observer("ridge-30", "30-tap predictor", (VIBRATION,), ridge_30, (Training, Bands), needs=("training",)),
         Observer("persistence", "Persistence", (TURBULENCE,), persistence, weight=0.1),
         Observer("zero", "Zero", TARGETS, zero, weight=0.1),
-    )
-}
+    ),
+    reserved=("truth", "loop", "bound"),
+)
 """Every observer, in the order of tables and legends."""

@@ -17,7 +17,7 @@ from wfsobs.record import Measurements, Record
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
-    from wfsobs.scenario.settings import Group
+    from wfsobs.settings.group import Group
 
 TURBULENCE, VIBRATION = "turbulence", "vibration"
 TARGETS = (TURBULENCE, VIBRATION)

@@ -13,7 +13,7 @@ from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
 from wfsobs.prior import Bands, LgsError, Line, Lines, Model, Part, Prior, Training
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.settings import Group
+from wfsobs.settings.group import Group
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3, fitted_ar3
 from wfsobs.signal.statespace import MIN_MODEL_DAMPING, DisturbanceModel

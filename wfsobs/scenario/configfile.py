@@ -15,7 +15,7 @@ import tomli_w
 from wfsobs.files import write_whole
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.scenario.settings import SettingError, leaves
+from wfsobs.settings.group import SettingError, leaves
 
 DEEPEST = 8
 """Tables and lists inside one another that a text may have; settings have four."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import NotToml, parse_toml, written
-from wfsobs.scenario.settings import Plain, SettingError
+from wfsobs.settings.group import Plain, SettingError
 
 MOST = 60
 """Combinations that are run at once."""

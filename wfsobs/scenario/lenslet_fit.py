@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 from wfsobs.scenario.groups.shack_hartmann import LensletArrays
-from wfsobs.scenario.settings import SettingError
 from wfsobs.sensors.lenslets import Lenslets
 from wfsobs.sensors.reconstructor import fittable
+from wfsobs.settings.group import SettingError
 
 Kind = Literal["lgs", "ngs"]
 

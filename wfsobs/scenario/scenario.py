@@ -20,9 +20,9 @@ from wfsobs.scenario.groups.run import Loop, Run
 from wfsobs.scenario.groups.sensors import Sensors
 from wfsobs.scenario.groups.vibration import Vibration
 from wfsobs.scenario.lenslet_fit import fit
-from wfsobs.scenario.settings import Group, SettingError, section
 from wfsobs.scenario.timeline import air_time, shift
 from wfsobs.sensors.modes import Mode, modes_up_to
+from wfsobs.settings.group import Group, SettingError, section
 
 HIGHEST = 0.9
 """Height of a layer over that of the laser guide stars: in a higher one the beam all but ends."""
@@ -42,7 +42,7 @@ class Scenario(Group):
     >>> s.set("turbulence.wind_speed", 200)
     Traceback (most recent call last):
     ...
-    wfsobs.scenario.settings.SettingError: turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s
+    wfsobs.settings.group.SettingError: turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s
     """
 
     telescope = section(Telescope, "Telescope")

@@ -14,7 +14,7 @@ from wfsobs.pipeline import Failure, each_estimate
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.settings import SettingError
+from wfsobs.settings.group import SettingError
 
 
 @dataclass(frozen=True)

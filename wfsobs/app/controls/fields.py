@@ -18,7 +18,7 @@ import param
 from wfsobs.app.controls.names import named
 from wfsobs.app.display import label_of, written_unit
 from wfsobs.app.store import Store
-from wfsobs.scenario.parameters import Reals
+from wfsobs.settings.parameters import Reals
 
 ROOM = {"sizing_mode": "stretch_width", "margin": (4, 0)}
 NUMBER_WIDTH = 92

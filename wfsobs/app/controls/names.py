@@ -9,8 +9,8 @@ from functools import cache
 import param
 
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.settings import Group, holds_groups
 from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.settings.group import Group, holds_groups
 
 SHORT = {
     "frequency": "f",

@@ -19,7 +19,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import asset
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.scenario.settings import Group
+from wfsobs.settings.group import Group
 
 FIRST = ("turbulence.wind_speed", "sensors.exposure_ratio")
 """Settings that stand above the topics."""

@@ -12,9 +12,9 @@ from wfsobs.app.controls.fields import TAG, number_text, parsed, written_unit
 from wfsobs.app.controls.names import column_of, named
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset
-from wfsobs.scenario.parameters import Reals, unit_of
-from wfsobs.scenario.settings import Group
 from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.settings.group import Group
+from wfsobs.settings.parameters import Reals, unit_of
 
 
 class RowTable(JSComponent):

@@ -27,8 +27,8 @@ from wfsobs.identification.report import toml
 from wfsobs.pipeline import as_stated
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.parameters import hint
-from wfsobs.scenario.settings import SettingError
+from wfsobs.settings.group import SettingError
+from wfsobs.settings.parameters import hint
 from wfsobs.spectral.search import LOWEST
 
 INTRO = (

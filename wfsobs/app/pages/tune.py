@@ -23,8 +23,8 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION
 from wfsobs.record import RecordError
 from wfsobs.scenario.configfile import changes
-from wfsobs.scenario.parameters import hint
-from wfsobs.scenario.settings import SettingError
+from wfsobs.settings.group import SettingError
+from wfsobs.settings.parameters import hint
 from wfsobs.tuning import Evaluation, Tuned
 from wfsobs.tuning.records import MEASURES, TRUTH
 from wfsobs.tuning.report import toml

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import param
 
-from wfsobs.scenario.parameters import Real, Reals, Whole
-from wfsobs.scenario.settings import Group, section
 from wfsobs.sensors.modes import HIGHEST_ORDER
+from wfsobs.settings.group import Group, section
+from wfsobs.settings.parameters import Real, Reals, Whole
 
 
 class Telescope(Group):

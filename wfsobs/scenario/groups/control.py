@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import param
 
-from wfsobs.scenario.parameters import Real
-from wfsobs.scenario.settings import Group
+from wfsobs.settings.group import Group
+from wfsobs.settings.parameters import Real
 
 
 class Control(Group):

@@ -7,8 +7,8 @@ from types import MappingProxyType
 
 import param
 
-from wfsobs.scenario.parameters import Real, Whole
-from wfsobs.scenario.settings import Group
+from wfsobs.settings.group import Group
+from wfsobs.settings.parameters import Real, Whole
 
 PEAK, WIND, LASER, FRAMES = "peak", "wind", "laser", "frames"
 OF_KIND: Mapping[str, tuple[str, ...]] = MappingProxyType(

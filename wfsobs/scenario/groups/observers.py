@@ -5,8 +5,8 @@ from __future__ import annotations
 import param
 
 from wfsobs.scenario.groups.vibration import PAPER_PEAK_HZ
-from wfsobs.scenario.parameters import Real, Reals, Whole
-from wfsobs.scenario.settings import Group
+from wfsobs.settings.group import Group
+from wfsobs.settings.parameters import Real, Reals, Whole
 
 
 class Kalman(Group):

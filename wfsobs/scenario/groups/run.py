@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import param
 
-from wfsobs.scenario.parameters import Real, Whole
-from wfsobs.scenario.settings import Group
+from wfsobs.settings.group import Group
+from wfsobs.settings.parameters import Real, Whole
 
 
 class Loop(Group):

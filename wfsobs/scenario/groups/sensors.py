@@ -5,8 +5,8 @@ from __future__ import annotations
 import param
 
 from wfsobs.scenario.groups.shack_hartmann import LensletArrays, Spots
-from wfsobs.scenario.parameters import Real, Reals, Whole
-from wfsobs.scenario.settings import Group, section
+from wfsobs.settings.group import Group, section
+from wfsobs.settings.parameters import Real, Reals, Whole
 
 
 class Sensors(Group):

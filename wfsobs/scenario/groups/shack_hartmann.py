@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from wfsobs.scenario.parameters import Real, Whole
-from wfsobs.scenario.settings import Group
+from wfsobs.settings.group import Group
+from wfsobs.settings.parameters import Real, Whole
 
 
 class LensletArrays(Group):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import param
 
 from wfsobs.scenario.groups.atmosphere import PsdTable
-from wfsobs.scenario.parameters import Real, Reals
-from wfsobs.scenario.settings import Group, section
+from wfsobs.settings.group import Group, section
+from wfsobs.settings.parameters import Real, Reals
 
 PAPER_PEAK_HZ = 47.4969
 """The dominant natural frequency of VLT UT4 (paper, Table 2)."""

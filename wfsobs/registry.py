@@ -1,0 +1,203 @@
+"""Observers and controllers by id: those of wfsobs, those of installed packages, and those that a script registers.
+
+A package names its own by entry points of the groups "wfsobs.observers" and "wfsobs.controllers", which are read when a registry
+is first used. The rooms above are named by strings: nothing is imported before it is asked for.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping
+from functools import cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from threading import RLock
+from typing import Any, Protocol, TypeVar
+
+import param
+
+from wfsobs.settings.group import Group, Section
+
+log = logging.getLogger(__name__)
+
+OBSERVERS, CONTROLLERS = "wfsobs.observers", "wfsobs.controllers"
+"""Groups of entry points."""
+
+HOMES = {OBSERVERS: ("wfsobs.observers", "OBSERVERS"), CONTROLLERS: ("wfsobs.control.controllers", "CONTROLLERS")}
+"""Group -> module and name of its registry."""
+
+ID = re.compile(r"[a-z0-9]+([+-][a-z0-9]+)*")
+GROUP_NAME = re.compile(r"[a-z][a-z0-9_]*")
+
+_SECTIONS: dict[str, Section] = {}
+
+
+class RegistrationError(ValueError):
+    """An observer or a controller that cannot be registered: one line that says why."""
+
+
+class Entry(Protocol):
+    """What can be registered."""
+
+    @property
+    def id(self) -> str:
+        """Its name in tables and files."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """Its name for people."""
+        ...
+
+
+E = TypeVar("E", bound=Entry)
+
+
+class Registry(MutableMapping[str, E]):
+    """Entries by id, in the order of tables and legends: first those of wfsobs, then those of installed packages.
+
+    kind     : type of the entries
+    group    : of entry points
+    built_in : entries of wfsobs
+    reserved : ids that are used for something else
+    """
+
+    def __init__(self, kind: type[E], group: str, built_in: Iterable[E], reserved: Iterable[str] = ()):
+        self.kind, self.group, self.reserved = kind, group, frozenset(reserved)
+        self._entries: dict[str, E] = {}
+        self._lock, self._complete, self._reading = RLock(), False, False
+        for entry in built_in:
+            self._put(entry)
+
+    def add(self, entry: E) -> None:
+        """Register an entry; the same one again changes nothing. Raises RegistrationError."""
+        with self._lock:
+            self.complete()
+            if self._entries.get(entry.id) is not entry:
+                self._check(entry)
+                self._put(entry)
+
+    def complete(self) -> None:
+        """Add those of installed packages, the first time; one that cannot be is named in the log and left out."""
+        if self._complete:
+            return
+        with self._lock:
+            if self._reading:  # by a package that is being imported
+                return
+            self._reading = True
+            for point in sorted(entry_points(group=self.group)):
+                self._load(point)
+            self._complete = True
+
+    def _load(self, point: EntryPoint) -> None:
+        try:
+            entry = point.load()
+            if not isinstance(entry, self.kind):
+                raise RegistrationError(f"takes a wfsobs {self.kind.__name__}, not {_kind(entry)}")
+            self.add(entry)
+        except (Exception, SystemExit) as error:
+            what = str(error) if isinstance(error, RegistrationError) else f"{type(error).__name__}: {error}"
+            package = f" of {point.dist.name}" if point.dist else ""
+            log.warning("wfsobs: %s %s%s is left out: %s", self._word, point.value, package, " ".join(what.split()))
+
+    def _put(self, entry: E) -> None:
+        self._entries[entry.id] = entry
+        if (own := section_of(entry)) is not None:
+            _SECTIONS.setdefault(own.name, own)
+
+    def _check(self, entry: E) -> None:
+        where = f"{self._word} {entry.id!r}"
+        if not isinstance(entry.id, str) or not ID.fullmatch(entry.id):
+            raise RegistrationError(f"{where}: an id takes lower-case letters, digits and hyphens between them")
+        if entry.id in self._entries:
+            raise RegistrationError(f"{where}: the id is taken, by {self._entries[entry.id].label}")
+        if entry.id in self.reserved:
+            raise RegistrationError(f"{where}: the id is taken, by a row of the tables")
+        _check_settings(getattr(entry, "settings", None), where)
+
+    @property
+    def _word(self) -> str:
+        return self.kind.__name__.lower()
+
+    def __getitem__(self, id_: str) -> E:
+        self.complete()
+        return self._entries[id_]
+
+    def __setitem__(self, id_: str, entry: E) -> None:
+        self.complete()
+        self._entries[id_] = entry
+
+    def __delitem__(self, id_: str) -> None:
+        self.complete()
+        del self._entries[id_]
+
+    def __iter__(self) -> Iterator[str]:
+        self.complete()
+        return iter(tuple(self._entries))
+
+    def __len__(self) -> int:
+        self.complete()
+        return len(self._entries)
+
+
+def register(entry: Any) -> None:
+    """Register an observer or a controller: it stands beside those of wfsobs from then on.
+
+    A package that is installed names its own by an entry point instead, which other processes see as well.
+
+    entry : Observer, or Controller; the same one again changes nothing
+    Raises RegistrationError for an id or a group of settings whose name is taken or has other characters than allowed, and for
+    what is neither.
+    """
+    for group in HOMES:
+        registry = _registry(group)
+        if isinstance(entry, registry.kind):
+            registry.add(entry)
+            return
+    raise RegistrationError(f"register: takes an Observer or a Controller, not {_kind(entry)}")
+
+
+def sections() -> Mapping[str, Section]:
+    """The groups of settings that observers and controllers bring along, by name, in the order of the registries."""
+    _complete()
+    return _SECTIONS
+
+
+def section_of(entry: Entry) -> Section | None:
+    """The group of settings that an entry brings along; None where it has none, or uses one that every scenario has."""
+    own = getattr(entry, "settings", None)
+    return own if isinstance(own, Section) else None
+
+
+@cache
+def _complete() -> None:
+    _registry(OBSERVERS).complete()
+    if entry_points(group=CONTROLLERS):  # those of wfsobs have no settings of their own
+        _registry(CONTROLLERS).complete()
+
+
+def _registry(group: str) -> Registry[Any]:
+    module, name = HOMES[group]
+    return getattr(import_module(module), name)
+
+
+def _check_settings(own: Any, where: str) -> None:
+    """Raises RegistrationError where a scenario cannot have these settings."""
+    scenario = import_module("wfsobs.scenario").Scenario
+    if own is None or (isinstance(own, str) and own in scenario.settings()):
+        return
+    if not isinstance(own, Section) or not (isinstance(own.group, type) and issubclass(own.group, Group)):
+        raise RegistrationError(f"{where}: settings takes a Section of a Group, not {_kind(own)}")
+    if not GROUP_NAME.fullmatch(own.name):
+        raise RegistrationError(f"{where}: settings {own.name!r}: a name takes lower-case letters, digits and underscores")
+    if _SECTIONS.get(own.name, own) != own or (own.name not in _SECTIONS and hasattr(scenario, own.name)):
+        raise RegistrationError(f"{where}: settings {own.name!r}: the name is taken")
+    for name, p in own.group.settings().items():
+        low, high = getattr(p, "bounds", None) or (None, None)
+        if isinstance(p, param.Number) and (low is None or high is None):
+            raise RegistrationError(f"{where}: settings {own.name}.{name}: a number takes bounds, lowest and highest")
+
+
+def _kind(value: Any) -> str:
+    return f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"

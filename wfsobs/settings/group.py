@@ -1,0 +1,317 @@
+"""What a tree of settings can do: dotted paths, strict checks, plain dictionaries, differences.
+
+The settings themselves are declared once, in `wfsobs.scenario.scenario` and by the observers; widgets, command-line settings,
+TOML files and shareable links all go through the functions here.
+"""
+
+from __future__ import annotations
+
+import reprlib
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple, Self, TypeVar, cast
+
+import numpy as np
+import param
+
+from wfsobs.notebook import html_table
+from wfsobs.settings.parameters import allowed, hint
+
+Plain = dict[str, Any]
+"""A tree as plain values: nested dictionaries, lists, numbers, strings and booleans."""
+
+
+SHOWN = 3
+"""Settings that the representation of a group names."""
+
+
+class SettingError(ValueError):
+    """A setting that cannot be used: one line naming the setting, its value and what is allowed."""
+
+
+G = TypeVar("G", bound="Group")
+
+
+class Group(param.Parameterized):
+    """A named group of settings; groups nest, and a list of groups can grow and shrink.
+
+    Values out of bounds raise `SettingError` at once when they come by path, dictionary or file, and
+    `ValueError` (from param, naming the parameter) on plain attribute assignment. Names that do not
+    exist are refused on every way in.
+    """
+
+    def __init_subclass__(cls) -> None:
+        """A declaration is that of the class: without this param copies it for every object whose value is set."""
+        super().__init_subclass__()
+        for p in vars(cls).values():
+            if isinstance(p, param.Parameter):
+                p.per_instance = False
+
+    def __init__(self, **values: Any):
+        for name, p in self.settings().items():
+            if name in values:
+                continue
+            if isinstance(p, param.List):
+                values[name] = [v.copy() if isinstance(v, Group) else v for v in p.default or []]
+            elif isinstance(p, param.ClassSelector):
+                values[name] = cast(type[Group], p.class_)()
+        super().__init__(**values)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not name.startswith("_") and name != "name" and name not in type(self).param:
+            raise AttributeError(f"{type(self).__name__} has no setting {name!r}")
+        super().__setattr__(name, _native(value))
+
+    def idle(self) -> tuple[str, ...]:
+        """Settings that mean nothing while the others are as they are."""
+        return ()
+
+    def __repr__(self) -> str:
+        changed = self._changed()
+        shown = ", ".join(f"{path}={value}" for path, value in changed[:SHOWN])
+        return f"{type(self).__name__}({shown}{f', and {len(changed) - SHOWN} more' if len(changed) > SHOWN else ''})"
+
+    def __str__(self) -> str:
+        return repr(self)
+
+    def _repr_html_(self) -> str:
+        return html_table((type(self).__name__, "" if (changed := self._changed()) else "default settings"), changed)
+
+    def _changed(self) -> list[tuple[str, str]]:
+        """(dotted path, value, shortened) of the settings that are not at their defaults."""
+
+        def text(value: Any) -> str:
+            return f"[{len(value)} entries]" if isinstance(value, list) and len(value) > 3 else _short(value, 40)
+
+        return [(path, text(value)) for path, value in leaves(self.difference(type(self)()))]
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and self.to_dict() == other.to_dict()  # type: ignore[attr-defined]
+
+    def __hash__(self) -> int:
+        return hash(repr(self.to_dict()))
+
+    def copy(self) -> Self:
+        """An independent copy of the whole tree."""
+        return type(self).from_dict(self.to_dict())
+
+    # ------------------------------------------------------------------ plain values
+
+    @classmethod
+    def settings(cls) -> dict[str, param.Parameter]:
+        """Name -> param.Parameter of every setting, in order of declaration."""
+        return {k: p for k, p in cls.param.objects("existing").items() if k != "name"}
+
+    def to_dict(self) -> Plain:
+        """The tree as nested plain values."""
+        return {name: _plain(getattr(self, name)) for name in self.settings()}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """A tree with `values` on top of the defaults. Raises SettingError."""
+        tree = cls()
+        tree.update(values)
+        return tree
+
+    def update(self, values: Mapping[str, Any], prefix: str = "") -> None:
+        """Set every value of a (partial) dictionary; whole lists are replaced. Raises SettingError."""
+        for name, value in values.items():
+            self._set_one(str(name), value, prefix)
+
+    def _set_one(self, name: str, value: Any, prefix: str) -> None:
+        path = f"{prefix}{name}"
+        p = self.settings().get(name)
+        if p is None:
+            raise SettingError(f"{path}: no such setting; {name!r} is not one of {', '.join(self.settings())}")
+        current = getattr(self, name)
+        if isinstance(current, Group) and not isinstance(value, Group):
+            if not isinstance(value, Mapping):
+                raise SettingError(f"{path} = {_short(value)}: this is a group of settings, not a value")
+            current.update(value, f"{path}.")
+            return
+        if isinstance(p, param.List) and holds_groups(p):
+            value = _groups(p, value, path)
+        elif isinstance(value, Group):
+            value = value.copy()
+        try:
+            setattr(self, name, value)
+        except (ValueError, TypeError, RecursionError) as error:  # the last of param's words for a value nested very deep
+            raise SettingError(f"{path} = {_short(value)}: {allowed(p)}{hint(value)}") from error
+
+    def difference(self, base: Group) -> Plain:
+        """The settings in which this tree differs from `base`, as a partial dictionary."""
+        out: Plain = {}
+        for name in self.settings():
+            mine, other = getattr(self, name), getattr(base, name)
+            if isinstance(mine, Group):
+                inner = mine.difference(other)
+                if inner:
+                    out[name] = inner
+            elif _plain(mine) != _plain(other):
+                out[name] = _plain(mine)
+        return out
+
+    # ------------------------------------------------------------------ dotted paths
+
+    def set(self, path: str, value: Any) -> None:
+        """Set one setting by its dotted path, list items by number; the number one past the end of a
+        list adds an item. Raises SettingError.
+
+        >>> from wfsobs.scenario import Scenario
+        >>> s = Scenario()
+        >>> s.set("vibration.peaks.0.frequency", 45)
+        >>> s.vibration.peaks[0].frequency
+        45.0
+        """
+        fresh = self.replace({path: value})
+        for name in self.settings():
+            setattr(self, name, getattr(fresh, name))
+
+    def replace(self, changes: Mapping[str, Any]) -> Self:
+        """A copy with some settings (dotted path -> value) changed. Raises SettingError."""
+        trial = self.to_dict()
+        for path, value in changes.items():
+            if _put(trial, path.split("."), value, path):
+                trial = type(self).from_dict(trial).to_dict()  # a new item has its other settings, too
+        return type(self).from_dict(trial)
+
+    def walk(self, prefix: str = "") -> Iterator[tuple[str, Group, param.Parameter]]:
+        """(dotted path, group that owns it, parameter) of every setting that is a value or a list."""
+        for name, p in self.settings().items():
+            value = getattr(self, name)
+            if isinstance(value, Group):
+                yield from value.walk(f"{prefix}{name}.")
+            elif isinstance(p, param.List) and holds_groups(p):
+                for i, item in enumerate(value):
+                    yield from item.walk(f"{prefix}{name}.{i}.")
+            else:
+                yield f"{prefix}{name}", self, p
+
+    def lists(self, prefix: str = "") -> Iterator[tuple[str, param.List]]:
+        """(dotted path, parameter) of every list of groups."""
+        for name, p in self.settings().items():
+            value = getattr(self, name)
+            if isinstance(value, Group):
+                yield from value.lists(f"{prefix}{name}.")
+            elif isinstance(p, param.List) and holds_groups(p):
+                yield f"{prefix}{name}", p
+
+
+class Section(NamedTuple):
+    """A group of settings that an observer or a controller brings along.
+
+    name  : its name in a scenario, before the first dot of the paths and in TOML
+    label : what it is called on the page
+    group : the settings
+    """
+
+    name: str
+    label: str
+    group: type[Group]
+
+
+class _Section(param.ClassSelector):
+    """A setting that is a group; a tree made before the setting was declared gets a fresh one when it is read."""
+
+    def __get__(self, obj: Any, objtype: Any) -> Any:
+        value = super().__get__(obj, objtype)
+        if value is None and obj is not None:
+            value = cast(type[Group], self.class_)()
+            self.__set__(obj, value)
+        return value
+
+
+def section(kind: type[G], label: str, doc: str = "") -> G:
+    """A setting that is a group of its own; each tree gets a fresh one."""
+    return cast(G, _Section(class_=kind, label=label, doc=doc, per_instance=False))
+
+
+def _native(value: Any) -> Any:
+    """Scalars of NumPy, alone or in a list, as Python's own: what is written of a setting is read again without NumPy."""
+    if isinstance(value, np.generic):
+        return value.item()
+    return [_native(v) for v in value] if isinstance(value, (list, tuple)) else value
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Group):
+        return value.to_dict()
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    return value
+
+
+def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted path, value) of a (partial) dictionary of settings; lists as a whole."""
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def holds_groups(p: param.List) -> bool:
+    """Whether a list's items are groups of settings."""
+    return isinstance(p.item_type, type) and issubclass(p.item_type, Group)
+
+
+def settings_of(p: param.List) -> dict[str, param.Parameter]:
+    """The settings of an item of a list of groups."""
+    return cast(type[Group], p.item_type).settings()
+
+
+def _groups(p: param.List, value: Any, path: str) -> list[Group]:
+    if not isinstance(value, (list, tuple)):
+        raise SettingError(f"{path} = {_short(value)}: takes a list of tables")
+    _, high = p.bounds or (0, None)
+    if high is not None and len(value) > high:
+        raise SettingError(f"{path}: {len(value)} entries, at most {high} are allowed")
+    out: list[Group] = []
+    for i, item in enumerate(value):
+        if isinstance(item, Group):
+            out.append(item.copy())
+        elif isinstance(item, Mapping):
+            made = cast(type[Group], p.item_type)()
+            made.update(item, f"{path}.{i}.")
+            out.append(made)
+        else:
+            raise SettingError(f"{path}.{i} = {_short(item)}: takes a table of settings")
+    return out
+
+
+def _put(node: Any, keys: list[str], value: Any, path: str) -> bool:
+    """Put `value` into nested plain values; unknown names are left for `update` to refuse. Returns whether a list grew."""
+    key = keys[0]
+    grown = False
+    if isinstance(node, list):
+        if not key.isdecimal() or int(key) > len(node):
+            raise SettingError(f"{path}: the list has {len(node)} entries, numbered from 0; {len(node)} adds one")
+        index = int(key)
+        if index == len(node):
+            node.append({} if len(keys) > 1 else None)
+            grown = True
+        if len(keys) == 1:
+            node[index] = value
+        else:
+            grown |= _put(node[index], keys[1:], value, path)
+    elif isinstance(node, dict):
+        if len(keys) == 1:
+            node[key] = value
+        elif key in node:
+            grown = _put(node[key], keys[1:], value, path)
+        elif node:
+            raise SettingError(f"{path}: no such setting; {key!r} is not one of {', '.join(node)}")
+        else:
+            raise SettingError(f"{path}: the entry is new; give it a whole {key} first")
+    else:
+        raise SettingError(f"{path}: no such setting")
+    return grown
+
+
+_WORDS = reprlib.Repr()  # stops at a depth, where `repr` would end in a RecursionError
+_WORDS.maxlist = _WORDS.maxtuple = _WORDS.maxdict = 40
+_WORDS.maxstring = _WORDS.maxother = _WORDS.maxlong = 400
+
+
+def _short(value: Any, most: int = 80) -> str:
+    text = _WORDS.repr(value)
+    return text if len(text) <= most else text[: most - 3] + "..."

@@ -1,0 +1,103 @@
+"""The kinds of value a setting can have, and how to say what one takes."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import param
+
+
+class Real(param.Number):
+    """A finite number; integers become floats, booleans and NaN are refused."""
+
+    def __set__(self, obj: Any, val: Any) -> None:
+        super().__set__(obj, _as_float(val))
+
+    def _validate_value(self, val: Any, allow_None: bool) -> None:
+        if isinstance(val, bool) or not isinstance(val, float) or not math.isfinite(val):
+            raise ValueError(f"{self.name} takes a finite number, not {val!r}")
+        super()._validate_value(val, allow_None)
+
+
+class Whole(param.Integer):
+    """A whole number; booleans are refused."""
+
+    def _validate_value(self, val: Any, allow_None: bool) -> None:
+        if isinstance(val, bool):
+            raise ValueError(f"{self.name} takes a whole number, not {val!r}")
+        super()._validate_value(val, allow_None)
+
+
+class Reals(param.List):
+    """A list of finite numbers, each within `item_bounds`; its length within `bounds`."""
+
+    __slots__ = ["item_bounds"]
+    item_bounds: tuple[float, float]
+
+    def __init__(self, default: Sequence[float] = (), *, item_bounds: tuple[float, float], **kwargs: Any):
+        self.item_bounds = item_bounds
+        super().__init__(default=[float(v) for v in default], **kwargs)
+
+    def __set__(self, obj: Any, val: Any) -> None:
+        if isinstance(val, (list, tuple)):
+            val = [_as_float(v) for v in val]
+        super().__set__(obj, val)
+
+    def _validate_value(self, val: Any, allow_None: bool) -> None:
+        super()._validate_value(val, allow_None)
+        low, high = self.item_bounds
+        for v in val:
+            if not isinstance(v, float) or not low <= v <= high:
+                raise ValueError(f"{self.name} takes numbers from {low:g} to {high:g}, not {v!r}")
+
+
+def _as_float(value: Any) -> Any:
+    """A whole number as the float that it is; anything else, and what no float can hold, as it came."""
+    if isinstance(value, int) and not isinstance(value, bool):
+        try:
+            return float(value)
+        except OverflowError:
+            pass
+    return value
+
+
+def allowed(p: param.Parameter) -> str:
+    """What a setting takes, as the end of a one-line message."""
+    unit = f" {u}" if (u := unit_of(p)) else ""
+    if isinstance(p, Reals):
+        low, high = p.item_bounds
+        shortest, longest = p.bounds or (0, 0)
+        return f"takes a list of {shortest:g} to {longest:g} numbers from {low:g} to {high:g}{unit}"
+    if isinstance(p, param.Selector):
+        return f"takes one of {', '.join(map(str, p.objects))}"
+    if isinstance(p, param.Boolean):
+        return "takes true or false"
+    if isinstance(p, param.Number):
+        kind = "a whole number" if isinstance(p, param.Integer) else "a number"
+        low, high = p.bounds or (None, None)
+        above, below = p.inclusive_bounds
+        start = f"{'from' if above else 'above'} {low:g}"
+        return f"takes {kind} {start} {'to' if below else 'and below'} {high:.10g}{unit}"
+    return f"takes a {getattr(p, 'class_', object).__name__.lower()}"
+
+
+def hint(value: object) -> str:
+    """What to do about a text that is a number but for its comma, alone or in a list; nothing about any other value.
+
+    >>> hint("15,5"), hint([1.0, "0,5"]), hint("fast"), hint(15.5)
+    ('; use a point: 15.5', '; use a point: 0.5', '', '')
+    """
+    if isinstance(value, list):
+        return next((said for v in value if isinstance(v, str) and (said := hint(v))), "")
+    if isinstance(value, str) and re.fullmatch(r"\s*[-+−]?\d*,\d+\s*", value):
+        return f"; use a point: {value.strip().replace(',', '.')}"
+    return ""
+
+
+def unit_of(p: param.Parameter) -> str:
+    """The unit a setting is in: what stands in [brackets] in its documentation, or nothing."""
+    match = re.search(r"(?<=\s)\[([^\]]+)\]", p.doc or "")
+    return match.group(1) if match else ""
