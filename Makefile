@@ -54,11 +54,12 @@ test-fast: $(TEST)  ## the quick tests alone: no dashboard, no report, none that
 setup: $(TEST)  ## install all that the tests need, the browser included
 	@scripts/need_browser.sh $(VENV)
 
-check: $(TEST)  ## ruff, pyright, and the walls between the rooms
+check: $(TEST)  ## ruff, pyright, the walls between the rooms, and calls that go up
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-logo --no-cache
+	$(BIN)/python scripts/count_jumps.py
 
 wheel: $(TEST)  ## build dist/*.tar.gz, and from it dist/*.whl
 	rm -rf dist
