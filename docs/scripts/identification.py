@@ -138,6 +138,14 @@ NOISE, TURBULENCE = 0.014, (7.0686, 0.9, 0.5)
 """Of `coverage`: rms of the noise [um]; omega [rad/s], damping, rms [um] of turbulence."""
 WITH = ((30.0, 0.02, 0.008), (52.0, 0.01, 0.006), (20.3, 0.0, 0.002), (70.031, 0.0, 0.0015))
 """Frequency [Hz], damping, rms [um] of its peaks."""
+KINDS = {
+    "nothing lost": (1000.0, 0.0),
+    "3 % lost": (1000.0, 0.03),
+    "10 % lost": (1000.0, 0.1),
+    "30 % lost": (1000.0, 0.3),
+    "2 kHz, nothing lost": (2000.0, 0.0),
+}
+"""Rate [Hz] and share of lost frames of its records."""
 
 
 def lossy(seed: int, rate: float, duration: float, lost: float) -> Record:
@@ -151,9 +159,9 @@ def lossy(seed: int, rate: float, duration: float, lost: float) -> Record:
     return Record(z[:, None], np.zeros((n, 1)), dt)
 
 
-def coverage(seeds: range, rate: float, duration: float, lost: float) -> None:
-    """How many of the 95 % intervals, 1.96 stated standard deviations, hold the truth, by quantity, with the 95 % interval of the
-    share (Clopper and Pearson), and how many state none; records with a peak more."""
+def held(seeds: range, rate: float, duration: float, lost: float) -> tuple[dict[str, str], str]:
+    """By quantity, how many of the 95 % intervals, 1.96 stated standard deviations, hold the truth, with the 95 % interval of
+    that share in percent (Clopper and Pearson), and how many numbers state none; and the records with a peak more."""
     inside: dict[str, list[bool]] = {}
     silent: dict[str, int] = {}
     more = []
@@ -171,17 +179,32 @@ def coverage(seeds: range, rate: float, duration: float, lost: float) -> None:
         for f, xi, rms in WITH:
             near = [p for p in mode.peaks if p.pure == (xi == 0) and abs(p.frequency.value - f) < max(0.3, 4.0 * p.frequency.std)]
             for p in sorted(near, key=lambda p: abs(p.frequency.value - f))[:1]:
-                kind = "resonance" if xi else "line"
+                kind = "resonances" if xi else "lines"
                 pairs += [(f"{kind}, frequency", p.frequency, f), (f"{kind}, rms", p.rms, rms)]
-                pairs += [("resonance, damping", p.damping, xi)] if xi else []
+                pairs += [("resonances, damping", p.damping, xi)] if xi else []
         for name, number, true in pairs:
-            held, stated = inside.setdefault(name, []), np.isfinite(number.std)
-            held += [abs(number.value - true) < 1.96 * number.std] * bool(stated)
+            stated = bool(np.isfinite(number.std))
+            inside.setdefault(name, []).extend([abs(number.value - true) < 1.96 * number.std] * stated)
             silent[name] = silent.get(name, 0) + (not stated)
-    print(f"{rate:g} Hz, {duration:g} s, {lost:.0%} lost, seeds {seeds[0]} to {seeds[-1]}; a peak more: {counted(more, seeds)}")
-    for name, held in inside.items():
-        share = binomtest(sum(held), len(held)).proportion_ci() if held else (0.0, 1.0)
-        print(f"  {name}: {sum(held)} of {len(held)} ({share[0]:.0%} - {share[1]:.0%}); none stated {silent[name]}", flush=True)
+    cells = {}
+    for name, ok in inside.items():
+        share = binomtest(sum(ok), len(ok)).proportion_ci() if ok else (0.0, 1.0)
+        none = f", {silent[name]} none" * (silent[name] > 0)
+        cells[name] = f"{sum(ok)} of {len(ok)} ({100.0 * share[0]:.0f} - {100.0 * share[1]:.0f}){none}"
+    return cells, counted(more, seeds)
+
+
+def coverage(count: int, duration: float) -> None:
+    """Intervals that hold the truth, as a table: records of their own for every column."""
+    columns = []
+    for i, (name, (rate, lost)) in enumerate(KINDS.items()):
+        seeds = range(i * count + 1, (i + 1) * count + 1)
+        cells, more = held(seeds, rate, duration, lost)
+        columns.append(cells)
+        print(f"{name}: seeds {seeds[0]} to {seeds[-1]}; a peak more: {more}", flush=True)
+    print(f"| | {' | '.join(KINDS)} |\n|{'---|' * (len(KINDS) + 1)}")
+    for name in sorted(set().union(*columns), key=list(columns[0]).index):
+        print(f"| {name} | {' | '.join(cells.get(name, '-') for cells in columns)} |", flush=True)
 
 
 def spread(scenario: Scenario, seeds: range) -> dict[str, Any]:
@@ -277,5 +300,4 @@ if __name__ == "__main__":
         print("Filters, known peaks:", filters(known_peaks(duration), few), flush=True)
         print("Filters, peaks of the paper:", filters(resonant, few), flush=True)
     if "coverage" in parts:
-        for rate, lost in ((1000.0, 0.0), (1000.0, 0.03), (1000.0, 0.1), (1000.0, 0.3), (2000.0, 0.0)):
-            coverage(seeds, rate, duration, lost)
+        coverage(count, duration)
