@@ -13,6 +13,7 @@ from wfsobs import bench, cli
 from wfsobs.bench import external, textbook
 from wfsobs.bench.measure import OURS, max_error, row, timed, with_ratios
 from wfsobs.bench.sizes import Sizes
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.offline import train
 from wfsobs.observers.gpr.online import predict_sliding
@@ -60,6 +61,7 @@ REQUIRED = {
     "kalman-record": {OURS, "numpy-loop"},
     "multirate-record": {OURS, "numpy-loop"},
     "adaptive-record": {OURS},
+    "observer": {OURS},
     "frozen-flow": {OURS, "ideal-sensors"},
     "whole-run": {OURS, "without-online-gpr", "without-learning"},
 }
@@ -82,13 +84,14 @@ def test_rows_are_complete(rows):
         assert r["median_s"] > 0 and r["ratio_to_ours"] > 0
         assert (r["per_step_us"] is None) == (r["steps"] is None) == (r["task"] == "offline-gpr-train")
         assert (r["ready_us"] is None) == (r["task"] != "online-gpr-stream")
-        assert (r["max_error_over_std"] is None) == (r["task"] in ("adaptive-record", "frozen-flow", "whole-run"))
+        assert (r["max_error_over_std"] is None) == (r["task"] in ("adaptive-record", "observer", "frozen-flow", "whole-run"))
         assert r["variant"] != OURS or r["ratio_to_ours"] == 1.0
     assert {r["size"] for r in rows if r["peak_memory_mb"] is not None} == {
         "0.3 s, 2 modes",
         "0.4 s, 2 modes, 1 layer",
         "0.4 s, 2 modes, 2 layers",
     }
+    assert {r["size"] for r in rows if r["task"] == "observer"} == {f"{name}, 0.4 s, 2 modes" for name in OBSERVERS}
     assert {r["size"] for r in rows if r["task"] == "online-gpr-record"} == {"m=30 d=12", "m=40 d=5"}
 
 

@@ -10,11 +10,11 @@ moment or a wait.
 from __future__ import annotations
 
 from wfsobs.atmosphere.von_karman import FIELD
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.per_mode import AT_ONCE
+from wfsobs.priors_from.scenario import settings_of
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import TRAINING_MARGIN
-
-CORES = 2
 
 
 def run_seconds(scenario: Scenario) -> float:
@@ -28,16 +28,17 @@ def run_seconds(scenario: Scenario) -> float:
 
 
 def part_seconds(scenario: Scenario) -> dict[str, float]:
-    """What `run_seconds` adds up [s]: the two GPR, the adaptive filter, and all else as "rest"."""
-    n, turns = scenario.n_steps, -(-len(scenario.modes) // CORES)
-    online, offline = scenario.gpr_online, scenario.gpr_offline
+    """What `run_seconds` adds up [s]: the observers that say how long they take, and all else as "rest"."""
+    n, n_modes, offline = scenario.n_steps, len(scenario.modes), scenario.gpr_offline
     training = offline.depth + offline.training_size + round(TRAINING_MARGIN * scenario.sensors.lgs_rate)
     air = _steps_of_air(scenario)
     return {
-        "gpr-online": turns * gpr_online_seconds(n, online.training_size, online.depth),
-        "gpr-offline": turns * gpr_offline_seconds(n, offline.training_size, offline.depth),
-        "kf-adaptive": len(scenario.modes) * adaptive_seconds(scenario),
-        "rest": 2.5e-6 * len(scenario.modes) * (n + training) + frozen_flow_seconds(scenario, air + training),
+        **{
+            o.id: o.seconds(settings_of(o, scenario), n, n_modes, scenario.dt)
+            for o in OBSERVERS.values()
+            if o.seconds is not None
+        },
+        "rest": 2.5e-6 * n_modes * (n + training) + frozen_flow_seconds(scenario, air + training),
     }
 
 
@@ -62,25 +63,6 @@ def frozen_flow_seconds(scenario: Scenario, n_steps: int) -> float:
     finest = max(40, s.lenslets.lgs_subapertures, s.lenslets.ngs_subapertures)
     each = 0.1 if s.kind == "zernike" else (finest / 40) ** 2
     return each * widths * beams * (2.8e-3 + 0.26e-3 * len(scenario.modes))
-
-
-def adaptive_seconds(scenario: Scenario) -> float:
-    """One mode [s]: 3.5 ms + 0.9 us per sample for every window."""
-    a, rate = scenario.adaptive, scenario.sensors.lgs_rate
-    windows = max((scenario.n_steps - round(a.window * rate)) // max(round(a.interval * rate), 1), 0)
-    return windows * (3.5e-3 + 0.9e-6 * a.window * rate)
-
-
-def gpr_online_seconds(n_steps: int, training_size: int, depth: int) -> float:
-    """One mode [s]: 10 us + 400 us / m + 0.065 ns m^2 for every step with a full training set."""
-    m = training_size
-    return max(n_steps - depth - m + 1, 0) * (10e-6 + 400e-6 / m + 65e-12 * m**2)
-
-
-def gpr_offline_seconds(n_steps: int, training_size: int, depth: int) -> float:
-    """One mode [s]: training 4 ns m^2 + 10 ps m^3, prediction 1.2 us + 4.2 ns m per step."""
-    m = training_size
-    return 4e-9 * m**2 + 10e-12 * m**3 + max(n_steps - depth + 1, 0) * (1.2e-6 + 4.2e-9 * m)
 
 
 def run_bytes(scenario: Scenario) -> float:

@@ -16,7 +16,6 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.tuning.space import TUNABLE
 
 ROOT = Path(__file__).parents[2]
 APART = ("app", "assets")
@@ -110,17 +109,18 @@ def observers() -> str:
         "[Model](../model.md#observers) the equations.\n"
     ]
     for o in OBSERVERS.values():
-        tuned = TUNABLE[o.id].usual if o.id in TUNABLE else ()
         rows = (
             ("Estimates", ", ".join(o.targets)),
             ("Needs beside measurements", o.told),
             ("Needs of a record", listed(("y_lgs", "u", *o.needs) if o.id != "zero" else ())),
             ("Causal", "yes" if o.causal else "no: a reference that looks ahead"),
             ("Computing time, Kalman filter = 1", f"{o.weight:g}"),
-            ("Settings that are tuned", listed(tuned)),
+            ("Its settings", listed([o.group] if o.group else ())),
+            ("Settings that are tuned", listed(o.tunable.usual)),
             ("Function", reference(o.run)),
         )
-        out.append(f"## {o.label} (`{o.id}`)\n\n{table(('Property', 'Value'), rows)}\n\n{inspect.getdoc(o.run)}\n")
+        about = f"{o.help[:1].upper()}{o.help[1:]}.\n\n" if o.help else ""
+        out.append(f"## {o.label} (`{o.id}`)\n\n{about}{table(('Property', 'Value'), rows)}\n\n{inspect.getdoc(o.run)}\n")
     return "\n".join(out)
 
 

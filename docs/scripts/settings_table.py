@@ -1,4 +1,4 @@
-"""Writes docs/settings.md from the declarations in wfsobs/scenario/scenario.py: `python docs/scripts/settings_table.py`."""
+"""Writes docs/settings.md from the declarations in the scenario and the observers: `python docs/scripts/settings_table.py`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ Every setting of a run, by the path that it has on the command line (`--set path
 `Scenario.replace`. Items of a list are numbered from 0, and the number one past the end adds an item; N stands for such a
 number. The defaults are those of `Scenario()`; `wfsobs presets NAME` prints those of a preset.
 
-This page is written by [settings_table.py](scripts/settings_table.py) from `wfsobs/scenario/scenario.py`.
+This page is written by [settings_table.py](scripts/settings_table.py) from the declarations in `wfsobs/scenario` and
+`wfsobs/observers`.
 """
 
 

@@ -12,7 +12,7 @@ from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.pages import mathml, model
 from wfsobs.app.pages.figures import PSD_TOP_HZ, Figures
 from wfsobs.app.pages.pages import EXPLORE, FIGURES, MODEL
-from wfsobs.app.style import LOOKS
+from wfsobs.app.style import look
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.description import describe
 from wfsobs.scenario import Scenario
@@ -110,13 +110,13 @@ class TestFigures:
     def test_colours_and_captions(self, figures: Figures, dashboard: Dashboard) -> None:
         for sheet in figures.sheets:
             for plot in sheet.plots:
-                assert {n: line.glyph.line_color for n, line in plot.lines.items()} == {n: LOOKS[n].light for n in plot.lines}
+                assert {n: line.glyph.line_color for n, line in plot.lines.items()} == {n: look(n).light for n in plot.lines}
         captions = [words(sheet.caption.object) for sheet in figures.sheets]
         assert [c.split(" of the paper")[0] for c in captions] == ["Figure 4a", "Figure 4b", "Figure 5", "Figure 6"]
         assert "RMS error of tilt [nm]: LGS KF" in captions[2] and "16.6e-3" in captions[3]
         dashboard.display.param.update(unit="mas", dark=True)
         assert figures.sheets[0].plots[0].figure.yaxis.axis_label == "tip [mas]"
-        assert figures.sheets[0].plots[0].lines[TRUTH].glyph.line_color == LOOKS[TRUTH].dark
+        assert figures.sheets[0].plots[0].lines[TRUTH].glyph.line_color == look(TRUTH).dark
 
     def test_without_a_vibration(self, figures: Figures, dashboard: Dashboard, loop: Any) -> None:
         dashboard.store.change("vibration.source", "none")

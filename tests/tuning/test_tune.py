@@ -27,7 +27,7 @@ from wfsobs.simulation.sensor_noise import noise_covariance
 from wfsobs.tuning import Evaluation, tune
 from wfsobs.tuning.records import NEXT, REFERENCE, TRUTH, cut, piece, simulated, stream
 from wfsobs.tuning.report import plain, toml
-from wfsobs.tuning.space import TUNABLE, space
+from wfsobs.tuning.space import space
 
 
 def short(**more: Any) -> Scenario:
@@ -245,7 +245,7 @@ def test_every_tunable_setting_is_read() -> None:
         return np.hstack([e.values for e in observe(record, scenario, observers=[observer]).estimates])
 
     for observer in OBSERVERS:
-        before, (usual, others) = estimate(observer, base), TUNABLE[observer]
+        before, (usual, others) = estimate(observer, base), OBSERVERS[observer].tunable
         for path in (*usual, *others):
             found = space(base, observer, [path])
             changes = found.changes(np.where(found.start(base) < 0.5, 0.6, 0.4))

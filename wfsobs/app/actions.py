@@ -20,7 +20,7 @@ from wfsobs.app.report.maker import LIMIT, ReportError, make
 from wfsobs.app.share import FILE, Link, from_file, from_query, to_file, to_query
 from wfsobs.app.sources import Kept
 from wfsobs.app.store import Store
-from wfsobs.app.style import LOOKS, asset
+from wfsobs.app.style import asset, labels
 from wfsobs.app.work import Shown
 from wfsobs.settings.group import SettingError
 
@@ -66,7 +66,7 @@ class Actions:
 
     def __init__(self, store: Store):
         self.store = store
-        self.toolbar = Toolbar(labels={name: it.label for name, it in LOOKS.items()}, sizing_mode="stretch_width", margin=0)
+        self.toolbar = Toolbar(labels=labels(), sizing_mode="stretch_width", margin=0)
         self.toolbar.on_action = self.handle
         self._tasks: dict[str, BackgroundTask] = {}
         self._under_way: dict[str, tuple[str, Callable[[Any], None]]] = {}

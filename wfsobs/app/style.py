@@ -1,12 +1,13 @@
 """Colours, dashes and names: how an observer or a controller looks wherever it appears.
 
-The colours are the paper's. In dark mode each has a lighter relative; dashes tell apart what comes close in colour.
+Observers say it themselves; here are the other lines. The colours are the paper's. In dark mode each has a lighter relative;
+dashes tell apart what comes close in colour.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from importlib.resources import files
 from types import MappingProxyType
 from typing import Any
@@ -14,41 +15,12 @@ from typing import Any
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
-
-
-@dataclass(frozen=True)
-class Look:
-    """Name in legends, colour in light and dark mode, dash pattern [px] (empty is solid), line width [px]."""
-
-    label: str
-    light: str
-    dark: str
-    dash: tuple[int, ...] = ()
-    width: float = 1.4
-
-    def colour(self, dark: bool) -> str:
-        """The colour for the mode."""
-        return self.dark if dark else self.light
-
+from wfsobs.observers.base import PLAIN, Look
 
 LOOKS: Mapping[str, Look] = MappingProxyType(
     {
         TRUTH: Look("Truth", "#606060", "#C8C8C8", (6, 3)),
-        "kf-lgs": Look("LGS KF", "#FF6600", "#FF8533"),
-        "kf-ngs": Look("NGS KF", "#003DE6", "#7AA2FF", (8, 2)),
-        "multirate": Look("Multi-rate KF", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
-        "multirate-optimal": Look("Opt. multi-rate", "#7A1FA2", "#C9A0FF", (3, 2)),
-        "butterworth-ol": Look("Butterworth OL", "#B40000", "#FF7A70", (2, 2)),
-        "butterworth-cl": Look("Butterworth CL", "#B40000", "#FF7A70", (8, 3)),
-        "gpr-offline": Look("Offline GPR", "#0A960A", "#4FD64F", (12, 2, 2, 2, 2, 2)),
-        "gpr-online": Look("Online GPR", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
-        "kf-multi": Look("Multi-peak", "#00707F", "#4DD0E1", (14, 3)),
-        "ridge": Look("Ridge", "#6B6B00", "#C8C84D", (4, 2)),
-        "ridge-30": Look("30-tap predictor", "#8A5A00", "#D8A44D", (2, 3)),
-        "persistence": Look("Persistence", "#707070", "#A8A8A8", (1, 3)),
-        "kf-adaptive": Look("Adaptive KF", "#E0006E", "#FF7AB8", (20, 2), width=1.8),
         BOUND: Look("Bound, mean of the LGS", "#202020", "#E8E8E8", (1, 2)),
-        "zero": Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4)),
         "measured": Look("Measured", "#606060", "#C8C8C8"),
         "highest": Look("Highest", "#8A8A8A", "#9A9A9A"),
         "fitted": Look("Model", "#E04E00", "#FF8533", width=2.2),
@@ -66,9 +38,7 @@ LOOKS: Mapping[str, Look] = MappingProxyType(
         "integrator+gpr-online": Look("Int. + online", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
     }
 )
-
-HIDDEN = ("ridge", "ridge-30", "persistence", "zero")
-"""Observers in the table only: their lines would be the axis, or hide the others."""
+"""Lines that are no observers'."""
 
 HEARD = ".MuiFormLabel-root { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); }"
 """Style of a switch whose name is heard but not seen."""
@@ -91,15 +61,23 @@ def theme() -> dict[str, Any]:
 
 
 def look(name: str) -> Look:
-    """The look of an observer or of the truth; one that is new here has its registered name, in grey."""
+    """The look of an observer, a controller, the truth or another line; one that is not known has its name."""
     if name in LOOKS:
         return LOOKS[name]
-    return Look(OBSERVERS[name].label if name in OBSERVERS else name, "#555577", "#BBBBDD", (4, 2))
+    entry = OBSERVERS.get(name)
+    if entry is None:
+        return replace(PLAIN, label=name)
+    return entry.look if entry.look.label else replace(entry.look, label=entry.label)
+
+
+def labels() -> dict[str, str]:
+    """Every line's name in legends."""
+    return {name: look(name).label for name in (*LOOKS, *OBSERVERS)}
 
 
 def observers_of(target: str, hidden: bool = False) -> list[str]:
-    """Observers that estimate a target, in the order of the registry."""
-    return [o.id for o in OBSERVERS.values() if target in o.targets and (hidden or o.id not in HIDDEN)]
+    """Observers that estimate a target, in the order of the registry. hidden : also those that stand in tables only"""
+    return [o.id for o in OBSERVERS.values() if target in o.targets and (hidden or o.look.drawn)]
 
 
 def asset(name: str) -> str:

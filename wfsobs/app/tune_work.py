@@ -16,11 +16,8 @@ from wfsobs.tuning import Evaluation, Stage, Tuned, tune
 from wfsobs.tuning.judge import Errors
 from wfsobs.tuning.records import MEASURES, TRUTH, judged_by
 from wfsobs.tuning.report import settings
-from wfsobs.tuning.space import TUNABLE
 
-CHOICES: Mapping[str, str] = MappingProxyType(
-    {o.label: name for name, o in OBSERVERS.items() if name in TUNABLE and TUNABLE[name].usual}
-)
+CHOICES: Mapping[str, str] = MappingProxyType({o.label: o.id for o in OBSERVERS.values() if o.tunable.usual})
 """Label -> observer, of those that have something to tune."""
 
 MOST = 1000

@@ -40,8 +40,8 @@ DELIVERY_INTERVAL = 0.4
 DRAWING = 0.15
 """What the page takes to draw a delivery [s]."""
 
-LEARNING = frozenset(o.id for o in OBSERVERS.values() if o.weight >= 50.0)
-"""The observers that learn during the run: the others do not wait for them."""
+LEARNING = frozenset(o.id for o in OBSERVERS.values() if o.slow)
+"""The observers that no other waits for: those that learn during the run."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from wfsobs.bench.measure import OURS, Row, peak_memory_mb, row, timed, with_rat
 from wfsobs.bench.sizes import Sizes
 from wfsobs.bench.turbulence import frozen
 from wfsobs.observers import OBSERVERS
-from wfsobs.pipeline import run
+from wfsobs.pipeline import estimated, run
+from wfsobs.simulation.loop import simulate
 
 
 class Task(NamedTuple):
@@ -38,10 +39,23 @@ def whole_run(sizes: Sizes, _libraries: Collection[str]) -> Iterator[Row]:
     scenario, size = sizes.scenario(sizes.duration), _length(sizes.duration)
     seconds, _ = timed(lambda: run(scenario), sizes.repeats)
     yield row("whole-run", size, OURS, seconds, scenario.n_steps)
-    for variant, left_out in (("without-online-gpr", ("gpr-online",)), ("without-learning", ("gpr-online", "kf-adaptive"))):
+    learning = tuple(name for name, observer in OBSERVERS.items() if observer.slow)
+    for variant, left_out in (("without-online-gpr", ("gpr-online",)), ("without-learning", learning)):
         quick = [name for name in OBSERVERS if name not in left_out]
         seconds, _ = timed(lambda quick=quick: run(scenario, observers=quick), sizes.repeats)
         yield row("whole-run", size, variant, seconds, scenario.n_steps)
+
+
+def each_observer(sizes: Sizes, _libraries: Collection[str]) -> Iterator[Row]:
+    """Every observer of the registry on the same record of two modes; one that has no estimate of it is left out."""
+    scenario, size = sizes.scenario(sizes.duration), _length(sizes.duration)
+    record = simulate(scenario)
+    for name in OBSERVERS:
+        try:
+            seconds, _ = timed(lambda name=name: estimated(name, record, scenario), sizes.repeats)
+        except ValueError:
+            continue
+        yield row("observer", f"{name}, {size}", OURS, seconds, record.n_steps)
 
 
 def _length(duration: float) -> str:
@@ -56,6 +70,7 @@ TASKS = (
     Task(kalman_record, 2.0),
     Task(multirate_record, 2.0),
     Task(adaptive_record, 2.0),
+    Task(each_observer, 2.0),
     Task(frozen, 20.0),
     Task(whole_run, 3.0),
 )

@@ -18,10 +18,9 @@ from wfsobs.settings.group import SettingError
 from wfsobs.telemetry.intake import Stated
 from wfsobs.tuning import report
 from wfsobs.tuning import tune as search
-from wfsobs.tuning.space import TUNABLE
 from wfsobs.tuning.tuning import EVALUATIONS
 
-NAMES = [name for name in OBSERVERS if name in TUNABLE and TUNABLE[name].usual]
+NAMES = [o.id for o in OBSERVERS.values() if o.tunable.usual]
 
 
 @click.command()

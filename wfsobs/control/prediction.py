@@ -14,14 +14,13 @@ import numpy as np
 from wfsobs.control.late_regression import LateRegression
 from wfsobs.control.mirror import Mirror
 from wfsobs.observers.gpr.inputs import Scale, StreamingInputs, scale_of, window_signals
-from wfsobs.observers.gpr.offline import train, training_targets
-from wfsobs.observers.gpr.online import kernel_of
+from wfsobs.observers.gpr.offline import OfflineGpr, train, training_targets
+from wfsobs.observers.gpr.online import OnlineGpr, kernel_of
 from wfsobs.observers.per_mode import over_modes
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.groups.observers import OfflineGpr, OnlineGpr
 from wfsobs.signal.bandpass import StreamingBank, bandpass_bank
 from wfsobs.typing import Array
 

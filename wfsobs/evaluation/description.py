@@ -11,13 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wfsobs.observers.kalman.multirate import multirate_filter, multirate_noise
+from wfsobs.observers.kalman.multirate import MultiRate, multirate_filter, multirate_noise
 from wfsobs.observers.kalman.multirate_optimal import optimal_filter, optimal_model
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Model, Prior
 from wfsobs.priors_from.scenario import lgs_error_of, model_of
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.groups.observers import MultiRate
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import paper_matrices

@@ -7,24 +7,61 @@ it asked to be told and settings of its own: the truth is out of reach.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, NamedTuple
 
 from wfsobs.observers.missing import LINE_WIDTH, bridged
 from wfsobs.prior import PARTS, Part, Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Record
+from wfsobs.settings import Group, Section
 from wfsobs.typing import Array
-
-if TYPE_CHECKING:
-    from wfsobs.settings.group import Group
 
 TURBULENCE, VIBRATION = "turbulence", "vibration"
 TARGETS = (TURBULENCE, VIBRATION)
 
+SLOW = 50.0
+"""Weight of an observer for which no other waits: those that learn during the run."""
+
 NOTHING, SPECTRA, MODEL, LINES, BANDS, TRAINING = "nothing", "true spectra", "model", "true lines", "bands", "training data"
 """What an observer or a controller may have to be given beside measurements: the spectra of turbulence, vibration and noise;
 a model with numbers, of one vibration peak; every line of the vibration; where the vibration is; a record to learn from."""
+
+
+class Tunable(NamedTuple):
+    """Dotted paths of the settings that are tuned unless others are named, and of what else it reads that could be."""
+
+    usual: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
+
+
+NOT_TUNED = Tunable()
+
+
+@dataclass(frozen=True)
+class Look:
+    """How an observer or a controller is drawn.
+
+    label       : its name in legends, where the full one is too long; the full one if empty
+    light, dark : colour in light and dark mode
+    dash        : pattern [px], empty is solid; width : of the line [px]
+    drawn       : false for one that stands in tables only: its line would be the axis, or hide the others
+    """
+
+    label: str = ""
+    light: str = "#555577"
+    dark: str = "#BBBBDD"
+    dash: tuple[int, ...] = ()
+    width: float = 1.4
+    drawn: bool = True
+
+    def colour(self, dark: bool) -> str:
+        """The colour for the mode."""
+        return self.dark if dark else self.light
+
+
+PLAIN = Look(dash=(4, 2))
+"""Of one that says nothing of its look."""
 
 
 def _nothing(_settings: Group | None) -> tuple[Part, ...]:
@@ -33,30 +70,39 @@ def _nothing(_settings: Group | None) -> tuple[Part, ...]:
 
 @dataclass(frozen=True)
 class Observer:
-    """An entry of the registry.
+    """An entry of the registry: all that wfsobs knows of an observer.
 
     id, label : for tables and files, and for people
     targets   : what it estimates, of "turbulence" and "vibration"
     run       : (measurements without gaps, prior, settings, watch) -> {target: (n_steps, n_modes) [um]}, NaN where there is
         no estimate yet
+    help      : a line on what it is
     prior     : what it has to be told beside measurements, see `wfsobs.prior`
-    settings  : the group of a scenario's settings that is its own, or None
+    settings  : the group of settings that it brings along, or the name of one that every scenario has
     needs     : record fields without which it cannot run
     asks      : settings -> what it has to be told besides for these
     causal    : false only for a reference that looks ahead
+    tunable   : what of the settings can be tuned
     weight    : its computing time relative to a Kalman filter's, for progress and to run the quick ones first
+    seconds   : (settings, n_steps, n_modes, dt [s]) -> about how long it takes [s]; None for one as quick as a Kalman filter
+    look      : how it is drawn
     """
 
     id: str
     label: str
     targets: tuple[str, ...]
     run: Callable[[Measurements, Prior, Any, Watch], dict[str, Array]]
+    _: KW_ONLY
+    help: str = ""
     prior: tuple[Part, ...] = ()
-    settings: str | None = None
+    settings: Section | str | None = None
     needs: tuple[str, ...] = ()
     asks: Callable[[Any], tuple[Part, ...]] = _nothing
     causal: bool = True
+    tunable: Tunable = NOT_TUNED
     weight: float = 1.0
+    seconds: Callable[[Any, int, int, float], float] | None = None
+    look: Look = PLAIN
 
     def missing(self, record: Record) -> tuple[str, ...]:
         """The needed fields that a record does not have."""
@@ -68,6 +114,16 @@ class Observer:
         """{target: (n_steps, n_modes) [um]}, missing samples bridged by what it is told. Raises ValueError, Cancelled."""
         whole = bridged(measurements, prior, getattr(settings, "line_width", LINE_WIDTH))
         return self.run(whole, prior, settings, watch)
+
+    @property
+    def group(self) -> str | None:
+        """Name of its group of settings in a scenario, or None."""
+        return self.settings.name if isinstance(self.settings, Section) else self.settings
+
+    @property
+    def slow(self) -> bool:
+        """Whether it takes so long that no other waits for it."""
+        return self.weight >= SLOW
 
     @property
     def given(self) -> tuple[str, ...]:

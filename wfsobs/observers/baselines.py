@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
+from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer, Tunable
 from wfsobs.prior import Bands, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements
@@ -53,3 +53,48 @@ def zero(measured: Measurements, _prior: Prior, _settings: None, watch: Watch) -
     """The trivial baseline: nothing disturbs."""
     watch.step(0.0)
     return {target: np.zeros_like(measured.y_lgs) for target in TARGETS}
+
+
+BUTTERWORTH_OL = Observer(
+    "butterworth-ol",
+    "Butterworth, open loop",
+    (VIBRATION,),
+    butterworth_ol,
+    help="band-passes forward and backward: a reference, looks ahead",
+    prior=(Bands,),
+    needs=("open_loop_y",),
+    causal=False,
+    tunable=Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
+    look=Look("Butterworth OL", "#B40000", "#FF7A70", (2, 2)),
+)
+
+BUTTERWORTH_CL = Observer(
+    "butterworth-cl",
+    "Butterworth, closed loop",
+    (VIBRATION,),
+    butterworth_cl,
+    help="the same bands, causal",
+    prior=(Bands,),
+    tunable=Tunable(("butterworth.bandwidth_online",), ("butterworth.order",)),
+    look=Look("Butterworth CL", "#B40000", "#FF7A70", (8, 3)),
+)
+
+PERSISTENCE = Observer(
+    "persistence",
+    "Persistence",
+    (TURBULENCE,),
+    persistence,
+    help="the newest measurement taken for the turbulence",
+    weight=0.1,
+    look=Look("Persistence", "#707070", "#A8A8A8", (1, 3), drawn=False),
+)
+
+ZERO = Observer(
+    "zero",
+    "Zero",
+    TARGETS,
+    zero,
+    help="the trivial baseline",
+    weight=0.1,
+    look=Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4), drawn=False),
+)

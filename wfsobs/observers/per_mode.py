@@ -13,8 +13,16 @@ import numpy as np
 from wfsobs.progress import Watch
 from wfsobs.typing import Array
 
+CORES = 2
+"""Processors of the machine that computing times were measured on (`wfsobs.cost`)."""
+
 AT_ONCE = max(os.cpu_count() or 1, 2)
 """Modes at work at the same time: more would only need more memory."""
+
+
+def turns(n_modes: int) -> int:
+    """How many modes that machine does one after the other, where modes run side by side."""
+    return -(-n_modes // CORES)
 
 
 def over_modes(n_modes: int, work: Callable[[int, Watch], Array], watch: Watch) -> Array:

@@ -7,25 +7,20 @@ then is this with lambda = (sigma_n l / sigma_SE)^2 and a free constant.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import solve
 
-from wfsobs.observers.base import VIBRATION
-from wfsobs.observers.gpr.inputs import scale_of, window_signals
+from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
+from wfsobs.observers.gpr.inputs import scale_of, tunable, window_signals
 from wfsobs.observers.gpr.kernels import sliding_products, square_from_band
-from wfsobs.observers.gpr.offline import training_targets
+from wfsobs.observers.gpr.offline import OFFLINE, OfflineGpr, training_targets
 from wfsobs.observers.per_mode import over_modes
-from wfsobs.prior import Prior
+from wfsobs.prior import Bands, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, pseudo_open_loop
 from wfsobs.signal.linalg import eliminate, solved_rows
 from wfsobs.typing import Array
-
-if TYPE_CHECKING:
-    from wfsobs.scenario.groups.observers import OfflineGpr
 
 TAPS = 30
 """Samples of z that the plain predictor sees."""
@@ -112,3 +107,33 @@ def ridge_30(measured: Measurements, prior: Prior, _settings: None, watch: Watch
         penalty = PLAIN * m * float(np.mean(z**2))
         columns.append(predict(measured.z[:, [mode]], *fit(z, targets[:, mode], TAPS, m, penalty)))
     return {VIBRATION: np.column_stack(columns)}
+
+
+RIDGE = Observer(
+    "ridge",
+    "Ridge",
+    (VIBRATION,),
+    ridge,
+    help="linear limit of the offline GPR: what its kernel becomes for a long length scale",
+    prior=(Training, Bands),
+    settings=OFFLINE,
+    needs=("training",),
+    # The penalty (sigma_n l / sigma_SE)^2 is one number.
+    tunable=Tunable(
+        ("gpr_offline.noise_std", "gpr_offline.depth"),
+        ("gpr_offline.length_scale", *tunable("gpr_offline"), "butterworth.bandwidth_offline", "butterworth.order"),
+    ),
+    look=Look("Ridge", "#6B6B00", "#C8C84D", (4, 2), drawn=False),
+)
+
+RIDGE_30 = Observer(
+    "ridge-30",
+    "30-tap predictor",
+    (VIBRATION,),
+    ridge_30,
+    help="plain least squares on 30 measurements z: the honest baseline",
+    prior=(Training, Bands),
+    needs=("training",),
+    tunable=Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
+    look=Look("30-tap predictor", "#8A5A00", "#D8A44D", (2, 3), drawn=False),
+)

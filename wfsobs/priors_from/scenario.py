@@ -30,9 +30,14 @@ def arguments(observer: Observer, record: Record, scenario: Scenario) -> tuple[M
 
     Raises ValueError where the scenario has no such prior.
     """
-    settings = None if observer.settings is None else getattr(scenario, observer.settings).copy()
+    settings = settings_of(observer, scenario)
     prior = prior_of(scenario, record, (*observer.prior, *observer.asks(settings)))
     return record.measurements(open_loop="open_loop_y" in observer.needs), prior, settings
+
+
+def settings_of(observer: Observer, scenario: Scenario) -> Group | None:
+    """A copy of the settings that are an observer's own, or None."""
+    return None if observer.group is None else getattr(scenario, observer.group).copy()
 
 
 def prior_of(scenario: Scenario, record: Record, parts: Iterable[Part]) -> Prior:

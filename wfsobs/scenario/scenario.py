@@ -1,4 +1,5 @@
-"""Every setting, declared once: the `Scenario` tree; its groups are declared in `wfsobs.scenario.groups`, one module per topic.
+"""Every setting, declared once: the `Scenario` tree; its groups are declared in `wfsobs.scenario.groups`, one module per topic,
+and by the observers that have settings of their own.
 
 Labels carry the name and the paper's letter, documentation strings the unit in [brackets] and the
 source. "The paper" is Jaufmann et al., "Simulation of Wavefront-based Disturbance Observers for
@@ -7,22 +8,32 @@ Large Telescopes". Wavefronts are Noll-normalised Zernike coefficients in microm
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import pairwise
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import param
 
+from wfsobs.registry import sections
 from wfsobs.scenario.groups.atmosphere import PsdTable, Telescope, Turbulence
 from wfsobs.scenario.groups.control import Control
 from wfsobs.scenario.groups.events import FRAMES, LASER, PEAK, WIND, Event
-from wfsobs.scenario.groups.observers import Adaptive, Butterworth, Kalman, MultiPeak, MultiRate, OfflineGpr, OnlineGpr
+from wfsobs.scenario.groups.priors import Butterworth, Kalman
 from wfsobs.scenario.groups.run import Loop, Run
 from wfsobs.scenario.groups.sensors import Sensors
 from wfsobs.scenario.groups.vibration import Vibration
 from wfsobs.scenario.lenslet_fit import fit
 from wfsobs.scenario.timeline import air_time, shift
 from wfsobs.sensors.modes import Mode, modes_up_to
-from wfsobs.settings.group import Group, SettingError, section
+from wfsobs.settings.group import Group, Section, SettingError, section
+
+if TYPE_CHECKING:
+    from wfsobs.observers.gpr.offline import OfflineGpr
+    from wfsobs.observers.gpr.online import OnlineGpr
+    from wfsobs.observers.kalman.adaptive import Adaptive
+    from wfsobs.observers.kalman.multi import MultiPeak
+    from wfsobs.observers.kalman.multirate import MultiRate
 
 HIGHEST = 0.9
 """Height of a layer over that of the laser guide stars: in a higher one the beam all but ends."""
@@ -51,15 +62,34 @@ class Scenario(Group):
     sensors = section(Sensors, "Sensors")
     loop = section(Loop, "Loop")
     kalman = section(Kalman, "Kalman filters")
-    multipeak = section(MultiPeak, "Multi-peak Kalman filter")
-    adaptive = section(Adaptive, "Adaptive Kalman filter")
-    multirate = section(MultiRate, "Multi-rate filter")
     butterworth = section(Butterworth, "Butterworth reference")
-    gpr_offline = section(OfflineGpr, "Offline GPR")
-    gpr_online = section(OnlineGpr, "Online GPR")
     control = section(Control, "Controllers")
     run = section(Run, "Run")
     events = param.List([], item_type=Event, bounds=(0, 20), label="Events", doc="What changes during the record.")
+
+    if TYPE_CHECKING:  # what observers of wfsobs bring along
+        multipeak: MultiPeak
+        adaptive: Adaptive
+        multirate: MultiRate
+        gpr_offline: OfflineGpr
+        gpr_online: OnlineGpr
+
+    @classmethod
+    def settings(cls) -> dict[str, param.Parameter]:
+        """Name -> param.Parameter of every setting; the groups that observers and controllers bring along before `control`."""
+        return cls._with(tuple(sections().values()))
+
+    @classmethod
+    @lru_cache(maxsize=4)
+    def _with(cls, own: tuple[Section, ...]) -> dict[str, param.Parameter]:
+        known = super().settings()
+        for name, label, group in own:
+            if name not in known:
+                cls.param.add_parameter(name, cast(param.Parameter, section(group, label)))
+        declared, names = super().settings(), [one.name for one in own]
+        rest = [name for name in known if name not in names]
+        before = rest.index("control")
+        return {name: declared[name] for name in (*rest[:before], *names, *rest[before:])}
 
     @property
     def modes(self) -> tuple[Mode, ...]:

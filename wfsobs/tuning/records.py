@@ -18,7 +18,7 @@ from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.observers.baselines import open_loop_reference
 from wfsobs.observers.missing import bridged
 from wfsobs.prior import Model
-from wfsobs.priors_from.scenario import bands_of, prior_of
+from wfsobs.priors_from.scenario import bands_of, prior_of, settings_of
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError, Training, delayed, frame_mean
 from wfsobs.scenario import Scenario
@@ -109,8 +109,8 @@ def cut(record: Record, scenario: Scenario, observer: str, target: str) -> Recor
     """The pieces of telemetry, and what they are judged by. Raises RecordError where there is nothing to judge by, and where the
     record is too short."""
     target, against = judged_by(record, observer, target)
-    g = getattr(scenario, observer.replace("-", "_"), None)
-    learns = "training" in OBSERVERS[observer].needs or getattr(g, "inputs_filter", "") == "standardised"
+    entry = OBSERVERS[observer]
+    learns = Training in (*entry.prior, *entry.asks(settings_of(entry, scenario)))
     cuts = _cuts(record, scenario, learns and record.training is None)
     training, validation, test = (piece(record, start, stop) for start, stop in cuts)
     known = record.training or (Training(training.y_lgs, training.u, training.open_loop_y) if learns else None)

@@ -1,6 +1,6 @@
-"""What of an observer is tuned: which settings, between which numbers, on which scale.
+"""What of an observer is tuned: which of the settings that it names, between which numbers, on which scale.
 
-A new observer is one entry in `TUNABLE`. The world (turbulence, vibration, sensors, loop) is not tuned.
+The world (turbulence, vibration, sensors, loop) is not tuned.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import param
@@ -26,51 +26,6 @@ FROM_ZERO = 1e-3
 """A range that begins at 0 is searched from this part of its end."""
 DIGITS = 6
 """Digits of a number that is tried, more than matter."""
-
-
-class Tunable(NamedTuple):
-    """The settings of an observer that are tuned unless others are named, and what else it reads that could be."""
-
-    usual: tuple[str, ...]
-    others: tuple[str, ...] = ()
-
-
-_MODEL = ("kalman.frequency", "kalman.damping", "kalman.turbulence_rms", "kalman.vibration_rms")
-_RATES = ("multirate.lgs_noise", "multirate.ngs_noise")
-_OFFLINE, _ONLINE = (
-    tuple(f"{group}.{name}" for name in ("signal_std", "training_size", "highpass")) for group in ("gpr_offline", "gpr_online")
-)
-
-TUNABLE: dict[str, Tunable] = {
-    # The gain depends on the ratios of turbulence, vibration and noise. Turbulence tuned for vibration would be no turbulence.
-    "kf-lgs": Tunable((*_MODEL[:2], "kalman.vibration_rms"), ("kalman.turbulence_rms", "kalman.lgs_noise")),
-    "kf-multi": Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
-    "kf-ngs": Tunable(("kalman.turbulence_rms", "kalman.vibration_rms"), (*_MODEL[:2], "kalman.ngs_noise")),
-    # A shorter interval costs time, which no error shows.
-    "kf-adaptive": Tunable(("adaptive.window",), ("adaptive.interval",)),
-    "multirate": Tunable(_RATES, _MODEL),
-    "multirate-optimal": Tunable(_RATES, _MODEL),
-    "butterworth-ol": Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
-    "butterworth-cl": Tunable(("butterworth.bandwidth_online",), ("butterworth.order",)),
-    # The mean depends on sigma_n / sigma_SE and l only: sigma_SE stays.
-    "gpr-offline": Tunable(
-        ("gpr_offline.length_scale", "gpr_offline.noise_std", "gpr_offline.depth"),
-        (*_OFFLINE, "butterworth.bandwidth_offline", "butterworth.order"),
-    ),
-    # Its targets are what the causal band-passes make of turbulence, too.
-    "gpr-online": Tunable(
-        ("gpr_online.noise_std", "gpr_online.depth", "butterworth.bandwidth_online"),
-        ("gpr_online.length_scale", *_ONLINE, "butterworth.order"),
-    ),
-    # The penalty (sigma_n l / sigma_SE)^2 is one number.
-    "ridge": Tunable(
-        ("gpr_offline.noise_std", "gpr_offline.depth"),
-        ("gpr_offline.length_scale", *_OFFLINE, "butterworth.bandwidth_offline", "butterworth.order"),
-    ),
-    "ridge-30": Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
-    "persistence": Tunable(()),
-    "zero": Tunable(()),
-}
 
 
 @dataclass(frozen=True)
@@ -137,7 +92,7 @@ def space(scenario: Scenario, observer: str, names: Sequence[str] | None = None)
     """
     if observer not in OBSERVERS:
         raise SettingError(f"observer {observer!r}: no such observer; there are {', '.join(OBSERVERS)}")
-    known = TUNABLE.get(observer, Tunable(()))
+    known = OBSERVERS[observer].tunable
     if not known.usual:
         raise SettingError(f"observer {observer!r}: has no settings to tune")
     chosen = tuple(known.usual if names is None else names)
@@ -156,7 +111,7 @@ def space(scenario: Scenario, observer: str, names: Sequence[str] | None = None)
 
 
 def _check(scenario: Scenario, observer: str, path: str) -> None:
-    usual, others = TUNABLE[observer]
+    usual, others = OBSERVERS[observer].tunable
     settings = {known: p for known, _, p in scenario.walk()}
     if path not in settings:
         raise SettingError(f"{path}: no such setting")
@@ -223,6 +178,6 @@ BY_HAND: dict[str, tuple[tuple[str, str], Callable[[Scenario], tuple[float, floa
     "kalman.peak": (("kalman.frequency", "kalman.damping"), _peak),
     "kalman.process_noise": (("kalman.turbulence_rms", "kalman.vibration_rms"), _process),
     "kalman.measurement_noise": (("kalman.lgs_noise", "kalman.ngs_noise"), _noise),
-    "multirate.measurement_noise": (_RATES, _noise),
+    "multirate.measurement_noise": (("multirate.lgs_noise", "multirate.ngs_noise"), _noise),
 }
 """Settings that say "matched", the two numbers that count instead once they say "manual", and what those are until then."""

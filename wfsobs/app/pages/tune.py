@@ -28,7 +28,6 @@ from wfsobs.settings.parameters import hint
 from wfsobs.tuning import Evaluation, Tuned
 from wfsobs.tuning.records import MEASURES, TRUTH
 from wfsobs.tuning.report import toml
-from wfsobs.tuning.space import TUNABLE
 from wfsobs.tuning.tuning import EVALUATIONS
 
 INTRO = (
@@ -134,7 +133,7 @@ class TunePage(Offers):
         name = self.observer.value
         targets = list(OBSERVERS[name].targets)
         self.target.param.update(options=targets, value=VIBRATION if VIBRATION in targets else targets[0])
-        self.searched.object = f'<p class="text">Searched: {", ".join(TUNABLE[name].usual)}.</p>'
+        self.searched.object = f'<p class="text">Searched: {", ".join(OBSERVERS[name].tunable.usual)}.</p>'
 
     def _tuned(self) -> Tuned | None:
         return self.work.result

@@ -7,16 +7,66 @@ from rest at the first sample, and the means and deviations are those of the tra
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import param
 from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from wfsobs.record import RecordError, Training, pseudo_open_loop
+from wfsobs.settings import Group, Real, Whole
 from wfsobs.typing import Array
 
-if TYPE_CHECKING:
-    from wfsobs.scenario.groups.observers import OfflineGpr, OnlineGpr
+
+class Gpr(Group):
+    """What both GPR share; the numbers are those of Table 4."""
+
+    inputs = param.Selector(
+        default="u-y",
+        objects=["u-y", "z"],
+        label="Inputs",
+        doc="What a window holds: commands and LGS measurements (paper, eq. 14) or pseudo-open-loop measurements z.",
+    )
+    inputs_filter = param.Selector(
+        default="raw",
+        objects=["raw", "high-pass", "standardised"],
+        label="Inputs are",
+        doc="What is done to the inputs first. raw: nothing (paper); high-pass: turbulence taken out below the corner; "
+        "standardised: each channel over its standard deviation in the training record, so that l has no unit.",
+    )
+    highpass = Real(
+        10.0,
+        bounds=(0.1, 1000.0),
+        softbounds=(1.0, 30.0),
+        step=0.5,
+        label="High-pass corner",
+        doc="Corner of the inputs' high-pass [Hz], a Butterworth of second order; not in the paper.",
+    )
+    training_size = Whole(1000, bounds=(2, 2048), label="Training size m", doc="Number of training windows (paper, Table 4).")
+    depth = Whole(407, bounds=(1, 2000), label="Depth d", doc="Samples in a window (paper, Table 4).")
+    signal_std = Real(
+        10.0,
+        bounds=(1e-3, 1e4),
+        softbounds=(0.1, 100.0),
+        label="Output scale σ_SE",
+        doc="sigma_SE of the squared-exponential kernel [um] (paper, eq. 13 and Table 4).",
+    )
+    length_scale = Real(
+        300.0,
+        bounds=(0.1, 1e5),
+        softbounds=(1.0, 1000.0),
+        label="Length scale l",
+        doc="l of the squared-exponential kernel [um] (paper, eq. 13 and Table 4). Far above the windows' norm the "
+        "kernel is linear: ridge regression with weight (sigma_n l / sigma_SE)^2.",
+    )
+    noise_std = Real(
+        0.13,
+        bounds=(1e-4, 10.0),
+        softbounds=(0.01, 1.0),
+        label="Noise σ_awgn",
+        doc="sigma_awgn on the diagonal of the covariance [um] (paper, Table 4).",
+    )
+
 
 ORDER = 2
 """Of the high-pass."""
@@ -29,9 +79,7 @@ class Scale(NamedTuple):
     std: Array
 
 
-def window_signals(
-    settings: OfflineGpr | OnlineGpr, y: Array, u: Array, z: Array, mode: int, dt: float, scale: Scale | None = None
-) -> Array:
+def window_signals(settings: Gpr, y: Array, u: Array, z: Array, mode: int, dt: float, scale: Scale | None = None) -> Array:
     """The channels of a window, (n_steps, channels): u and y_lgs (paper, eq. 14), or z, as they are, high-passed or standardised.
 
     scale : for standardised ones, from `scale_of`
@@ -46,7 +94,7 @@ def window_signals(
     return x
 
 
-def scale_of(settings: OfflineGpr | OnlineGpr, training: Training | None, delay: int, mode: int) -> Scale | None:
+def scale_of(settings: Gpr, training: Training | None, delay: int, mode: int) -> Scale | None:
     """What standardised inputs are divided by, from the training record; None for others. Raises RecordError without one."""
     if settings.inputs_filter != "standardised":
         return None
@@ -69,14 +117,14 @@ def at_rest(sos: Array, first: Array) -> Array:
     return sosfilt_zi(sos)[:, :, None] * first
 
 
-def _channels(settings: OfflineGpr | OnlineGpr, y: Array, u: Array, z: Array, mode: int) -> Array:
+def _channels(settings: Gpr, y: Array, u: Array, z: Array, mode: int) -> Array:
     return z[:, [mode]] if settings.inputs == "z" else np.column_stack([u[:, mode], y[:, mode]])
 
 
 class StreamingInputs:
     """`window_signals`, one sample at a time."""
 
-    def __init__(self, settings: OfflineGpr | OnlineGpr, dt: float, scale: Scale | None = None):
+    def __init__(self, settings: Gpr, dt: float, scale: Scale | None = None):
         if settings.inputs_filter == "standardised" and scale is None:
             raise ValueError("standardised inputs need their scale")
         self._scale = scale
@@ -92,3 +140,8 @@ class StreamingInputs:
         if self._scale is not None:
             return (sample - self._scale.mean) / self._scale.std
         return sample
+
+
+def tunable(group: str) -> tuple[str, ...]:
+    """Settings of a group of a GPR that are tuned only if they are named."""
+    return tuple(f"{group}.{name}" for name in ("signal_std", "training_size", "highpass"))

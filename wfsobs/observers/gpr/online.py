@@ -7,29 +7,48 @@ causal Butterworth bank on z, of which value j + 1 belongs to step j and is know
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wfsobs.observers.base import VIBRATION
+from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.baselines import online_reference
-from wfsobs.observers.gpr.inputs import scale_of, window_signals
+from wfsobs.observers.gpr.inputs import Gpr, scale_of, tunable, window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
 from wfsobs.observers.gpr.sliding import finish, run_lengths, slide
-from wfsobs.observers.per_mode import over_modes
-from wfsobs.prior import Bands, Prior
+from wfsobs.observers.per_mode import over_modes, turns
+from wfsobs.prior import Bands, Part, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Signals
+from wfsobs.settings import Real, Section, Whole
 from wfsobs.typing import Array
 
-if TYPE_CHECKING:
-    from wfsobs.scenario.groups.observers import OfflineGpr, OnlineGpr
+
+class OnlineGpr(Gpr):
+    """Online GPR: trained anew at every step on the last windows."""
+
+    training_size = Whole(511, bounds=(2, 2048), label="Training size m", doc="Number of training windows (paper, Table 4).")
+    depth = Whole(170, bounds=(1, 2000), label="Depth d", doc="Samples in a window (paper, Table 4).")
+    signal_std = Real(
+        30.0,
+        bounds=(1e-3, 1e4),
+        softbounds=(0.1, 100.0),
+        label="Output scale σ_SE",
+        doc="sigma_SE of the squared-exponential kernel [um] (paper, eq. 13 and Table 4).",
+    )
+    noise_std = Real(
+        0.1,
+        bounds=(1e-4, 10.0),
+        softbounds=(0.01, 1.0),
+        label="Noise σ_awgn",
+        doc="sigma_awgn on the diagonal of the covariance [um] (paper, Table 4).",
+    )
+
 
 BAND_ENTRIES, BAND_ROWS = 4_000_000, 8192
 """Covariances (32 MB) and windows at a time: enough to share the overlap of the runs, and soon done."""
 
 
-def kernel_of(settings: OfflineGpr | OnlineGpr) -> SquaredExponential:
+def kernel_of(settings: Gpr) -> SquaredExponential:
     """The kernel with the numbers of the settings."""
     return SquaredExponential(settings.signal_std, settings.length_scale, settings.noise_std)
 
@@ -121,3 +140,34 @@ def _whole_run(
     known = targets[at - m : at + run]
     f[: known.size] = known
     return S, f
+
+
+def standardised(settings: Gpr) -> tuple[Part, ...]:
+    """Standardised inputs are divided by the deviations of a training record."""
+    return (Training,) if settings.inputs_filter == "standardised" else ()
+
+
+def seconds(settings: OnlineGpr, n_steps: int, n_modes: int, _dt: float) -> float:
+    """One mode [s]: 10 us + 400 us / m + 0.065 ns m^2 for every step with a full training set."""
+    m = settings.training_size
+    return turns(n_modes) * max(n_steps - settings.depth - m + 1, 0) * (10e-6 + 400e-6 / m + 65e-12 * m**2)
+
+
+GPR_ONLINE = Observer(
+    "gpr-online",
+    "Online GPR",
+    (VIBRATION,),
+    gpr_online,
+    help="trained anew at every step on the last windows",
+    prior=(Bands,),
+    settings=Section("gpr_online", "Online GPR", OnlineGpr),
+    asks=standardised,
+    # Its targets are what the causal band-passes make of turbulence, too.
+    tunable=Tunable(
+        ("gpr_online.noise_std", "gpr_online.depth", "butterworth.bandwidth_online"),
+        ("gpr_online.length_scale", *tunable("gpr_online"), "butterworth.order"),
+    ),
+    weight=200.0,
+    seconds=seconds,
+    look=Look("Online GPR", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
+)

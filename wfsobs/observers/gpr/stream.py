@@ -19,20 +19,15 @@ number, for any length of stream: a replaced point takes its error with it, so n
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy.linalg.blas import dsymv, dsyr2
 
 from wfsobs.observers.gpr.inputs import Scale, StreamingInputs
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential, restart_interval
-from wfsobs.observers.gpr.online import kernel_of
+from wfsobs.observers.gpr.online import OnlineGpr, kernel_of
 from wfsobs.prior import Bands
 from wfsobs.signal.bandpass import StreamingBank, bandpass_bank
 from wfsobs.typing import Array
-
-if TYPE_CHECKING:
-    from wfsobs.scenario.groups.observers import OnlineGpr
 
 
 class SlidingRegression:
@@ -168,7 +163,6 @@ def _set_column(S: Array, s: int, values: Array) -> None:
 class OnlineGprStream:
     """The online GPR of one mode, one sample at a time, as a control loop calls it.
 
-    >>> from wfsobs.scenario.groups.observers import OnlineGpr
     >>> settings = OnlineGpr(training_size=3, depth=2)
     >>> stream = OnlineGprStream(settings, Bands((47.7,), 3.0, 2.0, 1), dt=1e-3)
     >>> [bool(np.isnan(stream.step(y, u=0.0))) for y in (0.0, 0.1, 0.0, -0.1, 0.0)]

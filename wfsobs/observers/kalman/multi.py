@@ -5,16 +5,31 @@ The filter is that of `kalman.single`, its model one AR(2) per line of the vibra
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.kalman.single import by_target, steady_filter
-from wfsobs.prior import Prior
+from wfsobs.prior import Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements
+from wfsobs.settings import Group, Real, Section, Whole
 from wfsobs.typing import Array
 
-if TYPE_CHECKING:
-    from wfsobs.scenario.groups.observers import MultiPeak
+
+class MultiPeak(Group):
+    """The Kalman filter with every peak of the scenario in its model."""
+
+    turbulence_order = Whole(
+        2,
+        bounds=(2, 3),
+        label="Order of the turbulence model",
+        doc="2: the AR(2) of the paper; 3: one more pole, fitted to the scenario's true spectrum.",
+    )
+    line_width = Real(
+        0.025,
+        bounds=(1e-4, 10.0),
+        softbounds=(0.005, 1.0),
+        label="Least line width",
+        doc="Width at half maximum that lines have at least [Hz]; the filter averages over the inverse of it.",
+    )
 
 
 def kf_multi(measured: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> dict[str, Array]:
@@ -26,3 +41,16 @@ def kf_multi(measured: Measurements, prior: Prior, settings: MultiPeak, watch: W
         kalman, _ = steady_filter(model.disturbance(settings.line_width), model.noise)
         columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
     return by_target(columns)
+
+
+KF_MULTI = Observer(
+    "kf-multi",
+    "Multi-peak KF",
+    TARGETS,
+    kf_multi,
+    help="every line of the scenario in its model, turbulence of order 2 or 3; not in the paper",
+    prior=(Lines,),
+    settings=Section("multipeak", "Multi-peak Kalman filter", MultiPeak),
+    tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
+    look=Look("Multi-peak", "#00707F", "#4DD0E1", (14, 3)),
+)

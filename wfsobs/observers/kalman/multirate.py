@@ -12,22 +12,56 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import param
 
-from wfsobs.observers.base import TARGETS, TURBULENCE
-from wfsobs.observers.kalman.single import by_target, filter_step
+from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
+from wfsobs.observers.kalman.single import MODEL, NGS, by_target, filter_step
 from wfsobs.prior import Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements
+from wfsobs.settings import Group, Real, Section
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 
-if TYPE_CHECKING:
-    from wfsobs.scenario.groups.observers import MultiRate
+
+class MultiRate(Group):
+    """Noise weights of the multi-rate Kalman filter."""
+
+    measurement_noise = param.Selector(
+        default="matched",
+        objects=["matched", "manual"],
+        label="Measurement noise R",
+        doc="matched: as the Kalman filters; manual: the two numbers below, r_NGS < r_LGS (paper, section 2.2.1).",
+    )
+    lgs_noise = Real(
+        0.05,
+        bounds=(1e-6, 100.0),
+        softbounds=(0.001, 0.2),
+        label="Weight of LGS",
+        doc="Square root of r_LGS [um], for measurement noise manual.",
+    )
+    ngs_noise = Real(
+        0.01,
+        bounds=(1e-6, 100.0),
+        softbounds=(0.001, 0.2),
+        label="Weight of NGS",
+        doc="Square root of r_NGS [um], for measurement noise manual.",
+    )
+    model_lgs_error = param.Boolean(
+        True,
+        label="LGS error in the optimal filter",
+        doc="Whether the optimal multi-rate filter knows of the slow LGS error (a state of its own); without it the filter "
+        "trusts the LGS far too much.",
+    )
+
+
+RATES = Section("multirate", "Multi-rate filter", MultiRate)
+
+TUNABLE = Tunable(("multirate.lgs_noise", "multirate.ngs_noise"), MODEL)
 
 
 class UnstableCycle(ValueError):
@@ -99,3 +133,17 @@ def multirate(measured: Measurements, prior: Prior, settings: MultiRate, watch: 
 
     columns = run_modes(measured, watch, of_mode)
     return {TURBULENCE: by_target(columns)[TURBULENCE]}
+
+
+MULTIRATE = Observer(
+    "multirate",
+    "Multi-rate KF",
+    (TURBULENCE,),
+    multirate,
+    help="LGS at every step, NGS at every n-th, two gains",
+    prior=(Model,),
+    settings=RATES,
+    needs=NGS,
+    tunable=TUNABLE,
+    look=Look("Multi-rate KF", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
+)

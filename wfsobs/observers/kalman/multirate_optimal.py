@@ -10,15 +10,13 @@ the periodic Riccati equation of the n steps. Optimal for its model only; the pa
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy.linalg import block_diag
 
-from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.multirate import MultiRateFilter, multirate_noise, run_modes
-from wfsobs.observers.kalman.single import by_target, filter_step
-from wfsobs.prior import Prior
+from wfsobs.observers.base import TARGETS, Look, Observer
+from wfsobs.observers.kalman.multirate import RATES, TUNABLE, MultiRate, MultiRateFilter, multirate_noise, run_modes
+from wfsobs.observers.kalman.single import NGS, by_target, filter_step
+from wfsobs.prior import LgsError, Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements
 from wfsobs.signal.ar2 import Ar2
@@ -26,9 +24,6 @@ from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import SteadyState, Step, periodic_steady_state
 from wfsobs.signal.statespace import DisturbanceModel, process_model
 from wfsobs.typing import Array
-
-if TYPE_CHECKING:
-    from wfsobs.scenario.groups.observers import MultiRate
 
 
 def optimal_cycle(
@@ -89,3 +84,17 @@ def multirate_optimal(measured: Measurements, prior: Prior, settings: MultiRate,
     ratio = measured.ratio
     columns = run_modes(measured, watch, lambda mode: optimal_filter(*optimal_model(settings, prior, mode, ratio))[0])
     return by_target(columns)
+
+
+MULTIRATE_OPTIMAL = Observer(
+    "multirate-optimal",
+    "Optimal multi-rate KF",
+    TARGETS,
+    multirate_optimal,
+    help="periodic gains, frames as the means that they are; not in the paper",
+    prior=(Model, LgsError),
+    settings=RATES,
+    needs=NGS,
+    tunable=TUNABLE,
+    look=Look("Opt. multi-rate", "#7A1FA2", "#C9A0FF", (3, 2)),
+)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wfsobs.observers.base import TARGETS
-from wfsobs.prior import Prior
+from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
+from wfsobs.prior import Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements
 from wfsobs.signal.ar2 import Ar2
@@ -23,7 +23,13 @@ from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
-    from wfsobs.scenario.groups.observers import Kalman
+    from wfsobs.scenario.groups.priors import Kalman
+
+NGS = ("y_ngs", "ratio")
+"""Fields that a record with NGS frames has."""
+
+MODEL = ("kalman.frequency", "kalman.damping", "kalman.turbulence_rms", "kalman.vibration_rms")
+"""Settings of the model with one peak."""
 
 MIN_NOISE = 1e-6
 """Floor of a modelled measurement noise [um]: a filter for perfect measurements has no Riccati solution."""
@@ -101,3 +107,29 @@ def by_target(columns: list[Array]) -> dict[str, Array]:
     """Per-mode results (n_steps, n_targets) as {target: (n_steps, n_modes)}."""
     stacked = np.stack(columns, axis=-1)
     return {target: stacked[:, i] for i, target in enumerate(TARGETS)}
+
+
+KF_LGS = Observer(
+    "kf-lgs",
+    "LGS KF",
+    TARGETS,
+    kf_lgs,
+    help="steady-state Kalman filter, one vibration peak in its model",
+    prior=(Model,),
+    # The gain depends on the ratios of turbulence, vibration and noise. Turbulence tuned for vibration would be no turbulence.
+    tunable=Tunable((*MODEL[:2], "kalman.vibration_rms"), ("kalman.turbulence_rms", "kalman.lgs_noise")),
+    look=Look("LGS KF", "#FF6600", "#FF8533"),
+)
+
+KF_NGS = Observer(
+    "kf-ngs",
+    "NGS KF",
+    (TURBULENCE,),
+    kf_ngs,
+    help="that of `kf-lgs` on NGS frames, held or spread between them",
+    prior=(Model,),
+    settings="kalman",
+    needs=NGS,
+    tunable=Tunable(("kalman.turbulence_rms", "kalman.vibration_rms"), (*MODEL[:2], "kalman.ngs_noise")),
+    look=Look("NGS KF", "#003DE6", "#7AA2FF", (8, 2)),
+)
