@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from html.parser import HTMLParser
 from typing import Any
 
@@ -9,9 +10,11 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.pages import mathml, model
+from wfsobs.app.numbers import short
+from wfsobs.app.pages import model
 from wfsobs.app.pages.figures import PSD_TOP_HZ, Figures
 from wfsobs.app.pages.pages import EXPLORE, FIGURES, MODEL
+from wfsobs.app.render import matrix, tex
 from wfsobs.app.style import look
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.description import describe
@@ -130,18 +133,18 @@ class TestModel:
         told = describe(dashboard.store.scenario, 0)
         text = words(page.pane.object)
         for number in (told.turbulence.a1, -told.turbulence.a2):
-            assert mathml.short(number, 7) in text
-        assert mathml.short(told.filters["kf-lgs"].gains["LGS"][0]) in text
+            assert short(number, 7) in text
+        assert short(told.filters["kf-lgs"].gains["LGS"][0]) in text
         for facts in told.filters.values():
-            assert f"Radius {mathml.short(facts.radius or 0.0, 6)}" in text
-        assert mathml.short(told.gprs["gpr-offline"].ridge) in text and "mode tip" in text
+            assert f"Radius {short(facts.radius or 0.0, 6)}" in text
+        assert short(told.gprs["gpr-offline"].ridge) in text and "mode tip" in text
         for facts in told.sensors.values():
-            assert mathml.short(facts.noise) in text and mathml.short(facts.aliasing) in text
+            assert short(facts.noise) in text and short(facts.aliasing) in text
 
     def test_it_follows_settings_and_mode(self, dashboard: Dashboard) -> None:
         page = opened(dashboard, MODEL)
         dashboard.store.change("turbulence.wind_speed", 30)
-        assert mathml.short(describe(dashboard.store.scenario, 0).turbulence.a1, 7) in words(page.pane.object)
+        assert short(describe(dashboard.store.scenario, 0).turbulence.a1, 7) in words(page.pane.object)
         dashboard.display.mode = "tilt"
         assert "mode tilt" in words(page.pane.object)
 
@@ -164,9 +167,23 @@ class TestModel:
         html = model.html(describe(Scenario(), 0), dark=True)
         assert "http" not in html and "src=" not in html
 
+    def test_no_font_for_mathematics_is_needed(self) -> None:
+        """Without one no sign grows with what it encloses, roots are cut off and hats stand beside their letter."""
+        html = model.html(describe(Scenario(), 0), dark=False)
+        assert html.count("<math") > 20 and "<mi>x\u0302</mi>" in html and "<mi>φ\u0302</mi>" in html
+        assert 'stretchy="true"' not in html and "<msqrt" not in html and "<mover" not in html
+
+    def test_formulas(self) -> None:
+        assert "<msub><mi>a</mi><mn>1</mn></msub>" in tex("a_1") and 'display="block"' in tex("a_1")
+        rows = re.findall("<mtr>(.*?)</mtr>", tex(matrix([[1.0, -0.5], [2.0, 0.25]])))
+        assert [re.findall("<mtd>(.*?)</mtd>", row) for row in rows] == [
+            ["<mn>1</mn>", "<mo>&#x02212;</mo><mn>0.5</mn>"],
+            ["<mn>2</mn>", "<mn>0.25</mn>"],
+        ]
+
     @pytest.mark.parametrize(("x", "text"), [(0.5, "0.5"), (-1.0, "−1"), (0.0, "0"), (100.0, "100"), (2e-7, "2.0000e-07")])
     def test_short(self, x: float, text: str) -> None:
-        assert mathml.short(x) == text
+        assert short(x) == text
 
 
 def test_the_first_page_rests_while_another_shows(dashboard: Dashboard, loop: Any) -> None:

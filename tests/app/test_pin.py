@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.numbers import change, number
 from wfsobs.app.pin import differences, name_of, pin
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.table import change, number
 from wfsobs.app.work import TRUTH
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.display import number
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.limits import Limits
+from wfsobs.app.numbers import number
 from wfsobs.app.pages.pages import TUNE
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.pages.tune_views import unit_for

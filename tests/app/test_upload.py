@@ -13,8 +13,8 @@ import pytest
 
 from wfsobs.app import picker as module
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.display import number
 from wfsobs.app.limits import Limits
+from wfsobs.app.numbers import number
 from wfsobs.app.picker import LARGEST
 from wfsobs.app.pin import pin
 from wfsobs.app.service import Service

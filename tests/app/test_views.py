@@ -10,8 +10,9 @@ import pytest
 from bokeh.models import CrosshairTool
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.display import number, per_micrometre
+from wfsobs.app.display import per_micrometre
 from wfsobs.app.downloads import data_csv
+from wfsobs.app.numbers import number
 from wfsobs.app.style import look
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.traces import BINS

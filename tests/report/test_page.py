@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from wfsobs import __version__
-from wfsobs.app.display import number
+from wfsobs.app.numbers import number
 from wfsobs.app.report.data import Grid, Report, state_of
 from wfsobs.app.report.page import page
 from wfsobs.app.report.text import FILE, LONGEST, command_of

@@ -16,7 +16,6 @@ PSD, CUMULATIVE = "psd", "cumulative"
 UNITS = {"nm": "nm", "mas": "mas", "um": "µm"}
 """Unit -> how it is written."""
 
-NOTHING = "–"
 IN_MOST = "where the error of an optimal observer lies in 95 % of records"
 
 NO_ANGLE = ("mas",)
@@ -37,18 +36,6 @@ def per_micrometre(unit: str, diameter: float) -> float:
     103.1
     """
     return {"nm": 1e3, "mas": 4e-6 / diameter * MAS_PER_RADIAN, "um": 1.0}[unit]
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """A number with some significant digits and no exponent where it is of common size."""
-    if value is None:
-        return NOTHING
-    if value == 0:
-        return "0"
-    if not 1e-4 <= abs(value) < 1e6:
-        return f"{value:.{digits - 1}e}"
-    text = f"{value:#.{digits}g}"
-    return (f"{value:.0f}" if "e" in text else text.rstrip(".")).replace("-", "−")
 
 
 def written_unit(unit: str) -> str:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
+import re
+from functools import lru_cache
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from numpy.typing import ArrayLike
 
-from wfsobs.app.display import NOTHING, number
-
-ENVIRONMENT = Environment(
-    loader=PackageLoader("wfsobs.app"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-)
-ENVIRONMENT.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-ENVIRONMENT.filters["number"] = number
-ENVIRONMENT.globals["NOTHING"] = NOTHING
+from wfsobs.app.numbers import number, short
 
 
 def render(template: str, **values: Any) -> str:
@@ -25,3 +22,33 @@ def render(template: str, **values: Any) -> str:
 def macro(name: str, *values: Any) -> Markup:
     """Fill a macro of `macros.html`: a piece that goes into other templates as it is."""
     return getattr(ENVIRONMENT.get_template("macros.html").module, name)(*values)
+
+
+def matrix(entries: ArrayLike) -> Markup:
+    """Write a matrix of numbers as LaTeX; a vector is a row.
+
+    >>> print(matrix([[1, 0], [0.5, -2]]))
+    \\begin{matrix}1 & 0 \\\\ 0.5 & −2\\end{matrix}
+    """
+    rows = (" & ".join(map(short, row)) for row in np.atleast_2d(np.asarray(entries, dtype=float)))
+    return Markup(r"\begin{matrix}" + r" \\ ".join(rows) + r"\end{matrix}")
+
+
+HAT = re.compile('<mover accent="true">(?:<mrow>)?<mi>(.)</mi>(?:</mrow>)?<mo>&#x0005E;</mo></mover>')
+"""Without a font for mathematics, which few systems have, a hat stands beside its letter; a combining character stands on it."""
+
+
+@lru_cache(maxsize=256)
+def tex(formula: str, display: str = "block") -> Markup:
+    """Convert LaTeX to MathML, which browsers set without a font or a script being fetched."""
+    from latex2mathml.converter import convert  # here: reports have no formulas
+
+    mathml = convert(formula.replace("−", "-"), xmlns="", display=display).replace(' xmlns=""', "")
+    return Markup(HAT.sub("<mi>\\1\u0302</mi>", mathml))
+
+
+ENVIRONMENT = Environment(
+    loader=PackageLoader("wfsobs.app"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+)
+ENVIRONMENT.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+ENVIRONMENT.filters.update(number=number, short=short, matrix=matrix, tex=tex)

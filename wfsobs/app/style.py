@@ -12,6 +12,9 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any
 
+from markupsafe import Markup
+
+from wfsobs.app.render import macro
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
@@ -85,11 +88,6 @@ def asset(name: str) -> str:
     return files("wfsobs.assets").joinpath(name).read_text(encoding="utf-8")
 
 
-def swatch(name: str, dark: bool, dashed: bool = True) -> str:
-    """A short line as drawn in the figures, as SVG; solid if not to be dashed."""
-    it = look(name)
-    dash = f' stroke-dasharray="{" ".join(map(str, it.dash))}"' if it.dash and dashed else ""
-    return (
-        '<svg class="swatch" width="26" height="8" aria-hidden="true">'
-        f'<line x1="0" y1="4" x2="26" y2="4" stroke="{it.colour(dark)}" stroke-width="2.5"{dash}/></svg>'
-    )
+def swatch(name: str, dark: bool, dashed: bool = True) -> Markup:
+    """Draw a short line as in the figures, as SVG; solid if not to be dashed."""
+    return macro("swatch", look(name), dark, dashed)

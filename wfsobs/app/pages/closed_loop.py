@@ -10,11 +10,12 @@ from typing import Any
 import panel as pn
 
 from wfsobs.app.copies import LOOP, Task
-from wfsobs.app.display import NOTHING, Display, number, per_micrometre
+from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save, residuals_csv, residuals_npz, table_csv
 from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.loop_work import LoopShown, compute, cost, seconds
+from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.pages.loop_figures import Nyquist, Response, Spectrum, Trace
 from wfsobs.app.pages.loop_table import margins_html, table_html
 from wfsobs.app.pages.parts import WIDE, Offers, box, captioned, html, text

@@ -10,8 +10,9 @@ import panel as pn
 from bokeh.models import BoxAnnotation, ColumnDataSource, DataRange1d, GlyphRenderer, Range1d
 from bokeh.plotting import figure
 
-from wfsobs.app.display import Display, number, per_micrometre
+from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.numbers import number
 from wfsobs.app.style import asset, look, swatch
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.plots import call, new_figure

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from wfsobs.app.display import NOTHING, Display, number, per_micrometre
+from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.loop_work import LoopShown
+from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.style import LOOKS, swatch
 from wfsobs.app.views.table import BEST
 from wfsobs.control.rows import LIMITED, NOT_APPLICABLE, Row, label

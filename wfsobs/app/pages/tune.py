@@ -11,10 +11,11 @@ import panel_material_ui as pmui
 
 from wfsobs.app.controls.fields import parsed
 from wfsobs.app.copies import TUNE, Task
-from wfsobs.app.display import UNITS, Display, number, per_micrometre
+from wfsobs.app.display import UNITS, Display, per_micrometre
 from wfsobs.app.downloads import Save, table_csv
 from wfsobs.app.jobs.job import RUNNING, SWEEP, Job
 from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.numbers import number
 from wfsobs.app.pages.parts import WIDE, Offers, Starter, box, html, legend, line, text
 from wfsobs.app.pages.tune_views import LEGEND, HistoryFigure, table_html, unit_for
 from wfsobs.app.store import Store

@@ -8,11 +8,11 @@ from html import escape
 import numpy as np
 from bokeh.models import ColumnDataSource, DataRange1d
 
-from wfsobs.app.display import NO_ANGLE, NOTHING, UNITS, Display, number, per_micrometre
+from wfsobs.app.display import NO_ANGLE, UNITS, Display, per_micrometre
+from wfsobs.app.numbers import NOTHING, change, number
 from wfsobs.app.style import look
 from wfsobs.app.tune_work import LIKELIHOOD, OTHER, SETTING, TEST, TOGETHER, VALIDATION, best_so_far, rows
 from wfsobs.app.views.plots import call, new_figure
-from wfsobs.app.views.table import change
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.tuning import Evaluation, Tuned
 from wfsobs.tuning.records import MEASURES, NEXT, REFERENCE, TRUTH

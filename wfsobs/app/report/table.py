@@ -6,7 +6,7 @@ import math
 from itertools import groupby
 from typing import Any
 
-from wfsobs.app.display import NOTHING
+from wfsobs.app.numbers import NOTHING
 from wfsobs.app.report.data import State
 from wfsobs.evaluation.rows import TIME, Row, competes, label_of, looks_ahead, own_stretch, stretch_of
 from wfsobs.evaluation.scores import RESIDUAL

@@ -7,9 +7,10 @@ from typing import Any
 import param
 from panel.custom import JSComponent
 
-from wfsobs.app.display import NOTHING, Display, number, per_micrometre
+from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.job import RUNNING
 from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, Shown

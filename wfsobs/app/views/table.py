@@ -8,8 +8,9 @@ from html import escape
 
 import panel as pn
 
-from wfsobs.app.display import IN_MOST, NOTHING, Display, number, per_micrometre
+from wfsobs.app.display import IN_MOST, Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.numbers import NOTHING, change, number
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import Shown
 from wfsobs.evaluation.rows import NOT_OBSERVERS, competes, label_of, looks_ahead, needs_of, own_stretch, rows, stretch_of
@@ -184,14 +185,3 @@ def _times(score: Score, dt: float) -> list[str]:
     if score.observer in NOT_OBSERVERS:
         return [NOTHING] * 2
     return [number(1e6 * score.seconds_per_step), number(score.seconds_per_step / dt, 2)]
-
-
-def change(before: float, now: float | None) -> str:
-    """A change in per cent, signed.
-
-    >>> change(20.0, 15.0)
-    '−25.0'
-    """
-    if now is None or before == 0:
-        return NOTHING
-    return f"{100.0 * (now / before - 1.0):+.1f}".replace("-", "−")
