@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
-from wfsobs.atmosphere.von_karman import spectrum
+from wfsobs.atmosphere.von_karman import von_karman_density
 from wfsobs.priors_from.scenario import modelled_processes
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import noll_covariance
@@ -114,7 +114,7 @@ def test_covariance_of_the_stars() -> None:
                 scales = [1 - layer.height / star.distance for star in (one, other)]
                 x, y = layer.height * (np.array(one.direction) - other.direction)
                 d, turn = np.hypot(x, y), 2 * np.arctan2(y, x)
-                density = np.pi * k**2 * spectrum(k**2, layer.strength, 25.0)
+                density = np.pi * k**2 * von_karman_density(k**2, layer.strength, 25.0)
                 for scale in scales:
                     density = density * 4 * jv(2, 4 * scale * k) / (4 * scale * k)
                 for i, sign in enumerate((-1, 1)):

@@ -9,10 +9,10 @@ import pytest
 from scipy.signal import welch
 from scipy.special import j0, jv
 
-from wfsobs.atmosphere.frozen_flow import Grid, View, frozen_flow, period_steps, waves
+from wfsobs.atmosphere.frozen_flow import FrequencyGrid, View, fft_length, frozen_flow, waves
 from wfsobs.atmosphere.plane_waves import Footprint
-from wfsobs.atmosphere.von_karman import Layer, spectrum
-from wfsobs.sensors.zernike import ZernikeProjection, noll, noll_covariance, over_argument
+from wfsobs.atmosphere.von_karman import TurbulenceLayer, von_karman_density
+from wfsobs.sensors.zernike import ZernikeProjection, bessel_ratio, noll, noll_covariance
 
 D, R0, L0 = 8.0, 0.157, 25.0
 STRENGTH = R0 ** (-5 / 3)
@@ -35,7 +35,7 @@ class Ones:
 
 
 def covariance(
-    layer: Layer,
+    layer: TurbulenceLayer,
     outer_scale: float,
     sensor: ZernikeProjection,
     footprints: list[Footprint],
@@ -44,7 +44,7 @@ def covariance(
     lag: float = 0.0,
 ) -> np.ndarray:
     """Covariance [um^2] of every output of every footprint at `lag` [s], as the sums over the waves have it."""
-    grid = Grid.of(layer, outer_scale, sensor.diameter, n_steps, dt)
+    grid = FrequencyGrid.of(layer, outer_scale, sensor.diameter, n_steps, dt)
     total = 0.0
     for part, wave in waves(grid, layer, outer_scale, sensor.diameter, Ones()):  # type: ignore[arg-type]
         m = np.concatenate([sensor.transform(*wave.in_pupil(), f) for f in footprints])
@@ -56,7 +56,7 @@ def covariance(
 def along_log_k(density: Any, strength: float, outer_scale: float) -> float:
     """integral of Phi(k) density(k) k dk [um^2]: the trapezoidal rule in log k, 4000 points over eight decades."""
     k = np.exp(np.linspace(np.log(1e-5), np.log(1e3), 4000))
-    return float(np.trapezoid(spectrum(k**2, strength, outer_scale) * density(k) * k**2, np.log(k)))
+    return float(np.trapezoid(von_karman_density(k**2, strength, outer_scale) * density(k) * k**2, np.log(k)))
 
 
 def tip_of(k: np.ndarray, scale: float = 1.0) -> np.ndarray:
@@ -73,7 +73,7 @@ def tip_of(k: np.ndarray, scale: float = 1.0) -> np.ndarray:
 @pytest.mark.parametrize("outer_scale", [2.0, 25.0, 3000.0])
 def test_variance_of_tip_and_tilt(outer_scale: float, speed: float, duration: float) -> None:
     """Whatever the wind, the outer scale and the record: pi integral Phi |M|^2 k dk, to 0.1 %."""
-    layer = Layer(STRENGTH, 8000.0, speed, 0.4)
+    layer = TurbulenceLayer(STRENGTH, 8000.0, speed, 0.4)
     found = covariance(layer, outer_scale, TIP_TILT, [NGS], round(duration * 250), 0.004)
     wanted = np.pi * along_log_k(lambda k: tip_of(k) ** 2, STRENGTH, outer_scale)
     assert np.diag(found) == pytest.approx(wanted, rel=1e-3)
@@ -81,7 +81,7 @@ def test_variance_of_tip_and_tilt(outer_scale: float, speed: float, duration: fl
 
 
 def test_the_size_that_everyone_quotes() -> None:
-    found = covariance(Layer(STRENGTH, 0.0, 15.0, 0.0), L0, TIP_TILT, [NGS], 1000, 1e-3)
+    found = covariance(TurbulenceLayer(STRENGTH, 0.0, 15.0, 0.0), L0, TIP_TILT, [NGS], 1000, 1e-3)
     assert 1e3 * np.sqrt(np.diag(found)) == pytest.approx(529.3, abs=0.3)
 
 
@@ -91,7 +91,7 @@ def test_the_size_that_everyone_quotes() -> None:
 @pytest.mark.parametrize("fraction", [0.01, 0.2, 0.6, 1.0])
 def test_autocovariance_along_and_across_the_wind(outer_scale: float, speed: float, duration: float, fraction: float) -> None:
     """At lags up to the whole record: pi integral Phi |M|^2 (J0 -+ J2)(k v tau) k dk, to 1e-3 of the variance."""
-    layer = Layer(STRENGTH, 8000.0, speed, 0.0)
+    layer = TurbulenceLayer(STRENGTH, 8000.0, speed, 0.0)
     lag = fraction * duration
     found = covariance(layer, outer_scale, TIP_TILT, [NGS], round(duration * 250), 0.004, lag)
     variance = np.pi * along_log_k(lambda k: tip_of(k) ** 2, STRENGTH, outer_scale)
@@ -105,7 +105,7 @@ def test_autocovariance_along_and_across_the_wind(outer_scale: float, speed: flo
 @pytest.mark.parametrize(("height", "wanted_nm"), [(4e3, 24.5), (8e3, 49.4), (10e3, 62.0), (12e3, 74.6)])
 def test_cone_effect(height: float, wanted_nm: float) -> None:
     """NGS - LGS on either axis: the figures of docs/scripts/cone_effect.py, by integration over k alone, to 0.5 %."""
-    found = covariance(Layer(STRENGTH, height, 15.0, 1.0), L0, TIP_TILT, [NGS, lgs(height)], 2000, 1e-3)
+    found = covariance(TurbulenceLayer(STRENGTH, height, 15.0, 1.0), L0, TIP_TILT, [NGS, lgs(height)], 2000, 1e-3)
     difference = found[:2, :2] + found[2:, 2:] - found[:2, 2:] - found[2:, :2]
     assert 1e3 * np.sqrt(np.diag(difference)) == pytest.approx(wanted_nm, rel=5e-3)
 
@@ -114,7 +114,7 @@ def test_cone_effect(height: float, wanted_nm: float) -> None:
 @pytest.mark.parametrize("angle", [0.0, 1.1])
 def test_covariance_of_beams_beside_each_other(shift: tuple[float, float], angle: float) -> None:
     """Tip of two discs at a distance d in the direction b: pi integral Phi |M|^2 (J0 - cos(2 b) J2)(k d) k dk."""
-    found = covariance(Layer(STRENGTH, 10e3, 15.0, angle), L0, TIP_TILT, [NGS, Footprint(1.0, shift)], 1000, 1e-3)
+    found = covariance(TurbulenceLayer(STRENGTH, 10e3, 15.0, angle), L0, TIP_TILT, [NGS, Footprint(1.0, shift)], 1000, 1e-3)
     d, b = np.hypot(*shift), np.arctan2(shift[1], shift[0])
     for i, sign in ((0, -1.0), (1, 1.0)):
         wanted = np.pi * along_log_k(
@@ -126,7 +126,7 @@ def test_covariance_of_beams_beside_each_other(shift: tuple[float, float], angle
 def test_covariances_of_the_first_ten_modes_are_noll_s() -> None:
     """To 1e-3 with an outer scale of 10 000 km, but for tip and tilt: of them it takes 1.42 (D / L0)^(1/3), 1.3 %."""
     modes = tuple(range(2, 12))
-    found = covariance(Layer(STRENGTH, 0.0, 15.0, 0.3), 1e7, ZernikeProjection(D, modes), [NGS], 1000, 1e-3)
+    found = covariance(TurbulenceLayer(STRENGTH, 0.0, 15.0, 0.3), 1e7, ZernikeProjection(D, modes), [NGS], 1000, 1e-3)
     unit = (D / R0) ** (5 / 3) * (0.5 / (2 * np.pi)) ** 2
     wanted = unit * np.array([[noll_covariance(j, i) for i in modes] for j in modes])
     wanted[[0, 1], [0, 1]] *= 1.0 - 1.42 * (D / 1e7) ** (1 / 3)
@@ -136,8 +136,8 @@ def test_covariances_of_the_first_ten_modes_are_noll_s() -> None:
 def test_variances_up_to_radial_order_six() -> None:
     for j in (4, 11, 21, 28):
         n = noll(j)[0]
-        found = covariance(Layer(STRENGTH, 0.0, 15.0, 0.3), L0, ZernikeProjection(D, (j,)), [NGS], 1000, 1e-3)
-        size = along_log_k(lambda k, n=n: (n + 1) * 4 * over_argument(n + 1, 0.5 * D * k) ** 2, STRENGTH, L0)
+        found = covariance(TurbulenceLayer(STRENGTH, 0.0, 15.0, 0.3), L0, ZernikeProjection(D, (j,)), [NGS], 1000, 1e-3)
+        size = along_log_k(lambda k, n=n: (n + 1) * 4 * bessel_ratio(n + 1, 0.5 * D * k) ** 2, STRENGTH, L0)
         assert found[0, 0] == pytest.approx(2 * np.pi * size, rel=2e-3)
 
 
@@ -147,12 +147,12 @@ def test_variances_up_to_radial_order_six() -> None:
 def sampled(
     seed: int,
     n_steps: int,
-    layers: list[Layer] | None = None,
+    layers: list[TurbulenceLayer] | None = None,
     views: list[View] | None = None,
     dt: float = 1e-3,
     outer_scale: float = L0,
 ) -> list[np.ndarray]:
-    layers = layers or [Layer(STRENGTH, 8000.0, 15.0, 0.0)]
+    layers = layers or [TurbulenceLayer(STRENGTH, 8000.0, 15.0, 0.0)]
     views = views or [View(TIP_TILT, tuple(NGS for _ in layers))]
     return frozen_flow(layers, outer_scale, D, views, n_steps, dt, np.random.default_rng(seed))
 
@@ -160,7 +160,7 @@ def sampled(
 def test_size_and_cone_effect_of_samples_from_the_first_step() -> None:
     """First and last of 500 records of 1 s: 529 nm to 5 %, and NGS - LGS 49.4 nm to 10 %, both without a mean."""
     views = [View(TIP_TILT, (NGS,)), View(TIP_TILT, (lgs(8000.0),))]
-    slow = [Layer(STRENGTH, 8000.0, 3.0, 0.0)]
+    slow = [TurbulenceLayer(STRENGTH, 8000.0, 3.0, 0.0)]
     found = np.array([sampled(seed, 5, slow, views, dt=0.2) for seed in range(500)])  # (seed, view, step, axis)
     for step in (0, -1):
         tip, seen = found[:, 0, step], found[:, 1, step]
@@ -172,7 +172,7 @@ def test_size_and_cone_effect_of_samples_from_the_first_step() -> None:
 
 @pytest.mark.parametrize("height", [8e3, 10e3])
 def test_cone_effect_of_samples_on_each_axis(height: float) -> None:
-    layers = [Layer(STRENGTH, height, 15.0, 0.0)]
+    layers = [TurbulenceLayer(STRENGTH, height, 15.0, 0.0)]
     views = [View(TIP_TILT, (NGS,)), View(TIP_TILT, (lgs(height),))]
     pairs = [sampled(seed, 20, layers, views, dt=0.1) for seed in range(60)]
     rms = 1e3 * np.sqrt(np.mean([(ngs - lgs) ** 2 for ngs, lgs in pairs], axis=(0, 1)))
@@ -182,7 +182,7 @@ def test_cone_effect_of_samples_on_each_axis(height: float) -> None:
 @pytest.mark.parametrize(("speed", "band"), [(15.0, (10.0, 200.0)), (5.0, (4.0, 80.0)), (40.0, (20.0, 300.0))])
 def test_temporal_slope_beyond_the_knee(speed: float, band: tuple[float, float]) -> None:
     """-17/3 to 0.3 (Conan et al. 1995), up to hundreds of Hz; a window that falls fast keeps the low frequencies out."""
-    x = np.concatenate([sampled(seed, 8192, [Layer(STRENGTH, 8000.0, speed, 0.5)])[0] for seed in range(3)], axis=1)
+    x = np.concatenate([sampled(seed, 8192, [TurbulenceLayer(STRENGTH, 8000.0, speed, 0.5)])[0] for seed in range(3)], axis=1)
     f, density = welch(x, 1000.0, "blackmanharris", 4096, axis=0)
     use = (f > band[0]) & (f < band[1])
     slope = np.polyfit(np.log(f[use]), np.log(density[use].mean(axis=1)), 1)[0]
@@ -198,8 +198,8 @@ def test_a_record_does_not_repeat() -> None:
 
 def test_samples_are_means_over_their_step() -> None:
     """A step of 20 ms holds the mean of twenty of 1 ms: with the same waves, sinc(f T) instead of sinc(f T / 20)."""
-    layer = Layer(STRENGTH, 8000.0, 60.0, 0.0)
-    assert period_steps(layer, D, 1000, 1e-3) == 1.0 * period_steps(layer, D, 50, 0.02) * 20
+    layer = TurbulenceLayer(STRENGTH, 8000.0, 60.0, 0.0)
+    assert fft_length(layer, D, 1000, 1e-3) == 1.0 * fft_length(layer, D, 50, 0.02) * 20
     fine, coarse = sampled(5, 1000, [layer])[0], sampled(5, 50, [layer], dt=0.02)[0]
     means = fine.reshape(50, 20, 2).mean(axis=1)
     # a step's number is of its start for both: the coarse one's middle lies 9.5 ms after the fine one's first
@@ -210,7 +210,7 @@ def test_samples_are_means_over_their_step() -> None:
 @pytest.mark.parametrize("angle", [0.0, 1.1, -2.0])
 def test_what_is_downwind_sees_the_same_later(angle: float) -> None:
     """A beam 0.9 m towards where the wind of 15 m/s blows is 60 ms behind, to rounding; across the wind it is another signal."""
-    layer, steps = Layer(STRENGTH, 8000.0, 15.0, angle), 60
+    layer, steps = TurbulenceLayer(STRENGTH, 8000.0, 15.0, angle), 60
     along = (0.9 * np.cos(angle), 0.9 * np.sin(angle))
     views = [View(TIP_TILT, (Footprint(1.0, shift),)) for shift in ((0.0, 0.0), along, (-along[1], along[0]))]
     here, downwind, beside = sampled(6, 1000, [layer], views)
@@ -227,15 +227,15 @@ def test_same_seed_same_numbers() -> None:
 
 
 def test_layers_add_up_and_keep_their_numbers() -> None:
-    near, far = Layer(0.7 * STRENGTH, 100.0, 8.0, 0.2), Layer(0.3 * STRENGTH, 9000.0, 25.0, 2.0)
+    near, far = TurbulenceLayer(0.7 * STRENGTH, 100.0, 8.0, 0.2), TurbulenceLayer(0.3 * STRENGTH, 9000.0, 25.0, 2.0)
     both = sampled(1, 800, [near, far])[0]
-    silent = Layer(0.0, 9000.0, 25.0, 2.0)
+    silent = TurbulenceLayer(0.0, 9000.0, 25.0, 2.0)
     only_near = sampled(1, 800, [near, silent])[0]
     assert np.array_equal(only_near, sampled(1, 800, [near])[0])
-    faster = sampled(1, 800, [near, Layer(0.3 * STRENGTH, 9000.0, 30.0, 2.0)])[0]
+    faster = sampled(1, 800, [near, TurbulenceLayer(0.3 * STRENGTH, 9000.0, 30.0, 2.0)])[0]
     only_far = both - only_near
     assert only_far.std() > 0.05 and not np.allclose(faster, both)
-    stronger = sampled(1, 800, [near, Layer(1.2 * STRENGTH, 9000.0, 25.0, 2.0)])[0]
+    stronger = sampled(1, 800, [near, TurbulenceLayer(1.2 * STRENGTH, 9000.0, 25.0, 2.0)])[0]
     assert np.allclose(stronger - only_near, 2.0 * only_far, atol=1e-12)
 
 

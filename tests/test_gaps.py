@@ -15,7 +15,7 @@ from wfsobs.observers.missing import bridged
 from wfsobs.pipeline import each_estimate, estimated
 from wfsobs.prior import Lines, Model, Prior
 from wfsobs.priors_from.scenario import kalman_model, measurement_noise, prior_of
-from wfsobs.record import Record, held, pseudo_open_loop
+from wfsobs.record import Record, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.welch import rms
@@ -94,7 +94,7 @@ def test_prediction_beats_holding() -> None:
     y = WHOLE.y_lgs.copy()
     y[lost] = np.nan
     record = replace(WHOLE, y_lgs=y)
-    predicted, simple = bridged(record, told(scenario().replace({"kalman.process_noise": "matched"}))).z, held(record.z)
+    predicted, simple = bridged(record, told(scenario().replace({"kalman.process_noise": "matched"}))).z, hold_last(record.z)
     error, worse = rms((predicted - WHOLE.z)[lost]), rms((simple - WHOLE.z)[lost])
     noise = scenario().sensors.lgs_noise / np.sqrt(2)
     assert noise < error and np.sqrt(0.5) < error / worse < 0.95
@@ -166,16 +166,16 @@ def test_filled_samples_count_in_no_prediction_score() -> None:
 
 def test_holding() -> None:
     x = np.array([[np.nan], [1.0], [np.nan], [np.nan], [3.0]])
-    np.testing.assert_array_equal(held(x), [[0.0], [1.0], [1.0], [1.0], [3.0]])
+    np.testing.assert_array_equal(hold_last(x), [[0.0], [1.0], [1.0], [1.0], [3.0]])
 
 
 def test_what_is_told_nothing_holds_the_last_value() -> None:
     """Of z, as the mirror's part is known; and of the mean over a frame. Estimates on a record held by hand are the same."""
     record = gappy()
     by_hand = bridged(record, Prior())
-    u, n = held(record.u), record.ratio
-    np.testing.assert_allclose(by_hand.z, held(pseudo_open_loop(record.y_lgs, u)), atol=1e-12)
-    np.testing.assert_allclose(by_hand.z_ngs[n::n], held(replace(record, u=u).z_ngs[n::n]), atol=1e-12)
+    u, n = hold_last(record.u), record.ratio
+    np.testing.assert_allclose(by_hand.z, hold_last(pseudo_open_loop(record.y_lgs, u)), atol=1e-12)
+    np.testing.assert_allclose(by_hand.z_ngs[n::n], hold_last(replace(record, u=u).z_ngs[n::n]), atol=1e-12)
     for name in ("persistence", "butterworth-cl", "kf-adaptive", "gpr-online"):
         for target, values in estimated(name, record, scenario()).items():
             np.testing.assert_array_equal(values, estimated(name, by_hand, scenario())[target])

@@ -29,11 +29,11 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import true_spectra
-from wfsobs.spectral.lines import Line, nearest_line
+from wfsobs.spectral.lines import Sinusoid, nearest_line
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.periodogram import Cells, fast_length, frequencies, inflation, periodogram
-from wfsobs.spectral.search import PAD, search
-from wfsobs.spectral.whittle import fitted, information, negative_log_likelihood
+from wfsobs.spectral.periodogram import Cells, fast_length, inflation, periodogram, periodogram_frequencies
+from wfsobs.spectral.search import PAD, search_peaks
+from wfsobs.spectral.whittle import fit_spectrum, spectrum_information, spectrum_negative_log_likelihood
 from wfsobs.telemetry.records import save_record
 
 DT = 1e-3
@@ -69,19 +69,19 @@ def test_periodogram_of_white_noise_has_its_density() -> None:
     rng = np.random.default_rng(1)
     I = periodogram(rng.standard_normal(100_000), DT)  # noqa: E741
     assert I.mean() == pytest.approx(2.0 * DT, rel=4.0 * sqrt(inflation(100_000) / len(I)))
-    assert len(frequencies(100_000, DT)) == len(I) and frequencies(100_000, DT)[0] == pytest.approx(0.01)
+    assert len(periodogram_frequencies(100_000, DT)) == len(I) and periodogram_frequencies(100_000, DT)[0] == pytest.approx(0.01)
 
 
 def test_turbulence_does_not_leak_over_the_noise() -> None:
     """Far above the corner the mean periodogram of steep turbulence is its density."""
-    turbulence, f = Ar2(7.0, 0.9, 0.5, DT), frequencies(20_000, DT)
+    turbulence, f = Ar2(7.0, 0.9, 0.5, DT), periodogram_frequencies(20_000, DT)
     I = np.mean([periodogram(turbulence.sample(20_000, np.random.default_rng(i)), DT) for i in range(4)], axis=0)  # noqa: E741
     ratio = (I / turbulence.psd(f))[f > 100.0]
     assert ratio.mean() == pytest.approx(1.0, abs=0.05)  # untapered it is several hundred
 
 
 def test_cells_keep_every_bin_once() -> None:
-    f = frequencies(20_000, DT)
+    f = periodogram_frequencies(20_000, DT)
     keep = np.where((f > 20.0) & (f < 25.0), 0.0, 1.0)
     cells = Cells(f, f**2, keep, [30.0])
     assert cells.count.sum() == keep.sum()
@@ -96,29 +96,31 @@ def test_fast_length(n: int) -> None:
 
 
 def test_slopes_and_information_are_derivatives_of_the_likelihood() -> None:
-    f = frequencies(20_000, DT)
+    f = periodogram_frequencies(20_000, DT)
     cells = Cells(f, MODEL.psd(f), np.ones(len(f)), [30.0])  # the mean of the periodogram: information is the curvature
-    x, F = MODEL.vector, information(MODEL, cells)
+    x, F = MODEL.vector, spectrum_information(MODEL, cells)
     steps = 1e-2 / np.sqrt(np.diag(F))
-    here = negative_log_likelihood(MODEL, cells)
+    here = spectrum_negative_log_likelihood(MODEL, cells)
     for i, step in enumerate(steps):
-        moves = [negative_log_likelihood(MODEL.moved(x + sign * step * np.eye(len(x))[i]), cells) for sign in (-1, 1)]
+        moves = [
+            spectrum_negative_log_likelihood(MODEL.with_vector(x + sign * step * np.eye(len(x))[i]), cells) for sign in (-1, 1)
+        ]
         assert (sum(moves) - 2 * here) / step**2 == pytest.approx(F[i, i], rel=0.02)  # cells take S at their middle
 
 
 def test_fit_finds_the_model_that_the_spectrum_has() -> None:
-    f = frequencies(60_000, DT)
+    f = periodogram_frequencies(60_000, DT)
     cells = Cells(f, MODEL.psd(f), np.ones(len(f)), [30.0])
-    off = MODEL.moved(MODEL.vector + np.array([0.2, 0.3, 0.5, -0.3, 0.005, 0.4, 0.3]))
-    std = 1.0 / np.sqrt(np.diag(information(MODEL, cells)))
-    assert np.all(np.abs(fitted(off, cells).vector - MODEL.vector) < 0.3 * std)
+    off = MODEL.with_vector(MODEL.vector + np.array([0.2, 0.3, 0.5, -0.3, 0.005, 0.4, 0.3]))
+    std = 1.0 / np.sqrt(np.diag(spectrum_information(MODEL, cells)))
+    assert np.all(np.abs(fit_spectrum(off, cells).vector - MODEL.vector) < 0.3 * std)
 
 
 def test_line_is_found_to_the_stated_error() -> None:
     n, rng, rho = 10_000, np.random.default_rng(2), 100.0
     floor, scores = 2.0 * DT, []
     for phase in rng.uniform(0.0, 2.0 * pi, 40):
-        true = Line(41.13, sqrt(2.0 * rho * floor / (n * DT)) * complex(np.cos(phase), np.sin(phase)))
+        true = Sinusoid(41.13, sqrt(2.0 * rho * floor / (n * DT)) * complex(np.cos(phase), np.sin(phase)))
         got = nearest_line(true.signal(n, DT) + rng.standard_normal(n), DT, 41.15, 0.05)
         std = true.standard_deviations(n, DT, floor)
         scores.append([(got.frequency - true.frequency) / std[0], (got.rms - true.rms) / std[1]])
@@ -128,7 +130,7 @@ def test_line_is_found_to_the_stated_error() -> None:
 def test_line_has_the_cramer_rao_bound() -> None:
     """Of a real line in white noise, var f = 12 / ((2 pi)^2 eta N^3 dt^2), eta = A^2 / 2 sigma^2; the taper costs 7 %."""
     n, amplitude = 60_000, 0.1
-    std = Line(20.0, amplitude).standard_deviations(n, DT, 2.0 * DT)[0]
+    std = Sinusoid(20.0, amplitude).standard_deviations(n, DT, 2.0 * DT)[0]
     bound = sqrt(12.0 / ((2 * pi) ** 2 * amplitude**2 / 2.0 * n**3)) / DT
     assert bound < std < 1.1 * bound
 
@@ -138,7 +140,7 @@ def test_search_finds_nothing_in_white_noise_as_often_as_it_says(modes: int) -> 
     n, level, runs = 4000, 0.2, 150
     rng = np.random.default_rng(3)
     hits = sum(
-        search(
+        search_peaks(
             np.sum([periodogram(rng.standard_normal(n), DT, PAD) for _ in range(modes)], axis=0) / (2.0 * DT), n, DT, modes, level
         ).best
         is not None
@@ -264,7 +266,7 @@ def test_frozen_flow_leaves_white_noise_and_no_peak() -> None:
 
 def test_a_right_spectrum_has_no_margin_and_one_with_lobes_that_of_its_lobes() -> None:
     """I / S of a record of 60 s at 1 kHz is exponential; lobes of 2 Hz, a factor 2.2 up and down, from 3 to 12 Hz."""
-    rng, f = np.random.default_rng(11), frequencies(60_000, DT)
+    rng, f = np.random.default_rng(11), periodogram_frequencies(60_000, DT)
     lobes = np.where((f > 3.0) & (f < 12.0), np.exp(0.8 * np.sin(pi * f)), 1.0)
     right = [margin(rng.exponential(size=len(f))) for _ in range(40)]
     wrong = np.array([margin(rng.exponential(lobes)) for _ in range(40)])

@@ -12,10 +12,10 @@ from scipy.stats import binom
 from wfsobs.identification import identify
 from wfsobs.record import Record, RecordError
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.spectral.missing import Missing
+from wfsobs.spectral.missing import MissingSamples
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.periodogram import Cells, frequencies
-from wfsobs.spectral.whittle import information
+from wfsobs.spectral.periodogram import Cells, periodogram_frequencies
+from wfsobs.spectral.whittle import spectrum_information
 from wfsobs.typing import Array
 
 DT = 1e-3
@@ -38,8 +38,8 @@ def bursts(share: float, n: int = N, seed: int = 1, length: int = 15) -> Array:
 
 
 def covariance(spectrum: Spectrum, n: int = N) -> Array:
-    """Of n samples, circulant: what `Missing` takes for the record's."""
-    S = spectrum.psd(frequencies(n, DT))
+    """Of n samples, circulant: what `MissingSamples` takes for the record's."""
+    S = spectrum.psd(periodogram_frequencies(n, DT))
     return circulant(np.fft.irfft(np.concatenate([S[:1], S, S[-1:]]), n) / (2.0 * DT))
 
 
@@ -63,7 +63,7 @@ def test_gaps_are_filled_with_the_conditional_mean(gone: Array) -> None:
     z = np.random.default_rng(2).multivariate_normal(np.zeros(N), covariance(MODEL))
     exact = covariance(MODEL) @ precision(MODEL, gone) @ np.where(gone, 0.0, z)
     lost = np.where(gone, np.nan, z)
-    filled = Missing(gone, DT, np.random.default_rng(3)).filled(lost, MODEL.psd(frequencies(N, DT)))
+    filled = MissingSamples(gone, DT, np.random.default_rng(3)).fill(lost, MODEL.psd(periodogram_frequencies(N, DT)))
     assert np.array_equal(filled[~gone], z[~gone])
     assert np.max(np.abs(filled - exact)[gone]) < 0.02 * MODEL.noise
 
@@ -72,13 +72,13 @@ def test_gaps_are_filled_with_the_conditional_mean(gone: Array) -> None:
 def test_share_of_a_bin_that_is_measured(gone: Array) -> None:
     """S_j times the diagonal of the precision in the Fourier basis, which adds up to the samples measured; over octaves, since V
     is of records drawn: means of a hundred draws have errors of a percent or two."""
-    S = MODEL.psd(frequencies(N, DT))
+    S = MODEL.psd(periodogram_frequencies(N, DT))
     F = np.fft.fft(np.eye(N), norm="ortho")
     exact = S * np.diag(F @ precision(MODEL, gone) @ F.conj().T).real[1 : N // 2] / (2.0 * DT)
     shares = []
     for seed in range(40):
-        missing = Missing(gone, DT, np.random.default_rng(seed))
-        shares.append(missing.measured(S, missing.unknown(S)))
+        missing = MissingSamples(gone, DT, np.random.default_rng(seed))
+        shares.append(missing.measured_share(S, missing.draw_errors(S)))
     octaves = np.round(np.log2(np.arange(1, N // 2))).astype(int)
     for octave in range(3, octaves.max() + 1):
         inside = octaves == octave
@@ -89,21 +89,21 @@ def test_share_of_a_bin_that_is_measured(gone: Array) -> None:
 @pytest.mark.parametrize("share", [0.1, 0.3])
 def test_information_is_that_of_what_is_measured(share: float) -> None:
     """Fisher's information of Gaussian samples, tr(P dC P dC) / 2; V is known to a percent or two."""
-    f = frequencies(N, DT)
+    f = periodogram_frequencies(N, DT)
     x, wanted = MODEL.vector, [0, 4, 5, 6]  # noise and the resonance: turbulence has too few bins for any of its numbers
     exact, got = np.zeros((2, 4, 4))
     for seed in range(6):
         gone = gaps(share, seed=seed)
         P, slopes = precision(MODEL, gone), []
         for i in wanted:
-            up, down = (covariance(MODEL.moved(x + sign * 1e-4 * np.eye(len(x))[i])) for sign in (1, -1))
+            up, down = (covariance(MODEL.with_vector(x + sign * 1e-4 * np.eye(len(x))[i])) for sign in (1, -1))
             slopes.append(P @ (up - down) / 2e-4)
         exact += 0.5 * np.array([[np.sum(a * b.T) for a in slopes] for b in slopes])
-        missing = Missing(gone, DT, np.random.default_rng(seed))
+        missing = MissingSamples(gone, DT, np.random.default_rng(seed))
         S = MODEL.psd(f)
-        cells = Cells(f, S, np.ones(len(f)), [120.0], missing.measured(S, missing.unknown(S)))
-        got += information(MODEL, cells, wanted)
-    complete = 6 * information(MODEL, Cells(f, MODEL.psd(f), np.ones(len(f)), [120.0]), wanted)
+        cells = Cells(f, S, np.ones(len(f)), [120.0], missing.measured_share(S, missing.draw_errors(S)))
+        got += spectrum_information(MODEL, cells, wanted)
+    complete = 6 * spectrum_information(MODEL, Cells(f, MODEL.psd(f), np.ones(len(f)), [120.0]), wanted)
     assert np.sqrt(np.diag(got)) == pytest.approx(np.sqrt(np.diag(exact)), rel=0.02)
     assert complete[0, 0] > (1.0 + share) * got[0, 0]  # and that differs from that of the complete record
 

@@ -27,7 +27,7 @@ from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
-from wfsobs.signal.statespace import sampled
+from wfsobs.signal.statespace import sample_ar3
 from wfsobs.simulation.turbulence import turbulence_rms
 from wfsobs.telemetry.records import save_record
 from wfsobs.typing import Array
@@ -37,7 +37,7 @@ QUICK = ("kf-lgs", "kf-multi", "butterworth-cl")
 
 
 def drawn(processes: list[Ar2 | Ar3], noise: float, n: int, rng: np.random.Generator) -> Array:
-    parts = [sampled(p, n, rng) if isinstance(p, Ar3) else p.sample(n, rng) for p in processes]
+    parts = [sample_ar3(p, n, rng) if isinstance(p, Ar3) else p.sample(n, rng) for p in processes]
     return np.sum(parts, axis=0) + noise * rng.standard_normal(n)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from wfsobs.pipeline import observe
 from wfsobs.priors_from.scenario import measurement_noise
-from wfsobs.record import delayed
+from wfsobs.record import delay_signal
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.disturbance import make_disturbance, vibration_variance
 from wfsobs.simulation.guide_stars import lgs_error_process, lgs_error_variance, lgs_noise_rms, lgs_weights, seen_turbulence
@@ -31,7 +31,7 @@ def error_of_samples(s: Scenario, seeds: int = 20, n: int = 200) -> np.ndarray:
     errors = []
     for seed in range(seeds):
         d = make_disturbance(slow, n, np.random.default_rng(seed))
-        errors.append((measure(slow, d, np.random.default_rng(1000 + seed)).lgs - delayed(d.total, 1))[1:])
+        errors.append((measure(slow, d, np.random.default_rng(1000 + seed)).lgs - delay_signal(d.total, 1))[1:])
     return np.sqrt(np.mean(np.square(errors), axis=(0, 1)))
 
 

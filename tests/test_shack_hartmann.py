@@ -11,16 +11,16 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import j1, jv
 
-from wfsobs.atmosphere.frozen_flow import Grid, View, frozen_flow, waves
+from wfsobs.atmosphere.frozen_flow import FrequencyGrid, View, frozen_flow, waves
 from wfsobs.atmosphere.plane_waves import Footprint, Wave
-from wfsobs.atmosphere.von_karman import Layer, spectrum
+from wfsobs.atmosphere.von_karman import TurbulenceLayer, von_karman_density
 from wfsobs.sensors import zernike
 from wfsobs.sensors.aliasing import Aliasing
 from wfsobs.sensors.lenslets import Lenslets
 from wfsobs.sensors.nufft import TrigonometricSum, lagrange_weights
 from wfsobs.sensors.reconstructor import interaction, polynomials, reconstructor
 from wfsobs.sensors.shack_hartmann import ShackHartmann
-from wfsobs.sensors.spots import ARCSEC, Spots
+from wfsobs.sensors.spots import ARCSEC, SpotModel
 from wfsobs.sensors.zernike import ZernikeProjection, up_to_order
 
 D, R0, L0 = 8.0, 0.157, 25.0
@@ -221,7 +221,7 @@ def test_mean_gradient_is_166_nm_away_from_the_tip() -> None:
     def integral(weight: Callable[[float], Any]) -> float:
         def integrand(log_k: float) -> float:
             k = np.exp(log_k)
-            return np.pi * k**2 * weight(k * D / 2) * float(spectrum(np.array(k**2), STRENGTH, L0))
+            return np.pi * k**2 * weight(k * D / 2) * float(von_karman_density(np.array(k**2), STRENGTH, L0))
 
         return 1e3 * math.sqrt(quad(integrand, np.log(1e-4), np.log(500.0), limit=3000)[0])
 
@@ -245,7 +245,7 @@ def test_aliasing_against_another_quadrature() -> None:
     kx, ky = k[None, 400:], k[:, None]
     wrong = sensor.transform(*np.broadcast_arrays(scale * kx, scale * ky))
     wrong -= [zernike.transform(j, scale * kx * D / 2, scale * ky * D / 2) for j in sensor.nolls]
-    wanted = np.einsum("iyx,jyx,yx->ij", wrong, wrong.conj(), 2 * step**2 * spectrum(kx**2 + ky**2, STRENGTH, L0)).real
+    wanted = np.einsum("iyx,jyx,yx->ij", wrong, wrong.conj(), 2 * step**2 * von_karman_density(kx**2 + ky**2, STRENGTH, L0)).real
     assert Aliasing(sensor).covariance(STRENGTH, L0, scale) == pytest.approx(wanted, rel=0.01, abs=1e-6)
 
 
@@ -263,8 +263,8 @@ class Ones:
 def test_frozen_flow_holds_the_waves_that_alias(across: int) -> None:
     """The variance of the error summed over the waves that the flow makes for this sensor, in a wind aslant, to 3 %."""
     sensor, ideal = ShackHartmann(Lenslets(D, across), (2, 3), 8), ZernikeProjection(D, (2, 3))
-    beam, layer = Footprint(0.94), Layer(STRENGTH, 5000.0, 15.0, 0.5)
-    grid, total = Grid.of(layer, L0, D, 20, 0.05), np.zeros(2)
+    beam, layer = Footprint(0.94), TurbulenceLayer(STRENGTH, 5000.0, 15.0, 0.5)
+    grid, total = FrequencyGrid.of(layer, L0, D, 20, 0.05), np.zeros(2)
     for _, wave in waves(grid, layer, L0, D, Ones(), sensor.reach / beam.scale):  # type: ignore[arg-type]
         kx, ky = wave.in_pupil()
         wrong = sensor.transform(beam.scale * kx, beam.scale * ky) - ideal.transform(kx, ky, beam)
@@ -274,9 +274,9 @@ def test_frozen_flow_holds_the_waves_that_alias(across: int) -> None:
 
 def test_cone_effect_through_the_sensor() -> None:
     """NGS less LGS on the axis, one layer at 8 km: 49.4 nm in tip and in tilt, to 1 %, as of the ideal projection."""
-    sensor, layer = ShackHartmann(Lenslets(D, 40), (2, 3), 8), Layer(STRENGTH, 8000.0, 15.0, 1.0)
+    sensor, layer = ShackHartmann(Lenslets(D, 40), (2, 3), 8), TurbulenceLayer(STRENGTH, 8000.0, 15.0, 1.0)
     total = np.zeros(2)
-    for _, wave in waves(Grid.of(layer, L0, D, 20, 0.05), layer, L0, D, Ones(), sensor.reach):  # type: ignore[arg-type]
+    for _, wave in waves(FrequencyGrid.of(layer, L0, D, 20, 0.05), layer, L0, D, Ones(), sensor.reach):  # type: ignore[arg-type]
         kx, ky = wave.in_pupil()
         cone = 1.0 - 8.0 / 90.0
         apart = sensor.transform(kx, ky) - sensor.transform(cone * kx, cone * ky)
@@ -287,7 +287,7 @@ def test_cone_effect_through_the_sensor() -> None:
 def test_sensor_and_projection_see_the_same_turbulence() -> None:
     """They differ by the aliasing and no more, in a record of ten frames of a millisecond: between 0.4 and 2 of its rms."""
     sensor, ideal = ShackHartmann(Lenslets(D, 40), (2, 3), 8), ZernikeProjection(D, (2, 3))
-    layers, beam = [Layer(STRENGTH, 5000.0, 15.0, 0.5)], (Footprint(0.94),)
+    layers, beam = [TurbulenceLayer(STRENGTH, 5000.0, 15.0, 0.5)], (Footprint(0.94),)
     runs = [
         frozen_flow(layers, L0, D, [View(sensor, beam), View(ideal, beam)], 10, 1e-3, np.random.default_rng(seed))
         for seed in range(5)
@@ -303,11 +303,11 @@ def test_sensor_and_projection_see_the_same_turbulence() -> None:
 @pytest.mark.parametrize(
     "spots",
     [
-        Spots(photons=200.0, read_noise=0.0, fwhm=1.5, pixel_scale=0.6, pixels=12),
-        Spots(photons=200.0, read_noise=3.0, fwhm=1.5, pixel_scale=0.6, pixels=8),
+        SpotModel(photons=200.0, read_noise=0.0, fwhm=1.5, pixel_scale=0.6, pixels=12),
+        SpotModel(photons=200.0, read_noise=3.0, fwhm=1.5, pixel_scale=0.6, pixels=8),
     ],
 )
-def test_slope_noise_against_simulated_spots(spots: Spots) -> None:
+def test_slope_noise_against_simulated_spots(spots: SpotModel) -> None:
     """4000 spots, photon by photon, on a noisy detector: 4 % is two standard errors of a variance; the mean is taken with
     the number of photons known, as the formula does."""
     rng = np.random.default_rng(5)
@@ -324,7 +324,7 @@ def test_slope_noise_against_simulated_spots(spots: Spots) -> None:
 
 
 def test_half_the_light_doubles_the_photon_noise() -> None:
-    photon, read = Spots(100.0, 0.0, 1.0, 0.5, 6), Spots(100.0, 3.0, 1e-9, 0.5, 6)
+    photon, read = SpotModel(100.0, 0.0, 1.0, 0.5, 6), SpotModel(100.0, 3.0, 1e-9, 0.5, 6)
     lit = np.array([1.0, 0.5])
     assert photon.slope_variance(lit)[1] == pytest.approx(2 * photon.slope_variance(lit)[0])
     assert read.slope_variance(lit)[1] == pytest.approx(4 * read.slope_variance(lit)[0])
@@ -332,7 +332,7 @@ def test_half_the_light_doubles_the_photon_noise() -> None:
 
 def test_noise_of_the_modes() -> None:
     """The covariance of what the reconstructor makes of 20 000 draws of noisy slopes, to 5 % of the variances."""
-    sensor, spots = ShackHartmann(COARSE, (2, 3, 4, 8), 4), Spots(50.0, 1.0, 1.0, 0.8, 6)
+    sensor, spots = ShackHartmann(COARSE, (2, 3, 4, 8), 4), SpotModel(50.0, 1.0, 1.0, 0.8, 6)
     std = np.sqrt(spots.slope_variance(COARSE.fraction[COARSE.valid]))
     draws = np.random.default_rng(6).standard_normal((20_000, 2 * COARSE.count)) * np.tile(std, 2)
     found, covariance = np.cov(draws @ sensor.reconstructor.T, rowvar=False), sensor.noise_covariance(spots)

@@ -7,7 +7,7 @@ import pytest
 
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
-from wfsobs.signal.statespace import disturbance_model, paper_matrices, sampled
+from wfsobs.signal.statespace import disturbance_model, paper_matrices, sample_ar3
 
 TURBULENCE, VIBRATION = Ar2(7.0686, 0.9, 0.5, 1e-3), Ar2(298.4, 0.03, 0.015, 1e-3)
 
@@ -84,7 +84,7 @@ def test_a_model_is_the_sum_of_its_processes(n_turbulence: int, n_vibration: int
 def test_samples_of_third_order_have_its_autocovariance_from_the_first_on() -> None:
     """Against the integral of the density, over many short runs: at steps 0, 1, 4 and 40, with the first and with themselves."""
     p = Ar3(200.0, 0.6, 400.0, 0.5, 1e-3)
-    runs = np.array([sampled(p, 41, np.random.default_rng(i)) for i in range(4000)])
+    runs = np.array([sample_ar3(p, 41, np.random.default_rng(i)) for i in range(4000)])
     f = (np.arange(100_000) + 0.5) * 5e-3  # 0 to 500 Hz
     S = p.psd(f) * 5e-3
     for k in (0, 1, 4, 40):

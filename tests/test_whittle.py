@@ -9,7 +9,7 @@ from scipy.special import expit, logit
 
 from wfsobs.priors_from.scenario import measurement_noise, modelled_processes
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.ar3 import TOLERANCE, Ar3, fitted_ar3
+from wfsobs.signal.ar3 import TOLERANCE, Ar3, fit_ar3
 from wfsobs.signal.whittle import information, whittle_fit
 from wfsobs.simulation.true_spectra import seen_turbulence
 from wfsobs.typing import Array
@@ -83,7 +83,7 @@ def test_the_fit_to_frozen_flow_is_at_its_minimum_from_wherever_it_starts(mode: 
     spectrum, noise = seen_turbulence(s, mode), measurement_noise(s, mode)[0] ** 2
     turbulence, _ = modelled_processes(s, mode, s.dt)
     start = Ar3(turbulence.omega, turbulence.damping, 5.0 * turbulence.omega, turbulence.rms, s.dt)
-    found = fitted_ar3(spectrum, noise, start)
+    found = fit_ar3(spectrum, noise, start)
     f = np.fft.rfftfreq(2 * (spectrum.size - 1), s.dt)[1:]
     S = found.psd(f) / (2.0 * s.dt) + noise
     slopes, ones = found.log_slopes(f) * (1.0 - noise / S), np.ones_like(f)
@@ -93,6 +93,6 @@ def test_the_fit_to_frozen_flow_is_at_its_minimum_from_wherever_it_starts(mode: 
     assert np.abs(gradient).max() < 0.3
     rng = np.random.default_rng(3)
     for _ in range(6):
-        other = fitted_ar3(spectrum, noise, process(vector(start) + rng.standard_normal(4), s.dt))
+        other = fit_ar3(spectrum, noise, process(vector(start) + rng.standard_normal(4), s.dt))
         # a gradient of TOLERANCE is a distance of that over the least curvature, 0.01 where corners can stand in for each other
         assert np.abs((vector(other) - vector(found)) / std).max() < 100.0 * TOLERANCE

@@ -15,7 +15,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
 from wfsobs.signal.riccati import steady_state
-from wfsobs.signal.wiener import advanced, causal_error, circle_mean, factorise
+from wfsobs.signal.wiener import advance_spectrum, causal_error, circle_mean, factorise
 from wfsobs.simulation.disturbance import vibration_variance
 from wfsobs.simulation.true_spectra import TrueSpectra, line_width, n_frequencies, true_spectra
 from wfsobs.typing import Array
@@ -52,8 +52,8 @@ def test_an_ar1_signal_in_white_noise_has_the_textbook_error() -> None:
     P = 0.5 * (b + np.sqrt(b**2 + 4 * q * R))
     whitener = factorise(spectrum + R)
     assert whitener.innovation_variance == pytest.approx(P + R, rel=1e-12)  # 0.9^4096 is nothing: rounding alone
-    assert causal_error(spectrum, advanced(spectrum, 1), whitener) == pytest.approx(P, rel=1e-12)
-    assert causal_error(spectrum, advanced(spectrum, 0), whitener) == pytest.approx(P * R / (P + R), rel=1e-12)
+    assert causal_error(spectrum, advance_spectrum(spectrum, 1), whitener) == pytest.approx(P, rel=1e-12)
+    assert causal_error(spectrum, advance_spectrum(spectrum, 0), whitener) == pytest.approx(P * R / (P + R), rel=1e-12)
 
 
 @given(seed=st.integers(0, 2**32 - 1))

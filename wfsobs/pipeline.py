@@ -14,7 +14,7 @@ from wfsobs.notebook import html_table
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Observer
 from wfsobs.priors_from.scenario import arguments
-from wfsobs.progress import QUIET, Watch, detached
+from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
@@ -167,7 +167,7 @@ def _only_forward(tell: Callable[[float], None]) -> Callable[[float], None]:
 
 def estimated(name: str, record: Record, scenario: Scenario, watch: Watch = QUIET) -> dict[str, Array]:
     """{target: (n_steps, n_modes) [um]} of one observer. Raises ValueError saying why there is none, Cancelled."""
-    with detached(watch) as alone:
+    with detach_watch(watch) as alone:
         return OBSERVERS[name].estimate(*arguments(OBSERVERS[name], record, scenario), alone)
 
 
@@ -178,7 +178,7 @@ def _one(observer: Observer, record: Record, scenario: Scenario, watch: Watch) -
     try:
         given = arguments(observer, record, scenario)
         start = perf_counter()
-        with detached(watch) as alone:
+        with detach_watch(watch) as alone:
             values = observer.estimate(*given, alone)
     except ValueError as error:
         return [Failure(observer.id, f"{observer.id} left out: {error}")]

@@ -58,7 +58,7 @@ _KEYS, _LISTENING = count(), dict[int, Watch]()
 
 
 @contextmanager
-def detached(watch: Watch) -> Iterator[Watch]:
+def detach_watch(watch: Watch) -> Iterator[Watch]:
     """A watch that reports to another and holds no reference to it, nor to what its callbacks know of."""
     key = next(_KEYS)
     _LISTENING[key] = watch

@@ -82,7 +82,7 @@ class Signals:
         which is what the mirror did during the frame, is taken off. Raises RecordError without NGS."""
         if self.y_ngs is None or self.ratio is None:
             raise RecordError("the record has no NGS measurement")
-        return self.y_ngs - frame_mean(delayed(self.u, self.delay - 1), self.ratio)
+        return self.y_ngs - frame_mean(delay_signal(self.u, self.delay - 1), self.ratio)
 
 
 @dataclass(frozen=True)
@@ -105,12 +105,12 @@ class Record(Signals):
     origin: str = ""
 
     def __repr__(self) -> str:
-        return f"Record({', '.join(f'{what} {value}' for what, value in self._told())})"
+        return f"Record({', '.join(f'{what} {value}' for what, value in self._summary())})"
 
     def _repr_html_(self) -> str:
-        return html_table(("Record", ""), self._told())
+        return html_table(("Record", ""), self._summary())
 
-    def _told(self) -> list[tuple[str, str]]:
+    def _summary(self) -> list[tuple[str, str]]:
         """What it is, in a few words."""
         parts = [("turbulence", self.turbulence), ("vibration", self.vibration)]
         return [
@@ -144,7 +144,7 @@ def _own(x: Array) -> Array:
     return np.array(x, dtype=float, order="C", copy=True, subok=False)
 
 
-def delayed(x: Array, steps: int) -> Array:
+def delay_signal(x: Array, steps: int) -> Array:
     """x[k - steps], zero before the start; same shape as x."""
     out = np.zeros_like(x)
     out[steps:] = x[: max(x.shape[0] - steps, 0)]
@@ -153,18 +153,18 @@ def delayed(x: Array, steps: int) -> Array:
 
 def pseudo_open_loop(y: Array, u: Array, delay: int = DELAY) -> Array:
     """z[k] = y[k] - u[k-delay], the measurement with the mirror's part taken off (paper, eq. 3 to 5)."""
-    return y - delayed(u, delay)
+    return y - delay_signal(u, delay)
 
 
 def frame_mean(x: Array, n: int) -> Array:
     """Mean of x[k-1] ... x[k-n] at every k, zeros before the start; same shape as x."""
     total = np.zeros_like(x)
     for j in range(1, n + 1):
-        total += delayed(x, j)
+        total += delay_signal(x, j)
     return total / n
 
 
-def held(x: Array) -> Array:
+def hold_last(x: Array) -> Array:
     """x (n, n_columns) with every NaN replaced by the last number before it in its column, zero where there is none."""
     gone = np.isnan(x)
     if not gone.any():

@@ -18,7 +18,7 @@ import numpy as np
 from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.prior import Prior
 from wfsobs.priors_from.scenario import arguments
-from wfsobs.record import Measurements, held
+from wfsobs.record import Measurements, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
@@ -129,7 +129,7 @@ def _check_gaps(observer: Observer, given: tuple[Measurements, Prior, Any]) -> N
 
 def _moved(x: Array, start: int, rng: np.random.Generator) -> Array:
     out = x.copy()
-    out[start:] += 3.0 * np.std(held(x)) * rng.standard_normal(out[start:].shape)
+    out[start:] += 3.0 * np.std(hold_last(x)) * rng.standard_normal(out[start:].shape)
     return out
 
 

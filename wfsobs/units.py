@@ -19,7 +19,7 @@ ANGLES = {"rad": 1.0, "arcsec": math.radians(1.0 / 3600.0), "mas": math.radians(
 UNITS = ("um", "nm", "mas", "arcsec", "rad")
 """What a user can say that a file is in."""
 
-_OTHERWISE = {"µm": "um", "micron": "um", "microns": "um", "\u03bcm": "um", "meter": "m", "arcseconds": "arcsec", "radian": "rad"}
+_SYNONYMS = {"µm": "um", "micron": "um", "microns": "um", "\u03bcm": "um", "meter": "m", "arcseconds": "arcsec", "radian": "rad"}
 
 
 def micrometres_per(unit: str, diameter: float) -> float:
@@ -27,11 +27,11 @@ def micrometres_per(unit: str, diameter: float) -> float:
     return LENGTHS[unit] if unit in LENGTHS else ANGLES[unit] * 1e6 * diameter / 4.0
 
 
-def unit_named(text: str) -> str | None:
+def parse_unit(text: str) -> str | None:
     """The unit that a file's text stands for, or None where it is none of these.
 
     >>> unit_named("micron"), unit_named("mas"), unit_named("V")
     ('um', 'mas', None)
     """
-    name = _OTHERWISE.get(text.strip(), text.strip())
+    name = _SYNONYMS.get(text.strip(), text.strip())
     return name if name in LENGTHS or name in ANGLES else None

@@ -19,7 +19,7 @@ from importlib.metadata import version
 
 import numpy as np
 
-from wfsobs.atmosphere.von_karman import spectrum
+from wfsobs.atmosphere.von_karman import von_karman_density
 from wfsobs.sensors import zernike
 from wfsobs.sensors.lenslets import Lenslets
 from wfsobs.sensors.reconstructor import reconstructor
@@ -52,7 +52,7 @@ class Screen:
         k = 2.0 * np.pi * np.fft.fftfreq(n, PERIOD / n)
         kx, ky = k[None, :], k[:, None]
         k2 = kx**2 + ky**2
-        density = np.where((k2 > 0) & (k2 < CUT**2), spectrum(k2, R0 ** (-5.0 / 3.0), L0), 0.0)
+        density = np.where((k2 > 0) & (k2 < CUT**2), von_karman_density(k2, R0 ** (-5.0 / 3.0), L0), 0.0)
         noise = rng.standard_normal((2, n, n))
         return cls(np.sqrt(density) * (2.0 * np.pi / PERIOD) * (noise[0] + 1j * noise[1]), kx, ky)
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.control.mirror import Mirror, mirror_of
-from wfsobs.record import delayed
+from wfsobs.record import delay_signal
 from wfsobs.scenario import Scenario
 
 delays = st.floats(1.0, 10.0) | st.integers(1, 10).map(float)
@@ -21,9 +21,9 @@ def test_a_command_acts_for_one_frame_after_its_delay(delay: float, seed: int) -
     n, f = int(delay), delay - int(delay)
     mirror = Mirror(delay)
     assert mirror.taps.sum() == pytest.approx(1.0) and mirror.taps[0] == 0.0
-    expected = (1 - f) * delayed(u, n - 1) + f * delayed(u, n)
+    expected = (1 - f) * delay_signal(u, n - 1) + f * delay_signal(u, n)
     assert np.allclose(mirror.correction(u), expected, rtol=0, atol=1e-14)
-    assert np.allclose(mirror.seen(u), delayed(expected, 1), rtol=0, atol=1e-14)
+    assert np.allclose(mirror.seen(u), delay_signal(expected, 1), rtol=0, atol=1e-14)
 
 
 @settings(max_examples=20, deadline=None, derandomize=True)

@@ -14,14 +14,14 @@ from wfsobs.observers.kalman.adaptive import filter_of
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import estimated
 from wfsobs.progress import Cancelled, Watch
-from wfsobs.record import Record, RecordError, delayed
+from wfsobs.record import Record, RecordError, delay_signal
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.riccati import RiccatiError
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.densities import densities
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.periodogram import frequencies
+from wfsobs.spectral.periodogram import periodogram_frequencies
 from wfsobs.spectral.quick import quick_spectrum
 
 DT, NOISE = 1e-3, 0.014
@@ -39,7 +39,7 @@ def made(n: int, modes: int, seed: int, *vibration: Ar2) -> Record:
 
     turbulence = columns(TURBULENCE, n)
     moving = np.vstack([columns(p, n // len(vibration)) for p in vibration]) if vibration else np.zeros((n, modes))
-    z = delayed(turbulence + moving, 1) + NOISE * rng.standard_normal((n, modes))
+    z = delay_signal(turbulence + moving, 1) + NOISE * rng.standard_normal((n, modes))
     return Record(z, np.zeros_like(z), DT, turbulence=turbulence, vibration=moving)
 
 
@@ -81,7 +81,7 @@ def test_densities_are_those_of_the_process_and_slopes_their_derivatives(frequen
 def test_the_spectrum_of_a_window_is_near_the_true_one(n: int, peaks: list[Ar2]) -> None:
     """The expected loss of log-likelihood, sum log S / S0 + S0 / S - 1 over all bins, is p / 2 for the best of p numbers (half of
     a chi squared of p). Here there are not only those: a wide peak is taken for several, each of three numbers."""
-    truth, f, lost = Spectrum(NOISE, DT, TURBULENCE, tuple(peaks)), frequencies(n, DT), []
+    truth, f, lost = Spectrum(NOISE, DT, TURBULENCE, tuple(peaks)), periodogram_frequencies(n, DT), []
     for seed in range(8):
         rng = np.random.default_rng(seed)
         z = NOISE * rng.standard_normal(n) + sum(p.sample(n, rng) for p in truth.processes)
@@ -116,7 +116,7 @@ def test_the_background_of_another_window_is_only_a_start(seed: int) -> None:
     of the 2.0 that four numbers lose to the truth."""
     z = made(4000, 1, seed).z[:, 0]
     other = Spectrum(3.0 * NOISE, DT, Ar2(20.0, 0.5, 0.17, DT))
-    f, alone, moved = frequencies(4000, DT), quick_spectrum(z, DT, 0), quick_spectrum(z, DT, 0, before=other)
+    f, alone, moved = periodogram_frequencies(4000, DT), quick_spectrum(z, DT, 0), quick_spectrum(z, DT, 0, before=other)
     ratio = alone.psd(f) / moved.psd(f)
     assert np.sum(ratio - 1.0 - np.log(ratio)) < 0.2
 
@@ -250,8 +250,8 @@ def test_estimates_are_sensible_whatever_the_record_is_like(changes: dict[str, f
     assert record.vibration is not None and record.turbulence is not None
     scale, line = changes.get("scale", 1.0), changes.get("line", 0.0) * np.sin(2 * pi * 41.3 * DT * np.arange(3000))[:, None]
     truth = {"turbulence": scale * record.turbulence + changes.get("offset", 0.0), "vibration": scale * record.vibration + line}
-    noise = record.z - delayed(record.turbulence + record.vibration, 1)
-    z = delayed(truth["turbulence"] + truth["vibration"], 1) + scale * changes.get("noise", 1.0) * noise
+    noise = record.z - delay_signal(record.turbulence + record.vibration, 1)
+    z = delay_signal(truth["turbulence"] + truth["vibration"], 1) + scale * changes.get("noise", 1.0) * noise
     got = estimated("kf-adaptive", Record(z, np.zeros_like(z), DT), with_window(1.5, 0.5))
     for target, values in got.items():
         assert np.isfinite(values[1501:]).all()

@@ -15,7 +15,7 @@ from wfsobs.prior import Model
 from wfsobs.priors_from.scenario import prior_of
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
-from wfsobs.spectral.periodogram import fast_length, frequencies, periodogram, taper
+from wfsobs.spectral.periodogram import fast_length, periodogram, periodogram_frequencies, taper
 from wfsobs.typing import Array
 
 BINS = 900
@@ -59,7 +59,7 @@ def measured(of: Shown, _watch: Watch, _tell: Tell) -> Measured:
     z = z[: fast_length(len(z))]
     if len(z) < 100:
         raise RecordError(f"the record has {record.n_steps} samples, too few for a spectrum")
-    f = frequencies(len(z), record.dt)
+    f = periodogram_frequencies(len(z), record.dt)
     start = np.flatnonzero(np.diff(np.floor(np.log(f / f[0]) / np.log(f[-1] / f[0]) * BINS), prepend=-1.0))
     count = np.diff(start, append=len(f))
     density = np.column_stack([periodogram(column - column.mean(), record.dt) for column in z.T])

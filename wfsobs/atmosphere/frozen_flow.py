@@ -1,7 +1,7 @@
-"""Von Karman turbulence that the wind carries along unchanged, layer by layer, without a phase screen.
+"""Von Karman turbulence carried by the wind unchanged, layer by layer, without a phase screen.
 
-A layer is a sum of plane waves with independent complex Gaussian amplitudes (see `wave`), so the signals of all sensors are
-sums over its waves, and the covariances between them are those of the continuous spectrum as far as the sums are quadratures
+A layer is a sum of plane waves with independent complex Gaussian amplitudes (see `plane_waves`), so the signals of all sensors
+are sums over its waves, and the covariances between them are those of the continuous spectrum as far as the sums are quadratures
 of the integrals. In the layer's own frame, x along the wind, a wave of k_x oscillates with the frequency f = k_x v / 2 pi.
 
 Along the wind: an FFT over a period P of more than twice the record and the passage of a beam gives f = j / P. The spectrum
@@ -11,8 +11,8 @@ covariance at all lags of the record, the first step like the last, and none of 
 
 Across the wind: the rule of `von_karman`.
 
-Small waves that a Zernike mode averages away are what a Shack-Hartmann sensor's aliasing is made of. Where a sensor reaches
-for them they are there, with random numbers of their own.
+Small waves that a Zernike mode averages away cause the aliasing of a Shack-Hartmann sensor. They are computed, with random
+numbers of their own, where a sensor's `reach` includes them.
 """
 
 from __future__ import annotations
@@ -25,37 +25,45 @@ from scipy.fft import irfft, next_fast_len
 from scipy.special import erfc
 
 from wfsobs.atmosphere.plane_waves import Footprint, Sensor, Wave
-from wfsobs.atmosphere.von_karman import CORE, FIELD, Layer, across, fine_rule, spectrum
+from wfsobs.atmosphere.von_karman import CORE, FIELD, TurbulenceLayer, fine_rule, nodes_across_wind, von_karman_density
 from wfsobs.progress import QUIET, Watch
 from wfsobs.typing import Array
 
 TAPER = 16
-"""Multiples of 1 / P below which the FFT gives way to single nodes."""
+"""Multiples of 1 / P below which single nodes replace the FFT."""
 STEEPNESS = 7.0
-"""Of the window between the two; erfc(STEEPNESS / 2) = 7e-7 is cut off."""
+"""Steepness of the window between the two; erfc(STEEPNESS / 2) = 7e-7 is cut off."""
 PANEL_NODES = 20
 """Gauss-Legendre nodes of a panel: the phase of a wave turns by less than 8 pi over it."""
 
 FAR = 32.0
-"""k_x D / 2 beyond which a coarse rule across the wind does: less than 2e-3 of the variance of order 6, 1e-6 of tip."""
+"""k_x D / 2 beyond which the rule across the wind is coarse: less than 2e-3 of the variance of order 6, 1e-6 of tip."""
 END = 700.0
-"""k_x D / 2 where waves end: 370 times the knee of tip, less than 1e-11 of its variance."""
+"""Maximum k_x D / 2 of the waves: 370 times the knee of tip; less than 1e-11 of its variance lies beyond."""
 NARROWEST = 0.5
-"""Beams narrower than that part of the aperture get no more waves: a layer halfway up to a guide star."""
+"""Minimum scale of a beam that gets more waves, over the aperture: a layer halfway up to a guide star."""
 COLUMNS = 512
-"""Most columns k_x of a block: 512 by 60 waves are half a megabyte."""
+"""Maximum number of columns k_x of a block: 512 by 60 waves are half a megabyte."""
 
 
 @dataclass(frozen=True)
 class View:
-    """A sensor and where its beam crosses each layer: one footprint per layer."""
+    """A sensor and where its beam crosses each layer.
+
+    Attributes
+    ----------
+    sensor : Sensor
+        The sensor.
+    footprints : tuple of Footprint
+        One per layer.
+    """
 
     sensor: Sensor
     footprints: tuple[Footprint, ...]
 
 
 def frozen_flow(
-    layers: Sequence[Layer],
+    layers: Sequence[TurbulenceLayer],
     outer_scale: float,
     diameter: float,
     views: Sequence[View],
@@ -64,9 +72,38 @@ def frozen_flow(
     rng: np.random.Generator,
     watch: Watch = QUIET,
 ) -> list[Array]:
-    """What each view sees, [(n_steps, n_outputs) um], every sample the mean over its step of `dt` [s].
+    """Simulate the signals of several sensors behind the same layers of frozen flow.
 
-    Every layer has a random stream of its own. Views that are alike (sensor and footprints) are computed once.
+    Every layer has a random stream of its own. Identical views (sensor and footprints) are computed once.
+
+    Parameters
+    ----------
+    layers : sequence of Layer
+        Layers along the line of sight.
+    outer_scale : float
+        L0 [m].
+    diameter : float
+        Aperture diameter [m].
+    views : sequence of View
+        Sensors and their beams.
+    n_steps : int
+        Number of steps.
+    dt : float
+        Time step [s]; every sample is the mean over its step.
+    rng : numpy.random.Generator
+        Source of all random numbers.
+    watch : Watch
+        Asked between blocks whether to stop.
+
+    Returns
+    -------
+    list of Array
+        Signal of each view, (n_steps, n_outputs) [um].
+
+    Raises
+    ------
+    Cancelled
+        `watch` asks to stop.
     """
     signals = [np.zeros((view.sensor.n_outputs, n_steps)) for view in views]
     for number, (layer, stream) in enumerate(zip(layers, rng.spawn(len(layers)), strict=True)):
@@ -85,7 +122,7 @@ def frozen_flow(
 
 
 def layer_signals(
-    layer: Layer,
+    layer: TurbulenceLayer,
     outer_scale: float,
     diameter: float,
     beams: Sequence[tuple[Sensor, Footprint]],
@@ -94,8 +131,8 @@ def layer_signals(
     rng: np.random.Generator,
     watch: Watch = QUIET,
 ) -> list[Array]:
-    """What each beam sees of one layer, [(n_outputs, n_steps) um]."""
-    grid = Grid.of(layer, outer_scale, diameter, n_steps, dt)
+    """Simulate the signal of each beam through one layer, [(n_outputs, n_steps) um]."""
+    grid = FrequencyGrid.of(layer, outer_scale, diameter, n_steps, dt)
     amplitudes = [np.zeros((sensor.n_outputs, grid.f.size), complex) for sensor, _ in beams]
     reaches = [sensor.reach / max(footprint.scale, NARROWEST) for sensor, footprint in beams]
     for part, wave in waves(grid, layer, outer_scale, diameter, rng, max(reaches)):
@@ -109,10 +146,19 @@ def layer_signals(
 
 
 @dataclass(frozen=True)
-class Grid:
-    """Temporal frequencies of a layer: nodes of their own first, then multiples of 1 / P.
+class FrequencyGrid:
+    """Temporal frequencies of a layer: single nodes first, then multiples of 1 / P.
 
-    f, weight : (n,) [Hz]; n_low: how many are single nodes; n_fft: steps of a period P; dt [s]
+    Attributes
+    ----------
+    f, weight : Array
+        Frequencies and quadrature weights, (n,) [Hz].
+    n_low : int
+        Number of single nodes.
+    n_fft : int
+        Steps of a period P.
+    dt : float
+        Time step [s].
     """
 
     f: Array
@@ -122,9 +168,9 @@ class Grid:
     dt: float
 
     @classmethod
-    def of(cls, layer: Layer, outer_scale: float, diameter: float, n_steps: int, dt: float) -> Grid:
-        """The grid that serves a record of `n_steps`."""
-        n_fft = period_steps(layer, diameter, n_steps, dt)
+    def of(cls, layer: TurbulenceLayer, outer_scale: float, diameter: float, n_steps: int, dt: float) -> FrequencyGrid:
+        """Return the grid for a record of `n_steps`."""
+        n_fft = fft_length(layer, diameter, n_steps, dt)
         period = n_fft * dt
         top = TAPER / period
         nodes, weights = np.polynomial.legendre.leggauss(PANEL_NODES)
@@ -139,7 +185,7 @@ class Grid:
         return cls(f, np.concatenate([w_low, w_high]) * share, f_low.size, n_fft, dt)
 
     def signal(self, amplitude: Array, n_steps: int) -> Array:
-        """Re sum_f a(f) exp(-2 pi i f t) at the steps, (n_outputs, n_steps), of a (n_outputs, n) complex."""
+        """Return Re sum_f a(f) exp(-2 pi i f t) at the steps, (n_outputs, n_steps), for complex a (n_outputs, n)."""
         j = np.arange(1, self.f.size - self.n_low + 1) % self.n_fft
         beyond = j > self.n_fft // 2  # aliases: exp(-2 pi i j t) = exp(2 pi i (n_fft - j) t) at the steps
         at = np.where(beyond, self.n_fft - j, j)
@@ -158,19 +204,19 @@ class Grid:
         return out + _sum_of_waves(self.f[: self.n_low], amplitude[:, : self.n_low], n_steps, self.dt)
 
 
-def period_steps(layer: Layer, diameter: float, n_steps: int, dt: float) -> int:
-    """Steps of the FFT's period: twice the record and the time in which the layer moves past all beams."""
+def fft_length(layer: TurbulenceLayer, diameter: float, n_steps: int, dt: float) -> int:
+    """Return the length of the FFT: twice the record and the time in which the layer moves past all beams."""
     across = (diameter + FIELD * layer.height) / layer.speed
     return next_fast_len(int(np.ceil(2.0 * (n_steps + across / dt))), real=True)
 
 
 def _window(x: Array) -> Array:
-    """From 1 at x = 0 smoothly to 0 at x = 1."""
+    """Return a smooth window from 1 at x = 0 to 0 at x = 1."""
     return np.where(x < 1.0, 0.5 * erfc(STEEPNESS * (x - 0.5)), 0.0)
 
 
 def _sum_of_waves(f: Array, a: Array, n_steps: int, dt: float) -> Array:
-    """Re sum a exp(-2 pi i f t) at t = 0, dt, ..., (n_outputs, n_steps): blocks of time, each with the phase of its start."""
+    """Return Re sum a exp(-2 pi i f t) at t = 0, dt, ..., (n_outputs, n_steps), by blocks of time."""
     block = 512
     angle = -2.0 * np.pi * np.outer(f, np.arange(block) * dt)
     cosine, sine = np.cos(angle), np.sin(angle)
@@ -183,11 +229,11 @@ def _sum_of_waves(f: Array, a: Array, n_steps: int, dt: float) -> Array:
 
 
 def waves(
-    grid: Grid, layer: Layer, outer_scale: float, diameter: float, rng: np.random.Generator, reach: float = 0.0
+    grid: FrequencyGrid, layer: TurbulenceLayer, outer_scale: float, diameter: float, rng: np.random.Generator, reach: float = 0.0
 ) -> Iterator[tuple[slice, Wave]]:
-    """(columns of the grid, their waves), block by block: those of the core, then what is beside, ahead and far of it.
+    """Yield (columns of the grid, their waves), block by block: the core, then beside, ahead of and far from it.
 
-    reach : spatial frequency [rad/m] up to which waves are resolved finely at least
+    reach : spatial frequency [rad/m] up to which waves are finely resolved at least
     """
     streams: dict[str, np.random.Generator] = dict(zip(("core", "far", "beside", "ahead"), rng.spawn(4), strict=True))
     kx = 2.0 * np.pi * grid.f / layer.speed
@@ -196,7 +242,7 @@ def waves(
 
     def made(part: slice, zone: str, ky: Array, weight: Array) -> tuple[slice, Wave]:
         noise = streams[zone].standard_normal((2, ky.size, kx[part].size))
-        density = spectrum(kx[part] ** 2 + ky[:, None] ** 2, layer.strength, outer_scale)
+        density = von_karman_density(kx[part] ** 2 + ky[:, None] ** 2, layer.strength, outer_scale)
         cell = weight[:, None] * (grid.weight[part] * (2.0 * np.pi / layer.speed))
         # phi = Re sum over half the plane: E |A|^2 = 4 density cell, and standard_normal has twice the unit variance
         return part, Wave(kx[part], ky, layer.angle, np.sqrt(2.0 * density * cell) * (noise[0] + 1j * noise[1]))
@@ -206,20 +252,20 @@ def waves(
         q = np.hypot(k0, 0.0 if part.start == 0 else first)
         delta, h = fine_rule(layer.height, diameter)
         if first >= max(front, reach):
-            yield made(part, "far", *across(q, 4.0 * last, np.inf, 0.25))
+            yield made(part, "far", *nodes_across_wind(q, 4.0 * last, np.inf, 0.25))
         elif first >= front:
-            yield made(part, "ahead", *across(q, max(core, reach), delta, h))
+            yield made(part, "ahead", *nodes_across_wind(q, max(core, reach), delta, h))
         else:
-            inner = across(q, core, delta, h)
+            inner = nodes_across_wind(q, core, delta, h)
             yield made(part, "core", *inner)
             if reach > core:
                 n = inner[0].size // 2
-                wider = across(q, reach, delta, h)
+                wider = nodes_across_wind(q, reach, delta, h)
                 yield made(part, "beside", *(np.concatenate([x[: x.size // 2 - n], x[x.size // 2 + n :]]) for x in wider))
 
 
 def blocks(kx: Array, n_low: int, borders: tuple[float, ...]) -> Iterator[slice]:
-    """The single nodes, then columns whose k_x at most doubles and does not cross a border."""
+    """Yield the single nodes, then columns whose k_x at most doubles and does not cross a border."""
     yield slice(0, n_low)
     start = n_low
     while start < kx.size:

@@ -14,20 +14,27 @@ import numpy as np
 from wfsobs.typing import Array
 
 SEEING_WAVELENGTH = 0.5
-"""Wavelength that r0 is given at [um]."""
+"""Wavelength of r0 [um]."""
 CORE = 64.0
-"""k D / 2 up to which waves are resolved finely across the wind; beyond lie less than 1e-4 of the variance of radial order 6."""
+"""k D / 2 up to which waves are finely resolved across the wind; less than 1e-4 of the variance of radial order 6 lies beyond."""
 FIELD = 1e-3
-"""Shifts between beams [m per m of height, 3.4 arcmin] that the spacing across the wind resolves."""
+"""Shifts between beams that the spacing across the wind resolves [m per m of height, 3.4 arcmin]."""
 
 
 @dataclass(frozen=True)
-class Layer:
+class TurbulenceLayer:
     """One layer along the line of sight.
 
-    strength : r0^(-5/3) of the layer alone [m^(-5/3)], r0 at 500 nm
-    height   : distance along the line of sight [m]; speed [m/s]
-    angle    : direction that the wind blows to, from the pupil's x axis to its y axis [rad]
+    Attributes
+    ----------
+    strength : float
+        r0^(-5/3) of the layer alone, r0 at 500 nm [m^(-5/3)].
+    height : float
+        Distance along the line of sight [m].
+    speed : float
+        Wind speed [m/s].
+    angle : float
+        Direction that the wind blows to, from the pupil's x axis to its y axis [rad].
     """
 
     strength: float
@@ -36,23 +43,36 @@ class Layer:
     angle: float
 
 
-def spectrum(k2: Array, strength: float, outer_scale: float) -> Array:
-    """Von Karman density of the wavefront [um^2 m^2] at squared angular spatial frequency k2 [rad^2/m^2].
+def von_karman_density(k2: Array, strength: float, outer_scale: float) -> Array:
+    """Return the von Karman density of the wavefront; its integral over the plane d^2k is the variance.
 
-    Its integral over the plane d^2k is the variance. 0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6) rad^2 m^2 with k = 2 pi f
-    (Noll 1976, eq. 21, with an outer scale); L0 = `outer_scale` [m].
+    0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6) rad^2 m^2 with k = 2 pi f (Noll 1976, eq. 21, with an outer scale).
+
+    Parameters
+    ----------
+    k2 : Array
+        Squared angular spatial frequency [rad^2/m^2].
+    strength : float
+        r0^(-5/3), r0 at 500 nm [m^(-5/3)].
+    outer_scale : float
+        L0 [m].
+
+    Returns
+    -------
+    Array
+        Density [um^2 m^2].
     """
     in_angular = 0.0229 * strength * (2.0 * np.pi) ** (11.0 / 3.0 - 2.0)
     return in_angular * (k2 + (2.0 * np.pi / outer_scale) ** 2) ** (-11.0 / 6.0) * (SEEING_WAVELENGTH / (2.0 * np.pi)) ** 2
 
 
 def fine_rule(height: float, diameter: float) -> tuple[float, float]:
-    """(delta, h) of the rule across the wind where waves matter."""
+    """Return (delta, h) of the fine rule across the wind."""
     return np.pi / (diameter + FIELD * height), 0.5
 
 
-def across(q: float, end: float, delta: float, h: float) -> tuple[Array, Array]:
-    """Nodes k_y, symmetric about 0, and weights [rad/m] of the rule above, out to about `end`."""
+def nodes_across_wind(q: float, end: float, delta: float, h: float) -> tuple[Array, Array]:
+    """Return nodes k_y, symmetric about 0, and weights [rad/m] of the rule above, out to about `end`."""
 
     def u(k: Array) -> Array:
         return np.arcsinh(k / q) / h + k / delta

@@ -24,7 +24,7 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import rms
-from wfsobs.signal.wiener import advanced, circle_mean, error_spectrum, explained, factorise, freedom
+from wfsobs.signal.wiener import advance_spectrum, circle_mean, degrees_of_freedom, error_spectrum, explained_variance, factorise
 from wfsobs.simulation.true_spectra import TrueSpectra, is_known, true_spectra
 from wfsobs.typing import Array
 
@@ -65,7 +65,7 @@ class LeastError:
         mean = least + learning
         if not mean > 0:
             return 0.0, 0.0
-        n = freedom(self.covariance, last - first) if least > 0 else inf
+        n = degrees_of_freedom(self.covariance, last - first) if least > 0 else inf
         if self.n_lines:
             n = mean**2 / (least**2 / n + learning**2 / (2 * self.n_lines * learning_freedom(last / max(first, 1))))
         low, high = np.sqrt(mean * chi2.ppf([0.5 - 0.5 * SHARE, 0.5 + 0.5 * SHARE], n) / n)
@@ -89,8 +89,8 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
     """
     past, known = min(n_steps, MOST_PAST), spectra.without_lines
     whitener = factorise(known.measured)
-    wanted = {name: (known.signal[name], advanced(known.shared[name], 1 + ahead)) for name in known.signal}
-    wanted[TOTAL] = known.total[0], advanced(known.total[1], 1 + ahead)
+    wanted = {name: (known.signal[name], advance_spectrum(known.shared[name], 1 + ahead)) for name in known.signal}
+    wanted[TOTAL] = known.total[0], advance_spectrum(known.total[1], 1 + ahead)
     lines = spectra.line_covariance(past + 1 + ahead)
     of_lines = {"vibration": 1.0, TOTAL: 1.0}
     cross = np.array(
@@ -100,7 +100,7 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
         ]
     )
     measured = np.fft.irfft(known.measured, whitener.n)[:past] + spectra.gain**2 * lines[:past]
-    gained = np.hstack([np.zeros((len(wanted), 1)), explained(measured, cross)])
+    gained = np.hstack([np.zeros((len(wanted), 1)), explained_variance(measured, cross)])
     return {
         name: LeastError(
             np.fft.irfft(error_spectrum(own, shared, whitener), whitener.n)[: min(n_steps, whitener.n // 2)],

@@ -13,12 +13,12 @@ from wfsobs.identification.remarks import in_time, remarks
 from wfsobs.identification.result import Identified, read_off
 from wfsobs.identification.whiteness import Whiteness, autocorrelation_test, cumulated_test, innovations
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record, RecordError, held, pseudo_open_loop
+from wfsobs.record import Record, RecordError, hold_last, pseudo_open_loop
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.riccati import RiccatiError
 from wfsobs.spectral.periodogram import fast_length, periodogram
-from wfsobs.spectral.search import LOWEST, PAD, Candidate, Found, search
+from wfsobs.spectral.search import LOWEST, PAD, Candidate, SearchResult, search_peaks
 from wfsobs.typing import Array
 
 LEVEL = 0.05
@@ -47,7 +47,7 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     """
     if np.isinf(record.y_lgs).any() or np.isinf(record.u).any():
         raise RecordError("the record has samples that are infinite")
-    z = pseudo_open_loop(record.y_lgs, held(record.u), record.delay)[record.delay :]
+    z = pseudo_open_loop(record.y_lgs, hold_last(record.u), record.delay)[record.delay :]
     z = z[: fast_length(len(z))]
     if len(z) < SHORTEST:
         raise RecordError(f"the record has {record.n_steps} samples, to identify it takes {SHORTEST + record.delay} or more")
@@ -110,14 +110,14 @@ def look(modes: Sequence[OneMode], level: float, lowest: float) -> list[Candidat
     return out
 
 
-def candidates(modes: Sequence[OneMode], level: float, lowest: float) -> list[list[Found]]:
+def candidates(modes: Sequence[OneMode], level: float, lowest: float) -> list[list[SearchResult]]:
     """What the search finds in every mode, alone and with all the others."""
     whitened = [mode.whitened() for mode in modes]
     n, dt, several = modes[0].n, modes[0].dt, len(modes) > 1
     alone = ALONE * level if several else level
-    out = [[search(fine, n, dt, 1, alone / len(modes), lowest)] for fine in whitened]
+    out = [[search_peaks(fine, n, dt, 1, alone / len(modes), lowest)] for fine in whitened]
     if several:
-        together = search(sum(whitened, np.zeros_like(whitened[0])), n, dt, len(modes), level - alone, lowest)
+        together = search_peaks(sum(whitened, np.zeros_like(whitened[0])), n, dt, len(modes), level - alone, lowest)
         for own, fine in zip(out, whitened, strict=True):
             if together.best is not None and _has_part(fine, n * dt, together.best.frequency, together.best.width):
                 own.append(together)

@@ -10,12 +10,12 @@ import numpy as np
 from wfsobs.identification.misfit import margin
 from wfsobs.identification.order import of_best_order, with_background
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.spectral.lines import Line, nearest_line
-from wfsobs.spectral.missing import Missing
+from wfsobs.spectral.lines import Sinusoid, nearest_line
+from wfsobs.spectral.missing import MissingSamples
 from wfsobs.spectral.model import RMS, Spectrum
-from wfsobs.spectral.periodogram import Cells, frequencies, inflation, periodogram
+from wfsobs.spectral.periodogram import Cells, inflation, periodogram, periodogram_frequencies
 from wfsobs.spectral.search import PAD, Candidate
-from wfsobs.spectral.whittle import first_guess, fitted, negative_log_likelihood, standard_deviations
+from wfsobs.spectral.whittle import first_guess, fit_spectrum, spectrum_negative_log_likelihood, standard_deviations
 from wfsobs.typing import Array
 
 NEIGHBOURS = 4.0
@@ -46,11 +46,11 @@ class OneMode:
 
     def __init__(self, z: Array, dt: float, rng: np.random.Generator | None = None):
         self.measured, self.dt, self.n = z - np.nanmean(z), dt, len(z)
-        self.missing = Missing(np.isnan(z), dt, rng or np.random.default_rng(0))
-        self.f = frequencies(self.n, dt)
+        self.missing = MissingSamples(np.isnan(z), dt, rng or np.random.default_rng(0))
+        self.f = periodogram_frequencies(self.n, dt)
         self.share, self.unknown, self.lost = np.ones(len(self.f)), np.zeros((0, self.n)), np.zeros(len(self.f))
-        self.z = self.missing.interpolated(self.measured)
-        self.lines: list[Line] = []
+        self.z = self.missing.interpolate(self.measured)
+        self.lines: list[Sinusoid] = []
         self._take_off()
         self.spectrum = first_guess(self.f, self.I, dt)
         self.strong = np.zeros(len(self.f), bool)
@@ -61,10 +61,10 @@ class OneMode:
         """Fill z as the model expects it now."""
         if self.missing.any:
             S, lines = self.spectrum.psd(self.f), self._signal()
-            self.unknown = self.missing.unknown(S)
-            self.share = self.missing.measured(S, self.unknown)
+            self.unknown = self.missing.draw_errors(S)
+            self.share = self.missing.measured_share(S, self.unknown)
             self.lost = (1.0 - self.share) * S
-            self.z = self.missing.filled(self.measured - lines, S) + lines
+            self.z = self.missing.fill(self.measured - lines, S) + lines
             self._take_off()
 
     def _signal(self) -> Array:
@@ -86,7 +86,7 @@ class OneMode:
 
     def whitened(self) -> Array:
         """I / S at PAD frequencies per bin, 1 at what has been refused; S as high as it may be (`misfit`)."""
-        f = frequencies(self.n, self.dt, PAD)
+        f = periodogram_frequencies(self.n, self.dt, PAD)
         S = self.spectrum.psd(self.f)
         S = np.exp(np.interp(f, self.f, np.log(S * self.share * margin(self.I / S))))
         ratio = periodogram(self.left, self.dt, PAD) / S
@@ -107,7 +107,7 @@ class OneMode:
         third order in any case. A resonance that has become as narrow as a line is one from then on; one that has become as
         wide as turbulence is dropped."""
         cells = self.cells()
-        self.spectrum = fitted(self.spectrum, cells)
+        self.spectrum = fit_spectrum(self.spectrum, cells)
         if reshape:
             self.spectrum = with_background(of_best_order(self.spectrum, cells, third), cells)
         for p in [p for p in self.spectrum.resonances if not self._sound(p)]:
@@ -132,7 +132,7 @@ class OneMode:
         before = self._misfit(window, self.spectrum, self.I)
         lines, spectrum = self.lines, self.spectrum
         beside = [line for line in lines if abs(line.frequency - candidate.frequency) < self._reach(candidate)]
-        trials: list[tuple[list[Line], Spectrum]] = []
+        trials: list[tuple[list[Sinusoid], Spectrum]] = []
         if beside:
             self.lines = rest = [line for line in lines if line not in beside]
             self._take_off()
@@ -193,8 +193,8 @@ class OneMode:
             keep = np.where(window, 1.0, 0.0)
             cells = Cells(self.f, self.I, keep, [p.omega / (2 * pi) for p in wider.resonances])
             count = len(wider.vector)
-            shape = fitted(wider, cells, range(count - 3, count))
-            value = negative_log_likelihood(shape, cells)
+            shape = fit_spectrum(wider, cells, range(count - 3, count))
+            value = spectrum_negative_log_likelihood(shape, cells)
             if best is None or value < best[0]:
                 best = value, shape
         assert best is not None
@@ -229,8 +229,8 @@ class OneMode:
         keep = np.where(self._window(Candidate(f0, int(4.0 * half / self.f[0]), 0.0)), 1.0, 0.0)
         cells = Cells(self.f, self.I, keep, [q.omega / (2 * pi) for q in (*start.resonances, p)])
         count = len(start.vector)
-        shape = fitted(start, cells, range(count - 6, count))
-        gain = negative_log_likelihood(self.spectrum, cells) - negative_log_likelihood(shape, cells)
+        shape = fit_spectrum(start, cells, range(count - 6, count))
+        gain = spectrum_negative_log_likelihood(self.spectrum, cells) - spectrum_negative_log_likelihood(shape, cells)
         if gain > SPLIT and all(map(self._sound, shape.resonances[-2:])):
             self.spectrum = shape
             self.refit()

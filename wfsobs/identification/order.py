@@ -10,7 +10,7 @@ from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.periodogram import Cells
-from wfsobs.spectral.whittle import fitted, negative_log_likelihood
+from wfsobs.spectral.whittle import fit_spectrum, spectrum_negative_log_likelihood
 
 WORTH = 6.0
 """Log-likelihood that the third corner has to gain: noise gives as much with a probability of 0.05 % (chi squared of 12)."""
@@ -33,8 +33,11 @@ def of_best_order(spectrum: Spectrum, cells: Cells, third: bool = False) -> Spec
         lower, higher = _smooth(replace(spectrum, turbulence=Ar2(t.omega, t.damping, t.rms, t.dt)), cells), spectrum
     else:
         starts = [replace(spectrum, turbulence=Ar3(t.omega, t.damping, k * t.omega, t.rms, t.dt)) for k in STARTS]
-        lower, higher = spectrum, min((_smooth(s, cells) for s in starts), key=lambda s: negative_log_likelihood(s, cells))
-    gain = negative_log_likelihood(lower, cells) - negative_log_likelihood(higher, cells)
+        lower, higher = (
+            spectrum,
+            min((_smooth(s, cells) for s in starts), key=lambda s: spectrum_negative_log_likelihood(s, cells)),
+        )
+    gain = spectrum_negative_log_likelihood(lower, cells) - spectrum_negative_log_likelihood(higher, cells)
     return higher if third or gain > WORTH else lower
 
 
@@ -48,8 +51,8 @@ def with_background(spectrum: Spectrum, cells: Cells) -> Spectrum:
         for reach in REACHES:
             rms = spectrum.noise * np.sqrt(reach)  # half of the density of the noise, about
             shapes.append(_smooth(replace(spectrum, background=Ar2(2.0 * np.pi * reach / dt, DAMPING, rms, dt)), cells))
-        without, wide = spectrum, min(shapes, key=lambda s: negative_log_likelihood(s, cells))
-    gain = negative_log_likelihood(without, cells) - negative_log_likelihood(wide, cells)
+        without, wide = spectrum, min(shapes, key=lambda s: spectrum_negative_log_likelihood(s, cells))
+    gain = spectrum_negative_log_likelihood(without, cells) - spectrum_negative_log_likelihood(wide, cells)
     return wide if gain > BACKGROUND and _beyond_turbulence(wide) else without
 
 
@@ -61,5 +64,5 @@ def _beyond_turbulence(spectrum: Spectrum) -> bool:
 
 def _smooth(spectrum: Spectrum, cells: Cells) -> Spectrum:
     """All that is smooth fitted, resonances left as they are."""
-    spectrum = spectrum.moved(spectrum.vector)  # within the bounds of its numbers
-    return fitted(spectrum, cells, range(spectrum.starts[len(spectrum.processes) - len(spectrum.resonances)]))
+    spectrum = spectrum.with_vector(spectrum.vector)  # within the bounds of its numbers
+    return fit_spectrum(spectrum, cells, range(spectrum.starts[len(spectrum.processes) - len(spectrum.resonances)]))

@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from wfsobs.prior import Prior
-from wfsobs.record import Signals, delayed, frame_mean, held
+from wfsobs.record import Signals, delay_signal, frame_mean, hold_last
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
@@ -35,16 +35,16 @@ class Predictor(NamedTuple):
 
 def bridged(signals: S, prior: Prior, line_width: float = LINE_WIDTH) -> S:
     """The signals without NaN, but in y_ngs at steps without a frame. line_width : of lines, at least [Hz]"""
-    u = held(signals.u)
+    u = hold_last(signals.u)
     y_lgs, open_loop_y, y_ngs = signals.y_lgs, signals.open_loop_y, signals.y_ngs
     if np.isnan(y_lgs).any():
-        mirror = delayed(u, signals.delay)
+        mirror = delay_signal(u, signals.delay)
         y_lgs = predicted(y_lgs - mirror, _of_lgs(prior, line_width)) + mirror
     if open_loop_y is not None and np.isnan(open_loop_y).any():
         open_loop_y = predicted(open_loop_y, _of_lgs(prior, line_width))
     if y_ngs is not None and signals.ratio is not None and np.isnan(y_ngs[signals.ratio :: signals.ratio]).any():
         n = signals.ratio
-        mirror = frame_mean(delayed(u, signals.delay - 1), n)[n::n]
+        mirror = frame_mean(delay_signal(u, signals.delay - 1), n)[n::n]
         y_ngs = y_ngs.copy()
         frames = [Predictor(m.at(n * signals.dt).disturbance(), m.ngs_noise) for m in prior.model]
         y_ngs[n::n] = predicted(y_ngs[n::n] - mirror, frames) + mirror
@@ -61,7 +61,7 @@ def _of_lgs(prior: Prior, line_width: float) -> list[Predictor]:
 def predicted(z: Array, predictors: Sequence[Predictor]) -> Array:
     """z (n, n_modes) with every NaN replaced by the prediction of the steady-state Kalman filter of that mode's model. Without
     models, or where a model has no such filter, the last measurement is held."""
-    out = held(z).copy()
+    out = hold_last(z).copy()
     for mode, (model, noise) in enumerate(predictors):
         try:
             K = model.A @ steady_state(model.A, model.C, model.Q, np.array(noise**2)).L[:, 0]

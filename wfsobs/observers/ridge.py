@@ -19,7 +19,7 @@ from wfsobs.observers.per_mode import over_modes
 from wfsobs.prior import Bands, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, pseudo_open_loop
-from wfsobs.signal.linalg import eliminate, solved_rows
+from wfsobs.signal.linalg import eliminate, solve_rows
 from wfsobs.typing import Array
 
 TAPS = 30
@@ -43,7 +43,7 @@ def fit(signals: Array, targets: Array, depth: int, m: int, penalty: float) -> t
         S.flat[: m * (m + 1) : m + 2] += penalty
         S[m, :m] = f - f.mean()
         eliminate(S, m, QUIET.check)
-        (a,) = solved_rows(S, m)
+        (a,) = solve_rows(S, m)
         a = a - a.mean()  # on windows less their mean
         w = np.array([np.correlate(channel, a, "valid") for channel in signals[: depth - 1 + m].T])
     else:

@@ -15,7 +15,7 @@ from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import Group
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3, fitted_ar3
+from wfsobs.signal.ar3 import Ar3, fit_ar3
 from wfsobs.signal.statespace import MIN_MODEL_DAMPING, DisturbanceModel
 from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
 from wfsobs.simulation.guide_stars import lgs_error_process, lgs_noise_rms
@@ -144,7 +144,7 @@ def modelled_turbulence(scenario: Scenario, mode: int, dt: float) -> Ar2 | Ar3:
         return process
     noise, _ = measurement_noise(scenario, mode)
     start = Ar3(process.omega, process.damping, 5.0 * process.omega, process.rms, dt)
-    return fitted_ar3(seen_turbulence(scenario, mode), noise**2, start)
+    return fit_ar3(seen_turbulence(scenario, mode), noise**2, start)
 
 
 def predicted_rms(scenario: Scenario, mode: int) -> float:

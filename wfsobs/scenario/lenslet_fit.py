@@ -6,7 +6,7 @@ from typing import Literal
 
 from wfsobs.scenario.groups.shack_hartmann import LensletArrays
 from wfsobs.sensors.lenslets import Lenslets
-from wfsobs.sensors.reconstructor import fittable
+from wfsobs.sensors.reconstructor import highest_order
 from wfsobs.settings.group import SettingError
 
 Kind = Literal["lgs", "ngs"]
@@ -19,7 +19,7 @@ def fit(settings: LensletArrays, kind: Kind, diameter: float, wanted: int) -> tu
     lenslets = Lenslets(diameter, across, settings.illumination, settings.obscuration)
     name = f"sensors.lenslets.{kind}_subapertures = {across}"
     try:
-        order = fittable(lenslets, settings.fitted_order)
+        order = highest_order(lenslets, settings.fitted_order)
     except ValueError as error:
         raise SettingError(f"{name}: {error}") from None
     if order < wanted:

@@ -1,4 +1,4 @@
-"""The lenslet array of a Shack-Hartmann sensor: which part of the pupil each subaperture sees.
+"""The lenslet array of a Shack-Hartmann sensor: the part of the pupil that each subaperture sees.
 
 The pupil is cut into square cells, several to a subaperture, each lit or dark by its centre. A slope is the mean gradient
 of the phase over the lit cells of its subaperture, so that one on the edge sees no phase from outside the pupil.
@@ -19,11 +19,18 @@ from wfsobs.typing import Array
 class Lenslets:
     """A square array of lenslets over a round aperture.
 
-    diameter     : of the aperture [m]
-    across       : subapertures along a side
-    illumination : smallest lit fraction of a subaperture that counts
-    obscuration  : diameter of the dark centre over that of the aperture
-    cells        : across the aperture, at least so many: 160 are 5 cm on 8 m
+    Attributes
+    ----------
+    diameter : float
+        Aperture diameter [m].
+    across : int
+        Subapertures along a side.
+    illumination : float
+        Minimum lit fraction of a valid subaperture.
+    obscuration : float
+        Diameter of the central obscuration over that of the aperture.
+    cells : int
+        Minimum number of cells across the aperture: 160 are 5 cm on 8 m.
     """
 
     diameter: float = 8.0
@@ -44,24 +51,24 @@ class Lenslets:
 
     @cached_property
     def centres(self) -> Array:
-        """Of the cells along either axis [m], (n,)."""
+        """Coordinates of the cell centres along either axis, (n,) [m]."""
         n = self.across * self.per_side
         return (np.arange(n) - (n - 1) / 2) * self.pitch
 
     @cached_property
     def lit(self) -> Array:
-        """Which cells are in the pupil: bool (n, n), y along the rows."""
+        """Cells inside the pupil: bool (n, n), y along the rows."""
         r = np.hypot(self.centres[:, None], self.centres[None, :])
         return (r <= self.diameter / 2) & (r >= self.obscuration * self.diameter / 2)
 
     @cached_property
     def fraction(self) -> Array:
-        """The lit fraction of every subaperture: (across, across), y along the rows."""
+        """Lit fraction of every subaperture: (across, across), y along the rows."""
         return self._blocks(self.lit.astype(float)).mean(axis=(-3, -1))
 
     @cached_property
     def valid(self) -> Array:
-        """Which subapertures are lit enough to count: bool (across, across)."""
+        """Subapertures that are lit enough: bool (across, across)."""
         return self.fraction >= max(self.illumination, 1e-9)
 
     @property
@@ -70,18 +77,18 @@ class Lenslets:
         return int(self.valid.sum())
 
     def mean(self, cells: Array) -> Array:
-        """Means over the lit cells of the valid subapertures: (..., n, n) -> (..., count)."""
+        """Average over the lit cells of the valid subapertures: (..., n, n) -> (..., count)."""
         sums = self._blocks(cells * self.lit).sum(axis=(-3, -1))
         return sums[..., self.valid] / (self.fraction[self.valid] * self.per_side**2)
 
     def spread(self, weights: Array) -> Array:
-        """The transpose of `mean`: weights of slopes (..., count) as weights of cells (..., n, n)."""
+        """Apply the transpose of `mean`: weights of slopes (..., count) to weights of cells (..., n, n)."""
         shares = np.zeros((*weights.shape[:-1], *self.valid.shape))
         shares[..., self.valid] = weights / (self.fraction[self.valid] * self.per_side**2)
         return shares.repeat(self.per_side, axis=-2).repeat(self.per_side, axis=-1) * self.lit
 
     def slopes(self, phase: Callable[[Array, Array], Array]) -> Array:
-        """Mean gradients [phase/m] of phase(x, y), x and y in [m]: (..., 2 count), those along x first.
+        """Return the mean gradients [phase/m] of phase(x, y), x and y in [m]: (..., 2 count), those along x first.
 
         The mean of a derivative over a cell is the difference of the means over two of its edges, and these come from
         two Gauss points: exact for cubics.

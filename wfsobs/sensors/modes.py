@@ -1,11 +1,11 @@
-"""The Zernike modes that columns of an array stand for."""
+"""The Zernike modes in the columns of an array."""
 
 from __future__ import annotations
 
 from functools import cache
 from typing import NamedTuple
 
-from wfsobs.sensors.zernike import name, noll, up_to_order
+from wfsobs.sensors.zernike import mode_name, noll, up_to_order
 
 HIGHEST_ORDER = 6
 
@@ -20,12 +20,12 @@ class Mode(NamedTuple):
 
 @cache
 def modes_up_to(order: int) -> tuple[Mode, ...]:
-    """All modes up to a radial order, piston left out, in Noll's order.
+    """Return all modes up to a radial order, without piston, in Noll's order.
 
     >>> [mode.name for mode in modes_up_to(2)]
     ['tip', 'tilt', 'defocus', 'oblique astigmatism', 'vertical astigmatism']
     """
-    return tuple(Mode(name(j), j, noll(j)[0]) for j in up_to_order(order))
+    return tuple(Mode(mode_name(j), j, noll(j)[0]) for j in up_to_order(order))
 
 
 TIP_TILT = modes_up_to(1)

@@ -1,7 +1,7 @@
-"""Sums of exponentials over a square grid, at any number of points at once, and interpolation of what varies slowly.
+"""Non-uniform FFT of a square grid, and Lagrange interpolation.
 
-The sum is one Fourier transform onto a grid twice as fine as need be, and five points of that grid along each axis for
-every point asked for, with a Kaiser-Bessel window whose own transform is divided out beforehand: the non-uniform fast
+A sum of exponentials is one Fourier transform onto a grid of twice the resolution, and five points of that grid along each
+axis for every point, with a Kaiser-Bessel window whose own transform is divided out beforehand: the non-uniform fast
 Fourier transform of type 2 (J. A. Fessler and B. P. Sutton, IEEE Trans. Signal Process. 51, 560, 2003).
 """
 
@@ -21,7 +21,7 @@ CHUNK = 1 << 16  # points at a time
 
 
 def _window() -> Array:
-    """Weights (FINE + 2, WIDTH) of the grid points about a point, against how far the first is from the window's edge."""
+    """Return weights (FINE + 2, WIDTH) of the grid points about a point, by the distance of the first from the edge."""
     distance = np.arange(FINE + 2)[:, None] / FINE + np.arange(WIDTH) - WIDTH / 2
     return i0(SHAPE * np.sqrt(np.maximum(1.0 - (distance / (WIDTH / 2)) ** 2, 0.0)))
 
@@ -32,7 +32,10 @@ WINDOW = _window()
 class TrigonometricSum:
     """f_m(x, y) = sum_pq w_m[q, p] exp(i (p x + q y)), p and q from -(n - 1) / 2 to (n - 1) / 2, to 1e-5 of sum |w|.
 
-    weights : real, (m, n, n), n even
+    Parameters
+    ----------
+    weights : Array
+        Real, (m, n, n), n even.
     """
 
     def __init__(self, weights: Array) -> None:
@@ -48,7 +51,7 @@ class TrigonometricSum:
         self._table = table.view(np.float32)  # (size^2, 2 m); single precision is finer than the window
 
     def __call__(self, x: Array, y: Array) -> Array:
-        """The sums at the points (x, y) [rad]: complex (m, *shape of x)."""
+        """Return the sums at the points (x, y) [rad]: complex (m, *shape of x)."""
         points = np.stack([np.ravel(x), np.ravel(y)])
         out = np.empty((points.shape[1], self._table.shape[1] // 2), dtype=complex)
         for start in range(0, len(out), CHUNK):
@@ -58,7 +61,7 @@ class TrigonometricSum:
         return out.T.reshape(-1, *np.shape(x))
 
     def _interpolation(self, x: Array, y: Array) -> csr_array:
-        """The matrix (points, size^2) that takes the table to the points."""
+        """Return the matrix (points, size^2) that interpolates the table at the points."""
         (column, across), (row, along) = self._taps(x), self._taps(y)
         index = row[:, :, None] * self._size + column[:, None, :]
         weight = along[:, :, None] * across[:, None, :]
@@ -66,7 +69,7 @@ class TrigonometricSum:
         return csr_array((weight.ravel(), index.ravel(), starts), shape=(len(x), self._size**2))
 
     def _taps(self, x: Array) -> tuple[Array, Array]:
-        """Grid points about each x, and their weights: (points, WIDTH) each."""
+        """Return the grid points about each x, and their weights: (points, WIDTH) each."""
         at = x * (self._size / (2.0 * np.pi)) - WIDTH / 2
         first = np.ceil(at)
         place = (first - at) * FINE
@@ -76,7 +79,7 @@ class TrigonometricSum:
 
 
 def lagrange_weights(t: Array, taps: int) -> Array:
-    """Weights (taps, len(t)) of values at 1 - taps / 2 ... taps / 2 in that at t, 0 <= t <= 1."""
+    """Return weights (taps, len(t)) that interpolate values at 1 - taps / 2 ... taps / 2 to t, 0 <= t <= 1."""
     nodes = np.arange(taps) + 1 - taps // 2
     out = np.ones((taps, len(t)))
     for i, node in enumerate(nodes):

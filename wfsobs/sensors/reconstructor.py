@@ -1,4 +1,4 @@
-"""From slopes to Zernike modes by least squares, and what that makes of the noise of the slopes."""
+"""Least-squares reconstruction of Zernike modes from slopes."""
 
 from __future__ import annotations
 
@@ -12,13 +12,30 @@ from wfsobs.sensors.zernike import noll, up_to_order
 from wfsobs.typing import Array
 
 MAX_CONDITION = 30.0
-"""Of the interaction matrix with its columns normalised: beyond it slopes hardly tell the modes apart."""
+"""Maximum condition number of the interaction matrix with normalised columns: beyond it the modes are not resolved."""
 
 
 @lru_cache(maxsize=8)
 def reconstructor(lenslets: Lenslets, order: int) -> Array:
-    """The least-squares fit of all modes up to a radial order, piston left out: (modes, 2 lenslets.count), [um] of the
-    modes from slopes in [um/m]. Raises ValueError, in one line, where the slopes do not determine the modes."""
+    """Return the least-squares fit of all modes up to a radial order, without piston.
+
+    Parameters
+    ----------
+    lenslets : Lenslets
+        Geometry of the sensor.
+    order : int
+        Radial order.
+
+    Returns
+    -------
+    Array
+        Modes [um] from slopes [um/m]: (modes, 2 lenslets.count), read-only.
+
+    Raises
+    ------
+    ValueError
+        The slopes do not determine the modes.
+    """
     if lenslets.count == 0:
         raise ValueError(f"no subaperture of {lenslets.across} x {lenslets.across} is lit to {lenslets.illumination:g}")
     matrix = interaction(lenslets, order)
@@ -38,9 +55,26 @@ def reconstructor(lenslets: Lenslets, order: int) -> Array:
     return out
 
 
-def fittable(lenslets: Lenslets, at_most: int) -> int:
-    """The highest radial order that the slopes determine, `at_most` and one for each subaperture along a side at most.
-    Raises ValueError, in one line, where it is none."""
+def highest_order(lenslets: Lenslets, at_most: int) -> int:
+    """Return the highest radial order that the slopes determine.
+
+    Parameters
+    ----------
+    lenslets : Lenslets
+        Geometry of the sensor.
+    at_most : int
+        Maximum order; another maximum is the number of subapertures along a side.
+
+    Returns
+    -------
+    int
+        Radial order.
+
+    Raises
+    ------
+    ValueError
+        The slopes determine no order.
+    """
     for order in range(min(at_most, lenslets.across), 1, -1):
         try:
             reconstructor(lenslets, order)
@@ -52,14 +86,28 @@ def fittable(lenslets: Lenslets, at_most: int) -> int:
 
 
 def interaction(lenslets: Lenslets, order: int) -> Array:
-    """Slopes [um/m] of one [um] of each mode up to a radial order, piston left out: (2 lenslets.count, modes)."""
+    """Return the slopes [um/m] of one [um] of each mode up to a radial order, without piston: (2 lenslets.count, modes)."""
     radius = lenslets.diameter / 2.0
     return lenslets.slopes(lambda x, y: polynomials(order, x / radius, y / radius)).T
 
 
 def polynomials(order: int, x: Array, y: Array) -> Array:
-    """Noll's Zernike polynomials up to a radial order, piston left out, at points in units of the radius, outside the disc
-    as well: (modes, *shape of x and y together). R_n^m(r) exp(i m t) = (x + iy)^m times a polynomial of r^2."""
+    """Evaluate Noll's Zernike polynomials up to a radial order, without piston.
+
+    R_n^m(r) exp(i m t) = (x + iy)^m times a polynomial of r^2; defined outside the unit disc as well.
+
+    Parameters
+    ----------
+    order : int
+        Radial order.
+    x, y : Array
+        Points in units of the radius.
+
+    Returns
+    -------
+    Array
+        (modes, *shape of x and y together).
+    """
     square, turn = x**2 + y**2, x + 1j * y
     powers = [np.ones_like(turn)]
     for _ in range(order):
@@ -75,6 +123,6 @@ def polynomials(order: int, x: Array, y: Array) -> Array:
 
 
 def _radial(n: int, m: int) -> list[float]:
-    """Coefficients of R_n^m(r) / r^m in r^2, the highest power first (Noll, eq. 2)."""
+    """Return the coefficients of R_n^m(r) / r^m in r^2, the highest power first (Noll, eq. 2)."""
     half = (n - m) // 2
     return [(-1) ** s * math.comb(n - s, s) * math.comb(n - 2 * s, half - s) for s in range(half + 1)]

@@ -1,14 +1,14 @@
-"""A geometric Shack-Hartmann sensor with a least-squares modal reconstructor, as a functional of plane waves.
+"""Geometric Shack-Hartmann sensor with a least-squares modal reconstructor, as a functional of plane waves.
 
 A slope is the mean gradient of the phase over the lit part of a subaperture (`Lenslets`). The reconstructor fits more
-Zernike modes to the slopes than are wanted and then keeps those wanted: a fit of tip and tilt alone would return the mean
-gradient, which coma and its like change too. What the fitted modes do not hold is seen as if it did: aliasing.
+Zernike modes to the slopes than its outputs: a fit of tip and tilt alone would return the mean
+gradient, which coma and similar modes change too. What the fitted modes do not include appears in them: aliasing.
 
 Slopes and fit are linear, so an output is one sum over the cells of the pupil, its transform
 
     M_j(k) = sum_cells i (k_x w_xj + k_y w_yj) sinc(k_x h / 2) sinc(k_y h / 2) exp(i k . r_cell),    sinc(x) = sin(x) / x,
 
-with w the weights of the cells of side h. No slope is formed on the way: the cost is that of the modes wanted,
+with w the weights of the cells of side h. No slope is computed: the cost is that of the output modes,
 whatever the number of subapertures.
 """
 
@@ -24,25 +24,33 @@ from wfsobs.atmosphere.plane_waves import Footprint, Wave
 from wfsobs.sensors.lenslets import Lenslets
 from wfsobs.sensors.nufft import TrigonometricSum, lagrange_weights
 from wfsobs.sensors.reconstructor import reconstructor
-from wfsobs.sensors.spots import Spots
+from wfsobs.sensors.spots import SpotModel
 from wfsobs.sensors.zernike import noll
 from wfsobs.typing import Array
 
 NODES = 4
-"""Nodes along k_x per 2 pi / D, the period of what the aperture's edge adds to a transform."""
+"""Nodes along k_x per 2 pi / D, the period of the contribution of the aperture's edge to a transform."""
 
 TAPS = 8
-"""Nodes that an interpolation along k_x takes: with four per period good to 2e-4 of what the edge adds."""
+"""Nodes of an interpolation along k_x: with four per period accurate to 2e-4 of the contribution of the edge."""
 
 
 class ShackHartmann:
     """A sensor whose outputs are Zernike coefficients [um].
 
-    lenslets : geometry of the sensor
-    nolls    : Noll indices of the modes wanted
-    order    : radial order up to which modes are fitted; by default the highest that is wanted
+    Parameters
+    ----------
+    lenslets : Lenslets
+        Geometry of the sensor.
+    nolls : sequence of int
+        Noll indices of the output modes.
+    order : int, optional
+        Radial order up to which modes are fitted; by default the highest of the output modes.
 
-    Raises ValueError, in one line, where the slopes do not determine the modes.
+    Raises
+    ------
+    ValueError
+        The slopes do not determine the modes.
     """
 
     def __init__(self, lenslets: Lenslets, nolls: Sequence[int], order: int | None = None) -> None:
@@ -56,32 +64,34 @@ class ShackHartmann:
 
     @property
     def n_outputs(self) -> int:
-        """Number of modes wanted."""
+        """Number of output modes."""
         return len(self.nolls)
 
     @property
     def reach(self) -> float:
-        """The second zero of a subaperture's own transform, on a coarse sensor that of an array of 40 [rad/m]."""
+        """The second zero of a subaperture's own transform; on a coarse sensor that of an array of 40 [rad/m]."""
         return 4.0 * np.pi * max(self.lenslets.across, 40) / self.lenslets.diameter
 
     def transform(self, kx: Array, ky: Array) -> Array:
-        """What the outputs are of exp(i k . r) on the pupil, k in its frame [rad/m]: complex (n_outputs, *shape of k)."""
+        """Return the outputs for exp(i k . r) on the pupil, k in its frame [rad/m]: complex (n_outputs, *shape of k)."""
         h = self.lenslets.pitch
         along_x, along_y = np.split(self._sums(kx * h, ky * h), 2)
         cell = 1j * np.sinc(kx * (h / (2.0 * np.pi))) * np.sinc(ky * (h / (2.0 * np.pi)))
         return cell * kx * along_x + cell * ky * along_y
 
-    def noise_covariance(self, spots: Spots) -> Array:
-        """What the noise of the spots becomes in one frame, (n_outputs, n_outputs) [um^2]: the slopes' noises are
-        independent, those of the modes are not."""
+    def noise_covariance(self, spots: SpotModel) -> Array:
+        """Return the noise covariance of the outputs in one frame, (n_outputs, n_outputs) [um^2].
+
+        The noises of the slopes are independent, those of the modes are not.
+        """
         variance = spots.slope_variance(self.lenslets.fraction[self.lenslets.valid])
         return (self.reconstructor * np.tile(variance, 2)) @ self.reconstructor.T
 
     def measure(self, wave: Wave, footprint: Footprint) -> Array:
-        """Modes of the waves of a layer, see `Sensor.measure`: complex (n_outputs, Nx) [um].
+        """Return the response to the waves of a layer, see `Sensor.measure`: complex (n_outputs, Nx) [um].
 
-        Against k_x the transform is no finer than a fringe of the aperture, which is many steps of a long record. So the
-        sum over k_y is taken with the transform at the nodes about each k_x, as matrix products, and interpolated. Single
+        The transform varies along k_x on the scale of a fringe of the aperture, which is many steps of a long record. So the
+        sum over k_y is computed at the nodes about each k_x, as matrix products, and interpolated. Single
         precision, 1e-7, is enough for the products.
         """
         amplitude = wave.through(footprint).astype(np.complex64)
@@ -100,8 +110,10 @@ class ShackHartmann:
         return out
 
     def _on_grid(self, wave: Wave, scale: float, kx: Array) -> Array:
-        """The transform at `kx` and the wave's k_y through a beam of that scale, (len(kx), n_outputs, Ny). That of the last
-        wave is kept: guide stars of one height differ in their shifts alone."""
+        """Return the transform at `kx` and the wave's k_y through a beam of that scale, (len(kx), n_outputs, Ny).
+
+        The last one is cached: guide stars at one height differ in their shifts alone.
+        """
         known = self._known  # another thread may replace it
         if known is None or known[0] is not wave or known[1] != scale:
             x, y = replace(wave, kx=kx).in_pupil()

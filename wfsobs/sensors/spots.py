@@ -1,4 +1,4 @@
-"""Noise of a Shack-Hartmann sensor's spots, and what a centre of gravity makes of it."""
+"""Noise of a Shack-Hartmann sensor's spots, and of their centre of gravity."""
 
 from __future__ import annotations
 
@@ -13,14 +13,21 @@ ARCSEC = np.pi / 180.0 / 3600.0
 
 
 @dataclass(frozen=True)
-class Spots:
-    """The spots of a sensor and their detector. Spots are round: the elongation of a laser's spot is left out.
+class SpotModel:
+    """The spots of a sensor and their detector. Spots are round: the elongation of a laser's spot is not modelled.
 
-    photons     : detected in a frame by a subaperture that is wholly lit [e-]
-    read_noise  : of a pixel in a frame, rms [e-]
-    fwhm        : full width at half maximum of a spot [arcsec]
-    pixel_scale : [arcsec]
-    pixels      : along a side of the window in which the centre of gravity is taken
+    Attributes
+    ----------
+    photons : float
+        Detected per frame by a fully lit subaperture [e-].
+    read_noise : float
+        Rms per pixel and frame [e-].
+    fwhm : float
+        Full width at half maximum of a spot [arcsec].
+    pixel_scale : float
+        Angle of a pixel [arcsec].
+    pixels : int
+        Side of the window of the centre of gravity.
     """
 
     photons: float
@@ -30,14 +37,14 @@ class Spots:
     pixels: int
 
     def slope_variance(self, lit: Array) -> Array:
-        """Variance of a slope [um^2/m^2] of subapertures of which the fraction `lit` is in the pupil.
+        """Return the variance of a slope [um^2/m^2] of subapertures with the lit fraction `lit`.
 
         For a Gaussian spot in photon noise, and read noise on every pixel of the window (G. Rousset in F. Roddier (ed.),
         "Adaptive optics in astronomy", 1999; S. Thomas et al., Mon. Not. R. Astron. Soc. 371, 323, 2006):
 
             fwhm^2 / (8 ln 2 photons) + pixel_scale^2 (read_noise / photons)^2 N^2 (N^2 - 1) / 12,
 
-        where N^2 (N^2 - 1) / 12 is the sum of the squares of the pixels' places along an axis.
+        where N^2 (N^2 - 1) / 12 is the sum of the squares of the pixels' positions along an axis.
         """
         photons = self.photons * lit
         photon_noise = self.fwhm**2 / (8.0 * np.log(2.0) * photons)

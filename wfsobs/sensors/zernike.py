@@ -32,7 +32,7 @@ NAMES = {
 
 
 def noll(j: int) -> tuple[int, int]:
-    """(n, m) of Noll's mode j: radial order and azimuthal frequency, m < 0 for a sine.
+    """Return (n, m) of Noll's mode j: radial order and azimuthal frequency, m < 0 for a sine.
 
     >>> [noll(j) for j in range(1, 8)]
     [(0, 0), (1, 1), (1, -1), (2, 0), (2, -2), (2, 2), (3, -1)]
@@ -43,13 +43,13 @@ def noll(j: int) -> tuple[int, int]:
     return n, m if j % 2 == 0 else -m
 
 
-def name(j: int) -> str:
-    """The usual name of mode j, or Z and its number."""
+def mode_name(j: int) -> str:
+    """Return the usual name of mode j, or Z and its number."""
     return NAMES.get(j, f"Z{j}")
 
 
 def up_to_order(order: int) -> range:
-    """Noll indices of all modes up to a radial order, piston left out.
+    """Return the Noll indices of all modes up to a radial order, without piston.
 
     >>> up_to_order(2)
     range(2, 7)
@@ -57,20 +57,33 @@ def up_to_order(order: int) -> range:
     return range(2, (order + 1) * (order + 2) // 2 + 1)
 
 
-def over_argument(order: int, x: Array) -> Array:
-    """J_order(x) / x for an order of 1 or more, its limit at 0."""
+def bessel_ratio(order: int, x: Array) -> Array:
+    """Return J_order(x) / x for an order of 1 or more, its limit at 0."""
     from scipy.special import jv  # here, since settings need the names of modes alone and SciPy takes long to import
 
     at_zero = 0.5 if order == 1 else 0.0
     return np.where(x > 0, jv(order, x) / np.where(x > 0, x, 1.0), at_zero)
 
 
-def transform(j: int, kx: Array, ky: Array, bessel: Callable[[int, Array], Array] = over_argument) -> Array:
-    """What mode j makes of exp(i k . r), r in units of the aperture's radius: complex, shape of k.
+def transform(j: int, kx: Array, ky: Array, bessel: Callable[[int, Array], Array] = bessel_ratio) -> Array:
+    """Return the transform of mode j: its coefficient in exp(i k . r), r in units of the aperture's radius.
 
     (1 / pi) integral over the unit disc of Z_j(r) exp(i k . r), Noll's eq. 8 in angular frequencies:
     2 sqrt(n + 1) (-1)^((n - m) / 2) i^m J_(n+1)(k) / k, times sqrt(2) cos or sin of m times the angle of k where m > 0.
-    bessel : (n, x) -> J_n(x) / x
+
+    Parameters
+    ----------
+    j : int
+        Noll index.
+    kx, ky : Array
+        Angular spatial frequency times radius.
+    bessel : callable
+        (n, x) -> J_n(x) / x.
+
+    Returns
+    -------
+    Array
+        Complex, shape of k.
     """
     n, signed = noll(j)
     m = abs(signed)
@@ -83,7 +96,7 @@ def transform(j: int, kx: Array, ky: Array, bessel: Callable[[int, Array], Array
 
 
 def noll_covariance(j: int, i: int) -> float:
-    """Covariance of the coefficients of two modes in Kolmogorov turbulence [(D / r0)^(5/3) rad^2] (Noll, eq. 25).
+    """Return the covariance of the coefficients of two modes in Kolmogorov turbulence [(D / r0)^(5/3) rad^2] (Noll, eq. 25).
 
     With the constant of the spectrum, 0.0229; the 2.2698 that is often printed here is 1 % larger.
 
@@ -112,11 +125,11 @@ TABLE_STEP, TABLE_END = 0.005, 1024.0
 
 @lru_cache(maxsize=16)
 def _table(order: int) -> Array:
-    return over_argument(order, np.arange(0.0, TABLE_END + 2.0 * TABLE_STEP, TABLE_STEP))
+    return bessel_ratio(order, np.arange(0.0, TABLE_END + 2.0 * TABLE_STEP, TABLE_STEP))
 
 
-def looked_up(order: int, x: Array) -> Array:
-    """J_order(x) / x from a table, 0 beyond its end."""
+def tabulated_bessel_ratio(order: int, x: Array) -> Array:
+    """Return J_order(x) / x from a table, 0 beyond its end."""
     table = _table(order)
     place = np.minimum(x, TABLE_END) * (1.0 / TABLE_STEP)
     below = place.astype(np.intp)
@@ -126,9 +139,14 @@ def looked_up(order: int, x: Array) -> Array:
 
 @dataclass(frozen=True)
 class ZernikeProjection:
-    """The ideal sensor: Noll's coefficients of the phase itself over the pupil.
+    """Ideal sensor: Noll's coefficients of the phase itself over the pupil.
 
-    diameter : of the pupil [m]; modes: Noll indices
+    Attributes
+    ----------
+    diameter : float
+        Pupil diameter [m].
+    modes : tuple of int
+        Noll indices.
     """
 
     diameter: float
@@ -141,20 +159,23 @@ class ZernikeProjection:
 
     @property
     def reach(self) -> float:
-        """The projection smooths: it asks for nothing beyond what the layer has anyway [rad/m]."""
+        """Zero: a projection averages, so the waves of the core are enough [rad/m]."""
         return 0.0
 
     def transform(
-        self, kx: Array, ky: Array, footprint: Footprint, bessel: Callable[[int, Array], Array] = over_argument
+        self, kx: Array, ky: Array, footprint: Footprint, bessel: Callable[[int, Array], Array] = bessel_ratio
     ) -> Array:
-        """M(k) of every mode, shift included, complex (n_outputs, *shape of k)."""
+        """Return M(k) of every mode, shift included, complex (n_outputs, *shape of k)."""
         radius = 0.5 * self.diameter * footprint.scale
         turn = np.exp(1j * (kx * footprint.shift[0] + ky * footprint.shift[1]))
         return np.array([transform(j, radius * kx, radius * ky, bessel) * turn for j in self.modes])
 
     def measure(self, wave: Wave, footprint: Footprint) -> Array:
-        """See `wave.Sensor`. Modes are even or odd across the wind, so k_y and -k_y are added up first; an angle
-        from the wind's direction to the pupil's axis turns the two modes of a pair into each other."""
+        """Return the response to the waves of a layer, see `plane_waves.Sensor`.
+
+        Modes are even or odd across the wind, so k_y and -k_y are summed first; the angle
+        from the wind's direction to the pupil's axis mixes the two modes of a pair.
+        """
         half = wave.ky.size // 2
         amplitude = wave.through(footprint)
         upper, lower = amplitude[half:], amplitude[half - 1 :: -1]
@@ -171,7 +192,7 @@ class ZernikeProjection:
             m = abs(signed)
             if (n, m) not in pairs:
                 if n not in radial:
-                    radial[n] = looked_up(n + 1, x)
+                    radial[n] = tabulated_bessel_ratio(n + 1, x)
                 if m not in turns:
                     turns[m] = direction**m
                 factor = 2.0 * math.sqrt((n + 1.0) * (2.0 if m else 1.0)) * (-1) ** ((n - m) // 2) * 1j**m

@@ -1,7 +1,7 @@
-"""A third-order process: the AR(2) of the paper with one more corner, beyond which its spectrum falls as f^-6.
+"""Third-order process: the AR(2) of the paper with one more corner, beyond which its spectrum falls as f^-6.
 
-Frozen flow falls as f^-17/3 there (Conan, Rousset and Madec, JOSA A 12, 1559, 1995), an AR(2) as f^-4: a filter that
-believes the AR(2) takes too much of the noise for turbulence.
+Frozen flow falls as f^-17/3 there (Conan, Rousset and Madec, JOSA A 12, 1559, 1995), an AR(2) as f^-4: a filter
+with the AR(2) model takes too much of the noise for turbulence.
 """
 
 from __future__ import annotations
@@ -16,19 +16,27 @@ from wfsobs.signal.whittle import negative_log_likelihood, whittle_fit
 from wfsobs.typing import Array
 
 SLOWEST = 3e-3
-"""Least corner of a fitted process, over the sampling rate: slower ones cost digits, and a filter nothing."""
+"""Minimum corner of a fitted process, over the sampling rate: slower ones lose digits and gain nothing in a filter."""
 TOLERANCE = 1e-3
 """Distance of a fit from its minimum, in standard deviations of its parameters."""
 STEPS = 100
-"""Of a fit, at most."""
+"""Maximum number of steps of a fit."""
 
 
 @dataclass(frozen=True)
 class Ar3:
-    """1 / ((1 - p q) (1 - p* q) (1 - r q)) driven by white noise, sampled every `dt`.
+    """Process 1 / ((1 - p q) (1 - p* q) (1 - r q)) driven by white noise.
 
-    omega, damping : of the pole pair p = exp((-xi + i sqrt(1 - xi^2)) w T) [rad/s], as of an AR(2)
-    corner : of the real pole r = exp(-corner T) [rad/s]; rms : standard deviation [any unit]; dt : sampling time [s]
+    Attributes
+    ----------
+    omega, damping : float
+        Of the pole pair p = exp((-xi + i sqrt(1 - xi^2)) w T), as of an AR(2) [rad/s, -].
+    corner : float
+        Corner of the real pole r = exp(-corner T) [rad/s].
+    rms : float
+        Standard deviation [any unit].
+    dt : float
+        Time step [s].
     """
 
     omega: float
@@ -44,13 +52,13 @@ class Ar3:
 
     @property
     def decays(self) -> NDArray[np.complex128]:
-        """a_i of the three poles exp(-a_i)."""
+        """Exponents a_i of the three poles exp(-a_i)."""
         pair = complex(self.damping, np.sqrt(1.0 - self.damping**2)) * self.omega * self.dt
         return np.array([pair, pair.conjugate(), self.corner * self.dt])
 
     @property
     def unit_drive_variance(self) -> float:
-        """Variance of the drive that gives the process the variance 1.
+        """Variance of the drive for which the process has the variance 1.
 
         The product of 1 - p_i p_j over i <= j, divided by 1 + e_2 - e_1 e_3 - e_3^2 with e_i the elementary symmetric polynomials
         of the poles: one over the sum of squares of the impulse response. Grouped so that nothing cancels when it is slow.
@@ -70,13 +78,13 @@ class Ar3:
         return out
 
     def psd(self, frequency: Array) -> Array:
-        """One-sided power spectral density [unit^2/Hz] at `frequency` [Hz]."""
+        """Return the one-sided power spectral density [unit^2/Hz] at `frequency` [Hz]."""
         turn = 2j * np.pi * np.asarray(frequency) * self.dt
         distance = np.abs(np.prod([np.expm1(-a - turn) for a in self.decays], axis=0))
         return 2.0 * self.dt * self.rms**2 * self.unit_drive_variance / distance**2
 
     def log_slopes(self, frequency: Array) -> Array:
-        """Derivatives of the logarithm of `psd` by log omega, logit damping, log corner and log rms, (4, n)."""
+        """Return the derivatives of log `psd` by log omega, logit damping, log corner and log rms, (4, n)."""
         a, xi = self.decays, self.damping
         turn = 2j * np.pi * np.asarray(frequency) * self.dt
         pairs = 1.0 / np.expm1(a[:, None] + a)
@@ -88,13 +96,27 @@ class Ar3:
         return np.vstack([(moves @ by_decay).real, np.full(by_decay.shape[1], 2.0)])
 
 
-def fitted_ar3(spectrum: Array, noise: float, start: Ar3) -> Ar3:
-    """The process whose spectrum, with white noise of variance `noise`, is nearest to a given one, with the same noise.
+def fit_ar3(spectrum: Array, noise: float, start: Ar3) -> Ar3:
+    """Fit a third-order process in white noise to a spectrum.
 
-    spectrum : per sample, on the frequencies of `wiener`, (n // 2 + 1,). Nearest is what makes the innovations of the
-    filter built on it whitest and smallest: the mean of log S + S_true / S is least (`whittle`). The frequencies are thinned out
-    to so many per octave, each standing for those about it. Two minima are possible, the pair below the real pole or above it:
-    the fit starts from `start` and from the same with the two exchanged, and the lower minimum counts.
+    The fit makes the innovations of the filter built on it as white and as small as possible: it minimises the mean of
+    log S + S_true / S (`whittle`). Frequencies are thinned to a fixed number per octave, each with the weight of those it
+    replaces. There can be two minima, with the pair below or above the real pole: the fit starts from `start` and from the
+    same with the two exchanged, and keeps the lower minimum.
+
+    Parameters
+    ----------
+    spectrum : Array
+        Two-sided spectrum per sample, on the frequencies of `wiener`, (n // 2 + 1,).
+    noise : float
+        Variance of the white noise, the same in spectrum and fit.
+    start : Ar3
+        First guess.
+
+    Returns
+    -------
+    Ar3
+        The process whose spectrum is nearest.
     """
     n, dt = 2 * (spectrum.size - 1), start.dt
     edges = np.unique(np.concatenate([[1], np.geomspace(1, n // 2 + 1, 400).astype(int)]))

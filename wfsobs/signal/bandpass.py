@@ -1,4 +1,4 @@
-"""The Butterworth bank: a sum of narrow band-passes that isolates vibration (paper, section 2.3)."""
+"""Butterworth bank: a sum of narrow band-passes that isolates vibration (paper, section 2.3)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,29 @@ from wfsobs.typing import Array
 
 
 def bandpass_bank(frequencies: Sequence[float], bandwidth: float, order: int, dt: float) -> list[Array]:
-    """Second-order sections of one digital Butterworth band-pass per centre, edges centre +- bandwidth / 2 [Hz]."""
+    """Design one digital Butterworth band-pass per centre frequency.
+
+    Parameters
+    ----------
+    frequencies : sequence of float
+        Centres [Hz].
+    bandwidth : float
+        Full width [Hz]: the edges are centre +- bandwidth / 2.
+    order : int
+        Order of each filter.
+    dt : float
+        Time step [s].
+
+    Returns
+    -------
+    list of Array
+        Second-order sections, one array per centre.
+    """
     return [butter(order, [f - bandwidth / 2.0, f + bandwidth / 2.0], "bandpass", fs=1.0 / dt, output="sos") for f in frequencies]
 
 
 def filter_causal(bank: Sequence[Array], x: Array) -> Array:
-    """Sum of the band-passes of x (n, n_modes) along the steps, from rest; same shape."""
+    """Return the sum of the band-passes of x (n, n_modes) along the steps, from rest; same shape."""
     out = np.zeros_like(x)
     for sos in bank:
         out += sosfilt(sos, x, axis=0)
@@ -25,9 +42,9 @@ def filter_causal(bank: Sequence[Array], x: Array) -> Array:
 
 
 def filter_zero_phase(bank: Sequence[Array], x: Array) -> Array:
-    """Sum of the band-passes, each run forward and then backward in time so that it delays nothing; same shape.
+    """Return the sum of the band-passes, each run forward and then backward in time, so without delay; same shape.
 
-    Looks ahead: for references and training targets only.
+    Not causal: for references and training targets only.
     """
     out = np.zeros_like(x)
     for sos in bank:
@@ -36,8 +53,10 @@ def filter_zero_phase(bank: Sequence[Array], x: Array) -> Array:
 
 
 class StreamingBank:
-    """The causal bank one sample at a time, as one state-space system: the output needs only a product, the
-    state follows in `settle`."""
+    """The causal bank, one sample at a time, as one state-space system.
+
+    The output needs only a product; the state is updated afterwards, in `settle`.
+    """
 
     def __init__(self, bank: Sequence[Array]):
         systems = [sos2ss(sos) for sos in bank]
@@ -50,18 +69,18 @@ class StreamingBank:
         self._ahead = 0.0
 
     def push(self, z: float) -> float:
-        """The filtered value at this sample."""
+        """Return the filtered value at this sample."""
         self._z = z
         return self._ahead + self._d * z
 
     def settle(self) -> None:
-        """Take the last sample into the state."""
+        """Update the state with the last sample."""
         self._x = self._A @ self._x + self._b * self._z
         self._ahead = float(self._c @ self._x)
 
 
 def sos2ss(sos: Array) -> tuple[Array, Array, Array, float]:
-    """State space (A, b, c, d) of second-order sections in a row, each in transposed direct form II."""
+    """Return the state space (A, b, c, d) of second-order sections in series, each in transposed direct form II."""
     A, b, c, d = np.zeros((0, 0)), np.zeros(0), np.zeros(0), 1.0
     for b0, b1, b2, _, a1, a2 in sos:
         Ai = np.array([[-a1, 1.0], [-a2, 0.0]])

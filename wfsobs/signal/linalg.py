@@ -1,4 +1,4 @@
-"""The few BLAS and LAPACK routines that the observers stand on, from scipy, on sub-matrices in place.
+"""The BLAS and LAPACK routines that the observers need, from scipy, on sub-matrices in place.
 
 scipy publishes the addresses of its BLAS and LAPACK for other compiled code (`scipy.linalg.cython_blas`). Called
 through ctypes they work on any part of a column-major matrix without a copy, and without the interpreter lock, so
@@ -26,7 +26,7 @@ _pointer.restype, _pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes
 
 
 def _routine(module: object, name: str, n_arguments: int):
-    """A Fortran routine by name: every argument an address."""
+    """Return a Fortran routine by name; every argument is an address."""
     capsule = module.__pyx_capi__[name]  # type: ignore[attr-defined]
     return ctypes.CFUNCTYPE(None, *([ctypes.c_void_p] * n_arguments))(_pointer(capsule, _name(capsule)))
 
@@ -57,15 +57,28 @@ def _char(value: bytes) -> int:
 
 
 PANEL = 256
-"""Columns eliminated at a time: the same work as all at once, with a moment to stop in between."""
+"""Columns eliminated at a time: no more work than all at once, and the computation can stop in between."""
 
 
 def eliminate(S: Array, n: int, check: Callable[[], None]) -> None:
-    """Eliminate the first `n` rows and columns of the symmetric S (N, N), in place.
+    """Eliminate the first `n` rows and columns of the symmetric S, in place.
 
     With S11 = L L', the lower triangle of S[n:, n:] becomes the Schur complement S22 - S21 S11^-1 S12, and the first n
-    columns become L over S21 L'^-1. check: called between pieces of work; what it raises ends the work.
-    Raises numpy.linalg.LinAlgError where S11 is not positive definite.
+    columns become L over S21 L'^-1.
+
+    Parameters
+    ----------
+    S : Array
+        Symmetric matrix, (N, N), column-major; its lower triangle is used.
+    n : int
+        Number of rows and columns to eliminate.
+    check : callable
+        Called between blocks; an exception that it raises ends the computation.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        S11 is not positive definite.
     """
     for done in range(0, n, PANEL):
         check()
@@ -85,8 +98,8 @@ def _eliminate_panel(S: Array, n: int) -> None:
     _syrk(_char(b"L"), _char(b"N"), rest, _int(n), _real(-1.0), below, lead, _real(1.0), corner, lead)
 
 
-def solved_rows(S: Array, n: int) -> Array:
-    """S21 S11^-1, (N - n, n), from what `eliminate` left of S; in place, over what was S21."""
+def solve_rows(S: Array, n: int) -> Array:
+    """Return S21 S11^-1, (N - n, n), from the result of `eliminate`; in place of S21."""
     size, lead, here = S.shape[0], _int(S.strides[1] // S.itemsize), S.ctypes.data
     _trsm(
         _char(b"R"),

@@ -17,26 +17,42 @@ import numpy as np
 from wfsobs.typing import Array
 
 BLOCK = 48
-"""Steps per block, about; the work per step grows with it, the number of blocks falls."""
+"""Approximate steps per block; the work per step grows with it, the number of blocks falls."""
 
 
 @dataclass(frozen=True)
 class PeriodicFilter:
-    """One tuple (F, G, H, J) per step of the cycle: F (n, n), G (n, m), H (p, n), J (p, m)."""
+    """Linear filter with a cycle of matrices.
+
+    Attributes
+    ----------
+    steps : sequence of tuple
+        One tuple (F, G, H, J) per step of the cycle: F (n, n), G (n, m), H (p, n), J (p, m).
+    """
 
     steps: Sequence[tuple[Array, Array, Array, Array]]
 
     def cycle_matrix(self) -> Array:
-        """Product of the F over one cycle, (n, n); the filter is stable if its spectral radius is below 1."""
+        """Return the product of the F over one cycle, (n, n); the filter is stable if its spectral radius is below 1."""
         out = np.eye(self.steps[0][0].shape[0])
         for F, *_ in self.steps:
             out = F @ out
         return out
 
     def run(self, v: Array, x0: Array | None = None) -> Array:
-        """Filter inputs v (n_steps, m, n_columns) from state x0 (n, n_columns; zero by default).
+        """Filter the inputs v.
 
-        Returns e (n_steps, p, n_columns); every column is a signal of its own.
+        Parameters
+        ----------
+        v : Array
+            Inputs, (n_steps, m, n_columns); every column is a signal of its own.
+        x0 : Array, optional
+            Initial state, (n, n_columns); zero by default.
+
+        Returns
+        -------
+        Array
+            Outputs e, (n_steps, p, n_columns).
         """
         n_steps, m, columns = v.shape
         cycle = len(self.steps)
@@ -55,7 +71,7 @@ class PeriodicFilter:
         return out.reshape(length, p, blocks, columns).transpose(2, 0, 1, 3).reshape(-1, p, columns)[:n_steps]
 
     def _lift(self, length: int) -> tuple[Array, Array, Array, Array]:
-        """The map of one block: (F, G, H, J) with all the inputs and outputs of the block stacked."""
+        """Return the map of one block: (F, G, H, J) with all the inputs and outputs of the block stacked."""
         F0, G0, H0, _ = self.steps[0]
         n, m, p = F0.shape[0], G0.shape[1], H0.shape[0]
         state, from_inputs = np.eye(n), np.zeros((n, length * m))
@@ -72,8 +88,10 @@ class PeriodicFilter:
 
 
 def _block_states(F: Array, driven: Array, start: Array) -> Array:
-    """State at the start of each block: x_0 = start, x_b+1 = F x_b + driven_b; shape of `driven`
-    (n, blocks, columns). The same trick once more: blocks of blocks, then one short loop."""
+    """Return the state at the start of each block: x_0 = start, x_b+1 = F x_b + driven_b.
+
+    `driven` is (n, blocks, columns). The same method again: blocks of blocks, then one short loop.
+    """
     n, blocks, columns = driven.shape
     length = max(1, int(np.sqrt(blocks)))
     groups = -(-blocks // length)

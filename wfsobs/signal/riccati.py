@@ -6,11 +6,12 @@ and the periodic one, where (A, C, Q, R) repeat every few steps. One step maps a
 
     P -> H + A_' P (I + G P)^-1 A_,    A_ = A', G = C' R^-1 C, H = Q,
 
-and two such maps in a row are one of the same kind. Composing a cycle, then the cycle with itself over and over, doubles
-the steps in every pass: about twelve passes do, even for hardly damped lines, and H is then the solution.
-What rounding leaves is taken out by Kleinman steps: the covariance that the gains at hand really give is a
+and two such maps in a row are one of the same kind. Composing a cycle, then the cycle with itself repeatedly, doubles
+the steps in every pass: about twelve passes are enough, even for lightly damped lines, and H is then the solution.
+
+Kleinman steps remove the rounding errors: the true covariance of the present gains is the solution of a
 Lyapunov equation, a sum of positive terms that loses nothing, and its gains are better, quadratically. Where the noise
-is so small that rounding spoils the doubling, they start from the covariance without any measurement.
+is so small that rounding spoils the doubling, they start from the covariance without measurements.
 """
 
 from __future__ import annotations
@@ -27,17 +28,30 @@ Step = tuple[Array, Array, Array, Array]
 """(A, C, Q, R) of one step: measure with C and R, then predict with A and Q."""
 
 RESIDUAL = 1e-9
-"""Largest residual of an accepted solution, relative to the covariance."""
+"""Maximum residual of an accepted solution, relative to the covariance."""
 
 
 class RiccatiError(ValueError):
-    """No usable steady-state filter for the given model; one line saying why."""
+    """Error: no usable steady-state filter for the given model; one line with the reason."""
 
 
 @dataclass(frozen=True)
 class SteadyState:
-    """P (n, n) predicted covariance; L (n, m) filter gain; K = A L (n, m) predictor gain;
-    filtered (n, n) covariance after the measurement; residual: of the Riccati equation, relative to P."""
+    """Steady state of a Kalman filter with state (n,) and measurements (m,).
+
+    Attributes
+    ----------
+    P : Array
+        Prediction covariance, (n, n).
+    L : Array
+        Filter gain, (n, m).
+    K : Array
+        Predictor gain A L, (n, m).
+    filtered : Array
+        Covariance after the measurement, (n, n).
+    residual : float
+        Residual of the Riccati equation, relative to P.
+    """
 
     P: Array
     L: Array
@@ -47,22 +61,55 @@ class SteadyState:
 
 
 def steady_state(A: Array, C: Array, Q: Array, R: Array) -> SteadyState:
-    """Solve the Riccati equation of a filter that does the same at every step.
+    """Solve the Riccati equation of a filter that is the same at every step.
 
-    A (n, n) stable, C (m, n) or (n,), Q (n, n), R (m, m) or scalar, positive definite. The result does not depend on
-    the unit. Raises RiccatiError where R is not positive definite or no stable solution is reached.
+    The result does not depend on the unit.
+
+    Parameters
+    ----------
+    A : Array
+        Transition matrix, (n, n), stable.
+    C : Array
+        Measurement matrix, (m, n) or (n,).
+    Q : Array
+        Process-noise covariance, (n, n).
+    R : Array or float
+        Measurement-noise covariance, (m, m) or scalar, positive definite.
+
+    Returns
+    -------
+    SteadyState
+        Gains and covariances.
+
+    Raises
+    ------
+    RiccatiError
+        R is not positive definite, or no stable solution is reached.
     """
     return periodic_steady_state([(A, np.atleast_2d(C), Q, np.atleast_2d(np.asarray(R, dtype=float)))])[0]
 
 
 def periodic_steady_state(cycle: Sequence[Step]) -> list[SteadyState]:
-    """Solve the Riccati equation of a filter whose steps repeat; one solution per step of the cycle.
+    """Solve the Riccati equation of a filter whose steps repeat.
 
-    Raises RiccatiError like `steady_state`.
+    Parameters
+    ----------
+    cycle : sequence of Step
+        (A, C, Q, R) of every step of the cycle, as for `steady_state`.
+
+    Returns
+    -------
+    list of SteadyState
+        One solution per step of the cycle.
+
+    Raises
+    ------
+    RiccatiError
+        As `steady_state`.
     """
-    found = _refined(cycle, _doubled(cycle))
+    found = _refine(cycle, _double_cycle(cycle))
     if found[0].residual > RESIDUAL:
-        found = _refined(cycle, _without_measurements(cycle))
+        found = _refine(cycle, _without_measurements(cycle))
     residual = found[0].residual
     if not residual <= RESIDUAL:
         raise RiccatiError(
@@ -75,8 +122,8 @@ def periodic_steady_state(cycle: Sequence[Step]) -> list[SteadyState]:
     return found
 
 
-def _refined(cycle: Sequence[Step], P: Array) -> list[SteadyState]:
-    """The best that Kleinman steps from P find: until rounding is all that is left, or three of them bring nothing."""
+def _refine(cycle: Sequence[Step], P: Array) -> list[SteadyState]:
+    """Improve P by Kleinman steps, until only rounding is left or three steps bring nothing."""
     best = _around(cycle, P)
     states, idle = best, 0
     while idle < 3 and best[0].residual > 1e-14:
@@ -102,7 +149,7 @@ def _map(A: Array, C: Array, Q: Array, R: Array) -> Map:
 
 
 def _compose(first: Map, then: Map) -> Map:
-    """The map of two steps in a row."""
+    """Return the map of two steps in a row."""
     A1, G1, H1 = first
     A2, G2, H2 = then
     n = A1.shape[0]
@@ -112,8 +159,8 @@ def _compose(first: Map, then: Map) -> Map:
     return A1 @ W[:, :n], 0.5 * (G + G.T), 0.5 * (H + H.T)
 
 
-def _doubled(cycle: Sequence[Step]) -> Array:
-    """The covariance after very many cycles, by doubling: until it stands still, or only rounding moves it."""
+def _double_cycle(cycle: Sequence[Step]) -> Array:
+    """Return the covariance after very many cycles, by doubling until it is constant or only rounding changes it."""
     m = reduce(_compose, (_map(*step) for step in cycle))
     last = np.inf
     for _ in range(60):
@@ -129,13 +176,13 @@ def _doubled(cycle: Sequence[Step]) -> Array:
 
 
 def _without_measurements(cycle: Sequence[Step]) -> Array:
-    """The covariance of the model itself, from which Kleinman steps lead to the solution as surely, if more slowly."""
+    """Return the covariance of the model itself; Kleinman steps from it converge as surely, but more slowly."""
     blind = _around([(A, np.zeros_like(C), Q, R) for A, C, Q, R in cycle], np.zeros_like(cycle[0][2]))
     return _lyapunov_around(cycle, blind)
 
 
 def _around(cycle: Sequence[Step], P: Array) -> list[SteadyState]:
-    """Gains and covariances once around the cycle from predicted covariance P, and how far it comes back to P."""
+    """Return gains and covariances around one cycle from the prediction covariance P, and the residual after it."""
     found: list[tuple[Array, Array, Array, Array]] = []
     start = P
     for A, C, Q, R in cycle:
@@ -152,7 +199,7 @@ def _around(cycle: Sequence[Step], P: Array) -> list[SteadyState]:
 
 
 def _lyapunov_around(cycle: Sequence[Step], states: Sequence[SteadyState]) -> Array:
-    """Predicted covariance at the start of the cycle that the given gains lead to."""
+    """Return the prediction covariance at the start of the cycle for the given gains."""
     F = np.eye(len(cycle[0][0]))
     W = np.zeros_like(F)
     for (A, C, Q, R), state in zip(cycle, states, strict=True):
@@ -170,7 +217,23 @@ def _closed_loop(cycle: Sequence[Step], states: Sequence[SteadyState]) -> Array:
 
 
 def lyapunov(F: Array, W: Array) -> Array:
-    """S = F S F' + W by doubling: every pass doubles the number of terms summed. Raises RiccatiError if F is not stable."""
+    """Solve S = F S F' + W by doubling the number of terms of its series in every pass.
+
+    Parameters
+    ----------
+    F, W : Array
+        Transition matrix, stable, and covariance of the drive, both (n, n).
+
+    Returns
+    -------
+    Array
+        S, (n, n).
+
+    Raises
+    ------
+    RiccatiError
+        F is not stable.
+    """
     S = W
     for _ in range(60):
         with np.errstate(over="ignore", invalid="ignore"):

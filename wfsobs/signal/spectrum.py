@@ -13,18 +13,32 @@ from wfsobs.typing import Array
 
 
 def bin_frequencies(n: int, dt: float) -> Array:
-    """Frequencies [Hz] of the DFT of `n` samples every `dt` [s], 0 to Nyquist, spaced 1 / (n dt)."""
+    """Return the frequencies [Hz] of the DFT of `n` samples every `dt` [s], 0 to Nyquist, spaced 1 / (n dt)."""
     return np.fft.rfftfreq(n, dt)
 
 
 def resonance_power(frequency: float, damping: float, edges: ArrayLike) -> Array:
-    """Share of a damped resonance's variance between successive `edges` [Hz], shape (len(edges) - 1,).
+    """Return the share of a damped resonance's variance between successive edges.
 
     The density is that of a white-driven mass-spring-damper, S(f) ~ 1 / |f0^2 - f^2 + 2 i xi f0 f|^2,
-    of integral 1 over (0, inf). It is integrated in closed form, so a line that is narrower than
+    of integral 1 over (0, inf). It is integrated in closed form, so a resonance that is narrower than
     its bin keeps its power. With p = f0 (sqrt(1 - xi^2) + i xi), 1 / ((f^2 - p^2) (f^2 - p*^2))
     has the antiderivative Im(log((f - p) / (f + p)) / 2p) / Im(p^2).
-    Damping 1 (a double pole) is taken as 1 - 1e-9.
+    Damping 1 (a double pole) is computed as 1 - 1e-9.
+
+    Parameters
+    ----------
+    frequency : float
+        Natural frequency f0 [Hz].
+    damping : float
+        Damping ratio xi.
+    edges : array_like
+        Edges of the bins [Hz].
+
+    Returns
+    -------
+    Array
+        Shares, (len(edges) - 1,).
     """
     xi = min(max(damping, 1e-12), 1.0 - 1e-9)
     p = complex(np.sqrt(1.0 - xi**2), xi)  # in units of f0
@@ -36,17 +50,32 @@ def resonance_power(frequency: float, damping: float, edges: ArrayLike) -> Array
 
 
 def bin_edges(n: int, dt: float) -> Array:
-    """Edges [Hz] of the DFT bins; the first bin (frequency 0) and the last are half as wide."""
+    """Return the edges [Hz] of the DFT bins; the first bin (frequency 0) and the last are half as wide."""
     f = bin_frequencies(n, dt)
     df = 1.0 / (n * dt)
     return np.clip(np.append(f - df / 2.0, f[-1] + df / 2.0), 0.0, 0.5 / dt)
 
 
 def table_power(frequency: ArrayLike, density: ArrayLike, n: int, dt: float) -> Array:
-    """Variance in each DFT bin of a tabulated density [unit^2/Hz], linear between its frequencies [Hz]
-    and zero outside them, shape (n // 2 + 1,).
+    """Return the variance in each DFT bin of a tabulated density.
 
     The density is integrated over the bin, so a line narrower than the bins of a short record keeps its power.
+
+    Parameters
+    ----------
+    frequency : array_like
+        Frequencies of the table [Hz].
+    density : array_like
+        Density [unit^2/Hz], linear between the frequencies and zero outside them.
+    n : int
+        Length of the DFT.
+    dt : float
+        Time step [s].
+
+    Returns
+    -------
+    Array
+        Variance [unit^2], (n // 2 + 1,).
     """
     f, S = np.asarray(frequency, float), np.asarray(density, float)
     edges = bin_edges(n, dt)
@@ -60,11 +89,25 @@ def table_power(frequency: ArrayLike, density: ArrayLike, n: int, dt: float) -> 
 
 
 def random_phase_signal(power: ArrayLike, n: int, rng: np.random.Generator) -> Array:
-    """A real signal of `n` samples whose DFT bins carry `power` [unit^2] with random phases, shape (n,).
+    """Draw a real signal of `n` samples whose DFT bins have a given power and random phases.
 
     The amplitude of a bin of power S df is sqrt(2 S df), its phase uniform on [0, 2 pi) (paper,
     Algorithm 4, which prints S itself as amplitude and drops the imaginary unit). The bins at zero
     and at Nyquist stay empty: a phase means nothing there.
+
+    Parameters
+    ----------
+    power : array_like
+        Variance in each bin [unit^2], (n // 2 + 1,).
+    n : int
+        Number of samples.
+    rng : numpy.random.Generator
+        Source of the phases.
+
+    Returns
+    -------
+    Array
+        The signal, (n,).
     """
     power = _one_per_bin(power, n)
     phases = 2.0 * np.pi * rng.random(power.size)
@@ -72,10 +115,24 @@ def random_phase_signal(power: ArrayLike, n: int, rng: np.random.Generator) -> A
 
 
 def gaussian_signal(power: ArrayLike, n: int, rng: np.random.Generator) -> Array:
-    """One period of `n` samples of the stationary Gaussian process with the variance `power` [unit^2] in each DFT bin, (n,).
+    """Draw one period of a stationary Gaussian process of given power in each DFT bin.
 
     Cosine and sine of a bin have independent normal amplitudes (Shinozuka and Deodatis, Appl. Mech. Rev. 44, 1991). The
-    process is periodic; a piece of it that is short beside the period is not.
+    process is periodic; a short piece of the period is not.
+
+    Parameters
+    ----------
+    power : array_like
+        Variance in each bin [unit^2], (n // 2 + 1,).
+    n : int
+        Number of samples in a period.
+    rng : numpy.random.Generator
+        Source of the amplitudes.
+
+    Returns
+    -------
+    Array
+        The signal, (n,).
     """
     power = _one_per_bin(power, n)
     a, b = rng.standard_normal((2, power.size))
@@ -90,7 +147,7 @@ def _one_per_bin(power: ArrayLike, n: int) -> Array:
 
 
 def _of_bins(amplitude: Array, turn: NDArray[np.complex128], n: int) -> Array:
-    """The signal of `n` samples whose bins have these amplitudes and factors, zero and Nyquist left out."""
+    """Return the signal of `n` samples whose bins have these amplitudes and factors, without zero and Nyquist."""
     bins = 0.5 * n * amplitude * turn
     bins[0] = 0.0
     if n % 2 == 0:

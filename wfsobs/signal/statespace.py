@@ -4,7 +4,7 @@ State x[k] = (phi_turb[k], phi_turb[k-1], phi_vib[k], phi_vib[k-1], u[k-1], u[k-
 y[k] = C x[k] + w[k] = phi_dist[k-1] + u[k-2] + w[k]. With the B_u = (0, 1) that the paper prints, y[k]
 would see u[k-1]; B_u = (1, 0) is what its sensor and mirror equations (3 to 5) say.
 
-The mirror's part of the state is known exactly: the Riccati solution is zero there, and the filter
+The commands in the state are known exactly: the Riccati solution is zero there, and the filter
 on y[k] and u[k] is the filter of the disturbance alone on z[k] = y[k] - u[k-2]. Observers use that
 smaller model, `DisturbanceModel`, in coordinates that keep its digits.
 """
@@ -24,16 +24,22 @@ from wfsobs.signal.ar3 import Ar3
 from wfsobs.typing import Array
 
 MIN_MODEL_DAMPING = 1e-4
-"""Damping floor of a modelled process: a line of damping 0 would put an estimator pole on the unit circle."""
+"""Minimum damping of a modelled process: a line of damping 0 would put an estimator pole on the unit circle."""
 
 
 @dataclass(frozen=True)
 class DisturbanceModel:
     """Sum of autoregressive processes measured one step late, z[k] = C x[k] + w[k].
 
-    A (n, n), C (n,), Q (n, n); x holds as many numbers per process as it has poles (`process_model`).
-    outputs : target -> row (n,) that gives its phi[k] [um].
-    pairs   : (two per process, n) that gives the paper's state (phi_1[k], phi_1[k-1], phi_2[k], ...) [um].
+    Attributes
+    ----------
+    A, C, Q : Array
+        Transition (n, n), measurement (n,) and process-noise covariance (n, n); the state has as many elements per
+        process as it has poles (`process_model`).
+    outputs : dict of str to Array
+        Target -> row (n,) that gives its phi[k] [um].
+    pairs : Array
+        (two per process, n): gives the paper's state (phi_1[k], phi_1[k-1], phi_2[k], ...) [um].
     """
 
     A: Array
@@ -43,7 +49,7 @@ class DisturbanceModel:
     pairs: Array
 
     def output_rows(self, targets: Sequence[str]) -> Array:
-        """The rows of several targets, (len(targets), n)."""
+        """Return the rows of several targets, (len(targets), n)."""
         return np.array([self.outputs[target] for target in targets])
 
 
@@ -57,9 +63,9 @@ class ProcessModel(NamedTuple):
 
 
 def process_model(p: Ar2) -> ProcessModel:
-    """An AR(2) process in coordinates of variance one, uncorrelated with each other.
+    """Return an AR(2) process in uncorrelated coordinates of unit variance.
 
-    The paper's pair (phi[k], phi[k-1]) is all but linearly dependent for a slow process, which costs the Riccati equation
+    The paper's pair (phi[k], phi[k-1]) is almost linearly dependent for a slow process, which costs the Riccati equation
     its digits. With rho the correlation of the two, s = sqrt(1 - rho^2) and
 
         phi[k] = rms xi_0,    phi[k-1] = rms (rho xi_0 + s xi_1)
@@ -80,11 +86,12 @@ def process_model(p: Ar2) -> ProcessModel:
 
 
 def third_order_model(p: Ar3) -> ProcessModel:
-    """A third-order process in coordinates of variance one, uncorrelated with each other, like `process_model`.
+    """Return a third-order process in uncorrelated coordinates of unit variance, like `process_model`.
 
-    xi_0 is phi[k], xi_1 what phi[k-1] has beyond it, xi_2 what phi[k-2] has beyond both, each over its own rms. With the
-    partial autocorrelations k_i and s_i = sqrt(1 - k_i^2), (A | drive) has orthonormal rows (the normalised lattice of Gray and
-    Markel, IEEE Trans. ASSP 23, 268, 1975), so the state keeps its variance whatever rounding did to the k_i.
+    xi_0 is phi[k], xi_1 the part of phi[k-1] that is independent of it, xi_2 the part of phi[k-2] that is independent of
+    both, each over its own rms. With the partial autocorrelations k_i and s_i = sqrt(1 - k_i^2), (A | drive) has orthonormal
+    rows (the normalised lattice of Gray and Markel, IEEE Trans. ASSP 23, 268, 1975), so the state keeps its variance
+    whatever the rounding of the k_i.
     """
     k1, k2, k3 = p.reflections
     s1, s2, s3 = np.sqrt(1.0 - p.reflections**2)
@@ -97,8 +104,8 @@ def third_order_model(p: Ar3) -> ProcessModel:
     )
 
 
-def sampled(p: Ar3, n: int, rng: np.random.Generator) -> Array:
-    """`n` steps of a third-order process, stationary from the first, (n,)."""
+def sample_ar3(p: Ar3, n: int, rng: np.random.Generator) -> Array:
+    """Draw `n` steps of a third-order process, stationary from the first, (n,)."""
     model, denominator = third_order_model(p), np.poly(p.poles).real
     drive = model.Q[:, 0] / np.sqrt(model.Q[0, 0])
     x, first = rng.standard_normal(3), []
@@ -111,7 +118,18 @@ def sampled(p: Ar3, n: int, rng: np.random.Generator) -> Array:
 
 
 def disturbance_model(turbulence: Sequence[Ar2 | Ar3], vibration: Sequence[Ar2 | Ar3]) -> DisturbanceModel:
-    """The model of all the given processes, each with its own drive (paper, eq. 1, 2 and 7)."""
+    """Return the model of the sum of processes, each with its own drive (paper, eq. 1, 2 and 7).
+
+    Parameters
+    ----------
+    turbulence, vibration : sequence of Ar2 or Ar3
+        Processes of either part.
+
+    Returns
+    -------
+    DisturbanceModel
+        The state-space model.
+    """
     models = [third_order_model(p) if isinstance(p, Ar3) else process_model(p) for p in (*turbulence, *vibration)]
     now = np.concatenate([m.now for m in models])
     first = np.arange(now.size) < sum(m.now.size for m in models[: len(turbulence)])
@@ -125,7 +143,7 @@ def disturbance_model(turbulence: Sequence[Ar2 | Ar3], vibration: Sequence[Ar2 |
 
 
 def paper_matrices(turbulence: Ar2, vibration: Ar2) -> tuple[Array, Array, Array]:
-    """A (6, 6), B (6,), C (6,) of the paper's eq. 7, with the B_u that its equations 3 to 5 imply."""
+    """Return A (6, 6), B (6,) and C (6,) of the paper's eq. 7, with the B_u that its equations 3 to 5 imply."""
     A = block_diag(turbulence.transition, vibration.transition, [[0.0, 0.0], [1.0, 0.0]])
     B = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
     C = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 1.0])

@@ -4,8 +4,8 @@ With m bins of mean power I about a frequency, - log L = sum m (log S + I / S). 
 expected second derivatives are the Fisher information, sum m (d log S)(d log S)'. A trust-region method with these two finds the
 minimum.
 
-Bounds are kept by a change of variables, x = middle + half sin t (James and Roos, Comput. Phys. Commun. 10, 343, 1975). At a
-bound that holds x back dx/dt is zero: the gradient by t vanishes at every minimum, inside or at a bound.
+Bounds are kept by a change of variables, x = middle + half sin t (James and Roos, Comput. Phys. Commun. 10, 343, 1975). At an
+active bound dx/dt is zero: the gradient by t vanishes at every minimum, inside or at a bound.
 """
 
 from __future__ import annotations
@@ -19,32 +19,48 @@ from scipy.optimize import minimize
 from wfsobs.typing import Array
 
 Density = Callable[[Array], Array]
-"""S at every frequency (n,), of a vector of parameters (p,)."""
+"""S at every frequency (n,), as a function of the parameters (p,)."""
 LogSlopes = Callable[[Array, Array], Array]
-"""d log S (p, n) by the parameters, of these and of S there."""
+"""d log S (p, n) by the parameters, as a function of these and of S."""
 
 INSIDE = 1e-3
-"""Distance of the start from a bound at least, over half the width: at a bound nothing moves."""
+"""Minimum distance of the start from a bound, over half the width: at a bound the gradient by t is zero."""
 
 
 def negative_log_likelihood(S: Array, mean: Array, count: Array) -> float:
-    """- log L of the density S, less a constant; mean : I; count : m; all (n,)."""
+    """Return - log L of the density S, without a constant; mean : I; count : m; all (n,)."""
     return float(count @ (np.log(S) + mean / S))
 
 
 def information(log_slopes: Array, count: Array) -> Array:
-    """Fisher information (p, p) of parameters by which log S has these slopes (p, n)."""
+    """Return the Fisher information (p, p) of parameters by which log S has these slopes (p, n)."""
     return (log_slopes * count) @ log_slopes.T
 
 
 def whittle_fit(
     density: Density, log_slopes: LogSlopes, start: Array, bounds: Array, mean: Array, count: Array, tolerance: float, steps: int
 ) -> Array:
-    """Find the parameters (p,) of the least - log L near a start.
+    """Find the parameters of the minimum of - log L near a start.
 
-    start : (p,); bounds : least and greatest value of each, (p, 2); mean, count : I and m at the frequencies of `density`, (n,);
-    tolerance : norm of the gradient that ends the search, by the parameters in units of their standard deviations at the start;
-    steps : their greatest number
+    Parameters
+    ----------
+    density, log_slopes : callable
+        Density of the parameters, and the derivatives of its logarithm.
+    start : Array
+        First guess, (p,).
+    bounds : Array
+        Minimum and maximum of each parameter, (p, 2).
+    mean, count : Array
+        I and m at the frequencies of `density`, (n,).
+    tolerance : float
+        Norm of the gradient at which the search ends, with the parameters in units of their standard deviations at the start.
+    steps : int
+        Maximum number of steps.
+
+    Returns
+    -------
+    Array
+        Parameters, (p,).
     """
     middle, half = bounds.mean(axis=1), 0.5 * np.diff(bounds)[:, 0]
     first = np.arcsin(np.clip((start - middle) / half, INSIDE - 1.0, 1.0 - INSIDE))

@@ -1,15 +1,15 @@
-"""The least error of any causal linear observer: Wiener filter by spectral factorisation.
+"""Minimum error of any causal linear observer: Wiener filter by spectral factorisation.
 
 A target s[k] is estimated from all measurements z[k], z[k-1], ... of a stationary process. With the spectrum of z factorised
-as S_z = sigma^2 |H|^2, H and 1/H causal, the innovations e = z / H are white, and the best estimate keeps of the
-cross spectrum S_sz = E s z* what is causal after whitening,
+as S_z = sigma^2 |H|^2, H and 1/H causal, the innovations e = z / H are white, and the best estimate keeps the causal part of
+the cross spectrum S_sz = E s z* after whitening,
 
     G = S_sz / H*,    error = E s^2 - sum_{n >= 0} g[n]^2 / sigma^2
                             = mean(S_s - |S_sz|^2 / S_z) + sum_{n < 0} g[n]^2 / sigma^2.
 
-The second form, the error of the two-sided filter plus what causality costs, is a sum of positive terms, so that a small
+The second form, the error of the two-sided filter plus the cost of causality, is a sum of positive terms, so that a small
 error keeps its digits. H is the exponential of the causal half of the cepstrum, the inverse DFT of log S_z (Kolmogorov; Oppenheim
-and Schafer, Discrete-Time Signal Processing, section 13.6). No filter of Gaussian signals does better, linear or not.
+and Schafer, Discrete-Time Signal Processing, section 13.6). For Gaussian signals no filter is better, linear or not.
 
 Spectra are two-sided and per sample, on the frequencies 0 ... 1/2 of a DFT of even length n, shape (n // 2 + 1,): their
 mean over the whole circle is the variance.
@@ -29,7 +29,17 @@ Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Whitener:
-    """H (n // 2 + 1,) complex of the measurement's spectrum S_z (n // 2 + 1,), and the variance of the innovations."""
+    """Minimum-phase factor of a measurement's spectrum.
+
+    Attributes
+    ----------
+    spectrum : Array
+        S_z, (n // 2 + 1,).
+    H : Array
+        Complex factor, (n // 2 + 1,).
+    innovation_variance : float
+        Variance of the innovations.
+    """
 
     spectrum: Array
     H: Complex
@@ -42,7 +52,23 @@ class Whitener:
 
 
 def factorise(spectrum: Array) -> Whitener:
-    """The minimum-phase factor of a spectrum. Raises ValueError unless it is positive throughout."""
+    """Return the minimum-phase factor of a spectrum.
+
+    Parameters
+    ----------
+    spectrum : Array
+        S_z, (n // 2 + 1,).
+
+    Returns
+    -------
+    Whitener
+        Factor and innovation variance.
+
+    Raises
+    ------
+    ValueError
+        The spectrum is not positive throughout.
+    """
     if not (np.isfinite(spectrum).all() and (spectrum > 0).all()):
         raise ValueError("the measurement's spectrum must be above 0 at every frequency: it needs some noise")
     n = 2 * (spectrum.size - 1)
@@ -54,9 +80,21 @@ def factorise(spectrum: Array) -> Whitener:
 
 
 def error_spectrum(target: Array, cross: Complex, whitener: Whitener) -> Array:
-    """The spectrum of the least error of s[k] from z[k], z[k-1], ..., (n // 2 + 1,).
+    """Return the spectrum of the minimum error of s[k] from z[k], z[k-1], ....
 
-    target : S_s; cross : S_sz, the transform over n of E s[k] z[k-n]; both (n // 2 + 1,)
+    Parameters
+    ----------
+    target : Array
+        S_s, (n // 2 + 1,).
+    cross : Array
+        S_sz, the transform over n of E s[k] z[k-n], (n // 2 + 1,).
+    whitener : Whitener
+        Factor of S_z.
+
+    Returns
+    -------
+    Array
+        Spectrum of the error, (n // 2 + 1,).
     """
     g = np.fft.irfft(cross / whitener.H.conj(), whitener.n)
     g[: whitener.n // 2] = 0.0
@@ -65,16 +103,26 @@ def error_spectrum(target: Array, cross: Complex, whitener: Whitener) -> Array:
 
 
 def causal_error(target: Array, cross: Complex, whitener: Whitener) -> float:
-    """Variance of that error."""
+    """Return the variance of the minimum error, see `error_spectrum`."""
     return circle_mean(error_spectrum(target, cross, whitener))
 
 
-def explained(measured: Array, cross: Array) -> Array:
-    """What n = 1, 2, ... measurements z[k], ..., z[k-n+1] explain of the variance of targets s[k], (n_targets, n).
-
-    measured : autocovariance of z at the lags 0 ... n - 1, (n,); cross : E s[k] z[k-j], j = 0 ... n - 1, (n_targets, n)
+def explained_variance(measured: Array, cross: Array) -> Array:
+    """Return the variance of targets s[k] that n = 1, 2, ... measurements z[k], ..., z[k-n+1] explain.
 
     Levinson's recursion: the errors of predicting each earlier measurement from the later ones are orthogonal.
+
+    Parameters
+    ----------
+    measured : Array
+        Autocovariance of z at the lags 0 ... n - 1, (n,).
+    cross : Array
+        E s[k] z[k-j], j = 0 ... n - 1, (n_targets, n).
+
+    Returns
+    -------
+    Array
+        Explained variance, (n_targets, n).
     """
     n = measured.size
     backwards = np.ascontiguousarray(cross[:, ::-1])
@@ -90,11 +138,23 @@ def explained(measured: Array, cross: Array) -> Array:
     return np.cumsum(out, axis=1)
 
 
-def freedom(covariance: Array, n_steps: int) -> float:
-    """Degrees of freedom of the mean square of `n_steps` samples of a Gaussian process with the autocovariance r at the lags
-    0, 1, ...: those of the chi-square distribution with its mean and variance (Satterthwaite, Biometrics Bulletin 2, 1946).
+def degrees_of_freedom(covariance: Array, n_steps: int) -> float:
+    """Return the degrees of freedom of the mean square of `n_steps` samples of a Gaussian process.
 
-    The mean square has the variance (2 / N) sum (1 - |k| / N) r[k]^2.
+    Those of the chi-square distribution with its mean and variance (Satterthwaite, Biometrics Bulletin 2, 1946); the mean square
+    has the variance (2 / N) sum (1 - |k| / N) r[k]^2.
+
+    Parameters
+    ----------
+    covariance : Array
+        Autocovariance r at the lags 0, 1, ....
+    n_steps : int
+        Number of samples N.
+
+    Returns
+    -------
+    float
+        Degrees of freedom.
     """
     r = covariance[:n_steps]
     weight = 1.0 - np.arange(r.size) / n_steps
@@ -102,10 +162,10 @@ def freedom(covariance: Array, n_steps: int) -> float:
 
 
 def circle_mean(spectrum: Array) -> float:
-    """Mean over the whole circle of a spectrum given on its upper half: the variance."""
+    """Return the mean over the whole circle of a spectrum given on its upper half: the variance."""
     return float((2.0 * spectrum.sum() - spectrum[0] - spectrum[-1]) / (2 * (spectrum.size - 1)))
 
 
-def advanced(spectrum: Complex | Array, steps: int) -> Complex:
-    """S_sz of z[k] = s[k - steps] + anything independent: the spectrum, turned `steps` ahead."""
+def advance_spectrum(spectrum: Complex | Array, steps: int) -> Complex:
+    """Return S_sz of z[k] = s[k - steps] + anything independent: the spectrum with the phase of `steps` ahead."""
     return spectrum * np.exp(2j * np.pi * steps * np.arange(spectrum.size) / (2 * (spectrum.size - 1)))

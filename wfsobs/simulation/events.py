@@ -43,7 +43,7 @@ def moved_process(process: Ar2, x: Array, events: Sequence[Event]) -> Array:
     expected to, and fades out."""
     guard = min(round(GUARD * 2.0 * np.pi / (process.omega * process.dt)), x.size)
     fade = 0.5 + 0.5 * np.cos(np.pi * np.arange(1, guard + 1) / (guard + 1))
-    ahead, behind = (fade * process.expected(ends, guard) for ends in (np.resize(x[-2:], 2), np.resize(x[1::-1], 2)))
+    ahead, behind = (fade * process.extrapolate(ends, guard) for ends in (np.resize(x[-2:], 2), np.resize(x[1::-1], 2)))
     return moved(np.concatenate([behind[::-1], x, ahead]), events, process.dt, guard)[guard:-guard]
 
 

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wfsobs.atmosphere.plane_waves import Footprint
-from wfsobs.atmosphere.von_karman import CORE, Layer, across, fine_rule, spectrum
+from wfsobs.atmosphere.von_karman import CORE, TurbulenceLayer, fine_rule, nodes_across_wind, von_karman_density
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.zernike import ZernikeProjection, looked_up
+from wfsobs.sensors.zernike import ZernikeProjection, tabulated_bessel_ratio
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.guide_stars import lgs_weights
 from wfsobs.typing import Array
@@ -68,7 +68,7 @@ def _frequencies(scenario: Scenario, speed: float, highest: float) -> Array:
     return f[: int(np.searchsorted(f, highest)) + 1]
 
 
-def _layer(scenario: Scenario, mode: int, layer: Layer, f: Array) -> NDArray[np.complex128]:
+def _layer(scenario: Scenario, mode: int, layer: TurbulenceLayer, f: Array) -> NDArray[np.complex128]:
     """own, seen and shared of one layer, (3, n)."""
     kx = 2.0 * np.pi * f / layer.speed
     front = CORE / (0.5 * scenario.telescope.diameter)
@@ -88,16 +88,16 @@ def _blocks(kx: Array, front: float) -> Iterator[slice]:
         start = stop
 
 
-def _block(scenario: Scenario, mode: int, layer: Layer, kx: Array, front: float) -> NDArray[np.complex128]:
+def _block(scenario: Scenario, mode: int, layer: TurbulenceLayer, kx: Array, front: float) -> NDArray[np.complex128]:
     diameter, q0 = scenario.telescope.diameter, 2.0 * np.pi / scenario.turbulence.outer_scale
     if kx[0] < front:
-        ky, weight = across(q0, front, *fine_rule(layer.height, diameter))
+        ky, weight = nodes_across_wind(q0, front, *fine_rule(layer.height, diameter))
     else:
-        ky, weight = across(float(np.hypot(q0, kx[0])), 4.0 * kx[-1], np.inf, 0.25)
+        ky, weight = nodes_across_wind(float(np.hypot(q0, kx[0])), 4.0 * kx[-1], np.inf, 0.25)
     density = (
         (4.0 * np.pi / layer.speed)
         * weight[:, None]
-        * spectrum(kx**2 + ky[:, None] ** 2, layer.strength, scenario.turbulence.outer_scale)
+        * von_karman_density(kx**2 + ky[:, None] ** 2, layer.strength, scenario.turbulence.outer_scale)
     )
     c, s = np.cos(layer.angle), np.sin(layer.angle)
     x, y = c * kx - s * ky[:, None], s * kx + c * ky[:, None]
@@ -114,4 +114,4 @@ def _block(scenario: Scenario, mode: int, layer: Layer, kx: Array, front: float)
 
 def _of_mode(scenario: Scenario, mode: int, x: Array, y: Array, footprint: Footprint) -> NDArray[np.complex128]:
     sensor = ZernikeProjection(scenario.telescope.diameter, (scenario.modes[mode].noll,))
-    return sensor.transform(x, y, footprint, looked_up)[0]
+    return sensor.transform(x, y, footprint, tabulated_bessel_ratio)[0]

@@ -13,9 +13,9 @@ import numpy as np
 
 from wfsobs.atmosphere.frozen_flow import View
 from wfsobs.atmosphere.plane_waves import Footprint, Sensor
-from wfsobs.atmosphere.von_karman import CORE, Layer, across, fine_rule, spectrum
+from wfsobs.atmosphere.von_karman import CORE, TurbulenceLayer, fine_rule, nodes_across_wind, von_karman_density
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.zernike import ZernikeProjection, looked_up, over_argument
+from wfsobs.sensors.zernike import ZernikeProjection, bessel_ratio, tabulated_bessel_ratio
 from wfsobs.typing import Array
 
 ARCSEC = np.pi / 180.0 / 3600.0
@@ -36,13 +36,13 @@ def airmass(scenario: Scenario) -> float:
     return float(1.0 / np.cos(np.radians(scenario.telescope.zenith_angle)))
 
 
-def layers(scenario: Scenario) -> tuple[Layer, ...]:
+def layers(scenario: Scenario) -> tuple[TurbulenceLayer, ...]:
     """The layers as the telescope sees them, their shares divided by their sum."""
     t, way = scenario.turbulence, airmass(scenario)
     total = sum(layer.fraction for layer in t.layers)
     strength = t.r0 ** (-5.0 / 3.0) * way
     return tuple(
-        Layer(
+        TurbulenceLayer(
             strength * layer.fraction / total,
             layer.height * way,
             t.wind_speed * layer.wind_factor,
@@ -80,7 +80,7 @@ def laser_stars(scenario: Scenario) -> list[Star]:
     return [Star((radius * float(np.cos(a)), radius * float(np.sin(a))), distance) for a in angles]
 
 
-def view(sensor: Sensor, star: Star, of: tuple[Layer, ...]) -> View:
+def view(sensor: Sensor, star: Star, of: tuple[TurbulenceLayer, ...]) -> View:
     """A sensor on a star, through these layers."""
     (x, y), distance = star
     return View(sensor, tuple(Footprint(1.0 - layer.height / distance, (layer.height * x, layer.height * y)) for layer in of))
@@ -104,9 +104,9 @@ def mode_variance(order: int, diameter: float, strength: float, outer_scale: flo
     diameter, outer_scale [m]; strength: r0^(-5/3) [m^(-5/3)], r0 at 500 nm.
     """
     x = np.exp(LOG_K)
-    seen = over_argument(order + 1, x) - (over_argument(order + 1, cone * x) if cone != 1.0 else 0.0)
+    seen = bessel_ratio(order + 1, x) - (bessel_ratio(order + 1, cone * x) if cone != 1.0 else 0.0)
     k = x / (0.5 * diameter)
-    density = spectrum(k**2, strength, outer_scale) * 4.0 * (order + 1) * seen**2
+    density = von_karman_density(k**2, strength, outer_scale) * 4.0 * (order + 1) * seen**2
     return float(np.trapezoid(2.0 * np.pi * k**2 * density, LOG_K))
 
 
@@ -144,20 +144,22 @@ def star_covariance(scenario: Scenario) -> Array:
 
 
 @lru_cache(maxsize=32)
-def _covariance(sensor: ZernikeProjection, of: tuple[Layer, ...], outer_scale: float, stars: tuple[Star, ...]) -> Array:
+def _covariance(sensor: ZernikeProjection, of: tuple[TurbulenceLayer, ...], outer_scale: float, stars: tuple[Star, ...]) -> Array:
     """By the rule that frozen flow has across the wind, here in both directions."""
     n = len(stars) * sensor.n_outputs
     total = np.zeros((n, n))
     for i, layer in enumerate(of):
-        nodes, weights = across(
+        nodes, weights = nodes_across_wind(
             2.0 * np.pi / outer_scale, CORE / (0.5 * sensor.diameter), *fine_rule(layer.height, sensor.diameter)
         )
         half = nodes.size // 2
         kx, ky = nodes[half:], nodes[:, None]
-        power = 2.0 * weights[half:] * weights[:, None] * spectrum(kx**2 + ky**2, layer.strength, outer_scale)
+        power = 2.0 * weights[half:] * weights[:, None] * von_karman_density(kx**2 + ky**2, layer.strength, outer_scale)
         footprints = [view(sensor, star, of).footprints[i] for star in stars]
         distinct = list(dict.fromkeys(footprints))
-        seen = np.concatenate([sensor.transform(kx, ky, f, looked_up).reshape(sensor.n_outputs, -1) for f in distinct])
+        seen = np.concatenate(
+            [sensor.transform(kx, ky, f, tabulated_bessel_ratio).reshape(sensor.n_outputs, -1) for f in distinct]
+        )
         seen *= np.sqrt(power).ravel()
         parts = np.real(seen @ seen.conj().T)
         rows = np.concatenate([np.arange(sensor.n_outputs) + distinct.index(f) * sensor.n_outputs for f in footprints])

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record, Training, delayed, frame_mean
+from wfsobs.record import Record, Training, delay_signal, frame_mean
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.disturbance import make_disturbance
 from wfsobs.simulation.sensing import measure
@@ -64,10 +64,10 @@ def _run(scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watc
         u = integrator(seen.lgs, scenario.loop.gain, scenario.loop.leak)
     n = scenario.sensors.exposure_ratio
     return Record(
-        y_lgs=seen.lgs + delayed(u, 2),
+        y_lgs=seen.lgs + delay_signal(u, 2),
         u=u,
         dt=scenario.dt,
-        y_ngs=seen.ngs + frame_mean(delayed(u, 1), n),
+        y_ngs=seen.ngs + frame_mean(delay_signal(u, 1), n),
         ratio=n,
         turbulence=disturbance.turbulence,
         vibration=disturbance.vibration,

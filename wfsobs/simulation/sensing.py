@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import delayed, frame_mean
+from wfsobs.record import delay_signal, frame_mean
 from wfsobs.scenario import Scenario
 from wfsobs.simulation import events
 from wfsobs.simulation.disturbance import Disturbance
@@ -59,9 +59,9 @@ def _together(scenario: Scenario, seen: Sequence[Array], vibration: Array, error
     stars = len(errors)
     if scenario.sensors.lgs_combination == MEAN:
         turbulence = seen[0] if len(seen) == 1 else np.mean(seen[:stars], axis=0)
-        return delayed(turbulence + vibration, 1) + np.mean(errors, axis=0)
+        return delay_signal(turbulence + vibration, 1) + np.mean(errors, axis=0)
     every = list(seen) * stars if len(seen) == 1 else seen[:stars]
-    each = [delayed(x + vibration, 1) + error for x, error in zip(every, errors, strict=True)]
+    each = [delay_signal(x + vibration, 1) + error for x, error in zip(every, errors, strict=True)]
     return np.tensordot(np.stack(each, axis=1), lgs_weights(scenario, stars), ([1, 2], [1, 2]))
 
 

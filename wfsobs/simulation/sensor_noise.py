@@ -12,7 +12,7 @@ from wfsobs.scenario.lenslet_fit import Kind, fit
 from wfsobs.sensors.aliasing import Aliasing
 from wfsobs.sensors.lenslets import Lenslets
 from wfsobs.sensors.shack_hartmann import ShackHartmann
-from wfsobs.sensors.spots import Spots
+from wfsobs.sensors.spots import SpotModel
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.typing import Array
 
@@ -42,7 +42,7 @@ def noise_covariance(scenario: Scenario, kind: Kind) -> Array:
     if s.noise_from == "nm":
         return np.diag(_stated_noise(scenario, kind) ** 2)
     photons, fwhm = (s.spots.lgs_photons, s.spots.lgs_fwhm) if kind == "lgs" else (s.spots.ngs_photons, s.spots.ngs_fwhm)
-    spots = Spots(photons, s.spots.read_noise, fwhm, s.spots.pixel_scale, s.spots.pixels)
+    spots = SpotModel(photons, s.spots.read_noise, fwhm, s.spots.pixel_scale, s.spots.pixels)
     return shack_hartmann(scenario, kind).noise_covariance(spots)
 
 

@@ -18,7 +18,7 @@ from wfsobs.scenario.groups.atmosphere import PsdTable
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.spectrum import gaussian_signal, table_power
-from wfsobs.signal.statespace import sampled
+from wfsobs.signal.statespace import sample_ar3
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.sensor_noise import sensor
 from wfsobs.simulation.synthesis import line_width, period_steps, widened
@@ -124,13 +124,13 @@ def _ar2(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Arr
 
 
 def _ar3(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
-    return sampled(third_order_process(scenario, mode, scenario.dt), n, rng)
+    return sample_ar3(third_order_process(scenario, mode, scenario.dt), n, rng)
 
 
 def _processes(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
     found = processes(scenario, mode, scenario.dt)
     parts = [
-        sampled(p, n, own) if isinstance(p, Ar3) else p.sample(n, own)
+        sample_ar3(p, n, own) if isinstance(p, Ar3) else p.sample(n, own)
         for p, own in zip(found, rng.spawn(len(found)), strict=True)
     ]
     return np.sum(parts, axis=0) if parts else np.zeros(n)

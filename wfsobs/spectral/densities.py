@@ -1,4 +1,4 @@
-"""Densities of many AR(2) processes at once, and their derivatives in closed form: what a fit in milliseconds needs."""
+"""Densities of many AR(2) processes at once, and their derivatives in closed form, for fits in milliseconds."""
 
 from __future__ import annotations
 
@@ -9,14 +9,27 @@ from wfsobs.typing import Array
 
 
 def densities(numbers: Array, dt: float, f: Array) -> tuple[Array, Array]:
-    """One-sided density [um^2/Hz] of every process at f [Hz], (processes, len(f)), and the derivatives of its logarithm by the
-    numbers of the process, (processes, 3, len(f)).
-
-    numbers : (processes, 3) log of omega [rad/s], logit of the damping, log of the rms [um]
+    """Compute the densities of AR(2) processes and the derivatives of their logarithms.
 
     The density is that of the drive over the squares of two distances |1 - r exp(i a)|^2 = (1 - r)^2 + 4 r sin(a / 2)^2, where
     r exp(+- i angle) are the poles and a = angle -+ 2 pi f dt; that of the drive has two such distances as well, with a = angle
     and a = angle - pi.
+
+    Parameters
+    ----------
+    numbers : Array
+        Log of omega [rad/s], logit of the damping, log of the rms [um], (processes, 3).
+    dt : float
+        Time step [s].
+    f : Array
+        Frequencies [Hz].
+
+    Returns
+    -------
+    density : Array
+        One-sided [um^2/Hz], (processes, len(f)).
+    slopes : Array
+        Derivatives of its logarithm by the numbers, (processes, 3, len(f)).
     """
     omega, damping, rms = np.exp(numbers[:, :1]), expit(numbers[:, 1:2]), np.exp(numbers[:, 2:])
     damped, rest = damping * omega * dt, np.sqrt(expit(-numbers[:, 1:2]) * (1.0 + damping))  # rest = sqrt(1 - damping^2)

@@ -1,4 +1,4 @@
-"""Pure lines: x(t) = Re(c exp(2 pi i f t)), found and taken off in the time domain."""
+"""Undamped lines: x(t) = Re(c exp(2 pi i f t)), found and subtracted in the time domain."""
 
 from __future__ import annotations
 
@@ -12,26 +12,34 @@ from wfsobs.typing import Array
 
 
 @dataclass(frozen=True)
-class Line:
-    """frequency [Hz], amplitude : c, complex [um]."""
+class Sinusoid:
+    """An undamped line.
+
+    Attributes
+    ----------
+    frequency : float
+        Frequency f [Hz].
+    amplitude : complex
+        Amplitude c [um].
+    """
 
     frequency: float
     amplitude: complex
 
     @property
     def rms(self) -> float:
-        """[um]."""
+        """Root mean square [um]."""
         return abs(self.amplitude) / np.sqrt(2.0)
 
     def signal(self, n: int, dt: float) -> Array:
-        """(n,) [um]."""
-        return (self.amplitude * _turning(self.frequency, n, dt)).real
+        """Return `n` steps of the signal, (n,) [um]."""
+        return (self.amplitude * _phasor(self.frequency, n, dt)).real
 
     def standard_deviations(self, n: int, dt: float, floor: float) -> tuple[float, float]:
-        """Of frequency [Hz] and rms [um] over white noise of the density floor [um^2/Hz].
+        """Return the standard deviations of frequency [Hz] and rms [um] in white noise of density `floor` [um^2/Hz].
 
         The Cramer-Rao bounds (Rife and Boorstyn, IEEE Trans. Inf. Theory 20, 591, 1974), with rho = rms^2 T / floor,
-        sigma_f = sqrt(6 / rho) / (2 pi T) and sigma_rms = rms / sqrt(2 rho), times what the taper loses.
+        sigma_f = sqrt(6 / rho) / (2 pi T) and sigma_rms = rms / sqrt(2 rho), times the loss by the taper.
         """
         T, h, t = n * dt, taper(n), (np.arange(n) - (n - 1) / 2.0) / n
         rho = self.rms**2 * T / floor
@@ -40,21 +48,21 @@ class Line:
         return np.sqrt(6.0 / rho) / (2.0 * np.pi * T) * float(in_frequency), self.rms / np.sqrt(2.0 * rho) * float(in_rms)
 
 
-def nearest_line(x: Array, dt: float, near: float, within: float) -> Line:
-    """The line of greatest power in x (n,), at `near` [Hz] to +- `within`."""
+def nearest_line(x: Array, dt: float, near: float, within: float) -> Sinusoid:
+    """Find the line of greatest power in x (n,), at `near` [Hz] to +- `within`."""
     n = len(x)
     tapered, total = taper(n) * x, float(taper(n).sum())
 
     def transform(f: float) -> complex:
-        return complex(np.vdot(_turning(f, n, dt), tapered))
+        return complex(np.vdot(_phasor(f, n, dt), tapered))
 
     low, high = max(near - within, 0.1 / (n * dt)), min(near + within, 0.5 / dt)
     best = minimize_scalar(lambda f: -abs(transform(f)), bounds=(low, high), method="bounded", options={"xatol": 1e-4 / (n * dt)})
-    return Line(float(best.x), 2.0 * transform(float(best.x)) / total)
+    return Sinusoid(float(best.x), 2.0 * transform(float(best.x)) / total)
 
 
-def _turning(f: float, n: int, dt: float) -> Array:
-    """exp(2 pi i f t), (n,), as an outer product of two shorter ones, which is fast."""
+def _phasor(f: float, n: int, dt: float) -> Array:
+    """Return exp(2 pi i f t), (n,), as an outer product of two shorter ones, which is fast."""
     block = 256
     fast = np.exp(2j * np.pi * f * dt * np.arange(block))
     slow = np.exp(2j * np.pi * f * dt * block * np.arange(-(-n // block)))

@@ -1,4 +1,4 @@
-"""The spectrum of one mode of z: white noise, turbulence of order two or three, AR(2) resonances. Pure lines are in `lines`."""
+"""The spectrum of one mode of z: white noise, turbulence of order two or three, AR(2) resonances. For lines see `lines`."""
 
 from __future__ import annotations
 
@@ -14,19 +14,33 @@ from wfsobs.signal.ar3 import Ar3
 from wfsobs.typing import Array
 
 STEP = 1e-4
-"""Of the central differences, in the logarithm of a parameter."""
+"""Step of the central differences, in the logarithm of a parameter."""
 
 SLOW, FAST, LEAST = 1e-3, 1.5, 0.02
-"""Bounds of omega of turbulence of third order, over the rate, and of its damping: beyond them it loses digits."""
+"""Bounds of omega of third-order turbulence, over the rate, and of its damping: beyond them it loses digits."""
 RMS = 2
-"""Place of the log of the rms among the numbers of a process."""
+"""Index of the log of the rms among the numbers of a process."""
 HIGHEST = 0.999
-"""Damping of a process at most: at 1 its two poles are one."""
+"""Maximum damping of a process: at 1 its two poles are one."""
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """noise : rms of the white noise [um]; turbulence, background : coloured noise, or None each; resonances : any number."""
+    """Model of the spectrum of one mode.
+
+    Attributes
+    ----------
+    noise : float
+        Rms of the white noise [um].
+    dt : float
+        Time step [s].
+    turbulence : Ar2 or Ar3, optional
+        Coloured noise of the atmosphere.
+    resonances : tuple of Ar2
+        Any number.
+    background : Ar2, optional
+        Another coloured noise.
+    """
 
     noise: float
     dt: float
@@ -36,32 +50,34 @@ class Spectrum:
 
     @property
     def processes(self) -> tuple[Ar2 | Ar3, ...]:
-        """Turbulence and background, where there are any, and the resonances."""
+        """Turbulence and background, where present, and the resonances."""
         return tuple(p for p in (self.turbulence, self.background) if p is not None) + self.resonances
 
     def psd(self, f: Array) -> Array:
-        """One-sided power spectral density [um^2/Hz] at f [Hz]."""
+        """Return the one-sided power spectral density [um^2/Hz] at f [Hz]."""
         at = _Frequencies(f, self.dt)
         return 2.0 * self.dt * self.noise**2 + sum((at.density(p) for p in self.processes), np.zeros_like(f))
 
     @property
     def vector(self) -> Array:
-        """log noise, then log omega, logit damping, log rms of every process, (numbers,); a third corner lies beyond
-        omega, its number is the log of how far, over omega."""
+        """Parameter vector: log noise, then log omega, logit damping, log rms of every process, (numbers,).
+
+        A third corner lies beyond omega; its parameter is the log of the distance, over omega.
+        """
         return np.concatenate([[np.log(self.noise)], *map(_vector, self.processes)])
 
     @property
     def starts(self) -> list[int]:
-        """Where the numbers of every process start in `vector`, and where the last ends."""
+        """Index in `vector` of the first parameter of every process, and of the end."""
         return list(accumulate((3 + isinstance(p, Ar3) for p in self.processes), initial=1))
 
     @property
-    def fixed(self) -> list[int]:
-        """Which numbers of `vector` no fit moves: the damping of the background, which is to be flat up to its corner."""
+    def fixed_parameters(self) -> list[int]:
+        """Indices in `vector` that no fit changes: the damping of the background, which is flat up to its corner."""
         return [] if self.background is None else [self.starts[0 if self.turbulence is None else 1] + 1]
 
-    def moved(self, vector: Array) -> Spectrum:
-        """The spectrum with these numbers as its `vector`."""
+    def with_vector(self, vector: Array) -> Spectrum:
+        """Return the spectrum with this parameter `vector`."""
         processes = [_process(vector[a:b], self.dt) for a, b in pairwise(self.starts)]
         turbulence, background = (None if p is None else processes.pop(0) for p in (self.turbulence, self.background))
         return replace(
@@ -69,7 +85,7 @@ class Spectrum:
         )
 
     def slopes(self, f: Array, wanted: Sequence[int]) -> Array:
-        """Derivatives of the density by the wanted numbers of `vector`, in their order, (len(wanted), len(f)) [um^2/Hz]."""
+        """Return the derivatives of the density by the wanted parameters, in their order, (len(wanted), len(f)) [um^2/Hz]."""
         on = _Frequencies(f, self.dt)
         rows = {0: np.full_like(f, 4.0 * self.dt * self.noise**2)}
         for start, p in zip(self.starts, self.processes, strict=False):
@@ -88,13 +104,13 @@ class Spectrum:
 
 
 class _Frequencies:
-    """Where the densities of many processes are taken: they share sine and cosine, which is most of the work of `Ar2.psd`."""
+    """Frequencies for the densities of many processes: they share sine and cosine, most of the work of `Ar2.psd`."""
 
     def __init__(self, f: Array, dt: float):
         self.f, self.sine, self.cosine = f, np.sin(np.pi * f * dt), np.cos(np.pi * f * dt)
 
     def density(self, p: Ar2 | Ar3) -> Array:
-        """One-sided power spectral density [um^2/Hz] of a process."""
+        """Return the one-sided power spectral density [um^2/Hz] of a process."""
         if isinstance(p, Ar3):
             return p.psd(self.f)
         damped, half = p.damping * p.omega * p.dt, 0.5 * p.omega * np.sqrt(1.0 - p.damping**2) * p.dt

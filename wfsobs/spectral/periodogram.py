@@ -1,4 +1,4 @@
-"""The periodogram of one mode, tapered, and its bins gathered into cells for fits."""
+"""The tapered periodogram of one mode, and its bins averaged in cells for fits."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ from scipy.signal.windows import tukey
 from wfsobs.typing import Array
 
 TAPERED, MOST_TAPERED = 500, 0.05
-"""Samples under the cosine at either end of a record, and their share at most. Leakage of turbulence over the noise falls as f^-6
-beyond two periods of it, 4 Hz at 1 kHz, below which no noise is seen; more would cost power of lines."""
+"""Samples under the cosine at either end of a record, and their maximum share.
+
+Leakage of turbulence over the noise falls as f^-6 beyond two periods of it, 4 Hz at 1 kHz, below which no noise is visible; more
+would cost power of lines.
+"""
 FINE, NEAR = 200, 8
 """A cell is at most 1 / FINE of its frequency wide, and 1 / NEAR of its distance to the next resonance."""
 
 
 @lru_cache(maxsize=4)
 def taper(n: int) -> Array:
-    """Tukey's taper for n samples, its mean square 1, (n,)."""
+    """Return Tukey's taper for n samples, its mean square 1, (n,)."""
     h = tukey(n, 2.0 * min(TAPERED / n, MOST_TAPERED))
     h /= np.sqrt(np.mean(h**2))
     h.flags.writeable = False
@@ -29,24 +32,27 @@ def taper(n: int) -> Array:
 
 @lru_cache(maxsize=4)
 def inflation(n: int) -> float:
-    """By what the taper raises the variance of a mean over bins, n sum h^4 / (sum h^2)^2: 1.009 at 60 000 samples."""
+    """Return the factor by which the taper raises the variance of a mean over bins.
+
+    n sum h^4 / (sum h^2)^2: 1.009 at 60 000 samples.
+    """
     return float(np.mean(taper(n) ** 4))
 
 
 def periodogram(x: Array, dt: float, pad: int = 1) -> Array:
-    """One-sided periodogram [unit^2/Hz] of x (n,) at j / (pad n dt), j = 1, 2, ... below Nyquist."""
+    """Compute the one-sided periodogram [unit^2/Hz] of x (n,) at j / (pad n dt), j = 1, 2, ... below Nyquist."""
     n = len(x)
     spectrum = rfft(taper(n) * x, pad * n)[1 : (pad * n + 1) // 2]
     return 2.0 * dt / n * (spectrum.real**2 + spectrum.imag**2)
 
 
-def frequencies(n: int, dt: float, pad: int = 1) -> Array:
-    """Those of `periodogram` [Hz]."""
+def periodogram_frequencies(n: int, dt: float, pad: int = 1) -> Array:
+    """Return the frequencies [Hz] of `periodogram`."""
     return np.arange(1, (pad * n + 1) // 2) / (pad * n * dt)
 
 
 def fast_length(n: int) -> int:
-    """The longest length up to n whose Fourier transform is fast, at most 2 % shorter, or n."""
+    """Return the longest length up to n whose Fourier transform is fast, at most 2 % shorter, or n."""
     for length in range(n, int(0.98 * n), -1):
         if next_fast_len(length) == length:
             return length
@@ -54,11 +60,23 @@ def fast_length(n: int) -> int:
 
 
 class Cells:
-    """Bins gathered where the spectrum is smooth: frequency [Hz], mean of the periodogram, number of bins and share of them that
-    is measured, each (cells,).
+    """Bins of a periodogram, averaged where the spectrum is smooth.
 
-    resonances : frequencies [Hz] near which cells stay narrow; keep : (bins,) which bins count; share : (bins,) of each that is
-    measured (`missing`), all of it unless told
+    Parameters
+    ----------
+    f, I : Array
+        Frequencies [Hz] and periodogram, (bins,).
+    keep : Array
+        Bins in use, bool (bins,).
+    resonances : iterable of float
+        Frequencies [Hz] near which cells stay narrow.
+    share : Array or float
+        Measured share of each bin (`missing`); by default all.
+
+    Attributes
+    ----------
+    frequency, mean, count, share : Array
+        Frequency [Hz], mean of the periodogram, number of bins and measured share, each (cells,).
     """
 
     def __init__(

@@ -1,9 +1,9 @@
-"""The spectrum of one mode from a window of a few seconds, in milliseconds.
+"""Fast fit of the spectrum of one mode, for repeated use on windows of a few seconds: milliseconds.
 
-What `identify` does with care, tests and errors, for who asks again every half second: the background of the window before,
-moved to this one; the highest maxima of the whitened periodogram as resonances, all at once; a few Newton steps of Whittle's
-likelihood for all numbers; and once more for what is left. A weak peak that is none costs the filter less than one that it lacks,
-so that less is asked of a peak than in `search`.
+A short form of `identify`, without its tests and errors: the background of the window before, adapted to this one; the highest
+maxima of the whitened periodogram as resonances, all at once; a few Newton steps of Whittle's likelihood for all parameters; and
+the same once more for the remainder. A false weak peak costs the filter less than a missed one, so the threshold is lower than
+in `search`.
 """
 
 from __future__ import annotations
@@ -18,42 +18,61 @@ from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.spectral.densities import densities
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.periodogram import Cells, frequencies, periodogram
+from wfsobs.spectral.periodogram import Cells, periodogram, periodogram_frequencies
 from wfsobs.spectral.search import LOWEST
 from wfsobs.spectral.whittle import first_guess
 from wfsobs.typing import Array
 
 SHORTEST = 100
-"""Samples of a window at least."""
+"""Minimum samples of a window."""
 FEWEST = 15.0
-"""Periods that a peak has in a window at least: with fewer, turbulence is in the way of its maximum."""
+"""Minimum periods of a peak in a window: with fewer, turbulence hides its maximum."""
 PAD = 2
-"""Frequencies per bin at which maxima are looked for."""
+"""Frequencies per bin in the search for maxima."""
 HEIGHT, AT, DEEPER = 6.0, 10.0, 0.35
-"""I / S that a maximum at AT [Hz] needs over noise to be taken for a peak. It grows as log f, since false ones get more by
-number, and by DEEPER log(S / noise), since the more turbulence there is the more of it a false one takes."""
+"""Minimum I / S over noise of a maximum at AT [Hz] that counts as a peak.
+
+It grows as log f, since the number of false maxima does, and by DEEPER log(S / noise), since a false peak takes more where
+there is more turbulence.
+"""
 APART = 2.0
-"""Bins between two peaks at least."""
+"""Minimum distance of two peaks, in bins."""
 START = 0.5
 """Half width of a new peak, in bins."""
 NARROWEST, WIDEST = 0.3, 0.3
-"""Half width of a peak in bins at least, which is what a window can tell; its damping at most."""
+"""Minimum half width of a peak in bins, the resolution of a window; its maximum damping."""
 WORTH = 4.0
-"""Log-likelihood that a peak has to be worth to be kept."""
+"""Minimum gain of log-likelihood of a peak that is kept."""
 CLIPPED = 4.0
-"""I / S from which a bin says no more of the background: it is of a peak."""
+"""I / S above which a bin belongs to a peak, not to the background."""
 STARTS = 2
-"""Corners of turbulence that the first guess tries: higher ones end where these do."""
+"""Corners of turbulence in the first guess: higher ones converge to the same."""
 STEPS, ENOUGH = 6, 0.2
-"""Of Newton's method, at a time at most; the gain of log-likelihood by one below which there is none more."""
+"""Maximum number of Newton steps in a row; gain of log-likelihood below which they end."""
 REACH = 1.0
-"""How far a number moves in one step, a logarithm; a frequency moves by half a bin."""
+"""Maximum change of a logarithmic parameter in one step; a frequency moves by half a bin."""
 
 
 def quick_spectrum(z: Array, dt: float, most: int, lowest: float = LOWEST, before: Spectrum | None = None) -> Spectrum:
-    """Noise, turbulence and up to `most` peaks from `lowest` [Hz] on, of z (n,) [um], n at least SHORTEST.
+    """Fit noise, turbulence and up to `most` peaks to a window.
 
-    before : the spectrum of a window that may have been much the same
+    Parameters
+    ----------
+    z : Array
+        Pseudo-open-loop measurements, (n,) with n at least SHORTEST [um].
+    dt : float
+        Time step [s].
+    most : int
+        Maximum number of peaks.
+    lowest : float
+        Minimum frequency of a peak [Hz].
+    before : Spectrum, optional
+        Spectrum of a similar window, the first guess.
+
+    Returns
+    -------
+    Spectrum
+        The fit.
     """
     if np.ptp(z) == 0:
         return Spectrum(float(np.finfo(float).tiny), dt)
@@ -61,7 +80,7 @@ def quick_spectrum(z: Array, dt: float, most: int, lowest: float = LOWEST, befor
     fit = _Fit(
         z,
         dt,
-        first_guess(frequencies(len(z), dt), periodogram(z, dt), dt, STARTS)
+        first_guess(periodogram_frequencies(len(z), dt), periodogram(z, dt), dt, STARTS)
         if before is None or before.turbulence is None
         else before,
     )
@@ -76,13 +95,15 @@ def quick_spectrum(z: Array, dt: float, most: int, lowest: float = LOWEST, befor
 
 
 class _Fit:
-    """A periodogram I at f, a finer one, and the numbers of the spectrum: log noise, then three of every process, turbulence
-    first where there is any (`densities`)."""
+    """A fit: periodogram I at f, a finer one, and the parameters of the spectrum.
+
+    x: log noise, then three per process, turbulence first where there is any (`densities`).
+    """
 
     def __init__(self, z: Array, dt: float, start: Spectrum):
         n = len(z)
-        self.dt, self.f, self.I = dt, frequencies(n, dt), periodogram(z, dt)
-        self.fine_f, self.fine = frequencies(n, dt, PAD), periodogram(z, dt, PAD)
+        self.dt, self.f, self.I = dt, periodogram_frequencies(n, dt), periodogram(z, dt)
+        self.fine_f, self.fine = periodogram_frequencies(n, dt, PAD), periodogram(z, dt, PAD)
         self.df = self.f[0]
         processes = [] if start.turbulence is None else [start.turbulence]
         self.first = 1 + 3 * len(processes)
@@ -91,12 +112,12 @@ class _Fit:
 
     @property
     def resonances(self) -> Array:
-        """A row of numbers each."""
+        """Parameters of the resonances, a row each."""
         return self.x[self.first :].reshape(-1, 3)
 
     @property
     def spectrum(self) -> Spectrum:
-        """As processes."""
+        """The fit as processes."""
         found = [
             Ar2(float(np.exp(w)), float(1.0 / (1.0 + np.exp(-d))), float(np.exp(rms)), self.dt)
             for w, d, rms in self.x[1:].reshape(-1, 3)
@@ -105,14 +126,14 @@ class _Fit:
         return Spectrum(float(np.exp(self.x[0])), self.dt, turbulence, tuple(found))
 
     def density(self, x: Array, f: Array) -> tuple[Array, Array]:
-        """S (len(f),) and the derivatives of its logarithm by x, (len(x), len(f))."""
+        """Return S (len(f),) and the derivatives of its logarithm by x, (len(x), len(f))."""
         noise = np.full_like(f, 2.0 * self.dt * np.exp(2.0 * x[0]))
         S, slopes = densities(x[1:].reshape(-1, 3), self.dt, f)
         total = noise + S.sum(axis=0)
         return total, np.vstack([2.0 * noise, (S[:, None] * slopes).reshape(-1, len(f))]) / total
 
     def background(self) -> None:
-        """Noise and turbulence as they are in this window, whatever its peaks."""
+        """Adapt noise and turbulence to this window, whatever its peaks."""
         whole = self.cells.mean
         for _ in range(2):
             self.cells.mean = np.minimum(whole, CLIPPED * self.density(self.x, self.cells.frequency)[0])
@@ -120,7 +141,7 @@ class _Fit:
         self.cells.mean = whole
 
     def maxima(self, lowest: float, most: int) -> list[tuple[float, float]]:
-        """Frequency and density of up to `most` maxima of the whitened periodogram that no peak explains, the highest first."""
+        """Return frequency and density of up to `most` unexplained maxima of the whitened periodogram, the highest first."""
         f = self.fine_f
         S = np.interp(f, self.f, self.density(self.x, self.f)[0])
         ratio = self.fine / S
@@ -138,7 +159,7 @@ class _Fit:
         return found
 
     def add(self, peaks: Sequence[tuple[float, float]]) -> bool:
-        """Resonances of START at these frequencies and densities; whether there are any."""
+        """Add resonances of width START at these frequencies and densities; return whether there are any."""
         for frequency, density in peaks:
             half = START * self.df
             new = Ar2(2.0 * pi * frequency, min(half / frequency, WIDEST), float(np.sqrt(0.5 * pi * half * density)), self.dt)
@@ -147,17 +168,17 @@ class _Fit:
         return len(peaks) > 0
 
     def improve(self) -> None:
-        """Newton steps with the expected second derivatives, held back (Levenberg, Marquardt) where they lead uphill."""
+        """Take Newton steps with the expected second derivatives, damped (Levenberg, Marquardt) where they lead uphill."""
         f, count, mean = self.cells.frequency, self.cells.count, self.cells.mean
         reach = np.full(len(self.x), REACH)
         reach[self.first :: 3] = np.minimum(0.5 * self.df / np.exp(self.resonances[:, 0]) * (2.0 * pi), REACH)
-        x = self._allowed(self.x)
+        x = self._clip_to_bounds(self.x)
         S, slopes = self.density(x, f)
         value, held = count @ (np.log(S) + mean / S), 0.3
         for _ in range(STEPS):
             gradient, F = slopes @ (count * (1.0 - mean / S)), (slopes * count) @ slopes.T
             step = np.linalg.solve(F + np.diag(held * np.diag(F) + 1e-2), -gradient)
-            trial = self._allowed(x + np.clip(step, -reach, reach))
+            trial = self._clip_to_bounds(x + np.clip(step, -reach, reach))
             S_there, slopes_there = self.density(trial, f)
             there = count @ (np.log(S_there) + mean / S_there)
             if there >= value:
@@ -168,8 +189,8 @@ class _Fit:
                 break
         self.x = x
 
-    def _allowed(self, x: Array) -> Array:
-        """x with every number within its bounds."""
+    def _clip_to_bounds(self, x: Array) -> Array:
+        """Return x with every parameter clipped to its bounds."""
         x = x.copy()
         if self.first > 1:
             x[1] = np.clip(x[1], log(pi * self.df), log(0.5 / self.dt))
@@ -180,7 +201,7 @@ class _Fit:
         return x
 
     def prune(self) -> None:
-        """Without the resonances that are not worth it."""
+        """Remove resonances that gain too little likelihood."""
         count, mean = self.cells.count, self.cells.mean
         S, slopes = self.density(self.x, self.cells.frequency)
         share = 0.5 * slopes[self.first + 2 :: 3]  # of each in S

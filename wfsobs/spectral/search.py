@@ -1,8 +1,8 @@
-"""Where a whitened periodogram still holds something: one test over all frequencies, widths and modes.
+"""Peak search in a whitened periodogram: one test over all frequencies, widths and modes.
 
-The whitened periodogram I / S of the right S is exponential of mean 1. A pure line raises one of its bins, a resonance several;
-means over 1 ... 243 bins are Gamma distributed. Every frequency gets a share of the level as df / f: of two equally strong peaks
-the lower is the likelier to be one of a structure; most of it below STRUCTURES.
+The whitened periodogram I / S of the right S is exponential of mean 1. An undamped line raises one of its bins, a resonance
+several; means over 1 ... 243 bins are Gamma distributed. Every frequency gets a share of the level as df / f: of two equally
+strong peaks the lower is the likelier to be one of a structure; most of it below STRUCTURES.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from wfsobs.typing import Array
 WIDTHS = (3, 9, 27, 81, 243)
 """Bins of a mean."""
 PAD = 4
-"""Frequencies per bin at which lines are looked for."""
+"""Frequencies per bin in the search for lines."""
 LOWEST = 5.0
-"""Frequency from which peaks are looked for [Hz], unless told: below, what is left is turbulence that no AR(2) is like."""
+"""Default minimum frequency of a peak [Hz]: below, the remainder is turbulence that no AR(2) matches."""
 OVERLAP = 4
 """Means per width."""
 OF_LINES = 0.8
-"""Share of the level that lines get: one bin has to stand out of all, means of many do so by little."""
+"""Share of the level for lines: one bin has to exceed all others, means of many exceed them by little."""
 SPOILS = 2.0
-"""Mean I / S from which bins would spoil the fit of a spectrum that has no peak there."""
+"""Mean I / S from which bins would spoil the fit of a spectrum without a peak there."""
 STRUCTURES, BELOW = 100.0, 0.9
-"""Frequency up to which structures of telescopes are known to vibrate [Hz], and the share of the level spent below it."""
+"""Maximum frequency at which structures of telescopes are known to vibrate [Hz], and the share of the level spent below it."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Something at `frequency` [Hz] over `width` bins.
+    """A possible peak at `frequency` [Hz] over `width` bins.
 
     strength : gain of log-likelihood if all of it were explained, over the square root of the width: the strongest of all widths
-        is then about as wide as the peak, and has no other one in it
+        is then about as wide as the peak, and contains no other one
     """
 
     frequency: float
@@ -46,19 +46,46 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Found:
-    """The strongest candidate; which bins (bins,) are above their limit at some width, and which of them by so much that they
-    would spoil a fit."""
+class SearchResult:
+    """Result of a peak search.
+
+    Attributes
+    ----------
+    best : Candidate or None
+        The strongest candidate.
+    flagged : Array
+        Bins above their limit at some width, bool (bins,).
+    strong : Array
+        Those so far above it that they would spoil a fit.
+    """
 
     best: Candidate | None
     flagged: Array
     strong: Array
 
 
-def search(fine: Array, n: int, dt: float, modes: int, level: float, lowest: float = LOWEST) -> Found:
-    """Candidates in a whitened periodogram, at PAD frequencies per bin, of n samples; the sum over `modes` of them.
+def search_peaks(fine: Array, n: int, dt: float, modes: int, level: float, lowest: float = LOWEST) -> SearchResult:
+    """Search a whitened periodogram for peaks.
 
-    level : probability of finding any where there is none, OF_LINES of it for lines
+    Parameters
+    ----------
+    fine : Array
+        Sum of the whitened periodograms of all modes, at PAD frequencies per bin.
+    n : int
+        Number of samples of the record.
+    dt : float
+        Time step [s].
+    modes : int
+        Number of modes in the sum.
+    level : float
+        Probability of a false peak where there is none, OF_LINES of it for lines.
+    lowest : float
+        Minimum frequency [Hz].
+
+    Returns
+    -------
+    Found
+        Best candidate and flagged bins.
     """
     T = n * dt
     of_lines, share = OF_LINES * level, (1.0 - OF_LINES) * level / len(WIDTHS)
@@ -86,20 +113,20 @@ def search(fine: Array, n: int, dt: float, modes: int, level: float, lowest: flo
             i = int(np.argmax(strengths))
             if best is None or strengths[i] > best.strength:
                 best = Candidate(float(centre[i]), width, float(strengths[i]))
-    return Found(best, flagged, strong)
+    return SearchResult(best, flagged, strong)
 
 
 def _gain(total: Array, count: int):
-    """Log-likelihood that `count` bins of the sum `total` gain by a spectrum raised to their mean."""
+    """Return the gain of log-likelihood of `count` bins of the sum `total` when the spectrum is raised to their mean."""
     mean = np.maximum(total / count, 1.0)
     return count * (mean - 1.0 - np.log(mean))
 
 
 @lru_cache(maxsize=32)
 def _limits(count: int, T: float, width: int, modes: int, share: float, n: int, lowest: float) -> Array:
-    """What a sum over `width` bins and `modes` modes may reach, at j / T, j = 1 ... count.
+    """Return the limit of a sum over `width` bins and `modes` modes, at j / T, j = 1 ... count.
 
-    A line is looked for between the bins as well: the maximum over a continuous frequency passes u as often as
+    A line is searched between the bins as well: the maximum over a continuous frequency passes u as often as
     sqrt(pi u / 3) exp(-u) per bin and once more (Turkman and Walker, Adv. Appl. Prob. 16, 819, 1984; for sums of several, Davies,
     Biometrika 74, 33, 1987).
     """
@@ -119,7 +146,7 @@ def _limits(count: int, T: float, width: int, modes: int, share: float, n: int, 
 
 
 def _prior(f: Array, lowest: float, highest: float) -> Array:
-    """Density [1/Hz] with which the level is spent from `lowest` to `highest`: as 1 / f, BELOW of it up to STRUCTURES."""
+    """Return the density [1/Hz] of the level from `lowest` to `highest`: as 1 / f, BELOW of it up to STRUCTURES."""
     f = np.maximum(f, lowest)
     if not lowest < STRUCTURES < highest:
         return 1.0 / (f * np.log(highest / lowest))

@@ -17,25 +17,25 @@ from wfsobs.spectral.periodogram import Cells
 from wfsobs.typing import Array
 
 STEPS = 40
-"""Of a fit, at most."""
+"""Maximum number of steps of a fit."""
 TOLERANCE = 1e-2
-"""Distance of a fit from its minimum, in standard deviations of its numbers."""
+"""Distance of a fit from its minimum, in standard deviations of its parameters."""
 NOISE, TURBULENCE, BACKGROUND, RESONANCE = 3.0, (2.0, 8.0, 4.0, 3.0), (1.5, 0.0, 4.0), (0.1, 6.0, 4.0)
-"""How far the numbers of a vector may leave their start: a resonance stays at its place."""
+"""Maximum distance of parameters from their start: a resonance stays near its frequency."""
 NO_NEARER = 1.1
-"""Third corner, over the first two, at which its standard deviation is taken at least."""
+"""Minimum third corner, over the first two, for its standard deviation."""
 
 
-def negative_log_likelihood(spectrum: Spectrum, cells: Cells) -> float:
-    """- log L, less a constant."""
+def spectrum_negative_log_likelihood(spectrum: Spectrum, cells: Cells) -> float:
+    """Return - log L of a spectrum, without a constant."""
     return whittle.negative_log_likelihood(spectrum.psd(cells.frequency), cells.mean, cells.count)
 
 
-def information(spectrum: Spectrum, cells: Cells, wanted: Sequence[int] | None = None) -> Array:
-    """Fisher information of the wanted numbers of `Spectrum.vector`, all unless told, (p, p).
+def spectrum_information(spectrum: Spectrum, cells: Cells, wanted: Sequence[int] | None = None) -> Array:
+    """Return the Fisher information of the wanted parameters of `Spectrum.vector`, by default all, (p, p).
 
-    Where samples are missing, with g the share of a bin that is measured, it is sum g^2 d d' + v v' / sum g (1 - g) with
-    v = sum g (1 - g) d: random gaps carry what a bin loses to all others alike, where noise finds it again and a peak does not.
+    Where samples are missing, with g the measured share of a bin, it is sum g^2 d d' + v v' / sum g (1 - g) with
+    v = sum g (1 - g) d: random gaps spread what a bin loses over all others, where it adds to noise but not to a peak.
     """
     wanted = range(spectrum.starts[-1]) if wanted is None else wanted
     d = spectrum.slopes(cells.frequency, wanted) / spectrum.psd(cells.frequency)
@@ -44,11 +44,25 @@ def information(spectrum: Spectrum, cells: Cells, wanted: Sequence[int] | None =
     return (d * (cells.count * cells.share**2)) @ d.T + np.outer(v, v) / max(carried.sum(), 1e-300)
 
 
-def fitted(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = None) -> Spectrum:
-    """The spectrum of greatest likelihood near the given one; free : which numbers of its vector may move, all unless told but
-    the damping of a background."""
+def fit_spectrum(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = None) -> Spectrum:
+    """Fit a spectrum by maximum likelihood, starting from the given one.
+
+    Parameters
+    ----------
+    spectrum : Spectrum
+        First guess.
+    cells : Cells
+        Periodogram.
+    free : sequence of int, optional
+        Indices of the parameters to fit; by default all but the damping of a background.
+
+    Returns
+    -------
+    Spectrum
+        The fit.
+    """
     start = spectrum.vector
-    index = [i for i in (range(len(start)) if free is None else free) if i not in spectrum.fixed]
+    index = [i for i in (range(len(start)) if free is None else free) if i not in spectrum.fixed_parameters]
     first = () if spectrum.turbulence is None else TURBULENCE[: spectrum.starts[1] - 1]
     second = () if spectrum.background is None else BACKGROUND
     reach = np.array([NOISE, *first, *second, *RESONANCE * len(spectrum.resonances)])[index]
@@ -56,7 +70,7 @@ def fitted(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = None) 
     def moved(x: Array) -> Spectrum:
         vector = start.copy()
         vector[index] = x
-        return spectrum.moved(vector)
+        return spectrum.with_vector(vector)
 
     def density(x: Array) -> Array:
         return moved(x).psd(cells.frequency)
@@ -69,13 +83,13 @@ def fitted(spectrum: Spectrum, cells: Cells, free: Sequence[int] | None = None) 
 
 
 def standard_deviations(spectrum: Spectrum, cells: Cells, inflation: float) -> Array:
-    """Of the numbers of the vector, but of the damping itself in the place of its logit, (p,)."""
+    """Return the standard deviations of the parameters, with that of the damping in place of its logit, (p,)."""
     t = spectrum.turbulence
     if isinstance(t, Ar3):  # at its bound the corner's own number says nothing
         spectrum = replace(spectrum, turbulence=replace(t, corner=max(t.corner, NO_NEARER * t.omega)))
     std = np.zeros(spectrum.starts[-1])
-    free = [i for i in range(len(std)) if i not in spectrum.fixed]
-    covariance = np.linalg.inv(information(spectrum, cells, free) + 1e-12 * np.eye(len(free)))
+    free = [i for i in range(len(std)) if i not in spectrum.fixed_parameters]
+    covariance = np.linalg.inv(spectrum_information(spectrum, cells, free) + 1e-12 * np.eye(len(free)))
     std[free] = np.sqrt(np.maximum(np.diag(covariance) * inflation, 0.0))
     for start, p in zip(spectrum.starts, spectrum.processes, strict=False):
         std[start + 1] *= p.damping * (1.0 - p.damping)
@@ -83,8 +97,24 @@ def standard_deviations(spectrum: Spectrum, cells: Cells, inflation: float) -> A
 
 
 def first_guess(f: Array, I: Array, dt: float, starts: int = 4) -> Spectrum:  # noqa: E741
-    """Noise and turbulence from the medians of the periodogram over bands, which lines and narrow resonances leave as they are;
-    without turbulence where white noise alone is as likely. starts : corners tried, of four, the lowest first."""
+    """Estimate noise and turbulence from medians of the periodogram over bands, which ignore lines and narrow resonances.
+
+    Without turbulence where white noise alone is as likely.
+
+    Parameters
+    ----------
+    f, I : Array
+        Frequencies [Hz] and periodogram, (bins,).
+    dt : float
+        Time step [s].
+    starts : int
+        Number of corners tried, of four, the lowest first.
+
+    Returns
+    -------
+    Spectrum
+        First guess, without resonances.
+    """
     edges = np.unique(np.concatenate([[0], np.geomspace(3, len(f), 60).astype(int)]))
     bands = [slice(a, b) for a, b in pairwise(edges)]
     at = np.array([f[b].mean() for b in bands])
@@ -92,7 +122,7 @@ def first_guess(f: Array, I: Array, dt: float, starts: int = 4) -> Spectrum:  # 
     weight = np.sqrt([b.stop - b.start for b in bands])
 
     def misfit(vector: Array, shape: Spectrum) -> Array:
-        return weight * (np.log(level) - np.log(shape.moved(vector).psd(at)))
+        return weight * (np.log(level) - np.log(shape.with_vector(vector).psd(at)))
 
     noise = float(np.sqrt(np.median(I[len(I) // 2 :]) / np.log(2.0) / (2.0 * dt)))
     alone = Spectrum(noise, dt)
@@ -103,7 +133,7 @@ def first_guess(f: Array, I: Array, dt: float, starts: int = 4) -> Spectrum:  # 
         fit = least_squares(
             misfit, shape.vector, args=(shape,), loss="soft_l1", max_nfev=60, bounds=(shape.vector - 12.0, shape.vector + 12.0)
         )
-        found.append((fit.cost, shape.moved(fit.x)))
+        found.append((fit.cost, shape.with_vector(fit.x)))
     cost, best = min(found, key=lambda pair: pair[0])
     nothing = least_squares(misfit, alone.vector, args=(alone,), loss="soft_l1")
-    return best if nothing.cost - cost > 3.0 * np.log(len(f)) else alone.moved(nothing.x)
+    return best if nothing.cost - cost > 3.0 * np.log(len(f)) else alone.with_vector(nothing.x)

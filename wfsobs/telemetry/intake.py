@@ -17,7 +17,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.telemetry import timestamps as clock
 from wfsobs.telemetry.formats.contents import FAST, NGS, SIGNALS, TRAINING, Contents
 from wfsobs.typing import Array
-from wfsobs.units import ANGLES, micrometres_per, unit_named
+from wfsobs.units import ANGLES, micrometres_per, parse_unit
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def _into_micrometres(signals: dict[str, Array], contents: Contents, stated: Sta
     """Scale every signal to um; returns (what to keep of unit, sign and aperture as one line, sign of the commands)."""
     arrays, own = contents.arrays, contents.units
     if "unit" in arrays:
-        unit = unit_named(str(arrays["unit"]))
+        unit = parse_unit(str(arrays["unit"]))
         if unit is None:
             raise RecordError(f"unit is {str(arrays['unit'])[:40]!r}, which is no unit of a wavefront")
         own = dict.fromkeys(signals, unit) | own

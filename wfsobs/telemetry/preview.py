@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wfsobs.record import Record, RecordError, held
+from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import rms, welch_psd
 from wfsobs.telemetry.formats.psd import NoSpectrumError, read_psd
@@ -116,7 +116,7 @@ def preview(data: bytes, name: str, scenario: Scenario | None = None, stated: St
     z = record.z
     signals = {"y_lgs": record.y_lgs, "u": record.u, "z": z}
     values = {key: tuple(rms(column[~np.isnan(column)]) for column in signal.T) for key, signal in signals.items()}
-    frequency, spectrum = welch_psd(held(z), record.dt)
+    frequency, spectrum = welch_psd(hold_last(z), record.dt)
     return Preview(record, shown, values, frequency, spectrum)
 
 

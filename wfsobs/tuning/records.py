@@ -20,7 +20,7 @@ from wfsobs.observers.missing import bridged
 from wfsobs.prior import Model
 from wfsobs.priors_from.scenario import bands_of, prior_of, settings_of
 from wfsobs.progress import Watch
-from wfsobs.record import Record, RecordError, Training, delayed, frame_mean
+from wfsobs.record import Record, RecordError, Training, delay_signal, frame_mean
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import TRAINING_MARGIN, simulate
 from wfsobs.tuning.space import Space
@@ -146,7 +146,7 @@ def piece(record: Record, start: int, stop: int) -> Record:
     u = record.u[start:stop]
     y_ngs = None
     if record.y_ngs is not None and record.ratio is not None:
-        y_ngs = record.z_ngs[start:stop] + frame_mean(delayed(u, record.delay - 1), record.ratio)
+        y_ngs = record.z_ngs[start:stop] + frame_mean(delay_signal(u, record.delay - 1), record.ratio)
         y_ngs[:1] = np.nan  # a frame that began before the piece
 
     def part(x: Array | None) -> Array | None:
@@ -154,7 +154,7 @@ def piece(record: Record, start: int, stop: int) -> Record:
 
     return replace(
         record,
-        y_lgs=record.z[start:stop] + delayed(u, record.delay),
+        y_lgs=record.z[start:stop] + delay_signal(u, record.delay),
         u=u,
         y_ngs=y_ngs,
         turbulence=part(record.turbulence),

@@ -32,7 +32,7 @@ from wfsobs.prior import Bands, Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import DELAY, Measurements, RecordError, Training, pseudo_open_loop
 from wfsobs.settings import Section
-from wfsobs.signal.linalg import eliminate, solved_rows
+from wfsobs.signal.linalg import eliminate, solve_rows
 from wfsobs.typing import Array
 
 ROWS = 256
@@ -92,7 +92,7 @@ def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExp
     S[m:, :m] = targets[first : first + m], points.delta
     check_condition(S[:m, :m], kernel)
     eliminate(S, m, watch.check)
-    a, b = solved_rows(S, m)
+    a, b = solve_rows(S, m)
     constant = (points.delta @ a) / (1.0 / kernel.variance + points.delta @ b)
     return TrainedGpr(signals[: first + m] / kernel.length_scale, depth, points, a - b * constant, float(constant), kernel)
 

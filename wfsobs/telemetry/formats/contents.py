@@ -11,7 +11,7 @@ import numpy as np
 from wfsobs.record import RecordError
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.typing import Array
-from wfsobs.units import unit_named
+from wfsobs.units import parse_unit
 
 FAST = ("y_lgs", "u", "turbulence", "vibration", "open_loop_y")
 """One row per fast step."""
@@ -44,7 +44,7 @@ class Contents:
 
     def state_unit(self, name: str, text: str) -> None:
         """Note the unit of a signal. Raises RecordError for one that is not known, or not that of its other modes."""
-        unit = unit_named(text)
+        unit = parse_unit(text)
         if unit is None:
             raise RecordError(f"{name} is in {text!r}, which is no unit of a wavefront")
         if self.units.setdefault(name, unit) != unit:

@@ -16,7 +16,7 @@ from wfsobs.record import RecordError
 from wfsobs.telemetry.formats.csv import lines_of
 from wfsobs.telemetry.formats.fits import opened
 from wfsobs.typing import Array
-from wfsobs.units import UNITS, micrometres_per, unit_named
+from wfsobs.units import UNITS, micrometres_per, parse_unit
 
 COLUMNS = ("frequency", "tip", "tilt")
 MOST = 64_000_000
@@ -100,7 +100,7 @@ def _scaled(columns: dict[str, Array], units: dict[str, str], unit: str | None, 
     out = {"frequency": columns["frequency"].tolist()}
     for name in COLUMNS[1:]:
         match = SQUARED.fullmatch(units[name].strip())
-        own = unit_named(match["unit"]) if match else None
+        own = parse_unit(match["unit"]) if match else None
         if units[name] and own is None:
             raise RecordError(f"{name} is in {units[name]!r}; it takes the square of {', '.join(UNITS)} per Hz")
         if own and unit and own != unit:
