@@ -1,10 +1,10 @@
-"""How long a run will take and how much memory, told from its settings.
+"""Estimates of the computing time and memory of a run, from its settings.
 
 Measured as processor time on the machine of docs/benchmarks.md (2 virtual cores of an AMD EPYC, one BLAS thread),
-10 s to 300 s of record, m from 20 to 2048, d from 20 to 2000; there a run of the paper's takes 0.62 s, 0.55 s by this. The
-depth and the exposure ratio cost next to nothing. Modes run side by side on two cores, but for those of the adaptive filter,
-whose steps are too small for that. A busy machine takes two to three times as long: what counts here is whether it will be a
-moment or a wait.
+10 s to 300 s of record, m from 20 to 2048, d from 20 to 2000; there a run of the paper's takes 0.62 s, the estimate is 0.55 s.
+The depth and the exposure ratio cost next to nothing. Modes run side by side on two cores, except those of the adaptive filter,
+whose steps are too small for that. A busy machine takes two to three times as long: the estimate only tells a
+moment from a wait.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from wfsobs.simulation.loop import TRAINING_MARGIN
 
 
 def run_seconds(scenario: Scenario) -> float:
-    """About how long simulation, every observer and the scores take [s].
+    """Estimate the time of simulation, every observer and the scores [s].
 
     >>> from wfsobs.scenario.presets import paper
     >>> round(run_seconds(paper()), 1), round(run_seconds(paper().replace({"run.duration": 300})))
@@ -28,7 +28,7 @@ def run_seconds(scenario: Scenario) -> float:
 
 
 def part_seconds(scenario: Scenario) -> dict[str, float]:
-    """What `run_seconds` adds up [s]: the observers that say how long they take, and all else as "rest"."""
+    """Estimate the parts of `run_seconds` [s]: the two GPR, the adaptive filter, and all else as "rest"."""
     n, n_modes, offline = scenario.n_steps, len(scenario.modes), scenario.gpr_offline
     training = offline.depth + offline.training_size + round(TRAINING_MARGIN * scenario.sensors.lgs_rate)
     air = _steps_of_air(scenario)
@@ -43,14 +43,16 @@ def part_seconds(scenario: Scenario) -> dict[str, float]:
 
 
 def _steps_of_air(scenario: Scenario) -> int:
-    """Steps of turbulence that are made, at least those of the record."""
+    """Return the number of steps of turbulence, at least those of the record."""
     return max(scenario.n_steps, round(scenario.air * scenario.sensors.lgs_rate))
 
 
 def frozen_flow_seconds(scenario: Scenario, n_steps: int) -> float:
-    """Turbulence as frozen flow and the sensors' view of it [s], nothing where it is made another way: for every aperture's
-    width of a layer and every beam, 3 ms and 0.3 ms for each mode, and a tenth of that through ideal sensors. Where stars may be
-    far apart against the aperture, waves are closer."""
+    """Estimate the time of frozen flow and its sensors [s]; zero for other sources.
+
+    For every aperture's width of a layer and every beam, 3 ms and 0.3 ms for each mode, and a tenth of that through ideal
+    sensors. Where stars may be far apart against the aperture, waves are closer.
+    """
     t, s = scenario.turbulence, scenario.sensors
     if t.source != "frozen-flow":
         return 0.0
@@ -66,11 +68,11 @@ def frozen_flow_seconds(scenario: Scenario, n_steps: int) -> float:
 
 
 def run_bytes(scenario: Scenario) -> float:
-    """About how much memory a run takes at its height [bytes], both modes at once.
+    """Estimate the peak memory of a run [bytes], both modes at once.
 
-    Measured from 10 s to 300 s of record and m from 20 to 2048, where it is within a third: what is kept of every
-    step, turbulence that grown wind carries past besides, and the windows of the larger GPR, or the waves of frozen flow that are
-    at work.
+    Measured from 10 s to 300 s of record and m from 20 to 2048, where it is within a third: the data of every
+    step, additional turbulence for a growing wind, and the windows of the larger GPR, or the waves of frozen flow in
+    progress.
 
     >>> from wfsobs.scenario.presets import paper
     >>> round(run_bytes(paper()) / 1e6), round(run_bytes(paper().replace({"run.duration": 300})) / 1e6)

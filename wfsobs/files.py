@@ -1,4 +1,4 @@
-"""Writing files so that nothing is ever half-written."""
+"""Writing of files: whole or not at all."""
 
 from __future__ import annotations
 
@@ -11,9 +11,19 @@ from typing import IO
 
 
 def write_whole(path: str | Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Call `write` on a temporary file beside `path`, then rename it to `path`.
+    """Call `write` on a temporary file in the folder of `path`, then rename it to `path`.
 
-    Raises OSError; whatever stood at `path` before then still stands there.
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    write : callable
+        Receives the open file.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written; a file that was at `path` before is unchanged.
     """
     path = Path(path)
     with NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
@@ -28,7 +38,7 @@ def write_whole(path: str | Path, write: Callable[[IO[bytes]], object]) -> None:
 
 
 def check_writable(path: str | Path) -> None:
-    """Raises OSError where `write_whole` could not write to `path` later."""
+    """Raise OSError where `write_whole` could not write to `path`."""
     path = Path(path)
     folder = path.parent
     number, where = (

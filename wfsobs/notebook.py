@@ -1,4 +1,4 @@
-"""Small tables that a notebook shows in the place of a representation."""
+"""Small HTML tables for notebooks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from html import escape
 
 
 def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """An HTML table of plain texts.
+    """Return an HTML table of plain texts.
 
     >>> html_table(("Mode", "rms"), [("tip", "< 1 nm")])
     '<table><thead><tr><th>Mode</th><th>rms</th></tr></thead><tbody><tr><td>tip</td><td>&lt; 1 nm</td></tr></tbody></table>'

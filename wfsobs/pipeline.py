@@ -1,4 +1,4 @@
-"""The flow in one place: Scenario -> Record -> Estimates -> Scores."""
+"""The whole path: Scenario -> Record -> Estimates -> Scores."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Failure:
-    """An observer that gave no estimate, and the one line that says why."""
+    """An observer without an estimate, and the reason in one line."""
 
     observer: str
     reason: str
@@ -35,9 +35,20 @@ class Failure:
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """All of a run: what was asked, what was measured, what was estimated, how well.
+    """Result of a run: scenario, record, estimates and scores.
 
-    Estimates, scores and failures are in the order of the registry.
+    Attributes
+    ----------
+    scenario : Scenario
+        Settings of the run.
+    record : Record
+        Measurements, commands and truth.
+    estimates : tuple of Estimate
+        One per observer and target, in the order of the registry.
+    scores : tuple of Score
+        One per observer, target and mode; the bounds last.
+    failures : tuple of Failure
+        Observers without an estimate.
     """
 
     scenario: Scenario
@@ -56,27 +67,110 @@ class Result:
         return html_table(("Target", "Mode", "Observer", "error, nm"), cells)
 
     def to_dataframe(self) -> pandas.DataFrame:
-        """One row per score, the keys of `wfsobs run --json` as columns. Raises ImportError without pandas."""
+        """Return the scores as a pandas table, one row per score.
+
+        Returns
+        -------
+        pandas.DataFrame
+            The keys of `wfsobs run --json` as columns.
+
+        Raises
+        ------
+        ImportError
+            pandas is not installed.
+        """
         import pandas
 
         return pandas.DataFrame(rows(self.scores, self.scenario.run.seed))
 
     def estimate(self, observer: str, target: str) -> Estimate | None:
-        """The estimate of one observer and target, or None."""
+        """Return the estimate of one observer and target.
+
+        Parameters
+        ----------
+        observer : str
+            Id of the observer.
+        target : str
+            "turbulence" or "vibration".
+
+        Returns
+        -------
+        Estimate or None
+            None where there is no such estimate.
+        """
         return next((e for e in self.estimates if (e.observer, e.target) == (observer, target)), None)
 
 
 def run(scenario: Scenario, *, observers: Sequence[str] | None = None, watch: Watch = QUIET) -> Result:
-    """Simulate a record and run the observers (all unless named) on it. Raises SettingError, Cancelled."""
+    """Simulate a record and run observers on it.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings of the run.
+    observers : sequence of str, optional
+        Ids of the observers; by default all.
+    watch : Watch, optional
+        Receives the progress, and is asked at every block of work whether to stop.
+
+    Returns
+    -------
+    Result
+        Record, estimates and scores.
+
+    Raises
+    ------
+    SettingError
+        Two settings exclude each other, or an observer is unknown.
+    Cancelled
+        `watch` asks to stop.
+
+    See Also
+    --------
+    simulate : The record alone.
+    observe : The observers alone, on any record.
+
+    Examples
+    --------
+    >>> import wfsobs
+    >>> scenario = wfsobs.PRESETS["paper"]().replace({"run.duration": 2.0})
+    >>> wfsobs.run(scenario, observers=["kf-lgs"])
+    Result(1 observers, ...)
+    """
     return observe(simulate(scenario, watch=watch), scenario, observers=observers, watch=watch, simulated=True)
 
 
 def observe(
     record: Record, scenario: Scenario, *, observers: Sequence[str] | None = None, watch: Watch = QUIET, simulated: bool = False
 ) -> Result:
-    """Run the observers on a record. What the record states (step, exposure ratio) overrides the scenario.
+    """Run observers on a record.
 
-    simulated : whether the record was made from the scenario, so that its bound is known
+    The time step and the exposure ratio of the record replace those of the scenario.
+
+    Parameters
+    ----------
+    record : Record
+        Measurements, and the truth where there is one.
+    scenario : Scenario
+        Settings; the models of the observers are made from it.
+    observers : sequence of str, optional
+        Ids of the observers; by default all.
+    watch : Watch, optional
+        Receives the progress, and is asked at every block of work whether to stop.
+    simulated : bool
+        Whether the record was simulated from the scenario, so that its Wiener bound is known.
+
+    Returns
+    -------
+    Result
+        Record, estimates and scores.
+
+    Raises
+    ------
+    SettingError
+        Two settings exclude each other, or an observer is unknown.
+    Cancelled
+        `watch` asks to stop.
     """
     scenario = as_stated(record, scenario)
     scenario.validate()
@@ -89,7 +183,7 @@ def observe(
 
 
 def as_stated(record: Record, scenario: Scenario) -> Scenario:
-    """The scenario with the step and exposure ratio of the record."""
+    """Return the scenario with the time step and exposure ratio of the record."""
     changes: dict[str, float] = {}
     if abs(record.dt * scenario.sensors.lgs_rate - 1.0) > 1e-12:
         changes["sensors.lgs_rate"] = 1.0 / record.dt
@@ -106,7 +200,7 @@ def collect(
     watch: Watch = QUIET,
     least: Sequence[Bound] = (),
 ) -> Result:
-    """A Result with its scores, everything in the order of the registry, the bounds last. Raises Cancelled."""
+    """Score estimates, and return a Result in the order of the registry, the bounds last. Raises Cancelled."""
     order = {name: i for i, name in enumerate(OBSERVERS)}
     names = [m.name for m in scenario.modes][: record.n_modes]
     ordered = sorted(estimates, key=lambda e: (order[e.observer], e.target))
@@ -126,10 +220,11 @@ def each_estimate(
     observers: Sequence[str] | None = None,
     on_partial: Callable[[str, str, Array], None] | None = None,
 ) -> Iterator[Estimate | Failure]:
-    """Run the observers and yield each one's estimates as soon as they are done, the slow ones last. Each receives
-    measurements, its prior and its settings: neither record nor scenario.
+    """Run observers, and yield the estimates of each as soon as they are done, the slow ones last.
 
-    on_partial : told (observer, target, values so far) by observers that deliver in blocks.
+    Each receives measurements, its prior and its settings: neither record nor scenario.
+
+    on_partial : receives (observer, target, values so far) from observers that compute in blocks
     """
     scenario = scenario.before_events  # no observer is told
     unknown = set(observers or ()) - set(OBSERVERS)
@@ -154,7 +249,7 @@ def each_estimate(
 
 
 def _only_forward(tell: Callable[[float], None]) -> Callable[[float], None]:
-    """Progress that never falls back, where two modes of an observer each tell their own."""
+    """Return a progress callback that never decreases, for modes that report each their own."""
     highest = 0.0
 
     def told(fraction: float) -> None:
@@ -166,7 +261,10 @@ def _only_forward(tell: Callable[[float], None]) -> Callable[[float], None]:
 
 
 def estimated(name: str, record: Record, scenario: Scenario, watch: Watch = QUIET) -> dict[str, Array]:
-    """{target: (n_steps, n_modes) [um]} of one observer. Raises ValueError saying why there is none, Cancelled."""
+    """Return {target: (n_steps, n_modes) [um]} of one observer.
+
+    Raises ValueError with the reason where there is none, Cancelled.
+    """
     with detach_watch(watch) as alone:
         return OBSERVERS[name].estimate(*arguments(OBSERVERS[name], record, scenario), alone)
 

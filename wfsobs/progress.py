@@ -1,4 +1,4 @@
-"""How long work tells its progress and hears that it is no longer wanted."""
+"""Progress and cancelling of long computations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 
 class Cancelled(Exception):
-    """The work was stopped on request."""
+    """Error: the computation was stopped on request."""
 
 
 def _never() -> bool:
@@ -29,12 +29,16 @@ def _keep(_target: str, _values: NDArray[np.float64]) -> None:
 
 @dataclass(frozen=True)
 class Watch:
-    """Callbacks into whoever started the work; all are called from the working thread.
+    """Callbacks of a computation; all are called from the working thread.
 
-    progress  : told the fraction done, 0 to 1
-    cancelled : asked at every block of work; true stops it
-    partial   : given (target, values so far with NaN where nothing is known yet) by observers that
-                deliver in blocks
+    Attributes
+    ----------
+    progress : callable
+        Receives the fraction done, 0 to 1.
+    cancelled : callable
+        Asked at every block of work; true stops it.
+    partial : callable
+        Receives (target, values so far, with NaN where not yet computed) from observers that compute in blocks.
     """
 
     progress: Callable[[float], None] = _silent
@@ -42,12 +46,12 @@ class Watch:
     partial: Callable[[str, NDArray[np.float64]], None] = _keep
 
     def check(self) -> None:
-        """Raises Cancelled if the work is no longer wanted."""
+        """Raise `Cancelled` if the computation is to stop."""
         if self.cancelled():
             raise Cancelled
 
     def step(self, fraction: float) -> None:
-        """Report progress. Raises Cancelled if the work is no longer wanted."""
+        """Report progress; raise `Cancelled` if the computation is to stop."""
         self.check()
         self.progress(fraction)
 
@@ -59,7 +63,7 @@ _KEYS, _LISTENING = count(), dict[int, Watch]()
 
 @contextmanager
 def detach_watch(watch: Watch) -> Iterator[Watch]:
-    """A watch that reports to another and holds no reference to it, nor to what its callbacks know of."""
+    """Yield a watch that reports to another without a reference to it or to what its callbacks know."""
     key = next(_KEYS)
     _LISTENING[key] = watch
     try:

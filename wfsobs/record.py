@@ -1,4 +1,4 @@
-"""`Measurements`: what the sensors and the mirror tell of one run. `Record`: the same, and the truth where there is one."""
+"""Types of one run's data: `Measurements` of sensors and mirror, and `Record`, which adds the truth where there is one."""
 
 from __future__ import annotations
 
@@ -14,14 +14,19 @@ DELAY = 2
 
 
 class RecordError(ValueError):
-    """A record that cannot be used: one line naming what, where and what is expected."""
+    """Error: a record that cannot be used; one line naming what, where and what is expected."""
 
 
 @dataclass(frozen=True)
 class Training:
-    """What the offline GPR is trained on, a record of its own.
+    """Training record of the offline GPR.
 
-    y_lgs, u : (n, n_modes) [um]; open_loop_y : the same sensors with the mirror at rest, or None.
+    Attributes
+    ----------
+    y_lgs, u : Array
+        LGS measurement and command, (n, n_modes) [um].
+    open_loop_y : Array or None
+        Open-loop measurement of the same sensors, (n, n_modes) [um].
     """
 
     y_lgs: Array
@@ -29,7 +34,7 @@ class Training:
     open_loop_y: Array | None = None
 
     def copy(self) -> Training:
-        """The same in memory of its own."""
+        """Return a copy in memory of its own."""
         return Training(_own(self.y_lgs), _own(self.u), None if self.open_loop_y is None else _own(self.open_loop_y))
 
 
@@ -37,15 +42,24 @@ class Training:
 class Signals:
     """Measurements and commands, one row per fast (LGS) step.
 
-    y_lgs       : (n_steps, n_modes) mean LGS measurement [um], y_lgs[k] = phi_res[k-1] + noise
-    u           : (n_steps, n_modes) mirror command [um], computed once y_lgs[k] is known
-    dt          : fast step [s]
-    y_ngs       : (n_steps, n_modes) NGS measurement [um], NaN in steps without a frame, or None
-    ratio       : fast steps per NGS frame, or None where there is no NGS
-    open_loop_y : (n_steps, n_modes) what the LGS would have measured with the mirror at rest [um], or None
-    delay       : steps from a command to the first measurement that sees it, y_lgs[k] = phi_dist[k-1] + u[k-delay] + noise
+    NaN is a missing sample; `wfsobs.observers.missing` replaces it.
 
-    NaN in y_lgs, u and the rest is a missing sample; `wfsobs.observers.missing.bridged` fills it.
+    Attributes
+    ----------
+    y_lgs : Array
+        Combined LGS measurement, (n_steps, n_modes) [um]; y_lgs[k] = phi_res[k-1] + noise.
+    u : Array
+        Mirror command, (n_steps, n_modes) [um], computed once y_lgs[k] is known.
+    dt : float
+        Time step [s].
+    y_ngs : Array or None
+        NGS measurement, (n_steps, n_modes) [um], NaN in steps without a frame.
+    ratio : int or None
+        Fast steps per NGS frame; None without NGS.
+    open_loop_y : Array or None
+        Open-loop LGS measurement, with the mirror at rest, (n_steps, n_modes) [um].
+    delay : int
+        Steps from a command to the first measurement that sees it, y_lgs[k] = phi_dist[k-1] + u[k-delay] + noise.
     """
 
     y_lgs: Array
@@ -68,7 +82,7 @@ class Signals:
 
     @property
     def missing(self) -> int:
-        """Steps in which a mode has no LGS measurement."""
+        """Number of steps in which a mode has no LGS measurement."""
         return int(np.isnan(self.y_lgs).any(axis=1).sum())
 
     @property
@@ -78,8 +92,10 @@ class Signals:
 
     @property
     def z_ngs(self) -> Array:
-        """Pseudo-open-loop NGS measurement [um], NaN without a frame: the mean of u[k-2] ... u[k-n-1] (delay 2),
-        which is what the mirror did during the frame, is taken off. Raises RecordError without NGS."""
+        """Pseudo-open-loop NGS measurement [um], NaN without a frame. Raises RecordError without NGS.
+
+        The mean of u[k-2] ... u[k-n-1] (delay 2), the mirror during the frame, is subtracted.
+        """
         if self.y_ngs is None or self.ratio is None:
             raise RecordError("the record has no NGS measurement")
         return self.y_ngs - frame_mean(delay_signal(self.u, self.delay - 1), self.ratio)
@@ -87,16 +103,21 @@ class Signals:
 
 @dataclass(frozen=True)
 class Measurements(Signals):
-    """What an observer receives: signals in memory of their own, no truth, no training record."""
+    """Signals in memory of their own, as an observer receives them: no truth, no training record."""
 
 
 @dataclass(frozen=True, repr=False)
 class Record(Signals):
-    """Signals, and what is known of them beside.
+    """Signals, with truth, training record and origin where known.
 
-    turbulence, vibration : (n_steps, n_modes) truth [um], or None. For scores alone: no observer receives them.
-    training : what the offline GPR learns from, or None
-    origin   : what a file said of unit, sign and timing before it was brought into this form, one line
+    Attributes
+    ----------
+    turbulence, vibration : Array or None
+        Truth, (n_steps, n_modes) [um]. For scores alone: no observer receives it.
+    training : Training or None
+        Training record of the offline GPR.
+    origin : str
+        Unit, sign and timing that a file had before conversion, one line.
     """
 
     turbulence: Array | None = None
@@ -111,7 +132,7 @@ class Record(Signals):
         return html_table(("Record", ""), self._summary())
 
     def _summary(self) -> list[tuple[str, str]]:
-        """What it is, in a few words."""
+        """Return a few lines of name and value."""
         parts = [("turbulence", self.turbulence), ("vibration", self.vibration)]
         return [
             ("length", f"{self.n_steps * self.dt:g} s"),
@@ -123,7 +144,7 @@ class Record(Signals):
         ]
 
     def measurements(self, open_loop: bool = False) -> Measurements:
-        """The signals alone, copied: no array is a view of one that may hold more. open_loop : with the open-loop twin."""
+        """Return copies of the signals alone: no array is a view of another; open_loop : with the open-loop measurement."""
         y_ngs, twin = self.y_ngs, self.open_loop_y if open_loop else None
         return Measurements(
             _own(self.y_lgs),
@@ -136,7 +157,7 @@ class Record(Signals):
         )
 
     def truth(self, target: str) -> Array | None:
-        """The true signal of `target` ("turbulence" or "vibration"), or None."""
+        """Return the true signal of `target` ("turbulence" or "vibration"), or None."""
         return {"turbulence": self.turbulence, "vibration": self.vibration}[target]
 
 
@@ -145,19 +166,19 @@ def _own(x: Array) -> Array:
 
 
 def delay_signal(x: Array, steps: int) -> Array:
-    """x[k - steps], zero before the start; same shape as x."""
+    """Return x[k - steps], zero before the start; same shape as x."""
     out = np.zeros_like(x)
     out[steps:] = x[: max(x.shape[0] - steps, 0)]
     return out
 
 
 def pseudo_open_loop(y: Array, u: Array, delay: int = DELAY) -> Array:
-    """z[k] = y[k] - u[k-delay], the measurement with the mirror's part taken off (paper, eq. 3 to 5)."""
+    """Return the pseudo-open-loop measurement z[k] = y[k] - u[k-delay] (paper, eq. 3 to 5)."""
     return y - delay_signal(u, delay)
 
 
 def frame_mean(x: Array, n: int) -> Array:
-    """Mean of x[k-1] ... x[k-n] at every k, zeros before the start; same shape as x."""
+    """Return the mean of x[k-1] ... x[k-n] at every k, zeros before the start; same shape as x."""
     total = np.zeros_like(x)
     for j in range(1, n + 1):
         total += delay_signal(x, j)
@@ -165,7 +186,7 @@ def frame_mean(x: Array, n: int) -> Array:
 
 
 def hold_last(x: Array) -> Array:
-    """x (n, n_columns) with every NaN replaced by the last number before it in its column, zero where there is none."""
+    """Return x (n, n_columns) with every NaN replaced by the last number before it in its column, zero where there is none."""
     gone = np.isnan(x)
     if not gone.any():
         return x

@@ -1,4 +1,4 @@
-"""Units of a wavefront at the boundary; inside, coefficients are Noll-normalised micrometres rms.
+"""Units of a wavefront in files and tables; inside, coefficients are Noll-normalised micrometres rms.
 
 A tip or tilt of a [m] rms over an aperture D tilts the wavefront by 4 a / D [rad].
 
@@ -11,26 +11,26 @@ from __future__ import annotations
 import math
 
 LENGTHS = {"um": 1.0, "nm": 1e-3, "m": 1e6}
-"""Micrometres in one."""
+"""Micrometres per unit."""
 
 ANGLES = {"rad": 1.0, "arcsec": math.radians(1.0 / 3600.0), "mas": math.radians(1.0 / 3.6e6)}
-"""Radians in one."""
+"""Radians per unit."""
 
 UNITS = ("um", "nm", "mas", "arcsec", "rad")
-"""What a user can say that a file is in."""
+"""Units that a user can give for a file."""
 
 _SYNONYMS = {"µm": "um", "micron": "um", "microns": "um", "\u03bcm": "um", "meter": "m", "arcseconds": "arcsec", "radian": "rad"}
 
 
 def micrometres_per(unit: str, diameter: float) -> float:
-    """Micrometres rms of tip or tilt in one of `unit`, on an aperture of `diameter` [m]."""
+    """Return the micrometres rms of tip or tilt per `unit`, on an aperture of `diameter` [m]."""
     return LENGTHS[unit] if unit in LENGTHS else ANGLES[unit] * 1e6 * diameter / 4.0
 
 
 def parse_unit(text: str) -> str | None:
-    """The unit that a file's text stands for, or None where it is none of these.
+    """Return the unit of a file's text, or None for an unknown one.
 
-    >>> unit_named("micron"), unit_named("mas"), unit_named("V")
+    >>> parse_unit("micron"), parse_unit("mas"), parse_unit("V")
     ('um', 'mas', None)
     """
     name = _SYNONYMS.get(text.strip(), text.strip())

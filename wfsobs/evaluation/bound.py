@@ -1,12 +1,13 @@
-"""The bound: the least error that any causal observer of the mean of the LGS could have on a scenario.
+"""Wiener bound: the minimum error of any causal observer of the mean of the LGS in a scenario.
 
-It is the Wiener filter's (`wiener`), which knows the true spectra of the scenario (`true_spectra`) and its noise, after an
-infinitely long record; pure lines are then known. What a row of an observer lacks to it is what a better model, better tuning
-or more training could gain. Who has more than the mean of the LGS may be better: each star by itself, where they see different
-air, or the NGS. So may be one who remembers a record of random phases, which repeats itself (`synthesis`).
+It is the error of the Wiener filter (`wiener`) for the true spectra of the scenario (`true_spectra`) and its noise, after an
+infinitely long record; undamped lines are then known. The gap between an observer and the bound is what a better model, better
+tuning or more training can gain. An observer with more than the mean of the LGS may be better: with each star by itself, where
+they see different turbulence, or with the NGS. So may one that remembers a record of random phases, which is periodic
+(`synthesis`).
 
-A record is neither infinitely long nor the mean of all. `interval` says where the rms of an observer lies that is optimal for
-all that was measured since the record began, in 95 % of records.
+A record is neither infinitely long nor the mean of all. `interval` is the range of the rms of an optimal observer
+of all samples since the start of the record, in 95 % of records.
 """
 
 from __future__ import annotations
@@ -29,22 +30,29 @@ from wfsobs.simulation.true_spectra import TrueSpectra, is_known, true_spectra
 from wfsobs.typing import Array
 
 SHARE = 0.95
-"""Of the records whose rms lies in an interval."""
+"""Share of the records whose rms lies in an interval."""
 
 MOST_PAST = 4000
-"""Measurements up to which their gain is computed; what is then still to be gained falls with the inverse of their number, as it
-does of pure lines."""
+"""Measurements up to which their gain is computed.
+
+The remaining gain falls with the inverse of their number, as it does for undamped lines.
+"""
 
 TOTAL = "total"
 
 
 @dataclass(frozen=True)
 class LeastError:
-    """The error of an optimal filter.
+    """Error of an optimal filter.
 
-    covariance : (n_lags,) [um^2] its autocovariance after an infinitely long record
-    started  : (n_past,) [um^2] its variance after 0, 1, 2, ... measurements
-    n_lines  : how many pure lines there are, whose phases and amplitudes are learnt from the record
+    Attributes
+    ----------
+    covariance : Array
+        Autocovariance after an infinitely long record, (n_lags,) [um^2].
+    started : Array
+        Variance after 0, 1, 2, ... measurements, (n_past,) [um^2].
+    n_lines : int
+        Number of undamped lines, whose phases and amplitudes are learnt from the record.
     """
 
     covariance: Array
@@ -53,11 +61,11 @@ class LeastError:
 
     @property
     def rms(self) -> float:
-        """[um], over all records, infinitely long ones."""
+        """Rms over all records, infinitely long ones [um]."""
         return float(np.sqrt(self.covariance[0]))
 
     def interval(self, first: int, last: int) -> tuple[float, float]:
-        """Where its rms [um] over the steps `first` to `last` of a record lies in SHARE of records."""
+        """Return the range of the rms [um] over the steps `first` to `last` of a record, in SHARE of records."""
         least = float(self.covariance[0])
         excess, past = np.maximum(self.started[first:last] - least, 0.0), self.started.size
         later = max(self.started[-1] - least, 0.0) * past / np.arange(max(first, past) + 1, last + 1)
@@ -73,9 +81,10 @@ class LeastError:
 
 
 def learning_freedom(ratio: float) -> float:
-    """Degrees of freedom of the mean square of W(t) / t, the error of an amplitude learnt in white noise, from t = 1 to `ratio`.
+    """Return the degrees of freedom of the mean square of W(t) / t from t = 1 to `ratio`.
 
-    W is Brownian, so that the mean square has the mean ln r and the variance 4 (ln r - 1 + 1 / r), either over r - 1, its square.
+    W(t) / t is the error of an amplitude learnt in white noise. W is Brownian, so that the mean square has the mean ln r and the
+    variance 4 (ln r - 1 + 1 / r), either over r - 1, its square.
     """
     if ratio < 1.01:
         return 1.0
@@ -83,9 +92,21 @@ def learning_freedom(ratio: float) -> float:
 
 
 def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict[str, LeastError]:
-    """Target -> the least error of phi[k + ahead] from z[k], z[k-1], ...; TOTAL is that of both together.
+    """Compute the minimum error of phi[k + ahead] from z[k], z[k-1], ....
 
-    n_steps : steps of the record that intervals are wanted of
+    Parameters
+    ----------
+    spectra : TrueSpectra
+        Spectra of one mode.
+    ahead : int
+        Steps of prediction.
+    n_steps : int
+        Steps of the record of the intervals.
+
+    Returns
+    -------
+    dict of str to LeastError
+        Target -> error; TOTAL is that of both together.
     """
     past, known = min(n_steps, MOST_PAST), spectra.without_lines
     whitener = factorise(known.measured)
@@ -112,13 +133,13 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
 
 
 def bound(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:
-    """Target -> rms [um] of the least error, as `least_errors`, of one mode of a scenario."""
+    """Return target -> rms [um] of the minimum error, as `least_errors`, of one mode of a scenario."""
     return {name: error.rms for name, error in least_errors(true_spectra(scenario, mode), ahead).items()}
 
 
 @dataclass(frozen=True)
 class Bound:
-    """The least error of a target in a mode of a record."""
+    """Minimum error of a target in a mode of a record."""
 
     target: str
     mode: str
@@ -127,7 +148,7 @@ class Bound:
 
 
 def bounds(scenario: Scenario, record: Record) -> list[Bound]:
-    """The bounds of a record that was simulated from the scenario; none where its spectra are not known."""
+    """Compute the bounds of a record that was simulated from the scenario; none where its spectra are not known."""
     if not is_known(scenario):
         return []
     modes = scenario.modes[: record.n_modes]
@@ -137,7 +158,7 @@ def bounds(scenario: Scenario, record: Record) -> list[Bound]:
 
 
 def bound_scores(bounds: Sequence[Bound], record: Record, scores: Sequence[Score], warm_up: float) -> list[Score]:
-    """The rows of bounds, for the samples that the rows of the observers are for, or all after the warm-up [s]."""
+    """Return the scores of bounds, on the samples of the observers' scores, or on all after the warm-up [s]."""
     stretches = {(s.target, s.mode): (s.start, s.stop) for s in scores if not s.apart}
     out = []
     for it in bounds:

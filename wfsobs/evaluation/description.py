@@ -1,4 +1,4 @@
-"""The models inside the observers as numbers: coefficients, gains, poles, and what a GPR amounts to.
+"""The models inside the observers as numbers: coefficients, gains, poles, and the equivalent ridge of a GPR.
 
 Gains are in the paper's state (phi_turb[k], phi_turb[k-1], phi_vib[k], phi_vib[k-1]); the mirror's two states are known
 without error and have none. Poles are those of A - K C of the disturbance model, for the multi-rate filters those of one cycle.
@@ -28,10 +28,18 @@ from wfsobs.typing import Array
 class FilterFacts:
     """A Kalman filter.
 
-    step   : time between its estimates [s]; period: time that the poles belong to, one step or one cycle [s]
-    gains  : what is measured -> filter gain L (4,), of LGS and NGS where both are
-    poles  : of A - K C, or of one cycle, the largest first
-    reason : why there is no such filter, in one line, or nothing
+    Attributes
+    ----------
+    step : float
+        Time between its estimates [s].
+    period : float
+        Time of the poles, one step or one cycle [s].
+    gains : dict of str to Array
+        Measurement -> filter gain L, (4,).
+    poles : Array
+        Poles of A - K C, or of one cycle, the largest first.
+    reason : str
+        Why there is no such filter, in one line; empty where there is.
     """
 
     step: float
@@ -42,14 +50,23 @@ class FilterFacts:
 
     @property
     def radius(self) -> float | None:
-        """The largest modulus of a pole; below 1 the filter is stable."""
+        """Largest modulus of a pole; below 1 the filter is stable."""
         return float(np.abs(self.poles).max()) if self.poles.size else None
 
 
 @dataclass(frozen=True)
 class GprFacts:
-    """A Gaussian process regression: ridge = (sigma_n l / sigma_SE)^2 [um^2], the weight of the ridge regression that
-    it all but is; window, training: length of a window, and from the first to the last of consecutive ones [s]."""
+    """A Gaussian process regression.
+
+    Attributes
+    ----------
+    ridge : float
+        (sigma_n l / sigma_SE)^2, the weight of the nearly equal ridge regression [um^2].
+    window : float
+        Length of a window [s].
+    training : float
+        Time from the first to the last training window [s].
+    """
 
     ridge: float
     window: float
@@ -58,7 +75,7 @@ class GprFacts:
 
 @dataclass(frozen=True)
 class SensorFacts:
-    """What one LGS, or the NGS, gets wrong by itself, rms [um]: white noise of a frame, and aliasing, see `sensors`."""
+    """Errors of one LGS, or of the NGS, rms: white noise of a frame, and aliasing [um]."""
 
     noise: float
     aliasing: float
@@ -66,7 +83,7 @@ class SensorFacts:
 
 @dataclass(frozen=True)
 class Description:
-    """The model of one mode. turbulence, vibration: the processes modelled, per fast step; A, B, C (paper, eq. 7)."""
+    """The model of one mode: its processes, per fast step, A, B, C (paper, eq. 7), and the filters, GPR and sensors."""
 
     mode: str
     ratio: int
@@ -81,7 +98,20 @@ class Description:
 
 
 def describe(scenario: Scenario, mode: int) -> Description:
-    """The numbers of a scenario's observers for one mode; a filter that cannot be has its reason in place of numbers."""
+    """Return the numbers of a scenario's observers for one mode.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    mode : int
+        Index of the mode.
+
+    Returns
+    -------
+    Description
+        Model, filters, GPR and sensors; a filter that does not exist has its reason in place of numbers.
+    """
     dt, ratio = scenario.dt, scenario.sensors.exposure_ratio
     model, own = model_of(scenario, mode), scenario.multirate
 
@@ -119,14 +149,14 @@ def _facts(step: float, period: float, make: Callable[[], tuple[Gains, Array]]) 
 
 
 def _kalman(prior: Model, noise: float, sensor: str) -> tuple[Gains, Array]:
-    """Gain and A - K C of a single-rate filter."""
+    """Return gain and A - K C of a single-rate filter."""
     model = prior.disturbance()
     kalman, steady = steady_filter(model, noise)
     return {sensor: model.pairs @ steady.L[:, 0]}, kalman.cycle_matrix()
 
 
 def _multirate(prior: Model, settings: MultiRate, ratio: int) -> tuple[Gains, Array]:
-    """The paper's two gains (eq. 11), and the product of the A - K C of one cycle. Raises where that is unstable."""
+    """Return the paper's two gains (eq. 11), and the product of the A - K C of one cycle. Raises where that is unstable."""
     model = prior.disturbance()
     lgs, ngs = multirate_noise(settings, prior)
     cycle = multirate_filter(model, ratio, lgs, ngs).cycle
@@ -137,7 +167,7 @@ def _multirate(prior: Model, settings: MultiRate, ratio: int) -> tuple[Gains, Ar
 
 
 def _optimal(prior: Prior, settings: MultiRate, ratio: int) -> tuple[Gains, Array]:
-    """Gains of the first step of a cycle and of the one with the frame, and the product of the A - K C of one cycle."""
+    """Return the gains of the first step and of the step with the frame, and the product of the A - K C of one cycle."""
     model = prior.model[0].disturbance()
     made, states = optimal_filter(*optimal_model(settings, prior, 0, ratio))
     n = len(model.A)

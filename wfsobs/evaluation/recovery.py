@@ -1,4 +1,4 @@
-"""Error against time: who is thrown off by an event, and how soon who is back."""
+"""Error against time: the effect of an event, and the recovery time of each observer."""
 
 from __future__ import annotations
 
@@ -12,14 +12,31 @@ from wfsobs.record import Record
 from wfsobs.typing import Array
 
 BACK = 1.1
-"""An observer is back where its error is at most that much of what it was before the event."""
+"""An observer has recovered where its error is at most this many times that before the event."""
 
 
 def running_rms(record: Record, estimate: Estimate, window: float) -> Array:
-    """Rms of the error over the last `window` [s] at every step, (n_steps, n_modes) [um].
+    """Compute the rms of the error over the last `window` at every step.
 
-    Steps without an estimate or a truth do not count; NaN where none is left, and before one window has passed. Raises ValueError
-    where the record has no truth for the target.
+    Parameters
+    ----------
+    record : Record
+        Record with truth.
+    estimate : Estimate
+        Estimate of one target.
+    window : float
+        Length of the window [s].
+
+    Returns
+    -------
+    Array
+        (n_steps, n_modes) [um]. Steps without estimate or truth do not count; NaN where none counts, and before the first window
+        is complete.
+
+    Raises
+    ------
+    ValueError
+        The record has no truth for the target.
     """
     truth = record.truth(estimate.target)
     if truth is None:
@@ -28,7 +45,7 @@ def running_rms(record: Record, estimate: Estimate, window: float) -> Array:
 
 
 def trailing_rms(x: Array, n: int) -> Array:
-    """Rms of x[k-n+1] ... x[k] at every k, (n_steps, n_columns); NaN do not count, and where k < n - 1 it is NaN."""
+    """Return the rms of x[k-n+1] ... x[k] at every k, (n_steps, n_columns); NaN do not count, and where k < n - 1 it is NaN."""
     known = ~np.isnan(x)
     count = trailing_sum(known.astype(float), n)
     mean = np.divide(trailing_sum(np.where(known, x, 0.0) ** 2, n), count, out=np.full(x.shape, np.nan), where=count > 0)
@@ -37,10 +54,10 @@ def trailing_rms(x: Array, n: int) -> Array:
 
 
 def trailing_sum(x: Array, n: int) -> Array:
-    """x[k-n+1] + ... + x[k] at every k, zeros before the start; same shape as x (n_steps, n_columns).
+    """Return x[k-n+1] + ... + x[k] at every k, zeros before the start; same shape as x (n_steps, n_columns).
 
     Of blocks of n, the sum from the start of the block to k and that from k - n + 1 to the end of the block before: nothing is
-    taken away, so that a large error leaves no trace in the sums after it.
+    subtracted, so that a large error leaves no trace in the sums after it.
     """
     steps, columns = x.shape
     blocks = np.zeros((1 + -(-steps // n), n, columns))
@@ -53,34 +70,40 @@ def trailing_sum(x: Array, n: int) -> Array:
 
 @dataclass
 class Pooled:
-    """The running rms of several records of one length together: root of the mean of squares, NaN left out."""
+    """Running rms of several records of one length together: root of the mean of squares, without NaN."""
 
     total: Array | float = 0.0
     count: Array | int = 0
 
     def add(self, running: Array) -> None:
-        """One more record's, (n_steps, n_modes)."""
+        """Add a record's running rms, (n_steps, n_modes)."""
         known = ~np.isnan(running)
         self.total = self.total + np.where(known, running, 0.0) ** 2
         self.count = self.count + known
 
     @property
     def rms(self) -> Array:
-        """(n_steps, n_modes), NaN where no record has any."""
+        """Pooled rms, (n_steps, n_modes), NaN where no record has any."""
         total, count = np.asarray(self.total), np.asarray(self.count)
         return np.sqrt(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """What an event did to an observer in one mode.
+    """Effect of an event on an observer in one mode.
 
-    start   : of the event [s]
-    settled : rms of the error before it [um]
-    worst   : highest running rms from it to the next [um]
-    last    : running rms at the end of that time [um]
-    back    : time from its start until the running rms is within 10 % of what it was, and stays so until the next [s]; None
-        where it never is
+    Attributes
+    ----------
+    start : float
+        Start of the event [s].
+    settled : float
+        Rms of the error before it [um].
+    worst : float
+        Maximum running rms from it to the next [um].
+    last : float
+        Running rms at the end of that time [um].
+    back : float or None
+        Recovery time: until the running rms is within 10 % of that before, and stays so until the next event [s]; None if never.
     """
 
     start: float
@@ -91,10 +114,27 @@ class Recovery:
 
 
 def recovery(running: Array, dt: float, starts: Sequence[float], window: float, warm_up: float) -> list[Recovery | None]:
-    """What each event did, from a running rms (n_steps,) [um] over `window` [s]; None where nothing is known before or after it.
+    """Measure the effect of each event on a running rms.
 
-    starts : of the events [s]; those that start together count as one. What an observer had settled to is its rms over the second
-    half of the time since the event before, or the warm-up.
+    The error before an event is the rms over the second half of the time since the event before, or the warm-up.
+
+    Parameters
+    ----------
+    running : Array
+        Running rms, (n_steps,) [um].
+    dt : float
+        Time step [s].
+    starts : sequence of float
+        Starts of the events [s]; simultaneous events count as one.
+    window : float
+        Window of the running rms [s].
+    warm_up : float
+        Start of the record that does not count [s].
+
+    Returns
+    -------
+    list of Recovery or None
+        One per event; None where there is nothing before or after it.
     """
     times = sorted(set(starts))
     out: list[Recovery | None] = []

@@ -1,4 +1,4 @@
-"""Scores as plain rows, and what is said of a row in every table."""
+"""Scores as plain rows, and the labels of rows in every table."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from wfsobs.observers.base import SPECTRA
 Row = dict[str, Any]
 
 TIME = "time_per_step_us"
-"""Computing time per step and mode [us]: in the table, but not part of the result, which the seed fixes."""
+"""Computing time per step and mode [us]: in the table, but not part of the result, which the seed determines."""
 
 NOT_OBSERVERS = {LOOP: "Recorded loop", BOUND: "Bound, mean of the LGS"}
-"""Labels of rows that stand among the observers' and are none."""
+"""Labels of rows in a table of observers that are not observers."""
 
 
 def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
-    """One plain dictionary per score: the keys of `wfsobs run --json`, and TIME."""
+    """Return one plain dictionary per score: the keys of `wfsobs run --json`, and TIME."""
     return [
         {
             "observer": s.observer,
@@ -42,29 +42,29 @@ def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
 
 
 def interval_text(interval: Sequence[float] | None, scale: float) -> str:
-    """Where the rms of an optimal observer lies in 95 % of records, "low - high"; "-" for rows that have none."""
+    """Return the interval of the rms of an optimal observer in 95 % of records, "low - high"; "-" where there is none."""
     return "-" if interval is None else f"{interval[0] * scale:.2f} - {interval[1] * scale:.2f}"
 
 
 def label_of(observer: str) -> str:
-    """What a row is called."""
+    """Return the label of a row."""
     return NOT_OBSERVERS.get(observer) or OBSERVERS[observer].label
 
 
 def needs_of(observer: str) -> str:
-    """What a row has to be given beside measurements: the bound the true spectra."""
+    """Return what a row needs beside measurements; the bound needs the true spectra."""
     if observer in NOT_OBSERVERS:
         return SPECTRA if observer == BOUND else ""
     return OBSERVERS[observer].told
 
 
 def competes(observer: str, apart: bool) -> bool:
-    """Whether a row can be the best: not the bound, nor what looks ahead or was scored on samples of its own."""
+    """Return whether a row can be the best: not the bound, nor a row that is not causal or was scored on samples of its own."""
     return observer not in NOT_OBSERVERS and not looks_ahead(observer) and not apart
 
 
 def stretch_of(rows: Iterable[Row]) -> str:
-    """What was scored of rows that can be compared, from the earliest to the latest, nothing where there are none.
+    """Return the interval of the scored samples of comparable rows, empty where there are none.
 
     >>> stretch_of([{"start_s": 4.001, "stop_s": 9.999, "apart": False}, {"start_s": None, "stop_s": None, "apart": False}])
     '4.00 to 10.00 s'
@@ -73,7 +73,7 @@ def stretch_of(rows: Iterable[Row]) -> str:
 
 
 def own_stretch(row: Row) -> str:
-    """What was scored of a row that stands apart, nothing of any other."""
+    """Return the interval of the scored samples of a row that stands apart, empty for any other."""
     return f"{_span([row])} only" if row["apart"] else ""
 
 
@@ -83,5 +83,5 @@ def _span(rows: Sequence[Row]) -> str:
 
 
 def looks_ahead(observer: str) -> bool:
-    """Whether an estimate uses later samples."""
+    """Return whether an estimate uses later samples."""
     return observer not in NOT_OBSERVERS and not OBSERVERS[observer].causal

@@ -1,4 +1,4 @@
-"""How good estimates are: error, lag, spectra, all after the warm-up; errors that are compared, on common samples."""
+"""Scores of estimates: error, lag and spectra after the warm-up; compared errors are on common samples."""
 
 from __future__ import annotations
 
@@ -14,27 +14,42 @@ from wfsobs.signal.welch import rms, welch_psd
 from wfsobs.typing import Array
 
 PREDICTION, RESIDUAL = "next z", "residual y"
-"""What takes the place of a target where there is no truth: the next measurement, and what the loop left of it."""
+"""Targets where there is no truth: the next measurement, and the residual of the loop."""
 
 LOOP, BOUND = "loop", "bound"
-"""In the place of an observer: the loop that made the record, and the least error that any observer of the LGS could have."""
+"""Rows that are not observers: the loop that made the record, and the Wiener bound."""
 
 MAX_LAG = 0.025
-"""Lags beyond this [s] are not looked for."""
+"""Maximum lag [s]."""
 
 SHARE = 0.5
-"""Of the samples after the warm-up, those that the observers of a table must have in common; who leaves fewer stands apart."""
+"""Minimum share of the samples after the warm-up that observers in a table have in common; those that leave fewer stand apart."""
 
 
 @dataclass(frozen=True)
 class Score:
     """One row of the RMS table: one observer, target and mode.
 
-    rms, truth_rms [um]; normalised_rms = rms / truth_rms, None where the truth is zero; lag [s], positive if the
-    estimate is late, None where it is constant; seconds_per_step: computing time [s] per step and mode.
-    start, stop : the stretch [s] that was scored, None for a mean over all records
-    apart : whether the stretch is the observer's own, not that of the other rows, so that it cannot be compared with them
-    interval [um]: of the bound, where the rms of an optimal observer lies in 95 % of records.
+    Attributes
+    ----------
+    observer, target, mode : str
+        What was scored.
+    rms : float
+        RMS error [um].
+    truth_rms : float
+        RMS of the truth [um].
+    normalised_rms : float or None
+        rms / truth_rms; None where the truth is zero.
+    lag : float or None
+        Lag, positive if the estimate is late; None where it is constant [s].
+    seconds_per_step : float
+        Computing time per step and mode [s].
+    start, stop : float or None
+        Interval of the scored samples; None for a mean over all records [s].
+    apart : bool
+        Whether the samples differ from those of the other rows, so that the row cannot be compared with them.
+    interval : tuple of float or None
+        Of a bound: range of the rms of an optimal observer in 95 % of records [um].
     """
 
     observer: str
@@ -52,10 +67,20 @@ class Score:
 
 
 def common_samples(known: Sequence[Array]) -> list[tuple[Array, bool]]:
-    """What is scored of every estimate, and whether it stands apart, from the samples that each of them has, (n,) bool.
+    """Select the samples on which estimates are scored.
 
-    From the one with most samples on, everyone takes part whose own leave SHARE of those in common. All of these are scored on
-    the samples that they have in common, every other one on its own, apart.
+    Starting with the estimate with most samples, every estimate takes part that leaves SHARE of the samples in common. These are
+    scored on the common samples, every other one on its own, apart.
+
+    Parameters
+    ----------
+    known : sequence of Array
+        Samples that each estimate has, bool (n,).
+
+    Returns
+    -------
+    list of (Array, bool)
+        Samples of each estimate, and whether it stands apart.
     """
     if not known:
         return []
@@ -73,9 +98,23 @@ def common_samples(known: Sequence[Array]) -> list[tuple[Array, bool]]:
 def score(
     record: Record, estimates: Sequence[Estimate], *, warm_up: float = 0.0, mode_names: Sequence[str] | None = None
 ) -> list[Score]:
-    """One Score per estimate and mode: the error where the record has a truth, else that of predicting the next measurement.
+    """Score estimates: the error where the record has a truth, else that of predicting the next measurement.
 
-    warm_up [s] : samples before it do not count;  mode_names : of the columns, those of Noll's order unless given
+    Parameters
+    ----------
+    record : Record
+        Measurements, and the truth where there is one.
+    estimates : sequence of Estimate
+        Estimates of the observers.
+    warm_up : float
+        Start of the record that does not count [s].
+    mode_names : sequence of str, optional
+        Names of the columns; by default those of Noll's order.
+
+    Returns
+    -------
+    list of Score
+        One per estimate and mode.
     """
     names = [m.name for m in modes_up_to(HIGHEST_ORDER)][: record.n_modes] if mode_names is None else list(mode_names)
     known = record.turbulence is not None or record.vibration is not None
@@ -83,8 +122,10 @@ def score(
 
 
 def supervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:
-    """One Score per estimate and mode, those of a target and mode on common samples; none where the record has no truth for the
-    target or no sample is left."""
+    """Score estimates against the truth, those of a target and mode on common samples.
+
+    None for a target without truth or where no sample is left.
+    """
     out = []
     for target in TARGETS:
         truth, of = record.truth(target), [e for e in estimates if e.target == target]
@@ -116,12 +157,12 @@ def supervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: fl
 
 
 def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:
-    """What can be said without truth, on common samples as well; truth_rms is the rms of z throughout.
+    """Score estimates without truth, on common samples as well; truth_rms is the rms of z throughout.
 
     - PREDICTION: rms of z[k+1] - phi_hat[k], one step ahead, since z[k+1] = phi_dist[k] + noise and phi_hat[k] knows y up to
-      k. The noise of the measurement stays in. Only an observer that estimates both turbulence and vibration says what
-      z will be; the others cannot be scored so. Samples that were missing do not count.
-    - RESIDUAL: rms of y_lgs, what the recorded loop left.
+      k. The noise of the measurement is included. Only an observer that estimates both turbulence and vibration predicts
+      z; the others have no such score. Missing samples do not count.
+    - RESIDUAL: rms of y_lgs, the residual of the recorded loop.
     """
     out: list[Score] = []
     whole: dict[str, list[Estimate]] = {}
@@ -171,40 +212,41 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
 
 
 def _after(record: Record, warm_up: float) -> Array:
-    """Which steps are after the warm-up [s]."""
+    """Return which steps are after the warm-up [s]."""
     return np.arange(record.n_steps) >= round(warm_up / record.dt)
 
 
 def _later(x: Array) -> Array:
-    """One step later, NaN first."""
+    """Return x one step later, NaN first."""
     return np.concatenate([[np.nan], x[:-1]])
 
 
 def _stretch(samples: Array, dt: float) -> tuple[float, float]:
-    """From the first of the samples to the end of the last [s]."""
+    """Return the time [s] of the first sample and of the end of the last."""
     return float(np.argmax(samples) * dt), float((samples.size - np.argmax(samples[::-1])) * dt)
 
 
 def _ratio(error: Array, signal: Array) -> float | None:
-    """The rms of an error over that of the signal, None where that is zero."""
+    """Return the rms of an error over that of the signal, None where that is zero."""
     scale = rms(signal)
     return rms(error) / scale if scale > 0 else None
 
 
 def scored_samples(record: Record, truth: Array, value: Array, warm_up: float) -> tuple[Array, Array]:
-    """(truth, estimate) without the warm-up [s] and without the steps where the estimate is NaN."""
+    """Return (truth, estimate) without the warm-up [s] and without the steps where the estimate is NaN."""
     start = round(warm_up / record.dt)
     known = ~np.isnan(value[start:]) & ~np.isnan(truth[start:])
     return truth[start:][known], value[start:][known]
 
 
 def lag(truth: Array, value: Array, dt: float) -> float | None:
-    """Delay of `value` behind `truth` [s]: where their correlation coefficient is highest, between samples by a parabola
-    through three points. Positive is late; None where either is constant.
+    """Estimate the delay of `value` behind `truth` [s]: where their correlation coefficient is highest.
+
+    The maximum is interpolated by a parabola through three points. Positive is late; None where either is constant.
 
     The middle of the truth is compared with equally long pieces of the estimate, each with its own mean and variance:
-    a plain cross-correlation has fewer terms at larger lags, which draws the peak of a slow signal, broad as it is, to
-    zero. Of peaks within 2 % of the highest, the periods of a pure tone, it is the one nearest to zero.
+    a plain cross-correlation has fewer terms at larger lags, which biases the broad maximum of a slow signal towards
+    zero. Of maxima within 2 % of the highest, the periods of a pure tone, it is the one nearest to zero.
     """
     reach = min(round(MAX_LAG / dt), (truth.size - 1) // 4)
     middle = truth[reach : truth.size - reach]
@@ -229,9 +271,25 @@ def lag(truth: Array, value: Array, dt: float) -> float | None:
 
 
 def spectra(record: Record, target: str, values: Array, warm_up: float) -> tuple[Array, Array, Array] | None:
-    """(frequency [Hz], density of the values, density of their error against the truth [um^2/Hz], a column per mode).
+    """Compute the spectra of an estimate and of its error.
 
-    Over every sample after the warm-up [s] that has an estimate; None where there are too few. Without a truth the error is zero.
+    Over all samples after the warm-up [s] that have an estimate; without a truth the error is zero.
+
+    Parameters
+    ----------
+    record : Record
+        Record, with the truth where there is one.
+    target : str
+        "turbulence" or "vibration".
+    values : Array
+        Estimate, (n_steps, n_modes) [um].
+    warm_up : float
+        Start of the record that does not count [s].
+
+    Returns
+    -------
+    tuple of Array or None
+        Frequency [Hz], density of the estimate and of its error [um^2/Hz], a column per mode; None with too few samples.
     """
     truth = record.truth(target)
     truth = values if truth is None else truth
@@ -247,6 +305,6 @@ def spectra(record: Record, target: str, values: Array, warm_up: float) -> tuple
 
 
 def cumulative_rms(frequency: Array, density: Array) -> Array:
-    """Root of the variance above each frequency, from high to low (the AO habit); same shape as `density`."""
+    """Return the root of the variance above each frequency, from high to low (the AO habit); same shape as `density`."""
     df = frequency[1] - frequency[0]
     return np.sqrt(np.cumsum(density[::-1], axis=0)[::-1] * df)

@@ -1,7 +1,7 @@
-"""`Disturbance`: turbulence and vibration of one run, made from a scenario.
+"""Turbulence and vibration of one run, simulated from a scenario.
 
-A new source of vibration is one more function in `VIBRATION`, under the name the scenario's `source`
-setting knows it by; turbulence has a module of its own.
+A new source of vibration is one more function in `VIBRATION`, under the name of the scenario's `source`
+setting; turbulence has a module of its own.
 """
 
 from __future__ import annotations
@@ -30,9 +30,16 @@ RANDOM_PHASE = "random-phase"
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Turbulence and vibration [um], each of shape (n_steps, n_modes).
+    """Turbulence and vibration of one run.
 
-    ngs_turbulence, lgs_turbulence : what the NGS and each of the LGS see of the turbulence, None where all see it as it is
+    Attributes
+    ----------
+    turbulence, vibration : Array
+        The truth, (n_steps, n_modes) [um].
+    ngs_turbulence : Array or None
+        Turbulence in the beam of the NGS; None where it is the truth.
+    lgs_turbulence : tuple of Array or None
+        Turbulence in the beam of each LGS; None where it is the truth.
     """
 
     turbulence: Array
@@ -42,13 +49,36 @@ class Disturbance:
 
     @property
     def total(self) -> Array:
-        """phi_dist = phi_turb + phi_vib [um] (paper, eq. 4b)."""
+        """Disturbance phi_dist = phi_turb + phi_vib [um] (paper, eq. 4b)."""
         return self.turbulence + self.vibration
 
 
 def make_disturbance(scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch = QUIET) -> Disturbance:
-    """Both disturbances over `n_steps`. Every source and mode has a random stream of its own, so
-    changing one setting leaves the others' numbers as they were."""
+    """Simulate both disturbances of a scenario.
+
+    Every source and mode has a random stream of its own, so changing one setting leaves the random numbers of the others.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    n_steps : int
+        Number of steps.
+    rng : numpy.random.Generator
+        Source of all random numbers.
+    watch : Watch
+        Asked at every block of work whether to stop.
+
+    Returns
+    -------
+    Disturbance
+        Turbulence and vibration.
+
+    Raises
+    ------
+    Cancelled
+        `watch` asks to stop.
+    """
     turbulence_rng, vibration_rng = rng.spawn(2)
     at = events.clock(scenario, n_steps)
     air = SOURCES[scenario.turbulence.source](scenario, events.steps_of_air(at, n_steps), turbulence_rng, watch)
@@ -62,12 +92,12 @@ def make_disturbance(scenario: Scenario, n_steps: int, rng: np.random.Generator,
 
 
 def peak_rms(peak_rms_list: list[float], mode: int) -> float:
-    """The rms [um] of a peak in one mode: 0 beyond the end of its list."""
+    """Return the rms [um] of a peak in one mode: 0 beyond the end of its list."""
     return peak_rms_list[mode] if mode < len(peak_rms_list) else 0.0
 
 
 def vibration_variance(scenario: Scenario, mode: int) -> float:
-    """Variance [um^2] that the scenario's vibration has in one mode."""
+    """Return the variance [um^2] of the scenario's vibration in one mode."""
     v = scenario.vibration
     if v.source == "none":
         return 0.0
@@ -78,18 +108,18 @@ def vibration_variance(scenario: Scenario, mode: int) -> float:
 
 
 def vibration_power(scenario: Scenario, mode: int, n: int) -> Array:
-    """Variance [um^2] of the vibration in each DFT bin of `n` steps, an even number, (n // 2 + 1,), but for its pure lines."""
+    """Return the variance [um^2] of the vibration, without its lines, in each DFT bin of `n` steps, even, (n // 2 + 1,)."""
     return _bin_power(scenario, mode, n, line_width(scenario))
 
 
 def pure_lines(scenario: Scenario, mode: int) -> list[tuple[float, float]]:
-    """(frequency [Hz], variance [um^2]) of the lines of no width that the vibration of a mode has."""
+    """Return (frequency [Hz], variance [um^2]) of the undamped lines of a mode's vibration."""
     pure = [peak for peak in scenario.vibration.peaks if _is_pure_line(scenario, peak)]
     return [(peak.frequency, peak_rms(peak.rms, mode) ** 2) for peak in pure if peak_rms(peak.rms, mode) > 0]
 
 
 def vibration_lines(scenario: Scenario, mode: int) -> list[tuple[float, float, float]]:
-    """(frequency [Hz], damping, rms [um]) of every line that the vibration of a mode has; none where it is a table."""
+    """Return (frequency [Hz], damping, rms [um]) of every peak of a mode's vibration; none where it is a table."""
     v = scenario.vibration
     if v.source == "measured":
         found = [(line.frequency, 0.0, peak_rms(list(line.rms), mode)) for line in measured_spectrum(v.spectrum).lines()]
@@ -105,7 +135,7 @@ def _no_vibration(_scenario: Scenario, _mode: int, n: int, _rng: np.random.Gener
 
 
 def _ar2_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
-    """Each peak as an AR(2) process (paper, eq. 2)."""
+    """Draw each peak as an AR(2) process (paper, eq. 2)."""
     out = np.zeros(n)
     for i, (peak, stream) in enumerate(zip(scenario.vibration.peaks, rng.spawn(len(scenario.vibration.peaks)), strict=True)):
         damping = damping_at_least(line_width(scenario), peak.frequency, peak.damping)
@@ -116,15 +146,17 @@ def _ar2_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generat
 
 
 def _synthesis(scenario: Scenario, n: int) -> tuple[Callable[[Array, int, np.random.Generator], Array], int, float]:
-    """(how the bins of a DFT become a signal, the steps of that DFT for a record of `n`, the least width of a line [Hz])."""
+    """Return (function from DFT bins to a signal, DFT length for a record of `n` steps, minimum line width [Hz])."""
     if scenario.vibration.synthesis == RANDOM_PHASE:
         return random_phase_signal, n, 0.0
     return gaussian_signal, period_steps(scenario, n), line_width(scenario)
 
 
 def _dft_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
-    """Inverse DFT of the spectrum below the cut-off, plus the pure lines at their own frequencies, and the peaks that have
-    events, each with random numbers of its own so that it can be moved."""
+    """Draw the vibration by an inverse DFT of the spectrum below the cut-off.
+
+    Lines are added at their own frequencies. Peaks with events have random numbers of their own, so that they can be shifted.
+    """
     bins, *peak_streams = rng.spawn(1 + len(scenario.vibration.peaks))
     moving = {event.peak for event in scenario.events if event.kind == PEAK}
     signal, period, width = _synthesis(scenario, n)
@@ -147,8 +179,10 @@ def _is_pure_line(scenario: Scenario, peak: Peak) -> bool:
 
 
 def _bin_power(scenario: Scenario, mode: int, n: int, width: float, without: Collection[int] = ()) -> Array:
-    """Variance [um^2] in each DFT bin: that of the damped peaks, but for those `without`, of the PSD table or of the
-    measured spectrum, up to the cut-off; nothing narrower than `width` [Hz]."""
+    """Return the variance [um^2] in each DFT bin up to the cut-off, nothing narrower than `width` [Hz].
+
+    That of the damped peaks except those `without`, of the PSD table or of the measured spectrum.
+    """
     v, dt = scenario.vibration, scenario.dt
     power = np.zeros(n // 2 + 1)
     if v.source == "peaks":
@@ -170,7 +204,7 @@ def _bin_power(scenario: Scenario, mode: int, n: int, width: float, without: Col
 
 
 def _resonance(scenario: Scenario, peak: Peak, mode: int, n: int, width: float) -> Array:
-    """Variance [um^2] of one damped peak in each DFT bin, those above the cut-off left out."""
+    """Return the variance [um^2] of one damped peak in each DFT bin up to the cut-off."""
     edges = bin_edges(n, scenario.dt)
     used = min(int(np.searchsorted(edges, scenario.vibration.cutoff)) + 2, edges.size)
     damping = damping_at_least(width, peak.frequency, peak.damping)

@@ -1,11 +1,11 @@
-"""What the events of a scenario do to the disturbance and to the measurements.
+"""Effects of a scenario's events on the disturbance and on the measurements.
 
-A peak is moved through its analytic signal x_a, which holds its positive frequencies alone,
+A peak is shifted through its analytic signal x_a, which has its positive frequencies alone,
 
     x'(t) = strength(t) Re(x_a(t) exp(2 pi i integral shift dt)),
 
-so that its spectrum is shifted as it is, and what was before the event stays as it was. A change of the wind is one of the clock
-of the turbulence (Taylor's frozen flow): phi'(t) = phi(s(t)), s = integral factor dt, for all that any star sees.
+so that its spectrum is shifted without change, and the signal before the event is unchanged. A change of the wind is a change of
+the clock of the turbulence (Taylor's frozen flow): phi'(t) = phi(s(t)), s = integral factor dt, for all stars.
 """
 
 from __future__ import annotations
@@ -23,24 +23,42 @@ from wfsobs.signal.ar2 import Ar2
 from wfsobs.typing import Array
 
 GUARD = 64
-"""Periods of an AR(2) peak, by which it is continued to both sides for its analytic signal, as long as the record at most."""
+"""Periods by which an AR(2) peak is extended on both sides for its analytic signal; at most the length of the record."""
 
 
 def of_peak(scenario: Scenario, number: int) -> list[Event]:
-    """The events of one peak of the vibration."""
+    """Return the events of one vibration peak."""
     return [event for event in scenario.events if event.kind == PEAK and event.peak == number]
 
 
 def moved(signal: Array, events: Sequence[Event], dt: float, before: int = 0) -> Array:
-    """The signal (n,) of a peak after its events, sampled every `dt` [s], `before` steps of it before the start of the record;
-    taken to be periodic, as an inverse DFT is."""
+    """Apply events to the signal of a vibration peak.
+
+    Parameters
+    ----------
+    signal : Array
+        Signal without events, (n,), periodic, as an inverse DFT is.
+    events : sequence of Event
+        Events of the peak.
+    dt : float
+        Time step [s].
+    before : int
+        Steps of the signal before the start of the record.
+
+    Returns
+    -------
+    Array
+        Signal with events, (n,).
+    """
     t = (np.arange(signal.size) - before) * dt
     return strength(events, t) * (hilbert(signal) * np.exp(2j * np.pi * turns(events, t))).real
 
 
 def moved_process(process: Ar2, x: Array, events: Sequence[Event]) -> Array:
-    """The same of a sample x (n,) of an AR(2) process, which is not periodic: on both sides it goes on as the process is
-    expected to, and fades out."""
+    """Apply events to a sample x (n,) of an AR(2) process, which is not periodic.
+
+    On both sides it is extended by the expectation of the process, which decays.
+    """
     guard = min(round(GUARD * 2.0 * np.pi / (process.omega * process.dt)), x.size)
     fade = 0.5 + 0.5 * np.cos(np.pi * np.arange(1, guard + 1) / (guard + 1))
     ahead, behind = (fade * process.extrapolate(ends, guard) for ends in (np.resize(x[-2:], 2), np.resize(x[1::-1], 2)))
@@ -48,24 +66,26 @@ def moved_process(process: Ar2, x: Array, events: Sequence[Event]) -> Array:
 
 
 def clock(scenario: Scenario, n_steps: int) -> Array | None:
-    """When each step sees the turbulence [steps], (n_steps,); None where the wind stays as it is."""
+    """Return the time [steps] of the turbulence at each step, (n_steps,); None where the wind is constant."""
     events = [event for event in scenario.events if event.kind == WIND]
     return air_time(events, np.arange(n_steps) * scenario.dt) / scenario.dt if events else None
 
 
 def steps_of_air(at: Array | None, n_steps: int) -> int:
-    """How many steps of turbulence a record takes, by its clock: those of the record at least, so that a wind that falls leaves
-    what was before as it was."""
+    """Return the number of steps of turbulence that a record needs, by its clock.
+
+    At least those of the record, so that a falling wind does not change the turbulence before it.
+    """
     return n_steps if at is None else max(n_steps, int(np.ceil(at[-1])) + 1, 2)
 
 
 def read(x: Array, at: Array | None) -> Array:
-    """x (n, ...) at the times `at` [steps], between steps by a cubic spline; as it is where `at` is None."""
+    """Interpolate x (n, ...) at the times `at` [steps] by a cubic spline; return x itself where `at` is None."""
     return x if at is None else CubicSpline(np.arange(len(x)), x)(at)
 
 
 def lasers(scenario: Scenario, n_steps: int) -> Array:
-    """How many LGS there are at each step, (n_steps,) whole numbers."""
+    """Return the number of LGS at each step, (n_steps,), integers."""
     out, t = np.full(n_steps, scenario.sensors.lgs_count), np.arange(n_steps) * scenario.dt
     for event in scenario.events:
         if event.kind == LASER:
@@ -74,7 +94,10 @@ def lasers(scenario: Scenario, n_steps: int) -> Array:
 
 
 def lost_frames(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> dict[str, Array]:
-    """Sensor -> whether its measurement at each step is lost, (n_steps,); every event has a random stream of its own."""
+    """Return for each sensor which of its measurements are missing, bool (n_steps,).
+
+    Every event has a random stream of its own.
+    """
     t = np.arange(n_steps) * scenario.dt
     out = {"lgs": np.zeros(n_steps, dtype=bool), "ngs": np.zeros(n_steps, dtype=bool)}
     for event, stream in zip(scenario.events, rng.spawn(len(scenario.events)), strict=True):

@@ -1,7 +1,7 @@
-"""Temporal spectra of frozen flow as ideal sensors see it: what `frozen_flow` draws its signals from, without a draw.
+"""Temporal spectra of frozen flow seen by ideal sensors: the expectation of the signals of `frozen_flow`.
 
 A layer of wind speed v turns the spatial frequency k_x along the wind into f = k_x v / 2 pi. With Phi the von Karman density and
-M_i the transform of a functional (`wave`), two of them have the one-sided cross spectrum
+M_i the transform of a functional (`plane_waves`), two of them have the one-sided cross spectrum
 
     S_ij(f) = (2 pi / v) 2 integral dk_y Phi(k) conj(M_i(k)) M_j(k),
 
@@ -25,14 +25,14 @@ from wfsobs.simulation.guide_stars import lgs_weights
 from wfsobs.typing import Array
 
 LOWEST = 1e-3
-"""Where spectra are flat: this share of the frequency of wind across the outer scale."""
+"""Frequency below which spectra are flat, over that of the wind across the outer scale."""
 
 RIPPLES = 24
-"""Spectra have ripples, speed / diameter wide; up to this many they are followed, beyond only their mean."""
+"""Spectra have ripples of width speed / diameter; up to this many they are resolved, beyond only their mean."""
 
 
 class FlowSpectra(NamedTuple):
-    """One-sided densities [um^2/Hz] of one mode on the axis, of what the LGS together see of it, and between the two."""
+    """One-sided spectra of one mode: own, on the axis; seen, of the mean of the LGS [um^2/Hz]; shared, between the two."""
 
     own: Array
     seen: Array
@@ -40,7 +40,22 @@ class FlowSpectra(NamedTuple):
 
 
 def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra:
-    """At frequencies from 0 on [Hz], shape (n,) each."""
+    """Compute the spectra of one mode of frozen flow.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    mode : int
+        Index of the mode.
+    frequency : Array
+        Frequencies from 0 on, (n,) [Hz].
+
+    Returns
+    -------
+    FlowSpectra
+        Three densities, (n,) each [um^2/Hz].
+    """
     found = atmosphere.layers(scenario)
     f = _frequencies(scenario, min(layer.speed for layer in found), float(frequency[-1]))
     total = np.sum([_layer(scenario, mode, layer, f) for layer in found], axis=0)
@@ -54,7 +69,7 @@ def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra
 
 
 def _frequencies(scenario: Scenario, speed: float, highest: float) -> Array:
-    """Where the densities are computed: by ratio, then by the width of the ripples of the slowest layer, then by ratio again."""
+    """Return the nodes in frequency: by ratio, then by the ripple width of the slowest layer, then by ratio again."""
     ripple = speed / scenario.telescope.diameter
     lowest = min(LOWEST * speed / scenario.turbulence.outer_scale, 0.01 * ripple)
     f = np.concatenate(
@@ -69,7 +84,7 @@ def _frequencies(scenario: Scenario, speed: float, highest: float) -> Array:
 
 
 def _layer(scenario: Scenario, mode: int, layer: TurbulenceLayer, f: Array) -> NDArray[np.complex128]:
-    """own, seen and shared of one layer, (3, n)."""
+    """Return own, seen and shared of one layer, (3, n)."""
     kx = 2.0 * np.pi * f / layer.speed
     front = CORE / (0.5 * scenario.telescope.diameter)
     out = np.zeros((3, f.size), complex)
@@ -79,7 +94,7 @@ def _layer(scenario: Scenario, mode: int, layer: TurbulenceLayer, f: Array) -> N
 
 
 def _blocks(kx: Array, front: float) -> Iterator[slice]:
-    """Runs of frequencies that share their nodes across the wind."""
+    """Yield ranges of frequencies that share their nodes across the wind."""
     start = 0
     while start < kx.size:
         end = front if kx[start] < front else 1.5 * kx[start]

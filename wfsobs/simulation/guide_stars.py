@@ -1,13 +1,13 @@
-"""What laser guide stars get wrong, and how several make one measurement.
+"""Errors of laser guide stars, and the combination of several to one measurement.
 
-The minimum-variance weights are those of the best linear estimate of the disturbance on the axis from all that the LGS
-measure in the same step,
+The minimum-variance weights are those of the best linear estimate of the disturbance on the axis from all
+LGS measurements of one step,
 
     W = C_ty C_yy^-1,    C_ty = E phi_dist y',    C_yy = E y y',
 
-with the covariances of the model: turbulence as each beam sees it, vibration, which all see alike, and noise. They know of
-the angle between the stars and of their cones, not of time. They weigh measurements from which the mirror's part has been
-taken, so that a loop sees its own commands in full.
+with the covariances of the model: turbulence in each beam, vibration, which is common to all, and noise. They account for
+the angle between the stars and for their cones, not for time. They apply to pseudo-open-loop measurements, so that a loop
+sees its own commands in full.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from wfsobs.simulation.turbulence import turbulence_process, turbulence_rms
 from wfsobs.typing import Array
 
 MEAN = "mean"
-"""The combination that needs no model."""
+"""The combination without a model."""
 
 
 def low_frequency_process(scenario: Scenario, mode: int) -> Ar2:
-    """The AR(2) that stands for cone effect and uplink turbulence of one LGS in one mode; none with frozen flow.
+    """Return the AR(2) process that stands for cone effect and uplink turbulence of one LGS in one mode; zero with frozen flow.
 
-    It has the corner of the turbulence, since the part of the beam that an LGS misses moves with the same wind. A higher
+    It has the corner of the turbulence, since the missed part of the beam moves with the same wind. A higher
     order has the rms of tip in the ratio of their cone effects.
     """
     t = scenario.turbulence
@@ -44,7 +44,20 @@ def low_frequency_process(scenario: Scenario, mode: int) -> Ar2:
 
 
 def lgs_weights(scenario: Scenario, stars: int | None = None) -> Array:
-    """Of mode j of star i in mode k of the combination, (n_modes, n_lgs, n_modes); of the first `stars` alone if given."""
+    """Return the weights of the guide-star combination.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    stars : int, optional
+        Number of stars in use, the first ones; by default all.
+
+    Returns
+    -------
+    Array
+        Weight of mode j of star i in mode k, (n_modes, n_lgs, n_modes).
+    """
     stars, modes = stars or scenario.sensors.lgs_count, len(scenario.modes)
     if scenario.sensors.lgs_combination == MEAN:
         return np.tile(np.eye(modes)[:, None] / stars, (1, stars, 1))
@@ -53,7 +66,7 @@ def lgs_weights(scenario: Scenario, stars: int | None = None) -> Array:
 
 @lru_cache(maxsize=8)  # a scenario is what its settings are, whenever it was asked
 def _best_weights(scenario: Scenario, stars: int) -> Array:
-    """Those of minimum variance, of the first so many stars."""
+    """Return the minimum-variance weights of the first `stars` stars."""
     modes = len(scenario.modes)
     seen, noise = seen_turbulence(scenario), noise_covariance(scenario, "lgs")
     for mode in range(modes):
@@ -69,8 +82,10 @@ def _best_weights(scenario: Scenario, stars: int) -> Array:
 
 
 def seen_turbulence(scenario: Scenario) -> Array:
-    """Covariance [um^2] of the turbulence on the axis and as each LGS sees it, errors of its own included, noise not,
-    (1 + n_lgs, n_modes, 1 + n_lgs, n_modes)."""
+    """Return the covariance [um^2] of the turbulence on the axis and as measured by each LGS, noise excluded.
+
+    (1 + n_lgs, n_modes, 1 + n_lgs, n_modes); the errors of the stars are included.
+    """
     stars, modes = 1 + scenario.sensors.lgs_count, len(scenario.modes)
     if scenario.turbulence.source == "frozen-flow":
         out = atmosphere.star_covariance(scenario).copy()
@@ -87,15 +102,14 @@ def seen_turbulence(scenario: Scenario) -> Array:
 
 
 def lgs_error_variance(scenario: Scenario, mode: int) -> float:
-    """Variance [um^2] of what the combination makes of the turbulence less the turbulence on the axis, noise aside."""
+    """Return the variance [um^2] of the combined LGS turbulence minus that on the axis, without noise."""
     combined = np.concatenate([np.zeros((1, len(scenario.modes))), lgs_weights(scenario)[mode]])
     combined[0, mode] = -1.0
     return float(np.einsum("ij,ijkl,kl->", combined, seen_turbulence(scenario), combined))
 
 
 def lgs_error_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
-    """The slow error of the LGS together in one mode, sampled every `dt` [s]: the AR(2) process of its variance with the
-    corner of the turbulence."""
+    """Return the slow error of the combined LGS in one mode: AR(2), with the corner of the turbulence."""
     if scenario.turbulence.source != "frozen-flow" and scenario.sensors.lgs_combination == MEAN:
         one = low_frequency_process(scenario, mode)
         return replace(one, rms=one.rms / np.sqrt(scenario.sensors.lgs_count), dt=dt)
@@ -104,7 +118,7 @@ def lgs_error_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
 
 
 def lgs_noise_rms(scenario: Scenario, mode: int) -> float:
-    """Rms [um] of the white noise of the LGS together in one mode."""
+    """Return the rms [um] of the white noise of the combined LGS in one mode."""
     if scenario.sensors.lgs_combination == MEAN:
         return float(noise_rms(scenario, "lgs")[mode] / np.sqrt(scenario.sensors.lgs_count))
     own = lgs_weights(scenario)[mode]

@@ -1,6 +1,6 @@
 """The scenario's atmosphere: layers along the line of sight, the beams of its stars through them, and their covariances.
 
-Airmass lengthens the way to layers and to guide stars alike, so that a laser's cone has the same share of the aperture in a
+Airmass lengthens the path to layers and to guide stars alike, so that a laser's cone has the same share of the aperture in a
 layer whatever the zenith angle.
 """
 
@@ -21,7 +21,7 @@ from wfsobs.typing import Array
 ARCSEC = np.pi / 180.0 / 3600.0
 
 CONE = 8.0 / 90.0
-"""Height of the layer over that of the guide star for which the low-frequency error of an LGS stands."""
+"""Height of the layer over that of the guide star that gives the slow LGS error."""
 
 
 class Star(NamedTuple):
@@ -32,12 +32,12 @@ class Star(NamedTuple):
 
 
 def airmass(scenario: Scenario) -> float:
-    """Way through the atmosphere over that at the zenith, of plane layers."""
+    """Return the path through the atmosphere over that at the zenith, for plane layers."""
     return float(1.0 / np.cos(np.radians(scenario.telescope.zenith_angle)))
 
 
 def layers(scenario: Scenario) -> tuple[TurbulenceLayer, ...]:
-    """The layers as the telescope sees them, their shares divided by their sum."""
+    """Return the layers along the line of sight, their shares normalised to a sum of one."""
     t, way = scenario.turbulence, airmass(scenario)
     total = sum(layer.fraction for layer in t.layers)
     strength = t.r0 ** (-5.0 / 3.0) * way
@@ -53,7 +53,7 @@ def layers(scenario: Scenario) -> tuple[TurbulenceLayer, ...]:
 
 
 def effective_wind(scenario: Scenario) -> float:
-    """The wind speed [m/s] of the one layer that stands for all, (sum of share v^(5/3))^(3/5) (Roddier 1981)."""
+    """Return the effective wind speed [m/s], (sum of share v^(5/3))^(3/5) (Roddier 1981)."""
     if scenario.turbulence.source != "frozen-flow":
         return scenario.turbulence.wind_speed
     found = layers(scenario)
@@ -62,18 +62,18 @@ def effective_wind(scenario: Scenario) -> float:
 
 
 def on_axis() -> Star:
-    """Where the truth is."""
+    """Return the direction of the truth."""
     return Star((0.0, 0.0), np.inf)
 
 
 def natural_star(scenario: Scenario) -> Star:
-    """The NGS."""
+    """Return the NGS."""
     x, y = scenario.sensors.ngs_direction
     return Star((x * ARCSEC, y * ARCSEC), np.inf)
 
 
 def laser_stars(scenario: Scenario) -> list[Star]:
-    """The LGS, evenly on their circle."""
+    """Return the LGS, evenly on their circle."""
     s = scenario.sensors
     angles = np.radians(s.lgs_angle) + 2.0 * np.pi * np.arange(s.lgs_count) / s.lgs_count
     radius, distance = s.lgs_radius * ARCSEC, s.lgs_altitude * airmass(scenario)
@@ -81,27 +81,43 @@ def laser_stars(scenario: Scenario) -> list[Star]:
 
 
 def view(sensor: Sensor, star: Star, of: tuple[TurbulenceLayer, ...]) -> View:
-    """A sensor on a star, through these layers."""
+    """Return a sensor and the footprints of its star's beam on the layers."""
     (x, y), distance = star
     return View(sensor, tuple(Footprint(1.0 - layer.height / distance, (layer.height * x, layer.height * y)) for layer in of))
 
 
 def ideal_sensor(scenario: Scenario) -> ZernikeProjection:
-    """The plain projection on the scenario's modes."""
+    """Return the plain projection on the scenario's modes."""
     return ZernikeProjection(scenario.telescope.diameter, tuple(mode.noll for mode in scenario.modes))
 
 
 # ---------------------------------------------------------------------- covariances
 
 LOG_K = np.linspace(np.log(1e-9), np.log(1e4), 6000)
-"""Spatial frequencies, times D / 2, of integrals over all directions; the least lie below any outer scale."""
+"""Spatial frequencies, times D / 2, of integrals over all directions; the smallest lie below any outer scale."""
 
 
 @lru_cache(maxsize=256)
 def mode_variance(order: int, diameter: float, strength: float, outer_scale: float, cone: float = 1.0) -> float:
-    """Variance [um^2] of a Zernike mode of a radial order; with `cone`, of what a beam narrower by that factor gets wrong.
+    """Return the variance [um^2] of a Zernike mode in turbulence, or with `cone` that of the cone effect.
 
-    diameter, outer_scale [m]; strength: r0^(-5/3) [m^(-5/3)], r0 at 500 nm.
+    Parameters
+    ----------
+    order : int
+        Radial order.
+    diameter : float
+        Aperture diameter [m].
+    strength : float
+        r0^(-5/3), r0 at 500 nm [m^(-5/3)].
+    outer_scale : float
+        L0 [m].
+    cone : float
+        Width of the beam over that of the aperture; below 1, the variance is that of the error of this beam.
+
+    Returns
+    -------
+    float
+        Variance [um^2].
     """
     x = np.exp(LOG_K)
     seen = bessel_ratio(order + 1, x) - (bessel_ratio(order + 1, cone * x) if cone != 1.0 else 0.0)
@@ -111,12 +127,12 @@ def mode_variance(order: int, diameter: float, strength: float, outer_scale: flo
 
 
 def relative_rms(scenario: Scenario, mode: int) -> float:
-    """Rms of a mode over that of tip, of the scenario's r0 and outer scale."""
+    """Return the rms of a mode over that of tip, for the scenario's r0 and outer scale."""
     return _relative(scenario, mode, 1.0)
 
 
 def relative_cone_error(scenario: Scenario, mode: int) -> float:
-    """What a guide star gets wrong in a mode over what it gets wrong in tip."""
+    """Return the cone effect of a mode over that of tip."""
     return _relative(scenario, mode, 1.0 - CONE)
 
 
@@ -129,7 +145,7 @@ def _relative(scenario: Scenario, mode: int, cone: float) -> float:
 
 
 def frozen_flow_variance(scenario: Scenario, mode: int) -> float:
-    """Variance [um^2] of one mode on the axis."""
+    """Return the variance [um^2] of one mode on the axis."""
     strength = sum(layer.strength for layer in layers(scenario))
     return mode_variance(
         scenario.modes[mode].radial_order, scenario.telescope.diameter, strength, scenario.turbulence.outer_scale
@@ -137,15 +153,17 @@ def frozen_flow_variance(scenario: Scenario, mode: int) -> float:
 
 
 def star_covariance(scenario: Scenario) -> Array:
-    """Covariance [um^2] of the modes that an ideal sensor would see on the axis and on each LGS,
-    (1 + n_lgs, n_modes, 1 + n_lgs, n_modes)."""
+    """Return the covariance [um^2] of the modes seen by an ideal sensor on the axis and on each LGS.
+
+    (1 + n_lgs, n_modes, 1 + n_lgs, n_modes).
+    """
     stars = (on_axis(), *laser_stars(scenario))
     return _covariance(ideal_sensor(scenario), layers(scenario), scenario.turbulence.outer_scale, stars)
 
 
 @lru_cache(maxsize=32)
 def _covariance(sensor: ZernikeProjection, of: tuple[TurbulenceLayer, ...], outer_scale: float, stars: tuple[Star, ...]) -> Array:
-    """By the rule that frozen flow has across the wind, here in both directions."""
+    """Integrate by the rule of frozen flow across the wind, in both directions."""
     n = len(stars) * sensor.n_outputs
     total = np.zeros((n, n))
     for i, layer in enumerate(of):

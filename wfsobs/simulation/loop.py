@@ -17,15 +17,26 @@ from wfsobs.simulation.sensing import measure
 from wfsobs.typing import Array
 
 TRAINING_MARGIN = 0.5
-"""What a training record has beyond its last window [s], so that the end of the zero-phase filter stays out of
-the targets."""
+"""Time after the last window of a training record [s]; it keeps the end of the zero-phase filter out of the targets."""
 
 
 def integrator(open_loop_y: Array, gain: float, leak: float) -> Array:
-    """Commands of the integrator u[k] = leak u[k-1] - g y[k] on y[k] = open_loop_y[k] + u[k-2].
+    """Compute the commands of the integrator u[k] = leak u[k-1] - g y[k] on y[k] = open_loop_y[k] + u[k-2].
 
     The loop is linear, so it is one recursive filter of the open-loop measurement,
-    u = -g / (1 - leak q^-1 + g q^-2) y_OL. Stable for 0 <= g < 1 and 0 <= leak <= 1. Where y_OL is NaN u stays as it is.
+    u = -g / (1 - leak q^-1 + g q^-2) y_OL. Stable for 0 <= g < 1 and 0 <= leak <= 1.
+
+    Parameters
+    ----------
+    open_loop_y : Array
+        Open-loop measurements, (n_steps, n_modes) [um]; where NaN, the command does not change.
+    gain, leak : float
+        Gain g and leak.
+
+    Returns
+    -------
+    Array
+        Commands u, (n_steps, n_modes) [um].
     """
     if np.isnan(open_loop_y).any():
         return np.column_stack([_holding_integrator(y.tolist(), gain, leak) for y in open_loop_y.T])
@@ -33,7 +44,7 @@ def integrator(open_loop_y: Array, gain: float, leak: float) -> Array:
 
 
 def _holding_integrator(open_loop_y: Sequence[float], gain: float, leak: float) -> list[float]:
-    """The same of one mode, measurement by measurement; one that is lost (NaN) leaves the command as it is."""
+    """Compute the commands of one mode, measurement by measurement; a missing one (NaN) holds the command."""
     u, before, last = [], 0.0, 0.0
     for y in open_loop_y:
         before, last = last, last if isnan(y) else leak * last - gain * (y + before)
@@ -42,10 +53,28 @@ def _holding_integrator(open_loop_y: Sequence[float], gain: float, leak: float) 
 
 
 def simulate(scenario: Scenario, *, rng: np.random.Generator | None = None, watch: Watch = QUIET) -> Record:
-    """Run the loop over the scenario's duration and return its record, training record included.
+    """Simulate the loop over the scenario's duration.
 
-    rng : source of every random number; by default one seeded with `scenario.run.seed`.
-    Raises SettingError where settings do not go together, Cancelled if `watch` says so.
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings of the run.
+    rng : numpy.random.Generator, optional
+        Source of all random numbers; by default one seeded with `scenario.run.seed`.
+    watch : Watch
+        Receives the progress, and is asked at every block of work whether to stop.
+
+    Returns
+    -------
+    Record
+        Measurements, commands and truth, with the training record.
+
+    Raises
+    ------
+    SettingError
+        Two settings exclude each other.
+    Cancelled
+        `watch` asks to stop.
     """
     scenario.validate()
     rng = np.random.default_rng(scenario.run.seed) if rng is None else rng
@@ -76,8 +105,10 @@ def _run(scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watc
 
 
 def _training(scenario: Scenario, rng: np.random.Generator, watch: Watch) -> Training:
-    """A record of the same scenario, without its events, with random numbers of its own, cut to start after the warm-up:
-    the loop has settled, and it is as long as the offline GPR needs."""
+    """Simulate a training record: the same scenario without its events, with random numbers of its own.
+
+    It starts after the warm-up, when the loop has settled, and has the length that the offline GPR needs.
+    """
     g = scenario.gpr_offline
     settle = round(scenario.run.warm_up * scenario.sensors.lgs_rate)
     needed = g.training_size + g.depth + round(TRAINING_MARGIN * scenario.sensors.lgs_rate)

@@ -1,4 +1,4 @@
-"""What the wavefront sensors see of the disturbance, the mirror at rest."""
+"""Open-loop measurements: the disturbance seen by the wavefront sensors with the mirror at rest."""
 
 from __future__ import annotations
 
@@ -19,20 +19,50 @@ from wfsobs.typing import Array
 
 @dataclass(frozen=True)
 class OpenLoop:
-    """Open-loop measurements [um]: lgs (n_steps, n_modes), that of the LGS together, and ngs, NaN in
-    steps without a frame; both NaN where a frame is lost."""
+    """Open-loop measurements [um].
+
+    Attributes
+    ----------
+    lgs : Array
+        Combined LGS, (n_steps, n_modes); NaN where a frame is missing.
+    ngs : Array
+        NGS, (n_steps, n_modes); NaN in steps without a frame or where it is missing.
+    """
 
     lgs: Array
     ngs: Array
 
 
 def measure(scenario: Scenario, disturbance: Disturbance, rng: np.random.Generator, watch: Watch = QUIET) -> OpenLoop:
-    """LGS at every step, NGS at every n-th, both of the wavefront up to the step before.
+    """Simulate the open-loop measurements of a disturbance.
 
-    LGS: the mean over the guide stars of phi_dist[k-1] + error (paper, eq. 3), or their combination of minimum variance, each
-    guide star with noise and error of its own; of frozen flow, each sees what is in its own beam. NGS at k = n, 2n, ...: the
+    LGS at every step, NGS at every n-th, both of the wavefront up to the step before.
+
+    LGS: the mean over the guide stars of phi_dist[k-1] + error (paper, eq. 3), or their minimum-variance combination, each
+    guide star with noise and error of its own; with frozen flow, each measures its own beam. NGS at k = n, 2n, ...: the
     mean of phi_dist[k-1] ... phi_dist[k-n], plus noise. With tip-tilt indetermination the LGS see no turbulence in tip and tilt.
-    Without a laser, and where a frame is lost, NaN.
+    Without a laser, and where a frame is missing, NaN.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    disturbance : Disturbance
+        Turbulence and vibration.
+    rng : numpy.random.Generator
+        Source of the noise.
+    watch : Watch
+        Asked at every guide star whether to stop.
+
+    Returns
+    -------
+    OpenLoop
+        Measurements.
+
+    Raises
+    ------
+    Cancelled
+        `watch` asks to stop.
     """
     lgs_rng, ngs_rng, lost_rng = rng.spawn(3)
     n_steps, n_modes = disturbance.total.shape
@@ -55,7 +85,7 @@ def measure(scenario: Scenario, disturbance: Disturbance, rng: np.random.Generat
 
 
 def _together(scenario: Scenario, seen: Sequence[Array], vibration: Array, errors: Sequence[Array]) -> Array:
-    """What the LGS measure together, as many as there are errors, (n_steps, n_modes)."""
+    """Combine the LGS, as many as there are errors, (n_steps, n_modes)."""
     stars = len(errors)
     if scenario.sensors.lgs_combination == MEAN:
         turbulence = seen[0] if len(seen) == 1 else np.mean(seen[:stars], axis=0)
@@ -66,7 +96,7 @@ def _together(scenario: Scenario, seen: Sequence[Array], vibration: Array, error
 
 
 def _without_blind(scenario: Scenario, turbulence: Array) -> Array:
-    """What is left of the turbulence where an LGS cannot see tip and tilt."""
+    """Return the turbulence without tip and tilt where an LGS cannot see them."""
     if not scenario.sensors.tip_tilt_indetermination:
         return turbulence
     visible = [mode.radial_order > 1 for mode in scenario.modes[: turbulence.shape[1]]]
@@ -74,8 +104,10 @@ def _without_blind(scenario: Scenario, turbulence: Array) -> Array:
 
 
 def _lgs_errors(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.Generator, watch: Watch) -> list[Array]:
-    """Errors of every guide star [um], each (n_steps, n_modes): white noise, plus what stands for the cone effect where
-    turbulence has no layers, which the wind carries along with the turbulence."""
+    """Draw the errors of every guide star [um], each (n_steps, n_modes).
+
+    White noise, plus the slow LGS error where turbulence has no layers; the wind carries it along with the turbulence.
+    """
     out, at = [], events.clock(scenario, n_steps)
     for star in rng.spawn(scenario.sensors.lgs_count):
         noise_rng, slow_rng = star.spawn(2)

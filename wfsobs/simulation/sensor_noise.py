@@ -1,4 +1,4 @@
-"""The scenario's wavefront sensors: what they are, how noisy, and what they alias."""
+"""The scenario's wavefront sensors, their noise and their aliasing."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from wfsobs.typing import Array
 
 
 def sensor(scenario: Scenario, kind: Kind) -> Sensor:
-    """What looks at an LGS or at the NGS. Raises SettingError where its slopes do not determine the modes."""
+    """Return the sensor on an LGS or on the NGS. Raises SettingError where its slopes do not determine the modes."""
     return atmosphere.ideal_sensor(scenario) if scenario.sensors.kind == "zernike" else shack_hartmann(scenario, kind)
 
 
 def shack_hartmann(scenario: Scenario, kind: Kind) -> ShackHartmann:
-    """The Shack-Hartmann sensor on an LGS or on the NGS, see `sensor`."""
+    """Return the Shack-Hartmann sensor on an LGS or on the NGS, see `sensor`."""
     lenslets, order = fit(scenario.sensors.lenslets, kind, scenario.telescope.diameter, scenario.telescope.radial_order)
     return _made(lenslets, tuple(mode.noll for mode in scenario.modes), order)
 
@@ -34,9 +34,21 @@ def _made(lenslets: Lenslets, nolls: tuple[int, ...], order: int) -> ShackHartma
 
 
 def noise_covariance(scenario: Scenario, kind: Kind) -> Array:
-    """Covariance [um^2] of the white noise of one LGS, or of the NGS, in one frame, (n_modes, n_modes).
+    """Return the covariance of the white noise of one LGS, or of the NGS, in one frame.
 
-    That of photons and read noise is the noise of Shack-Hartmann slopes, correlated between modes, whatever the sensor.
+    Photon and read noise is the noise of Shack-Hartmann slopes, correlated between modes, whatever the sensor.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    kind : {"lgs", "ngs"}
+        Which sensor.
+
+    Returns
+    -------
+    Array
+        (n_modes, n_modes) [um^2].
     """
     s = scenario.sensors
     if s.noise_from == "nm":
@@ -47,7 +59,7 @@ def noise_covariance(scenario: Scenario, kind: Kind) -> Array:
 
 
 def _stated_noise(scenario: Scenario, kind: Kind) -> Array:
-    """Rms [um] per mode, of noise from nm, (n_modes,)."""
+    """Return the rms [um] per mode of noise given in nm, (n_modes,)."""
     s = scenario.sensors
     if kind == "ngs":
         return np.full(len(scenario.modes), s.ngs_noise)
@@ -56,13 +68,15 @@ def _stated_noise(scenario: Scenario, kind: Kind) -> Array:
 
 
 def noise_rms(scenario: Scenario, kind: Kind) -> Array:
-    """Rms [um] of that noise in each mode, (n_modes,)."""
+    """Return the rms [um] of the white noise of one frame in each mode, (n_modes,)."""
     return np.sqrt(np.diag(noise_covariance(scenario, kind)))
 
 
 def white_noise(scenario: Scenario, kind: Kind, n_steps: int, rng: np.random.Generator) -> Array:
-    """The noise of one LGS, or of the NGS, at every step [um], (n_steps, n_modes). Higher modes leave tip and tilt the
-    numbers that they have alone."""
+    """Draw the noise of one LGS, or of the NGS, at every step [um], (n_steps, n_modes).
+
+    Tip and tilt have the same random numbers with and without higher modes.
+    """
     n_modes = len(scenario.modes)
     normal = np.hstack([rng.standard_normal((n_steps, 2)), rng.standard_normal((n_steps, n_modes - 2))])
     if scenario.sensors.noise_from == "nm":
@@ -71,8 +85,10 @@ def white_noise(scenario: Scenario, kind: Kind, n_steps: int, rng: np.random.Gen
 
 
 def aliasing_rms(scenario: Scenario, kind: Kind) -> Array:
-    """Rms [um] of what an LGS, or the NGS, takes for its modes and is none of them, (n_modes,): the sensor less the Zernike
-    coefficients of the same beam. None where turbulence has no layers or the sensor is the ideal one."""
+    """Return the rms [um] of the aliasing of an LGS, or of the NGS, in each mode, (n_modes,).
+
+    The sensor minus the Zernike coefficients in the same beam. Zero where turbulence has no layers or the sensor is ideal.
+    """
     if scenario.turbulence.source != "frozen-flow" or scenario.sensors.kind == "zernike":
         return np.zeros(len(scenario.modes))
     error, outer_scale = _aliasing(shack_hartmann(scenario, kind)), scenario.turbulence.outer_scale

@@ -1,8 +1,8 @@
-"""The spectra that a scenario really has, mode by mode, from its settings alone.
+"""True spectra of a scenario, mode by mode, from its settings alone.
 
-How wide lines are decides how well they can be told ahead. Damped ones have the width that they have in the record
-(`synthesis`); pure lines are told ahead without error after long enough (`TrueSpectra.without_lines`). What a controller
-leaves of those is asked of lines `line_width` wide at half maximum.
+The width of lines determines how well they can be predicted. Damped ones have the width that they have in the record
+(`synthesis`); undamped ones are predicted without error after long enough (`TrueSpectra.without_lines`). For the residual of
+a controller they are taken `line_width` wide at half maximum.
 """
 
 from __future__ import annotations
@@ -26,26 +26,36 @@ from wfsobs.simulation.turbulence import processes, table_variance, third_order_
 from wfsobs.typing import Array
 
 DECAYED = 2.5
-"""How far correlations have decayed after half the DFT, as an exponent; a line that turns round by then is nothing new."""
+"""Decay of correlations after half the DFT, as an exponent; a line that wraps around by then brings nothing new."""
 
 SMOOTH = 4.0
-"""The same for processes of a known width, whose correlations may not come round at all: exp(-10) of them does."""
+"""The same for processes of a known width, whose correlations must not wrap around: exp(-10) of them does."""
 
 MOST = 2**20
-"""Length of the DFT at most: of an AR(2) what decays more slowly comes round, which moves the bound by little."""
+"""Maximum length of the DFT: an AR(2) that decays more slowly wraps around, which changes the bound by little."""
 
 FLOOR = 1e-6
-"""Least noise of a measurement [um]."""
+"""Minimum noise of a measurement [um]."""
 
 
 @dataclass(frozen=True)
 class TrueSpectra:
-    """What one mode of a scenario really is, on the frequencies of `wiener`, all (n // 2 + 1,) [um^2 per sample].
+    """Spectra of one mode of a scenario, on the frequencies of `wiener`, all (n // 2 + 1,) [um^2 per sample].
 
-    measured : S_z of the pseudo-open-loop LGS measurement, noise and all
-    signal   : target -> S_s;  shared : target -> spectrum between s[k] and what z[k + 1] has of it
-    lines    : of the pure lines in the vibration, `line_width` wide; gain : what the measurement has of them
-    pure     : (frequency [cycles per step], variance [um^2]) of each
+    Attributes
+    ----------
+    measured : Array
+        S_z of the pseudo-open-loop LGS measurement, with noise.
+    signal : dict of str to Array
+        Target -> S_s.
+    shared : dict of str to Array
+        Target -> cross spectrum of s[k] and z[k + 1].
+    lines : Array or None
+        Spectrum of the undamped lines of the vibration, `line_width` wide.
+    gain : float
+        Gain of the measurement for lines.
+    pure : tuple
+        (frequency [cycles per step], variance [um^2]) of each line.
     """
 
     measured: Array
@@ -62,7 +72,7 @@ class TrueSpectra:
 
     @property
     def without_lines(self) -> TrueSpectra:
-        """What is left to be estimated once the pure lines are known."""
+        """The spectra once the undamped lines are known."""
         if self.lines is None:
             return self
         return TrueSpectra(
@@ -72,13 +82,26 @@ class TrueSpectra:
         )
 
     def line_covariance(self, n: int) -> Array:
-        """Autocovariance of the pure lines at the lags 0 to n - 1, (n,)."""
+        """Return the autocovariance of the undamped lines at the lags 0 to n - 1, (n,)."""
         lag = np.arange(n)
         return sum((variance * np.cos(2.0 * pi * f * lag) for f, variance in self.pure), np.zeros(n))
 
 
 def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
-    """The spectra of one mode, from the settings alone."""
+    """Compute the spectra of one mode, from the settings alone.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    mode : int
+        Index of the mode.
+
+    Returns
+    -------
+    TrueSpectra
+        Spectra.
+    """
     n = n_frequencies(scenario)
     turbulence, seen, shared = TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n)
     vibration, gain = _vibration(scenario, mode, n), lgs_weights(scenario)[mode, :, mode].sum()
@@ -96,18 +119,20 @@ def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
 
 
 def seen_turbulence(scenario: Scenario, mode: int) -> Array:
-    """S of what the LGS together see of the turbulence, on the frequencies of `true_spectra`."""
+    """Return the spectrum of the turbulence in the combined LGS, on the frequencies of `true_spectra`."""
     return TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n_frequencies(scenario))[1]
 
 
 def n_frequencies(scenario: Scenario) -> int:
-    """Length of the DFT, a power of two: the slowest correlation has decayed by its half."""
+    """Return the length of the DFT, a power of two: the slowest correlation has decayed by its half."""
     return min(_wanted_frequencies(scenario), MOST)
 
 
 def is_known(scenario: Scenario) -> bool:
-    """Whether the spectra can be told: not those of frozen flow so slow that its low frequencies would not be resolved, nor
-    where events change them."""
+    """Return whether the spectra are known.
+
+    They are not for frozen flow so slow that its low frequencies would not be resolved, nor where events change them.
+    """
     source = scenario.turbulence.source
     if scenario.events:
         return False
@@ -119,7 +144,7 @@ def _wanted_frequencies(scenario: Scenario) -> int:
 
 
 def _decay_rates(scenario: Scenario) -> list[float]:
-    """How fast the correlations of the disturbances decay [1/s], xi w, with the margin that smooth spectra leave."""
+    """Return the decay rates of the correlations of the disturbances [1/s], xi w, with the margin of smooth spectra."""
     v, least = scenario.vibration, pi * line_width(scenario)
     smooth = [turbulence_process(scenario, 0, scenario.dt)]
     if scenario.turbulence.source == "processes":
@@ -137,16 +162,16 @@ def _decay_rates(scenario: Scenario) -> list[float]:
 
 
 def _density(process: Ar2 | Ar3, n: int) -> Array:
-    """Of an autoregressive process, per sample."""
+    """Return the spectrum of an autoregressive process, per sample."""
     return process.psd(np.fft.rfftfreq(n, process.dt)) / (2.0 * process.dt)
 
 
 Looks = tuple[Array, Array, Complex | Array]
-"""S of the turbulence, of what the LGS together see of it, errors of their own included, and between the two."""
+"""S of the turbulence, of the turbulence in the combined LGS, errors included, and between the two."""
 
 
 def _through_lgs(scenario: Scenario, mode: int, own: Array) -> Looks:
-    """Turbulence that all stars see alike, each LGS with a slow error of its own."""
+    """Return the spectra of turbulence that is common to all stars, each LGS with a slow error of its own."""
     weights = lgs_weights(scenario)[mode, :, mode]
     error = _density(low_frequency_process(scenario, mode), 2 * (own.size - 1)) * np.sum(weights**2)
     blind = scenario.sensors.tip_tilt_indetermination and scenario.modes[mode].radial_order == 1
@@ -194,7 +219,7 @@ def _vibration(scenario: Scenario, mode: int, n: int) -> Array:
 
 
 def _pure_lines(scenario: Scenario, mode: int, n: int) -> Array | None:
-    """The spectrum of the pure lines; None where there is none."""
+    """Return the spectrum of the undamped lines; None where there is none."""
     power = np.zeros(n // 2 + 1)
     for frequency, variance in pure_lines(scenario, mode):
         power[min(round(frequency * n * scenario.dt), n // 2)] += variance
@@ -209,4 +234,4 @@ TURBULENCE_SPECTRA: dict[str, Callable[[Scenario, int, int], Looks]] = {
     "psd": _table,
     "none": _no_turbulence,
 }
-"""How the turbulence of each source looks to `true_spectra`."""
+"""Source of turbulence -> its spectra."""

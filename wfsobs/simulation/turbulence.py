@@ -1,6 +1,6 @@
-"""Turbulence of one run, made from a scenario, and what the stars see of it.
+"""Turbulence of one run, simulated from a scenario, on the axis and in the beams of the stars.
 
-A new source is one more function in `SOURCES`, under the name that the scenario's `turbulence.source` knows it by.
+A new source is one more function in `SOURCES`, under the name of the scenario's `turbulence.source` setting.
 """
 
 from __future__ import annotations
@@ -27,10 +27,16 @@ from wfsobs.typing import Array
 
 @dataclass(frozen=True)
 class Turbulence:
-    """Turbulence [um], each array (n_steps, n_modes).
+    """Turbulence of one run, each array (n_steps, n_modes) [um].
 
-    on_axis  : the truth
-    ngs, lgs : what the NGS and each of the LGS see of it, or None where all see the truth
+    Attributes
+    ----------
+    on_axis : Array
+        The truth.
+    ngs : Array or None
+        In the beam of the NGS; None where it is the truth.
+    lgs : tuple of Array or None
+        In the beam of each LGS; None where it is the truth.
     """
 
     on_axis: Array
@@ -45,8 +51,10 @@ ModeSource = Callable[[Scenario, int, int, np.random.Generator], Array]
 
 
 def turbulence_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
-    """The AR(2) turbulence of one mode (paper, eq. 1), sampled every `dt` [s], rms in [um]; where turbulence is made
-    another way, the AR(2) process of its variance and effective wind, or of its strongest process."""
+    """Return the AR(2) turbulence of one mode (paper, eq. 1), sampled every `dt` [s], rms in [um].
+
+    Where the source is another, the AR(2) process of its variance and effective wind, or of its strongest process.
+    """
     rms = turbulence_rms(scenario, mode)
     if found := processes(scenario, mode, dt) if scenario.turbulence.source == "processes" else []:
         strongest = max(found, key=lambda p: p.rms)
@@ -58,7 +66,7 @@ def turbulence_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
 
 
 def processes(scenario: Scenario, mode: int, dt: float) -> list[Ar2 | Ar3]:
-    """The coloured noises whose sum the turbulence of one mode is, for source processes."""
+    """Return the coloured noises whose sum is the turbulence of one mode, for source processes."""
     out: list[Ar2 | Ar3] = []
     for p in scenario.turbulence.processes:
         omega, rms = 2.0 * pi * p.frequency, p.rms[mode] if mode < len(p.rms) else 0.0
@@ -69,13 +77,13 @@ def processes(scenario: Scenario, mode: int, dt: float) -> list[Ar2 | Ar3]:
 
 
 def third_order_process(scenario: Scenario, mode: int, dt: float) -> Ar3:
-    """The turbulence of one mode with its third corner, for source ar3."""
+    """Return the turbulence of one mode with its third corner, for source ar3."""
     p = turbulence_process(scenario, mode, dt)
     return Ar3(p.omega, p.damping, scenario.turbulence.third_corner * p.omega, p.rms, dt)
 
 
 def turbulence_rms(scenario: Scenario, mode: int) -> float:
-    """Standard deviation [um] that the scenario's turbulence has in one mode."""
+    """Return the standard deviation [um] of the scenario's turbulence in one mode."""
     t = scenario.turbulence
     if t.source == "none":
         return 0.0
@@ -89,20 +97,20 @@ def turbulence_rms(scenario: Scenario, mode: int) -> float:
 
 
 def mode_power(table: PsdTable, scenario: Scenario, mode: int, n: int) -> Array:
-    """Variance [um^2] that a table gives one mode in each DFT bin of `n` steps; modes that it does not hold have none."""
+    """Return the variance [um^2] of a table in each DFT bin of `n` steps, for one mode; zero for modes without a column."""
     density = getattr(table, scenario.modes[mode].name, None)
     return np.zeros(n // 2 + 1) if density is None else table_power(table.frequency, density, n, scenario.dt)
 
 
 def table_variance(scenario: Scenario, mode: int, n: int) -> Array:
-    """Variance [um^2] of the turbulence of source psd in each DFT bin of `n` steps, an even number."""
+    """Return the variance [um^2] of the turbulence of source psd in each DFT bin of `n` steps, even."""
     power = mode_power(scenario.turbulence.psd, scenario, mode, n)
     power[0] = 0.0
     return widened(power, line_width(scenario) * scenario.dt)
 
 
 def columns(source: ModeSource, scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch) -> Array:
-    """One signal per mode, each with a random stream of its own, (n_steps, n_modes)."""
+    """Draw one signal per mode, each with a random stream of its own, (n_steps, n_modes)."""
     out = []
     for mode, stream in enumerate(rng.spawn(len(scenario.modes))):
         watch.check()
@@ -111,7 +119,7 @@ def columns(source: ModeSource, scenario: Scenario, n_steps: int, rng: np.random
 
 
 def _mode_by_mode(source: ModeSource) -> Source:
-    """A source that knows no stars."""
+    """Return a source that is the same for all stars."""
     return lambda scenario, n, rng, watch: Turbulence(columns(source, scenario, n, rng, watch))
 
 
@@ -137,13 +145,13 @@ def _processes(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) 
 
 
 def _psd(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Array:
-    """A Gaussian process with the spectrum of the table, all of it up to half the rate."""
+    """Draw a Gaussian process with the spectrum of the table, up to half the rate."""
     period = period_steps(scenario, n)
     return gaussian_signal(table_variance(scenario, mode, period), period, rng)[:n]
 
 
 def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Watch) -> Turbulence:
-    """Von Karman layers: their modes on the axis, and what the sensors on the NGS and on every LGS see."""
+    """Simulate von Karman layers: their modes on the axis, and the signals of the sensors on the NGS and on every LGS."""
     layers = atmosphere.layers(scenario)
     ideal, on_ngs, on_lgs = atmosphere.ideal_sensor(scenario), sensor(scenario, "ngs"), sensor(scenario, "lgs")
     looking = [(ideal, atmosphere.on_axis()), (on_ngs, atmosphere.natural_star(scenario))]
