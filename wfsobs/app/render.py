@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -22,6 +24,19 @@ def render(template: str, **values: Any) -> str:
 def macro(name: str, *values: Any) -> Markup:
     """Fill a macro of `macros.html`: a piece that goes into other templates as it is."""
     return getattr(ENVIRONMENT.get_template("macros.html").module, name)(*values)
+
+
+class Row(NamedTuple):
+    """A row of a table: its heading, its cells, and attributes by which scripts and tests find it."""
+
+    head: str
+    cells: Sequence[str]
+    data: Mapping[str, str] = MappingProxyType({})
+
+
+def table(label: str, columns: Mapping[str, str], groups: Iterable[tuple[str, Iterable[Row]]]) -> Markup:
+    """Write a table that scrolls sideways; columns: heading -> explanation, groups: title, or nothing, and rows."""
+    return macro("table", label, columns, groups)
 
 
 def matrix(entries: ArrayLike) -> Markup:

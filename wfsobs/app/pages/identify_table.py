@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from html import escape
-
 from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.render import Row, macro, table
 from wfsobs.identification import Identified
 from wfsobs.identification.process import Number
 from wfsobs.identification.report import rows, verdict, written
 from wfsobs.identification.result import IdentifiedMode
 
-WHITE = '<span class="tag best">white</span> '
-COLOURED = '<span class="tag above">not white</span> '
+WHITE, COLOURED = macro("tag", "best", "white"), macro("tag", "above", "not white")
 
 
 def table_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
@@ -23,16 +21,11 @@ def table_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
         "Damping": "0 is a pure line",
         f"Rms [{display.unit_label}]": "standard deviation of it in z",
     }
-    head = "".join(f'<th scope=col title="{why}">{name}</th>' for name, why in columns.items())
-    body = ""
+    body = []
     for what, frequency, damping, rms in rows(mode):
         scaled = None if rms is None else Number(rms.value * scale, rms.std * scale)
-        cells = ["" if n is None else spoken(n) for n in (frequency, damping, scaled)]
-        body += f"<tr><th scope=row>{what}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
-    return (
-        f'<div class="scroll" tabindex=0 role=region aria-label="Identified in {mode.name}">'
-        f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-    )
+        body.append(Row(what, ["" if n is None else spoken(n) for n in (frequency, damping, scaled)]))
+    return str(table(f"Identified in {mode.name}", columns, [("", body)]))
 
 
 def spoken(number: Number) -> str:
@@ -46,8 +39,8 @@ def spoken(number: Number) -> str:
 
 def verdict_html(result: Identified) -> str:
     """Whether anything is left, mode by mode."""
-    lines = "".join(
-        f'<p class="text">{WHITE if mode.whiteness.white else COLOURED}{escape(line)}.</p>'
+    lines = [
+        (WHITE if mode.whiteness.white else COLOURED) + f"{line}."
         for mode, line in zip(result.modes, verdict(result), strict=True)
-    )
-    return f'<div role="status">{lines}</div>'
+    ]
+    return f'<div role="status">{macro("texts", "text", lines)}</div>'

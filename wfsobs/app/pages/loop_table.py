@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
+
+from markupsafe import Markup
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.loop_work import LoopShown
 from wfsobs.app.numbers import NOTHING, number
+from wfsobs.app.render import Row, macro, table
 from wfsobs.app.style import LOOKS, swatch
 from wfsobs.app.views.table import BEST
-from wfsobs.control.rows import LIMITED, NOT_APPLICABLE, Row, label
+from wfsobs.control.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.evaluation.bound import BOUND
+from wfsobs.evaluation.rows import Row as Score
 
-UNSTABLE = '<span class="tag above">unstable</span>'
+UNSTABLE = macro("tag", "above", "unstable")
 
 
-def of_mode(shown: LoopShown, display: Display) -> list[Row]:
+def of_mode(shown: LoopShown, display: Display) -> list[Score]:
     """The rows of the mode shown, least residual first, those without one last."""
     rows = [r for r in shown.rows if r["mode"] == display.mode]
     return sorted(rows, key=lambda r: float("inf") if r["residual_rms_nm"] is None else r["residual_rms_nm"])
@@ -37,23 +40,23 @@ def table_html(shown: LoopShown, display: Display) -> str:
     rows = of_mode(shown, display)
     best = next((r["controller"] for r in rows if r["controller"] != BOUND and r["residual_rms_nm"] is not None), None)
     scale = 1e-3 * per_micrometre(display.unit, shown.result.scenario.telescope.diameter)
-    body = "".join(_row(r, display, scale, r["controller"] == best) for r in rows)
+    body = [_row(r, display, scale, r["controller"] == best) for r in rows]
     notes = {r["note"]: label(r["controller"]) for r in reversed(rows) if r["note"] and not r["limited"]}
-    failures = "".join(f'<p class="failure">{escape(name)}: {escape(note)}</p>' for note, name in notes.items())
-    return _table("Controllers", columns, body) + limits_note(rows) + failures
+    failures = macro("texts", "failure", [f"{name}: {note}" for note, name in notes.items()])
+    return f"{table('Controllers', columns, [('', body)])}{limits_note(rows)}{failures}"
 
 
-def limits_note(rows: Sequence[Row]) -> str:
+def limits_note(rows: Sequence[Score]) -> str:
     """Why some of the rows have no theory and no margins; nothing where no limit of the mirror acts."""
     return f"<p>{NOT_APPLICABLE}: {LIMITED}</p>" if any(r["limited"] for r in rows) else ""
 
 
-def unlimited(row: Row, value: str) -> str:
+def unlimited(row: Score, value: str) -> str:
     """What is shown of the linear loop: not applicable where a limit of the mirror acts."""
-    return f'<span title="{LIMITED}">{NOT_APPLICABLE}</span>' if row["limited"] else value
+    return Markup('<span title="{}">{}</span>').format(LIMITED, NOT_APPLICABLE) if row["limited"] else value
 
 
-def _row(row: Row, display: Display, scale: float, best: bool) -> str:
+def _row(row: Score, display: Display, scale: float, best: bool) -> Row:
     def scaled(key: str) -> str:
         return NOTHING if row[key] is None else number(row[key] * scale)
 
@@ -64,7 +67,7 @@ def _row(row: Row, display: Display, scale: float, best: bool) -> str:
         NOTHING if row["strehl"] is None else f"{row['strehl']:.4f}",
         number(row["gain"]),
         NOTHING if row["limited"] is None else number(100.0 * row["limited"], 2),
-        escape(row["needs"]),
+        row["needs"],
     ]
     return _line(row, display, cells)
 
@@ -78,22 +81,11 @@ def margins_html(shown: LoopShown, display: Display) -> str:
         "Delay margin [ms]": "by which it may come later",
     }
     rows = [r for r in of_mode(shown, display) if r["phase_margin_deg"] is not None]
-    body = "".join(
-        _line(r, display, [number(r[key]) for key in ("gain_margin_db", "phase_margin_deg", "delay_margin_ms")]) for r in rows
-    )
-    return _table("Margins", columns, body)
+    keys = ("gain_margin_db", "phase_margin_deg", "delay_margin_ms")
+    return str(table("Margins", columns, [("", [_line(r, display, [number(r[key]) for key in keys]) for r in rows])]))
 
 
-def _line(row: Row, display: Display, cells: list[str]) -> str:
+def _line(row: Score, display: Display, cells: list[str]) -> Row:
     name = row["controller"]
-    line = swatch(name, display.dark) if name in LOOKS else ""
-    values = "".join(f"<td>{c}</td>" for c in cells)
-    return f'<tr data-controller="{name}"><th scope=row>{line}{escape(label(name))}</th>{values}</tr>'
-
-
-def _table(name: str, columns: dict[str, str], body: str) -> str:
-    head = "".join(f'<th scope=col title="{escape(why)}">{escape(column)}</th>' for column, why in columns.items())
-    return (
-        f'<div class="scroll" tabindex=0 role=region aria-label="{name}">'
-        f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-    )
+    line = swatch(name, display.dark) if name in LOOKS else Markup()
+    return Row(line + label(name), cells, {"controller": name})

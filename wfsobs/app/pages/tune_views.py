@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
+from itertools import groupby
 
 import numpy as np
 from bokeh.models import ColumnDataSource, DataRange1d
+from markupsafe import Markup
 
 from wfsobs.app.display import NO_ANGLE, UNITS, Display, per_micrometre
 from wfsobs.app.numbers import NOTHING, change, number
+from wfsobs.app.render import Row, macro, table
 from wfsobs.app.style import look
 from wfsobs.app.tune_work import LIKELIHOOD, OTHER, SETTING, TEST, TOGETHER, VALIDATION, best_so_far, rows
 from wfsobs.app.views.plots import call, new_figure
@@ -70,27 +72,25 @@ def unit_for(tuned: Tuned | None, display: Display) -> str:
 def table_html(tuned: Tuned, display: Display, diameter: float) -> str:
     """Settings, errors and likelihoods before and after."""
     unit = unit_for(tuned, display)
-    scale, body, last = per_micrometre(unit, diameter), "", ""
-    for section, name, before, after in rows(tuned):
-        if section != last:
-            title = TITLES[section].format(measure=tuned.measure, unit=UNITS[unit])
-            body += f'<tr><th colspan=4 class="target" scope=rowgroup>{escape(title)}</th></tr>'
-            last = section
-        error = section in (VALIDATION, TEST, OTHER)
-        cells = [_cell(x, scale if error else 1.0, 4) for x in (before, after)]
-        known = error and isinstance(before, float) and isinstance(after, float)
-        cells.append(change(before, after) if known else "")  # type: ignore[arg-type]
-        shown = f"<b>{escape(name)}</b>" if name == TOGETHER else escape(name)
-        body += f'<tr data-section="{section}"><th scope=row>{shown}</th>{"".join(f"<td>{c}</td>" for c in cells)}</tr>'
-    head = "".join(f"<th scope=col>{name}</th>" for name in ("What", "Before", "After", "Change [%]"))
-    notes = "".join(f'<p class="text">{escape(line)}.</p>' for line in remarks(tuned) if "likelihood" not in line)
-    return (
-        f'<div class="scroll" tabindex=0 role=region aria-label="Before and after">'
-        f'<table class="rms"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>{notes}'
-    )
+    scale = per_micrometre(unit, diameter)
+    groups = [
+        (TITLES[section].format(measure=tuned.measure, unit=UNITS[unit]), [_row(*row, scale) for row in found])
+        for section, found in groupby(rows(tuned), key=lambda row: row[0])
+    ]
+    columns = {"What": "", "Before": "", "After": "", "Change [%]": ""}
+    notes = [f"{line}." for line in remarks(tuned) if "likelihood" not in line]
+    return f"{table('Before and after', columns, groups)}{macro('texts', 'text', notes)}"
 
 
-def _cell(value: float | str | None, scale: float, digits: int) -> str:
+def _row(section: str, name: str, before: float | str | None, after: float | str | None, scale: float) -> Row:
+    error = section in (VALIDATION, TEST, OTHER)
+    cells = [_cell(x, scale if error else 1.0) for x in (before, after)]
+    known = error and isinstance(before, float) and isinstance(after, float)
+    cells.append(change(before, after) if known else "")  # type: ignore[arg-type]
+    return Row(Markup("<b>{}</b>").format(name) if name == TOGETHER else name, cells, {"section": section})
+
+
+def _cell(value: float | str | None, scale: float) -> str:
     if isinstance(value, str):
-        return escape(value)
-    return NOTHING if value is None else number(value * scale, digits)
+        return value
+    return NOTHING if value is None else number(value * scale, 4)

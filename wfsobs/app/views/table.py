@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from html import escape
 
 import panel as pn
+from markupsafe import Markup
 
 from wfsobs.app.display import IN_MOST, Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.numbers import NOTHING, change, number
+from wfsobs.app.render import Row, macro, table
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import Shown
 from wfsobs.evaluation.rows import NOT_OBSERVERS, competes, label_of, looks_ahead, needs_of, own_stretch, rows, stretch_of
 from wfsobs.evaluation.scores import BOUND, LOOP, RESIDUAL, Score
 from wfsobs.observers.base import TARGETS
 
-BEST = '<span class="tag best">best</span> '
-ABOVE = '<span class="tag above">above truth</span> '
+BEST, ABOVE = macro("tag", "best", "best"), macro("tag", "above", "above truth")
 
 
 def find(shown: Shown, observer: str, target: str, mode: str) -> Score | None:
@@ -39,12 +39,11 @@ class Table:
         self.pane.object = self.html()
 
     def html(self) -> str:
-        """The table."""
-        columns = self._columns()
-        head = "".join(f'<th scope=col title="{why}">{name}</th>' for name, why in columns.items())
-        body = self._measured(len(columns)) or "".join(self._target(target, len(columns)) for target in TARGETS)
-        table = f'<table class="rms"><thead><tr>{head}</tr></thead>{body}</table>'
-        return f'<div class="scroll" tabindex=0 role=region aria-label="RMS errors">{table}</div>{self._notes()}'
+        """Write the table."""
+        groups = self._measured() or [self._target(target) for target in TARGETS]
+        shown = self.run.result
+        failures = [failure.reason for failure in shown.result.failures] if shown else []
+        return f"{table('RMS errors', self._columns(), groups)}{macro('texts', 'failure', failures)}"
 
     def _columns(self) -> dict[str, str]:
         """Heading -> explanation."""
@@ -76,17 +75,17 @@ class Table:
         scores = [s for s in shown.result.scores if s.mode == self.display.mode] if shown else []
         return scores if any(s.target == RESIDUAL for s in scores) else []
 
-    def _measured(self, columns: int) -> str:
-        """The rows of a record without truth: predictions of the next measurement, and what the recorded loop left."""
-        scores = self._without_truth()
+    def _measured(self) -> list[tuple[str, list[Row]]]:
+        """List the rows of a record without truth: predictions of the next measurement, and what the recorded loop left."""
+        scores, shown = self._without_truth(), self.run.result
+        if not scores or shown is None:
+            return []
         if self.display.best_first:
             scores.sort(key=lambda s: (s.target == RESIDUAL, s.apart, s.rms))
         best = min((s.rms for s in scores if competes(s.observer, s.apart)), default=None)
-        shown, out = self.run.result, []
+        scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
+        found = []
         for score in scores:
-            assert shown is not None
-            scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
-            loop = score.observer == LOOP
             is_best = score.rms == best and competes(score.observer, score.apart)
             cells = [
                 (BEST if is_best else "") + number(score.rms * scale),
@@ -97,20 +96,12 @@ class Table:
                 NOTHING,
                 *_times(score, shown.result.record.dt),
             ]
-            label = (
-                "Recorded loop, residual"
-                if loop
-                else (f"{swatch(score.observer, self.display.dark)}{escape(label_of(score.observer))}{_own(score)}")
-            )
-            values = "".join(f"<td>{c}</td>" for c in cells)
-            head = f"<th scope=row>{label}</th>"
-            out.append(f'<tr data-observer="{score.observer}" data-target="{score.target}">{head}{values}</tr>')
-        title = f"Next measurement z, {self.display.mode}{_scored(scores)}, one step ahead: the record has no truth"
-        head = f'<tr><th colspan={columns} class="target" scope=rowgroup>{title}</th></tr>'
-        return f"<tbody>{head}{''.join(out)}</tbody>" if out else ""
+            head = "Recorded loop, residual" if score.observer == LOOP else self._head(score.observer) + _own(score)
+            found.append(Row(head, cells, {"observer": score.observer, "target": score.target}))
+        return [(f"Next measurement z, {self.display.mode}{_scored(scores)}, one step ahead: the record has no truth", found)]
 
-    def _target(self, target: str, columns: int) -> str:
-        """The rows of a target, best first if asked for, those without a score last."""
+    def _target(self, target: str) -> tuple[str, list[Row]]:
+        """List the rows of a target, best first if asked for, those without a score last."""
         shown = self.run.result
         scores = {
             name: find(shown, name, target, self.display.mode) if shown else None
@@ -120,19 +111,17 @@ class Table:
         order = list(scores.items())
         if self.display.best_first:
             order.sort(key=lambda item: (item[1].apart, item[1].rms) if item[1] else (True, math.inf))
-        body = "".join(self._row(name, target, score, best) for name, score in order)
         title = f"{target.capitalize()}, {self.display.mode}{_scored([s for s in scores.values() if s])}"
-        return f'<tbody><tr><th colspan={columns} class="target" scope=rowgroup>{title}</th></tr>{body}</tbody>'
+        return title, [self._row(name, target, score, best) for name, score in order]
 
-    def _row(self, name: str, target: str, score: Score | None, best: float | None) -> str:
-        label = escape(label_of(name)) + (" <sup>looks ahead</sup>" if looks_ahead(name) else "") + _own(score)
+    def _row(self, name: str, target: str, score: Score | None, best: float | None) -> Row:
         shown, pinned = self.run.result, self._pinned(name, target, score)
         cells = [NOTHING, *pinned, *[NOTHING] * 2, needs_of(name), *[NOTHING] * 3]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             is_best = score.rms == best and competes(name, score.apart)
             cells = [
-                (BEST if is_best else "") + number(score.rms * scale) + interval_html(score.interval, scale),
+                (BEST if is_best else "") + number(score.rms * scale) + _interval(score.interval, scale),
                 *pinned,
                 number(score.truth_rms * scale),
                 (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
@@ -140,9 +129,11 @@ class Table:
                 NOTHING if score.lag is None else f"{1e3 * score.lag:.2f}".replace("-", "−"),
                 *_times(score, shown.result.record.dt),
             ]
-        values = "".join(f"<td>{c}</td>" for c in cells)
-        head = f"<th scope=row>{swatch(name, self.display.dark)}{label}</th>"
-        return f'<tr data-observer="{name}" data-target="{target}">{head}{values}</tr>'
+        head = self._head(name) + macro("note", "looks ahead" if looks_ahead(name) else "") + _own(score)
+        return Row(head, cells, {"observer": name, "target": target})
+
+    def _head(self, name: str) -> Markup:
+        return swatch(name, self.display.dark) + label_of(name)
 
     def _pinned(self, name: str, target: str, score: Score | None) -> list[str]:
         """The pinned run's error and the change since; nothing while nothing is pinned."""
@@ -155,11 +146,6 @@ class Table:
         scale = per_micrometre(self.display.unit, kept.scenario.telescope.diameter)
         return [number(before.rms * scale), change(before.rms, score.rms if score else None)]
 
-    def _notes(self) -> str:
-        shown = self.run.result
-        failures = shown.result.failures if shown else ()
-        return "".join(f'<p class="failure">{escape(f.reason)}</p>' for f in failures)
-
 
 def _scored(scores: list[Score]) -> str:
     """What was scored of rows that can be compared, for the end of a heading."""
@@ -167,17 +153,14 @@ def _scored(scores: list[Score]) -> str:
     return f", {stretch}" if stretch else ""
 
 
-def _own(score: Score | None) -> str:
+def _own(score: Score | None) -> Markup:
     """What is beside the name of an observer that was scored on samples of its own."""
-    return f" <sup>{own_stretch(rows([score], None)[0])}</sup>" if score and score.apart else ""
+    return macro("note", own_stretch(rows([score], None)[0]) if score and score.apart else "")
 
 
-def interval_html(interval: Sequence[float] | None, scale: float) -> str:
+def _interval(interval: Sequence[float] | None, scale: float) -> Markup:
     """The interval of a bound, behind it."""
-    if interval is None:
-        return ""
-    low, high = (number(x * scale) for x in interval)
-    return f' <span class="range" title="{IN_MOST}">{low} – {high}</span>'
+    return macro("interval", *(number(x * scale) for x in interval), IN_MOST) if interval else Markup()
 
 
 def _times(score: Score, dt: float) -> list[str]:
