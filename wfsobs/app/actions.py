@@ -76,7 +76,7 @@ class Actions:
         self._refresh()
 
     def attach(self, pages: Pages) -> None:
-        """The pages, of which the one that is shown says what is copied and saved."""
+        """Watch the pages: the one that is shown says what is copied and saved."""
         self._pages = pages
         self._watched: set[str] = set()
         pages.param.watch(self._turn, "current")

@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 def key_of(scenario: Scenario, record: str = "") -> str:
-    """What names the results of a scenario: the same settings, the same key, and in practice no others.
+    """Name the results of a scenario: the same settings give the same key, and in practice no others do.
 
     record : names the record that the observers ran on, where it was not simulated from the scenario
 
@@ -44,7 +44,7 @@ def arrays_in(value: Any) -> Iterator[NDArray[Any]]:
 
 
 def frozen(value: T) -> T:
-    """The same value, its arrays read-only from now on."""
+    """Make the arrays of a value read-only."""
     for array in arrays_in(value):
         array.flags.writeable = False
     return value
@@ -72,7 +72,7 @@ class Cache(Generic[T]):
         self._lock = threading.Lock()
 
     def get(self, key: Hashable) -> T | None:
-        """What is kept under a key, or None."""
+        """Return the value under a key, or None."""
         with self._lock:
             return self._kept.get(key)
 

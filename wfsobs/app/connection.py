@@ -25,7 +25,7 @@ class Connection(JSComponent):
     _stylesheets = [asset("connection.css")]  # noqa: RUF012
 
     def __init__(self, take: Callable[[dict[str, Any]], None], **params: Any):
-        """take : makes a change again that did not arrive"""
+        """Connect a page. take : makes a change again that did not arrive."""
         self._take = take
         super().__init__(session=uuid4().hex, **params)
 

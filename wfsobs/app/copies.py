@@ -33,7 +33,7 @@ EXPLORED = Task()
 
 
 def to_command(scenario: Scenario, preset: str, source: Source | None = None, task: Task = EXPLORED) -> str:
-    """The command that prints what a page shows; two where the record has to be simulated first."""
+    """Write the command that prints what a page shows; two where the record has to be simulated first."""
     given = _options(scenario, preset, FILE)
     more = [word for name, value in task.arguments.items() for word in (f"--{name}", str(value))]
     if source is None and task.what != IDENTIFY:
@@ -57,7 +57,7 @@ def _options(scenario: Scenario, preset: str, file: str) -> list[str]:
 
 
 def _said(source: Loaded) -> list[str]:
-    """What was said of a file, and what tells it from another."""
+    """List what the user stated about a file, and what tells the file from others."""
     stated = source.stated
     sign = None if stated.command_sign is None else f"{stated.command_sign:+d}"
     named = {
@@ -74,7 +74,7 @@ def _said(source: Loaded) -> list[str]:
 
 
 def to_python(scenario: Scenario, preset: str, source: Source | None = None, task: Task = EXPLORED) -> str:
-    """A script that computes and prints what a page shows."""
+    """Write a script that computes and prints what a page shows."""
     imports, lines = {"import wfsobs"}, [f"scenario = {_made(scenario, preset, FILE)}"]
     if isinstance(source, Loaded):
         stated = "".join(f"{name}={value!r}, " for name, value in vars(source.stated).items() if value is not None)

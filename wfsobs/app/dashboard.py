@@ -82,7 +82,7 @@ class Dashboard:
         self.store.param.watch(self._refresh, ["stale", "waiting"])
 
     def page(self) -> pmui.Page:
-        """The whole page."""
+        """Build the whole page."""
         self.pages = Pages(self.explore, self.store, self.display)
         self.actions.attach(self.pages)
         page = pmui.Page(
@@ -118,19 +118,19 @@ class Dashboard:
         return page
 
     def start(self) -> None:
-        """The first run, unless settings from a link have brought one or would take long."""
+        """Start the first run, unless settings from a link have brought one or would take long."""
         if self.store.run.state == IDLE:
             self.store.follow()
 
     def close(self) -> None:
-        """The session has ended."""
+        """Release what the session holds; called when it ends."""
         self.store.close()
 
     def _themed(self, event: param.parameterized.Event) -> None:
         self.display.dark = self.frame.dark = event.new
 
     def _top(self) -> pn.FlexBox:
-        """The pages, and what holds on all of them."""
+        """Lay out the buttons of the pages, and the switches that all pages share."""
         return pn.FlexBox(self.pages.switch, *self.modes.view(), *self.units.view(), gap="12px", align_items="center", **WIDE)
 
     def _row_of_actions(self) -> pn.Row:
@@ -148,7 +148,7 @@ class Dashboard:
 
 
 def _title() -> pn.pane.HTML:
-    """The heading of the page, for those who hear it."""
+    """Make the page's heading for screen readers."""
     return pn.pane.HTML(
         "<h1>wfsobs: disturbance observers for adaptive optics</h1>",
         margin=0,

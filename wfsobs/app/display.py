@@ -39,7 +39,7 @@ def per_micrometre(unit: str, diameter: float) -> float:
 
 
 def written_unit(unit: str) -> str:
-    """A unit as the page writes it.
+    """Write a unit as the page does.
 
     >>> written_unit("um^2/Hz")
     'µm²/Hz'
@@ -48,13 +48,13 @@ def written_unit(unit: str) -> str:
 
 
 def label_of(p: param.Parameter) -> str:
-    """A setting's label with its unit in [brackets]."""
+    """Write a setting's label with its unit in [brackets]."""
     unit = written_unit(unit_of(p))
     return f"{p.label} [{unit}]" if unit else str(p.label)
 
 
 def short_name(mode: Mode) -> str:
-    """A mode's name where there is little room: a long one is Z and Noll's index.
+    """Shorten a mode's name: a long one becomes Z and Noll's index.
 
     >>> [short_name(mode) for mode in modes_up_to(2)]
     ['tip', 'tilt', 'defocus', 'Z5', 'Z6']

@@ -35,7 +35,7 @@ class TooLarge(ValueError):
 
 
 def data_npz(shown: Shown) -> bytes:
-    """The record as `wfsobs observe` takes it, every finished estimate as observer/target, the scenario. Raises TooLarge."""
+    """Write the record as `wfsobs observe` reads it, finished estimates as observer/target, the scenario. Raises TooLarge."""
     result = shown.result
     _check(shown)
     arrays = record_arrays(result.record, to_toml(shown.scenario))
@@ -57,7 +57,7 @@ def data_csv(shown: Shown) -> bytes:
 
 
 def residuals_npz(shown: LoopShown) -> bytes:
-    """The residual of every controller that has one, (n_steps, n_modes) [um], as residual/controller; dt; the scenario."""
+    """Write the residuals of the controllers, (n_steps, n_modes) [um], as residual/controller; dt; the scenario."""
     arrays = {f"residual/{o.controller}": o.residual for o in shown.result.outcomes if o.residual is not None}
     return _npz(arrays | {"dt": np.array(shown.result.record.dt), "scenario": np.array(to_toml(shown.result.scenario))})
 

@@ -53,7 +53,7 @@ class Fit:
 
 
 def measured(of: Shown, _watch: Watch, _tell: Tell) -> Measured:
-    """The spectrum of the record shown, with the taper that identification uses. Raises RecordError."""
+    """Estimate the spectrum of the record shown, with the taper that the identification uses. Raises RecordError."""
     record = of.result.record
     z = bridged(record, prior_of(of.result.scenario.before_events, record, (Model,))).z[record.delay :]
     z = z[: fast_length(len(z))]
@@ -73,7 +73,7 @@ def measured(of: Shown, _watch: Watch, _tell: Tell) -> Measured:
 
 
 def fit(mode: IdentifiedMode, result: Identified) -> Fit:
-    """The spectrum of a mode of an identification."""
+    """Compute the spectrum of the model identified in a mode."""
     s, T = mode.spectrum, result.duration
     centres = [(p.omega / (2 * np.pi), p.damping) for p in s.processes]
     near = [c * (1.0 + max(damping, 1e-5) * np.linspace(-8.0, 8.0, 65)) for c, damping in centres]
@@ -105,5 +105,5 @@ def same(one: Record, other: Record) -> bool:
 
 
 def compute(of: Shown, level: float, lowest: float, watch: Watch, _tell: Tell) -> tuple[Identified, Record]:
-    """The model of the record shown, and that record. Raises RecordError, Cancelled."""
+    """Identify a model in the record shown; return both. Raises RecordError, Cancelled."""
     return identify(of.result.record, level=level, lowest=lowest, watch=watch), of.result.record

@@ -36,7 +36,7 @@ class Limits:
     sessions: float = math.inf
 
     def check(self, scenario: Scenario) -> None:
-        """Raises SettingError, one line, where a run of this scenario is more than the server allows."""
+        """Raise SettingError, one line, where a run of this scenario is more than the server allows."""
         _most("run.duration", scenario.run.duration, self.duration, " s")
         if scenario.n_steps > self.steps:
             raise SettingError(
@@ -56,12 +56,12 @@ class Limits:
         _whole(run_bytes(scenario) / 1e6, self.megabytes, "MB of memory")
 
     def check_seconds(self, seconds: float, what: str) -> None:
-        """Raises SettingError where something beside the runs would take longer than a run may."""
+        """Raise SettingError where a computation beside the runs would take longer than a run may."""
         if seconds > self.seconds:
             raise SettingError(f"The {what} would take about {seconds:.0f} s, at most {self.seconds:g} on this server")
 
     def check_steps(self, n_steps: int) -> None:
-        """Raises SettingError where a loaded record is longer than the server allows."""
+        """Raise SettingError where a loaded record is longer than the server allows."""
         if n_steps > self.steps:
             raise SettingError(f"The record has {n_steps} steps; at most {self.steps:g} on this server")
 

@@ -7,7 +7,7 @@ NOTHING = "–"
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number with some significant digits and no exponent where it is of common size."""
+    """Write a number with some significant digits, and without an exponent where it is of common size."""
     if value is None:
         return NOTHING
     if value == 0:
@@ -29,7 +29,7 @@ def short(x: float, digits: int = 5) -> str:
 
 
 def change(before: float, now: float | None) -> str:
-    """A change in per cent, signed.
+    """Write a change in per cent, signed.
 
     >>> change(20.0, 15.0)
     '−25.0'

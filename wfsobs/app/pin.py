@@ -41,12 +41,12 @@ class Pin:
     errors: Mapping[Key, NDArray[np.float32]]
 
     def score(self, observer: str, target: str, mode: str) -> Score | None:
-        """The score of one observer, target and mode, or None."""
+        """Find the score of one observer, target and mode; None if there is none."""
         return next((s for s in self.scores if (s.observer, s.target, s.mode) == (observer, target, mode)), None)
 
 
 def pin(shown: Shown) -> Pin:
-    """What to keep of the results shown."""
+    """Keep what is compared of the results shown."""
     signals: dict[Key, NDArray[np.float32]] = {}
     errors: dict[Key, NDArray[np.float32]] = {}
     for target in TARGETS:
@@ -67,7 +67,7 @@ def _thin(values: Array) -> NDArray[np.float32]:
 
 
 def differences(before: Scenario, now: Scenario) -> list[str]:
-    """What differs between two scenarios, a setting each in words.
+    """List the differences between two scenarios, one setting each, in words.
 
     >>> differences(Scenario(), Scenario().replace({"turbulence.wind_speed": 20}))
     ['Wind speed V₀ 15 → 20 m/s']
@@ -104,7 +104,7 @@ def _word(value: Any) -> str:
 
 
 def name_of(pinned: Scenario, now: Scenario) -> str:
-    """The name of a pinned run: how the present one differs from it."""
+    """Name a pinned run by the settings in which the present one differs."""
     words = differences(pinned, now)
     if not words:
         return "the same settings"

@@ -40,10 +40,10 @@ def table(label: str, columns: Mapping[str, str], groups: Iterable[tuple[str, It
 
 
 def matrix(entries: ArrayLike) -> Markup:
-    """Write a matrix of numbers as LaTeX; a vector is a row.
+    r"""Write a matrix of numbers as LaTeX; a vector is a row.
 
     >>> print(matrix([[1, 0], [0.5, -2]]))
-    \\begin{matrix}1 & 0 \\\\ 0.5 & −2\\end{matrix}
+    \begin{matrix}1 & 0 \\ 0.5 & −2\end{matrix}
     """
     rows = (" & ".join(map(short, row)) for row in np.atleast_2d(np.asarray(entries, dtype=float)))
     return Markup(r"\begin{matrix}" + r" \\ ".join(rows) + r"\end{matrix}")

@@ -114,7 +114,7 @@ def serve(options: Options) -> None:
 
 
 def make_service(limits: Limits, runs: int = 0, cache_mb: int = CACHE_MB) -> Service:
-    """What the sessions of a server share."""
+    """Make what the sessions of a server share."""
     return Service(limits, runs or os.cpu_count() or 1, cache_mb * 1_000_000)
 
 
@@ -126,7 +126,7 @@ def prepare() -> None:
 
 @cache
 def shared() -> Service:
-    """The one service of a process that is served by something else: `panel serve app`."""
+    """Return the one service of a process that something else serves: `panel serve app`."""
     prepare()
     service = make_service(NONE)
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -144,7 +144,7 @@ def _end(service: Service, then: Any, number: int, frame: Any) -> None:
 
 
 def new_page(service: Service) -> Any:
-    """The page of a new session."""
+    """Build the page of a new session."""
     try:
         session = service.enter()
     except Full as error:
@@ -154,7 +154,7 @@ def new_page(service: Service) -> Any:
 
 
 def make_server(options: Options, service: Service) -> Server:
-    """A server that listens but has not started."""
+    """Make a server that listens but has not started."""
     server = get_server(
         {"/": lambda: new_page(service)},
         port=options.port,
@@ -207,7 +207,7 @@ class Door(DocHandler):
     service: Service
 
     async def prepare(self) -> None:
-        """Called before anything is done for a request."""
+        """Turn the visitor away if the server is full."""
         await super().prepare()
         if self.service.full:
             self.set_status(503)
@@ -226,7 +226,7 @@ class Liveness(RequestHandler):
     """Whether the server answers, and how busy it is."""
 
     def initialize(self, service: Service) -> None:
-        """Called by Tornado with what was given beside the pattern."""
+        """Take what was given beside the pattern; called by Tornado."""
         self.service = service
 
     def get(self) -> None:
@@ -236,5 +236,5 @@ class Liveness(RequestHandler):
 
 
 def full_html(line: str) -> str:
-    """What is shown to one visitor too many."""
+    """Write the page for a visitor for whom there is no room."""
     return f"<!doctype html><title>wfsobs</title><h1>wfsobs is full</h1><p>{escape(line)}</p>"

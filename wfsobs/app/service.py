@@ -48,7 +48,7 @@ class Service:
         self._numbers = itertools.count(1)
 
     def enter(self) -> Session:
-        """A new session. Raises Full."""
+        """Open a new session. Raises Full."""
         with self._lock:
             if self.full:
                 event("refused", logging.WARNING, what="session", sessions=self.sessions)
@@ -68,7 +68,7 @@ class Service:
         return _key(scenario, source) in self.cache
 
     def left(self) -> None:
-        """A session has ended."""
+        """Count a session that has ended."""
         with self._lock:
             self.sessions -= 1
             last = self.sessions == 0
@@ -77,7 +77,7 @@ class Service:
             give_back()
 
     def run(self, scenario: Scenario, source: Source | None = None) -> Job:
-        """The job that computes the results of a scenario, or of the observers on another record. Raises SettingError."""
+        """Make the job that computes a scenario, or the observers on another record. Raises SettingError."""
         self.limits.check(scenario)
         if source is not None:
             source.check(self.limits)
@@ -106,7 +106,7 @@ class Session:
         return self.service.queue.submit(job, self.number, listener, before)
 
     def leave(self) -> None:
-        """The session has ended, and takes its jobs with it."""
+        """Close the session, and cancel its jobs."""
         if not self.closed:
             self.closed = True
             for task in self.tasks:

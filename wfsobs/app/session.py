@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 
 def page(build: Callable[[Post], Dashboard]) -> Any:
-    """The page of a new session; a page that says what went wrong where it cannot be built."""
+    """Build the page of a new session; one with the error where it cannot be built."""
     try:
         dashboard = build(post_to_session())
         if query := asked_for():
@@ -37,8 +37,10 @@ def page(build: Callable[[Post], Dashboard]) -> Any:
 
 
 def asked_for() -> str:
-    """The query of the page's address; where a browser connects so late that its session is made anew, as the page was
-    given it."""
+    """Return the query of the page's address.
+
+    If a browser connects so late that its session is made anew, it is the query with which the page was fetched.
+    """
     if pn.state.location is not None and pn.state.location.search:
         return str(pn.state.location.search)
     texts = [(key, value) for key, values in pn.state.session_args.items() for value in values]
@@ -46,7 +48,7 @@ def asked_for() -> str:
 
 
 def post_to_session() -> Post:
-    """How another thread has something done on this session's, from when its page has been drawn.
+    """Return a function by which other threads run something on this session's thread, once its page has been drawn.
 
     What is changed before does not reach a browser that is just being told of the page, so it waits.
     """
@@ -91,7 +93,7 @@ def post_to_session() -> Post:
 
 
 def error_page(error: Exception) -> pn.Column:
-    """What went wrong, in place of a page that never comes."""
+    """Show the error in place of a page that could not be built."""
     line = "".join(traceback.format_exception_only(error)).strip()
     return pn.Column(
         pn.pane.HTML(

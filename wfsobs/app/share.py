@@ -65,7 +65,7 @@ def changes(scenario: Scenario, preset: str) -> dict[str, Any]:
 
 
 def to_query(scenario: Scenario, preset: str, simulation: Scenario | None = None) -> str | None:
-    """The query of a link to these settings, without "?"; None where it would be too long.
+    """Write the query of a link to these settings, without "?"; None where it would be too long.
 
     simulation : of other settings, which is kept
     """
@@ -83,7 +83,7 @@ def _fields(changed: Mapping[str, Any], prefix: str = "") -> list[str]:
 
 
 def from_query(query: str, check: Check = Scenario.validate) -> Link:
-    """The settings that a query asks for, and a line for every field of it that was refused.
+    """Read the settings of a query, and a line for every field of it that was refused.
 
     check : raises SettingError where settings do not go together
     """
@@ -108,7 +108,7 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
 
 
 def written(path: str, value: Any) -> str:
-    """A setting's plain value as a link has it."""
+    """Write a setting's plain value as a link has it."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return ";".join(
             written(path, [v for one in item.values() for v in (one if isinstance(one, list) else [one])]) for item in value
@@ -119,7 +119,7 @@ def written(path: str, value: Any) -> str:
 
 
 def read(path: str, text: str, known: Mapping[str, param.Parameter]) -> Any:
-    """The value that a link has written; what makes no sense stays text, for the setting itself to refuse."""
+    """Read a value of a link; what makes no sense stays text, for the setting itself to refuse."""
     p = known.get(path)
     if isinstance(p, param.List) and holds_groups(p):
         return [_item(part, settings_of(p)) for part in text.split(";")] if text else []
@@ -183,7 +183,7 @@ def _clash(scenario: Scenario, check: Check) -> str:
 
 
 def _line(path: str, text: str, reason: str) -> str:
-    """The line of a field that was refused; a reason that does not name it gets it in front."""
+    """Write the line of a field that was refused, with its name in front if the reason lacks it."""
     line = reason if reason.startswith(path) else f"{path} = {text}: {reason}"
     return line if len(line) <= 200 else f"{line[:197]}..."
 
@@ -203,7 +203,7 @@ def to_file(scenario: Scenario, preset: str) -> str:
 
 
 def from_file(text: str) -> Link:
-    """The settings of a TOML file; preset "" where it names none. Raises SettingError with one line."""
+    """Read the settings of a TOML file; preset "" where it names none. Raises SettingError with one line."""
     try:
         scenario = from_toml(text, where="file")
         preset = parse_toml(text).get("preset", "")

@@ -31,11 +31,11 @@ class Loaded:
     simulation = None
 
     def make(self, _watch: Watch) -> Record:
-        """The record."""
+        """Return the record."""
         return self.record
 
     def check(self, limits: Limits) -> None:
-        """Raises SettingError where a server does not allow it."""
+        """Raise SettingError where a server does not allow it."""
         limits.check_steps(self.record.n_steps)
 
     @property
@@ -56,11 +56,11 @@ class Kept:
         return key_of(self.simulation)
 
     def make(self, watch: Watch) -> Record:
-        """The record. Raises SettingError, Cancelled."""
+        """Simulate the record. Raises SettingError, Cancelled."""
         return simulate(self.simulation, watch=watch)
 
     def check(self, limits: Limits) -> None:
-        """Raises SettingError where the simulation cannot be, or is more than a server allows."""
+        """Raise SettingError where the simulation is impossible, or more than a server allows."""
         self.simulation.validate()
         limits.check(self.simulation)
 

@@ -81,7 +81,7 @@ class Store(param.Parameterized):
             self._accept(self._future.pop(), {}, step=False)
 
     def value(self, path: str) -> Any:
-        """The accepted value of a setting, by dotted path."""
+        """Look up the accepted value of a setting, by dotted path."""
         node: Any = self.scenario
         for key in path.split("."):
             node = node[int(key)] if isinstance(node, list) else getattr(node, key)
@@ -109,7 +109,7 @@ class Store(param.Parameterized):
         return False
 
     def validate(self, scenario: Scenario) -> None:
-        """Raises SettingError where settings do not go together, or are more than is allowed here."""
+        """Raise SettingError where settings do not go together, or are more than is allowed here."""
         scenario.validate()
         self.limits.check(scenario)
 
@@ -137,7 +137,7 @@ class Store(param.Parameterized):
         return _paths(self.scenario.difference(pristine(self.preset)))
 
     def close(self) -> None:
-        """The session has ended."""
+        """Release what the store holds; called when the session ends."""
         self.session.leave()
 
     @property
@@ -151,7 +151,7 @@ class Store(param.Parameterized):
         self._accept((scenario, preset, source), {})
 
     def _accept(self, to: Step, refused: dict[str, Any], step: bool = True) -> None:
-        """The one way in for new settings. step : whether it is a change of its own, to be undone later."""
+        """Accept new settings, the one way in. step : whether it is a change of its own, to be undone later."""
         scenario, preset, source = to
         unchanged, stays = scenario == self.scenario, same(source, self.source)
         if step and not (unchanged and stays and preset == self.preset):

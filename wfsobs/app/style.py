@@ -56,7 +56,7 @@ _COMPONENTS = {
 
 
 def theme() -> dict[str, Any]:
-    """The page's colours in light and dark mode. Units are written as they are, not in capitals."""
+    """Return the page's colours in light and dark mode; units are written as they are, not in capitals."""
     return {
         "light": {"palette": {"primary": {"main": PRIMARY}}, "components": _COMPONENTS},
         "dark": {"palette": {"primary": {"main": "#6FB7D6"}}, "components": _COMPONENTS},
@@ -64,7 +64,7 @@ def theme() -> dict[str, Any]:
 
 
 def look(name: str) -> Look:
-    """The look of an observer, a controller, the truth or another line; one that is not known has its name."""
+    """Return the look of an observer, a controller, the truth or another line; an unknown one is labelled with its id."""
     if name in LOOKS:
         return LOOKS[name]
     entry = OBSERVERS.get(name)
@@ -79,7 +79,7 @@ def labels() -> dict[str, str]:
 
 
 def observers_of(target: str, hidden: bool = False) -> list[str]:
-    """Observers that estimate a target, in the order of the registry. hidden : also those that stand in tables only"""
+    """List the observers that estimate a target, in the order of the registry. hidden : also those that stand in tables only."""
     return [o.id for o in OBSERVERS.values() if target in o.targets and (hidden or o.look.drawn)]
 
 

@@ -30,8 +30,11 @@ SETTING, VALIDATION, TEST, OTHER, LIKELIHOOD = "setting", "validation", "test", 
 
 
 def seconds(of: Shown, scenario: Scenario, observer: str, evaluations: int) -> float:
-    """About how long a tuning takes [s]: the observer as it was timed in the results shown, on records of their length, or on
-    pieces of at most half of one that was loaded."""
+    """Estimate how long a tuning takes [s].
+
+    The observer is taken to need the time per step that it had in the results shown, on records of the same length, or on at
+    most half of a record that was loaded.
+    """
     each = max((e.seconds_per_step for e in of.result.estimates if e.observer == observer), default=0.0)
     record, share = of.result.record, 0.5 if of.recorded else 1.0
     simulation = 0.0 if of.recorded else 3.0 * part_seconds(scenario)["rest"]
@@ -39,7 +42,7 @@ def seconds(of: Shown, scenario: Scenario, observer: str, evaluations: int) -> f
 
 
 def measure(of: Shown, observer: str, target: str) -> str:
-    """What a tuning makes small, in words. Raises RecordError where a record that was loaded has nothing to judge by."""
+    """Say what a tuning minimises. Raises RecordError where a loaded record has nothing to judge by."""
     return MEASURES[judged_by(of.result.record, observer, target)[1] if of.recorded else TRUTH]
 
 
@@ -63,7 +66,7 @@ def compute(of: Shown, scenario: Scenario, observer: str, target: str, evaluatio
 
 
 def best_so_far(history: Sequence[Evaluation]) -> list[float]:
-    """The least error after every evaluation [um], infinite until one has succeeded."""
+    """Compute the least error after every evaluation [um], infinite until one has succeeded."""
     out: list[float] = []
     for evaluation in history:
         out.append(min(evaluation.rms, out[-1] if out else evaluation.rms))
@@ -71,7 +74,7 @@ def best_so_far(history: Sequence[Evaluation]) -> list[float]:
 
 
 def rows(tuned: Tuned) -> Rows:
-    """Settings as text, errors [um] by mode and together, log marginal likelihoods of a GPR by mode; None for what failed."""
+    """List settings as text, errors [um] by mode and together, a GPR's log marginal likelihoods by mode; None for failures."""
     out: Rows = [(SETTING, *row) for row in settings(tuned)]
     stages = tuned.before, tuned.after
     for section, before, after in (

@@ -1,5 +1,4 @@
-"""A record of the visitor's own in place of the simulation, or a vibration spectrum: a file, a preview to confirm, then the
-same views.
+"""A record or a vibration spectrum from a file, in place of the simulated one, after a preview.
 
 The browser sends the file in parts. What it is said to be can be changed while the preview stands; nothing runs before it
 is confirmed. Reading is done beside the page, in a thread.
@@ -113,7 +112,7 @@ class Upload:
     # ------------------------------------------------------------------ the preview
 
     def stated(self) -> Stated:
-        """What the fields say. Raises RecordError where one holds no number."""
+        """Read the fields. Raises RecordError where one holds no number."""
 
         def number(field: Any, kind: type, least: float) -> Any:
             text = str(field.value or "").strip()
@@ -233,7 +232,7 @@ class Upload:
 
 
 def fitting(record: Any, scenario: Scenario) -> Scenario:
-    """The scenario with the rate, ratio, length and modes of a record. Raises SettingError."""
+    """Set the rate, ratio, length and modes of a scenario to those of a record. Raises SettingError."""
     order = next((n for n in range(1, 7) if (n + 1) * (n + 2) // 2 - 1 >= record.n_modes), 6)
     duration = record.n_steps * record.dt
     changes = {

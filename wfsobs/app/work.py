@@ -97,8 +97,10 @@ def one_blas_thread() -> None:
 
 
 def compute(scenario: Scenario, watch: Watch, tell: Tell, source: Source | None = None) -> Shown:
-    """Run everything on a scenario, or the observers on another record; tells the results that there are. Raises
-    SettingError, Cancelled."""
+    """Run everything on a scenario, or the observers on another record; report results as they come.
+
+    Raises SettingError, Cancelled.
+    """
     return _Work(scenario, watch, tell, source).run()
 
 
@@ -150,7 +152,7 @@ class _Work:
         return self._so_far(record)
 
     def _left(self) -> set[str]:
-        """The observers that have not said all that they will."""
+        """List the observers that have not delivered everything."""
         said = {(e.observer, e.target) for e in self.estimates}
         left = {o.id for o in OBSERVERS.values() if any((o.id, target) not in said for target in o.targets)}
         return left - {f.observer for f in self.failures}
@@ -172,7 +174,7 @@ class _Work:
         return Shown(result, partial, dict(self.spectra), perf_counter() - self.started, self.source)
 
     def _progress(self, fraction: float) -> None:
-        """Called from any thread of the observers."""
+        """Take the progress of the observers; called from any of their threads."""
         with self.telling:  # one after the other, or a report could arrive before one that it was made after
             with self.lock:
                 now = perf_counter()

@@ -38,12 +38,12 @@ SOON = 5
 
 
 def number_text(value: float) -> str:
-    """A number as a person would type it."""
+    """Write a number as a person would type it."""
     return f"{value:.10g}"
 
 
 def parsed(text: str) -> float | str:
-    """What a typed text stands for; text that is no number stays text, for the setting to refuse."""
+    """Read a typed text as a number; other text stays text, for the setting to refuse."""
     text = text.strip().replace("−", "-")
     for kind in (int, float):
         try:
@@ -151,11 +151,11 @@ class TextField(Field):
         super().enter(value if isinstance(value, str) else number_text(float(value)))
 
     def written(self, value: Any) -> str:
-        """The value as text."""
+        """Write the value as text."""
         return number_text(value)
 
     def read(self, text: str) -> Any:
-        """The text as a value."""
+        """Read the value from text."""
         return parsed(text)
 
 
@@ -163,11 +163,11 @@ class NumbersField(TextField):
     """A list of numbers, typed with commas between them."""
 
     def written(self, value: Any) -> str:
-        """The numbers as text."""
+        """Write the numbers as text."""
         return ", ".join(number_text(v) for v in value)
 
     def read(self, text: str) -> Any:
-        """The text as numbers."""
+        """Read the numbers from text."""
         return [parsed(part) for part in re.split(r"[,;\s]+", text.strip()) if part]
 
 
@@ -224,7 +224,7 @@ class SliderField(TextField):
 
 
 def make_field(store: Store, path: str, p: param.Parameter) -> Field:
-    """The field that fits a setting."""
+    """Make the field that fits a setting."""
     if isinstance(p, param.Boolean):
         return SwitchField(store, path, p)
     if isinstance(p, param.Selector):
@@ -237,10 +237,10 @@ def make_field(store: Store, path: str, p: param.Parameter) -> Field:
 
 
 def error_html(reason: str) -> str:
-    """A refusal, to stand beside its setting."""
+    """Write the reason of a refusal, to stand beside its setting."""
     return f'<div role="alert" style="color:#d93025;font-size:12px">{escape(reason)}</div>' if reason else ""
 
 
 def _step(low: float, high: float) -> float:
-    """A round step, about a two-hundredth of the range."""
+    """Choose a round step, about a two-hundredth of the range."""
     return 10.0 ** math.floor(math.log10((high - low) / 100.0))

@@ -27,7 +27,7 @@ PATH = re.compile(r"\b[a-z_]+(?:\.(?:[a-z_]+|\d+))+\b")
 
 
 def named(line: str) -> str:
-    """A message with the names of the page in place of paths.
+    """Replace the paths in a message by the names of the page.
 
     >>> named("vibration.peaks.0.rms.1 = -1.0: takes a number from 0"), named("night.toml: turbulence.wind_speed = 200")
     ('Peak 1: tilt = -1.0: takes a number from 0', 'night.toml: Wind speed V₀ = 200')
@@ -36,7 +36,7 @@ def named(line: str) -> str:
 
 
 def column_of(key: str) -> str:
-    """The name of a setting of a list's item; rms.0 is the first of a list of numbers, one per mode.
+    """Name a setting of a list's item; rms.0 is the first of a list of numbers, one per mode.
 
     >>> column_of("frequency"), column_of("rms.0"), column_of("start")
     ('f', 'tip', 'start')
@@ -47,7 +47,7 @@ def column_of(key: str) -> str:
 
 @cache
 def name_of(path: str) -> str:
-    """What a setting is called on the page; its topic stands before a name that several have. A path that is none stays.
+    """Name a setting as the page does, its topic in front where several share a name; an unknown path stays as it is.
 
     >>> name_of("gpr_online.depth"), name_of("vibration.peaks.14"), name_of("vibration.peaks.0.height")
     ('Online GPR: Depth d', 'Peak 15', 'vibration.peaks.0.height')
@@ -70,7 +70,7 @@ def name_of(path: str) -> str:
 
 
 def _item(p: param.List, number: str, *keys: str) -> str:
-    """What an item of a list is called, or a setting of it."""
+    """Name an item of a list, or a setting of it."""
     kind = p.item_type
     if not number.isdecimal() or (keys and keys[0] not in kind.settings()):  # type: ignore[union-attr]
         return ""

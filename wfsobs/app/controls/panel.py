@@ -97,7 +97,7 @@ class Controls:
         self._refresh_preset()
 
     def view(self) -> pn.Column:
-        """What goes into the drawer."""
+        """Return the contents of the drawer."""
         first = [self._field(path) for path in FIRST]
         return pn.Column(
             self.preset,
@@ -147,7 +147,7 @@ class Controls:
                     view.visible = below[0] not in getattr(self.store.scenario, topic).idle()
 
     def _fields_of(self, name: str) -> list[tuple[str, Any]]:
-        """The fields of a topic under the headings of its groups, with the paths of both; none where it is a list."""
+        """Make the fields of a topic under the headings of its groups, with the paths of both; none where it is a list."""
         group = getattr(self.store.scenario, name)
         if not isinstance(group, Group):
             return []
@@ -208,7 +208,7 @@ class Controls:
 
 
 def status_of(store: Store) -> tuple[str, str]:
-    """A line on the run, and one on what was refused."""
+    """Describe the run in one line, and what was refused in another."""
     run = store.run
     seconds = f" in {run.result.seconds:.2f} s" if run.result and run.state == DONE else ""
     text = {
@@ -243,7 +243,7 @@ ACRONYMS = ("ut4", "galacsi", "nfm", "wfm")
 
 
 def _title(preset: str) -> str:
-    """A preset's name as the page writes it.
+    """Write a preset's name as the page does.
 
     >>> _title("ut4-floor"), _title("strong-turbulence")
     ('UT4 floor', 'Strong turbulence')

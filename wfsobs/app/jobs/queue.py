@@ -153,7 +153,7 @@ class JobQueue:
                 give_back()
 
     def _next(self) -> Job | None:
-        """The first in the line; None when there will be no more."""
+        """Take the first job of the line; None when there will be no more."""
         with self._changed:
             while not self.closing:
                 if self._waiting:
@@ -175,7 +175,7 @@ class JobQueue:
         return sorted(self._waiting, key=lambda job: (CLICK if job.since < late else job.priority, job.turn))
 
     def _tell_places(self) -> None:
-        """A thread that is free takes the next at once."""
+        """Tell the waiting jobs their places; a free thread takes the next job at once."""
         if len(self._running) >= len(self._threads):
             for place, job in enumerate(self._line(), 1):
                 job.moved(place)

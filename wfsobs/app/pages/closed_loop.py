@@ -61,7 +61,7 @@ class ClosedLoopPage(Offers):
         self.cards.param.watch(self._restyle, "hidden")
 
     def view(self) -> pn.Column:
-        """What is shown."""
+        """Return the contents of the page."""
         figures = pn.Column(
             *(
                 captioned(title, drawn.figure)
@@ -101,7 +101,7 @@ class ClosedLoopPage(Offers):
         return Task(LOOP)
 
     def saves(self) -> Mapping[str, Save | None]:
-        """The table of `wfsobs loop --json`, and the residuals."""
+        """Offer the table of `wfsobs loop --json`, and the residuals."""
         shown = self.shown
         if shown is None:
             return {"Controllers as CSV": None, "Residuals as CSV": None, "Residuals as NPZ": None}
@@ -162,7 +162,7 @@ class ClosedLoopPage(Offers):
                 self.cards.items = self._items(self.shown)
 
     def _items(self, shown: LoopShown) -> list[dict[str, Any]]:
-        """A card per controller."""
+        """Describe a card per controller."""
         scale = 1e-3 * per_micrometre(self.display.unit, shown.result.scenario.telescope.diameter)
         left = {r["controller"]: r for r in shown.rows if r["mode"] == self.display.mode}
         out = []

@@ -46,7 +46,7 @@ class Explore:
         self.pinning = Pinning(run, display)
 
     def view(self) -> pn.Column:
-        """What is shown."""
+        """Return the contents of the page."""
         body = pn.Column(
             *(self._section(target) for target in TARGETS),
             box("RMS errors", self._best_first(), self.table.pane),
@@ -83,7 +83,7 @@ class Explore:
         return pn.Row(*buttons, margin=0)
 
     def _section(self, target: str) -> pn.Column:
-        """The strip and the two figures of one target."""
+        """Lay out the strip and the two figures of one target."""
         call(self.traces.traces[target].figure, f"{target.capitalize()} time trace")
         call(self.spectra.spectra[target].figure, f"{target.capitalize()} spectrum")
         cards = self.strips[target].cards
@@ -102,7 +102,7 @@ class Explore:
 
 
 def group(display: Display, name: str, options: Any) -> pmui.RadioButtonGroup:
-    """The buttons of one switch of the display."""
+    """Make the buttons of one switch of the display."""
     widget = pmui.RadioButtonGroup.from_param(
         display.param[name], options=options, size="small", margin=0, variant="outlined", stylesheets=[HEARD]
     )

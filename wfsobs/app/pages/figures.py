@@ -95,7 +95,7 @@ class Figures:
         display.param.watch(self._refresh, ["unit", "dark"])
 
     def view(self) -> pn.Column:
-        """The figures, one below the other."""
+        """Return the figures, one below the other."""
         return pn.Column(
             *(sheet.view() for sheet in self.sheets), sizing_mode="stretch_width", margin=0, stylesheets=[":host { gap: 10px; }"]
         )
@@ -127,7 +127,7 @@ class _Sheet:
         self.caption = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, stylesheets=sheet)
 
     def view(self) -> pn.Column:
-        """What the page shows."""
+        """Return the contents of the page."""
         panes = [pn.pane.Bokeh(drawn.figure, sizing_mode="stretch_width", margin=0) for drawn in self.plots]
         return pn.Column(self.head, *panes, self.caption, sizing_mode="stretch_width", margin=0, stylesheets=[asset("box.css")])
 
@@ -143,7 +143,7 @@ class _Sheet:
             drawn.draw(shown, display)
 
     def _errors(self, shown: Shown, display: Display) -> str:
-        """The RMS errors of the lines, mode by mode."""
+        """List the RMS errors of the lines, mode by mode."""
         scale = per_micrometre(display.unit, shown.scenario.telescope.diameter)
         parts = []
         for column in sorted({plot.column for plot in self.figure.plots}):

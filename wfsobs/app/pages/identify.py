@@ -77,7 +77,7 @@ class IdentifyPage(Offers):
         display.param.watch(self._redraw, ["mode", "unit", "dark"])
 
     def view(self) -> pn.Column:
-        """What is shown."""
+        """Return the contents of the page."""
         row = line(self.level, self.lowest, *self.starter.view())
         return pn.Column(
             box("Identification", text(INTRO), row, self.starter.status, self.stale, self.verdict),
@@ -123,7 +123,7 @@ class IdentifyPage(Offers):
         return Task(IDENTIFY, {"level": parsed(str(self.level.value)), "lowest": parsed(str(self.lowest.value))})
 
     def saves(self) -> Mapping[str, Save | None]:
-        """The model as `wfsobs identify --out` writes it."""
+        """Offer the model as `wfsobs identify --out` writes it."""
         result, record = self._identified()
         if result is None or record is None:
             return {"Model as TOML": None}
@@ -159,7 +159,7 @@ class IdentifyPage(Offers):
             self._redraw()
 
     def _identified(self) -> tuple[Identified, Record] | tuple[None, None]:
-        """The model, and the record that it is of."""
+        """Return the model and the record from which it was identified."""
         return self.work.result or (None, None)
 
     def _redraw(self, *_: object) -> None:
@@ -186,7 +186,7 @@ def _number(label: str, value: float) -> pmui.TextInput:
 
 
 def _read(field: pmui.TextInput, low: float, high: float) -> float:
-    """What was typed. Raises SettingError."""
+    """Read a number that was typed. Raises SettingError."""
     value = parsed(str(field.value))
     if isinstance(value, str) or not low <= value <= high:
         raise SettingError(

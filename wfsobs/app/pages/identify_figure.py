@@ -86,7 +86,7 @@ class SpectrumFigure:
         }
 
     def restyle(self, dark: bool) -> None:
-        """The colours of the mode."""
+        """Set the colours of light or dark mode."""
         for name, renderers in self._coloured.items():
             for renderer in renderers:
                 renderer.glyph.line_color = look(name).colour(dark)  # type: ignore[union-attr]

@@ -29,7 +29,7 @@ def table_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
 
 
 def spoken(number: Number) -> str:
-    """A number and its standard deviation.
+    """Write a number and its standard deviation.
 
     >>> spoken(Number(47.43812, 0.0264))
     '47.438 ± 0.026'

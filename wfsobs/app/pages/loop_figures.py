@@ -36,11 +36,11 @@ class Lines:
         self.lines = {name: add_line(fig, name, source) for name, source in self.sources.items()}
 
     def restyle(self, dark: bool, hidden: list[str]) -> None:
-        """The colours of the mode, and no hidden lines."""
+        """Set the colours of light or dark mode, and hide lines."""
         restyle(self.lines, dark, hidden)
 
     def highest(self) -> float:
-        """The largest number in any line."""
+        """Find the largest number in any line."""
         return max((float(np.max(s.data["y"])) for s in self.sources.values() if len(s.data["y"])), default=0.0)
 
 
@@ -128,7 +128,7 @@ class Response(Lines):
             self.noise[name].data = {"x": x, "y": _decibel(noise)}
 
     def restyle(self, dark: bool, hidden: list[str]) -> None:
-        """The faint lines too."""
+        """Restyle the faint lines too."""
         super().restyle(dark, hidden)
         restyle(self.faint, dark, hidden)
 
@@ -169,7 +169,7 @@ class Nyquist(Lines):
                 self._at[name].append((min(both, key=lambda p, L=L: np.nanmin(np.abs(L - p))), "square"))
 
     def restyle(self, dark: bool, hidden: list[str]) -> None:
-        """The marks too."""
+        """Restyle the marks too."""
         super().restyle(dark, hidden)
         shown = [
             (point, marker, look(name).colour(dark))

@@ -20,7 +20,7 @@ UNSTABLE = macro("tag", "above", "unstable")
 
 
 def of_mode(shown: LoopShown, display: Display) -> list[Score]:
-    """The rows of the mode shown, least residual first, those without one last."""
+    """Select the rows of the mode shown, least residual first, those without one last."""
     rows = [r for r in shown.rows if r["mode"] == display.mode]
     return sorted(rows, key=lambda r: float("inf") if r["residual_rms_nm"] is None else r["residual_rms_nm"])
 
@@ -52,7 +52,7 @@ def limits_note(rows: Sequence[Score]) -> str:
 
 
 def unlimited(row: Score, value: str) -> str:
-    """What is shown of the linear loop: not applicable where a limit of the mirror acts."""
+    """Write a result of the linear loop: not applicable where a limit of the mirror acts."""
     return Markup('<span title="{}">{}</span>').format(LIMITED, NOT_APPLICABLE) if row["limited"] else value
 
 

@@ -25,7 +25,7 @@ class Model:
         display.param.watch(self._refresh, ["mode", "dark"])
 
     def view(self) -> pn.pane.HTML:
-        """What is shown."""
+        """Return the contents of the page."""
         return self.pane
 
     def show(self, visible: bool) -> None:

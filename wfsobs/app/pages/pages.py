@@ -32,7 +32,7 @@ class Page(Protocol):
     """What a page beside the first must be able to do."""
 
     def view(self) -> Any:
-        """What is shown."""
+        """Return the contents of the page."""
 
     def show(self, visible: bool) -> None:
         """Bring it up to date, and keep it so while it is visible."""

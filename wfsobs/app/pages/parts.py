@@ -33,7 +33,7 @@ class Offers:
         return EXPLORED
 
     def saves(self) -> Mapping[str, Save | None]:
-        """What can be saved, by its name in the menu; None where it is not there yet."""
+        """Offer what can be saved, by its name in the menu; None where it is not there yet."""
         return {}
 
 
@@ -41,7 +41,7 @@ WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "mar
 
 
 def heading(title: str) -> pn.pane.HTML:
-    """The title of a box."""
+    """Make the title of a box."""
     return pn.pane.HTML(f'<h2 class="title">{escape(title)}</h2>', margin=0, stylesheets=[asset("style.css")])
 
 
@@ -51,12 +51,12 @@ def html(content: str = "") -> pn.pane.HTML:
 
 
 def text(content: str) -> pn.pane.HTML:
-    """A paragraph."""
+    """Make a paragraph."""
     return html(f'<p class="text">{escape(content)}</p>')
 
 
 def box(title: str, *content: Any) -> pn.Column:
-    """A part of a page under its title."""
+    """Lay out a part of a page under its title."""
     return pn.Column(heading(title), *content, **WIDE, stylesheets=[asset("box.css")])
 
 
@@ -66,7 +66,7 @@ def line(*parts: Any) -> pn.FlexBox:
 
 
 def captioned(title: str, fig: figure) -> pn.Column:
-    """A figure under its caption."""
+    """Lay out a figure under its caption."""
     call(fig, title)
     caption = pn.pane.HTML(f'<div class="caption">{escape(title)}</div>', margin=(8, 0, 0, 0), stylesheets=[asset("style.css")])
     return pn.Column(caption, pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), **WIDE)
@@ -84,7 +84,7 @@ class Starter:
     def __init__(
         self, work: BackgroundTask, start: str, label: str, detail: Callable[[], str] = str, uses: Sequence[str] = ("Use it",)
     ):
-        """detail : what to add to the line while the work goes on;  uses : what can be done with the result."""
+        """Make the buttons. detail : what to add to the line while the work goes on; uses : what can be done with the result."""
         self.work, self._detail = work, detail
         self.start = pmui.Button(label=start, icon="play_arrow", color="primary", size="small", margin=0)
         self.cancel = pmui.Button(label="Stop", icon="stop", variant="outlined", size="small", margin=0, disabled=True)
@@ -96,11 +96,11 @@ class Starter:
         work.param.watch(self.refresh, ["state", "progress", "place", "message", "latest", "result"])
 
     def view(self) -> list[Any]:
-        """The row of buttons; the line is `status`."""
+        """Return the row of buttons; the line of progress is `status`."""
         return [self.start, self.cancel, *self.uses]
 
     def refresh(self, *_: object) -> None:
-        """What may be pressed, and how it is going."""
+        """Enable the buttons that can be used, and describe the progress."""
         work = self.work
         running = work.state == RUNNING
         said = {RUNNING: work.line("Computing"), CANCELLED: "Stopped", DONE: "Finished"}.get(work.state, "")

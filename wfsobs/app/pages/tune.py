@@ -70,7 +70,7 @@ class TunePage(Offers):
         self._choose()
 
     def view(self) -> pn.Column:
-        """What is shown."""
+        """Return the contents of the page."""
         row = line(self.observer, self.target, self.evaluations, *self.starter.view())
         return pn.Column(
             box("Tuning", text(INTRO), row, self.searched, self.starter.status, self.stale),
@@ -120,7 +120,7 @@ class TunePage(Offers):
         )
 
     def saves(self) -> Mapping[str, Save | None]:
-        """The table, errors [um], and the settings as `wfsobs tune --out` writes them."""
+        """Offer the table, errors in [um], and the settings as `wfsobs tune --out` writes them."""
         if (tuned := self._tuned()) is None:
             return {"Tuning table as CSV": None, "Tuned settings as TOML": None}
         table = [dict(zip(COLUMNS, row, strict=True)) for row in rows(tuned)]
@@ -150,7 +150,7 @@ class TunePage(Offers):
         return unit_for(self._tuned(), self.display), self.store.scenario.telescope.diameter
 
     def _so_far(self) -> str:
-        """What the search has reached."""
+        """Describe what the search has reached."""
         history = self._history()
         if self.work.state != RUNNING or not history:
             return ""
@@ -178,7 +178,7 @@ class TunePage(Offers):
 
 
 def _whole(field: pmui.TextInput, most: int) -> int:
-    """What was typed. Raises SettingError."""
+    """Read a whole number that was typed. Raises SettingError."""
     value = parsed(str(field.value))
     if not isinstance(value, int) or not 1 <= value <= most:
         raise SettingError(

@@ -56,21 +56,21 @@ class HistoryFigure:
         self.figure.yaxis.axis_label = f"{AXES[measure]}, validation [{UNITS[unit]}]"
 
     def restyle(self, dark: bool) -> None:
-        """The colours of the mode."""
+        """Set the colours of light or dark mode."""
         colour = look("tried").colour(dark)
         self._tried.glyph.update(line_color=colour, fill_color=colour)
         self._best.glyph.update(line_color=look("fitted").colour(dark))
 
 
 def unit_for(tuned: Tuned | None, display: Display) -> str:
-    """The unit shown; where modes have no angle, none that is one."""
+    """Choose the unit: the one shown, or nm where it is an angle and the modes have none."""
     modes = (tuned.before.validation or tuned.after.validation) if tuned else None
     angles = modes is None or set(modes.modes) <= {mode.name for mode in TIP_TILT}
     return "nm" if display.unit in NO_ANGLE and not angles else display.unit
 
 
 def table_html(tuned: Tuned, display: Display, diameter: float) -> str:
-    """Settings, errors and likelihoods before and after."""
+    """Write settings, errors and likelihoods before and after."""
     unit = unit_for(tuned, display)
     scale = per_micrometre(unit, diameter)
     groups = [

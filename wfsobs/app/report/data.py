@@ -48,8 +48,10 @@ FEWEST, MOST_BINS = 200, 10_000
 
 @dataclass(frozen=True)
 class Grid:
-    """Which points of a line are kept: the extremes of bins, but every sample where the bins are not worth it and
-    between `first` and `last`."""
+    """Which points of a line are kept.
+
+    They are the extremes of bins, but every sample between `first` and `last`, and where bins save nothing.
+    """
 
     n: int
     dt: float
@@ -83,11 +85,11 @@ class Grid:
         return [part for part in parts if part[1] > part[0]]
 
     def times(self) -> Array:
-        """Times [s] of the points kept."""
+        """Return the times [s] of the points kept."""
         return np.concatenate([envelope_times(a, b, bins or b - a, self.dt) for a, b, bins in self._parts()])
 
     def thin(self, x: Array) -> Floats:
-        """The points kept of a signal (n,)."""
+        """Select the points kept of a signal (n,)."""
         return np.concatenate([envelope(x[a:b], bins or b - a) for a, b, bins in self._parts()]).astype(np.float32)
 
 
@@ -139,7 +141,7 @@ def bins_for(states: int, observers: int, modes: int) -> int:
 
 
 def state_of(result: Result, states: int = 1) -> State:
-    """What a report of so many states keeps of a run."""
+    """Select what a report of so many states keeps of a run."""
     record, scenario = result.record, result.scenario
     names = [m.name for m in scenario.modes][: record.n_modes]
     lines: dict[str, Floats] = {}
@@ -165,7 +167,7 @@ def state_of(result: Result, states: int = 1) -> State:
 
 
 def loop_rows(result: Result) -> list[Row]:
-    """The closed loop on the record of a run, of the controllers that take a moment; none where the truth is not known."""
+    """Close the loop on the record of a run with the controllers that take a moment; nothing where the truth is not known."""
     quick = [name for name, controller in CONTROLLERS.items() if controller.predict is None]
     try:
         return controller_rows(closed_loop(result.record, design(result.scenario, quick)), result.scenario.run.seed)
@@ -181,7 +183,7 @@ def _reasons(result: Result) -> list[str]:
 
 
 def _frequencies(frequency: Array) -> dict[str, Floats]:
-    """The frequencies [Hz] of the points kept of spectra, from the first above zero."""
+    """Return the frequencies [Hz] of the points kept of spectra, from the first above zero."""
     n, step = frequency.size, float(frequency[1])
     high = envelope_times(min(SPECTRUM, n), n, SPECTRUM_BINS, step)
     return {
@@ -191,13 +193,13 @@ def _frequencies(frequency: Array) -> dict[str, Floats]:
 
 
 def _spectra(frequency: Array, density: Array) -> tuple[Floats, Floats]:
-    """The points kept of a density, and of its cumulative rms."""
+    """Select the points kept of a density and of its cumulative rms."""
     thin = np.concatenate([density[1:SPECTRUM], envelope(density[SPECTRUM:], SPECTRUM_BINS)])
     return thin.astype(np.float32), cumulative_rms(frequency[1:], density[1:])[_spaced(density.size) - 1].astype(np.float32)
 
 
 def _spaced(n: int) -> NDArray[np.int64]:
-    """Indices from 1 to n - 1, evenly on a logarithmic axis."""
+    """Choose indices from 1 to n - 1, evenly on a logarithmic axis."""
     return np.unique(np.round(np.geomspace(1, n - 1, CUMULATIVE)).astype(np.int64))
 
 
@@ -211,7 +213,7 @@ class Pool:
         self.number: dict[bytes, int] = {}
 
     def add(self, content: bytes) -> int:
-        """The number of an array's bytes."""
+        """Add the bytes of an array; return its number."""
         return self.number.setdefault(content, len(self.number))
 
     def all(self) -> list[bytes]:
@@ -224,7 +226,7 @@ LEVELS = 65_534
 
 
 def coded(line: Sequence[float] | Floats, pool: Pool, logarithmic: bool = False) -> list[float]:
-    """A line in 16 bits a point: [number in the pool, lowest, step], of its decimal logarithm where that is wanted."""
+    """Write a line in 16 bits a point: [number in the pool, lowest, step]; of its decimal logarithm if asked for."""
     x = np.asarray(line, dtype=np.float64)
     if logarithmic:
         x = np.log10(np.where(x > 0, x, np.nan))

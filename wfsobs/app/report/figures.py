@@ -19,7 +19,7 @@ SHADES = {WARM_UP: "#808080", WINDOW: "#2B8AB3"}
 
 
 def all_figures(sweeps: bool) -> dict[str, figure]:
-    """ "trace-turbulence" and the like -> figure; the traces share their time axis, the spectra their frequencies.
+    """Make all figures by name, as in "trace-turbulence"; the traces share their time axis, the spectra their frequencies.
 
     sweeps : with those of errors over a setting that varies
     """

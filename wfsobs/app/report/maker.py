@@ -29,7 +29,7 @@ class ReportError(Exception):
 
 
 def make(shown: Shown, preset: str, watch: Watch, _tell: object = None) -> bytes:
-    """The file of the results shown; blocks, so that it belongs into a job. Raises ReportError, Cancelled."""
+    """Make the file of the results shown; blocks, so call it in a job. Raises ReportError, Cancelled."""
     content = packed(Report(preset, shown.scenario, (), (state_of(shown.result),), shown.recorded))
     root = str(Path(wfsobs.__file__).parents[1])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}
@@ -52,7 +52,7 @@ def make(shown: Shown, preset: str, watch: Watch, _tell: object = None) -> bytes
 
 
 def _output(process: subprocess.Popen[bytes], watch: Watch) -> tuple[bytes, bytes]:
-    """Standard output and error of a process once it has ended; it is killed where the report is no longer wanted."""
+    """Wait for a process and return its standard output and error; kill it where the report is no longer wanted."""
     try:
         while True:
             try:

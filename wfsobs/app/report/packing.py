@@ -13,7 +13,7 @@ from wfsobs.scenario.grid import Variation
 
 
 def packed(report: Report) -> bytes:
-    """A report as a file of plain arrays and text."""
+    """Write a report as a file of plain arrays and text."""
     words = {
         "preset": report.preset,
         "base": to_toml(report.base),
@@ -37,7 +37,7 @@ def packed(report: Report) -> bytes:
 
 
 def unpacked(content: bytes) -> Report:
-    """The report of `packed`."""
+    """Read the report that `packed` wrote."""
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         words = json.loads(str(file["words"]))
         lines: list[dict[str, Floats]] = [{} for _ in words["states"]]

@@ -70,7 +70,7 @@ def page(report: Report, made: datetime) -> str:
 
 
 def _policy(*scripts: str) -> str:
-    """What the page may do: show itself and run these scripts."""
+    """Write the content security policy: the page may show itself and run these scripts."""
     sums = " ".join(f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'" for s in scripts)
     return (
         f"default-src 'none'; script-src {sums}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; "
@@ -79,7 +79,7 @@ def _policy(*scripts: str) -> str:
 
 
 def _modes(report: Report) -> list[str]:
-    """The modes of the states, by name; those with fewer have the first of them."""
+    """List the modes of the states, by name; states with fewer have the first of them."""
     return [mode.name for mode in max((state.scenario.modes for state in report.states), key=len)]
 
 
@@ -100,7 +100,7 @@ def _drawn() -> list[str]:
 
 
 def _figures(report: Report) -> dict[str, Any]:
-    """The figures without data, and where each is drawn."""
+    """Collect the figures without data, and where each is drawn."""
     document = Document()
     for figure in all_figures(bool(_sweeps(report))).values():
         document.add_root(figure)
@@ -108,12 +108,12 @@ def _figures(report: Report) -> dict[str, Any]:
 
 
 def _rows(report: Report) -> list[dict[str, Any]]:
-    """What varies and the rows of every state: those of `wfsobs run --json`, with the computing time."""
+    """Collect what varies and the rows of every state: those of `wfsobs run --json`, with the computing time."""
     return [{"state": state_name(report, state, i), "rows": state.rows} for i, state in enumerate(report.states)]
 
 
 def _data(report: Report) -> dict[str, Any]:
-    """Looks, states and lines."""
+    """Collect looks, states and lines."""
     pool = Pool()
     states = [_state(state, pool) for state in report.states]
     return {

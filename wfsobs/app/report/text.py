@@ -40,13 +40,13 @@ def summary(report: Report, made: datetime) -> str:
 
 
 def name_of(scenario: Scenario, path: str) -> str:
-    """A setting's label, its unit in [brackets]; the path itself of what has none."""
+    """Write a setting's label with its unit in [brackets]; the path itself if it has no label."""
     p = {known: p for known, _, p in scenario.walk()}.get(path)
     return path if p is None else label_of(p)
 
 
 def value_of(value: Any) -> str:
-    """A setting's value for people."""
+    """Write a setting's value for people."""
     if isinstance(value, bool):
         return "on" if value else "off"
     text = f"{value:.6g}" if isinstance(value, (int, float)) else written(value)
@@ -54,7 +54,7 @@ def value_of(value: Any) -> str:
 
 
 def state_name(report: Report, state: State, index: int) -> str:
-    """A state by the values of what varies."""
+    """Name a state by the values of what varies."""
     parts = []
     for variation, value in zip(report.variations, values_of(report, index), strict=True):
         label, bracket, unit = name_of(state.scenario, variation.path).partition(" [")
@@ -63,7 +63,7 @@ def state_name(report: Report, state: State, index: int) -> str:
 
 
 def values_of(report: Report, index: int) -> list[Any]:
-    """The value of every variation in a state."""
+    """List the value of every variation in a state."""
     out = []
     for variation in reversed(report.variations):
         index, at = divmod(index, len(variation.values))
@@ -123,7 +123,7 @@ def origin_values(report: Report, made: datetime) -> dict[str, Any]:
 
 
 def command_of(report: Report) -> tuple[str, bool]:
-    """The command line of a report, and whether it takes its settings from FILE, as too long to be written out."""
+    """Write the command line of a report; say whether it takes its settings from FILE, being too long otherwise."""
     changed = changes(report.base, pristine(report.preset))
     ends = _words("--vary", report.variations)
     command = _command(["--preset", report.preset, *_words("--set", (f"{k}={written(v)}" for k, v in changed.items())), *ends])
@@ -139,7 +139,7 @@ def _words(option: str, values: Iterable[object]) -> list[str]:
 
 
 def _at(scenario: Scenario, path: str) -> Any:
-    """The plain value at a dotted path of groups."""
+    """Look up the plain value at a dotted path of groups."""
     node: Any = scenario.to_dict()
     for key in path.split("."):
         node = node[key]

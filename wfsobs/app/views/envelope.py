@@ -9,7 +9,7 @@ Array = NDArray[np.float64]
 
 
 def envelope_times(start: int, stop: int, bins: int, dt: float) -> Array:
-    """Times [s] that belong to `envelope` of samples start ... stop - 1."""
+    """Compute the times [s] that belong to `envelope` of samples start ... stop - 1."""
     n = stop - start
     if n <= 2 * bins:
         return dt * np.arange(start, stop, dtype=np.float64)

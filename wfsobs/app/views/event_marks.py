@@ -24,7 +24,7 @@ WORD = 0.25
 
 
 def word(event: Event, scenario: Scenario) -> str:
-    """What an event does, in a word or two.
+    """Name an event in a word or two.
 
     >>> word(Event(kind="peak", frequency_shift=3.0), Scenario()), word(Event(kind="laser", lasers=2), Scenario())
     ('47.5 Hz peak +3 Hz', '2 LGS out')
@@ -46,7 +46,7 @@ def events_of(shown: Shown) -> list[Event]:
 
 
 def room(shown: Shown) -> float:
-    """What the words take above the lines, as a share of the axis."""
+    """Compute the height of the words above the lines, as a share of the axis."""
     return 0.1 * (1 + max(levels(shown), default=-1))
 
 
@@ -94,5 +94,5 @@ class EventMarks:
         self.restyle(dark)
 
     def restyle(self, dark: bool) -> None:
-        """The colour of the mode."""
+        """Set the colour of light or dark mode."""
         self._line.line_color = self._strip.fill_color = self._text.text_color = COLOURS[dark]

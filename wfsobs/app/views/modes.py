@@ -33,7 +33,7 @@ class ModeSwitch:
         display.param.watch(self._follow, ["mode", "unit"])
 
     def view(self) -> list[object]:
-        """The buttons and the list, one of them visible."""
+        """Return the buttons and the list, one of them visible."""
         return [self.buttons, self.list]
 
     def _chosen(self, event: object) -> None:
@@ -86,7 +86,7 @@ class UnitSwitch:
         display.param.watch(self._follow, ["mode", "unit"])
 
     def view(self) -> list[object]:
-        """The buttons and the note."""
+        """Return the buttons and the note."""
         return [self.buttons, self.note]
 
     def _options(self) -> dict[str, str]:
@@ -108,6 +108,6 @@ NO_MAS = '<span style="font-size:12px;opacity:0.75">mas: tip and tilt only</span
 
 
 def _title(mode: Mode) -> str:
-    """A mode's name in a list, with the one that axes have."""
+    """Write a mode's name in a list, with the short one of the axes."""
     short = short_name(mode)
     return mode.name[0].upper() + mode.name[1:] + (f" ({short})" if short != mode.name else "")

@@ -29,7 +29,7 @@ class Pinning:
         display.param.watch(self._refresh, "pinned")
 
     def view(self) -> list[object]:
-        """The button and the line."""
+        """Return the button and the line."""
         return [self.button, self.note]
 
     def _pressed(self, _event: object) -> None:

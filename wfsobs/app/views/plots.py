@@ -24,7 +24,7 @@ MARKED_LINE = 0.004
 
 
 def new_figure(**options: Any) -> figure:
-    """An empty figure as wide as its room, the scroll wheel left to the page until chosen."""
+    """Make an empty figure as wide as its room, the scroll wheel left to the page until chosen."""
     fig = figure(
         height=HEIGHT,
         sizing_mode="stretch_width",
@@ -47,14 +47,14 @@ def call(fig: figure, name: str) -> None:
 
 
 def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> GlyphRenderer:
-    """A line in the look of an observer or of the truth."""
+    """Draw a line in the look of an observer or of the truth."""
     it = look(name)
     renderer = fig.line("x", y, source=source, color=it.light, line_width=it.width, line_dash=list(it.dash), name=name)
     return renderer
 
 
 def marked_peaks(scenario: Scenario) -> list[Peak]:
-    """The peaks of the scenario that are in its vibration; of a measured spectrum, its stronger lines."""
+    """List the peaks in the scenario's vibration; of a measured spectrum, its stronger lines."""
     vibration = scenario.vibration
     if vibration.source == "ar2":
         return list(vibration.peaks)

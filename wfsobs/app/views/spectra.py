@@ -31,7 +31,7 @@ class Spectra:
         display.param.watch(self._restyle, ["dark", "hidden"])
 
     def pane(self, target: str) -> pn.pane.Bokeh:
-        """The figure of one target."""
+        """Return the figure of one target."""
         return pn.pane.Bokeh(self.spectra[target].figure, sizing_mode="stretch_width", margin=0)
 
     def show(self, visible: bool) -> None:
@@ -148,7 +148,7 @@ class _Spectrum:
 
 
 def _curve(spectrum: Spectrum, name: str, display: Display, diameter: float) -> Array:
-    """What is drawn of a spectrum above zero frequency. Under "error" the truth stays: it is the error of answering zero."""
+    """Compute what is drawn of a spectrum above zero frequency. In error plots the truth stays: the error of answering zero."""
     scale = per_micrometre(display.unit, diameter)
     density = (spectrum.error if display.error and name != TRUTH else spectrum.signal)[1:, display.column]
     return scale * cumulative_rms(spectrum.frequency[1:], density) if display.cumulative else scale**2 * density

@@ -41,7 +41,7 @@ class Strip:
         self.cards.items = self.items()
 
     def items(self) -> list[dict[str, Any]]:
-        """What the cards say."""
+        """Describe the cards."""
         shown = self.run.result
         observers = [self._observer(name, shown) for name in observers_of(self.target)]
         return [self._truth(shown), *observers]
@@ -73,7 +73,7 @@ class Strip:
         return self._card(TRUTH, self._scaled(scores[0].truth_rms, shown), "rms")
 
     def _loop(self, left: Score, shown: Shown) -> dict[str, Any]:
-        """What the recorded loop left, in the place of the truth, which has no line either."""
+        """Describe the recorded loop's residual, in the place of the truth, which has no line either."""
         return self._scored(TRUTH, left, shown, "z, residual") | {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
 
     def _scaled(self, value: float, shown: Shown) -> float:

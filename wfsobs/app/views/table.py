@@ -22,7 +22,7 @@ BEST, ABOVE = macro("tag", "best", "best"), macro("tag", "above", "above truth")
 
 
 def find(shown: Shown, observer: str, target: str, mode: str) -> Score | None:
-    """The score of one observer, target and mode, or None."""
+    """Find the score of one observer, target and mode; None if there is none."""
     return next((s for s in shown.result.scores if (s.observer, s.target, s.mode) == (observer, target, mode)), None)
 
 
@@ -70,7 +70,7 @@ class Table:
         }
 
     def _without_truth(self) -> list[Score]:
-        """The scores of a record without truth, of the mode shown."""
+        """Select the scores of a record without truth, of the mode shown."""
         shown = self.run.result
         scores = [s for s in shown.result.scores if s.mode == self.display.mode] if shown else []
         return scores if any(s.target == RESIDUAL for s in scores) else []
@@ -136,7 +136,7 @@ class Table:
         return swatch(name, self.display.dark) + label_of(name)
 
     def _pinned(self, name: str, target: str, score: Score | None) -> list[str]:
-        """The pinned run's error and the change since; nothing while nothing is pinned."""
+        """Write the pinned run's error and the change since; nothing while nothing is pinned."""
         kept = self.display.pinned
         if kept is None:
             return []
@@ -148,18 +148,18 @@ class Table:
 
 
 def _scored(scores: list[Score]) -> str:
-    """What was scored of rows that can be compared, for the end of a heading."""
+    """Write the stretch over which comparable rows were scored, for the end of a heading."""
     stretch = stretch_of(rows(scores, None))
     return f", {stretch}" if stretch else ""
 
 
 def _own(score: Score | None) -> Markup:
-    """What is beside the name of an observer that was scored on samples of its own."""
+    """Write the stretch of an observer that was scored on samples of its own, to stand beside its name."""
     return macro("note", own_stretch(rows([score], None)[0]) if score and score.apart else "")
 
 
 def _interval(interval: Sequence[float] | None, scale: float) -> Markup:
-    """The interval of a bound, behind it."""
+    """Write the interval of a bound, to stand behind it."""
     return macro("interval", *(number(x * scale) for x in interval), IN_MOST) if interval else Markup()
 
 

@@ -52,7 +52,7 @@ class Traces:
             self.x_range.on_change(end, self._moved)
 
     def pane(self, target: str) -> pn.pane.Bokeh:
-        """The figure of one target."""
+        """Return the figure of one target."""
         return pn.pane.Bokeh(self.traces[target].figure, sizing_mode="stretch_width", margin=0)
 
     def show(self, visible: bool) -> None:
@@ -77,7 +77,7 @@ class Traces:
                 trace.draw(shown, self.display, first, last)
 
     def _window(self, n_steps: int, dt: float) -> tuple[int, int]:
-        """The samples to send: those in view and a margin."""
+        """Find the samples to send: those in view and a margin."""
         start, end = sorted((float(self.x_range.start), float(self.x_range.end)))  # type: ignore[arg-type]
         margin = 0.0 if end - start >= self.length else MARGIN * (end - start)
         first = max(int((start - margin) / dt), 0)
@@ -169,14 +169,14 @@ class _Trace:
 
 
 def _thinned(times: Array) -> Array:
-    """The times of an envelope of samples that are a run of times themselves."""
+    """Compute the times of an envelope of samples that are a run of times themselves."""
     if times.size <= 2 * BINS:
         return times
     return np.interp(envelope_times(0, times.size, BINS, 1.0), np.arange(times.size), times)
 
 
 def _line(shown: Shown, name: str, target: str, display: Display, first: int, last: int) -> Array:
-    """The samples of one line [um], NaN where there is nothing to draw."""
+    """Compute the samples of one line [um], NaN where there is nothing to draw."""
     values, truth = shown.values(name, target), shown.values(TRUTH, target)
     nothing = np.full(last - first, np.nan)
     if values is None:
