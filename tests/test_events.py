@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from wfsobs import PRESETS, Scenario, SettingError, observe, simulate
-from wfsobs.control.closed_loop import closed_loop, design
-from wfsobs.control.rows import rows
+from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.rows import rows
+from wfsobs.closed_loop.run import closed_loop
 from wfsobs.cost import run_bytes, run_seconds
 from wfsobs.evaluation.bound import bounds
 from wfsobs.identification import identify

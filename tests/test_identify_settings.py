@@ -12,8 +12,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from wfsobs.cli import main
-from wfsobs.control.lqg import LQG
-from wfsobs.control.mirror import Mirror
+from wfsobs.closed_loop.design import design
 from wfsobs.evaluation.bound import bound
 from wfsobs.identification import Identified, identify
 from wfsobs.identification.process import Number, Process, merged
@@ -120,9 +119,8 @@ def test_every_mode_has_its_own_in_a_simulation_and_in_the_bound(found: Identifi
 @pytest.mark.parametrize("name", ["lqg-kf-multi", "lqg-kf-lgs"])
 def test_a_controller_takes_the_model_of_its_mode(saved: Scenario, name: str) -> None:
     """Tip as if it were alone, and not as tilt."""
-    laws = [LQG[name](saved, mode, Mirror(2.0)) for mode in (0, 1)]
-    z = np.random.default_rng(3).standard_normal((200, 1, 1))
-    tip, tilt = (law.run(z[:, :, 0]) for law in laws)
+    z = np.random.default_rng(3).standard_normal((200, 1))
+    tip, tilt = (one.law.run(z) for one in design(saved, (name,)).laws[name] if one.law is not None)
     assert np.std(tip - tilt) > 0.1 * np.std(tip)
 
 

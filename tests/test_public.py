@@ -12,7 +12,8 @@ import pytest
 
 import wfsobs
 from wfsobs.cli.group import COMMANDS, main
-from wfsobs.control.closed_loop import closed_loop, design
+from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.run import closed_loop
 from wfsobs.telemetry.records import save_record
 
 FUNCTIONS = ("close_loop", "export", "identify", "load", "observe", "run", "score", "simulate", "tune")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from wfsobs.app.report.export import export
-    from wfsobs.control.closed_loop import close_loop
+    from wfsobs.closed_loop.run import close_loop
     from wfsobs.evaluation.scores import score
     from wfsobs.identification.identification import identify
     from wfsobs.pipeline import Result, observe, run
@@ -31,7 +31,7 @@ __version__ = "0.2.0"
 
 _HOMES = {
     "export": "app.report.export",
-    "close_loop": "control.closed_loop",
+    "close_loop": "closed_loop.run",
     "score": "evaluation.scores",
     "identify": "identification.identification",
     "Result": "pipeline",

@@ -8,11 +8,12 @@ from statistics import median
 
 import numpy as np
 
-from wfsobs.control.closed_loop import closed_loop, design
+from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.rows import label, rows
+from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.integrator import highest_stable_gain
 from wfsobs.control.mirror import Mirror
-from wfsobs.control.rows import label, rows
 from wfsobs.evaluation.bound import BOUND
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

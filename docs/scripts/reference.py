@@ -12,6 +12,7 @@ import click
 from settings_table import changes
 
 from wfsobs.cli import main
+from wfsobs.closed_loop.rows import needed
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
@@ -126,7 +127,9 @@ def observers() -> str:
 
 def controllers() -> str:
     """Every controller: what it needs and costs."""
-    rows = ((f"`{c.id}`", c.label, c.needed(Scenario()), "yes" if c.ngs else "no", f"{c.weight:g}") for c in CONTROLLERS.values())
+    rows = (
+        (f"`{c.id}`", c.label, needed(c.id, Scenario()), "yes" if c.ngs else "no", f"{c.weight:g}") for c in CONTROLLERS.values()
+    )
     head = ("Id", "Name", "Needs beside measurements", "Uses the NGS", "Computing time, linear law = 1")
     about = (
         "The registry of controllers, which `wfsobs loop` compares. [Closed loop](../closed_loop.md) has the method and the "

@@ -15,9 +15,10 @@ from wfsobs.app.pages.loop_figures import CURVES
 from wfsobs.app.pages.pages import EXPLORE, LOOP
 from wfsobs.app.style import LOOKS
 from wfsobs.app.views.envelope import envelope
-from wfsobs.control.closed_loop import closed_loop, design
+from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.rows import rows
+from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.rows import rows
 from wfsobs.evaluation.bound import BOUND
 
 

@@ -26,7 +26,7 @@ from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.share import from_query
 from wfsobs.app.sources import Kept, Loaded
 from wfsobs.app.work import Shown
-from wfsobs.control.rows import rows
+from wfsobs.closed_loop.rows import rows
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.identification import report as identified
 from wfsobs.record import RecordError

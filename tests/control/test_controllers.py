@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.control.closed_loop import ClosedLoop, Outcome, closed_loop, design, residual_rms, strehl
+from wfsobs.closed_loop.design import Design, design
+from wfsobs.closed_loop.run import ClosedLoop, Outcome, closed_loop, residual_rms, strehl
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.integrator import best_gain, highest_stable_gain, integrator_law, limited_integrator
-from wfsobs.control.lqg import lqg_kf_lgs
 from wfsobs.control.mirror import Mirror
-from wfsobs.control.prediction import gpr_offline_ahead
 from wfsobs.control.residual import residual_variance
 from wfsobs.observers.baselines import online_reference
-from wfsobs.priors_from.scenario import bands_of, kalman_model, measurement_noise, modelled_processes
+from wfsobs.priors_from.controllers import arguments, own_settings
+from wfsobs.priors_from.scenario import bands_of, kalman_model, measurement_noise, modelled_processes, spectra_of
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
@@ -28,7 +28,6 @@ from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import paper_matrices
 from wfsobs.signal.welch import welch_psd
 from wfsobs.simulation.loop import simulate
-from wfsobs.simulation.true_spectra import true_spectra
 from wfsobs.typing import Array
 
 # The loop of one 530 nm turbulence, one 50 nm line at 47.5 Hz, 20 nm of noise, and a model that is the truth.
@@ -157,7 +156,17 @@ def test_lqg_in_a_simulated_loop_commands_the_same() -> None:
         return command
 
     u = feedback(z, Mirror(2.0), law)
-    assert np.allclose(lqg_kf_lgs(MATCHED, 0, Mirror(2.0)).run(z[:, None]), u, rtol=0, atol=1e-7)
+    lqg = design(MATCHED, ("lqg-kf-lgs",)).laws["lqg-kf-lgs"][0].law
+    assert lqg is not None and np.allclose(lqg.run(z[:, None]), u, rtol=0, atol=1e-7)
+
+
+def predicted(record: Record, scenario: Scenario, plan: Design) -> Array:
+    """The vibration that the offline GPR predicts, (n_steps, n_modes)."""
+    controller = CONTROLLERS["integrator+gpr-offline"]
+    assert controller.predict is not None
+    settings = own_settings(controller, scenario)
+    measured, prior = arguments(controller, record, settings, plan.priors[controller.id])
+    return controller.predict(measured, prior, plan.plant, settings, QUIET)
 
 
 @pytest.mark.parametrize("changes", [{}, {"control.stroke": 0.5, "control.rate": 0.03}, {"control.delay": 2.5}])
@@ -165,7 +174,7 @@ def test_a_vibration_that_is_predicted_is_not_corrected_twice(changes: dict[str,
     """The loop with its feedback, the integrator on y[k] - (f[k] - vib_hat[k-1]), each part as the documentation says."""
     scenario = MATCHED.replace({**QUICK, **changes})
     record, plan = simulate(scenario), design(scenario, ("integrator+gpr-offline",))
-    ahead = gpr_offline_ahead(record, scenario, plan.mirror, QUIET)[:, 0]
+    ahead = predicted(record, scenario, plan)[:, 0]
     known = ~np.isnan(ahead)
     ahead = np.where(known, ahead, 0.0)
     f = np.where(known, online_reference(bands_of(scenario), record.z, record.dt)[:, 0], 0.0)
@@ -249,7 +258,7 @@ def test_the_gain_is_the_best_of_all() -> None:
     # with a delay of 3 and of 4 there are two minima, the better one once at the higher gain, once at the lower
     for delay, change in [*((2.0, c) for c in changes), (3.0, {}), (4.0, {})]:
         mirror = Mirror(delay)
-        spectra = true_spectra(MATCHED.replace(change), 0)
+        spectra = spectra_of(MATCHED.replace(change), 0)
         gains = highest_stable_gain(mirror, 1.0) * np.linspace(0.01, 0.99, 60)
         others = [residual_variance(integrator_law(mirror, g, 1.0), spectra, mirror) for g in gains]
         best = best_gain(spectra, mirror, 1.0)
@@ -304,6 +313,9 @@ def test_what_cannot_run_says_why() -> None:
         closed_loop(replace(record, turbulence=None), plan)
     with pytest.raises(RecordError, match="another rate"):
         closed_loop(replace(record, dt=2e-3), plan)
+    tip = {name: getattr(record, name)[:, :1] for name in ("y_lgs", "u", "y_ngs", "turbulence", "vibration")}
+    with pytest.raises(RecordError, match="has 1 modes, the controllers are for 2"):
+        closed_loop(replace(record, **tip), plan)  # type: ignore[arg-type]
     with pytest.raises(SettingError, match="'pid': no such controller"):
         design(MATCHED, ("pid",))
 

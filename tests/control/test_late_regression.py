@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.control.late_regression import LateRegression
-from wfsobs.control.mirror import Mirror
+from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.control.prediction import VibrationPredictor, of_z
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.gpr.inputs import Scale, window_signals
@@ -71,7 +71,7 @@ def test_the_vibration_is_predicted_for_the_time_that_the_command_acts(delay: fl
     late = taps.size - 2
     targets = np.array([taps[1:] @ f[j + 1 : j + taps.size] for j in range(n - taps.size)])
     scale = Scale(np.array([0.1]), np.array([0.7])) if inputs == "standardised" else None
-    predictor = VibrationPredictor(scenario, Mirror(delay), scale)
+    predictor = VibrationPredictor(scenario.gpr_online, bands_of(scenario), Plant(Mirror(delay), scenario.dt, 5), scale)
     nothing = np.zeros((n, 1))
     seen = window_signals(of_z(scenario.gpr_online), nothing, nothing, z[:, None], 0, scenario.dt, scale)[:, 0]
     values = [predictor.step(x) for x in z]

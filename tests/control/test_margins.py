@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from wfsobs.closed_loop.design import design
 from wfsobs.control.integrator import highest_stable_gain, integrator_law
 from wfsobs.control.law import Law, transfer
-from wfsobs.control.lqg import lqg_kf_lgs
 from wfsobs.control.margins import Margins, crossings, frequencies, margins
 from wfsobs.control.mirror import Mirror
 from wfsobs.scenario.presets import PRESETS
@@ -67,8 +67,9 @@ def polynomials(law: Law, mirror: Mirror) -> tuple[Any, Any]:
 @pytest.mark.parametrize(("name", "delay"), [("paper", 2.0), ("paper", 2.5), ("ut4", 2.0), ("ut4", 3.0)])
 def test_the_gain_margin_of_lqg_is_where_a_pole_reaches_the_circle(name: str, delay: float) -> None:
     """With the loop gain times kappa the poles are the roots of (den - num) + kappa num."""
-    mirror = Mirror(delay)
-    law = lqg_kf_lgs(PRESETS[name](), 0, mirror)
+    plan = design(PRESETS[name]().replace({"control.delay": delay}), ("lqg-kf-lgs",))
+    mirror, law = plan.mirror, plan.laws["lqg-kf-lgs"][0].law
+    assert law is not None
     m = of(law, mirror)
     numerator, denominator = polynomials(law, mirror)
 

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.control.mirror import Mirror, mirror_of
+from wfsobs.control.mirror import Mirror
+from wfsobs.priors_from.controllers import plant_of
 from wfsobs.record import delay_signal
 from wfsobs.scenario import Scenario
 
@@ -36,8 +37,8 @@ def test_the_response_is_that_of_a_sine(delay: float, omega: float) -> None:
 
 def test_the_paper_s_mirror_is_one_step_late() -> None:
     u = np.arange(1.0, 6.0)
-    assert mirror_of(Scenario()).correction(u).tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
-    assert not mirror_of(Scenario()).limited
+    assert plant_of(Scenario()).mirror.correction(u).tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert not plant_of(Scenario()).mirror.limited
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
@@ -56,4 +57,4 @@ def test_commands_keep_the_limits_and_go_as_far_as_they_allow(stroke: float, sle
 
 def test_the_rate_is_given_per_millisecond() -> None:
     scenario = Scenario().replace({"control.rate": 0.2, "control.stroke": 3.0, "sensors.lgs_rate": 500.0})
-    assert mirror_of(scenario).slew == pytest.approx(0.4) and mirror_of(scenario).stroke == 3.0
+    assert plant_of(scenario).mirror.slew == pytest.approx(0.4) and plant_of(scenario).mirror.stroke == 3.0

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from wfsobs.control.mirror import Mirror
-from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.priors_from.controllers import arguments, own_settings, plant_of, prior_for
 from wfsobs.progress import QUIET
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
-from wfsobs.typing import Array
 
 LINE = Scenario().replace(
     {  # one pure line in the middle of its band-pass, next to no noise
@@ -44,18 +41,19 @@ def _record() -> Record:
 
 
 @pytest.mark.parametrize("delay", [1.0, 2.0, 2.5])
-@pytest.mark.parametrize("predict", [gpr_offline_ahead, gpr_online_ahead])
-def test_a_prediction_is_the_vibration_while_the_command_acts(
-    predict: Callable[..., Array], delay: float, record: Record
-) -> None:
+@pytest.mark.parametrize("name", ["integrator+gpr-offline", "integrator+gpr-online"])
+def test_a_prediction_is_the_vibration_while_the_command_acts(name: str, delay: float, record: Record) -> None:
     """A command held for a frame acts from `delay` - 1 to `delay` steps after its own: the mean of a line over that time."""
     assert record.vibration is not None
-    mirror = Mirror(delay)
-    got = predict(record, LINE, mirror, QUIET)
+    scenario, controller = LINE.replace({"control.delay": delay, "control.integrator": "manual"}), CONTROLLERS[name]
+    settings, plant = own_settings(controller, scenario), plant_of(scenario)
+    measured, prior = arguments(controller, record, settings, prior_for(controller, scenario))
+    assert controller.predict is not None
+    got = controller.predict(measured, prior, plant, settings, QUIET)
     command = np.zeros(20)
     command[0] = 1.0
     wanted = np.zeros_like(record.vibration)
-    for later, share in enumerate(mirror.correction(command)):
+    for later, share in enumerate(plant.mirror.correction(command)):
         wanted += share * np.roll(record.vibration, -later, axis=0)
     settled = slice(500, -20)  # the online band-pass has forgotten its start; what `roll` brings round is left out
     error = np.std((got - wanted)[settled], axis=0) / np.std(wanted[settled], axis=0)

@@ -9,9 +9,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from wfsobs.cli import main
-from wfsobs.control.closed_loop import closed_loop, design
+from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
+from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.evaluation.bound import BOUND
 from wfsobs.scenario import configfile
 from wfsobs.simulation.loop import simulate

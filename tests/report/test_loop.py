@@ -11,8 +11,8 @@ from wfsobs.app.numbers import number
 from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.packing import packed, unpacked
 from wfsobs.app.report.page import page
+from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.evaluation.bound import BOUND
 from wfsobs.pipeline import Result
 from wfsobs.scenario import Scenario

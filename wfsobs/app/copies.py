@@ -114,7 +114,8 @@ def _observe(recorded: bool, _arguments: Mapping[str, Any]) -> Lines:
 
 
 def _loop(_recorded: bool, _arguments: Mapping[str, Any]) -> Lines:
-    return {"from wfsobs.control.rows import rows", "from wfsobs.control.closed_loop import closed_loop, design"}, [
+    modules = {"design": "design", "run": "closed_loop", "rows": "rows"}
+    return {f"from wfsobs.closed_loop.{module} import {name}" for module, name in modules.items()}, [
         "result = closed_loop(record, design(scenario))",
         "for row in rows(result, None):",
         '    print(row["controller"], row["mode"], row["residual_rms_nm"], "nm")',

@@ -8,10 +8,11 @@ from typing import Any
 
 from wfsobs.app.jobs.job import Tell
 from wfsobs.app.work import Shown
-from wfsobs.control.closed_loop import ClosedLoop, design, each_outcome
+from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.rows import Row, rows
+from wfsobs.closed_loop.run import ClosedLoop, each_outcome
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.curves import Curves, curves
-from wfsobs.control.rows import Row, rows
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import welch_psd

@@ -7,7 +7,7 @@ from statistics import median
 
 from rich.table import Table
 
-from wfsobs.control.rows import LIMITED, NOT_APPLICABLE, label, linear
+from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label, linear
 from wfsobs.evaluation.rows import Row
 
 

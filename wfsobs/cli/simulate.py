@@ -10,8 +10,9 @@ from wfsobs.cli.loop_table import loop_table
 from wfsobs.cli.options import loaded, record_options, scenario_options
 from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.show import progress_bar, show, show_over_time, show_table, warn
-from wfsobs.control.closed_loop import closed_loop, design
-from wfsobs.control.rows import rows as loop_rows
+from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.rows import rows as loop_rows
+from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.rows import Row, rows
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record

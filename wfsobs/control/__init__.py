@@ -1,1 +1,1 @@
-"""Controllers in the closed loop: what an observer is worth in nanometres, milliarcseconds and Strehl."""
+"""Controllers: from measurements, a prior and settings of their own to commands. What they are worth is `wfsobs.closed_loop`."""

@@ -1,85 +1,84 @@
-"""The controllers, by id: what each is, and what it has to be given."""
+"""The controllers, by id."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
+from wfsobs import registry
+from wfsobs.control.base import Controller
 from wfsobs.control.integrator import best_gain, integrator_law
 from wfsobs.control.law import Law
-from wfsobs.control.lqg import LQG
-from wfsobs.control.mirror import Mirror
+from wfsobs.control.lqg import lqg_kf_lgs, lqg_kf_multi, lqg_multirate, lqg_multirate_multi, lqg_multirate_optimal
+from wfsobs.control.mirror import Plant
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
-from wfsobs.observers.base import BANDS, LINES, MODEL, NOTHING, SPECTRA, TRAINING
-from wfsobs.progress import Watch
-from wfsobs.record import Record
-from wfsobs.scenario import Scenario
-from wfsobs.simulation.true_spectra import TrueSpectra
-from wfsobs.typing import Array
-
-MakeLaw = Callable[[Scenario, int, Mirror, TrueSpectra | None], Law]
-"""(scenario, mode, mirror, its true spectra if known) -> law. Raises ValueError saying why there is none."""
-
-Predict = Callable[[Record, Scenario, Mirror, Watch], Array]
-"""Vibration while u[k] acts, (n_steps, n_modes) [um], NaN where it is not known yet."""
+from wfsobs.prior import Bands, LgsError, Lines, Model, Part, Prior, Spectra, Training
+from wfsobs.registry import Registry
 
 
-@dataclass(frozen=True)
-class Controller:
-    """An entry of the registry: a linear law, or an integrator beside a prediction of the vibration, or nothing.
-
-    id, label : for tables and files, and for people
-    needs     : what it must be given beside measurements, the gain of an integrator aside
-    law       : of one mode; of an integrator with a prediction, that of the integrator
-    predict   : of the vibration
-    ngs       : whether it uses NGS frames
-    weight    : its computing time relative to a linear law's
-    """
-
-    id: str
-    label: str
-    needs: tuple[str, ...] = ()
-    law: MakeLaw | None = None
-    predict: Predict | None = None
-    ngs: bool = False
-    weight: float = 1.0
-
-    def needed(self, scenario: Scenario) -> str:
-        """What it must be given beside measurements, for people; an optimised gain takes the true spectra."""
-        gain = (SPECTRA,) if self.law is _integrator and scenario.control.integrator == "optimised" else ()
-        return ", ".join((*gain, *self.needs)) or NOTHING
+def integrator(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
+    """The integrator with the gain of the settings, or the best one for the spectra that it is told."""
+    c = settings.control
+    gain = c.gain if c.integrator == "manual" else best_gain(prior.spectra[mode], plant.mirror, c.leak)
+    return integrator_law(plant.mirror, gain, c.leak)
 
 
-def _integrator(scenario: Scenario, mode: int, mirror: Mirror, spectra: TrueSpectra | None) -> Law:
-    c = scenario.control
-    if c.integrator == "manual":
-        return integrator_law(mirror, c.gain, c.leak)
-    if spectra is None:
-        raise ValueError(
-            f"the spectrum of turbulence from {scenario.turbulence.source} is not known: set control.integrator "
-            "to manual, and control.gain"
-        )
-    return integrator_law(mirror, best_gain(spectra, mirror, c.leak), c.leak)
+def _gain(settings: Any) -> tuple[Part, ...]:
+    """An optimised gain takes the spectra."""
+    return (Spectra,) if settings.control.integrator == "optimised" else ()
 
 
-def _lqg(id_: str) -> MakeLaw:
-    return lambda scenario, mode, mirror, _spectra: LQG[id_](scenario, mode, mirror)
+def _gain_and_scale(settings: Any) -> tuple[Part, ...]:
+    """Beside the gain, standardised inputs are divided by the deviations of a training record."""
+    scale = (Training,) if settings.gpr_online.inputs_filter == "standardised" else ()
+    return (*_gain(settings), *scale)
 
 
-CONTROLLERS: dict[str, Controller] = {
-    c.id: c
-    for c in (
+CONTROLLERS = Registry(
+    Controller,
+    registry.CONTROLLERS,
+    (
         Controller("none", "No control", weight=0.1),
-        Controller("integrator", "Integrator", law=_integrator),
-        Controller("lqg-kf-lgs", "LQG, LGS KF", (MODEL,), _lqg("lqg-kf-lgs")),
-        Controller("lqg-kf-multi", "LQG, multi-peak KF", (MODEL, LINES), _lqg("lqg-kf-multi")),
-        Controller("lqg-multirate", "LQG, multi-rate KF", (MODEL,), _lqg("lqg-multirate"), ngs=True),
-        Controller("lqg-multirate-optimal", "LQG, optimal multi-rate KF", (MODEL,), _lqg("lqg-multirate-optimal"), ngs=True),
-        Controller("lqg-multirate-multi", "LQG, multi-rate multi-peak KF", (MODEL, LINES), _lqg("lqg-multirate-multi"), ngs=True),
+        Controller("integrator", "Integrator", integrator, settings=("control",), asks=_gain),
+        Controller("lqg-kf-lgs", "LQG, LGS KF", lqg_kf_lgs, prior=(Model,)),
+        Controller("lqg-kf-multi", "LQG, multi-peak KF", lqg_kf_multi, prior=(Lines,), settings=("multipeak",)),
+        Controller("lqg-multirate", "LQG, multi-rate KF", lqg_multirate, prior=(Model,), settings=("multirate",), ngs=True),
         Controller(
-            "integrator+gpr-offline", "Integrator and offline GPR", (TRAINING, BANDS), _integrator, gpr_offline_ahead, weight=20.0
+            "lqg-multirate-optimal",
+            "LQG, optimal multi-rate KF",
+            lqg_multirate_optimal,
+            prior=(Model, LgsError),
+            settings=("multirate",),
+            ngs=True,
         ),
-        Controller("integrator+gpr-online", "Integrator and online GPR", (BANDS,), _integrator, gpr_online_ahead, weight=200.0),
-    )
-}
+        Controller(
+            "lqg-multirate-multi",
+            "LQG, multi-rate multi-peak KF",
+            lqg_multirate_multi,
+            prior=(Model, LgsError, Lines),
+            settings=("multirate", "multipeak"),
+            ngs=True,
+        ),
+        Controller(
+            "integrator+gpr-offline",
+            "Integrator and offline GPR",
+            integrator,
+            gpr_offline_ahead,
+            (Training, Bands),
+            ("control", "gpr_offline"),
+            _gain,
+            weight=20.0,
+        ),
+        Controller(
+            "integrator+gpr-online",
+            "Integrator and online GPR",
+            integrator,
+            gpr_online_ahead,
+            (Bands,),
+            ("control", "gpr_online"),
+            _gain_and_scale,
+            weight=200.0,
+        ),
+    ),
+    reserved=("bound",),
+)
 """Every controller, in the order of tables and legends."""

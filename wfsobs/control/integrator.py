@@ -8,8 +8,8 @@ from scipy.optimize import minimize_scalar
 from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.residual import residual_density
+from wfsobs.prior import Spectra
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.simulation.true_spectra import TrueSpectra
 from wfsobs.typing import Array
 
 FINE, COARSE = 2048, 64
@@ -28,7 +28,7 @@ def integrator_law(mirror: Mirror, gain: float, leak: float) -> Law:
     A = np.vstack([row, np.eye(n)[:-1]])
     into = np.array([-gain])
     cycle = PeriodicFilter([(A, np.eye(n)[:, :1] * into, row[None, :], into[:, None])])
-    return steady_law(cycle, gain)
+    return steady_law(cycle, gain, leak)
 
 
 def highest_stable_gain(mirror: Mirror, leak: float) -> float:
@@ -40,8 +40,8 @@ def highest_stable_gain(mirror: Mirror, leak: float) -> float:
     return low
 
 
-def best_gain(spectra: TrueSpectra, mirror: Mirror, leak: float) -> float:
-    """The stable gain of least residual variance for the true spectra of a mode."""
+def best_gain(spectra: Spectra, mirror: Mirror, leak: float) -> float:
+    """The stable gain of least residual variance for the spectra of a mode."""
     omega, weight, target, cross, measured = _binned(spectra)
     P, one = mirror.response(omega), 1.0 - leak * np.exp(-1j * omega)
 
@@ -56,7 +56,7 @@ def best_gain(spectra: TrueSpectra, mirror: Mirror, leak: float) -> float:
     return float(minimize_scalar(variance, bounds=around, method="bounded", options={"xatol": 1e-5}).x)
 
 
-def _binned(spectra: TrueSpectra) -> tuple[Array, Array, Array, Array, Array]:
+def _binned(spectra: Spectra) -> tuple[Array, Array, Array, Array, Array]:
     """(omega, weight in the mean over the circle, and the three spectra of `residual_density`) on fewer points."""
     n = spectra.measured.size
     weight = np.full(n, 1.0 / (n - 1))
@@ -67,8 +67,8 @@ def _binned(spectra: TrueSpectra) -> tuple[Array, Array, Array, Array, Array]:
     def mean(x: Array) -> Array:
         return np.add.reduceat(weight * x, starts) / total
 
-    target, cross = spectra.total
-    return mean(np.pi * np.arange(n) / (n - 1)), total, mean(target), mean(cross), mean(spectra.measured)
+    omega = np.pi * np.arange(n) / (n - 1)
+    return mean(omega), total, mean(spectra.disturbance), mean(spectra.cross), mean(spectra.measured)
 
 
 def limited_integrator(mirror: Mirror, gain: float, leak: float, z: Array, forward: Array) -> tuple[Array, Array]:

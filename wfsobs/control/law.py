@@ -26,12 +26,13 @@ class Law:
 
     cycle : the filter from z (LGS, or LGS and NGS) to u
     run   : z (n_steps, n_inputs) [um] -> u (n_steps,) [um]
-    gain  : of an integrator
+    gain, leak : of an integrator
     """
 
     cycle: PeriodicFilter
     run: Callable[[Array], Array]
     gain: float | None = None
+    leak: float = 1.0
 
     @property
     def poles(self) -> Complex:
@@ -54,9 +55,9 @@ class Law:
         return -transfer(F, G[:, 0], H[0], float(J[0, 0]), np.exp(1j * omega))
 
 
-def steady_law(cycle: PeriodicFilter, gain: float | None = None) -> Law:
+def steady_law(cycle: PeriodicFilter, gain: float | None = None, leak: float = 1.0) -> Law:
     """The law of a filter of the LGS alone."""
-    return Law(cycle, lambda z: cycle.run(z[:, :1, None])[:, 0, 0], gain)
+    return Law(cycle, lambda z: cycle.run(z[:, :1, None])[:, 0, 0], gain, leak)
 
 
 def transfer(F: Array, G: Array, H: Array, J: float, z: Complex) -> Complex:

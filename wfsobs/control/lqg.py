@@ -9,19 +9,17 @@ frames, and for n + f frames the mean over the time that the command is held,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from wfsobs.control.law import Law, steady_law
-from wfsobs.control.mirror import Mirror
+from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.multirate import MultiRateFilter, multirate_filter, multirate_noise
 from wfsobs.observers.kalman.multirate_optimal import optimal_filter, optimal_model
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Prior
-from wfsobs.priors_from.scenario import kalman_model, lgs_error_of, measurement_noise, model_of, multi_model
-from wfsobs.scenario import Scenario
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 
@@ -48,48 +46,39 @@ def lqg_of(model: DisturbanceModel, noise: float, mirror: Mirror) -> Law:
     return steady_law(steady_filter(model, noise, _rows_of(model, mirror))[0])
 
 
-def lqg_kf_lgs(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
+def lqg_kf_lgs(prior: Prior, mode: int, plant: Plant, _settings: Any) -> Law:
     """With the model of the LGS Kalman filter: turbulence and one vibration peak."""
-    return lqg_of(kalman_model(scenario, mode, scenario.dt), measurement_noise(scenario, mode)[0], mirror)
+    model = prior.model[mode]
+    return lqg_of(model.disturbance(), model.lgs_noise, plant.mirror)
 
 
-def lqg_kf_multi(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
+def lqg_kf_multi(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With every peak of the vibration in the model."""
-    return lqg_of(multi_model(scenario, mode, scenario.dt), measurement_noise(scenario, mode)[0], mirror)
+    lines = prior.lines[mode]
+    return lqg_of(lines.disturbance(settings.multipeak.line_width), lines.noise, plant.mirror)
 
 
-def lqg_multirate(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
-    """With the paper's multi-rate filter. Raises SettingError where its cycle is unstable."""
-    prior = model_of(scenario, mode)
-    model, noise = prior.disturbance(), multirate_noise(scenario.multirate, prior)
-    return _two_sensors(multirate_filter(model, scenario.sensors.exposure_ratio, *noise, _rows_of(model, mirror)))
+def lqg_multirate(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
+    """With the paper's multi-rate filter. Raises UnstableCycle."""
+    known = prior.model[mode]
+    model, noise = known.disturbance(), multirate_noise(settings.multirate, known)
+    return _two_sensors(multirate_filter(model, plant.ratio, *noise, _rows_of(model, plant.mirror)))
 
 
-def lqg_multirate_optimal(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
+def lqg_multirate_optimal(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the optimal multi-rate filter."""
-    return _optimal(scenario, mode, mirror, None)
+    return _optimal(prior, mode, plant, settings, None)
 
 
-def lqg_multirate_multi(scenario: Scenario, mode: int, mirror: Mirror) -> Law:
+def lqg_multirate_multi(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the optimal multi-rate filter and every peak of the vibration in its model."""
-    return _optimal(scenario, mode, mirror, multi_model(scenario, mode, scenario.dt))
+    return _optimal(prior, mode, plant, settings, prior.lines[mode].disturbance(settings.multipeak.line_width))
 
 
-def _optimal(scenario: Scenario, mode: int, mirror: Mirror, model: DisturbanceModel | None) -> Law:
-    prior = Prior((model_of(scenario, mode),), (lgs_error_of(scenario, mode),))
-    cycle, rows = optimal_model(scenario.multirate, prior, 0, scenario.sensors.exposure_ratio, model)
-    return _two_sensors(optimal_filter(cycle, command_rows(cycle[0][0], rows.sum(axis=0), mirror))[0])
+def _optimal(prior: Prior, mode: int, plant: Plant, settings: Any, model: DisturbanceModel | None) -> Law:
+    cycle, rows = optimal_model(settings.multirate, prior, mode, plant.ratio, model)
+    return _two_sensors(optimal_filter(cycle, command_rows(cycle[0][0], rows.sum(axis=0), plant.mirror))[0])
 
 
 def _two_sensors(filter_: MultiRateFilter) -> Law:
     return Law(filter_.cycle, lambda z: filter_.run(z)[:, 0])
-
-
-LQG: dict[str, Callable[[Scenario, int, Mirror], Law]] = {
-    "lqg-kf-lgs": lqg_kf_lgs,
-    "lqg-kf-multi": lqg_kf_multi,
-    "lqg-multirate": lqg_multirate,
-    "lqg-multirate-optimal": lqg_multirate_optimal,
-    "lqg-multirate-multi": lqg_multirate_multi,
-}
-"""Controller -> its law in one mode."""

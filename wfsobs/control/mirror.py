@@ -1,4 +1,4 @@
-"""The deformable mirror of one mode: its delay, a fraction of a frame included, and its limits.
+"""The deformable mirror of one mode: its delay, a fraction of a frame included, and its limits; and the plant that it is part of.
 
 With a delay of n + f frames, 0 <= f < 1, a command held for a frame acts during the last 1 - f of step k + n - 1 and the
 first f of step k + n (zero-order hold), so that
@@ -16,7 +16,6 @@ from math import inf
 import numpy as np
 from scipy.signal import lfilter
 
-from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
 
@@ -77,8 +76,10 @@ class Mirror:
         return np.array(out)
 
 
-def mirror_of(scenario: Scenario) -> Mirror:
-    """The mirror of a scenario's closed loop."""
-    c = scenario.control
-    slew = c.rate * scenario.dt * 1e3
-    return Mirror(c.delay, c.stroke or inf, slew or inf)
+@dataclass(frozen=True)
+class Plant:
+    """What a controller is made for: the mirror of a mode, the fast step `dt` [s], and fast steps per NGS frame."""
+
+    mirror: Mirror
+    dt: float
+    ratio: int

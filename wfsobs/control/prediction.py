@@ -7,44 +7,44 @@ step j is phi_vib[j+1]; the Butterworth bank on z says so at step j + 2, one ste
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from wfsobs.control.late_regression import LateRegression
-from wfsobs.control.mirror import Mirror
+from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers.gpr.inputs import Scale, StreamingInputs, scale_of, window_signals
 from wfsobs.observers.gpr.offline import OfflineGpr, train, training_targets
 from wfsobs.observers.gpr.online import OnlineGpr, kernel_of
 from wfsobs.observers.per_mode import over_modes
-from wfsobs.priors_from.scenario import bands_of
+from wfsobs.prior import Bands, Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Record, RecordError, pseudo_open_loop
-from wfsobs.scenario import Scenario
+from wfsobs.record import Measurements, RecordError, pseudo_open_loop
 from wfsobs.signal.bandpass import StreamingBank, bandpass_bank
 from wfsobs.typing import Array
 
 G = TypeVar("G", OfflineGpr, OnlineGpr)
 
 
-def gpr_offline_ahead(record: Record, scenario: Scenario, mirror: Mirror, watch: Watch) -> Array:
+def gpr_offline_ahead(measured: Measurements, prior: Prior, plant: Plant, settings: Any, watch: Watch) -> Array:
     """Prediction of the vibration during the time that u[k] acts, (n_steps, n_modes) [um], NaN before the first full
     window; trained once on the training record, its targets as many steps later."""
-    g, training = of_z(scenario.gpr_offline), record.training
+    g, training = of_z(settings.gpr_offline), prior.training
     if training is None:
         raise RecordError("the record has no training record")
-    if record.n_steps < g.depth:
-        raise RecordError(f"the record has {record.n_steps} steps; depth needs {g.depth}")
-    targets = _ahead(training_targets(training, bands_of(scenario), record.dt, record.delay), mirror)
-    training_z = pseudo_open_loop(training.y_lgs, training.u, record.delay)
+    assert prior.bands is not None
+    if measured.n_steps < g.depth:
+        raise RecordError(f"the record has {measured.n_steps} steps; depth needs {g.depth}")
+    targets = _ahead(training_targets(training, prior.bands, measured.dt, measured.delay), plant.mirror)
+    training_z = pseudo_open_loop(training.y_lgs, training.u, measured.delay)
 
     def one(mode: int, watch: Watch) -> Array:
-        scale = scale_of(g, training, record.delay, mode)
-        signals = window_signals(g, training.y_lgs, training.u, training_z, mode, record.dt, scale)
+        scale = scale_of(g, training, measured.delay, mode)
+        signals = window_signals(g, training.y_lgs, training.u, training_z, mode, measured.dt, scale)
         model = train(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), watch)
-        return model.predict(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt, scale), watch)
+        return model.predict(window_signals(g, measured.y_lgs, measured.u, measured.z, mode, measured.dt, scale), watch)
 
-    return over_modes(record.n_modes, one, watch)
+    return over_modes(measured.n_modes, one, watch)
 
 
 def of_z(settings: G) -> G:
@@ -69,12 +69,12 @@ class VibrationPredictor:
     At step k it has learnt from the windows whose target is known by then: those up to k - mirror.taps.size + 1.
     """
 
-    def __init__(self, scenario: Scenario, mirror: Mirror, scale: Scale | None = None):
+    def __init__(self, settings: OnlineGpr, bands: Bands, plant: Plant, scale: Scale | None = None):
         """Scale: of standardised inputs, from `inputs.scale_of`."""
-        g, b = of_z(scenario.gpr_online), scenario.butterworth
-        self._inputs = StreamingInputs(g, scenario.dt, scale)
-        self._taps = mirror.taps
-        self._bank = StreamingBank(bandpass_bank(b.frequencies, b.bandwidth_online, b.order, scenario.dt))
+        g = of_z(settings)
+        self._inputs = StreamingInputs(g, plant.dt, scale)
+        self._taps = plant.mirror.taps
+        self._bank = StreamingBank(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, plant.dt))
         self._regression = LateRegression(g.depth, g.training_size, 1, kernel_of(g), late=self._taps.size - 2)
         self._filtered = np.zeros(self._taps.size - 1)  # newest first; of step k it tells phi_vib[k-1]
 
@@ -90,19 +90,21 @@ class VibrationPredictor:
         return value
 
 
-def gpr_online_ahead(record: Record, scenario: Scenario, mirror: Mirror, watch: Watch) -> Array:
+def gpr_online_ahead(measured: Measurements, prior: Prior, plant: Plant, settings: Any, watch: Watch) -> Array:
     """As `gpr_offline_ahead`, by `VibrationPredictor`."""
-    done = np.zeros(record.n_modes)
+    g, bands = settings.gpr_online, prior.bands
+    assert bands is not None
+    done = np.zeros(measured.n_modes)
 
     def one(mode: int, watch: Watch) -> Array:
-        scale = scale_of(of_z(scenario.gpr_online), record.training, record.delay, mode)
-        predictor, z = VibrationPredictor(scenario, mirror, scale), record.z[:, mode].tolist()
-        out = np.empty(record.n_steps)
+        scale = scale_of(of_z(g), prior.training, measured.delay, mode)
+        predictor, z = VibrationPredictor(g, bands, plant, scale), measured.z[:, mode].tolist()
+        out = np.empty(measured.n_steps)
         for k, sample in enumerate(z):
             if k % 256 == 0:
-                done[mode] = k / record.n_steps
+                done[mode] = k / measured.n_steps
                 watch.step(float(done.mean()))
             out[k] = predictor.step(sample)
         return out
 
-    return over_modes(record.n_modes, one, watch)
+    return over_modes(measured.n_modes, one, watch)

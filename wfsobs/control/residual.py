@@ -1,4 +1,4 @@
-"""What a time-invariant loop leaves, by theory: its transfer functions on the true spectra."""
+"""What a time-invariant loop leaves, by theory: its transfer functions on the spectra."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 from wfsobs.control.law import Law
 from wfsobs.control.margins import frequencies
 from wfsobs.control.mirror import Mirror
-from wfsobs.simulation.true_spectra import TrueSpectra
+from wfsobs.prior import Spectra
 from wfsobs.typing import Array
 
 AT_A_TIME = 2**17
@@ -25,7 +25,7 @@ def residual_density(T: Any, target: Array, cross: Any, measured: Array) -> Arra
     return target + np.abs(T) ** 2 * measured - 2.0 * np.real(np.conj(cross) * T)
 
 
-def residual_variance(law: Law, spectra: TrueSpectra, mirror: Mirror) -> float:
+def residual_variance(law: Law, spectra: Spectra, mirror: Mirror) -> float:
     """Variance [um^2] of the residual that a stable time-invariant law leaves.
 
     T is smooth between the points that `frequencies` takes, close together near the poles of the law, whatever the number
@@ -33,11 +33,10 @@ def residual_variance(law: Law, spectra: TrueSpectra, mirror: Mirror) -> float:
     """
     points = frequencies(law.poles)
     T = CubicSpline(points, mirror.response(points) * law.response(points))
-    target, cross = spectra.total
     n, total = spectra.measured.size, 0.0
     for start in range(0, n, AT_A_TIME):
         part = slice(start, min(start + AT_A_TIME, n))
         omega = np.pi * np.arange(part.start, part.stop) / (n - 1)
-        density = residual_density(T(omega), target[part], cross[part], spectra.measured[part])
+        density = residual_density(T(omega), spectra.disturbance[part], spectra.cross[part], spectra.measured[part])
         total += 2.0 * float(density.sum()) - float(density[0]) * (start == 0) - float(density[-1]) * (part.stop == n)
     return total / (2 * (n - 1))

@@ -1,22 +1,23 @@
-"""What observers are told beside measurements."""
+"""What observers and controllers are told beside measurements."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from wfsobs.prior.parts import Bands, LgsError, Line, Lines, Model
+from wfsobs.prior.parts import Bands, LgsError, Line, Lines, Model, Spectra
 from wfsobs.record import Training
 
-__all__ = ["PARTS", "Bands", "LgsError", "Line", "Lines", "Model", "Part", "Prior", "Training"]
+__all__ = ["PARTS", "Bands", "LgsError", "Line", "Lines", "Model", "Part", "Prior", "Spectra", "Training"]
 
-Part = type[Model] | type[LgsError] | type[Lines] | type[Bands] | type[Training]
-"""A kind of thing that an observer can ask for."""
+Part = type[Model] | type[LgsError] | type[Lines] | type[Bands] | type[Spectra] | type[Training]
+"""A kind of thing that an observer or a controller can ask for."""
 
 PARTS: dict[Part, tuple[str, ...]] = {
     Model: ("model",),
     LgsError: ("model",),
     Lines: ("model", "true lines"),
     Bands: ("bands",),
+    Spectra: ("true spectra",),
     Training: ("training data",),
 }
 """Part -> what it is called in the column "Needs"."""
@@ -24,15 +25,16 @@ PARTS: dict[Part, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Prior:
-    """The parts that an observer asked for, empty or None where it did not.
+    """The parts that an observer or a controller asked for, empty or None where it did not.
 
-    model, lgs_error, lines : one per mode
-    bands                   : of all modes
-    training                : a record to learn from
+    model, lgs_error, lines, spectra : one per mode
+    bands    : of all modes
+    training : a record to learn from
     """
 
     model: tuple[Model, ...] = ()
     lgs_error: tuple[LgsError, ...] = ()
     lines: tuple[Lines, ...] = ()
     bands: Bands | None = None
+    spectra: tuple[Spectra, ...] = ()
     training: Training | None = None

@@ -13,6 +13,8 @@ from typing import NamedTuple
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
+from wfsobs.signal.wiener import Complex
+from wfsobs.typing import Array
 
 
 @dataclass(frozen=True)
@@ -88,3 +90,16 @@ class Bands:
     bandwidth_offline: float
     bandwidth_online: float
     order: int
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """The spectra of one mode at frequencies that are evenly spaced from 0 to half the rate, (n,) [um^2 per sample].
+
+    disturbance : of phi_dist;  measured : of z, noise and all
+    cross       : between phi_dist[k] and z[k + 1], complex where the sensor sees other turbulence
+    """
+
+    disturbance: Array
+    measured: Array
+    cross: Complex | Array

@@ -1,8 +1,8 @@
-"""What observers are told of a scenario: matched to it, or wrong on purpose where its settings say so."""
+"""What observers and controllers are told of a scenario: matched to it, or wrong on purpose where its settings say so."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from math import sqrt
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from wfsobs.observers.base import Observer
 from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
-from wfsobs.prior import Bands, LgsError, Line, Lines, Model, Part, Prior, Training
+from wfsobs.prior import Bands, LgsError, Line, Lines, Model, Part, Prior, Spectra, Training
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import Group
@@ -21,7 +21,7 @@ from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
 from wfsobs.simulation.guide_stars import lgs_error_process, lgs_noise_rms
 from wfsobs.simulation.layers import relative_rms
 from wfsobs.simulation.sensor_noise import noise_rms
-from wfsobs.simulation.true_spectra import seen_turbulence
+from wfsobs.simulation.true_spectra import TrueSpectra, is_known, seen_turbulence, true_spectra
 from wfsobs.simulation.turbulence import processes, turbulence_process, turbulence_rms
 
 
@@ -40,15 +40,21 @@ def settings_of(observer: Observer, scenario: Scenario) -> Group | None:
     return None if observer.group is None else getattr(scenario, observer.group).copy()
 
 
-def prior_of(scenario: Scenario, record: Record, parts: Iterable[Part]) -> Prior:
-    """These parts of what a scenario tells of the modes of a record. Raises ValueError where it does not have one."""
-    asked, modes, dt = set(parts), range(record.n_modes), record.dt
+def prior_of(scenario: Scenario, record: Record | None, parts: Iterable[Part], spectra: Sequence[Spectra] = ()) -> Prior:
+    """These parts of what a scenario tells of the modes of a record; without a record, of its own modes.
+
+    spectra : one per mode, where they have been made already
+    Raises ValueError where the scenario does not have a part.
+    """
+    asked, modes = set(parts), range(record.n_modes if record else len(scenario.modes))
+    dt = record.dt if record else scenario.dt
     return Prior(
         model=tuple(model_of(scenario, mode, dt) for mode in modes) if Model in asked else (),
         lgs_error=tuple(lgs_error_of(scenario, mode, dt) for mode in modes) if LgsError in asked else (),
         lines=tuple(lines_of(scenario, mode, dt) for mode in modes) if Lines in asked else (),
         bands=bands_of(scenario) if Bands in asked else None,
-        training=record.training.copy() if Training in asked and record.training is not None else None,
+        spectra=tuple(spectra or [spectra_of(scenario, mode) for mode in modes]) if Spectra in asked else (),
+        training=record.training.copy() if Training in asked and record and record.training else None,
     )
 
 
@@ -56,6 +62,22 @@ def bands_of(scenario: Scenario) -> Bands:
     """The bands that the vibration is looked for in."""
     b = scenario.butterworth
     return Bands(tuple(b.frequencies), b.bandwidth_offline, b.bandwidth_online, b.order)
+
+
+def spectra_of(scenario: Scenario, mode: int) -> Spectra:
+    """The true spectra of one mode. Raises ValueError where they are not known."""
+    if not is_known(scenario):
+        raise ValueError(
+            f"the spectrum of turbulence from {scenario.turbulence.source} is not known: set control.integrator "
+            "to manual, and control.gain"
+        )
+    return told_spectra(true_spectra(scenario, mode))
+
+
+def told_spectra(known: TrueSpectra) -> Spectra:
+    """What is told of true spectra: those of the disturbance as a whole."""
+    disturbance, cross = known.total
+    return Spectra(disturbance, known.measured, cross)
 
 
 # ---------------------------------------------------------------------- one vibration peak

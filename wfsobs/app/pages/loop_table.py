@@ -12,7 +12,7 @@ from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.render import Row, macro, table
 from wfsobs.app.style import LOOKS, swatch
 from wfsobs.app.views.table import BEST
-from wfsobs.control.rows import LIMITED, NOT_APPLICABLE, label
+from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.evaluation.bound import BOUND
 from wfsobs.evaluation.rows import Row as Score
 

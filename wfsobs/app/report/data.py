@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.work import TRUTH
-from wfsobs.control.closed_loop import closed_loop, design
+from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.rows import rows as controller_rows
+from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.control.rows import rows as controller_rows
 from wfsobs.evaluation.rows import Row, rows
 from wfsobs.evaluation.scores import cumulative_rms, spectra
 from wfsobs.observers import OBSERVERS

@@ -7,7 +7,7 @@ from typing import Any
 
 from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.report.data import State
-from wfsobs.control.rows import NOT_APPLICABLE, label
+from wfsobs.closed_loop.rows import NOT_APPLICABLE, label
 from wfsobs.evaluation.rows import Row
 
 

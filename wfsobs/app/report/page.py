@@ -25,7 +25,7 @@ from wfsobs.app.report.text import meaning_values, name_of, origin_values, scena
 from wfsobs.app.style import PRIMARY, asset, look, observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, marked_peaks
 from wfsobs.app.work import TRUTH
-from wfsobs.control.rows import LIMITED, NOT_APPLICABLE
+from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS

@@ -7,11 +7,13 @@ from dataclasses import replace
 from math import degrees, log10
 from typing import Any
 
-from wfsobs.control.closed_loop import ClosedLoop, residual_rms, strehl
+from wfsobs.closed_loop.run import ClosedLoop, residual_rms, strehl
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import NOT_OBSERVERS, Row
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers.base import SPECTRA
+from wfsobs.priors_from.controllers import own_settings
+from wfsobs.scenario import Scenario
 from wfsobs.units import micrometres_per
 
 LIMITED = "theory and margins are not applicable: a limit of the mirror acts, and the loop is no longer linear"
@@ -64,7 +66,7 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
             out.append(
                 row(
                     outcome.controller,
-                    CONTROLLERS[outcome.controller].needed(result.scenario),
+                    needed(outcome.controller, result.scenario),
                     mode,
                     outcome.stable[mode],
                     left,
@@ -80,6 +82,11 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
     if plan.bound is not None:
         out += [row(BOUND, SPECTRA, mode, True, plan.bound) for mode in range(len(modes))]
     return out
+
+
+def needed(controller: str, scenario: Scenario) -> str:
+    """What a controller has to be given beside measurements, for people."""
+    return CONTROLLERS[controller].needed(own_settings(CONTROLLERS[controller], scenario))
 
 
 def label(controller: str) -> str:

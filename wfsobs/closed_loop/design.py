@@ -1,0 +1,122 @@
+"""The laws of all controllers of a scenario, and what theory says of them before any random number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from wfsobs.control.base import Controller, Settings
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.law import Law
+from wfsobs.control.margins import Margins, frequencies, margins
+from wfsobs.control.mirror import Mirror, Plant
+from wfsobs.control.residual import residual_variance
+from wfsobs.evaluation.bound import least_errors
+from wfsobs.observers.kalman.multirate import UnstableCycle
+from wfsobs.prior import Prior, Spectra
+from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for
+from wfsobs.priors_from.scenario import told_spectra
+from wfsobs.scenario import Scenario
+from wfsobs.settings.group import SettingError
+from wfsobs.simulation.true_spectra import is_known, true_spectra
+
+
+@dataclass(frozen=True)
+class Designed:
+    """A law in one mode and what theory says of it.
+
+    law       : None for control by nothing, and where there is none
+    stable    : None where there is no law
+    predicted : rms [um] of the residual by the true spectra; None where the law has no frequency response or is not stable
+    margins   : the same
+    note      : why there is no law
+    """
+
+    law: Law | None
+    stable: bool | None
+    predicted: float | None = None
+    margins: Margins | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Design:
+    """All controllers of a scenario, before any random number.
+
+    laws   : controller -> one per mode
+    bound  : per mode, rms [um] of the least residual of any causal controller of the mean of the LGS; None where the spectrum of
+        the turbulence is not known
+    priors : controller -> what it is told, spectra aside, of which only laws are made
+    """
+
+    scenario: Scenario
+    plant: Plant
+    laws: dict[str, tuple[Designed, ...]]
+    bound: tuple[float, ...] | None
+    priors: dict[str, Prior] = field(default_factory=dict, repr=False)
+
+    @property
+    def mirror(self) -> Mirror:
+        """The mirror of the plant."""
+        return self.plant.mirror
+
+
+def design(scenario: Scenario, controllers: Sequence[str] | None = None) -> Design:
+    """Make the laws of the controllers (all unless named) and judge them by theory. Raises SettingError.
+
+    Laws are those of the scenario before its events. What they will leave is then not known by theory, nor a bound.
+    """
+    scenario.validate()
+    before, plant = scenario.before_events, plant_of(scenario)
+    true = [true_spectra(before, mode) for mode in range(len(scenario.modes))] if is_known(before) else []
+    spectra = [told_spectra(one) for one in true]
+    made = {c.id: _designed(c, before, plant, spectra) for c in chosen(controllers)}
+    laws, priors = {name: laws for name, (laws, _) in made.items()}, {name: prior for name, (_, prior) in made.items()}
+    if scenario.events:
+        laws = {name: tuple(replace(one, predicted=None) for one in designed) for name, designed in laws.items()}
+        return Design(scenario, plant, laws, None, priors)
+    # A fraction of a frame comes on top of the whole ones, which alone bound what can be known.
+    least = tuple(least_errors(one, ahead=int(plant.mirror.delay) - 1)["total"].rms for one in true)
+    return Design(scenario, plant, laws, least or None, priors)
+
+
+def chosen(controllers: Sequence[str] | None) -> list[Controller]:
+    """The controllers of these ids, in the order of the registry; all for None. Raises SettingError."""
+    unknown = set(controllers or ()) - set(CONTROLLERS)
+    if unknown:
+        raise SettingError(f"controller {sorted(unknown)[0]!r}: no such controller; there are {', '.join(CONTROLLERS)}")
+    return [c for c in CONTROLLERS.values() if controllers is None or c.id in controllers]
+
+
+def _designed(
+    controller: Controller, scenario: Scenario, plant: Plant, spectra: Sequence[Spectra]
+) -> tuple[tuple[Designed, ...], Prior]:
+    """(one per mode, the prior that they were made with less its spectra)."""
+    settings, modes = own_settings(controller, scenario), range(len(scenario.modes))
+    try:
+        prior = prior_for(controller, scenario, spectra)
+    except ValueError as error:
+        return tuple(Designed(None, None, note=str(error)) for _ in modes), Prior()
+    designed = (_of_mode(controller, prior, mode, plant, settings, spectra[mode] if spectra else None) for mode in modes)
+    return tuple(designed), replace(prior, spectra=())
+
+
+def _of_mode(
+    controller: Controller, prior: Prior, mode: int, plant: Plant, settings: Settings, spectra: Spectra | None
+) -> Designed:
+    if controller.law is None:
+        return Designed(None, True)
+    try:
+        law = controller.law(prior, mode, plant, settings)
+    except UnstableCycle as error:
+        return Designed(None, False, note=str(error))
+    except ValueError as error:
+        return Designed(None, None, note=str(error))
+    stable, mirror = law.stable, plant.mirror
+    if not stable or controller.predict is not None or not law.time_invariant:
+        return Designed(law, stable)
+    predicted = None if spectra is None else float(np.sqrt(residual_variance(law, spectra, mirror)))
+    known = margins(lambda omega: mirror.response(omega) * law.response(omega), frequencies(law.poles), plant.dt)
+    return Designed(law, stable, predicted, known)

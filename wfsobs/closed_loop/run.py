@@ -1,0 +1,143 @@
+"""The closed loop: the same disturbance and the same noise under every controller.
+
+    phi_res[k] = phi_dist[k] + phi_corr[k]
+
+A controller sees z and knows what it commanded; what the mirror does of it is `wfsobs.control.mirror`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from math import pi
+
+import numpy as np
+
+from wfsobs.closed_loop.design import Design, Designed, design
+from wfsobs.control.base import Controller
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.pipeline import as_stated
+from wfsobs.priors_from.controllers import arguments, own_settings
+from wfsobs.progress import QUIET, Watch, detach_watch
+from wfsobs.record import Record, RecordError
+from wfsobs.scenario import Scenario
+from wfsobs.signal.welch import rms
+from wfsobs.simulation.loop import simulate
+from wfsobs.typing import Array
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one controller left.
+
+    residual : (n_steps, n_modes) [um], or None where the loop is not stable or could not run
+    u        : (n_steps, n_modes) commands that the mirror took [um], or None
+    limited  : share of the steps after the warm-up in which a limit changed a command, per mode
+    note     : why there is no residual
+    """
+
+    controller: str
+    stable: tuple[bool | None, ...]
+    residual: Array | None = None
+    u: Array | None = None
+    limited: tuple[float, ...] = ()
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """All of a run in closed loop; outcomes in the order of the registry."""
+
+    design: Design
+    record: Record
+    outcomes: tuple[Outcome, ...] = field(default=())
+
+    @property
+    def scenario(self) -> Scenario:
+        """The settings."""
+        return self.design.scenario
+
+
+def close_loop(scenario: Scenario, *, controllers: Sequence[str] | None = None, watch: Watch = QUIET) -> ClosedLoop:
+    """Simulate a disturbance and close the loop on it with every controller (all unless named).
+
+    Raises SettingError where settings do not go together or a controller is unknown, Cancelled.
+    """
+    plan = design(scenario, controllers)
+    return closed_loop(simulate(scenario, watch=Watch(cancelled=watch.cancelled)), plan, watch)
+
+
+def closed_loop(record: Record, plan: Design, watch: Watch = QUIET) -> ClosedLoop:
+    """Run every controller of a design on the disturbance and noise of a record.
+
+    Raises RecordError if the record has no truth, or another rate, exposure ratio or number of modes, Cancelled.
+    """
+    total = sum(CONTROLLERS[name].weight for name in plan.laws)
+    outcomes, done = [], 0.0
+    for name, weight in ((name, CONTROLLERS[name].weight) for name in plan.laws):
+        inner = Watch(lambda f, at=done, w=weight: watch.progress((at + f * w) / total), watch.cancelled)
+        outcomes += each_outcome(record, plan, inner, [name])
+        done += weight
+    return ClosedLoop(plan, record, tuple(outcomes))
+
+
+def each_outcome(
+    record: Record, plan: Design, watch: Watch = QUIET, controllers: Sequence[str] | None = None
+) -> Iterator[Outcome]:
+    """Run the controllers of a design (all unless named) and yield each one's outcome as soon as it is done.
+
+    Each receives measurements, its prior and its settings: neither record nor scenario.
+    """
+    disturbance = truth(record)
+    if as_stated(record, plan.scenario) is not plan.scenario:
+        raise RecordError("the record was made with another rate or exposure ratio than the controllers")
+    if record.n_modes != len(plan.scenario.modes):
+        raise RecordError(f"the record has {record.n_modes} modes, the controllers are for {len(plan.scenario.modes)}")
+    for name, designed in plan.laws.items():
+        if controllers is None or name in controllers:
+            watch.check()
+            yield _outcome(CONTROLLERS[name], designed, record, disturbance, plan, watch)
+
+
+def truth(record: Record) -> Array:
+    """phi_dist (n_steps, n_modes) [um] of a record. Raises RecordError."""
+    if record.turbulence is None or record.vibration is None:
+        raise RecordError("the record has no truth: what another controller would have left of it is not known")
+    return record.turbulence + record.vibration
+
+
+def _outcome(
+    controller: Controller, designed: Sequence[Designed], record: Record, disturbance: Array, plan: Design, watch: Watch
+) -> Outcome:
+    stable = tuple(d.stable for d in designed)
+    notes = [d.note for d in designed if d.note]
+    if notes or not all(stable):
+        note = notes[0] if notes else "a pole of the closed loop is not within the unit circle"
+        return Outcome(controller.id, stable, note=note)
+    laws, settings = [d.law for d in designed if d.law is not None], own_settings(controller, plan.scenario)
+    try:
+        measured, prior = arguments(controller, record, settings, plan.priors[controller.id])
+        with detach_watch(watch) as alone:
+            u, limited = controller.commands(laws, measured, prior, plan.plant, settings, alone)
+    except ValueError as error:
+        return Outcome(controller.id, tuple(None for _ in stable), note=str(error))
+    start = round(plan.scenario.run.warm_up / record.dt)
+    residual = disturbance + plan.mirror.correction(u)
+    return Outcome(controller.id, stable, residual, u, tuple(limited[start:].mean(axis=0).tolist()))
+
+
+def residual_rms(outcome: Outcome, record: Record, warm_up: float) -> list[float] | None:
+    """rms [um] of the residual after the warm-up [s], one per mode; None without a residual."""
+    if outcome.residual is None:
+        return None
+    return [rms(column) for column in outcome.residual[round(warm_up / record.dt) :].T]
+
+
+def strehl(rms_per_mode: Sequence[float], wavelength: float) -> float:
+    """exp(-(2 pi sigma / lambda)^2), the extended Marechal approximation (Mahajan 1983), sigma^2 the variance of the
+    simulated modes together: no other error counts. rms and wavelength [um].
+
+    >>> round(strehl([0.1, 0.1], 2.2), 4)
+    0.8495
+    """
+    return float(np.exp(-((2.0 * pi / wavelength) ** 2) * np.sum(np.square(rms_per_mode))))

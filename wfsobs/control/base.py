@@ -1,0 +1,126 @@
+"""What a controller is: a name, a linear law, perhaps a prediction of the vibration beside it, and what they are made from.
+
+Like an observer it receives measurements, what it asked to be told and settings of its own, and besides the plant. The truth is
+out of reach. An integrator with a prediction of the vibration must not correct the vibration twice. Its measurement is therefore
+freed of what is left of it,
+
+    y_int[k] = y[k] - (f[k] - vib_hat[k-1]),
+
+f the causal Butterworth bank on z, which at step k estimates phi_vib[k-1], and vib_hat[k-1] what was commanded against it. In
+pseudo-open-loop terms the integrator works on z - f, and u[k] = u_int[k] - vib_hat[k+1].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from wfsobs.control.integrator import limited_integrator
+from wfsobs.control.law import Law
+from wfsobs.control.mirror import Plant
+from wfsobs.observers.base import NOTHING
+from wfsobs.observers.baselines import online_reference
+from wfsobs.observers.missing import LINE_WIDTH, bridged
+from wfsobs.prior import PARTS, Bands, Part, Prior
+from wfsobs.progress import QUIET, Watch
+from wfsobs.record import Measurements, RecordError
+from wfsobs.typing import Array
+
+Settings = SimpleNamespace
+"""A controller's own groups of settings, by name."""
+
+MakeLaw = Callable[[Prior, int, Plant, Any], Law]
+"""(prior, mode, plant, settings) -> law. Raises ValueError saying why there is none."""
+
+Predict = Callable[[Measurements, Prior, Plant, Any, Watch], Array]
+"""(measurements without gaps, prior, plant, settings, watch) -> vibration while u[k] acts, (n_steps, n_modes) [um], NaN where it
+is not known yet."""
+
+
+def _nothing(_settings: Settings) -> tuple[Part, ...]:
+    return ()
+
+
+@dataclass(frozen=True)
+class Controller:
+    """An entry of the registry: a linear law, or a linear law beside a prediction of the vibration, or nothing.
+
+    id, label : for tables and files, and for people
+    law       : of one mode, made before there is a record; of one with a prediction, that of the rest
+    predict   : of the vibration
+    prior     : what it has to be told beside measurements, see `wfsobs.prior`; a prediction takes Bands
+    settings  : the groups of a scenario's settings that are its own
+    asks      : settings -> what it has to be told besides for these
+    ngs       : whether it uses NGS frames
+    weight    : its computing time relative to a linear law's
+    Raises ValueError where it predicts and is told no bands.
+    """
+
+    id: str
+    label: str
+    law: MakeLaw | None = None
+    predict: Predict | None = None
+    prior: tuple[Part, ...] = ()
+    settings: tuple[str, ...] = ()
+    asks: Callable[[Any], tuple[Part, ...]] = _nothing
+    ngs: bool = False
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.predict is not None and Bands not in self.prior:
+            raise ValueError(f"controller {self.id!r}: one that predicts takes Bands in its prior, where the vibration is")
+
+    def parts(self, settings: Settings) -> tuple[Part, ...]:
+        """What it has to be told beside measurements for these settings."""
+        return tuple(dict.fromkeys((*self.asks(settings), *self.prior)))
+
+    def needed(self, settings: Settings) -> str:
+        """The same for people."""
+        return ", ".join(dict.fromkeys(word for part in self.parts(settings) for word in PARTS[part])) or NOTHING
+
+    def laws(self, prior: Prior, plant: Plant, settings: Settings, n_modes: int) -> tuple[Law, ...]:
+        """One law per mode, none for control by nothing. Raises ValueError saying why there is none."""
+        return () if self.law is None else tuple(self.law(prior, mode, plant, settings) for mode in range(n_modes))
+
+    def commands(
+        self, laws: Sequence[Law], measured: Measurements, prior: Prior, plant: Plant, settings: Settings, watch: Watch = QUIET
+    ) -> tuple[Array, Array]:
+        """(commands that the mirror takes [um], whether a limit changed them), both (n_steps, n_modes).
+
+        laws : of `laws`, from the same prior, plant and settings. Missing samples are bridged by what the controller is told.
+        Raises ValueError, Cancelled.
+        """
+        if self.ngs and measured.y_ngs is None:
+            raise RecordError("the record has no NGS measurement")
+        width = getattr(getattr(settings, "multipeak", None), "line_width", LINE_WIDTH)
+        measured = bridged(measured, prior, width)
+        z = measured.z
+        forward = np.zeros_like(z)
+        if self.law is None:
+            return forward, forward > 0.0
+        if self.predict is not None:
+            assert prior.bands is not None
+            ahead = self.predict(measured, prior, plant, settings, watch)
+            known = ~np.isnan(ahead)
+            forward = -np.where(known, ahead, 0.0)
+            z = z - np.where(known, online_reference(prior.bands, z, measured.dt), 0.0)
+        inputs = np.stack([z, np.nan_to_num(measured.z_ngs)], axis=1) if self.ngs else z[:, None]
+        modes = [_taken(law, plant, inputs[:, :, mode], forward[:, mode]) for mode, law in enumerate(laws)]
+        return np.column_stack([u for u, _ in modes]), np.column_stack([u != wanted for u, wanted in modes])
+
+
+def _taken(law: Law, plant: Plant, inputs: Array, forward: Array) -> tuple[Array, Array]:
+    """(commands that the mirror takes, commands wanted) of one mode, (n_steps,).
+
+    inputs : (n_steps, n_inputs); forward : (n_steps,)
+    """
+    wanted = law.run(inputs) + forward
+    if plant.mirror.within(wanted):
+        return wanted, wanted
+    if law.gain is None:
+        return plant.mirror.follow(wanted), wanted
+    return limited_integrator(plant.mirror, law.gain, law.leak, inputs[:, 0], forward)
