@@ -1,7 +1,7 @@
 """By how much a smooth spectrum may be too low: what it is seen to be too high by nearby.
 
 Frozen flow has lobes, a few hertz apart and by tens of percent above and below any smooth curve, which are no peaks. Peaks only
-rise: where a fitted spectrum is too high, its shape is wrong, and it is as likely to be too low by as much an octave about.
+rise: where a fitted spectrum is too high, its shape is wrong, and it is as likely to be too low by as much within an octave.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from wfsobs.typing import Array
 
 WIDTH = 27
 """Bins of a mean I / S: the lobes of frozen flow are wider in a minute."""
-ABOUT = np.sqrt(2.0)
-"""Factor in frequency on either side over which dips are gathered."""
+ABOUT = 2.0
+"""Factor in frequency on either side over which dips are gathered: the first lobes are as far apart as they are from zero."""
 LEVEL = 1e-3
 """Probability with which the right spectrum is given a margin at a frequency."""
 MEAN, VARIANCE = 0.2772, 0.3543
@@ -25,7 +25,8 @@ def margin(ratio: Array) -> Array:
     """Factor (bins,), 1 or more, by which S may be too low, from I / S (bins,).
 
     A dip of WIDTH bins is worth d = WIDTH (r - 1 - log r) in log-likelihood, r < 1 their mean. Where the sum of d over an octave
-    is not that of noise, all of it is taken for that of log S + a sin: over n means n WIDTH a^2 / 8. The factor is exp(a).
+    on either side is not that of noise, all of it is taken for that of log S + a sin: over n means n WIDTH a^2 / 8. The factor
+    is exp(a).
     """
     n = len(ratio) // WIDTH
     if n < 2:
