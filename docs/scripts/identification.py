@@ -6,6 +6,7 @@ parts : which of search, flow, filters, coverage, all unless told. Every seed th
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from math import pi, sqrt
@@ -159,11 +160,10 @@ def lossy(seed: int, rate: float, duration: float, lost: float) -> Record:
     return Record(z[:, None], np.zeros((n, 1)), dt)
 
 
-def held(seeds: range, rate: float, duration: float, lost: float) -> tuple[dict[str, str], str]:
-    """By quantity, how many of the 95 % intervals, 1.96 stated standard deviations, hold the truth, with the 95 % interval of
-    that share in percent (Clopper and Pearson), and how many numbers state none; and the records with a peak more."""
-    inside: dict[str, list[bool]] = {}
-    silent: dict[str, int] = {}
+def held(seeds: range, rate: float, duration: float, lost: float) -> tuple[dict[str, Counter[str]], str]:
+    """By quantity, how many of the 95 % intervals, 1.96 stated standard deviations, hold the truth ("held"), of how many
+    ("stated"), and how many numbers state none ("none"); and the records with a peak more."""
+    out: dict[str, Counter[str]] = {}
     more = []
     for seed in seeds:
         mode = identify(lossy(seed, rate, duration, lost)).modes[0]
@@ -184,27 +184,30 @@ def held(seeds: range, rate: float, duration: float, lost: float) -> tuple[dict[
                 pairs += [("resonances, damping", p.damping, xi)] if xi else []
         for name, number, true in pairs:
             stated = bool(np.isfinite(number.std))
-            inside.setdefault(name, []).extend([abs(number.value - true) < 1.96 * number.std] * stated)
-            silent[name] = silent.get(name, 0) + (not stated)
-    cells = {}
-    for name, ok in inside.items():
-        share = binomtest(sum(ok), len(ok)).proportion_ci() if ok else (0.0, 1.0)
-        none = f", {silent[name]} none" * (silent[name] > 0)
-        cells[name] = f"{sum(ok)} of {len(ok)} ({100.0 * share[0]:.0f} - {100.0 * share[1]:.0f}){none}"
-    return cells, counted(more, seeds)
+            inside = stated and abs(number.value - true) < 1.96 * number.std
+            out.setdefault(name, Counter()).update(held=int(inside), stated=int(stated), none=int(not stated))
+    return out, counted(more, seeds)
+
+
+def share(of: Counter[str]) -> str:
+    """How many hold, of how many, with the 95 % interval of the share in percent (Clopper and Pearson); how many state none."""
+    low, high = binomtest(of["held"], of["stated"]).proportion_ci() if of["stated"] else (0.0, 1.0)
+    none = f", {of['none']} none" if of["none"] else ""
+    return f"{of['held']} of {of['stated']} ({100.0 * low:.0f} - {100.0 * high:.0f}){none}"
 
 
 def coverage(count: int, duration: float) -> None:
-    """Intervals that hold the truth, as a table: records of their own for every column."""
+    """Intervals that hold the truth, as a table: records of their own for every column, and all together."""
     columns = []
     for i, (name, (rate, lost)) in enumerate(KINDS.items()):
         seeds = range(i * count + 1, (i + 1) * count + 1)
-        cells, more = held(seeds, rate, duration, lost)
-        columns.append(cells)
+        found, more = held(seeds, rate, duration, lost)
+        columns.append(found)
         print(f"{name}: seeds {seeds[0]} to {seeds[-1]}; a peak more: {more}", flush=True)
-    print(f"| | {' | '.join(KINDS)} |\n|{'---|' * (len(KINDS) + 1)}")
-    for name in sorted(set().union(*columns), key=list(columns[0]).index):
-        print(f"| {name} | {' | '.join(cells.get(name, '-') for cells in columns)} |", flush=True)
+    print(f"| | {' | '.join(KINDS)} | all |\n|{'---|' * (len(KINDS) + 2)}")
+    for name in columns[0]:
+        cells = [found[name] for found in columns]
+        print(f"| {name} | {' | '.join(map(share, [*cells, sum(cells, Counter())]))} |", flush=True)
 
 
 def spread(scenario: Scenario, seeds: range) -> dict[str, Any]:
