@@ -274,7 +274,7 @@ def test_a_right_spectrum_has_no_margin_and_one_with_lobes_that_of_its_lobes() -
     inside = wrong[:, (f > 5.0) & (f < 9.0)]
     assert np.exp(0.6) < np.median(inside) < np.exp(1.2)  # what noise dips by is in it
     assert np.mean(wrong[:, f > 30.0] > 1.0) < 0.01
-    f = frequencies(30_000, DT)
+    f = periodogram_frequencies(30_000, DT)
     first = np.exp(0.8 * np.cos(2 * pi * (f - 5.0) / 6.0)) ** (f < 12.0)  # 5 Hz above the smooth curve, 2 and 8 Hz below it
     top = np.array([margin(rng.exponential(first)) for _ in range(40)])[:, (f > 4.5) & (f < 5.5)]
     assert np.exp(0.4) < np.median(top) < np.exp(1.2)  # there are four dips of 27 bins to tell it from
