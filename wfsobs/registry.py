@@ -77,6 +77,7 @@ class Registry(MutableMapping[str, E]):
             if self._entries.get(entry.id) is not entry:
                 self._check(entry)
                 self._put(entry)
+                _scenario().settings()  # those made before have its settings from now on, too
 
     def complete(self) -> None:
         """Add those of installed packages, the first time; one that cannot be is named in the log and left out."""
@@ -103,8 +104,9 @@ class Registry(MutableMapping[str, E]):
 
     def _put(self, entry: E) -> None:
         self._entries[entry.id] = entry
-        if (own := section_of(entry)) is not None:
-            _SECTIONS.setdefault(own.name, own)
+        for own in _settings(entry):
+            if isinstance(own, Section):
+                _SECTIONS.setdefault(own.name, own)
 
     def _check(self, entry: E) -> None:
         where = f"{self._word} {entry.id!r}"
@@ -114,7 +116,8 @@ class Registry(MutableMapping[str, E]):
             raise RegistrationError(f"{where}: the id is taken, by {self._entries[entry.id].label}")
         if entry.id in self.reserved:
             raise RegistrationError(f"{where}: the id is taken, by a row of the tables")
-        _check_settings(getattr(entry, "settings", None), where)
+        for own in _settings(entry):
+            _check_settings(own, where)
 
     @property
     def _word(self) -> str:
@@ -164,12 +167,6 @@ def sections() -> Mapping[str, Section]:
     return _SECTIONS
 
 
-def section_of(entry: Entry) -> Section | None:
-    """The group of settings that an entry brings along; None where it has none, or uses one that every scenario has."""
-    own = getattr(entry, "settings", None)
-    return own if isinstance(own, Section) else None
-
-
 @cache
 def _complete() -> None:
     _registry(OBSERVERS).complete()
@@ -182,16 +179,29 @@ def _registry(group: str) -> Registry[Any]:
     return getattr(import_module(module), name)
 
 
+def _scenario() -> Any:
+    return import_module("wfsobs.scenario").Scenario
+
+
+def _settings(entry: Entry) -> tuple[Any, ...]:
+    """What an entry says of its settings: sections that it brings along, or names of groups that a scenario has."""
+    own = getattr(entry, "settings", None)
+    if own is None:
+        return ()
+    return own if isinstance(own, tuple) and not isinstance(own, Section) else (own,)
+
+
 def _check_settings(own: Any, where: str) -> None:
     """Raises RegistrationError where a scenario cannot have these settings."""
-    scenario = import_module("wfsobs.scenario").Scenario
-    if own is None or (isinstance(own, str) and own in scenario.settings()):
+    if isinstance(own, str) and own in _scenario().settings():
         return
+    if isinstance(own, str):
+        raise RegistrationError(f"{where}: settings {own!r}: no scenario has such a group")
     if not isinstance(own, Section) or not (isinstance(own.group, type) and issubclass(own.group, Group)):
         raise RegistrationError(f"{where}: settings takes a Section of a Group, not {_kind(own)}")
     if not GROUP_NAME.fullmatch(own.name):
         raise RegistrationError(f"{where}: settings {own.name!r}: a name takes lower-case letters, digits and underscores")
-    if _SECTIONS.get(own.name, own) != own or (own.name not in _SECTIONS and hasattr(scenario, own.name)):
+    if _SECTIONS.get(own.name, own) != own or (own.name not in _SECTIONS and hasattr(_scenario(), own.name)):
         raise RegistrationError(f"{where}: settings {own.name!r}: the name is taken")
     for name, p in own.group.settings().items():
         low, high = getattr(p, "bounds", None) or (None, None)

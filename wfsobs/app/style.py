@@ -16,6 +16,7 @@ from markupsafe import Markup
 
 from wfsobs.app.render import macro
 from wfsobs.app.work import TRUTH
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import PLAIN, Look
@@ -67,10 +68,9 @@ def look(name: str) -> Look:
     """Return the look of an observer, a controller, the truth or another line; an unknown one is labelled with its id."""
     if name in LOOKS:
         return LOOKS[name]
-    entry = OBSERVERS.get(name)
-    if entry is None:
-        return replace(PLAIN, label=name)
-    return entry.look if entry.look.label else replace(entry.look, label=entry.label)
+    entry = OBSERVERS.get(name) or CONTROLLERS.get(name)
+    own = getattr(entry, "look", PLAIN)
+    return own if own.label else replace(own, label=entry.label if entry else name)
 
 
 def labels() -> dict[str, str]:

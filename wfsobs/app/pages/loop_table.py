@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from markupsafe import Markup
-
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.loop_work import LoopShown
 from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.render import Row, macro, table
-from wfsobs.app.style import LOOKS, swatch
+from wfsobs.app.style import swatch
 from wfsobs.app.views.table import BEST
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.evaluation.bound import BOUND
@@ -87,5 +85,4 @@ def margins_html(shown: LoopShown, display: Display) -> str:
 
 def _line(row: Score, display: Display, cells: list[str]) -> Row:
     name = row["controller"]
-    line = swatch(name, display.dark) if name in LOOKS else Markup()
-    return Row(line + label(name), cells, {"controller": name})
+    return Row(swatch(name, display.dark) + label(name), cells, {"controller": name})
