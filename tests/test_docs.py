@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import dataclasses
 import doctest
 import importlib.util
 import inspect
 import io
 import re
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -25,6 +27,7 @@ from wfsobs import RecordError
 from wfsobs.cli import main
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Observer
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.telemetry.formats.contents import Contents
@@ -140,9 +143,9 @@ def names_of(file: Path) -> set[str]:
 
 
 def test_the_page_of_observers_lists_them() -> None:
-    rows = re.findall(r"^\| `([\w-]+)` \| ([^|]+?) \| ([^|]+?) \|", prose(DOCS / "observers.md"), flags=re.M)
-    here = {(id_, name, targets) for id_, name, targets in rows if id_ in OBSERVERS}
-    assert here == {(o.id, o.label, ", ".join(o.targets)) for o in OBSERVERS.values()}
+    rows = re.findall(r"^\| `([\w-]+)` \| ([^|]+?) \| ([^|]+?) \| ([^|]+?) \|", prose(DOCS / "observers.md"), flags=re.M)
+    here = {row for row in rows if row[0] in OBSERVERS}
+    assert here == {(o.id, o.label, ", ".join(o.targets), o.help) for o in OBSERVERS.values()}
 
 
 @pytest.mark.parametrize("page", COMMANDS, ids=lambda p: p.name)
@@ -201,13 +204,23 @@ def test_settings_file_of_the_command_line() -> None:
     assert configfile.from_toml(text).sensors.lgs_count == 4
 
 
-def test_the_new_observer_runs(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """It stands beside the others, and is better than taking the measurement as it is."""
-    monkeypatch.setitem(OBSERVERS, "low-pass", OBSERVERS["zero"])  # so that it is taken out again
-    run_page(DOCS / "how-to" / "add-an-observer.md")
-    errors = {line.split()[0]: float(line.split()[1]) for line in capsys.readouterr().out.splitlines()}
+def test_the_new_observer_is_the_example_and_runs() -> None:
+    """In a process of its own, which may keep it. It is better than taking the measurement as it is."""
+    page, example = DOCS / "how-to" / "add-an-observer.md", ROOT / "examples" / "wfsobs-example"
+    code, package = blocks(page, "python"), blocks(page, "toml")
+    assert code[0] == (example / "wfsobs_example.py").read_text(encoding="utf-8")
+    assert package == [(example / "pyproject.toml").read_text(encoding="utf-8")]
+    done = subprocess.run([sys.executable, "-c", "\n".join(code)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    errors = {line.split()[0]: float(line.split()[1]) for line in done.stdout.splitlines()}
     assert set(errors) >= {"low-pass", "kf-lgs", "persistence"}
     assert errors["low-pass"] < errors["persistence"]
+
+
+def test_the_new_observer_names_every_field() -> None:
+    named = re.findall(r"^\| (`.*?`) \|", prose(DOCS / "how-to" / "add-an-observer.md"), flags=re.M)
+    fields = {field.name for field in dataclasses.fields(Observer)} - {"asks"}
+    assert {name for cell in named for name in re.findall(r"`(\w+)`", cell)} == fields
 
 
 def test_the_new_format_brings_a_record_back(tmp_path: Path) -> None:

@@ -27,10 +27,12 @@ OBSERVERS, CONTROLLERS = "wfsobs.observers", "wfsobs.controllers"
 HOMES = {OBSERVERS: ("wfsobs.observers", "OBSERVERS"), CONTROLLERS: ("wfsobs.control.controllers", "CONTROLLERS")}
 """Group -> module and name of its registry."""
 
-ID = re.compile(r"[a-z0-9]+([+-][a-z0-9]+)*")
+ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 GROUP_NAME = re.compile(r"[a-z][a-z0-9_]*")
 
 _SECTIONS: dict[str, Section] = {}
+_LOCK = RLock()
+"""One for all registries: a package that is imported for one may read the others."""
 
 
 class RegistrationError(ValueError):
@@ -66,13 +68,13 @@ class Registry(MutableMapping[str, E]):
     def __init__(self, kind: type[E], group: str, built_in: Iterable[E], reserved: Iterable[str] = ()):
         self.kind, self.group, self.reserved = kind, group, frozenset(reserved)
         self._entries: dict[str, E] = {}
-        self._lock, self._complete, self._reading = RLock(), False, False
+        self._complete, self._reading = False, False
         for entry in built_in:
             self._put(entry)
 
     def add(self, entry: E) -> None:
         """Register an entry; the same one again changes nothing. Raises RegistrationError."""
-        with self._lock:
+        with _LOCK:
             self.complete()
             if self._entries.get(entry.id) is not entry:
                 self._check(entry)
@@ -83,7 +85,7 @@ class Registry(MutableMapping[str, E]):
         """Add those of installed packages, the first time; one that cannot be is named in the log and left out."""
         if self._complete:
             return
-        with self._lock:
+        with _LOCK:
             if self._reading:  # by a package that is being imported
                 return
             self._reading = True
@@ -163,15 +165,15 @@ def register(entry: Any) -> None:
 
 def sections() -> Mapping[str, Section]:
     """The groups of settings that observers and controllers bring along, by name, in the order of the registries."""
-    _complete()
-    return _SECTIONS
+    _registry(OBSERVERS).complete()
+    if _installed(CONTROLLERS):  # else none has to be imported: those of wfsobs bring no settings
+        _registry(CONTROLLERS).complete()
+    return dict(_SECTIONS)
 
 
 @cache
-def _complete() -> None:
-    _registry(OBSERVERS).complete()
-    if entry_points(group=CONTROLLERS):  # those of wfsobs have no settings of their own
-        _registry(CONTROLLERS).complete()
+def _installed(group: str) -> bool:
+    return bool(entry_points(group=group))
 
 
 def _registry(group: str) -> Registry[Any]:
