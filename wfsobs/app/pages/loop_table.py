@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from markupsafe import Markup
+
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.loop_work import LoopShown
 from wfsobs.app.numbers import NOTHING, number
