@@ -1,9 +1,11 @@
-"""The tables of docs/events.md: `python docs/scripts/events.py [seeds] [preset ...]`."""
+"""The tables of docs/events.md: `python docs/scripts/events.py [seeds] [preset or "bridged" ...]`."""
 
 from __future__ import annotations
 
 import sys
 from itertools import groupby
+
+import numpy as np
 
 from wfsobs.cli.recovery_tables import OverTime, recovery_texts
 from wfsobs.evaluation.rows import label_of
@@ -38,7 +40,28 @@ def tables(preset: str, seeds: int) -> str:
     return "\n".join(out)
 
 
+def bridged(seeds: int) -> str:
+    """Error on tip within the lost frames of `lost-frames`, and over that of the same records with all their frames."""
+    scenario = PRESETS["lost-frames"]()
+    stretches = [(e.start, e.start + e.duration) for e in scenario.events]
+    squares: dict[tuple[str, str, int], list[tuple[float, float]]] = {}
+    for seed in range(1, seeds + 1):
+        pair = [run(scenario.replace({"run.seed": seed, **change})) for change in ({}, {"events": []})]
+        for lossy, whole in zip(*(result.estimates for result in pair), strict=True):
+            truth = getattr(pair[0].record, lossy.target)
+            for i, stretch in enumerate(stretches):
+                at = slice(*(round(t / scenario.dt) for t in stretch))
+                means = [float(np.mean((e.values - truth)[at, 0] ** 2)) for e in (lossy, whole)]
+                squares.setdefault((lossy.target, lossy.observer, i), []).append((means[0], means[1]))
+    out = ["| | LGS frames lost, nm | over all frames | NGS frames lost, nm | over all frames |\n|---|---|---|---|---|"]
+    for target, name in dict.fromkeys(key[:2] for key in squares):
+        if name not in LEFT_OUT:
+            error = [np.sqrt(np.mean(squares[target, name, i], axis=0)) for i in range(len(stretches))]
+            out.append(f"| {target}, {label_of(name)} | {' | '.join(f'{1e3 * a:.2f} | {a / b:.3f}' for a, b in error)} |")
+    return "\n".join(out)
+
+
 if __name__ == "__main__":
     number, *chosen = sys.argv[1:] or ["20"]
-    for one in chosen or CASES:
-        print(tables(one, int(number)))
+    for one in chosen or [*CASES, "bridged"]:
+        print(bridged(int(number)) if one == "bridged" else tables(one, int(number)))
