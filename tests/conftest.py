@@ -1,6 +1,9 @@
 """One BLAS thread, set before numpy is imported; tests that take long are marked as slow."""
 
 import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -23,3 +26,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 or (f"{file}::{getattr(item, 'originalname', item.name)}" in SLOW)
             ):
                 item.add_marker(pytest.mark.slow)
+
+
+@pytest.fixture(scope="session")
+def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the package of examples/ installed, to be put on the path of a process."""
+    folder = tmp_path_factory.mktemp("example")
+    shutil.copytree(HERE.parent / "examples" / "wfsobs-example", folder / "source")
+    install = ("pip", "install", "--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check")
+    subprocess.run([sys.executable, "-m", *install, "--target", "installed", "./source"], cwd=folder, check=True)
+    return folder / "installed"

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-EXAMPLE = ROOT / "examples" / "wfsobs-example"
 SHORT = (
     *("--set", "run.duration=1.2", "--set", "run.warm_up=0.3", "--set", "adaptive.window=0.25"),
     *("--set", "gpr_online.training_size=20", "--set", "gpr_offline.training_size=20"),
@@ -24,21 +23,12 @@ SHORT = (
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
-@pytest.fixture(scope="module")
-def python(tmp_path_factory: pytest.TempPathFactory) -> Run:
+@pytest.fixture
+def python(example: Path, tmp_path: Path) -> Run:
     """Runs Python with the package installed, in a folder of its own."""
-    folder = tmp_path_factory.mktemp("example")
-    shutil.copytree(EXAMPLE, folder / "source")
-    install = ("pip", "install", "--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check")
-    subprocess.run([sys.executable, "-m", *install, "--target", "installed", "./source"], cwd=folder, check=True)
-    return lambda *arguments: run_python(arguments, folder, folder / "installed")
-
-
-def run_python(arguments: tuple[str, ...], folder: Path, *packages: Path) -> subprocess.CompletedProcess[str]:
-    paths = os.pathsep.join(map(str, (*packages, ROOT)))
-    return subprocess.run(
-        [sys.executable, *arguments], cwd=folder, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True
-    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (example, ROOT)))}
+    options: dict[str, Any] = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
+    return lambda *arguments: subprocess.run([sys.executable, *arguments], **options)
 
 
 def said(done: subprocess.CompletedProcess[str]) -> str:

@@ -38,9 +38,9 @@ expect.set_options(timeout=30_000)  # a busy machine is no fault
 
 
 class Server:
-    """A server on a port of this machine, a free one unless told, its output in a file."""
+    """A server on a port of this machine, a free one unless told, its output in a file; `packages` : a folder of more."""
 
-    def __init__(self, command: list[str], log: Path, path: str, port: int = 0):
+    def __init__(self, command: list[str], log: Path, path: str, port: int = 0, packages: Path | None = None):
         self.log = log
         if not port:
             with socket.socket() as s:
@@ -48,7 +48,11 @@ class Server:
                 port = s.getsockname()[1]
         self.port = port
         self.url = f"http://localhost:{port}{path}"
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(map(str, filter(None, (packages, ROOT)))),
+            "OPENBLAS_NUM_THREADS": "1",
+        }
         with log.open("w") as out:
             self.process = subprocess.Popen(
                 [sys.executable, *(part.format(port=port) for part in command)],
