@@ -11,14 +11,14 @@ import numpy as np
 import panel as pn
 import pytest
 
-from wfsobs.app.cache import frozen, key_of
+from wfsobs.app.cache import freeze, key_of
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs.job import RUNNING, Tell
 from wfsobs.app.limits import NONE, Limits
 from wfsobs.app.service import Service, Session
 from wfsobs.app.sources import Source
 from wfsobs.app.store import Store
-from wfsobs.app.work import Shown, compute
+from wfsobs.app.work import RunResults, compute
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -100,18 +100,18 @@ def make_store(loop: Loop, short: Scenario, enter: Callable[..., Session]) -> Ca
 
 
 FIRST = key_of(PRESETS["paper"]().replace(SHORT))
-KEPT: dict[str, Shown] = {}
+KEPT: dict[str, RunResults] = {}
 """Results by the scenario's key, their arrays read-only."""
 
 
-def compute_once(scenario: Scenario, watch: Watch, tell: Tell, source: Source | None = None) -> Shown:
+def compute_once(scenario: Scenario, watch: Watch, tell: Tell, source: Source | None = None) -> RunResults:
     """`compute`, and for the scenario that every dashboard starts with what it gave the first time."""
     key = key_of(scenario)
     if source is None and key in KEPT:
         return KEPT[key]
     shown = compute(scenario, watch, tell, source)
     if source is None and key == FIRST:
-        KEPT[key] = frozen(shown)
+        KEPT[key] = freeze(shown)
     return shown
 
 

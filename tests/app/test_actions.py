@@ -19,7 +19,7 @@ from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.downloads import TooLarge, data_csv, data_npz
 from wfsobs.app.report.maker import ReportError
 from wfsobs.app.share import to_query
-from wfsobs.app.work import Shown, compute
+from wfsobs.app.work import RunResults, compute
 from wfsobs.cli import main
 from wfsobs.progress import QUIET
 from wfsobs.scenario import Scenario
@@ -40,7 +40,7 @@ def actions(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> Actions:
 
 
 @pytest.fixture(scope="module")
-def shown() -> Shown:
+def shown() -> RunResults:
     scenario = PRESETS["paper"]().replace(
         {
             "run.duration": 1.0,
@@ -178,7 +178,7 @@ def test_settings_too_long_for_a_link(actions: Actions) -> None:
     assert "save the scenario" in actions.toolbar.notes[0]
 
 
-def test_csv(shown: Shown) -> None:
+def test_csv(shown: RunResults) -> None:
     text = data_csv(shown).decode()
     head = [line for line in text.splitlines() if line.startswith("#")]
     assert from_toml("\n".join(line[1:].strip() for line in head)) == shown.scenario
@@ -200,7 +200,7 @@ def test_csv(shown: Shown) -> None:
             np.testing.assert_allclose(table[f"{name}/{mode}_um"], values[:, i], rtol=1e-8)
 
 
-def test_csv_is_a_record(shown: Shown) -> None:
+def test_csv_is_a_record(shown: RunResults) -> None:
     """What was saved is observed again, to nine digits."""
     record = read_record(io.BytesIO(data_csv(shown)), "wfsobs.csv")
     kept = shown.result.record
@@ -209,7 +209,7 @@ def test_csv_is_a_record(shown: Shown) -> None:
         np.testing.assert_allclose(getattr(record, name), getattr(kept, name), rtol=1e-8)
 
 
-def test_npz_is_a_record_and_its_estimates(shown: Shown, tmp_path: Path) -> None:
+def test_npz_is_a_record_and_its_estimates(shown: RunResults, tmp_path: Path) -> None:
     path = tmp_path / "wfsobs.npz"
     path.write_bytes(data_npz(shown))
     record = load_record(path)

@@ -17,7 +17,7 @@ from wfsobs.app.cache import Cache, arrays_in, key_of, size_of
 from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Tell
 from wfsobs.app.limits import NONE
 from wfsobs.app.service import Service
-from wfsobs.app.work import Shown, Spectrum, compute
+from wfsobs.app.work import RunResults, Spectrum, compute
 from wfsobs.pipeline import Result
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
@@ -27,9 +27,9 @@ from wfsobs.settings.group import SettingError
 WAIT = 20.0
 
 
-def answer(scenario: Scenario) -> Shown:
+def answer(scenario: Scenario) -> RunResults:
     record = Record(y_lgs=np.zeros((8, 2)), u=np.zeros((8, 2)), dt=1e-3)
-    return Shown(Result(scenario, record, (), ()))
+    return RunResults(Result(scenario, record, (), ()))
 
 
 class Gated:
@@ -39,7 +39,7 @@ class Gated:
         self.entered, self.gate = threading.Semaphore(0), threading.Event()
         self.calls: list[tuple[Scenario, Watch, Tell]] = []
 
-    def __call__(self, scenario: Scenario, watch: Watch, tell: Tell, _loaded: object) -> Shown:
+    def __call__(self, scenario: Scenario, watch: Watch, tell: Tell, _loaded: object) -> RunResults:
         self.calls.append((scenario, watch, tell))
         self.entered.release()
         assert self.gate.wait(WAIT)
@@ -123,7 +123,7 @@ def test_least_recently_used_goes_first_and_the_bound_holds(most: int, steps: li
 
 def test_what_is_kept_cannot_be_changed() -> None:
     shown = answer(Scenario())
-    kept = Cache[Shown](10**6).put("a", shown)
+    kept = Cache[RunResults](10**6).put("a", shown)
     with pytest.raises(ValueError, match="read-only"):
         kept.result.record.u[0] = 1.0
 
@@ -179,7 +179,7 @@ def test_the_same_settings_are_computed_once_at_the_same_time(make_service: Any,
     results = [one.end()["result"] for one in asked]
     assert len(work.calls) == 1 and len({id(shown) for shown in results}) == 1
     assert Asked(service, short).end()["result"] is results[0] and len(work.calls) == 1, "and kept"
-    assert service.held(short)
+    assert service.is_cached(short)
 
 
 def test_other_settings_are_not_mixed_up(make_service: Any, short: Scenario) -> None:
@@ -237,7 +237,7 @@ def test_a_failure_reaches_all_and_is_not_kept(make_service: Any, short: Scenari
     gate, entered = threading.Event(), threading.Event()
     errors: list[Exception] = [SettingError("loop.gain: not today")]
 
-    def fails(scenario: Scenario, *_: object) -> Shown:
+    def fails(scenario: Scenario, *_: object) -> RunResults:
         entered.set()
         assert gate.wait(WAIT)
         if errors:
@@ -251,14 +251,14 @@ def test_a_failure_reaches_all_and_is_not_kept(make_service: Any, short: Scenari
     gate.set()
     for one in (first, second):
         assert one.end() == {"state": FAILED, "message": "loop.gain: not today"}
-    assert not service.held(short)
+    assert not service.is_cached(short)
     assert Asked(service, short).end()["result"].scenario == short
 
 
 def test_closing_the_service_ends_every_wait(make_service: Any, short: Scenario) -> None:
     entered = threading.Event()
 
-    def works(scenario: Scenario, watch: Watch, *_: object) -> Shown:
+    def works(scenario: Scenario, watch: Watch, *_: object) -> RunResults:
         entered.set()
         while True:
             watch.check()

@@ -8,10 +8,10 @@ import numpy as np
 import param
 import pytest
 
-from wfsobs.app.controls.fields import SliderField, label_of, parsed, written_unit
+from wfsobs.app.controls.fields import SliderField, label_of, parse_number, unit_text
 from wfsobs.app.controls.names import name_of
 from wfsobs.app.controls.panel import FIRST, Controls, status_of
-from wfsobs.app.work import Shown
+from wfsobs.app.work import RunResults
 from wfsobs.pipeline import Result
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -20,10 +20,10 @@ from wfsobs.scenario.presets import PRESETS
 PATH = "vibration.peaks"
 
 
-def nothing(scenario: Scenario, *_: object) -> Shown:
+def nothing(scenario: Scenario, *_: object) -> RunResults:
     """An empty result, at once."""
     record = Record(y_lgs=np.zeros((8, 2)), u=np.zeros((8, 2)), dt=1e-3)
-    return Shown(Result(scenario, record, (), ()))
+    return RunResults(Result(scenario, record, (), ()))
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ def test_labels_come_from_the_settings(controls: Controls) -> None:
     assert label_of(field.parameter) == "Wind speed V₀ [m/s]" == field.widgets[0].label
     assert field.widgets[0].description == field.parameter.doc
     assert label_of(field_of(controls, "sensors.lgs_noise").parameter) == "LGS noise [µm]"
-    assert written_unit("um^2/Hz") == "µm²/Hz"
+    assert unit_text("um^2/Hz") == "µm²/Hz"
 
 
 def test_what_matters_most_stands_first(controls: Controls) -> None:
@@ -209,7 +209,7 @@ def test_every_widget_follows_the_store(controls: Controls, loop: Any) -> None:
     for path, field in controls.fields.items():
         value = controls.store.value(path)
         for widget in field.widgets:
-            expected = field.written(value) if widget is field.widgets[-1] and hasattr(field, "written") else value
+            expected = field.to_text(value) if widget is field.widgets[-1] and hasattr(field, "to_text") else value
             assert widget.value == expected, path
     for field in controls.fields.values():
         if isinstance(field, SliderField):
@@ -304,9 +304,9 @@ class TestPeaks:
 
 
 def test_parsed() -> None:
-    assert parsed("3") == 3 and isinstance(parsed("3"), int)
-    assert parsed("−1.5e-3") == -0.0015
-    assert parsed("three") == "three"
+    assert parse_number("3") == 3 and isinstance(parse_number("3"), int)
+    assert parse_number("−1.5e-3") == -0.0015
+    assert parse_number("three") == "three"
 
 
 def test_what_did_not_arrive_is_done_again(controls: Controls, loop: Any) -> None:

@@ -24,8 +24,8 @@ from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.identify import IdentifyPage
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.share import from_query
-from wfsobs.app.sources import Kept, Loaded
-from wfsobs.app.work import Shown
+from wfsobs.app.sources import LoadedRecord, SimulatedRecord
+from wfsobs.app.work import RunResults
 from wfsobs.closed_loop.rows import rows
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.identification import report as identified
@@ -69,12 +69,12 @@ def board(request: Any, dashboard: Dashboard, loop: Any, short: Scenario, tmp_pa
         upload.handle({"action": "part", "name": FILE, "index": 0, "count": 1, "data": base64.b64encode(content).decode()})
         loop.until(lambda: not upload.picker.said.startswith("Reading"))
         upload.confirm()
-        assert isinstance(dashboard.store.source, Loaded), upload.picker.said
+        assert isinstance(dashboard.store.source, LoadedRecord), upload.picker.said
         (tmp_path / dashboard.store.source.name).write_bytes(content)
         loop.until(lambda: dashboard.store.run.state != RUNNING, 120)
     if request.param == KEPT:
         told = simulation.replace({"turbulence.wind_speed": 11.0, "vibration.peaks": [{"frequency": 33.0}]})
-        dashboard.store.run_on(Kept(simulation), told)
+        dashboard.store.run_on(SimulatedRecord(simulation), told)
         loop.until(lambda: dashboard.store.run.state != RUNNING, 120)
     return dashboard
 
@@ -100,7 +100,7 @@ def script(dashboard: Dashboard) -> dict[str, Any]:
     return made
 
 
-def of(dashboard: Dashboard) -> Shown:
+def of(dashboard: Dashboard) -> RunResults:
     shown = dashboard.store.run.result
     assert shown is not None
     return shown
@@ -163,7 +163,7 @@ def test_tune(board: Dashboard, loop: Any) -> None:
 def test_a_link_has_the_simulation_that_is_kept(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     store = dashboard.store
     simulation = short.replace({"run.seed": 4, "vibration.peaks": [{"frequency": 20.0}, {"frequency": 30.0}]})
-    store.run_on(Kept(simulation), short.replace({"turbulence.wind_speed": 11.0}))
+    store.run_on(SimulatedRecord(simulation), short.replace({"turbulence.wind_speed": 11.0}))
     link = from_query(dashboard.actions.toolbar.query)
     assert (link.scenario, link.simulation, link.rejected) == (store.scenario, simulation, ())
     store.load(short)
@@ -171,14 +171,14 @@ def test_a_link_has_the_simulation_that_is_kept(dashboard: Dashboard, loop: Any,
     dashboard.actions.open_link("?preset=paper&run.duration=2&simulation&simulation.run.duration=2&simulation.loop.gain=9")
     assert isinstance(store.source, type(None)), "what is refused leaves the same settings"
     dashboard.actions.open_link("?run.duration=2&simulation.run.duration=2&simulation.run.seed=3")
-    assert isinstance(store.source, Kept) and store.source.simulation.run.seed == 3 and store.scenario.run.seed != 3
+    assert isinstance(store.source, SimulatedRecord) and store.source.simulation.run.seed == 3 and store.scenario.run.seed != 3
 
 
 def test_another_file_of_the_same_name_is_refused(tmp_path: Path, short: Scenario) -> None:
     content = file_of(short)
     path = tmp_path / "a.npz"
     path.write_bytes(content)
-    record = Loaded(simulate(short), "a.npz", "key", sha256=hashlib.sha256(content + b".").hexdigest())
+    record = LoadedRecord(simulate(short), "a.npz", "key", sha256=hashlib.sha256(content + b".").hexdigest())
     assert f"--sha256 {record.sha256}" in to_command(short, "paper", record)
     with pytest.raises(RecordError, match=r"a\.npz: is another file: its SHA-256 is [0-9a-f]{64}, not [0-9a-f]{64}$"):
         load_record(path, sha256=record.sha256)
@@ -186,7 +186,7 @@ def test_another_file_of_the_same_name_is_refused(tmp_path: Path, short: Scenari
 
 def test_names_that_are_no_words_of_a_shell() -> None:
     for name in ("a b.npz", "-x.npz", "$(touch x).npz", "it's.npz"):
-        source = Loaded(simulate(PRESETS["paper"]().replace({"run.duration": 1.2})), name, "key")
+        source = LoadedRecord(simulate(PRESETS["paper"]().replace({"run.duration": 1.2})), name, "key")
         for task in (Task(OBSERVE), Task(LOOP), Task(TUNE, {"observer": "kf-lgs"})):
             command = to_command(PRESETS["paper"](), "paper", source, task)
             words = subprocess.run(f"printf '%s\\n' {command}", shell=True, capture_output=True, text=True)

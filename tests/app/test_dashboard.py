@@ -12,7 +12,7 @@ import pytest
 from wfsobs.app import dashboard as module
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.session import page
-from wfsobs.app.work import Shown, compute
+from wfsobs.app.work import RunResults, compute
 from wfsobs.scenario import Scenario
 
 
@@ -46,7 +46,7 @@ def test_a_page_that_cannot_be_assembled(monkeypatch: pytest.MonkeyPatch, loop: 
 
 
 def test_a_failing_run_shows_inline(loop: Any, short: Scenario, enter: Any) -> None:
-    def work(scenario: Scenario, *how: Any) -> Shown:
+    def work(scenario: Scenario, *how: Any) -> RunResults:
         if scenario.loop.gain == 0.1:
             raise RuntimeError("no such luck")
         return compute(scenario, *how)
@@ -70,7 +70,7 @@ def test_a_failing_run_shows_inline(loop: Any, short: Scenario, enter: Any) -> N
 def test_results_are_marked_stale_until_new_ones_land(loop: Any, short: Scenario, enter: Any) -> None:
     gate = threading.Event()
 
-    def work(scenario: Scenario, *how: Any) -> Shown:
+    def work(scenario: Scenario, *how: Any) -> RunResults:
         if scenario.loop.gain == 0.1:
             assert gate.wait(20)
         return compute(scenario, *how)

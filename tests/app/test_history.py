@@ -10,7 +10,7 @@ import pytest
 from wfsobs.app.controls.panel import Controls
 from wfsobs.app.jobs.job import DONE
 from wfsobs.app.store import STEPS_BACK, Store
-from wfsobs.app.work import Shown
+from wfsobs.app.work import RunResults
 from wfsobs.cost import run_seconds
 from wfsobs.pipeline import Result
 from wfsobs.record import Record
@@ -21,9 +21,9 @@ WIND = "turbulence.wind_speed"
 LONG = {"run.duration": 300}
 
 
-def nothing(scenario: Scenario, *_: object) -> Shown:
+def nothing(scenario: Scenario, *_: object) -> RunResults:
     """An empty result, at once."""
-    return Shown(Result(scenario, Record(y_lgs=np.zeros((8, 2)), u=np.zeros((8, 2)), dt=1e-3), (), ()))
+    return RunResults(Result(scenario, Record(y_lgs=np.zeros((8, 2)), u=np.zeros((8, 2)), dt=1e-3), (), ()))
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from wfsobs.app.limits import PUBLIC, Limits
 from wfsobs.app.pages import identify as module
 from wfsobs.app.pages.identify import EARLIER, IdentifyPage
 from wfsobs.app.pages.pages import EXPLORE, IDENTIFY
-from wfsobs.app.sources import Kept, Loaded
+from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.style import LOOKS
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.identification import Identified, identify
@@ -132,7 +132,7 @@ def test_filters_only(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> No
     store.undo()
     assert (store.scenario, store.source) == (before.scenario, None) and dashboard.upload.picker.loaded == ""
     store.redo()
-    assert store.scenario == told and isinstance(store.source, Kept), "and not the simulation of the model"
+    assert store.scenario == told and isinstance(store.source, SimulatedRecord), "and not the simulation of the model"
     dashboard.upload.handle({"action": "simulate"})
     assert (store.scenario, store.source) == (before.scenario, None), "back to the simulation is back to its settings"
     page.starter.uses[0].param.trigger("clicks")
@@ -155,7 +155,7 @@ def test_as_a_new_simulation(page: IdentifyPage, dashboard: Dashboard, loop: Any
     dashboard.store.undo()
     dashboard.store.undo()
     loop.finish(dashboard.store)
-    assert isinstance(dashboard.store.source, Kept)
+    assert isinstance(dashboard.store.source, SimulatedRecord)
     dashboard.store.undo()
     assert dashboard.store.scenario == before
     loop.finish(dashboard.store)
@@ -172,7 +172,7 @@ def test_a_loaded_record_stays(page: IdentifyPage, dashboard: Dashboard, loop: A
     record = simulate(short.replace({"run.seed": 9}))
     format_of(".npz").write(file, record_arrays(replace(record, turbulence=None, vibration=None)))
     file.seek(0)
-    dashboard.store.run_on(Loaded(loaded := read_record(file, "night.npz"), "night.npz", "key"), dashboard.store.scenario)
+    dashboard.store.run_on(LoadedRecord(loaded := read_record(file, "night.npz"), "night.npz", "key"), dashboard.store.scenario)
     loop.finish(dashboard.store)
     identified(page, loop)
     page.starter.uses[0].param.trigger("clicks")

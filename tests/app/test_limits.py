@@ -16,7 +16,7 @@ from wfsobs.app.serve import Options, full_html, options, origins
 from wfsobs.app.service import Full, Service
 from wfsobs.app.share import from_query, to_file
 from wfsobs.app.store import Store
-from wfsobs.app.work import Shown
+from wfsobs.app.work import RunResults
 from wfsobs.cost import run_bytes, run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS, paper
@@ -134,7 +134,7 @@ def test_links_are_limited_only_where_asked() -> None:
 
 
 def test_a_service_refuses_what_has_passed_by_the_page(short: Scenario) -> None:
-    def never(*_: Any) -> Shown:
+    def never(*_: Any) -> RunResults:
         raise AssertionError
 
     service = Service(Limits(duration=1.0), 1, 0, never)

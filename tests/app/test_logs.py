@@ -16,7 +16,7 @@ from wfsobs.app.jobs.job import Job
 from wfsobs.app.limits import NONE
 from wfsobs.app.logs import event, to_stream
 from wfsobs.app.service import Service
-from wfsobs.app.work import Shown
+from wfsobs.app.work import RunResults
 from wfsobs.scenario import Scenario
 
 LINE = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (INFO|WARNING|ERROR) ")
@@ -49,7 +49,7 @@ def test_an_event_is_a_line_of_fields(written: io.StringIO) -> None:
 
 
 def test_a_run_from_beginning_to_end(written: io.StringIO, short: Scenario) -> None:
-    def fails(*_: Any) -> Shown:
+    def fails(*_: Any) -> RunResults:
         raise RuntimeError("no such luck")
 
     service, over = Service(NONE, 1, 0, fails), threading.Event()

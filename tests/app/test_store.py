@@ -10,7 +10,7 @@ import numpy as np
 from wfsobs import pipeline
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING, Tell
 from wfsobs.app.store import Store
-from wfsobs.app.work import Shown
+from wfsobs.app.work import RunResults
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -18,13 +18,13 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.group import SettingError
 
 
-def answer(scenario: Scenario) -> Shown:
+def answer(scenario: Scenario) -> RunResults:
     """An empty result of a scenario."""
     record = Record(y_lgs=np.zeros((8, 2)), u=np.zeros((8, 2)), dt=1e-3)
-    return Shown(pipeline.Result(scenario, record, (), ()))
+    return RunResults(pipeline.Result(scenario, record, (), ()))
 
 
-def instant(scenario: Scenario, *_: object) -> Shown:
+def instant(scenario: Scenario, *_: object) -> RunResults:
     return answer(scenario)
 
 
@@ -42,7 +42,7 @@ class Gated:
         for speed in speeds:
             self.gates[speed], self.entered[speed], self.left[speed] = (threading.Event() for _ in range(3))
 
-    def __call__(self, scenario: Scenario, watch: Watch, tell: Tell, _loaded: object) -> Shown:
+    def __call__(self, scenario: Scenario, watch: Watch, tell: Tell, _loaded: object) -> RunResults:
         speed = scenario.turbulence.wind_speed
         self.telling[speed] = tell
         self.entered[speed].set()
@@ -225,7 +225,7 @@ def test_cancelling_before_anything_has_landed_leaves_the_results_stale(make_sto
 
 
 def test_cancelled_work_that_reports_it_itself(make_store: Any, loop: Any) -> None:
-    def stops(*_: object) -> Shown:
+    def stops(*_: object) -> RunResults:
         raise Cancelled
 
     store = make_store(stops)
@@ -235,7 +235,7 @@ def test_cancelled_work_that_reports_it_itself(make_store: Any, loop: Any) -> No
 
 
 def test_a_failing_run_says_why_and_leaves_the_last_result_standing(make_store: Any, loop: Any, caplog: Any) -> None:
-    def fails(scenario: Scenario, *_: object) -> Shown:
+    def fails(scenario: Scenario, *_: object) -> RunResults:
         if scenario.loop.gain == 0.1:
             raise RuntimeError("no such luck")
         if scenario.loop.gain == 0.2:

@@ -17,7 +17,7 @@ from wfsobs.app.numbers import number
 from wfsobs.app.pages.pages import TUNE
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.pages.tune_views import unit_for
-from wfsobs.app.sources import Loaded
+from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.tune_work import CHOICES, best_so_far, seconds
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
@@ -105,7 +105,7 @@ def test_a_gpr_and_its_likelihood(page: TunePage, dashboard: Dashboard, loop: An
 
 def test_a_loaded_record_is_cut(page: TunePage, dashboard: Dashboard, loop: Any, short: Scenario) -> None:
     record = replace(simulate(short.replace({"run.duration": 9.0, "run.seed": 4})), turbulence=None, vibration=None)
-    dashboard.store.run_on(Loaded(record, "night.npz", "key"), dashboard.store.scenario.replace({"run.duration": 9.0}))
+    dashboard.store.run_on(LoadedRecord(record, "night.npz", "key"), dashboard.store.scenario.replace({"run.duration": 9.0}))
     loop.finish(dashboard.store)
     found = tuned(page, loop)
     assert "RMS one-step prediction error of z on the validation record" in page.table.object

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from wfsobs.app import work
-from wfsobs.app.work import TRUTH, Shown, compute
+from wfsobs.app.work import TRUTH, RunResults, compute
 from wfsobs.evaluation.scores import scored_samples
 from wfsobs.observers import OBSERVERS
 from wfsobs.progress import QUIET, Cancelled, Watch
@@ -17,16 +17,16 @@ from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import welch_psd
 
 
-def keys(shown: Shown) -> set[tuple[str, str]]:
+def keys(shown: RunResults) -> set[tuple[str, str]]:
     return {(e.observer, e.target) for e in shown.result.estimates}
 
 
 @pytest.fixture
-def reports(monkeypatch: pytest.MonkeyPatch, short: Scenario) -> list[tuple[float, Shown | None]]:
+def reports(monkeypatch: pytest.MonkeyPatch, short: Scenario) -> list[tuple[float, RunResults | None]]:
     """Everything that a run reports when nothing is held back, the final result last."""
     monkeypatch.setattr(work, "INTERVAL", 0.0)
     monkeypatch.setattr(work, "DELIVERY_INTERVAL", 0.0)
-    out: list[tuple[float, Shown | None]] = []
+    out: list[tuple[float, RunResults | None]] = []
     final = compute(short, Watch(lambda fraction: out.append((fraction, None))), lambda result: out.append((out[-1][0], result)))
     return [*out, (1.0, final)]
 
@@ -56,7 +56,7 @@ def test_progress_rises_to_one(reports: Any) -> None:
 
 def test_deliveries_are_held_back(short: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(work, "INTERVAL", 1000.0)
-    told: list[Shown | None] = []
+    told: list[RunResults | None] = []
     compute(short, QUIET, lambda result: told.append(result))
     (shown,) = told
     assert shown is not None
@@ -65,7 +65,7 @@ def test_deliveries_are_held_back(short: Scenario, monkeypatch: pytest.MonkeyPat
 
 
 def test_spectra_are_of_what_is_scored(reports: Any) -> None:
-    final: Shown = reports[-1][1]
+    final: RunResults = reports[-1][1]
     record, key = final.result.record, ("gpr-online", "vibration")
     truth, values = final.values(TRUTH, "vibration"), final.values(*key)
     assert truth is not None and values is not None

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wfsobs.app.report.data import LEVELS, Grid, Pool, Report, bins_for, coded, state_of, window_of
-from wfsobs.app.report.packing import packed, unpacked
+from wfsobs.app.report.data import LEVELS, Grid, Pool, Report, bins_for, encode, state_of, window_of
+from wfsobs.app.report.packing import pack, unpack
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.rows import rows
 from wfsobs.evaluation.scores import cumulative_rms
@@ -48,7 +48,7 @@ def test_more_states_leave_fewer_points() -> None:
 @given(st.lists(st.floats(-1e6, 1e6) | st.just(float("nan")), min_size=1, max_size=50))
 def test_a_line_is_written_to_half_a_step(line: list[float]) -> None:
     pool = Pool()
-    index, low, step = coded(line, pool)
+    index, low, step = encode(line, pool)
     levels = np.frombuffer(pool.all()[int(index)], dtype="<u2").astype(float)
     x = np.array(line)
     read = np.where(levels == LEVELS + 1, np.nan, low + step * levels)
@@ -62,7 +62,7 @@ def test_a_line_is_written_to_half_a_step(line: list[float]) -> None:
 def test_densities_are_written_as_logarithms_and_zero_is_none() -> None:
     pool = Pool()
     density = np.array([0.0, 1e-9, 1e-3, 10.0])
-    index, low, step = coded(density, pool, logarithmic=True)
+    index, low, step = encode(density, pool, logarithmic=True)
     levels = np.frombuffer(pool.all()[int(index)], dtype="<u2")
     assert levels[0] == LEVELS + 1
     np.testing.assert_allclose(10 ** (low + step * levels[1:].astype(float)), density[1:], rtol=10 / LEVELS * 2.31)
@@ -71,7 +71,7 @@ def test_densities_are_written_as_logarithms_and_zero_is_none() -> None:
 def test_what_two_states_share_is_there_once() -> None:
     pool = Pool()
     line = np.arange(5.0)
-    assert coded(line, pool)[0] == coded(2 * line + 1, pool)[0] and len(pool.all()) == 1, "the same levels"
+    assert encode(line, pool)[0] == encode(2 * line + 1, pool)[0] and len(pool.all()) == 1, "the same levels"
 
 
 def test_a_state_has_the_lines_of_the_result(result: Result) -> None:
@@ -102,7 +102,7 @@ def test_an_unfinished_observer_is_named(result: Result) -> None:
 def test_to_another_process_and_back(result: Result, short: Scenario) -> None:
     state = state_of(result)
     report = Report("paper", short, (Variation("loop.gain", (0.3, 0.2)),), (state, replace(state, reasons=("why",))), True)
-    again = unpacked(packed(report))
+    again = unpack(pack(report))
     assert again.base == short and again.variations == report.variations and again.preset == "paper"
     assert again.start == 0 and again.recorded
     for ours, theirs in zip(report.states, again.states, strict=True):

@@ -9,7 +9,7 @@ import pytest
 
 from wfsobs.app.numbers import number
 from wfsobs.app.report.data import Report, state_of
-from wfsobs.app.report.packing import packed, unpacked
+from wfsobs.app.report.packing import pack, unpack
 from wfsobs.app.report.page import page
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.control.controllers import CONTROLLERS
@@ -32,7 +32,7 @@ def test_rows_of_the_controllers_that_take_a_moment(report: Report) -> None:
 
 
 def test_they_stand_in_the_page_best_first(report: Report) -> None:
-    text = page(unpacked(packed(report)), MADE)
+    text = page(unpack(pack(report)), MADE)
     section = text[text.index("<h2>Closed loop</h2>") : text.index("<h2>Scenario</h2>")]
     tip, tilt = section.split('<tbody data-mode="')[1:]
     for mode, body in (("tip", tip), ("tilt", tilt)):

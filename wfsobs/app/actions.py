@@ -15,13 +15,13 @@ from wfsobs.app.downloads import Save, TooLarge, data_csv, data_npz
 from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.pages import Pages
-from wfsobs.app.pages.parts import Offers
+from wfsobs.app.pages.parts import PageActions
 from wfsobs.app.report.maker import LIMIT, ReportError, make
 from wfsobs.app.share import FILE, Link, from_file, from_query, to_file, to_query
-from wfsobs.app.sources import Kept
+from wfsobs.app.sources import SimulatedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, labels
-from wfsobs.app.work import Shown
+from wfsobs.app.work import RunResults
 from wfsobs.settings.group import SettingError
 
 LARGEST = 2_000_000
@@ -82,9 +82,9 @@ class Actions:
         pages.param.watch(self._turn, "current")
 
     @property
-    def _offers(self) -> Offers | None:
+    def _offers(self) -> PageActions | None:
         page = self._pages and self._pages.made.get(self._pages.current)
-        return page if isinstance(page, Offers) else None
+        return page if isinstance(page, PageActions) else None
 
     def _turn(self, _event: object) -> None:
         page = self._offers
@@ -114,7 +114,7 @@ class Actions:
     def open_link(self, query: str) -> None:
         """Take the settings that the page's address asks for, and name what cannot be taken."""
         link = from_query(query, self.store.validate)
-        kept = Kept(link.simulation) if link.simulation and link.simulation != link.scenario else None
+        kept = SimulatedRecord(link.simulation) if link.simulation and link.simulation != link.scenario else None
         self.store.load(link.scenario, link.preset, kept)
         self.toolbar.notes = [f"Not used from the link: {line}" for line in link.rejected]
 
@@ -139,7 +139,7 @@ class Actions:
         text = to_file(self.store.scenario, self.store.preset)
         self.toolbar.save(FILE, "application/toml", text.encode())
 
-    def save_data(self, name: str, kind: str, make: Callable[[Shown], bytes]) -> None:
+    def save_data(self, name: str, kind: str, make: Callable[[RunResults], bytes]) -> None:
         """Make a file of the results shown, beside the page, and send it."""
         shown = self.store.run.result
         if shown is None:

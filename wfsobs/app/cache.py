@@ -43,7 +43,7 @@ def arrays_in(value: Any) -> Iterator[NDArray[Any]]:
             yield from arrays_in(getattr(value, field.name))
 
 
-def frozen(value: T) -> T:
+def freeze(value: T) -> T:
     """Make the arrays of a value read-only."""
     for array in arrays_in(value):
         array.flags.writeable = False
@@ -78,7 +78,7 @@ class Cache(Generic[T]):
 
     def put(self, key: Hashable, value: T) -> T:
         """Keep a value, in place of the least wanted ones; gives it back, its arrays read-only."""
-        frozen(value)
+        freeze(value)
         with self._lock, suppress(ValueError):  # larger than all that is kept
             self._kept.pop(key, None)
             self._kept[key] = value

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from wfsobs.app.share import FILE, LONGEST, changes
-from wfsobs.app.sources import Kept, Loaded, Source
+from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.scenario import Scenario, configfile
 
 RECORD, SIMULATION = "wfsobs-record.npz", "wfsobs-simulation.toml"
@@ -38,12 +38,12 @@ def to_command(scenario: Scenario, preset: str, source: Source | None = None, ta
     more = [word for name, value in task.arguments.items() for word in (f"--{name}", str(value))]
     if source is None and task.what != IDENTIFY:
         return shlex.join(["wfsobs", "run" if task.what == OBSERVE else task.what, *more, *given])
-    file, said = (source.name, _said(source)) if isinstance(source, Loaded) else (RECORD, [])
+    file, said = (source.name, _said(source)) if isinstance(source, LoadedRecord) else (RECORD, [])
     # a name that starts with a dash would be read as an option
     file = f"./{file}" if file.startswith("-") else file
     positional = [file] if task.what in (OBSERVE, IDENTIFY) else ["--record", file]
     command = shlex.join(["wfsobs", task.what, *positional, *more, *given, *said])
-    if isinstance(source, Loaded):
+    if isinstance(source, LoadedRecord):
         return command
     simulation = _options(source.simulation, preset, SIMULATION) if source else given
     return f"{shlex.join(['wfsobs', 'run', *simulation, '--save', RECORD])} &&\n{command}"
@@ -56,7 +56,7 @@ def _options(scenario: Scenario, preset: str, file: str) -> list[str]:
     return words if len(shlex.join(words)) <= LONGEST else ["--config", file]
 
 
-def _said(source: Loaded) -> list[str]:
+def _said(source: LoadedRecord) -> list[str]:
     """List what the user stated about a file, and what tells the file from others."""
     stated = source.stated
     sign = None if stated.command_sign is None else f"{stated.command_sign:+d}"
@@ -76,12 +76,12 @@ def _said(source: Loaded) -> list[str]:
 def to_python(scenario: Scenario, preset: str, source: Source | None = None, task: Task = EXPLORED) -> str:
     """Write a script that computes and prints what a page shows."""
     imports, lines = {"import wfsobs"}, [f"scenario = {_made(scenario, preset, FILE)}"]
-    if isinstance(source, Loaded):
+    if isinstance(source, LoadedRecord):
         stated = "".join(f"{name}={value!r}, " for name, value in vars(source.stated).items() if value is not None)
         imports |= {"from wfsobs.telemetry.intake import Stated", "from wfsobs.telemetry.records import load_record"}
         check = f", sha256={source.sha256!r}" if source.sha256 else ""
         lines.append(f"record = load_record({source.name!r}, scenario, Stated({stated.removesuffix(', ')}){check})")
-    elif isinstance(source, Kept):
+    elif isinstance(source, SimulatedRecord):
         lines += [f"simulation = {_made(source.simulation, preset, SIMULATION)}", "record = wfsobs.simulate(simulation)"]
     elif task.what in (LOOP, IDENTIFY):
         lines.append("record = wfsobs.simulate(scenario)")

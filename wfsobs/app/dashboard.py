@@ -12,7 +12,7 @@ from panel.util.parameters import edit_readonly
 
 from wfsobs.app.actions import Actions
 from wfsobs.app.connection import Connection
-from wfsobs.app.controls.names import named
+from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.panel import Controls, waiting_text
 from wfsobs.app.display import Display
 from wfsobs.app.jobs.job import FAILED
@@ -139,7 +139,7 @@ class Dashboard:
     def _refresh(self, *_: object) -> None:
         run = self.store.run
         failed = run.state == FAILED
-        self.alert.param.update(object=named(run.message), visible=failed)
+        self.alert.param.update(object=name_settings(run.message), visible=failed)
         texts = [STALE] if self.store.stale else []
         if self.store.waiting:
             texts.append(f"{waiting_text(self.store.waiting)}.")

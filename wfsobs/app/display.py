@@ -38,10 +38,10 @@ def per_micrometre(unit: str, diameter: float) -> float:
     return {"nm": 1e3, "mas": 4e-6 / diameter * MAS_PER_RADIAN, "um": 1.0}[unit]
 
 
-def written_unit(unit: str) -> str:
+def unit_text(unit: str) -> str:
     """Write a unit as the page does.
 
-    >>> written_unit("um^2/Hz")
+    >>> unit_text("um^2/Hz")
     'µm²/Hz'
     """
     return re.sub(r"\bum\b", "µm", unit).replace("^2", "²")
@@ -49,7 +49,7 @@ def written_unit(unit: str) -> str:
 
 def label_of(p: param.Parameter) -> str:
     """Write a setting's label with its unit in [brackets]."""
-    unit = written_unit(unit_of(p))
+    unit = unit_text(unit_of(p))
     return f"{p.label} [{unit}]" if unit else str(p.label)
 
 

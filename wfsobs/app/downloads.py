@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wfsobs.app.loop_work import LoopShown
-from wfsobs.app.work import Shown
+from wfsobs.app.loop_work import LoopResults
+from wfsobs.app.work import RunResults
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario.configfile import to_toml
 from wfsobs.telemetry.records import record_arrays
@@ -34,7 +34,7 @@ class TooLarge(ValueError):
     """More than a browser should be sent: one line saying so."""
 
 
-def data_npz(shown: Shown) -> bytes:
+def data_npz(shown: RunResults) -> bytes:
     """Write the record as `wfsobs observe` reads it, finished estimates as observer/target, the scenario. Raises TooLarge."""
     result = shown.result
     _check(shown)
@@ -43,7 +43,7 @@ def data_npz(shown: Shown) -> bytes:
     return _npz(arrays)
 
 
-def data_csv(shown: Shown) -> bytes:
+def data_csv(shown: RunResults) -> bytes:
     """Time, truth, measurements, commands and finished estimates, one row per step, the scenario as comments.
 
     Numbers have nine digits; NaN where there is none. Raises TooLarge.
@@ -56,13 +56,13 @@ def data_csv(shown: Shown) -> bytes:
     return _csv(head, dict(_columns(shown)))
 
 
-def residuals_npz(shown: LoopShown) -> bytes:
+def residuals_npz(shown: LoopResults) -> bytes:
     """Write the residuals of the controllers, (n_steps, n_modes) [um], as residual/controller; dt; the scenario."""
     arrays = {f"residual/{o.controller}": o.residual for o in shown.result.outcomes if o.residual is not None}
     return _npz(arrays | {"dt": np.array(shown.result.record.dt), "scenario": np.array(to_toml(shown.result.scenario))})
 
 
-def residuals_csv(shown: LoopShown) -> bytes:
+def residuals_csv(shown: LoopResults) -> bytes:
     """Time and the residual of every controller that has one, a row per step; nine digits; the scenario as comments."""
     record, scenario = shown.result.record, shown.result.scenario
     modes = [m.name for m in scenario.modes][: record.n_modes]
@@ -96,7 +96,7 @@ def _csv(head: Sequence[str], columns: Mapping[str, Array]) -> bytes:
     return "\n".join([*head, ",".join(columns), *lines, ""]).encode()
 
 
-def _columns(shown: Shown) -> Iterator[tuple[str, Array]]:
+def _columns(shown: RunResults) -> Iterator[tuple[str, Array]]:
     """(name with its unit, values) of every column."""
     result, record = shown.result, shown.result.record
     modes = [m.name for m in shown.scenario.modes][: record.n_modes]
@@ -109,7 +109,7 @@ def _columns(shown: Shown) -> Iterator[tuple[str, Array]]:
             yield from ((f"{name}/{mode}_um", values[:, i]) for i, mode in enumerate(modes))
 
 
-def _check(shown: Shown) -> None:
+def _check(shown: RunResults) -> None:
     result = shown.result
     numbers = result.record.n_steps * (1 + result.record.n_modes * (5 + len(result.estimates)))
     if numbers > MOST:

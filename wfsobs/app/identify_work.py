@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wfsobs.app.jobs.job import Tell
-from wfsobs.app.work import Shown
+from wfsobs.app.work import RunResults
 from wfsobs.identification import Identified, identify
 from wfsobs.identification.result import IdentifiedMode
 from wfsobs.observers.missing import bridged
@@ -25,7 +25,7 @@ PER_SAMPLE = 40e-6
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredSpectrum:
     """The periodogram of z in the bins of an axis: mean and highest, (bins, n_modes) [um^2/Hz], at frequency (bins,) [Hz].
 
     duration [s]
@@ -52,7 +52,7 @@ class Fit:
     lines: tuple[tuple[float, float, float], ...]
 
 
-def measured(of: Shown, _watch: Watch, _tell: Tell) -> Measured:
+def measure(of: RunResults, _watch: Watch, _tell: Tell) -> MeasuredSpectrum:
     """Estimate the spectrum of the record shown, with the taper that the identification uses. Raises RecordError."""
     record = of.result.record
     z = bridged(record, prior_of(of.result.scenario.before_events, record, (Model,))).z[record.delay :]
@@ -63,7 +63,7 @@ def measured(of: Shown, _watch: Watch, _tell: Tell) -> Measured:
     start = np.flatnonzero(np.diff(np.floor(np.log(f / f[0]) / np.log(f[-1] / f[0]) * BINS), prepend=-1.0))
     count = np.diff(start, append=len(f))
     density = np.column_stack([periodogram(column - column.mean(), record.dt) for column in z.T])
-    return Measured(
+    return MeasuredSpectrum(
         record,
         np.add.reduceat(f, start) / count,
         np.add.reduceat(density, start) / count[:, None],
@@ -104,6 +104,6 @@ def same(one: Record, other: Record) -> bool:
     )
 
 
-def compute(of: Shown, level: float, lowest: float, watch: Watch, _tell: Tell) -> tuple[Identified, Record]:
+def compute(of: RunResults, level: float, lowest: float, watch: Watch, _tell: Tell) -> tuple[Identified, Record]:
     """Identify a model in the record shown; return both. Raises RecordError, Cancelled."""
     return identify(of.result.record, level=level, lowest=lowest, watch=watch), of.result.record

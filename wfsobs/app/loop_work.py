@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from wfsobs.app.jobs.job import Tell
-from wfsobs.app.work import Shown
+from wfsobs.app.work import RunResults
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import Row, rows
 from wfsobs.closed_loop.run import ClosedLoop, each_outcome
@@ -23,7 +23,7 @@ PATIENCE = 60.0
 
 
 @dataclass(frozen=True)
-class LoopShown:
+class LoopResults:
     """What a closed loop has given so far.
 
     rows    : those of `wfsobs loop --json`
@@ -42,7 +42,7 @@ class LoopShown:
         return next((o.residual for o in self.result.outcomes if o.controller == controller), None)
 
 
-def compute(of: Shown, watch: Watch, tell: Tell) -> LoopShown | None:
+def compute(of: RunResults, watch: Watch, tell: Tell) -> LoopResults | None:
     """Run every controller on the record shown; tell what is done once the quick ones are, and after each of the others."""
     record, shown = of.result.record, None
     plan = design(of.scenario, [name for name in CONTROLLERS if seconds(name, of.scenario) <= PATIENCE])
@@ -62,7 +62,7 @@ def compute(of: Shown, watch: Watch, tell: Tell) -> LoopShown | None:
             spectra[outcome.controller] = welch_psd(outcome.residual[start:], record.dt)
         if outcome.controller not in quick[:-1]:
             result = ClosedLoop(plan, record, tuple(outcomes))
-            shown = LoopShown(result, tuple(rows(result, None)), dict(spectra), linear, outcome.controller == names[-1])
+            shown = LoopResults(result, tuple(rows(result, None)), dict(spectra), linear, outcome.controller == names[-1])
             if not shown.done:
                 tell(result=shown)
     return shown

@@ -1,5 +1,5 @@
 """What `panel serve app` runs, once per session."""
 
-from wfsobs.app.serve import new_page, shared
+from wfsobs.app.serve import new_page, shared_service
 
-new_page(shared()).servable(title="wfsobs")
+new_page(shared_service()).servable(title="wfsobs")

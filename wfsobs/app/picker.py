@@ -39,7 +39,7 @@ class Picker(JSComponent):
             self.on_message(data)
 
 
-class Parcel:
+class PartialFile:
     """A file on its way, in parts that come one after the other."""
 
     def __init__(self, name: str):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
-from wfsobs.app.work import TRUTH, Key, Shown, Spectrum
+from wfsobs.app.work import TRUTH, Key, RunResults, Spectrum
 from wfsobs.evaluation.scores import Score
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
@@ -45,7 +45,7 @@ class Pin:
         return next((s for s in self.scores if (s.observer, s.target, s.mode) == (observer, target, mode)), None)
 
 
-def pin(shown: Shown) -> Pin:
+def pin(shown: RunResults) -> Pin:
     """Keep what is compared of the results shown."""
     signals: dict[Key, NDArray[np.float32]] = {}
     errors: dict[Key, NDArray[np.float32]] = {}

@@ -125,7 +125,7 @@ def prepare() -> None:
 
 
 @cache
-def shared() -> Service:
+def shared_service() -> Service:
     """Return the one service of a process that something else serves: `panel serve app`."""
     prepare()
     service = make_service(NONE)
@@ -179,7 +179,7 @@ def make_server(options: Options, service: Service) -> Server:
     router.rules = [rule for rule in router.rules if not issubclass(rule.target, UNUSED)]
     for rule in router.rules:
         if rule.target is DocHandler:
-            rule.target = type("Door", (Door,), {"service": service})
+            rule.target = type("Door", (PageHandler,), {"service": service})
     return server
 
 
@@ -201,7 +201,7 @@ def is_local(address: str) -> bool:
         return address.lower() == "localhost"
 
 
-class Door(DocHandler):
+class PageHandler(DocHandler):
     """The page: turns visitors away who are too many, and takes no session's name and no endless query from an address."""
 
     service: Service

@@ -11,18 +11,18 @@ from time import monotonic
 
 from wfsobs.app.cache import Cache, key_of
 from wfsobs.app.jobs.job import Job, Listener, Tell, Work
-from wfsobs.app.jobs.queue import JobQueue, give_back
+from wfsobs.app.jobs.queue import JobQueue, release_memory
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.limits import Limits
 from wfsobs.app.logs import event
 from wfsobs.app.sources import Source
-from wfsobs.app.work import Shown, compute
+from wfsobs.app.work import RunResults, compute
 from wfsobs.cost import run_seconds
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 
-Compute = Callable[[Scenario, Watch, Tell, Source | None], Shown]
+Compute = Callable[[Scenario, Watch, Tell, Source | None], RunResults]
 Post = Callable[[Callable[[], None]], None]
 """Has a function called soon on the thread that owns the session; may itself be called from any thread."""
 
@@ -40,7 +40,7 @@ class Service:
 
     def __init__(self, limits: Limits, workers: int, most_bytes: int, work: Compute = compute):
         self.limits = limits
-        self.cache: Cache[Shown] = Cache(most_bytes)
+        self.cache: Cache[RunResults] = Cache(most_bytes)
         self.queue = JobQueue(workers, self.cache)
         self.sessions = 0
         self._work = work
@@ -63,18 +63,18 @@ class Service:
         """Whether there are as many sessions as may be."""
         return self.sessions >= self.limits.sessions
 
-    def held(self, scenario: Scenario, source: Source | None = None) -> bool:
+    def is_cached(self, scenario: Scenario, source: Source | None = None) -> bool:
         """Whether the results are there already."""
         return _key(scenario, source) in self.cache
 
-    def left(self) -> None:
+    def end_session(self) -> None:
         """Count a session that has ended."""
         with self._lock:
             self.sessions -= 1
             last = self.sessions == 0
         if last:  # nobody is kept waiting
             gc.collect()
-            give_back()
+            release_memory()
 
     def run(self, scenario: Scenario, source: Source | None = None) -> Job:
         """Make the job that computes a scenario, or the observers on another record. Raises SettingError."""
@@ -111,7 +111,7 @@ class Session:
             self.closed = True
             for task in self.tasks:
                 task.close()
-            self.service.left()
+            self.service.end_session()
             event("session-end", session=self.number, seconds=monotonic() - self._since, sessions=self.service.sessions)
 
 

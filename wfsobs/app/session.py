@@ -25,7 +25,7 @@ def page(build: Callable[[Post], Dashboard]) -> Any:
     """Build the page of a new session; one with the error where it cannot be built."""
     try:
         dashboard = build(post_to_session())
-        if query := asked_for():
+        if query := page_query():
             dashboard.actions.open_link(query)
         page = dashboard.page()
         dashboard.start()
@@ -36,7 +36,7 @@ def page(build: Callable[[Post], Dashboard]) -> Any:
         return error_page(error)
 
 
-def asked_for() -> str:
+def page_query() -> str:
     """Return the query of the page's address.
 
     If a browser connects so late that its session is made anew, it is the query with which the page was fetched.

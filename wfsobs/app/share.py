@@ -16,7 +16,7 @@ from urllib.parse import parse_qsl, quote
 
 import param
 
-from wfsobs.app.controls.fields import parsed
+from wfsobs.app.controls.fields import parse_number
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.configfile import from_toml, parse_toml, pristine, to_toml
 from wfsobs.scenario.presets import PRESETS
@@ -79,7 +79,7 @@ def to_query(scenario: Scenario, preset: str, simulation: Scenario | None = None
 
 
 def _fields(changed: Mapping[str, Any], prefix: str = "") -> list[str]:
-    return [f"{prefix}{path}={quote(written(path, value), safe=',;:+-.')}" for path, value in changed.items()]
+    return [f"{prefix}{path}={quote(value_text(path, value), safe=',;:+-.')}" for path, value in changed.items()]
 
 
 def from_query(query: str, check: Check = Scenario.validate) -> Link:
@@ -107,32 +107,32 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
     return Link(scenario, name, (*rejected, *refused, *more), simulation)
 
 
-def written(path: str, value: Any) -> str:
+def value_text(path: str, value: Any) -> str:
     """Write a setting's plain value as a link has it."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return ";".join(
-            written(path, [v for one in item.values() for v in (one if isinstance(one, list) else [one])]) for item in value
+            value_text(path, [v for one in item.values() for v in (one if isinstance(one, list) else [one])]) for item in value
         )
     if isinstance(value, list):
         return ",".join(map(_word, value))
     return _word(value)
 
 
-def read(path: str, text: str, known: Mapping[str, param.Parameter]) -> Any:
+def read_value(path: str, text: str, known: Mapping[str, param.Parameter]) -> Any:
     """Read a value of a link; what makes no sense stays text, for the setting itself to refuse."""
     p = known.get(path)
     if isinstance(p, param.List) and holds_groups(p):
         return [_item(part, settings_of(p)) for part in text.split(";")] if text else []
     if isinstance(p, param.List):
-        return [parsed(part) for part in text.split(",")] if text else []
+        return [parse_number(part) for part in text.split(",")] if text else []
     if isinstance(p, param.Boolean):
         return {"true": True, "false": False}.get(text, text)
-    return parsed(text) if isinstance(p, param.Number) else text
+    return parse_number(text) if isinstance(p, param.Number) else text
 
 
 def _item(text: str, settings: Mapping[str, param.Parameter]) -> Any:
     """One group of a list: its numbers in the order of its settings, a list of numbers at the end."""
-    numbers = [parsed(part) for part in text.split(",")]
+    numbers = [parse_number(part) for part in text.split(",")]
     *names, last = settings
     rest = numbers[len(names) :]
     if not rest or (len(rest) > 1 and not isinstance(settings[last], param.List)):
@@ -146,7 +146,7 @@ def _apply(base: Scenario, fields: Mapping[str, str], check: Check) -> tuple[Sce
     values, refused = {}, {}
     scenario = base.copy()
     for path, text in fields.items():
-        values[path] = read(path, text, known)
+        values[path] = read_value(path, text, known)
         try:
             _set(scenario, path, values[path])
         except SettingError as error:

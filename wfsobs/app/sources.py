@@ -14,7 +14,7 @@ from wfsobs.telemetry.intake import Stated
 
 
 @dataclass(frozen=True, eq=False)
-class Loaded:
+class LoadedRecord:
     """A record that was loaded.
 
     key    : names its content and what was said of it
@@ -45,7 +45,7 @@ class Loaded:
 
 
 @dataclass(frozen=True, eq=False)
-class Kept:
+class SimulatedRecord:
     """The simulation of other settings than those that the observers are told."""
 
     simulation: Scenario
@@ -73,7 +73,7 @@ class Kept:
         return f"The simulation{peaks} is kept; the settings are what the filters are told."
 
 
-Source = Loaded | Kept
+Source = LoadedRecord | SimulatedRecord
 
 
 def same(one: Source | None, other: Source | None) -> bool:

@@ -12,7 +12,7 @@ import param
 
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.service import Post, Session
-from wfsobs.app.sources import Kept, Loaded, Source, same
+from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, same
 from wfsobs.cost import run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import pristine
@@ -62,7 +62,7 @@ class Store(param.Parameterized):
     def follow(self) -> None:
         """Run the settings as they stand, unless that takes long: then stop, and wait to be asked."""
         seconds = run_seconds(self.scenario)
-        if seconds <= AT_ONCE or self.session.service.held(self.scenario, self.source):
+        if seconds <= AT_ONCE or self.session.service.is_cached(self.scenario, self.source):
             self.start()
         else:
             self.run.cancel()
@@ -113,12 +113,12 @@ class Store(param.Parameterized):
         scenario.validate()
         self.limits.check(scenario)
 
-    def load(self, scenario: Scenario, preset: str | None = None, kept: Kept | None = None) -> None:
+    def load(self, scenario: Scenario, preset: str | None = None, kept: SimulatedRecord | None = None) -> None:
         """Replace every setting and run; a loaded record stays. Raises SettingError where they do not go together.
 
         preset : the one that they are to be compared with from now on; as it was if not given
         """
-        self._put(scenario, preset or self.preset, self.source if isinstance(self.source, Loaded) else kept)
+        self._put(scenario, preset or self.preset, self.source if isinstance(self.source, LoadedRecord) else kept)
 
     def replace(self, changes: Mapping[str, Any]) -> None:
         """Set several settings (dotted path -> value) in one step and run. Raises SettingError."""
@@ -181,7 +181,7 @@ def _of_one_file(steps: list[Step], source: Source | None) -> list[Step]:
     """Without those on another file than the one that is loaded: a session holds one."""
 
     def other(step: Step) -> bool:
-        return isinstance(step[2], Loaded) and isinstance(source, Loaded) and not same(step[2], source)
+        return isinstance(step[2], LoadedRecord) and isinstance(source, LoadedRecord) and not same(step[2], source)
 
     return [step for step in steps if not other(step)]
 

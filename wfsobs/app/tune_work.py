@@ -7,7 +7,7 @@ from time import monotonic
 from types import MappingProxyType
 
 from wfsobs.app.jobs.job import INTERVAL, Tell
-from wfsobs.app.work import Shown
+from wfsobs.app.work import RunResults
 from wfsobs.cost import part_seconds
 from wfsobs.observers import OBSERVERS
 from wfsobs.progress import Watch
@@ -29,7 +29,7 @@ Rows = list[tuple[str, str, float | str | None, float | str | None]]
 SETTING, VALIDATION, TEST, OTHER, LIKELIHOOD = "setting", "validation", "test", "other target", "likelihood"
 
 
-def seconds(of: Shown, scenario: Scenario, observer: str, evaluations: int) -> float:
+def seconds(of: RunResults, scenario: Scenario, observer: str, evaluations: int) -> float:
     """Estimate how long a tuning takes [s].
 
     The observer is taken to need the time per step that it had in the results shown, on records of the same length, or on at
@@ -41,12 +41,12 @@ def seconds(of: Shown, scenario: Scenario, observer: str, evaluations: int) -> f
     return (evaluations + 2) * each * share * record.n_steps * record.n_modes + simulation
 
 
-def measure(of: Shown, observer: str, target: str) -> str:
+def measure(of: RunResults, observer: str, target: str) -> str:
     """Say what a tuning minimises. Raises RecordError where a loaded record has nothing to judge by."""
     return MEASURES[judged_by(of.result.record, observer, target)[1] if of.recorded else TRUTH]
 
 
-def compute(of: Shown, scenario: Scenario, observer: str, target: str, evaluations: int, watch: Watch, tell: Tell) -> Tuned:
+def compute(of: RunResults, scenario: Scenario, observer: str, target: str, evaluations: int, watch: Watch, tell: Tell) -> Tuned:
     """Tune on simulated records, or on the pieces of a record that was loaded; tells of all evaluations so far.
 
     Raises SettingError, RecordError, Cancelled.

@@ -17,8 +17,8 @@ from bokeh.models import ColumnDataSource
 
 from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job, Tell
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.picker import Parcel, Picker, too_large
-from wfsobs.app.sources import Loaded
+from wfsobs.app.picker import PartialFile, Picker, too_large
+from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.views.plots import new_figure, send
 from wfsobs.pipeline import as_stated
@@ -57,7 +57,7 @@ class Upload:
         for source, colour, mode in zip(self.sources, COLOURS, TIP_TILT, strict=True):
             self.figure.line("x", "y", source=source, color=colour, line_width=1.4, legend_label=mode.name)
         self.room = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
-        self._parcel: Parcel | None = None
+        self._parcel: PartialFile | None = None
         self._name, self._content = "", b""
         self._preview: Preview | SpectrumPreview | None = None
         self.reading = BackgroundTask(store.session)
@@ -94,7 +94,7 @@ class Upload:
     def _take(self, msg: dict[str, Any]) -> None:
         if msg.get("index") == 0:
             self.discard()
-            self._parcel = Parcel(safe_name(str(msg.get("name", ""))))
+            self._parcel = PartialFile(safe_name(str(msg.get("name", ""))))
         if self._parcel is None:  # more of a file that has been given up
             return
         try:
@@ -111,7 +111,7 @@ class Upload:
 
     # ------------------------------------------------------------------ the preview
 
-    def stated(self) -> Stated:
+    def read_fields(self) -> Stated:
         """Read the fields. Raises RecordError where one holds no number."""
 
         def number(field: Any, kind: type, least: float) -> Any:
@@ -136,7 +136,7 @@ class Upload:
         content, name = self._content, self._name
         scenario = self.store.scenario.replace({"telescope.radial_order": 6})  # as many modes as there may be
         try:
-            stated = self.stated()
+            stated = self.read_fields()
         except RecordError as error:
             self.reading.refuse(str(error))
             return
@@ -188,12 +188,11 @@ class Upload:
         if not isinstance(found, Preview):
             return
         record = found.record
-        stated, digest = self.stated(), hashlib.sha256(self._content).hexdigest()
+        stated, digest = self.read_fields(), hashlib.sha256(self._content).hexdigest()
         key = hashlib.sha256(repr((digest, stated, self.store.scenario.telescope.diameter)).encode()).hexdigest()
         try:
-            self.store.run_on(
-                Loaded(record, found.name, key, found.lines()[0], stated, digest), fitting(record, self.store.scenario)
-            )
+            scenario = fit_to_record(record, self.store.scenario)
+            self.store.run_on(LoadedRecord(record, found.name, key, found.lines()[0], stated, digest), scenario)
         except SettingError as error:
             self._say(f"{found.name}: {error}")
         else:
@@ -231,7 +230,7 @@ class Upload:
         return pmui.TextInput(label=label, value="", placeholder=SILENT, size="small", width=190, margin=(4, 0))
 
 
-def fitting(record: Any, scenario: Scenario) -> Scenario:
+def fit_to_record(record: Any, scenario: Scenario) -> Scenario:
     """Set the rate, ratio, length and modes of a scenario to those of a record. Raises SettingError."""
     order = next((n for n in range(1, 7) if (n + 1) * (n + 2) // 2 - 1 >= record.n_modes), 6)
     duration = record.n_steps * record.dt

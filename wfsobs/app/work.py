@@ -54,7 +54,7 @@ class Spectrum:
 
 
 @dataclass(frozen=True)
-class Shown:
+class RunResults:
     """What a run has given so far.
 
     partial : values so far, NaN where there are none yet, of observers still at work
@@ -96,7 +96,7 @@ def one_blas_thread() -> None:
     threadpool_limits(limits=1, user_api="blas")
 
 
-def compute(scenario: Scenario, watch: Watch, tell: Tell, source: Source | None = None) -> Shown:
+def compute(scenario: Scenario, watch: Watch, tell: Tell, source: Source | None = None) -> RunResults:
     """Run everything on a scenario, or the observers on another record; report results as they come.
 
     Raises SettingError, Cancelled.
@@ -121,7 +121,7 @@ class _Work:
         self.lock, self.telling = threading.Lock(), threading.Lock()
         self.record: Record | None = None
 
-    def run(self) -> Shown:
+    def run(self) -> RunResults:
         self.watch.step(0.0)
         stated = self.scenario
         if self.source is None:
@@ -164,14 +164,14 @@ class _Work:
             self.watch.check()
             sleep(0.01)
 
-    def _deliver(self, record: Record) -> Shown:
+    def _deliver(self, record: Record) -> RunResults:
         self.delivered, self.news = perf_counter(), False
         return self._so_far(record)
 
-    def _so_far(self, record: Record) -> Shown:
+    def _so_far(self, record: Record) -> RunResults:
         result = collect(self.scenario, record, self.estimates, self.failures, least=self.bounds)
         partial = {key: values.copy() for key, values in self.growing.items()}
-        return Shown(result, partial, dict(self.spectra), perf_counter() - self.started, self.source)
+        return RunResults(result, partial, dict(self.spectra), perf_counter() - self.started, self.source)
 
     def _progress(self, fraction: float) -> None:
         """Take the progress of the observers; called from any of their threads."""

@@ -15,8 +15,8 @@ import panel as pn
 import panel_material_ui as pmui
 import param
 
-from wfsobs.app.controls.names import named
-from wfsobs.app.display import label_of, written_unit
+from wfsobs.app.controls.names import name_settings
+from wfsobs.app.display import label_of, unit_text
 from wfsobs.app.store import Store
 from wfsobs.settings.parameters import Reals
 
@@ -42,7 +42,7 @@ def number_text(value: float) -> str:
     return f"{value:.10g}"
 
 
-def parsed(text: str) -> float | str:
+def parse_number(text: str) -> float | str:
     """Read a typed text as a number; other text stays text, for the setting to refuse."""
     text = text.strip().replace("−", "-")
     for kind in (int, float):
@@ -69,7 +69,7 @@ class Field:
         if not reason:
             self.show(self.store.value(self.path))
         if reason or len(self.view) > 1:
-            note = [pn.pane.HTML(error_html(named(reason)), margin=(0, 0, 6, 0))] if reason else []
+            note = [pn.pane.HTML(error_html(name_settings(reason)), margin=(0, 0, 6, 0))] if reason else []
             self.view[1:] = note
         for widget in self.widgets:
             if "error_state" in widget.param:
@@ -95,7 +95,7 @@ class Field:
     def _names(self) -> dict[str, Any]:
         return {
             "label": label_of(self.parameter),
-            "description": written_unit(self.parameter.doc or ""),
+            "description": unit_text(self.parameter.doc or ""),
             "tags": [TAG + self.path],
         }
 
@@ -138,37 +138,37 @@ class TextField(Field):
         return text
 
     def _typed(self, event: param.parameterized.Event) -> None:
-        if self.path in self.store.errors or event.new != self.written(self.store.value(self.path)):
-            self.store.change(self.path, self.read(event.new))
+        if self.path in self.store.errors or event.new != self.to_text(self.store.value(self.path)):
+            self.store.change(self.path, self.from_text(event.new))
 
     def show(self, value: Any) -> None:
         """Put a value into the text."""
-        written = self.written(value)
+        written = self.to_text(value)
         self.widgets[-1].param.update(value=written, value_input=written)
 
     def enter(self, value: Any) -> None:
         """Type a text, or the number that the slider stands at."""
         super().enter(value if isinstance(value, str) else number_text(float(value)))
 
-    def written(self, value: Any) -> str:
+    def to_text(self, value: Any) -> str:
         """Write the value as text."""
         return number_text(value)
 
-    def read(self, text: str) -> Any:
+    def from_text(self, text: str) -> Any:
         """Read the value from text."""
-        return parsed(text)
+        return parse_number(text)
 
 
 class NumbersField(TextField):
     """A list of numbers, typed with commas between them."""
 
-    def written(self, value: Any) -> str:
+    def to_text(self, value: Any) -> str:
         """Write the numbers as text."""
         return ", ".join(number_text(v) for v in value)
 
-    def read(self, text: str) -> Any:
+    def from_text(self, text: str) -> Any:
         """Read the numbers from text."""
-        return [parsed(part) for part in re.split(r"[,;\s]+", text.strip()) if part]
+        return [parse_number(part) for part in re.split(r"[,;\s]+", text.strip()) if part]
 
 
 class SliderField(TextField):

@@ -26,11 +26,13 @@ SHORT = {
 PATH = re.compile(r"\b[a-z_]+(?:\.(?:[a-z_]+|\d+))+\b")
 
 
-def named(line: str) -> str:
+def name_settings(line: str) -> str:
     """Replace the paths in a message by the names of the page.
 
-    >>> named("vibration.peaks.0.rms.1 = -1.0: takes a number from 0"), named("night.toml: turbulence.wind_speed = 200")
-    ('Peak 1: tilt = -1.0: takes a number from 0', 'night.toml: Wind speed V₀ = 200')
+    >>> name_settings("vibration.peaks.0.rms.1 = -1.0: takes a number from 0")
+    'Peak 1: tilt = -1.0: takes a number from 0'
+    >>> name_settings("night.toml: turbulence.wind_speed = 200")
+    'night.toml: Wind speed V₀ = 200'
     """
     return PATH.sub(lambda match: name_of(match[0]), line)
 

@@ -8,8 +8,8 @@ import panel as pn
 import param
 from panel.custom import JSComponent
 
-from wfsobs.app.controls.fields import TAG, number_text, parsed, written_unit
-from wfsobs.app.controls.names import column_of, named
+from wfsobs.app.controls.fields import TAG, number_text, parse_number, unit_text
+from wfsobs.app.controls.names import column_of, name_settings
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset
 from wfsobs.sensors.modes import TIP_TILT
@@ -80,7 +80,7 @@ class RowEditor:
         """Set one cell; `key` is the setting within the item, rms.0 for the first of a list of numbers."""
         path = f"{self.path}.{row}.{key}"
         self._texts[path] = text
-        self.store.change(path, parsed(text))
+        self.store.change(path, parse_number(text))
 
     def refresh(self, *_: object) -> None:
         """Show the accepted items and what was refused."""
@@ -89,7 +89,7 @@ class RowEditor:
         errors: dict[str, dict[str, str]] = {}
         for path, reason in self.store.errors.items():
             if f"{path}.".startswith(f"{self.path}."):
-                errors[path.removeprefix(f"{self.path}.")] = {"text": self._texts.get(path, ""), "reason": named(reason)}
+                errors[path.removeprefix(f"{self.path}.")] = {"text": self._texts.get(path, ""), "reason": name_settings(reason)}
         self.table.param.update(rows=rows, errors=errors)
 
     def _plain(self) -> list[dict[str, Any]]:
@@ -106,7 +106,7 @@ def _columns(kind: type[Group]) -> list[dict[str, Any]]:
         keys = [setting]
         if isinstance(p, Reals):
             keys = [f"{setting}.{i}" for i, _ in enumerate(TIP_TILT)]
-        unit = written_unit(unit_of(p))
+        unit = unit_text(unit_of(p))
         choices = list(p.objects) if isinstance(p, param.Selector) else []
         out += [
             {"key": key, "name": f"{name} [{unit}]" if unit else name, "doc": p.doc or "", "choices": choices}

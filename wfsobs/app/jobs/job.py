@@ -102,7 +102,7 @@ class Job:
             for listener in [*self._listeners]:
                 listener(news)
 
-    def moved(self, place: int) -> None:
+    def tell_place(self, place: int) -> None:
         """Its place in the line may have changed."""
         if self._known.get("place", 0) != place:
             self.tell(place=place)

@@ -139,7 +139,7 @@ class JobQueue:
         return not any(thread.is_alive() for thread in self._threads)
 
     def _work(self) -> None:
-        step_back()
+        lower_priority()
         while (job := self._next()) is not None:
             try:
                 job.run(lambda: self.closing, self.cache.put)
@@ -150,7 +150,7 @@ class JobQueue:
                     self._running.remove(job)
                     self._take_out(job)
                 del job
-                give_back()
+                release_memory()
 
     def _next(self) -> Job | None:
         """Take the first job of the line; None when there will be no more."""
@@ -163,7 +163,7 @@ class JobQueue:
                         self._timers.pop(job).cancel()
                     self._running.append(job)
                     self._turn = max(self._turn, job.turn)
-                    job.moved(0)
+                    job.tell_place(0)
                     self._tell_places()
                     return job
                 self._changed.wait()
@@ -178,17 +178,17 @@ class JobQueue:
         """Tell the waiting jobs their places; a free thread takes the next job at once."""
         if len(self._running) >= len(self._threads):
             for place, job in enumerate(self._line(), 1):
-                job.moved(place)
+                job.tell_place(place)
 
 
-def give_back() -> None:
+def release_memory() -> None:
     """Return free memory to the system: glibc keeps what was freed in another thread than the page's."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError, AttributeError):  # another C library
             ctypes.CDLL(None).malloc_trim(0)
 
 
-def step_back() -> None:
+def lower_priority() -> None:
     """Let the page's own thread, and a browser on the same machine, go first. On Linux priority is the thread's own."""
     if sys.platform == "linux":
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)

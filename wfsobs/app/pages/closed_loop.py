@@ -14,11 +14,11 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save, residuals_csv, residuals_npz, table_csv
 from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.loop_work import LoopShown, compute, cost, seconds
+from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
 from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.pages.loop_figures import Nyquist, Response, Spectrum, Trace
 from wfsobs.app.pages.loop_table import margins_html, table_html
-from wfsobs.app.pages.parts import WIDE, Offers, box, captioned, html, text
+from wfsobs.app.pages.parts import WIDE, PageActions, box, figure_with_caption, html, text
 from wfsobs.app.style import look
 from wfsobs.app.views.strip import Cards
 from wfsobs.control.controllers import CONTROLLERS
@@ -41,7 +41,7 @@ ABOUT = (
 )
 
 
-class ClosedLoopPage(Offers):
+class ClosedLoopPage(PageActions):
     """The page; computed anew when the results change, while it is visible."""
 
     def __init__(self, run: BackgroundTask, display: Display):
@@ -64,7 +64,7 @@ class ClosedLoopPage(Offers):
         """Return the contents of the page."""
         figures = pn.Column(
             *(
-                captioned(title, drawn.figure)
+                figure_with_caption(title, drawn.figure)
                 for title, drawn in (
                     ("Residual, whole record", self.whole),
                     ("Spectrum of the residual", self.spectrum),
@@ -76,7 +76,7 @@ class ClosedLoopPage(Offers):
             stylesheets=[GRID],
         )
         stability = pn.Column(
-            captioned("Loop gain L, unit circle", self.nyquist.figure),
+            figure_with_caption("Loop gain L, unit circle", self.nyquist.figure),
             pn.Column(text(ABOUT), self.margins, **WIDE),
             **WIDE,
             stylesheets=[GRID],
@@ -125,7 +125,7 @@ class ClosedLoopPage(Offers):
         self.work.start(Job("loop", partial(compute, of), cost=cost(of.scenario)))
 
     @property
-    def shown(self) -> LoopShown | None:
+    def shown(self) -> LoopResults | None:
         """What the loop has given so far, or the one before."""
         return self.work.result
 
@@ -161,7 +161,7 @@ class ClosedLoopPage(Offers):
                 self.margins.object = margins_html(self.shown, self.display)
                 self.cards.items = self._items(self.shown)
 
-    def _items(self, shown: LoopShown) -> list[dict[str, Any]]:
+    def _items(self, shown: LoopResults) -> list[dict[str, Any]]:
         """Describe a card per controller."""
         scale = 1e-3 * per_micrometre(self.display.unit, shown.result.scenario.telescope.diameter)
         left = {r["controller"]: r for r in shown.rows if r["mode"] == self.display.mode}

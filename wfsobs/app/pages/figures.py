@@ -17,7 +17,7 @@ from wfsobs.app.style import asset, look, swatch
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.plots import call, new_figure
 from wfsobs.app.views.table import find
-from wfsobs.app.work import TRUTH, Shown
+from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.observers.base import TURBULENCE, VIBRATION
 from wfsobs.sensors.modes import TIP_TILT
 
@@ -131,7 +131,7 @@ class _Sheet:
         panes = [pn.pane.Bokeh(drawn.figure, sizing_mode="stretch_width", margin=0) for drawn in self.plots]
         return pn.Column(self.head, *panes, self.caption, sizing_mode="stretch_width", margin=0, stylesheets=[asset("box.css")])
 
-    def draw(self, shown: Shown, display: Display) -> None:
+    def draw(self, shown: RunResults, display: Display) -> None:
         """Every plot and the texts."""
         legend = "".join(
             f'<span class="mark">{swatch(n, display.dark, dashed=_dashed(n, self.figure))}{escape(_label(n))}</span>'
@@ -142,7 +142,7 @@ class _Sheet:
         for drawn in self.plots:
             drawn.draw(shown, display)
 
-    def _errors(self, shown: Shown, display: Display) -> str:
+    def _errors(self, shown: RunResults, display: Display) -> str:
         """List the RMS errors of the lines, mode by mode."""
         scale = per_micrometre(display.unit, shown.scenario.telescope.diameter)
         parts = []
@@ -179,7 +179,7 @@ class _Drawn:
         if plot.what == WHOLE and any(p.what == ZOOMED for p in of.plots):
             self.figure.add_layout(self.window)
 
-    def draw(self, shown: Shown, display: Display) -> None:
+    def draw(self, shown: RunResults, display: Display) -> None:
         """Send every line in the colours of the paper."""
         scale = per_micrometre(display.unit, shown.scenario.telescope.diameter)
         for name, line in self.lines.items():
@@ -192,7 +192,7 @@ class _Drawn:
             self.figure.yaxis.axis_label = f"{mode} [{display.unit_label}]"
             self._draw_traces(shown, scale)
 
-    def _draw_traces(self, shown: Shown, scale: float) -> None:
+    def _draw_traces(self, shown: RunResults, scale: float) -> None:
         dt, n = shown.result.record.dt, shown.result.record.n_steps
         begin = min(round(shown.scenario.run.warm_up / dt), n - 2)
         middle, half = (begin + n) // 2, min(round(ZOOM_S / dt), n - begin) // 2
@@ -206,7 +206,7 @@ class _Drawn:
         self.figure.x_range.update(start=first * dt, end=last * dt, reset_start=first * dt, reset_end=last * dt)
         self.window.update(left=zoomed[0] * dt, right=zoomed[1] * dt)
 
-    def _draw_spectra(self, shown: Shown, scale: float) -> None:
+    def _draw_spectra(self, shown: RunResults, scale: float) -> None:
         tops: list[float] = []
         for name, source in self.sources.items():
             spectrum = shown.spectra.get((name, self.of.target))

@@ -9,17 +9,17 @@ from html import escape
 import panel as pn
 import panel_material_ui as pmui
 
-from wfsobs.app.controls.fields import parsed
+from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.copies import IDENTIFY, Task
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
-from wfsobs.app.identify_work import Measured, compute, fit, measured, same, seconds
+from wfsobs.app.identify_work import MeasuredSpectrum, compute, fit, measure, same, seconds
 from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.identify_figure import NAMES, SpectrumFigure
 from wfsobs.app.pages.identify_table import table_html, verdict_html
-from wfsobs.app.pages.parts import WIDE, Offers, Starter, box, html, legend, line, text
-from wfsobs.app.sources import Kept, Source
+from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
+from wfsobs.app.sources import SimulatedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.identification import Identified
 from wfsobs.identification.identification import LEVEL
@@ -49,7 +49,7 @@ REPLACED = (
 )
 
 
-class IdentifyPage(Offers):
+class IdentifyPage(PageActions):
     """The page. The measured spectrum follows the results shown while it is visible; the model comes when asked for."""
 
     def __init__(self, store: Store, display: Display):
@@ -63,7 +63,7 @@ class IdentifyPage(Offers):
         self.figure = SpectrumFigure()
         self.legend, self.table, self.verdict, self.note = html(), html(), html(), html()
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
-        self.of: Measured | None = None
+        self.of: MeasuredSpectrum | None = None
         self.measuring = BackgroundTask(store.session)
         self._made: Scenario | None = None
         self.visible, self._measured = False, object()
@@ -111,7 +111,7 @@ class IdentifyPage(Offers):
 
     def tell_filters(self) -> None:
         """Take the model into the settings, for the filters alone: the record stays, be it loaded or simulated."""
-        self._take(self.store.source or Kept(self.store.scenario))
+        self._take(self.store.source or SimulatedRecord(self.store.scenario))
 
     def simulate(self) -> None:
         """Take the model into the settings, and simulate it in place of the record."""
@@ -120,7 +120,7 @@ class IdentifyPage(Offers):
     @property
     def task(self) -> Task:
         """To identify the record."""
-        return Task(IDENTIFY, {"level": parsed(str(self.level.value)), "lowest": parsed(str(self.lowest.value))})
+        return Task(IDENTIFY, {"level": parse_number(str(self.level.value)), "lowest": parse_number(str(self.lowest.value))})
 
     def saves(self) -> Mapping[str, Save | None]:
         """Offer the model as `wfsobs identify --out` writes it."""
@@ -147,7 +147,7 @@ class IdentifyPage(Offers):
         if not self.visible or of is None or self.run.state == RUNNING or of is self._measured:
             return
         self._measured = of
-        self.measuring.start(Job("identify", partial(measured, of), refusal=RecordError))
+        self.measuring.start(Job("identify", partial(measure, of), refusal=RecordError))
 
     def _land(self, *_: object) -> None:
         task = self.measuring
@@ -187,7 +187,7 @@ def _number(label: str, value: float) -> pmui.TextInput:
 
 def _read(field: pmui.TextInput, low: float, high: float) -> float:
     """Read a number that was typed. Raises SettingError."""
-    value = parsed(str(field.value))
+    value = parse_number(str(field.value))
     if isinstance(value, str) or not low <= value <= high:
         raise SettingError(
             f"{field.label} = {str(field.value)[:40]!r}: takes a number from {low:g} to {high:g}{hint(str(field.value))}"

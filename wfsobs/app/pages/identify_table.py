@@ -24,14 +24,14 @@ def table_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
     body = []
     for what, frequency, damping, rms in rows(mode):
         scaled = None if rms is None else Number(rms.value * scale, rms.std * scale)
-        body.append(Row(what, ["" if n is None else spoken(n) for n in (frequency, damping, scaled)]))
+        body.append(Row(what, ["" if n is None else deviation_text(n) for n in (frequency, damping, scaled)]))
     return str(table(f"Identified in {mode.name}", columns, [("", body)]))
 
 
-def spoken(number: Number) -> str:
+def deviation_text(number: Number) -> str:
     """Write a number and its standard deviation.
 
-    >>> spoken(Number(47.43812, 0.0264))
+    >>> deviation_text(Number(47.43812, 0.0264))
     '47.438 ± 0.026'
     """
     return written(number).replace("+-", "±").replace("-", "−")

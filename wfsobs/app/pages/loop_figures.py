@@ -7,7 +7,7 @@ from bokeh.models import ColumnDataSource, Range1d
 from bokeh.plotting import figure
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.loop_work import LoopShown
+from wfsobs.app.loop_work import LoopResults
 from wfsobs.app.style import look
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.plots import add_line, new_figure, restyle
@@ -55,7 +55,7 @@ class Trace(Lines):
         self.what = what
         self.figure.xaxis.axis_label = "time [s]"
 
-    def draw(self, shown: LoopShown, display: Display, first: int, last: int) -> None:
+    def draw(self, shown: LoopResults, display: Display, first: int, last: int) -> None:
         """Send the samples first ... last - 1 of every line."""
         dt = shown.result.record.dt
         scale = per_micrometre(display.unit, shown.result.scenario.telescope.diameter)
@@ -89,7 +89,7 @@ class Spectrum(Lines):
         )
         self.figure.xaxis.axis_label = "frequency [Hz]"
 
-    def draw(self, shown: LoopShown, display: Display) -> None:
+    def draw(self, shown: LoopResults, display: Display) -> None:
         """Send every line."""
         scale = per_micrometre(display.unit, shown.result.scenario.telescope.diameter) ** 2
         for name, source in self.sources.items():
@@ -116,7 +116,7 @@ class Response(Lines):
             line.glyph.update(line_alpha=0.45, line_width=1.2)
         fig.xaxis.axis_label, fig.yaxis.axis_label = "frequency [Hz]", "amplitude [dB]"
 
-    def draw(self, shown: LoopShown, display: Display) -> None:
+    def draw(self, shown: LoopResults, display: Display) -> None:
         """Send every line."""
         nyquist = 0.5 / shown.result.record.dt
         self.figure.x_range.update(start=1e-3 * nyquist, end=nyquist)
@@ -152,7 +152,7 @@ class Nyquist(Lines):
         fig.xaxis.axis_label, fig.yaxis.axis_label = "real part", "imaginary part"
         self._at: dict[str, list[tuple[complex, str]]] = {}
 
-    def draw(self, shown: LoopShown, display: Display) -> None:
+    def draw(self, shown: LoopResults, display: Display) -> None:
         """Send every line and mark."""
         self._at = {}
         for name, source in self.sources.items():

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from markupsafe import Markup
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.loop_work import LoopShown
+from wfsobs.app.loop_work import LoopResults
 from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.render import Row, macro, table
 from wfsobs.app.style import swatch
@@ -19,13 +19,13 @@ from wfsobs.evaluation.rows import Row as Score
 UNSTABLE = macro("tag", "above", "unstable")
 
 
-def of_mode(shown: LoopShown, display: Display) -> list[Score]:
+def of_mode(shown: LoopResults, display: Display) -> list[Score]:
     """Select the rows of the mode shown, least residual first, those without one last."""
     rows = [r for r in shown.rows if r["mode"] == display.mode]
     return sorted(rows, key=lambda r: float("inf") if r["residual_rms_nm"] is None else r["residual_rms_nm"])
 
 
-def table_html(shown: LoopShown, display: Display) -> str:
+def table_html(shown: LoopResults, display: Display) -> str:
     """Residual and Strehl of every controller, and the bound."""
     unit = display.unit_label
     columns = {
@@ -51,7 +51,7 @@ def limits_note(rows: Sequence[Score]) -> str:
     return f"<p>{NOT_APPLICABLE}: {LIMITED}</p>" if any(r["limited"] for r in rows) else ""
 
 
-def unlimited(row: Score, value: str) -> str:
+def linear_text(row: Score, value: str) -> str:
     """Write a result of the linear loop: not applicable where a limit of the mirror acts."""
     return Markup('<span title="{}">{}</span>').format(LIMITED, NOT_APPLICABLE) if row["limited"] else value
 
@@ -63,7 +63,7 @@ def _row(row: Score, display: Display, scale: float, best: bool) -> Row:
     residual = UNSTABLE if row["stable"] is False else scaled("residual_rms_nm")
     cells = [
         (BEST if best else "") + residual,
-        unlimited(row, scaled("predicted_rms_nm")),
+        linear_text(row, scaled("predicted_rms_nm")),
         NOTHING if row["strehl"] is None else f"{row['strehl']:.4f}",
         number(row["gain"]),
         NOTHING if row["limited"] is None else number(100.0 * row["limited"], 2),
@@ -72,7 +72,7 @@ def _row(row: Score, display: Display, scale: float, best: bool) -> Row:
     return _line(row, display, cells)
 
 
-def margins_html(shown: LoopShown, display: Display) -> str:
+def margins_html(shown: LoopResults, display: Display) -> str:
     """Margins of the loops that have a transfer function."""
     columns = {
         "Controller": "",

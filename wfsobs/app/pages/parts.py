@@ -11,7 +11,7 @@ import panel as pn
 import panel_material_ui as pmui
 from bokeh.plotting import figure
 
-from wfsobs.app.controls.names import named
+from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.panel import Status
 from wfsobs.app.copies import EXPLORED, Task
 from wfsobs.app.downloads import Save
@@ -21,7 +21,7 @@ from wfsobs.app.style import asset, swatch
 from wfsobs.app.views.plots import call
 
 
-class Offers:
+class PageActions:
     """What a page has for the row of actions: what it does, to be copied, and what it has found, to be saved."""
 
     inputs: Sequence[Any] = ()
@@ -65,7 +65,7 @@ def line(*parts: Any) -> pn.FlexBox:
     return pn.FlexBox(*parts, gap="14px 10px", align_items="center", styles={"padding": "10px 0 4px"}, **WIDE)
 
 
-def captioned(title: str, fig: figure) -> pn.Column:
+def figure_with_caption(title: str, fig: figure) -> pn.Column:
     """Lay out a figure under its caption."""
     call(fig, title)
     caption = pn.pane.HTML(f'<div class="caption">{escape(title)}</div>', margin=(8, 0, 0, 0), stylesheets=[asset("style.css")])
@@ -108,5 +108,5 @@ class Starter:
         for use in self.uses:
             use.disabled = running or work.result is None
         self.status.param.update(
-            progress=work.progress, text=said + self._detail(), note=named(work.message), visible=work.state != IDLE
+            progress=work.progress, text=said + self._detail(), note=name_settings(work.message), visible=work.state != IDLE
         )

@@ -9,14 +9,14 @@ from typing import Any
 import panel as pn
 import panel_material_ui as pmui
 
-from wfsobs.app.controls.fields import parsed
+from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.copies import TUNE, Task
 from wfsobs.app.display import UNITS, Display, per_micrometre
 from wfsobs.app.downloads import Save, table_csv
 from wfsobs.app.jobs.job import RUNNING, SWEEP, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.numbers import number
-from wfsobs.app.pages.parts import WIDE, Offers, Starter, box, html, legend, line, text
+from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
 from wfsobs.app.pages.tune_views import LEGEND, HistoryFigure, table_html, unit_for
 from wfsobs.app.store import Store
 from wfsobs.app.tune_work import CHOICES, MOST, best_so_far, compute, measure, rows, seconds
@@ -42,7 +42,7 @@ START = "gpr-online"
 COLUMNS: tuple[str, ...] = ("section", "name", "before", "after")
 
 
-class TunePage(Offers):
+class TunePage(PageActions):
     """The page. Nothing is computed before it is asked for."""
 
     def __init__(self, store: Store, display: Display):
@@ -114,10 +114,8 @@ class TunePage(Offers):
     @property
     def task(self) -> Task:
         """To tune the chosen observer."""
-        return Task(
-            TUNE,
-            {"observer": self.observer.value, "target": self.target.value, "evaluations": parsed(str(self.evaluations.value))},
-        )
+        evaluations = parse_number(str(self.evaluations.value))
+        return Task(TUNE, {"observer": self.observer.value, "target": self.target.value, "evaluations": evaluations})
 
     def saves(self) -> Mapping[str, Save | None]:
         """Offer the table, errors in [um], and the settings as `wfsobs tune --out` writes them."""
@@ -179,7 +177,7 @@ class TunePage(Offers):
 
 def _whole(field: pmui.TextInput, most: int) -> int:
     """Read a whole number that was typed. Raises SettingError."""
-    value = parsed(str(field.value))
+    value = parse_number(str(field.value))
     if not isinstance(value, int) or not 1 <= value <= most:
         raise SettingError(
             f"{field.label} = {str(field.value)[:40]!r}: takes a whole number from 1 to {most}{hint(str(field.value))}"

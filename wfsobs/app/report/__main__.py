@@ -6,14 +6,14 @@ import os
 import sys
 from datetime import datetime
 
-from wfsobs.app.report.packing import unpacked
+from wfsobs.app.report.packing import unpack
 from wfsobs.app.report.page import page
 
 
 def main() -> None:
     """Behind everything else in priority: who waits for a report can wait."""
     os.nice(10)
-    report = unpacked(sys.stdin.buffer.read())
+    report = unpack(sys.stdin.buffer.read())
     sys.stdout.buffer.write(page(report, datetime.now().astimezone()).encode())
 
 

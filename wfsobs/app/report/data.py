@@ -226,7 +226,7 @@ LEVELS = 65_534
 """Steps between the lowest and the highest point of a line; one number more stands for none."""
 
 
-def coded(line: Sequence[float] | Floats, pool: Pool, logarithmic: bool = False) -> list[float]:
+def encode(line: Sequence[float] | Floats, pool: Pool, logarithmic: bool = False) -> list[float]:
     """Write a line in 16 bits a point: [number in the pool, lowest, step]; of its decimal logarithm if asked for."""
     x = np.asarray(line, dtype=np.float64)
     if logarithmic:

@@ -11,8 +11,8 @@ from tempfile import TemporaryFile
 
 import wfsobs
 from wfsobs.app.report.data import Report, state_of
-from wfsobs.app.report.packing import packed
-from wfsobs.app.work import Shown
+from wfsobs.app.report.packing import pack
+from wfsobs.app.work import RunResults
 from wfsobs.progress import Watch
 
 log = logging.getLogger(__name__)
@@ -28,9 +28,9 @@ class ReportError(Exception):
     """Why there is no report, in one line."""
 
 
-def make(shown: Shown, preset: str, watch: Watch, _tell: object = None) -> bytes:
+def make(shown: RunResults, preset: str, watch: Watch, _tell: object = None) -> bytes:
     """Make the file of the results shown; blocks, so call it in a job. Raises ReportError, Cancelled."""
-    content = packed(Report(preset, shown.scenario, (), (state_of(shown.result),), shown.recorded))
+    content = pack(Report(preset, shown.scenario, (), (state_of(shown.result),), shown.recorded))
     root = str(Path(wfsobs.__file__).parents[1])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}
     # A file, not a pipe: what a pipe has not taken when `communicate` times out is never sent.

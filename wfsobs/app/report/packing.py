@@ -12,7 +12,7 @@ from wfsobs.scenario.configfile import from_toml, to_toml
 from wfsobs.scenario.grid import Variation
 
 
-def packed(report: Report) -> bytes:
+def pack(report: Report) -> bytes:
     """Write a report as a file of plain arrays and text."""
     words = {
         "preset": report.preset,
@@ -36,8 +36,8 @@ def packed(report: Report) -> bytes:
     return file.getvalue()
 
 
-def unpacked(content: bytes) -> Report:
-    """Read the report that `packed` wrote."""
+def unpack(content: bytes) -> Report:
+    """Read the report that `pack` wrote."""
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         words = json.loads(str(file["words"]))
         lines: list[dict[str, Floats]] = [{} for _ in words["states"]]

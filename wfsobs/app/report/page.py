@@ -17,7 +17,7 @@ from markupsafe import Markup
 from wfsobs import __version__
 from wfsobs.app.display import IN_MOST, NO_ANGLE, UNITS, per_micrometre
 from wfsobs.app.render import render
-from wfsobs.app.report.data import Pool, Report, State, coded, window_of
+from wfsobs.app.report.data import Pool, Report, State, encode, window_of
 from wfsobs.app.report.figures import SHADES, all_figures
 from wfsobs.app.report.loop import loop_table
 from wfsobs.app.report.table import state_table
@@ -138,7 +138,7 @@ def _data(report: Report) -> dict[str, Any]:
 def _state(state: State, pool: Pool) -> dict[str, Any]:
     scenario, grid = state.scenario, state.grid
     lines = {
-        name: coded(line, pool, logarithmic=name.startswith(("psd", "cumulative")))
+        name: encode(line, pool, logarithmic=name.startswith(("psd", "cumulative")))
         for name, line in state.lines.items()
         if "/" in name
     }

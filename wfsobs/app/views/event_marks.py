@@ -8,7 +8,7 @@ from bokeh.models import ColumnDataSource, Text, VSpan, VStrip
 from bokeh.plotting import figure
 
 from wfsobs.app.views.plots import send
-from wfsobs.app.work import Shown
+from wfsobs.app.work import RunResults
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.events import LASER, PEAK, WIND, Event
 
@@ -40,17 +40,17 @@ def word(event: Event, scenario: Scenario) -> str:
     return f"{100 * event.share:g} % {event.sensor.upper()} lost"
 
 
-def events_of(shown: Shown) -> list[Event]:
+def events_of(shown: RunResults) -> list[Event]:
     """By their start, of the simulation; a record that was loaded has none."""
     return [] if shown.simulation is None else sorted(shown.simulation.events, key=lambda e: e.start)
 
 
-def room(shown: Shown) -> float:
+def room(shown: RunResults) -> float:
     """Compute the height of the words above the lines, as a share of the axis."""
     return 0.1 * (1 + max(levels(shown), default=-1))
 
 
-def levels(shown: Shown) -> list[int]:
+def levels(shown: RunResults) -> list[int]:
     """How many lines below the top the word of each event stands, so that none stands in the one before."""
     out, before = [], -math.inf
     for event in events_of(shown):
@@ -75,7 +75,7 @@ class EventMarks:
         fig.add_glyph(self.jumps, self._line)
         fig.add_glyph(self.words, self._text, level="overlay")
 
-    def draw(self, shown: Shown, dark: bool) -> None:
+    def draw(self, shown: RunResults, dark: bool) -> None:
         """Show those of the results."""
         events = events_of(shown)
         lasting = [e for e in events if e.duration > 0]

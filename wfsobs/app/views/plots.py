@@ -85,7 +85,7 @@ def restyle(lines: dict[str, GlyphRenderer], dark: bool, hidden: list[str]) -> N
         line.visible = name not in hidden
 
 
-class Faint:
+class PinnedLines:
     """The lines of the pinned run in a figure, faint under those of the present one; nothing until there is one."""
 
     def __init__(self, fig: figure):

@@ -9,8 +9,8 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d, VSpan
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.plots import MODEL, PEAKS, Faint, add_line, marked_peaks, new_figure, restyle, send
-from wfsobs.app.work import TRUTH, Array, Shown, Spectrum
+from wfsobs.app.views.plots import MODEL, PEAKS, PinnedLines, add_line, marked_peaks, new_figure, restyle, send
+from wfsobs.app.work import TRUTH, Array, RunResults, Spectrum
 from wfsobs.evaluation.scores import cumulative_rms
 from wfsobs.observers.base import TARGETS, VIBRATION
 
@@ -77,7 +77,7 @@ class _Spectrum:
             self._add_marks()
         self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in (TRUTH, *observers_of(target))}
         self.lines = {name: add_line(self.figure, name, source) for name, source in self.sources.items()}
-        self.faint = Faint(self.figure)
+        self.faint = PinnedLines(self.figure)
 
     def _add_marks(self) -> None:
         """Vertical lines at the scenario's peaks and at the one that the Kalman filters model."""
@@ -87,7 +87,7 @@ class _Spectrum:
         model = self.figure.add_glyph(self.model, VSpan(x="x", line_color=MODEL, line_dash=[4, 3], line_width=1.5))
         self.figure.add_tools(HoverTool(renderers=[peaks, model], tooltips="@text"))
 
-    def draw(self, shown: Shown, display: Display) -> None:
+    def draw(self, shown: RunResults, display: Display) -> None:
         """Send every line, its axis and the marks."""
         diameter = shown.scenario.telescope.diameter
         drawn: list[Array] = []
@@ -128,7 +128,7 @@ class _Spectrum:
             room, decades = (1.5, DECADES / 2) if cumulative else (3.0, DECADES)
             self.figure.y_range.update(start=max(low / room, high * 10.0**-decades), end=high * room)
 
-    def _draw_marks(self, shown: Shown) -> None:
+    def _draw_marks(self, shown: RunResults) -> None:
         simulated = shown.result.record.vibration is not None  # peaks of the settings are not those of a record
         drawn, kalman = marked_peaks(shown.scenario) if simulated else [], shown.scenario.kalman
         send(

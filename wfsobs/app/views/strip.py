@@ -13,7 +13,7 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.table import find
-from wfsobs.app.work import TRUTH, Shown
+from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.rows import NOT_OBSERVERS, own_stretch, rows
 from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL, Score
 
@@ -46,7 +46,7 @@ class Strip:
         observers = [self._observer(name, shown) for name in observers_of(self.target)]
         return [self._truth(shown), *observers]
 
-    def _observer(self, name: str, shown: Shown | None) -> dict[str, Any]:
+    def _observer(self, name: str, shown: RunResults | None) -> dict[str, Any]:
         score = find(shown, name, self.target, self.display.mode) if shown else None
         if shown is None or score is None:
             if shown is not None and shown.result.estimate(name, self.target) is not None:
@@ -55,16 +55,16 @@ class Strip:
             return self._card(name, None, "computing …" if waiting else "no result")
         return self._scored(name, score, shown, "truth")
 
-    def _scored(self, name: str, score: Score, shown: Shown, base: str) -> dict[str, Any]:
+    def _scored(self, name: str, score: Score, shown: RunResults, base: str) -> dict[str, Any]:
         relative = f"{score.normalised_rms:.2f} × {base}" if score.normalised_rms is not None else ""
         return self._card(name, self._scaled(score.rms, shown), own_stretch(rows([score], None)[0]) or relative)
 
-    def _without_truth(self, name: str, shown: Shown) -> dict[str, Any]:
+    def _without_truth(self, name: str, shown: RunResults) -> dict[str, Any]:
         """How well the next measurement is predicted, by whoever says what it will be."""
         score = find(shown, name, PREDICTION, self.display.mode)
         return self._scored(name, score, shown, "z, next z") if score else self._card(name, None, "no truth")
 
-    def _truth(self, shown: Shown | None) -> dict[str, Any]:
+    def _truth(self, shown: RunResults | None) -> dict[str, Any]:
         of = (self.target, self.display.mode)
         scores = [s for s in shown.result.scores if (s.target, s.mode) == of and not s.apart] if shown else []
         if shown is None or not scores:
@@ -72,11 +72,11 @@ class Strip:
             return self._loop(left, shown) if shown and left else self._card(TRUTH, None, "")
         return self._card(TRUTH, self._scaled(scores[0].truth_rms, shown), "rms")
 
-    def _loop(self, left: Score, shown: Shown) -> dict[str, Any]:
+    def _loop(self, left: Score, shown: RunResults) -> dict[str, Any]:
         """Describe the recorded loop's residual, in the place of the truth, which has no line either."""
         return self._scored(TRUTH, left, shown, "z, residual") | {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
 
-    def _scaled(self, value: float, shown: Shown) -> float:
+    def _scaled(self, value: float, shown: RunResults) -> float:
         return value * per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
 
     def _card(self, name: str, value: float | None, note: str) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.numbers import NOTHING, change, number
 from wfsobs.app.render import Row, macro, table
 from wfsobs.app.style import asset, observers_of, swatch
-from wfsobs.app.work import Shown
+from wfsobs.app.work import RunResults
 from wfsobs.evaluation.rows import NOT_OBSERVERS, competes, label_of, looks_ahead, needs_of, own_stretch, rows, stretch_of
 from wfsobs.evaluation.scores import BOUND, LOOP, RESIDUAL, Score
 from wfsobs.observers.base import TARGETS
@@ -21,7 +21,7 @@ from wfsobs.observers.base import TARGETS
 BEST, ABOVE = macro("tag", "best", "best"), macro("tag", "above", "above truth")
 
 
-def find(shown: Shown, observer: str, target: str, mode: str) -> Score | None:
+def find(shown: RunResults, observer: str, target: str, mode: str) -> Score | None:
     """Find the score of one observer, target and mode; None if there is none."""
     return next((s for s in shown.result.scores if (s.observer, s.target, s.mode) == (observer, target, mode)), None)
 

@@ -14,8 +14,8 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.event_marks import EventMarks, room
-from wfsobs.app.views.plots import Faint, add_line, new_figure, restyle, send
-from wfsobs.app.work import TRUTH, Shown
+from wfsobs.app.views.plots import PinnedLines, add_line, new_figure, restyle, send
+from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.recovery import trailing_rms
 from wfsobs.observers.base import TARGETS
 
@@ -119,10 +119,10 @@ class _Trace:
         self.warm_up = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.10, line_width=0, level="underlay")
         self.figure.add_layout(self.warm_up)
         self.lines = {name: add_line(self.figure, name, self.source, name) for name in self.names}
-        self.faint = Faint(self.figure)
+        self.faint = PinnedLines(self.figure)
         self.events = EventMarks(self.figure)
 
-    def draw(self, shown: Shown, display: Display, first: int, last: int) -> None:
+    def draw(self, shown: RunResults, display: Display, first: int, last: int) -> None:
         """Send the samples first ... last - 1 of every line."""
         scale = per_micrometre(display.unit, shown.scenario.telescope.diameter)
         data: dict[str, Any] = {"x": envelope_times(first, last, BINS, shown.result.record.dt)}
@@ -175,7 +175,7 @@ def _thinned(times: Array) -> Array:
     return np.interp(envelope_times(0, times.size, BINS, 1.0), np.arange(times.size), times)
 
 
-def _line(shown: Shown, name: str, target: str, display: Display, first: int, last: int) -> Array:
+def _line(shown: RunResults, name: str, target: str, display: Display, first: int, last: int) -> Array:
     """Compute the samples of one line [um], NaN where there is nothing to draw."""
     values, truth = shown.values(name, target), shown.values(TRUTH, target)
     nothing = np.full(last - first, np.nan)
