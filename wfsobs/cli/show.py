@@ -14,6 +14,7 @@ from rich.table import Table
 from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.tables import score_table
 from wfsobs.evaluation.rows import TIME, Row
+from wfsobs.evaluation.verdict import verdict
 from wfsobs.pipeline import Result
 
 
@@ -37,6 +38,17 @@ def show_table(table: Table) -> None:
     """Print a table as wide as the terminal, or where there is none as wide as a page."""
     console = Console()
     (console if console.is_terminal else Console(width=180)).print(table)
+
+
+def show_verdicts(result: Result) -> None:
+    """Print what the table of a simulated record says, a paragraph per target and mode."""
+    of = dict.fromkeys((s.target, s.mode) for s in result.scores)
+    found = (
+        verdict(result.scenario, result.record, result.estimates, result.scores, *key, simulation=result.scenario) for key in of
+    )
+    for it in found:
+        if it is not None:
+            click.echo("\n" + "\n".join(f"{'  ' * bool(i)}{line}" for i, line in enumerate(it.sentences())))
 
 
 def warn(result: Result) -> None:

@@ -9,7 +9,7 @@ import click
 from wfsobs.cli.loop_table import loop_table
 from wfsobs.cli.options import loaded, record_options, scenario_options
 from wfsobs.cli.recovery_tables import OverTime
-from wfsobs.cli.show import progress_bar, show, show_over_time, show_table, warn
+from wfsobs.cli.show import progress_bar, show, show_over_time, show_table, show_verdicts, warn
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
@@ -76,6 +76,8 @@ def run(
         show_over_time(history, as_json)
     else:
         show(all_rows, as_json)
+        if seeds == 1 and not as_json:
+            show_verdicts(result)
 
 
 @click.command()

@@ -21,6 +21,7 @@ from wfsobs.app.views.spectra import MODEL, PEAKS, Spectra
 from wfsobs.app.views.strip import Strip
 from wfsobs.app.views.table import Table
 from wfsobs.app.views.traces import Traces
+from wfsobs.app.views.verdict import VerdictLine
 from wfsobs.observers.base import TARGETS, VIBRATION
 
 GRID = """
@@ -42,6 +43,7 @@ class Explore:
         self.display = display
         self.traces, self.spectra = Traces(run, display), Spectra(run, display)
         self.strips = {target: Strip(target, run, display) for target in TARGETS}
+        self.verdicts = {target: VerdictLine(target, run, display) for target in TARGETS}
         self.table = Table(run, display)
         self.pinning = Pinning(run, display)
 
@@ -95,7 +97,7 @@ class Explore:
             **WIDE,
             stylesheets=[GRID],
         )
-        return box(target.capitalize(), cards, figures)
+        return box(target.capitalize(), self.verdicts[target].pane, cards, figures)
 
     def _hide(self, target: str, names: list[str]) -> None:
         self.display.hidden = {**self.display.hidden, target: list(names)}

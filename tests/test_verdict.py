@@ -1,0 +1,131 @@
+"""The sentences above the figures, against the numbers of the table, in several scenarios."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from wfsobs.evaluation.rows import competes, label_of
+from wfsobs.evaluation.scores import BOUND
+from wfsobs.evaluation.verdict import BATCHES, LEVEL, differs, verdict
+from wfsobs.pipeline import Result, run
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.disturbance import vibration_lines
+from wfsobs.typing import Array
+
+QUICK = ("kf-lgs", "kf-multi", "multirate-optimal", "ridge-30", "butterworth-cl", "persistence", "zero")
+SCENARIOS = {
+    "paper": PRESETS["paper"](),
+    "ut4": PRESETS["ut4"](),
+    "strong turbulence": PRESETS["strong-turbulence"](),
+    "one line": PRESETS["paper"]().replace({"vibration.peaks": [{"frequency": 13.0, "damping": 0.003, "rms": [0.05, 0.05]}], "kalman.peak": "matched"}),
+}
+
+
+@pytest.fixture(scope="module", params=SCENARIOS)
+def result(request: pytest.FixtureRequest) -> Result:
+    return run(SCENARIOS[request.param], observers=QUICK)
+
+
+def power_near(x: Array, dt: float, lines: list[float]) -> float:
+    """Share of the power of x within 1.5 Hz of the lines, by Parseval's theorem, in pieces of 2 s side by side."""
+    n = round(2.0 / dt)
+    pieces = x[: x.size // n * n].reshape(-1, n)
+    power = (np.abs(np.fft.rfft((pieces - pieces.mean(axis=1, keepdims=True)) * np.hanning(n))) ** 2).sum(axis=0)
+    frequency = np.fft.rfftfreq(n, dt)
+    near = np.zeros(frequency.size, dtype=bool)
+    for line in lines:
+        near |= np.abs(frequency - line) <= 1.5
+    return float(power[near].sum() / power.sum())
+
+
+def test_the_best_is_the_least_error_of_the_table_and_the_sentence_has_its_numbers(result: Result) -> None:
+    for target in ("turbulence", "vibration"):
+        for mode in ("tip", "tilt"):
+            of = [s for s in result.scores if (s.target, s.mode) == (target, mode)]
+            rivals = {s.observer: s.rms for s in of if competes(s.observer, s.apart) and s.observer != "zero"}
+            found = verdict(
+                result.scenario, result.record, result.estimates, result.scores, target, mode, simulation=result.scenario
+            )
+            assert found is not None and found.best.observer == min(rivals, key=rivals.__getitem__)
+            first = found.sentences()[0]
+            assert first.startswith(f"{target.capitalize()}, {mode}: {label_of(found.best.observer)} ")
+            # Three digits, so that half of the last is at most 0.5 %.
+            said = re.search(r"(?:best|error), ([\d.]+) nm", first)
+            assert said and float(said[1]) == pytest.approx(found.best.rms * 1e3, rel=5e-3)
+            bound = next(s.rms for s in of if s.observer == BOUND)
+            if found.best.observer == "multirate-optimal":
+                assert f"bound of the LGS alone {bound * 1e3:.3g} nm" in first
+            else:
+                percent = re.search(r"(\d+) % (above|below) the bound", first)
+                signed = 0.0 if percent is None else float(percent[1]) * (1 if percent[2] == "above" else -1)
+                assert signed == pytest.approx(100.0 * (found.best.rms / bound - 1.0), abs=0.51)
+            assert ("tied" in first) == bool(found.tied) and all(label_of(name) in first for name in found.tied)
+
+
+def test_who_does_harm_is_named_with_where_its_error_lies(result: Result) -> None:
+    for target in ("turbulence", "vibration"):
+        found = verdict(
+            result.scenario, result.record, result.estimates, result.scores, target, "tip", simulation=result.scenario
+        )
+        assert found is not None
+        harmful = {s.observer for s in result.scores if (s.target, s.mode) == (target, "tip") and s.rms >= s.truth_rms}
+        assert {harm.observer for harm in found.harms} == harmful - {BOUND, "zero"}
+        truth = result.record.truth(target)
+        assert truth is not None
+        said = " ".join(found.sentences()[1:])
+        lines = [line[0] for line in vibration_lines(result.scenario, 0)]
+        for harm in found.harms:
+            estimate = result.estimate(harm.observer, target)
+            assert estimate is not None and label_of(harm.observer) in said
+            error = (estimate.values - truth)[1000:, 0]
+            # The code overlaps its pieces by half: other samples weigh more, by a few per cent of the power.
+            whole = power_near(error[~np.isnan(error)], result.record.dt, lines)
+            assert harm.at_known + harm.at_others == pytest.approx(whole, abs=0.04)
+
+
+def test_a_filter_of_one_line_does_harm_at_the_others_and_not_where_there_are_none() -> None:
+    by_name = {}
+    for name in ("paper", "one line"):
+        result = run(SCENARIOS[name], observers=("kf-lgs", "kf-multi", "zero"))
+        found = verdict(
+            result.scenario, result.record, result.estimates, result.scores, "vibration", "tilt", simulation=result.scenario
+        )
+        assert found is not None
+        by_name[name] = found
+    (harm,) = by_name["paper"].harms
+    assert harm.observer == "kf-lgs" and harm.worse and harm.at_others > 0.6 > 0.3 > harm.at_known
+    assert "LGS KF is worse than no estimate: it is given a model with one line" in by_name["paper"].sentences()[1]
+    # With one line both filters have the same model.
+    assert not by_name["one line"].harms and by_name["one line"].tied
+
+
+def test_without_truth_there_is_no_verdict_and_without_a_simulation_no_lines() -> None:
+    result = run(SCENARIOS["paper"], observers=("kf-lgs", "kf-multi", "zero"))
+    given = (result.scenario, result.record, result.estimates, result.scores, "vibration", "tilt")
+    unknown = verdict(*given)
+    assert unknown is not None and unknown.lines == 0 and "%" not in " ".join(unknown.sentences()[1:])
+    assert verdict(result.scenario, replace(result.record, turbulence=None, vibration=None), *given[2:]) is None
+
+
+def errors_of(rng: np.random.Generator, scale: float) -> tuple[Array, Array]:
+    """Two records of 10 s of equally distributed errors, correlated over 20 ms and with each other; the other scaled."""
+    noise = rng.standard_normal((3, 10_000))
+    for k in range(1, noise.shape[1]):
+        noise[:, k] = 0.95 * noise[:, k - 1] + np.sqrt(1.0 - 0.95**2) * noise[:, k]
+    shared, one, other = noise
+    return 0.8 * shared + 0.6 * one, scale * (0.8 * shared + 0.6 * other)
+
+
+def test_a_difference_is_called_significant_as_often_as_the_level_says_and_a_large_one_always() -> None:
+    """Of 400 pairs, LEVEL with a standard deviation of 1.1 %: within four of these. Twenty per cent of rms are 11 standard
+    deviations of the mean difference (with a correlation time of 20 ms, 250 independent samples of a difference with a
+    standard deviation of 1.6 and the mean 0.44: 4.4 of them at least)."""
+    rng = np.random.default_rng(3)
+    even = np.mean([differs(*errors_of(rng, 1.0)) for _ in range(400)])
+    assert abs(even - LEVEL) < 4.0 * np.sqrt(LEVEL * (1.0 - LEVEL) / 400)
+    assert np.mean([differs(*errors_of(rng, 1.2)) for _ in range(50)]) > 0.9
+    assert not differs(np.zeros(BATCHES), np.zeros(BATCHES))

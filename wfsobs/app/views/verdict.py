@@ -1,0 +1,42 @@
+"""One or two sentences above the figures of a target: who is best, and who does harm and why."""
+
+from __future__ import annotations
+
+from html import escape
+
+import panel as pn
+
+from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.jobs.job import DONE
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.style import asset
+from wfsobs.evaluation.verdict import verdict
+
+
+class VerdictLine:
+    """The verdict on one target in the mode and unit shown, once all observers are done."""
+
+    def __init__(self, target: str, run: BackgroundTask, display: Display):
+        self.target, self.run, self.display = target, run, display
+        self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
+        run.param.watch(self._refresh, ["result", "state"])
+        display.param.watch(self._refresh, ["mode", "unit"])
+
+    def _refresh(self, *_: object) -> None:
+        self.pane.object = self.html()
+
+    def html(self) -> str:
+        """The sentences, nothing while observers are at work or where there is no truth."""
+        shown = self.run.result
+        if shown is None or self.run.state != DONE:
+            return ""
+        it = shown.result
+        found = verdict(
+            it.scenario, it.record, it.estimates, it.scores, self.target, self.display.mode, simulation=shown.simulation
+        )
+        if found is None:
+            return ""
+        scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
+        first, *others = found.sentences(scale, self.display.unit_label)
+        more = "".join(f"<br>{escape(sentence)}" for sentence in others)
+        return f'<p class="verdict" role="status"><strong>{escape(first)}</strong>{more}</p>'

@@ -1,0 +1,234 @@
+"""What a table of errors says, in one or two sentences per target: who is best, by how much, and who does harm and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+from scipy.stats import t as student
+
+from wfsobs.evaluation.rows import competes, label_of
+from wfsobs.evaluation.scores import BOUND, Score
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Estimate
+from wfsobs.prior import Bands, Lines, Model, Part, Training
+from wfsobs.priors_from.scenario import modelled_peak
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.signal.welch import welch_psd
+from wfsobs.simulation.disturbance import vibration_lines
+from wfsobs.typing import Array
+
+BATCHES = 20
+"""Pieces of the record whose mean squared errors are compared; longer than the correlation of an error by far."""
+
+LEVEL = 0.05
+"""Of two equally good observers, the share of records in which a difference is called significant."""
+
+HALF_WIDTH = 1.5
+"""What counts as at a line [Hz] to either side, three bins of a spectrum with 0.5 Hz."""
+
+NO_ESTIMATE = "zero"
+"""The observer that stands for having none; it is never the best, nor worse than itself."""
+
+
+@dataclass(frozen=True)
+class Harm:
+    """An observer whose error is as large as the disturbance itself, or larger.
+
+    worse               : whether it is significantly larger
+    at_known, at_others : shares of its error's variance at the lines that it is told, and at those that it is not
+    """
+
+    observer: str
+    worse: bool
+    at_known: float
+    at_others: float
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the scores of one target and mode amount to.
+
+    best  : the score with the least error of those that can be compared
+    tied  : observers whose error is larger, but not significantly so on this record
+    bound : the least error possible [um], None where it is not known
+    lines : how many lines the vibration has
+    harms : observers that are worse than no estimate, the worst first
+    """
+
+    best: Score
+    tied: tuple[str, ...]
+    bound: float | None
+    lines: int
+    harms: tuple[Harm, ...]
+
+    def sentences(self, scale: float = 1e3, unit: str = "nm") -> list[str]:
+        """The verdict in words; scale: from micrometres to the unit."""
+        groups: dict[tuple[bool, str], list[Harm]] = {}
+        for harm in self.harms:
+            groups.setdefault((harm.worse, told_of(harm.observer, self.lines)), []).append(harm)
+        return [_best_sentence(self, scale, unit), *(_harm_sentence(self, of, told) for (_, told), of in groups.items())]
+
+
+def verdict(
+    scenario: Scenario,
+    record: Record,
+    estimates: Sequence[Estimate],
+    scores: Sequence[Score],
+    target: str,
+    mode: str,
+    *,
+    simulation: Scenario | None = None,
+) -> Verdict | None:
+    """Return the verdict on one target and mode, None where nothing can be compared or there is no truth.
+
+    scenario   : what the observers' priors were made from
+    simulation : what the record was made from, so that the lines of the vibration are known
+    """
+    of = [s for s in scores if (s.target, s.mode) == (target, mode)]
+    ranked = sorted((s for s in of if competes(s.observer, s.apart) and s.observer != NO_ESTIMATE), key=lambda s: s.rms)
+    truth = record.truth(target)
+    if not ranked or truth is None or not ranked[0].truth_rms > 0:
+        return None
+    column = [m.name for m in scenario.modes].index(mode)
+    values = {e.observer: e.values[:, column] for e in estimates if e.target == target}
+    errors = {s.observer: _scored(record, values[s.observer] - truth[:, column], s) for s in ranked}
+    lines = () if simulation is None else tuple(line[0] for line in vibration_lines(simulation, column))
+    first = ranked[0]
+    return Verdict(
+        first,
+        tuple(s.observer for s in ranked[1:] if not differs(errors[first.observer], errors[s.observer])),
+        next((s.rms for s in of if s.observer == BOUND), None),
+        len(lines),
+        tuple(
+            Harm(
+                s.observer,
+                differs(_scored(record, truth[:, column], s), errors[s.observer]),
+                *_shares(errors[s.observer], record.dt, lines, _given(scenario, s.observer, column, lines)),
+            )
+            for s in reversed(ranked)
+            if s.rms >= s.truth_rms
+        ),
+    )
+
+
+def differs(one: Array, other: Array) -> bool:
+    """Whether two errors (n,), step by step of one record, differ significantly in their mean squares.
+
+    The difference of the squares is averaged over BATCHES pieces, whose means are nearly independent, and compared with their
+    scatter by a t-test (batch means: Law and Kelton, Simulation Modeling and Analysis, ch. 9). NaN where a step does not count.
+    """
+    difference = other**2 - one**2
+    pieces = np.array_split(difference[~np.isnan(difference)], BATCHES)
+    means = np.array([piece.mean() for piece in pieces if piece.size])
+    if means.size < 2:
+        return False
+    scatter = means.std(ddof=1) / sqrt(means.size)
+    return bool(abs(means.mean()) > student.ppf(1.0 - LEVEL / 2.0, means.size - 1) * scatter)
+
+
+def _scored(record: Record, error: Array, score: Score) -> Array:
+    """A signal where it was scored, NaN elsewhere."""
+    assert score.start is not None and score.stop is not None
+    out = np.full_like(error, np.nan)
+    scored = slice(round(score.start / record.dt), round(score.stop / record.dt))
+    out[scored] = error[scored]
+    return out
+
+
+def _shares(error: Array, dt: float, lines: Sequence[float], given: Sequence[float]) -> tuple[float, float]:
+    """Shares of an error's variance at the lines [Hz] that an observer is given, and at the others."""
+    frequency, density = welch_psd(error[~np.isnan(error)][:, None], dt)
+    total = density.sum()
+    if not total > 0:
+        return 0.0, 0.0
+    at_given = _near(frequency, given)
+    at_others = _near(frequency, lines) & ~at_given
+    return float(density[at_given].sum() / total), float(density[at_others].sum() / total)
+
+
+def _near(frequency: Array, lines: Sequence[float]) -> Array:
+    """Which bins are at one of the lines."""
+    return (np.abs(frequency[:, None] - np.asarray(lines, dtype=float)) <= HALF_WIDTH).any(axis=1)
+
+
+def _given(scenario: Scenario, observer: str, column: int, lines: Sequence[float]) -> Sequence[float]:
+    """The lines [Hz] that an observer is given."""
+    prior = OBSERVERS[observer].prior
+    if Lines in prior or not lines:
+        return lines
+    if Model in prior:
+        return [modelled_peak(scenario, column)[0]]
+    return scenario.butterworth.frequencies if Bands in prior else ()
+
+
+# ---------------------------------------------------------------------- in words
+
+TOLD: tuple[tuple[Part, str], ...] = (
+    (Lines, "all {n} lines"),
+    (Model, "a model with one line"),
+    (Training, "training data"),
+    (Bands, "where the bands are"),
+)
+"""What is said of an observer by the first part of its prior that is found here."""
+
+
+def told_of(observer: str, lines: int) -> str:
+    """Return what an observer is told, as a phrase."""
+    prior = OBSERVERS[observer].prior
+    words = next((words for part, words in TOLD if part in prior), "nothing")
+    return words.format(n=lines).replace("all 1 lines", "the one line").replace("all 0 lines", "a model")
+
+
+def _best_sentence(it: Verdict, scale: float, unit: str) -> str:
+    target, mode, name = it.best.target.capitalize(), it.best.mode, label_of(it.best.observer)
+    size = f"{_rounded(it.best.rms * scale)} {unit}"
+    if it.tied:
+        start = f"{name} has the smallest error, {size}, tied with {_listed(it.tied)} on this record"
+    else:
+        start = f"{name} is best, {size}"
+    return f"{target}, {mode}: {start}{_to_bound(it, scale, unit)}; it is given {told_of(it.best.observer, it.lines)}."
+
+
+def _to_bound(it: Verdict, scale: float, unit: str) -> str:
+    """How far the best error is from the least possible. It is a mean over records, so that one may lie below."""
+    if not it.bound:
+        return ""
+    if "y_ngs" in OBSERVERS[it.best.observer].needs:
+        return f", with the NGS (bound of the LGS alone {_rounded(it.bound * scale)} {unit})"
+    percent = round(100.0 * (it.best.rms / it.bound - 1.0))
+    return f", {'at' if percent == 0 else f'{abs(percent)} % ' + ('above' if percent > 0 else 'below')} the bound of the LGS"
+
+
+def _harm_sentence(it: Verdict, harms: Sequence[Harm], told: str) -> str:
+    """Observers that are told the same, together; shares are the mean of theirs."""
+    names = _listed([harm.observer for harm in harms])
+    be, they, their = ("is", "it", "its") if len(harms) == 1 else ("are", "they", "their")
+    tell = "is" if len(harms) == 1 else "are"
+    known, others = (float(np.mean([getattr(harm, name) for harm in harms])) for name in ("at_known", "at_others"))
+    shares = {
+        f"at lines that {they} {tell} not given": others,
+        f"at lines that {they} {tell} given": known,
+        "away from the lines": 1.0 - known - others,
+    }
+    where, share = max(shares.items(), key=lambda item: item[1])
+    reason = f"; {100.0 * share:.0f} % of {their} error lies {where}" if it.lines else ""
+    return f"{names} {be} {'worse' if harms[0].worse else 'no better'} than no estimate: {they} {tell} given {told}{reason}."
+
+
+def _listed(observers: Sequence[str]) -> str:
+    """Labels as a person lists them.
+
+    >>> _listed(["kf-lgs", "ridge", "kf-multi"])
+    'LGS KF, Ridge and Multi-peak KF'
+    """
+    names = [label_of(observer) for observer in observers]
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def _rounded(x: float) -> str:
+    """Three digits, as a person would say them."""
+    return f"{x:.3g}" if x < 1000.0 else f"{x:.0f}"
