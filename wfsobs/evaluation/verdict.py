@@ -145,14 +145,16 @@ def _shares(error: Array, dt: float, lines: Sequence[float], given: Sequence[flo
     total = density.sum()
     if not total > 0:
         return 0.0, 0.0
-    at_given = _near(frequency, given)
-    at_others = _near(frequency, lines) & ~at_given
+    at_lines = _near(frequency, lines)
+    at_given = at_lines & _near(frequency, given)
+    at_others = at_lines & ~at_given
     return float(density[at_given].sum() / total), float(density[at_others].sum() / total)
 
 
 def _near(frequency: Array, lines: Sequence[float]) -> Array:
     """Which bins are at one of the lines."""
-    return (np.abs(frequency[:, None] - np.asarray(lines, dtype=float)) <= HALF_WIDTH).any(axis=1)
+    apart = np.abs(frequency[:, None] - np.asarray(lines, dtype=float))
+    return np.any(apart <= HALF_WIDTH, axis=1)
 
 
 def _given(scenario: Scenario, observer: str, column: int, lines: Sequence[float]) -> Sequence[float]:

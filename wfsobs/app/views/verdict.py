@@ -39,4 +39,4 @@ class VerdictLine:
         scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
         first, *others = found.sentences(scale, self.display.unit_label)
         more = "".join(f"<br>{escape(sentence)}" for sentence in others)
-        return f'<p class="verdict" role="status"><strong>{escape(first)}</strong>{more}</p>'
+        return f'<p class="verdict"><strong>{escape(first)}</strong>{more}</p>'

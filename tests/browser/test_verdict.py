@@ -1,0 +1,34 @@
+"""The sentences above the figures say what the table says."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from playwright.sync_api import Locator, Page, expect
+
+
+def sentences(page: Page, target: str) -> Locator:
+    return page.locator("p.verdict", has_text=target.capitalize())
+
+
+def best(page: Page, target: str) -> tuple[str, float]:
+    """Label and error of the row that the table marks."""
+    row = page.locator(f'tr[data-target="{target}"]', has=page.locator(".best"))
+    return row.locator("th").inner_text().strip(), float(row.locator("td").first.inner_text().split()[-1])
+
+
+def test_the_verdict_names_the_best_of_the_table_in_the_mode_and_unit_shown(open_page: Any) -> None:
+    page: Page = open_page()
+    for mode, unit in (("Tip", "nm"), ("Tilt", "nm"), ("Tilt", "mas")):
+        page.get_by_role("button", name=mode, exact=True).click()
+        page.get_by_role("button", name=unit, exact=True).click()
+        for target in ("turbulence", "vibration"):
+            start = sentences(page, target)
+            expect(start).to_contain_text(re.compile(rf"^{target.capitalize()}, {mode.lower()}: .* {unit}[,;]"))
+            label, error = best(page, target)
+            expect(start).to_contain_text(f"{mode.lower()}: {label} ")
+            said = re.search(rf"([\d.]+) {unit}[,;]", start.inner_text())
+            # Three digits either way.
+            assert said and abs(float(said[1]) / error - 1.0) < 0.006
+    expect(sentences(page, "vibration")).to_contain_text("than no estimate: they are given a model with one line")
