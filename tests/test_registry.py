@@ -55,6 +55,8 @@ def mine(**changes: Any) -> Observer:
         (mine(settings=Own), "observer 'mine': settings takes a Section of a Group, not the class Own"),
         (mine(settings="nothing"), "observer 'mine': settings 'nothing': no scenario has such a group"),
         (mine(settings=Section("own", "Own", Endless)), "settings own.speed: a number takes bounds, lowest and highest"),
+        (Observer, "register: takes an Observer or a Controller, not the class Observer"),
+        (len, "register: takes an Observer or a Controller, not a builtin_function_or_method"),
     ],
 )
 def test_what_is_refused(entry: Any, reason: str) -> None:
