@@ -13,7 +13,7 @@ from wfsobs.app.display import per_micrometre
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.loop_figures import CURVES
 from wfsobs.app.pages.pages import EXPLORE, LOOP
-from wfsobs.app.style import LOOKS
+from wfsobs.app.style import look
 from wfsobs.app.views.envelope import envelope
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows
@@ -90,7 +90,7 @@ def test_marks_hiding_colours_and_reasons(page: ClosedLoopPage, dashboard: Dashb
     assert not page.whole.lines["integrator"].visible and page.whole.lines["lqg-multirate-multi"].visible
     assert top(page) < before and not len(page.nyquist.marks.data["x"])
     dashboard.display.dark = True
-    assert page.whole.lines["integrator"].glyph.line_color == LOOKS["integrator"].dark
+    assert page.whole.lines["integrator"].glyph.line_color == look("integrator").dark
     page.work.refuse("the record has no truth")
     assert "No closed loop: the record has no truth" in page.note.object
 

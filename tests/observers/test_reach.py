@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -19,11 +16,9 @@ from wfsobs.priors_from import scenario as door
 from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.groups.run import Run
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
-
-SEED = 918_273_645
+from wfsobs.testing.reach import SEED, given_away, reached
 
 
 def scenario(inputs_filter: str = "raw") -> Scenario:
@@ -45,43 +40,6 @@ def together(record: Record) -> Record:
     names = ("y_lgs", "u", "y_ngs", "open_loop_y", "turbulence", "vibration")
     block = np.stack([getattr(record, name) for name in names])
     return replace(record, **{name: block[i] for i, name in enumerate(names)})  # type: ignore[arg-type]
-
-
-def reached(*roots: Any) -> Iterator[Any]:
-    """Everything reachable from the roots, by references, bases of arrays, closures, defaults and partials. Classes and modules
-    are the program, and so are the globals of a function."""
-    seen, waiting = set[int](), list(roots)
-    while waiting:
-        x = waiting.pop()
-        if id(x) in seen or isinstance(x, (type, ModuleType, BuiltinFunctionType)):
-            continue
-        seen.add(id(x))
-        yield x
-        if isinstance(x, FunctionType):
-            waiting += [cell.cell_contents for cell in x.__closure__ or ()]
-            waiting += [x.__defaults__, x.__kwdefaults__, x.__dict__]
-        elif isinstance(x, partial):
-            waiting += [x.func, x.args, x.keywords]
-        else:
-            waiting += gc.get_referents(x)
-            if isinstance(x, np.ndarray):
-                waiting.append(x.base)
-
-
-def given_away(record: Record, *roots: Any) -> set[str]:
-    """What can be reached from the roots that should not."""
-    found = set()
-    for x in reached(*roots):
-        if isinstance(x, (Scenario, Run, Record)):
-            found.add(type(x).__name__)
-        elif isinstance(x, int) and x == SEED:
-            found.add("seed")
-        elif isinstance(x, np.ndarray) and x.dtype == float:
-            for name in ("turbulence", "vibration"):
-                truth = getattr(record, name)
-                if np.shares_memory(x, truth) or any(np.isin(column, x).all() for column in truth.T):
-                    found.add(name)
-    return found
 
 
 def leaks(record: Record, s: Scenario, monkeypatch: pytest.MonkeyPatch, only: str) -> set[str]:

@@ -13,6 +13,7 @@ from wfsobs.closed_loop.rows import Row, rows
 from wfsobs.closed_loop.run import ClosedLoop, each_outcome
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.curves import Curves, curves
+from wfsobs.priors_from.controllers import own_settings
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import welch_psd
@@ -74,7 +75,6 @@ def cost(scenario: Scenario) -> float:
 
 
 def seconds(controller: str, scenario: Scenario) -> float:
-    """About how long a controller takes at most [s]: the online GPR is a step of 0.1 ms + 0.7 ns m^2 at a time."""
-    if controller != "integrator+gpr-online":
-        return 0.0
-    return scenario.n_steps * len(scenario.modes) * (1e-4 + 0.7e-9 * scenario.gpr_online.training_size**2)
+    """Estimate how long a controller takes at most [s]."""
+    it = CONTROLLERS[controller]
+    return it.seconds(own_settings(it, scenario), scenario.n_steps, len(scenario.modes)) if it.seconds else 0.0

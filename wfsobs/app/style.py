@@ -1,7 +1,7 @@
 """Colours, dashes and names: how an observer or a controller looks wherever it appears.
 
-Observers say it themselves; here are the other lines. The colours are the paper's. In dark mode each has a lighter relative;
-dashes tell apart what comes close in colour.
+Observers and controllers say it themselves; here are the other lines. The colours are the paper's. In dark mode each has a
+lighter relative; dashes tell apart what comes close in colour.
 """
 
 from __future__ import annotations
@@ -31,18 +31,9 @@ LOOKS: Mapping[str, Look] = MappingProxyType(
         "tried": Look("Tried", "#606060", "#C8C8C8"),
         "parts": Look("Parts", "#003DE6", "#7AA2FF", (4, 3)),
         "found": Look("Peaks", "#A1260D", "#FFB3A1"),
-        "none": Look("No control", "#606060", "#C8C8C8", (6, 3)),
-        "integrator": Look("Integrator", "#003DE6", "#7AA2FF"),
-        "lqg-kf-lgs": Look("LQG LGS KF", "#FF6600", "#FF8533"),
-        "lqg-kf-multi": Look("LQG multi-peak", "#00707F", "#4DD0E1", (14, 3)),
-        "lqg-multirate": Look("LQG multi-rate", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
-        "lqg-multirate-optimal": Look("LQG optimal", "#7A1FA2", "#C9A0FF", (3, 2)),
-        "lqg-multirate-multi": Look("LQG opt. peaks", "#B40000", "#FF7A70", (8, 3)),
-        "integrator+gpr-offline": Look("Int. + offline", "#0A960A", "#4FD64F", (12, 2, 2, 2, 2, 2)),
-        "integrator+gpr-online": Look("Int. + online", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
     }
 )
-"""Lines that are no observers'."""
+"""Lines that are neither observers' nor controllers'."""
 
 HEARD = ".MuiFormLabel-root { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); }"
 """Style of a switch whose name is heard but not seen."""
@@ -69,13 +60,14 @@ def look(name: str) -> Look:
     if name in LOOKS:
         return LOOKS[name]
     entry = OBSERVERS.get(name) or CONTROLLERS.get(name)
-    own = getattr(entry, "look", PLAIN)
-    return own if own.label else replace(own, label=entry.label if entry else name)
+    if entry is None:
+        return replace(PLAIN, label=name)
+    return entry.look if entry.look.label else replace(entry.look, label=entry.label)
 
 
 def labels() -> dict[str, str]:
     """Every line's name in legends."""
-    return {name: look(name).label for name in (*LOOKS, *OBSERVERS)}
+    return {name: look(name).label for name in (*LOOKS, *OBSERVERS, *CONTROLLERS)}
 
 
 def observers_of(target: str, hidden: bool = False) -> list[str]:

@@ -13,7 +13,7 @@ pseudo-open-loop terms the integrator works on z - f, and u[k] = u_int[k] - vib_
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,12 +22,13 @@ import numpy as np
 from wfsobs.control.integrator import limited_integrator
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Plant
-from wfsobs.observers.base import NOTHING
+from wfsobs.observers.base import NOTHING, PLAIN, Look
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridged
 from wfsobs.prior import PARTS, Bands, Part, Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError
+from wfsobs.settings import Section
 from wfsobs.typing import Array
 
 Settings = SimpleNamespace
@@ -47,32 +48,45 @@ def _nothing(_settings: Settings) -> tuple[Part, ...]:
 
 @dataclass(frozen=True)
 class Controller:
-    """An entry of the registry: a linear law, or a linear law beside a prediction of the vibration, or nothing.
+    """An entry of the registry: a linear law, or a linear law beside a prediction of the vibration, or nothing; and all else that
+    wfsobs knows of a controller.
 
     id, label : for tables and files, and for people
     law       : of one mode, made before there is a record; of one with a prediction, that of the rest
     predict   : of the vibration
+    help      : a line on what it is
     prior     : what it has to be told beside measurements, see `wfsobs.prior`; a prediction takes Bands
-    settings  : the groups of a scenario's settings that are its own
+    settings  : the groups of settings that are its own, brought along or named as those that every scenario has
     asks      : settings -> what it has to be told besides for these
     ngs       : whether it uses NGS frames
     weight    : its computing time relative to a linear law's
+    seconds   : (settings, n_steps, n_modes) -> about how long it takes at most [s]; None for one as quick as a linear law
+    look      : how it is drawn
     Raises ValueError where it predicts and is told no bands.
     """
 
     id: str
     label: str
     law: MakeLaw | None = None
+    _: KW_ONLY
     predict: Predict | None = None
+    help: str = ""
     prior: tuple[Part, ...] = ()
-    settings: tuple[str, ...] = ()
+    settings: tuple[Section | str, ...] = ()
     asks: Callable[[Any], tuple[Part, ...]] = _nothing
     ngs: bool = False
     weight: float = 1.0
+    seconds: Callable[[Any, int, int], float] | None = None
+    look: Look = PLAIN
 
     def __post_init__(self) -> None:
         if self.predict is not None and Bands not in self.prior:
             raise ValueError(f"controller {self.id!r}: one that predicts takes Bands in its prior, where the vibration is")
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of its groups of settings in a scenario."""
+        return tuple(own.name if isinstance(own, Section) else own for own in self.settings)
 
     def parts(self, settings: Settings) -> tuple[Part, ...]:
         """What it has to be told beside measurements for these settings."""
@@ -105,6 +119,8 @@ class Controller:
         if self.predict is not None:
             assert prior.bands is not None
             ahead = self.predict(measured, prior, plant, settings, watch)
+            if np.shape(ahead) != z.shape:
+                raise ValueError(f"its prediction takes the shape {z.shape}, (n_steps, n_modes), not {np.shape(ahead)}")
             known = ~np.isnan(ahead)
             forward = -np.where(known, ahead, 0.0)
             z = z - np.where(known, online_reference(prior.bands, z, measured.dt), 0.0)

@@ -11,6 +11,7 @@ from wfsobs.control.law import Law
 from wfsobs.control.lqg import lqg_kf_lgs, lqg_kf_multi, lqg_multirate, lqg_multirate_multi, lqg_multirate_optimal
 from wfsobs.control.mirror import Plant
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
+from wfsobs.observers.base import Look
 from wfsobs.prior import Bands, LgsError, Lines, Model, Part, Prior, Spectra, Training
 from wfsobs.registry import Registry
 
@@ -33,52 +34,100 @@ def _gain_and_scale(settings: Any) -> tuple[Part, ...]:
     return (*_gain(settings), *scale)
 
 
+def _online_seconds(settings: Any, n_steps: int, n_modes: int) -> float:
+    """One sample at a time takes a step of 0.1 ms + 0.7 ns m^2."""
+    return n_steps * n_modes * (1e-4 + 0.7e-9 * settings.gpr_online.training_size**2)
+
+
 CONTROLLERS = Registry(
     Controller,
     registry.CONTROLLERS,
     (
-        Controller("none", "No control", weight=0.1),
-        Controller("integrator", "Integrator", integrator, settings=("control",), asks=_gain),
-        Controller("lqg-kf-lgs", "LQG, LGS KF", lqg_kf_lgs, prior=(Model,)),
-        Controller("lqg-kf-multi", "LQG, multi-peak KF", lqg_kf_multi, prior=(Lines,), settings=("multipeak",)),
-        Controller("lqg-multirate", "LQG, multi-rate KF", lqg_multirate, prior=(Model,), settings=("multirate",), ngs=True),
+        Controller(
+            "none", "No control", help="no command at all", weight=0.1, look=Look("No control", "#606060", "#C8C8C8", (6, 3))
+        ),
+        Controller(
+            "integrator",
+            "Integrator",
+            integrator,
+            help="u[k] = leak u[k-1] - g y[k]",
+            settings=("control",),
+            asks=_gain,
+            look=Look("Integrator", "#003DE6", "#7AA2FF"),
+        ),
+        Controller(
+            "lqg-kf-lgs",
+            "LQG, LGS KF",
+            lqg_kf_lgs,
+            help="minus what the LGS Kalman filter predicts",
+            prior=(Model,),
+            look=Look("LQG LGS KF", "#FF6600", "#FF8533"),
+        ),
+        Controller(
+            "lqg-kf-multi",
+            "LQG, multi-peak KF",
+            lqg_kf_multi,
+            help="minus what the Kalman filter of every peak predicts",
+            prior=(Lines,),
+            settings=("multipeak",),
+            look=Look("LQG multi-peak", "#00707F", "#4DD0E1", (14, 3)),
+        ),
+        Controller(
+            "lqg-multirate",
+            "LQG, multi-rate KF",
+            lqg_multirate,
+            help="minus what the paper's multi-rate filter predicts",
+            prior=(Model,),
+            settings=("multirate",),
+            ngs=True,
+            look=Look("LQG multi-rate", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
+        ),
         Controller(
             "lqg-multirate-optimal",
             "LQG, optimal multi-rate KF",
             lqg_multirate_optimal,
+            help="minus what the optimal multi-rate filter predicts",
             prior=(Model, LgsError),
             settings=("multirate",),
             ngs=True,
+            look=Look("LQG optimal", "#7A1FA2", "#C9A0FF", (3, 2)),
         ),
         Controller(
             "lqg-multirate-multi",
             "LQG, multi-rate multi-peak KF",
             lqg_multirate_multi,
+            help="minus what the optimal multi-rate filter of every peak predicts",
             prior=(Model, LgsError, Lines),
             settings=("multirate", "multipeak"),
             ngs=True,
+            look=Look("LQG opt. peaks", "#B40000", "#FF7A70", (8, 3)),
         ),
         Controller(
             "integrator+gpr-offline",
             "Integrator and offline GPR",
             integrator,
-            gpr_offline_ahead,
-            (Training, Bands),
-            ("control", "gpr_offline"),
-            _gain,
+            predict=gpr_offline_ahead,
+            help="integrator and minus the vibration that the offline GPR predicts",
+            prior=(Training, Bands),
+            settings=("control", "gpr_offline"),
+            asks=_gain,
             weight=20.0,
+            look=Look("Int. + offline", "#0A960A", "#4FD64F", (12, 2, 2, 2, 2, 2)),
         ),
         Controller(
             "integrator+gpr-online",
             "Integrator and online GPR",
             integrator,
-            gpr_online_ahead,
-            (Bands,),
-            ("control", "gpr_online"),
-            _gain_and_scale,
+            predict=gpr_online_ahead,
+            help="the same with the online GPR, one sample at a time",
+            prior=(Bands,),
+            settings=("control", "gpr_online"),
+            asks=_gain_and_scale,
             weight=200.0,
+            seconds=_online_seconds,
+            look=Look("Int. + online", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
         ),
     ),
-    reserved=("bound",),
+    reserved=("truth", "loop", "bound"),
 )
 """Every controller, in the order of tables and legends."""

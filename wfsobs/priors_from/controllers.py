@@ -23,7 +23,7 @@ def plant_of(scenario: Scenario) -> Plant:
 
 def own_settings(controller: Controller, scenario: Scenario) -> Settings:
     """Copies of the groups of settings that are the controller's own."""
-    return Settings(**{name: getattr(scenario, name).copy() for name in controller.settings})
+    return Settings(**{name: getattr(scenario, name).copy() for name in controller.groups})
 
 
 def prior_for(controller: Controller, scenario: Scenario, spectra: Sequence[Spectra] = ()) -> Prior:

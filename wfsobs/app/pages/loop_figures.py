@@ -21,8 +21,8 @@ NYQUIST = 2.5
 """How far the Nyquist plot reaches from the origin."""
 
 NONE = "none"
-CURVES = tuple(name for name in CONTROLLERS if name == "integrator" or name.startswith("lqg-kf"))
-"""Controllers that have a transfer function."""
+CURVES = tuple(c.id for c in CONTROLLERS.values() if c.law and not c.predict and not c.ngs)
+"""Controllers that may have a transfer function."""
 
 NOWHERE = (np.empty(0), np.empty(0, dtype=complex), np.empty(0, dtype=complex))
 

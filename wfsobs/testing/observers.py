@@ -7,10 +7,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
-from pickle import PicklingError
 from typing import Any
 
 import numpy as np
@@ -18,30 +15,14 @@ import numpy as np
 from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.prior import Prior
 from wfsobs.priors_from.scenario import arguments
-from wfsobs.record import Measurements, hold_last
+from wfsobs.record import Measurements
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
+from wfsobs.testing.common import QUICK, SAME, CheckError, in_a_fresh_process, moved
 from wfsobs.typing import Array
 
-SAME = 1e-9
-"""Difference over the rms of an estimate that is rounding: blocks of another length add up in another order."""
-
-QUICK: dict[str, Any] = {
-    "run.duration": 1.5,
-    "run.warm_up": 0.2,
-    "adaptive.window": 0.25,
-    "gpr_offline.training_size": 60,
-    "gpr_offline.depth": 25,
-    "gpr_online.training_size": 60,
-    "gpr_online.depth": 25,
-}
-
 Estimates = dict[str, Array]
-
-
-class CheckError(AssertionError):
-    """An observer that does not keep a rule: one line naming the observer and the rule."""
 
 
 def check_observer(observer: Observer, scenario: Scenario | None = None, alone: bool = True) -> None:
@@ -72,7 +53,7 @@ def check_observer(observer: Observer, scenario: Scenario | None = None, alone: 
     if alone:
         _compare(
             observer,
-            _in_a_fresh_process(observer, again),
+            in_a_fresh_process(observer.id, _run, observer, *again),
             base,
             "in a fresh process, with measurements and prior alone, it gives another result: it knows more than it is told",
         )
@@ -105,9 +86,9 @@ def _check_causal(observer: Observer, given: tuple[Measurements, Prior, Any], ba
         rng = np.random.default_rng(k)
         later = replace(
             measured,
-            y_lgs=_moved(measured.y_lgs, k + 1, rng),
-            u=_moved(measured.u, k + 1, rng),
-            y_ngs=None if measured.y_ngs is None else _moved(measured.y_ngs, k + 1, rng),
+            y_lgs=moved(measured.y_lgs, k + 1, rng),
+            u=moved(measured.u, k + 1, rng),
+            y_ngs=None if measured.y_ngs is None else moved(measured.y_ngs, k + 1, rng),
         )
         _compare(
             observer,
@@ -127,12 +108,6 @@ def _check_gaps(observer: Observer, given: tuple[Measurements, Prior, Any]) -> N
             raise CheckError(f"{observer.id}: {target} does not come back after missing samples")
 
 
-def _moved(x: Array, start: int, rng: np.random.Generator) -> Array:
-    out = x.copy()
-    out[start:] += 3.0 * np.std(hold_last(x)) * rng.standard_normal(out[start:].shape)
-    return out
-
-
 def _compare(
     observer: Observer, got: Estimates, base: Estimates, what: str, stop: int | None = None, exact: bool = False
 ) -> None:
@@ -141,15 +116,6 @@ def _compare(
         bound = 0.0 if exact else SAME * float(np.nanstd(base[target]))
         if not np.allclose(a, b, rtol=0.0, atol=bound, equal_nan=True):
             raise CheckError(f"{observer.id}: {what} ({target})")
-
-
-def _in_a_fresh_process(observer: Observer, given: tuple[Measurements, Prior, Any]) -> Estimates:
-    """The estimates of a process that is started for it and receives the arguments, and the function by its name."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        try:
-            return pool.submit(_run, observer, *given).result()
-        except (PicklingError, AttributeError, TypeError) as error:
-            raise CheckError(f"{observer.id}: cannot run in a fresh process: {error}") from error
 
 
 def _run(observer: Observer, *given: Any) -> Estimates:

@@ -1,0 +1,162 @@
+"""A check of controllers written elsewhere.
+
+>>> from wfsobs.control.controllers import CONTROLLERS
+>>> from wfsobs.testing import check_controller
+>>> check_controller(CONTROLLERS["lqg-kf-lgs"], alone=False)
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from wfsobs.control.base import Controller, Settings
+from wfsobs.control.law import Law
+from wfsobs.control.mirror import Plant
+from wfsobs.prior import Prior
+from wfsobs.priors_from.controllers import arguments, own_settings, plant_of, prior_for
+from wfsobs.record import Measurements, Record
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.loop import simulate
+from wfsobs.testing.common import QUICK, SAME, CheckError, in_a_fresh_process, moved
+from wfsobs.testing.reach import SEED, given_away, reached
+from wfsobs.typing import Array
+
+LOST = 7
+"""Measurements in a row that are missing."""
+
+
+class Given(NamedTuple):
+    """All that a controller receives."""
+
+    measured: Measurements
+    prior: Prior
+    plant: Plant
+    settings: Settings
+
+
+def check_controller(controller: Controller, scenario: Scenario | None = None, alone: bool = True) -> None:
+    """Run a controller on a short simulated record and check what holds for all of them.
+
+    It reaches neither truth nor scenario nor seed. Its laws are stable. Its commands are numbers of the shape of the measurements
+    and the same twice. Nothing that comes after a step changes its command of the step. It leaves its arguments as they are and
+    gets over missing samples. In a fresh process, which has never seen the truth, it commands the same.
+
+    Parameters
+    ----------
+    controller
+        Entry that is checked; it need not be registered.
+    scenario
+        What is simulated, 1.5 s of the preset paper unless given; its seed is replaced by one that can be recognised.
+    alone
+        Whether to start the fresh process; a script that does needs the guard `if __name__ == "__main__"`.
+
+    Raises
+    ------
+    CheckError
+        With the rule that it does not keep.
+    ValueError
+        Where the controller has no law for the scenario.
+    """
+    s = (scenario or PRESETS["paper"]().replace(QUICK)).replace({"run.seed": SEED})
+    record = simulate(s)
+    given = _given(controller, record, s)
+    laws = _check_laws(controller, given)
+    if found := given_away(record, controller, laws, *given):
+        raise CheckError(f"{controller.id}: knows more than it is told: it reaches {', '.join(sorted(found))}")
+    base = _commands(controller, given)
+    _check_shape(controller, base, given.measured)
+    again = _given(controller, record, s)
+    twice = "run twice on the same measurements it gives two results: it keeps something between runs, or draws random numbers"
+    _compare(controller, _commands(controller, again), base, twice, exact=True)
+    _check_untouched(controller, given, _given(controller, record, s))
+    _check_causal(controller, given, base)
+    _check_gaps(controller, given)
+    if alone:
+        there = in_a_fresh_process(controller.id, _commands, controller, again)
+        what = "in a fresh process, with measurements and prior alone, it commands something else: it knows more than it is told"
+        _compare(controller, there, base, what)
+
+
+def _given(controller: Controller, record: Record, scenario: Scenario) -> Given:
+    settings = own_settings(controller, scenario)
+    measured, prior = arguments(controller, record, settings, prior_for(controller, scenario))
+    return Given(measured, prior, plant_of(scenario), settings)
+
+
+def _laws(controller: Controller, given: Given) -> tuple[Law, ...]:
+    return controller.laws(given.prior, given.plant, given.settings, given.measured.n_modes)
+
+
+def _commands(controller: Controller, given: Given) -> Array:
+    laws = _laws(controller, given)
+    try:
+        return controller.commands(laws, *given)[0]
+    except ValueError as error:
+        raise CheckError(f"{controller.id}: cannot run: {error}") from error
+
+
+def _check_laws(controller: Controller, given: Given) -> tuple[Law, ...]:
+    laws = _laws(controller, given)
+    for law in laws:
+        if not isinstance(law, Law):
+            raise CheckError(f"{controller.id}: law takes a wfsobs.control.law.Law, not a {type(law).__name__}")
+        if not law.stable:
+            raise CheckError(f"{controller.id}: a pole of its closed loop is not within the unit circle")
+    return laws
+
+
+def _check_shape(controller: Controller, u: Any, measured: Measurements) -> None:
+    if not isinstance(u, np.ndarray) or u.dtype != float or u.shape != measured.y_lgs.shape:
+        raise CheckError(f"{controller.id}: its commands take numbers of shape {measured.y_lgs.shape}, (n_steps, n_modes)")
+    if not np.isfinite(u).all():
+        raise CheckError(f"{controller.id}: a command is NaN or infinite")
+
+
+def _check_untouched(controller: Controller, given: Given, fresh: Given) -> None:
+    for name, now, was in zip(Given._fields, given, fresh, strict=True):
+        same = not isinstance(was, Settings) or _settings(now) == _settings(was)
+        if not same or not all(np.array_equal(a, b, equal_nan=True) for a, b in zip(_arrays(now), _arrays(was), strict=True)):
+            raise CheckError(f"{controller.id}: changes its arguments ({name})")
+
+
+def _arrays(root: Any) -> list[Array]:
+    return [x for x in reached(root) if isinstance(x, np.ndarray) and x.dtype == float]
+
+
+def _settings(own: Any) -> dict[str, Any]:
+    return {name: group.to_dict() for name, group in vars(own).items()}
+
+
+def _check_causal(controller: Controller, given: Given, base: Array) -> None:
+    """Check that u[k] uses y[0..k] and u[0..k-1] alone."""
+    measured, n = given.measured, given.measured.n_steps
+    for k in (n // 2, n // 2 + 3, n - 5):
+        rng = np.random.default_rng(k)
+        later = replace(
+            measured,
+            y_lgs=moved(measured.y_lgs, k + 1, rng),
+            u=moved(measured.u, k, rng),
+            y_ngs=None if measured.y_ngs is None else moved(measured.y_ngs, k + 1, rng),
+        )
+        what = f"looks ahead: measurements after step {k} change its command of that step or an earlier one"
+        _compare(controller, _commands(controller, given._replace(measured=later)), base, what, stop=k + 1)
+
+
+def _check_gaps(controller: Controller, given: Given) -> None:
+    y, start = given.measured.y_lgs.copy(), given.measured.n_steps // 2
+    y[start : start + LOST] = np.nan
+    u = _commands(controller, given._replace(measured=replace(given.measured, y_lgs=y)))
+    if not np.isfinite(u).all():
+        raise CheckError(f"{controller.id}: a command is NaN or infinite after missing samples")
+    if controller.law is not None and not np.ptp(u[start + LOST :], axis=0).any():
+        raise CheckError(f"{controller.id}: does not come back after missing samples")
+
+
+def _compare(controller: Controller, got: Array, base: Array, what: str, stop: int | None = None, exact: bool = False) -> None:
+    bound = 0.0 if exact else SAME * float(np.std(base))
+    if not np.allclose(got[:stop], base[:stop], rtol=0.0, atol=bound):
+        raise CheckError(f"{controller.id}: {what}")
