@@ -9,7 +9,8 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d, VSpan
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.plots import MODEL, PEAKS, PinnedLines, add_line, marked_peaks, new_figure, restyle, send
+from wfsobs.app.views.plots import MODEL, PEAKS, PinnedLines, add_line, marked_peaks, new_figure, send
+from wfsobs.app.views.target_figures import TargetFigures
 from wfsobs.app.work import TRUTH, Array, RunResults, Spectrum
 from wfsobs.evaluation.scores import cumulative_rms
 from wfsobs.observers.base import TARGETS, VIBRATION
@@ -18,46 +19,27 @@ DECADES = 8
 """The most that an axis of densities spans; one of amplitudes spans half of it."""
 
 
-class Spectra:
+class Spectra(TargetFigures):
     """The figures, redrawn when the results or the switches change."""
 
     def __init__(self, run: BackgroundTask, display: Display):
-        self.run, self.display = run, display
-        self.visible, self._behind = True, False
         self.x_range = Range1d(start=0.5, end=500.0)
         self.spectra = {target: _Spectrum(target, self.x_range) for target in TARGETS}
-        run.param.watch(self._redraw, "result")
-        display.param.watch(self._redraw, ["mode", "show", "unit", "spectrum", "pinned"])
-        display.param.watch(self._restyle, ["dark", "hidden"])
+        super().__init__(run, display, self.spectra, ["mode", "show", "unit", "spectrum", "pinned"])
 
-    def pane(self, target: str) -> pn.pane.Bokeh:
-        """Return the figure of one target."""
-        return pn.pane.Bokeh(self.spectra[target].figure, sizing_mode="stretch_width", margin=0)
-
-    def show(self, visible: bool) -> None:
-        """Draw what has come meanwhile, and go on while visible."""
-        self.visible = visible
-        if visible and self._behind:
-            self._redraw()
-
-    def _redraw(self, *_: object) -> None:
-        shown = self.run.result
-        self._behind = not self.visible
-        if shown is None or self._behind:
-            return
-        with pn.io.hold():
-            for spectrum in self.spectra.values():
-                spectrum.draw(shown, self.display)
-            frequencies = next((s.frequency for s in shown.spectra.values()), None)
-            if frequencies is not None:
-                limits = {"start": float(frequencies[1]), "end": float(frequencies[-1])}
-                if self.x_range.reset_start != limits["start"] or self.x_range.reset_end != limits["end"]:
-                    self.x_range.update(**limits, reset_start=limits["start"], reset_end=limits["end"])
+    def _draw(self, shown: RunResults) -> None:
+        for spectrum in self.spectra.values():
+            spectrum.draw(shown, self.display)
+        frequencies = next((s.frequency for s in shown.spectra.values()), None)
+        if frequencies is not None:
+            limits = {"start": float(frequencies[1]), "end": float(frequencies[-1])}
+            if self.x_range.reset_start != limits["start"] or self.x_range.reset_end != limits["end"]:
+                self.x_range.update(**limits, reset_start=limits["start"], reset_end=limits["end"])
 
     def _restyle(self, *_: object) -> None:
+        super()._restyle()
         with pn.io.hold():
-            for target, spectrum in self.spectra.items():
-                restyle(spectrum.lines, self.display.dark, self.display.hidden.get(target, []))
+            for spectrum in self.spectra.values():
                 spectrum.draw_pinned(self.display)
 
 

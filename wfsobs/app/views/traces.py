@@ -14,7 +14,8 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.event_marks import EventMarks, room
-from wfsobs.app.views.plots import PinnedLines, add_line, new_figure, restyle, send
+from wfsobs.app.views.plots import PinnedLines, add_line, new_figure, send
+from wfsobs.app.views.target_figures import TargetFigures
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.recovery import trailing_rms
 from wfsobs.observers.base import TARGETS
@@ -34,47 +35,28 @@ SETTLE_MS = 60
 """A zoom is answered when the window has not moved for this long."""
 
 
-class Traces:
+class Traces(TargetFigures):
     """The figures, redrawn when the results, the switches or the window change."""
 
     def __init__(self, run: BackgroundTask, display: Display):
-        self.run, self.display = run, display
         self.x_range = Range1d(start=0.0, end=10.0)
         self.length = 0.0
-        self._waiting = self._behind = False
-        self.visible = True
+        self._waiting = False
         crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
         self.traces = {target: _Trace(target, self.x_range, crosshair) for target in TARGETS}
-        run.param.watch(self._redraw, "result")
-        display.param.watch(self._redraw, ["mode", "show", "unit", "pinned"])
-        display.param.watch(self._restyle, ["dark", "hidden"])
+        super().__init__(run, display, self.traces, ["mode", "show", "unit", "pinned"])
         for end in ("start", "end"):
             self.x_range.on_change(end, self._moved)
 
-    def pane(self, target: str) -> pn.pane.Bokeh:
-        """Return the figure of one target."""
-        return pn.pane.Bokeh(self.traces[target].figure, sizing_mode="stretch_width", margin=0)
-
-    def show(self, visible: bool) -> None:
-        """Draw what has come meanwhile, and go on while visible."""
-        self.visible = visible
-        if visible and self._behind:
-            self._redraw()
-
-    def _redraw(self, *_: object) -> None:
-        shown = self.run.result
-        self._behind = not self.visible
-        if shown is None or self._behind:
-            return
+    def _draw(self, shown: RunResults) -> None:
         record = shown.result.record
         length = record.n_steps * record.dt
-        with pn.io.hold():
-            if length != self.length:
-                self.length = length
-                self.x_range.update(start=0.0, end=length, reset_start=0.0, reset_end=length)
-            first, last = self._window(record.n_steps, record.dt)
-            for trace in self.traces.values():
-                trace.draw(shown, self.display, first, last)
+        if length != self.length:
+            self.length = length
+            self.x_range.update(start=0.0, end=length, reset_start=0.0, reset_end=length)
+        first, last = self._window(record.n_steps, record.dt)
+        for trace in self.traces.values():
+            trace.draw(shown, self.display, first, last)
 
     def _window(self, n_steps: int, dt: float) -> tuple[int, int]:
         """Find the samples to send: those in view and a margin."""
@@ -100,9 +82,7 @@ class Traces:
         self.x_range.update(start=start, end=start + length)
 
     def _restyle(self, *_: object) -> None:
-        with pn.io.hold():
-            for target, trace in self.traces.items():
-                restyle(trace.lines, self.display.dark, self.display.hidden.get(target, []))
+        super()._restyle()
         self._redraw()
 
 
