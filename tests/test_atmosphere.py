@@ -15,7 +15,7 @@ from wfsobs.sensors.zernike import noll_covariance
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.disturbance import make_disturbance
 from wfsobs.simulation.guide_stars import lgs_error_process, lgs_error_variance, low_frequency_process
-from wfsobs.simulation.sensing import measure
+from wfsobs.simulation.sensing import measure_open_loop
 from wfsobs.simulation.turbulence import turbulence_process, turbulence_rms
 
 FLOW: dict[str, Any] = {"turbulence.source": "frozen-flow", "sensors.kind": "zernike"}
@@ -145,7 +145,7 @@ def test_error_of_the_mean_over_lgs_on_the_axis_is_the_cone_effect(height: float
 def seen(changes: dict[str, Any], seed: int = 1, n: int = 2000) -> tuple[Any, Any]:
     s = scenario(QUIET_SENSORS | changes)
     disturbance = make_disturbance(s, n, np.random.default_rng(seed))
-    return disturbance, measure(s, disturbance, np.random.default_rng(seed + 1))
+    return disturbance, measure_open_loop(s, disturbance, np.random.default_rng(seed + 1))
 
 
 def test_the_lgs_see_their_own_beam_and_the_ngs_the_truth() -> None:

@@ -108,7 +108,7 @@ def test_observers_that_lack_something_are_left_out_with_a_line(tmp_path):
 def test_the_record_overrides_the_scenario(tmp_path):
     """A record at 500 Hz with a frame every 4 steps is scored as such, whatever the preset says."""
     scenario = paper().replace(SHORT | {"sensors.lgs_rate": 500.0, "sensors.exposure_ratio": 4})
-    configfile.save(scenario, tmp_path / "s.toml")
+    configfile.save_scenario(scenario, tmp_path / "s.toml")
     path = str(tmp_path / "r.npz")
     first = call("run", "--config", str(tmp_path / "s.toml"), "--json", "--save", path)
     second = call("observe", path, *QUICK, "--json")

@@ -15,8 +15,8 @@ from wfsobs.settings.group import SettingError
 def test_round_trip_is_exact(name, tmp_path):
     scenario = PRESETS[name]()
     assert configfile.from_toml(configfile.to_toml(scenario)) == scenario
-    configfile.save(scenario, tmp_path / "s.toml")
-    assert configfile.load(tmp_path / "s.toml") == scenario
+    configfile.save_scenario(scenario, tmp_path / "s.toml")
+    assert configfile.load_scenario(tmp_path / "s.toml") == scenario
     assert [p.name for p in tmp_path.iterdir()] == ["s.toml"]
 
 
@@ -113,10 +113,10 @@ def test_a_value_nested_deep_is_no_setting():
 
 def test_unreadable_files_give_one_line(tmp_path):
     with pytest.raises(SettingError, match="cannot be read: No such file"):
-        configfile.load(tmp_path / "none.toml")
+        configfile.load_scenario(tmp_path / "none.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SettingError, match="not UTF-8"):
-        configfile.load(tmp_path / "binary.toml")
+        configfile.load_scenario(tmp_path / "binary.toml")
 
 
 @pytest.mark.parametrize(

@@ -14,16 +14,16 @@ from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.cost import run_bytes, run_seconds
-from wfsobs.evaluation.bound import bounds
+from wfsobs.evaluation.bound import record_bounds
 from wfsobs.identification import identify
 from wfsobs.observers import OBSERVERS
 from wfsobs.record import Record
 from wfsobs.scenario.groups.events import Event
-from wfsobs.scenario.timeline import air_time, shift, strength, turns
+from wfsobs.scenario.timeline import phase_turns, shift, strength, turbulence_time
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
 from wfsobs.signal.spectrum import bin_frequencies, random_phase_signal
 from wfsobs.simulation.disturbance import make_disturbance
-from wfsobs.simulation.events import moved, moved_process, read
+from wfsobs.simulation.events import interpolate_steps, shift_peak, shift_process
 from wfsobs.simulation.guide_stars import lgs_weights
 from wfsobs.simulation.loop import integrator
 from wfsobs.telemetry.records import load_record, save_record
@@ -52,8 +52,8 @@ def test_changes_add_up_and_multiply() -> None:
     np.testing.assert_allclose(strength(events, t), (1 - 0.5 * one) * (1 + 2 * two) * (1 + jump), atol=1e-12)
     blown = np.cumsum((1 + one) * (1 - 0.75 * two) * (1 + 2 * jump)) * 1e-4
     phase = np.cumsum(df) * 1e-4
-    np.testing.assert_allclose(turns(events, t), phase, atol=5e-4)  # of a sum of 8e4 terms, one step of the jump
-    np.testing.assert_allclose(air_time(events, t), blown, atol=5e-4)
+    np.testing.assert_allclose(phase_turns(events, t), phase, atol=5e-4)  # of a sum of 8e4 terms, one step of the jump
+    np.testing.assert_allclose(turbulence_time(events, t), blown, atol=5e-4)
 
 
 # ---------------------------------------------------------------------- a peak moves
@@ -64,7 +64,7 @@ def test_a_jump_shifts_the_spectrum_bin_by_bin() -> None:
     n, dt, bins = 4000, 1e-3, 12
     power = np.where(np.abs(bin_frequencies(n, dt) - 40.0) < 30.0, np.random.default_rng(1).random(n // 2 + 1), 0.0)
     x = random_phase_signal(power, n, np.random.default_rng(2))
-    y = moved(x, [Event(start=0.0, frequency_shift=bins / (n * dt), strength=0.5)], dt)
+    y = shift_peak(x, [Event(start=0.0, frequency_shift=bins / (n * dt), strength=0.5)], dt)
     after = 2.0 * np.abs(np.fft.rfft(y) / n) ** 2
     np.testing.assert_allclose(after[bins:], 0.25 * power[:-bins], atol=1e-12)
 
@@ -93,8 +93,8 @@ def test_ends_of_a_process_leave_no_trace(frequency: float, damping: float, with
     process, dt, around = Ar2(2 * np.pi * frequency, damping, 1.0, 1e-3), 1e-3, 20_000
     x = process.sample(5000 + 2 * around, np.random.default_rng(4))
     jump = [Event(start=0.0, frequency_shift=3.0)]
-    whole = moved(x, jump, dt, around)[around:-around]
-    error = moved_process(process, x[around:-around], jump) - whole
+    whole = shift_peak(x, jump, dt, around)[around:-around]
+    error = shift_process(process, x[around:-around], jump) - whole
     assert np.sqrt(np.mean(error**2)) < within
     assert np.sqrt(np.mean(error[: round(1 / frequency / dt)] ** 2)) < within
     assert np.std(whole - x[around:-around]) > 0.5, "it did move"
@@ -151,7 +151,7 @@ def test_reading_between_steps_errs_by_less_than_a_hundredth_of_the_noise() -> N
     at = np.random.default_rng(7).uniform(20, n - 20, 300)
     bins = np.fft.rfft(x)[1 : n // 2] * (2.0 / n)
     exact = (np.exp(2j * np.pi * np.outer(at, np.arange(1, n // 2)) / n) @ bins).real
-    assert 1e-6 < np.std(read(x, at) - exact) < 0.14e-3
+    assert 1e-6 < np.std(interpolate_steps(x, at) - exact) < 0.14e-3
 
 
 def test_a_wind_that_falls_or_stays_leaves_what_was_before() -> None:
@@ -314,7 +314,7 @@ def test_the_loop_runs_with_the_laws_of_before(broken: tuple[Scenario, Record]) 
 
 def test_there_is_no_bound_where_spectra_change(broken: tuple[Scenario, Record]) -> None:
     s, record = broken
-    assert bounds(s, record) == [] and bounds(s.replace({"events": []}), record)
+    assert record_bounds(s, record) == [] and record_bounds(s.replace({"events": []}), record)
 
 
 def test_records_with_events_are_files_like_others(broken: tuple[Scenario, Record], tmp_path: Path) -> None:

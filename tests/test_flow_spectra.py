@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.signal import csd, welch
 
-from wfsobs.evaluation.bound import bound, bounds
+from wfsobs.evaluation.bound import bound_rms, record_bounds
 from wfsobs.pipeline import estimated
 from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import circle_mean
 from wfsobs.simulation.flow_spectra import flow_spectra
 from wfsobs.simulation.guide_stars import lgs_error_variance
 from wfsobs.simulation.loop import simulate
-from wfsobs.simulation.true_spectra import is_known, n_frequencies, true_spectra
+from wfsobs.simulation.true_spectra import has_known_spectra, n_frequencies, true_spectra
 from wfsobs.simulation.turbulence import turbulence_rms
 
 FLOW = Scenario().replace(
@@ -103,7 +103,7 @@ def test_on_frozen_flow_a_third_order_model_is_within_a_tenth_of_the_bound() -> 
         for order, found in errors.items():
             values = estimated("kf-multi", record, s.replace({"multipeak.turbulence_order": order}))
             found.append(np.mean((values["turbulence"] - record.turbulence)[500:] ** 2))
-    least = np.sqrt(np.mean([bound(s, mode)["turbulence"] ** 2 for mode in (0, 1)]))
+    least = np.sqrt(np.mean([bound_rms(s, mode)["turbulence"] ** 2 for mode in (0, 1)]))
     # 12 signals of 3.5 s, errors with a correlation time of about 50 ms: 4 % at one sigma.
     assert 0.92 * least < np.sqrt(np.mean(errors[3])) < 1.1 * least
     assert np.mean(errors[2]) > np.mean(errors[3])
@@ -111,9 +111,9 @@ def test_on_frozen_flow_a_third_order_model_is_within_a_tenth_of_the_bound() -> 
 
 def test_too_slow_a_flow_has_no_bound_rather_than_a_wrong_one() -> None:
     slow = FLOW.replace({"turbulence.wind_speed": 0.2})
-    assert not is_known(slow) and bounds(slow, simulate(slow)) == []
-    assert is_known(FLOW) and n_frequencies(FLOW.replace({"turbulence.wind_speed": 1.0})) == 2**20
+    assert not has_known_spectra(slow) and record_bounds(slow, simulate(slow)) == []
+    assert has_known_spectra(FLOW) and n_frequencies(FLOW.replace({"turbulence.wind_speed": 1.0})) == 2**20
     # In slower air all is easier: at 2 m/s as little of the cone effect is left as at 1.
-    assert bound(FLOW.replace({"turbulence.wind_speed": 1.0}), 0)["total"] == pytest.approx(
-        bound(FLOW.replace({"turbulence.wind_speed": 2.0}), 0)["total"], rel=0.05
+    assert bound_rms(FLOW.replace({"turbulence.wind_speed": 1.0}), 0)["total"] == pytest.approx(
+        bound_rms(FLOW.replace({"turbulence.wind_speed": 2.0}), 0)["total"], rel=0.05
     )

@@ -13,13 +13,13 @@ from click.testing import CliRunner
 from scipy.stats import binom, gamma, kstest
 
 from wfsobs.cli import main
-from wfsobs.identification import Identified, identify, misfit
-from wfsobs.identification.continuum import of_continuum
+from wfsobs.identification import Identification, identify, misfit
+from wfsobs.identification.continuum import is_continuum
 from wfsobs.identification.misfit import margin
 from wfsobs.identification.one_mode import OneMode
-from wfsobs.identification.process import Number, Process, mean, merged
-from wfsobs.identification.process import known as known_number
-from wfsobs.identification.report import annotated, plain, rows, toml, verdict, written
+from wfsobs.identification.process import IdentifiedProcess, Number, mean, merge_peaks
+from wfsobs.identification.process import with_reliable_std as known_number
+from wfsobs.identification.report import add_comments, format_number, identification_dict, identification_toml, mode_rows, verdict
 from wfsobs.identification.whiteness import autocorrelation_test, cumulated_test, innovations
 from wfsobs.pipeline import observe
 from wfsobs.progress import Cancelled, Watch
@@ -61,7 +61,7 @@ def record() -> Record:
 
 
 @pytest.fixture(scope="module")
-def found(record: Record) -> Identified:
+def found(record: Record) -> Identification:
     return identify(record)
 
 
@@ -170,7 +170,7 @@ def test_innovations_have_the_variance_that_the_spectrum_says() -> None:
     assert np.var(innovations(z, MODEL)) == pytest.approx(least, rel=4.0 * sqrt(2.0 / 40_000))
 
 
-def test_known_peaks_are_found_and_no_others(found: Identified) -> None:
+def test_known_peaks_are_found_and_no_others(found: Identification) -> None:
     assert found.white
     truth = known()
     for i, mode in enumerate(found.modes):
@@ -184,7 +184,7 @@ def test_known_peaks_are_found_and_no_others(found: Identified) -> None:
         assert mode.turbulence and abs(mode.turbulence.frequency.value - 7.0686 / (2 * pi)) < 4.0 * mode.turbulence.frequency.std
 
 
-def test_closed_loop_is_its_open_loop_twin(record: Record, found: Identified) -> None:
+def test_closed_loop_is_its_open_loop_twin(record: Record, found: Identification) -> None:
     assert record.open_loop_y is not None
     opened = identify(replace(record, y_lgs=record.open_loop_y, u=np.zeros_like(record.u)))
     for a, b in zip(found.modes, opened.modes, strict=True):
@@ -206,7 +206,7 @@ def test_a_resonance_as_uncertain_as_this_is_taken_off() -> None:
     assert left.rms == pytest.approx(true.rms, rel=0.15)
 
 
-def test_missing_frames_change_little(record: Record, found: Identified) -> None:
+def test_missing_frames_change_little(record: Record, found: Identification) -> None:
     y = record.y_lgs.copy()
     y[5000:5020], y[np.random.default_rng(6).integers(0, len(y), 50)] = np.nan, np.nan
     gappy = identify(replace(record, y_lgs=y))
@@ -297,7 +297,7 @@ def test_lobes_of_frozen_flow_are_no_peaks(name: str) -> None:
     assert found <= binom.isf(0.01, 4, 0.05)
 
 
-def test_filter_built_from_the_result_is_as_good_as_from_the_truth(found: Identified) -> None:
+def test_filter_built_from_the_result_is_as_good_as_from_the_truth(found: Identification) -> None:
     truth = known()
     model = found.scenario(truth)
     test = simulate(known(20.0, **{"run.seed": 99}))
@@ -305,21 +305,21 @@ def test_filter_built_from_the_result_is_as_good_as_from_the_truth(found: Identi
     assert np.all(np.array(a) < 1.05 * np.array(b))
 
 
-def test_result_as_a_file_of_settings(record: Record, found: Identified, tmp_path: Path) -> None:
+def test_result_as_a_file_of_settings(record: Record, found: Identification, tmp_path: Path) -> None:
     save_record(tmp_path / "r.npz", record)
     out = tmp_path / "f.toml"
     done = CliRunner().invoke(main, ["identify", str(tmp_path / "r.npz"), "--out", str(out)])
     assert done.exit_code == 0, done.output
     assert "resonance" in done.stdout and "what is left is white at 1%" in done.stdout
-    saved = configfile.load(out)
+    saved = configfile.load_scenario(out)
     saved.validate()
     assert saved == found.scenario(PRESETS["paper"]())
     assert out.read_text().count("+-") >= 4 + 2 * len(found.peaks)
-    assert saved.turbulence.wind_speed == pytest.approx(15.0, abs=4 * found.shared(saved)["turbulence.wind_speed"].std)
+    assert saved.turbulence.wind_speed == pytest.approx(15.0, abs=4 * found.shared_settings(saved)["turbulence.wind_speed"].std)
 
 
-def test_rows_are_the_numbers(found: Identified) -> None:
-    said = json.loads(json.dumps(plain(found), allow_nan=False))
+def test_rows_are_the_numbers(found: Identification) -> None:
+    said = json.loads(json.dumps(identification_dict(found), allow_nan=False))
     assert [len(m["peaks"]) for m in said["modes"]] == [len(m.peaks) for m in found.modes]
     assert said["modes"][0]["noise"] == found.modes[0].noise.value
     assert said["modes"][1]["peaks"][0]["frequency_std"] == found.modes[1].peaks[0].frequency.std
@@ -336,10 +336,10 @@ def test_neighbours_that_look_like_one_are_told_apart() -> None:
 
 
 def test_peaks_that_agree_are_one() -> None:
-    def peak(f: float, xi: float = 0.01, rms: float = 0.01) -> Process:
-        return Process(Number(f, 0.01), Number(xi, 0.001 if xi else 0.0), Number(rms, 0.001))
+    def peak(f: float, xi: float = 0.01, rms: float = 0.01) -> IdentifiedProcess:
+        return IdentifiedProcess(Number(f, 0.01), Number(xi, 0.001 if xi else 0.0), Number(rms, 0.001))
 
-    both, *alone = merged([(peak(20.0), peak(30.0), peak(40.0, 0.0, 0.02)), (peak(20.03), peak(31.0), peak(40.0))])
+    both, *alone = merge_peaks([(peak(20.0), peak(30.0), peak(40.0, 0.0, 0.02)), (peak(20.03), peak(31.0), peak(40.0))])
     assert both.frequency.value == pytest.approx(20.015) and all(both.rms)
     assert [p.frequency.value for p in alone] == [30.0, 31.0, 40.0, 40.0]
 
@@ -361,7 +361,7 @@ NOISE = 0.01 * np.random.default_rng(9).standard_normal((6000, 1))
 def test_records_that_are_none_of_the_model_are_survived_and_told(z: np.ndarray, said: str) -> None:
     got = identify(Record(z, np.zeros_like(z), DT))
     assert said in verdict(got)[0]
-    json.dumps(plain(got), allow_nan=False)
+    json.dumps(identification_dict(got), allow_nan=False)
     got.scenario().validate()
 
 
@@ -388,8 +388,8 @@ def test_cancel_and_progress(record: Record) -> None:
 
 
 def test_written_and_annotated() -> None:
-    assert written(Number(0.00312, 0.00099)) == "0.00312 +- 0.00099"
-    text = annotated("[a]\nx = 1\n\n[[a.b]]\nx = 2\n\n[[a.b]]\nx = 3\n", {"a.x": "one", "a.b.1.x": "three"})
+    assert format_number(Number(0.00312, 0.00099)) == "0.00312 +- 0.00099"
+    text = add_comments("[a]\nx = 1\n\n[[a.b]]\nx = 2\n\n[[a.b]]\nx = 3\n", {"a.x": "one", "a.b.1.x": "three"})
     assert text == "[a]\nx = 1  # one\n\n[[a.b]]\nx = 2\n\n[[a.b]]\nx = 3  # three\n"
 
 
@@ -405,7 +405,7 @@ def test_written_and_annotated() -> None:
 )
 def test_a_resonance_without_a_maximum_is_of_the_continuum(damping: float, rms: float, frequency: float, smooth: bool) -> None:
     p = Ar2(2 * pi * frequency, damping, rms, DT)
-    assert of_continuum(Spectrum(0.014, DT, TURBULENCE, (p,)), p, 5.0) == smooth
+    assert is_continuum(Spectrum(0.014, DT, TURBULENCE, (p,)), p, 5.0) == smooth
 
 
 def test_turbulence_that_no_third_order_fits_is_no_vibration() -> None:
@@ -421,7 +421,7 @@ def test_turbulence_that_no_third_order_fits_is_no_vibration() -> None:
     assert p.damping.value > 0.1
     assert len(mode.prior.turbulence) == 2 and not mode.prior.lines
     assert len(got.scenario().turbulence.processes) == 2
-    assert "broad, of the continuum" in [name for name, *_ in rows(mode)]
+    assert "broad, of the continuum" in [name for name, *_ in mode_rows(mode)]
 
 
 def test_a_number_has_no_interval_where_none_is_known_to_hold() -> None:
@@ -434,9 +434,9 @@ def test_a_number_has_no_interval_where_none_is_known_to_hold() -> None:
     assert mode.turbulence and np.isnan(mode.turbulence.frequency.std) and np.isfinite(mode.noise.std)
     (line,) = [p for p in mode.peaks if p.frequency.value > 490.0]
     assert np.isnan(line.rms.std)
-    assert plain(result)["modes"][0]["turbulence"]["frequency_std"] is None
+    assert identification_dict(result)["modes"][0]["turbulence"]["frequency_std"] is None
     assert known_number(Number(0.3, 0.11)).value == 0.3 and np.isnan(known_number(Number(0.3, 0.11)).std)
     assert known_number(Number(0.3, 0.09)) == Number(0.3, 0.09)
-    assert "+- -" in toml(result, result.scenario())
+    assert "+- -" in identification_toml(result, result.scenario())
     assert tuple(mean([Number(1.0, nan), Number(2.0, 0.1)])) == pytest.approx((2.0, 0.1), rel=1e-12)
     assert np.isnan(mean([Number(1.0, nan), Number(2.0, nan)]).std)

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from wfsobs.cli import main
 from wfsobs.closed_loop.design import design
-from wfsobs.evaluation.bound import bound
-from wfsobs.identification import Identified, identify
-from wfsobs.identification.process import Number, Process, merged
-from wfsobs.identification.report import toml
+from wfsobs.evaluation.bound import bound_rms
+from wfsobs.identification import Identification, identify
+from wfsobs.identification.process import IdentifiedProcess, Number, merge_peaks
+from wfsobs.identification.report import identification_toml
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import observe, run
 from wfsobs.prior import Lines
@@ -58,14 +58,14 @@ def hump_and_line(seed: int, n: int = 40_000) -> Record:
 
 
 @pytest.fixture(scope="module")
-def found() -> Identified:
+def found() -> Identification:
     return identify(hump_and_line(1))
 
 
 @pytest.fixture(scope="module")
-def saved(found: Identified) -> Scenario:
+def saved(found: Identification) -> Scenario:
     base = PRESETS["paper"]()
-    return configfile.from_toml(toml(found, found.scenario(base)))
+    return configfile.from_toml(identification_toml(found, found.scenario(base)))
 
 
 def numbers(p: Lines) -> list[float]:
@@ -74,14 +74,14 @@ def numbers(p: Lines) -> list[float]:
     return [p.noise, *smooth, *(x for line in p.lines for x in line)]
 
 
-def test_the_file_tells_the_filters_what_was_found(found: Identified, saved: Scenario) -> None:
+def test_the_file_tells_the_filters_what_was_found(found: Identification, saved: Scenario) -> None:
     for i, mode in enumerate(found.modes):
         # A product and a quotient each: a few units in the last place.
         assert numbers(lines_of(saved, i, DT)) == pytest.approx(numbers(mode.prior), rel=1e-14)
     assert [len(m.prior.turbulence) for m in found.modes] == [1, 2]  # the second has a background
 
 
-def test_the_file_predicts_a_new_record_as_what_was_found_does(found: Identified, saved: Scenario) -> None:
+def test_the_file_predicts_a_new_record_as_what_was_found_does(found: Identification, saved: Scenario) -> None:
     test = hump_and_line(2, 10_000)
     result = observe(test, saved, observers=["kf-multi"])
     for i, mode in enumerate(found.modes):
@@ -92,7 +92,7 @@ def test_the_file_predicts_a_new_record_as_what_was_found_does(found: Identified
         assert np.max(np.abs(values - expected)) < 1e-10 * np.std(expected)  # rounding through the Riccati equation
 
 
-def test_a_filter_of_one_peak_has_that_of_its_mode(found: Identified, saved: Scenario) -> None:
+def test_a_filter_of_one_peak_has_that_of_its_mode(found: Identification, saved: Scenario) -> None:
     for i, mode in enumerate(found.modes):
         strongest = max(mode.peaks, key=lambda p: p.rms.value)
         assert modelled_peak(saved, i) == (strongest.frequency.value, strongest.damping.value)
@@ -101,7 +101,7 @@ def test_a_filter_of_one_peak_has_that_of_its_mode(found: Identified, saved: Sce
     assert modelled_peak(by_hand, 0) == modelled_peak(by_hand, 1) == (12.0, 0.2)
 
 
-def test_every_mode_has_its_own_in_a_simulation_and_in_the_bound(found: Identified, saved: Scenario) -> None:
+def test_every_mode_has_its_own_in_a_simulation_and_in_the_bound(found: Identification, saved: Scenario) -> None:
     """A record made from the file is like the one that was identified, and no filter of its own model beats the bound."""
     assert [turbulence_rms(saved, i) for i in (0, 1)] == pytest.approx(
         [np.sqrt(sum(p.rms**2 for p in m.prior.turbulence)) for m in found.modes], rel=1e-12
@@ -113,7 +113,7 @@ def test_every_mode_has_its_own_in_a_simulation_and_in_the_bound(found: Identifi
         _, steady = steady_filter(model, mode.prior.noise)
         own = np.sqrt(row @ (steady.P - steady.L @ model.C[None] @ steady.P) @ row)
         made = saved.replace({"vibration.source": "ar2"})
-        assert own == pytest.approx(bound(made, i)["total"], rel=2e-3)  # the same model on a grid of frequencies
+        assert own == pytest.approx(bound_rms(made, i)["total"], rel=2e-3)  # the same model on a grid of frequencies
 
 
 @pytest.mark.parametrize("name", ["lqg-kf-multi", "lqg-kf-lgs"])
@@ -124,8 +124,8 @@ def test_a_controller_takes_the_model_of_its_mode(saved: Scenario, name: str) ->
     assert np.std(tip - tilt) > 0.1 * np.std(tip)
 
 
-def peak(f: float, xi: float, std: float = 0.01, xi_std: float | None = None) -> Process:
-    return Process(Number(f, std), Number(xi, 0.1 * xi if xi_std is None else xi_std), Number(0.01, 0.001))
+def peak(f: float, xi: float, std: float = 0.01, xi_std: float | None = None) -> IdentifiedProcess:
+    return IdentifiedProcess(Number(f, std), Number(xi, 0.1 * xi if xi_std is None else xi_std), Number(0.01, 0.001))
 
 
 @pytest.mark.parametrize(
@@ -141,8 +141,8 @@ def peak(f: float, xi: float, std: float = 0.01, xi_std: float | None = None) ->
         (peak(30.0, 0.02, 0.01, 0.05), peak(30.0, 0.02), False),  # could be of any width
     ],
 )
-def test_peaks_are_one_that_agree_in_all_that_is_known_of_them(tip: Process, tilt: Process, one: bool) -> None:
-    assert len(merged([(tip,), (tilt,)])) == (1 if one else 2)
+def test_peaks_that_agree_are_merged(tip: IdentifiedProcess, tilt: IdentifiedProcess, one: bool) -> None:
+    assert len(merge_peaks([(tip,), (tilt,)])) == (1 if one else 2)
 
 
 Modes = list[list[tuple[float, float, float]]]
@@ -190,7 +190,7 @@ def test_whatever_is_written_loads_and_runs(
     done = CliRunner().invoke(main, command)
     assert done.exit_code == 0, done.output
     short = configfile.scenario_from(None, file, ("run.duration=3", "run.warm_up=0.5"))
-    assert short.replace({"run.duration": base.run.duration, "run.warm_up": base.run.warm_up}) == configfile.load(file)
+    assert short.replace({"run.duration": base.run.duration, "run.warm_up": base.run.warm_up}) == configfile.load_scenario(file)
     for result in (observe(record, short, observers=QUICK), run(short, observers=QUICK)):
         assert not result.failures
         assert {e.observer for e in result.estimates} == set(QUICK)

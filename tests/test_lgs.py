@@ -12,9 +12,15 @@ from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.record import delay_signal
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.disturbance import make_disturbance, vibration_variance
-from wfsobs.simulation.guide_stars import lgs_error_process, lgs_error_variance, lgs_noise_rms, lgs_weights, seen_turbulence
+from wfsobs.simulation.guide_stars import (
+    lgs_error_process,
+    lgs_error_variance,
+    lgs_noise_rms,
+    lgs_turbulence_covariance,
+    lgs_weights,
+)
 from wfsobs.simulation.loop import simulate
-from wfsobs.simulation.sensing import measure
+from wfsobs.simulation.sensing import measure_open_loop
 
 BEST: dict[str, Any] = {"sensors.lgs_combination": "minimum-variance"}
 FLOW: dict[str, Any] = {"turbulence.source": "frozen-flow", "sensors.kind": "zernike"}
@@ -31,7 +37,7 @@ def error_of_samples(s: Scenario, seeds: int = 20, n: int = 200) -> np.ndarray:
     errors = []
     for seed in range(seeds):
         d = make_disturbance(slow, n, np.random.default_rng(seed))
-        errors.append((measure(slow, d, np.random.default_rng(1000 + seed)).lgs - delay_signal(d.total, 1))[1:])
+        errors.append((measure_open_loop(slow, d, np.random.default_rng(1000 + seed)).lgs - delay_signal(d.total, 1))[1:])
     return np.sqrt(np.mean(np.square(errors), axis=(0, 1)))
 
 
@@ -61,7 +67,7 @@ def test_no_weights_do_better() -> None:
     """What the combination gets wrong has nothing in common with what any star measures in any mode: there is nothing left
     to gain (the principle of orthogonality), to rounding."""
     s = scenario(BESIDE, BEST, {"vibration.source": "none"})
-    seen, w = seen_turbulence(s), lgs_weights(s)
+    seen, w = lgs_turbulence_covariance(s), lgs_weights(s)
     for star in range(1, 5):
         measured = seen[star, :, 1:].copy()
         measured[:, star - 1] += np.diag(np.full(9, s.sensors.lgs_noise**2))

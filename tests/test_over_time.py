@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from wfsobs import PRESETS, SettingError
 from wfsobs.cli import main
 from wfsobs.cli.recovery_tables import OverTime
-from wfsobs.evaluation.recovery import Pooled, recovery, running_rms, trailing_rms
+from wfsobs.evaluation.recovery import PooledRms, recovery, running_rms, trailing_rms
 from wfsobs.observers.base import VIBRATION, Estimate
 from wfsobs.pipeline import run
 from wfsobs.record import Record
@@ -44,7 +44,7 @@ def test_running_rms_is_of_the_error() -> None:
 
 
 def test_pooled_is_the_root_of_the_mean_of_squares() -> None:
-    pool = Pooled()
+    pool = PooledRms()
     for values in ([3.0, np.nan, np.nan], [4.0, 2.0, np.nan]):
         pool.add(np.array(values)[:, None])
     np.testing.assert_allclose(pool.rms[:, 0], [np.sqrt(12.5), 2.0, np.nan])
@@ -112,7 +112,7 @@ def test_after_a_jump_who_learns_is_back_and_who_is_fixed_is_not() -> None:
     )
     adapt = {"gpr-online": (training + depth) * s.dt, "kf-adaptive": s.adaptive.window + s.adaptive.interval}
     fixed = ("kf-lgs", "kf-multi", "gpr-offline")
-    pools = {name: Pooled() for name in (*fixed, *adapt)}
+    pools = {name: PooledRms() for name in (*fixed, *adapt)}
     for seed in range(1, 5):
         result = run(s.replace({"run.seed": seed}), observers=list(pools))
         for name, pool in pools.items():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from wfsobs import PRESETS, Record, Scenario, SettingError, observe, run, simulate
-from wfsobs.evaluation.bound import bound
+from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Estimate
@@ -54,7 +54,7 @@ def test_scores_are_those_of_the_estimates() -> None:
             scored = slice(300, 799 if s.target == "vibration" else 800)  # those of the rows beside it
             assert truth is not None and s.truth_rms == pytest.approx(np.sqrt(np.mean(truth[scored, mode] ** 2)), rel=1e-12)
             assert (s.start, s.stop) == pytest.approx((0.3, scored.stop / 1000)) and s.interval is not None
-            assert s.rms == bound(scenario(), mode)[s.target]
+            assert s.rms == bound_rms(scenario(), mode)[s.target]
             continue
         e, truth = result.estimate(s.observer, s.target), result.record.truth(s.target)
         assert e is not None and truth is not None

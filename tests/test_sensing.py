@@ -9,7 +9,7 @@ import pytest
 
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.disturbance import Disturbance
-from wfsobs.simulation.sensing import measure
+from wfsobs.simulation.sensing import measure_open_loop
 
 N = 4000
 
@@ -31,7 +31,7 @@ QUIET = Disturbance(np.zeros((N, 2)), np.zeros((N, 2)))
 def test_lgs_sees_the_step_before() -> None:
     """Paper, eq. 3: y[k] = phi_dist[k-1], to the last bit; nothing is there before the start."""
     d = disturbance()
-    lgs = measure(sensors(), d, np.random.default_rng(0)).lgs
+    lgs = measure_open_loop(sensors(), d, np.random.default_rng(0)).lgs
     assert np.array_equal(lgs[1:], (d.turbulence + d.vibration)[:-1])
     assert not lgs[0].any()
 
@@ -40,7 +40,7 @@ def test_lgs_sees_the_step_before() -> None:
 @pytest.mark.parametrize("steps", [3, 99, 100, 101, 1003])
 def test_ngs_frames_average_exactly_their_exposure(n: int, steps: int) -> None:
     d = disturbance(steps)
-    ngs = measure(sensors(exposure_ratio=n), d, np.random.default_rng(0)).ngs
+    ngs = measure_open_loop(sensors(exposure_ratio=n), d, np.random.default_rng(0)).ngs
     total = d.turbulence + d.vibration
     for k in range(steps):
         if k >= n and k % n == 0:
@@ -53,7 +53,7 @@ def test_ngs_frames_average_exactly_their_exposure(n: int, steps: int) -> None:
 @pytest.mark.parametrize("count", [1, 2, 5, 16])
 def test_noise_of_the_mean_over_the_lgs(count: int) -> None:
     s = sensors(lgs_noise=0.02, ngs_noise=0.03, lgs_count=count, exposure_ratio=2)
-    seen = measure(s, QUIET, np.random.default_rng(count))
+    seen = measure_open_loop(s, QUIET, np.random.default_rng(count))
     # a variance from M Gaussians is known to sqrt(2 / M); 4.5 of that, two-sided
     for x, wanted in ((seen.lgs, 0.02**2 / count), (seen.ngs[2::2], 0.03**2)):
         assert abs(np.mean(x**2) / wanted - 1) < 4.5 * np.sqrt(2 / x.size)
@@ -66,7 +66,7 @@ def test_guide_stars_are_independent_and_stay_when_one_is_added() -> None:
     """The second star alone is 2 mean(1, 2) - (1): as large as the first, and not correlated with it."""
     for slow, noise in ((0.0, 0.02), (0.05, 0.0)):
         scenarios = [sensors(lgs_noise=noise, lgs_low_frequency_rms=slow, lgs_count=c) for c in (1, 2, 3)]
-        means = [measure(s, QUIET, np.random.default_rng(2)).lgs for s in scenarios]
+        means = [measure_open_loop(s, QUIET, np.random.default_rng(2)).lgs for s in scenarios]
         stars = [means[0], 2 * means[1] - means[0], 3 * means[2] - 2 * means[1]]
         if noise:
             for i, x in enumerate(stars):
@@ -82,7 +82,7 @@ def test_low_frequency_error_has_its_rms_and_falls_with_the_number_of_stars() ->
     for count in (1, 4):
         # One number per seed, mode and end of the record, 4 s apart: exp(-0.9 * 7.07 * 4) = 1e-11, independent.
         s = sensors(lgs_low_frequency_rms=0.05, lgs_count=count)
-        ends = np.array([measure(s, QUIET, np.random.default_rng(seed)).lgs[[1, -1]] for seed in range(120)])
+        ends = np.array([measure_open_loop(s, QUIET, np.random.default_rng(seed)).lgs[[1, -1]] for seed in range(120)])
         wanted = 0.05**2 / count
         assert abs(np.mean(ends**2) / wanted - 1) < 4.5 * np.sqrt(2 / ends.size)
         assert abs(np.mean(ends[..., 0] * ends[..., 1])) < 4.5 * wanted / np.sqrt(ends[..., 0].size)
@@ -90,17 +90,17 @@ def test_low_frequency_error_has_its_rms_and_falls_with_the_number_of_stars() ->
 
 def test_ngs_has_no_low_frequency_error() -> None:
     d = disturbance()
-    with_error = measure(sensors(lgs_low_frequency_rms=1.0), d, np.random.default_rng(0))
-    without = measure(sensors(), d, np.random.default_rng(0))
+    with_error = measure_open_loop(sensors(lgs_low_frequency_rms=1.0), d, np.random.default_rng(0))
+    without = measure_open_loop(sensors(), d, np.random.default_rng(0))
     assert np.array_equal(with_error.ngs, without.ngs, equal_nan=True)
     assert not np.allclose(with_error.lgs, without.lgs)
 
 
 def test_indetermination_takes_turbulence_from_the_lgs_alone() -> None:
     d = disturbance()
-    blind = measure(sensors(tip_tilt_indetermination=True), d, np.random.default_rng(0))
+    blind = measure_open_loop(sensors(tip_tilt_indetermination=True), d, np.random.default_rng(0))
     assert np.array_equal(blind.lgs[1:], d.vibration[:-1])
-    assert np.array_equal(blind.ngs, measure(sensors(), d, np.random.default_rng(0)).ngs, equal_nan=True)
+    assert np.array_equal(blind.ngs, measure_open_loop(sensors(), d, np.random.default_rng(0)).ngs, equal_nan=True)
 
 
 @pytest.mark.parametrize(
@@ -115,8 +115,8 @@ def test_indetermination_takes_turbulence_from_the_lgs_alone() -> None:
 )
 def test_a_change_of_one_sensor_leaves_the_noise_of_the_other(change: dict[str, Any], lgs_same: bool) -> None:
     base = {"lgs_noise": 0.02, "ngs_noise": 0.01, "lgs_low_frequency_rms": 0.05, "lgs_count": 2}
-    before = measure(sensors(**base), QUIET, np.random.default_rng(4))
-    after = measure(sensors(**(base | change)), QUIET, np.random.default_rng(4))
+    before = measure_open_loop(sensors(**base), QUIET, np.random.default_rng(4))
+    after = measure_open_loop(sensors(**(base | change)), QUIET, np.random.default_rng(4))
     assert np.array_equal(before.lgs, after.lgs) == lgs_same
     if lgs_same and "exposure_ratio" in change:
         both = ~np.isnan(before.ngs) & ~np.isnan(after.ngs)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.vibration import Peak
 from wfsobs.settings.group import Group, SettingError
-from wfsobs.settings.parameters import Reals, allowed, unit_of
+from wfsobs.settings.parameters import Reals, allowed_values, unit_of
 
 EXAMPLES = settings(max_examples=30, deadline=None, derandomize=True)
 HUGE = 10**400
@@ -164,7 +164,7 @@ def test_every_number_states_its_unit_or_has_none(path: str) -> None:
     is_quantity = isinstance(p, (param.Number, Reals)) and path.rsplit(".", 1)[-1] not in pure
     assert bool(unit_of(p)) == is_quantity
     if is_quantity:
-        assert allowed(p).endswith(unit_of(p))
+        assert allowed_values(p).endswith(unit_of(p))
 
 
 @pytest.mark.parametrize(("path", "value"), [("telescope.diameter", 0.01), ("loop.closed", 1), ("run.seed", True)])

@@ -11,7 +11,7 @@ from wfsobs.priors_from.scenario import measurement_noise, modelled_processes
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar3 import TOLERANCE, Ar3, fit_ar3
 from wfsobs.signal.whittle import information, whittle_fit
-from wfsobs.simulation.true_spectra import seen_turbulence
+from wfsobs.simulation.true_spectra import lgs_turbulence_spectrum
 from wfsobs.typing import Array
 
 F = np.geomspace(1.0, 100.0, 200)
@@ -80,7 +80,7 @@ def process(x: Array, dt: float) -> Ar3:
 def test_the_fit_to_frozen_flow_is_at_its_minimum_from_wherever_it_starts(mode: int) -> None:
     """Rounding, which differs from processor to processor, moves a converged fit no more than another start does."""
     s = PRESETS["ut4"]()
-    spectrum, noise = seen_turbulence(s, mode), measurement_noise(s, mode)[0] ** 2
+    spectrum, noise = lgs_turbulence_spectrum(s, mode), measurement_noise(s, mode)[0] ** 2
     turbulence, _ = modelled_processes(s, mode, s.dt)
     start = Ar3(turbulence.omega, turbulence.damping, 5.0 * turbulence.omega, turbulence.rms, s.dt)
     found = fit_ar3(spectrum, noise, start)

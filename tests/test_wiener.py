@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_toeplitz
 
-from wfsobs.evaluation.bound import bound
+from wfsobs.evaluation.bound import bound_rms
 from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.scenario import kalman_model, measurement_noise
 from wfsobs.scenario import Scenario
@@ -76,8 +76,8 @@ def test_a_spectrum_without_noise_is_refused() -> None:
 
 def test_the_bound_of_the_two_frame_loop() -> None:
     # 21.63 nm by theory for the residual, phi[k + 1] given z[k]; two decimals are given.
-    assert bound(MATCHED, 0, ahead=1)["total"] == pytest.approx(21.63e-3, abs=0.005e-3)
-    assert bound(MATCHED, 0, ahead=1) == pytest.approx(riccati_errors(MATCHED)[1], rel=1e-7)
+    assert bound_rms(MATCHED, 0, ahead=1)["total"] == pytest.approx(21.63e-3, abs=0.005e-3)
+    assert bound_rms(MATCHED, 0, ahead=1) == pytest.approx(riccati_errors(MATCHED)[1], rel=1e-7)
 
 
 @settings(max_examples=25, deadline=None)
@@ -108,8 +108,8 @@ def test_where_the_truth_is_ar2_it_is_the_riccati_covariance(
     scenario = scenario.replace({"vibration.peaks.0.damping": max(damping, floor), "kalman.damping": max(damping, floor)})
     filtered, predicted = riccati_errors(scenario)
     # At half the DFT the narrowest line has exp(-10) of its correlation, which comes round.
-    assert bound(scenario, 0) == pytest.approx(filtered, rel=1e-3)
-    assert bound(scenario, 0, ahead=1) == pytest.approx(predicted, rel=1e-3)
+    assert bound_rms(scenario, 0) == pytest.approx(filtered, rel=1e-3)
+    assert bound_rms(scenario, 0, ahead=1) == pytest.approx(predicted, rel=1e-3)
 
 
 def autocovariance(spectrum: Array) -> Array:
@@ -131,7 +131,7 @@ def test_thirty_taps_of_the_two_frame_loop() -> None:
 @pytest.mark.parametrize(("name", "mode"), [("paper", 0), ("paper", 1), ("ut4", 0)])
 def test_where_it_is_not_ar2_long_fir_filters_come_near_from_above(name: str, mode: int) -> None:
     scenario = PRESETS[name]().replace({"turbulence.source": "ar2", "run.duration": 2.0})
-    spectra, least = true_spectra(scenario, mode), bound(scenario, mode, ahead=1)["total"]
+    spectra, least = true_spectra(scenario, mode), bound_rms(scenario, mode, ahead=1)["total"]
     errors = [fir_error(spectra, taps, 1) for taps in (30, 300, 3000)]
     assert errors[0] > errors[1] > errors[2] > least * (1 - 1e-6)
     assert errors[2] == pytest.approx(least, rel=0.02)  # 3 s of taps, lines 1/32 Hz wide: their memory is 10 s
@@ -151,8 +151,8 @@ def test_the_spectra_have_the_variances_of_the_scenario(name: str) -> None:
 
 def test_what_the_lgs_cannot_see_cannot_be_estimated() -> None:
     blind = PRESETS["paper"]().replace({"turbulence.source": "ar2", "sensors.tip_tilt_indetermination": True})
-    assert bound(blind, 0)["turbulence"] == pytest.approx(blind.turbulence.rms, rel=1e-6)
-    assert set(bound(blind, 0)) == {*TARGETS, "total"}
+    assert bound_rms(blind, 0)["turbulence"] == pytest.approx(blind.turbulence.rms, rel=1e-6)
+    assert set(bound_rms(blind, 0)) == {*TARGETS, "total"}
 
 
 def test_slow_turbulence_is_resolved_at_any_wind() -> None:
@@ -163,4 +163,4 @@ def test_slow_turbulence_is_resolved_at_any_wind() -> None:
 
 def test_no_vibration_has_no_spectrum() -> None:
     s = MATCHED.replace({"vibration.source": "none"})
-    assert bound(s, 0)["vibration"] == 0.0 and vibration_variance(s, 0) == 0.0
+    assert bound_rms(s, 0)["vibration"] == 0.0 and vibration_variance(s, 0) == 0.0

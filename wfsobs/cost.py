@@ -44,7 +44,7 @@ def part_seconds(scenario: Scenario) -> dict[str, float]:
 
 def _steps_of_air(scenario: Scenario) -> int:
     """Return the number of steps of turbulence, at least those of the record."""
-    return max(scenario.n_steps, round(scenario.air * scenario.sensors.lgs_rate))
+    return max(scenario.n_steps, round(scenario.turbulence_duration * scenario.sensors.lgs_rate))
 
 
 def frozen_flow_seconds(scenario: Scenario, n_steps: int) -> float:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from wfsobs.evaluation.bound import Bound, bound_scores, bounds
-from wfsobs.evaluation.rows import rows
+from wfsobs.evaluation.bound import Bound, bound_scores, record_bounds
+from wfsobs.evaluation.rows import score_rows
 from wfsobs.evaluation.scores import Score, score
 from wfsobs.notebook import html_table
 from wfsobs.observers import OBSERVERS
@@ -81,7 +81,7 @@ class Result:
         """
         import pandas
 
-        return pandas.DataFrame(rows(self.scores, self.scenario.run.seed))
+        return pandas.DataFrame(score_rows(self.scores, self.scenario.run.seed))
 
     def estimate(self, observer: str, target: str) -> Estimate | None:
         """Return the estimate of one observer and target.
@@ -178,7 +178,7 @@ def observe(
     failures: list[Failure] = []
     for item in each_estimate(record, scenario, watch, observers):
         (failures if isinstance(item, Failure) else estimates).append(item)  # type: ignore[arg-type]
-    least = bounds(scenario, record) if simulated else []
+    least = record_bounds(scenario, record) if simulated else []
     return collect(scenario, record, estimates, failures, watch, least)
 
 

@@ -1,7 +1,7 @@
 """Observers and controllers by id: those of wfsobs, those of installed packages, and those that a script registers.
 
-A package names its own by entry points of the groups "wfsobs.observers" and "wfsobs.controllers", which are read when a registry
-is first used. The rooms above are named by strings: nothing is imported before it is asked for.
+A package declares its own by entry points of the groups "wfsobs.observers" and "wfsobs.controllers", which are read when a
+registry is first used. Higher rooms are named by strings: nothing is imported before it is used.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ _LOCK = RLock()
 
 
 class RegistrationError(ValueError):
-    """An observer or a controller that cannot be registered: one line that says why."""
+    """Error: an observer or a controller that cannot be registered; one line with the reason."""
 
 
 class Entry(Protocol):
-    """What can be registered."""
+    """Interface of an entry."""
 
     @property
     def id(self) -> str:
-        """Its name in tables and files."""
+        """Id in tables and files."""
         ...
 
     @property
     def label(self) -> str:
-        """Its name for people."""
+        """Label for people."""
         ...
 
 
@@ -59,10 +59,16 @@ E = TypeVar("E", bound=Entry)
 class Registry(MutableMapping[str, E]):
     """Entries by id, in the order of tables and legends: first those of wfsobs, then those of installed packages.
 
-    kind     : type of the entries
-    group    : of entry points
-    built_in : entries of wfsobs
-    reserved : ids that are used for something else
+    Parameters
+    ----------
+    kind : type
+        Type of the entries.
+    group : str
+        Group of entry points.
+    built_in : iterable
+        Entries of wfsobs.
+    reserved : iterable of str
+        Ids that are used for something else.
     """
 
     def __init__(self, kind: type[E], group: str, built_in: Iterable[E], reserved: Iterable[str] = ()):
@@ -82,7 +88,7 @@ class Registry(MutableMapping[str, E]):
                 _scenario().settings()  # those made before have its settings from now on, too
 
     def complete(self) -> None:
-        """Add those of installed packages, the first time; one that cannot be is named in the log and left out."""
+        """Load the entries of installed packages, once; one that cannot be used is logged and left out."""
         if self._complete:
             return
         with _LOCK:
@@ -147,13 +153,19 @@ class Registry(MutableMapping[str, E]):
 
 
 def register(entry: Any) -> None:
-    """Register an observer or a controller: it stands beside those of wfsobs from then on.
+    """Register an observer or a controller, beside those of wfsobs.
 
-    A package that is installed names its own by an entry point instead, which other processes see as well.
+    An installed package declares its own by an entry point instead, which other processes see as well.
 
-    entry : Observer, or Controller; the same one again changes nothing
-    Raises RegistrationError for an id or a group of settings whose name is taken or has other characters than allowed, and for
-    what is neither.
+    Parameters
+    ----------
+    entry : Observer or Controller
+        What to register; the same one again changes nothing.
+
+    Raises
+    ------
+    RegistrationError
+        An id or a group of settings is taken or has forbidden characters, or `entry` is neither.
     """
     for group in HOMES:
         registry = _registry(group)

@@ -8,7 +8,7 @@ from itertools import groupby
 import numpy as np
 
 from wfsobs.cli.recovery_tables import OverTime, recovery_texts
-from wfsobs.evaluation.rows import label_of
+from wfsobs.evaluation.rows import row_label
 from wfsobs.observers.base import TARGETS
 from wfsobs.pipeline import run
 from wfsobs.scenario.presets import PRESETS
@@ -35,7 +35,7 @@ def tables(preset: str, seeds: int) -> str:
     lines = [line for line in history.recoveries() if line[0] in CASES[preset] and line[1] == "tip" and line[3] not in LEFT_OUT]
     for (target, _, event), group in groupby(lines, key=lambda line: line[:3]):
         out.append(f"| {target}, {event} | before, nm | worst after | at the end | back after, s |\n|---|---|---|---|---|")
-        out += [f"| {label_of(name)} | {' | '.join(recovery_texts(r))} |" for *_, name, r in group]
+        out += [f"| {row_label(name)} | {' | '.join(recovery_texts(r))} |" for *_, name, r in group]
         out.append("")
     return "\n".join(out)
 
@@ -57,7 +57,7 @@ def bridged(seeds: int) -> str:
     for target, name in dict.fromkeys(key[:2] for key in squares):
         if name not in LEFT_OUT:
             error = [np.sqrt(np.mean(squares[target, name, i], axis=0)) for i in range(len(stretches))]
-            out.append(f"| {target}, {label_of(name)} | {' | '.join(f'{1e3 * a:.2f} | {a / b:.3f}' for a, b in error)} |")
+            out.append(f"| {target}, {row_label(name)} | {' | '.join(f'{1e3 * a:.2f} | {a / b:.3f}' for a, b in error)} |")
     return "\n".join(out)
 
 

@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 from scipy.stats import binomtest, ncx2
 
 from wfsobs import PRESETS, Record, Scenario, observe, simulate
-from wfsobs.identification import Identified, identify
+from wfsobs.identification import Identification, identify
 from wfsobs.identification.identification import ALONE, LEVEL
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.simulation.guide_stars import lgs_error_process, lgs_noise_rms
@@ -77,7 +77,7 @@ def known_peaks(duration: float, modes: int = 2, level: float = IN_ONE_BIN) -> S
     return s.replace({"vibration.peaks": [{"frequency": f, "damping": xi, "rms": [rms] * modes} for f, xi, rms in sorted(peaks)]})
 
 
-def hits(result: Identified, scenario: Scenario) -> tuple[list[tuple[float, bool, bool]], int]:
+def hits(result: Identification, scenario: Scenario) -> tuple[list[tuple[float, bool, bool]], int]:
     """(frequency, pure, found) of every peak in every mode that has it, and the number of peaks found that there are not."""
     out, false = [], 0
     for i, mode in enumerate(result.modes):

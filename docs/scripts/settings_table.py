@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from pathlib import Path
 
@@ -47,7 +48,7 @@ def sections(group: Group, prefix: str) -> list[str]:
             "\n".join(
                 [
                     f"## {prefix.rstrip('.')}\n",
-                    f"{type(group).__doc__}\n",
+                    f"{inspect.getdoc(type(group))}\n",
                     "| Path | Default | Range | Unit | Meaning |",
                     "|---|---|---|---|---|",
                     *rows,

@@ -138,8 +138,8 @@ def test_identify(board: Dashboard, loop: Any) -> None:
     page.level.value, page.lowest.value = "0.02", "8"
     page.start()
     loop.until(lambda: page.work.state != RUNNING, 120)
-    expected = identified.plain(page.work.result[0])
-    for found in (shell(board), identified.plain(script(board)["found"])):
+    expected = identified.identification_dict(page.work.result[0])
+    for found in (shell(board), identified.identification_dict(script(board)["found"])):
         assert [[p["frequency"] for p in m["peaks"]] for m in found["modes"]] == [
             pytest.approx([p["frequency"] for p in m["peaks"]], rel=CLOSE) for m in expected["modes"]
         ]
@@ -221,7 +221,9 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
     loop.until(lambda: page.work.state != RUNNING, 120)
     files = saved(dashboard, loop, sent)
     result = page.work.result[0]
-    assert files["wfsobs-model.toml"].decode() == identified.toml(result, result.scenario(dashboard.store.scenario))
+    assert files["wfsobs-model.toml"].decode() == identified.identification_toml(
+        result, result.scenario(dashboard.store.scenario)
+    )
 
     dashboard.pages.current = "tune"
     page = dashboard.pages.made["tune"]

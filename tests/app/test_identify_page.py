@@ -20,9 +20,9 @@ from wfsobs.app.pages.pages import EXPLORE, IDENTIFY
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.style import LOOKS
 from wfsobs.evaluation.scores import BOUND
-from wfsobs.identification import Identified, identify
+from wfsobs.identification import Identification, identify
 from wfsobs.identification.process import Number
-from wfsobs.identification.report import verdict, written
+from wfsobs.identification.report import format_number, verdict
 from wfsobs.pipeline import observe
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
@@ -50,7 +50,7 @@ def page(dashboard: Dashboard, loop: Any) -> IdentifyPage:
     return page
 
 
-def identified(page: IdentifyPage, loop: Any) -> Identified:
+def identified(page: IdentifyPage, loop: Any) -> Identification:
     """What the page found, once it has."""
     page.starter.start.param.trigger("clicks")
     assert page.work.state == RUNNING and not page.starter.cancel.disabled
@@ -70,7 +70,7 @@ def test_it_shows_what_the_core_finds(page: IdentifyPage, dashboard: Dashboard, 
     assert line.frequency.value == pytest.approx(LINE, abs=0.1)
     noise = Number(*(1e3 * x for x in expected.modes[0].noise))
     for number in (line.frequency, noise, Number(*(1e3 * x for x in line.rms))):
-        assert f"<td>{written(number).replace('+-', '±')}</td>" in page.table.object
+        assert f"<td>{format_number(number).replace('+-', '±')}</td>" in page.table.object
     the_measured_spectrum_holds_the_variance(page)
     dashboard.display.param.update(unit="mas")
     scale = per_micrometre("mas", 8.0) ** 2

@@ -175,7 +175,7 @@ def test_settings_too_long_for_a_link_travel_as_a_file() -> None:
     scenario = PRESETS["paper"]().replace({"vibration.psd": {"frequency": frequencies, "tip": frequencies, "tilt": frequencies}})
     assert to_query(scenario, "paper") is None
     assert to_command(scenario, "paper") == "wfsobs run --config wfsobs.toml"
-    assert 'configfile.load("wfsobs.toml")' in to_python(scenario, "paper")
+    assert 'configfile.load_scenario("wfsobs.toml")' in to_python(scenario, "paper")
     assert from_file(to_file(scenario, "paper")).scenario == scenario
 
 

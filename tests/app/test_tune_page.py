@@ -21,7 +21,7 @@ from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.tune_work import CHOICES, best_so_far, seconds
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.configfile import changes
+from wfsobs.scenario.configfile import changed_settings
 from wfsobs.simulation.loop import simulate
 from wfsobs.tuning import Evaluation, Tuned, tune
 from wfsobs.tuning.judge import Errors
@@ -66,7 +66,7 @@ def test_it_shows_what_the_core_finds(page: TunePage, dashboard: Dashboard, loop
             assert float(cells[2].replace("−", "-")) == pytest.approx(100 * (b / a - 1), abs=0.051)
     assert before.other and after.other
     assert row(table, "other target", "rms over modes")[:2] == [number(1e3 * s.rms, 4) for s in (before.other, after.other)]
-    for path, value in changes(expected.scenario, before.scenario).items():
+    for path, value in changed_settings(expected.scenario, before.scenario).items():
         text = f"{value:.6g}" if isinstance(value, float) else str(value)
         assert row(table, "setting", path)[1] == text
     assert "likelihood" not in table, "it is no GPR"
@@ -82,7 +82,7 @@ def using_it_leaves_the_other_settings(page: TunePage, dashboard: Dashboard, fou
     store.change("run.seed", 5)
     assert page.stale.visible
     page.starter.uses[0].param.trigger("clicks")
-    expected = found.before.scenario.replace({"run.seed": 5, **changes(found.scenario, found.before.scenario)})
+    expected = found.before.scenario.replace({"run.seed": 5, **changed_settings(found.scenario, found.before.scenario)})
     assert store.scenario == expected
     store.undo()
     store.undo()

@@ -22,7 +22,7 @@ from wfsobs.app.display import UNITS, per_micrometre
 from wfsobs.app.numbers import number
 from wfsobs.app.work import TRUTH
 from wfsobs.cli import main
-from wfsobs.evaluation.rows import label_of
+from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import cumulative_rms, spectra
 from wfsobs.observers.base import TARGETS
 
@@ -136,7 +136,7 @@ def test_every_state_shows_the_numbers_of_its_run(open_report: Any) -> None:
             for row in of_mode:
                 key = f"{row['target']}/{row['observer']}"
                 cells = [re.sub(r"^(best|above truth) ", "", cell) for cell in table[key]]
-                assert cells[0].startswith(label_of(row["observer"]))
+                assert cells[0].startswith(row_label(row["observer"]))
                 error, truth = number(row["rms_um"] * scale), number(row["truth_rms_um"] * scale)
                 spread = "" if row["interval_um"] is None else " " + " – ".join(number(x * scale) for x in row["interval_um"])
                 assert cells[1:4] == [error + spread, truth, number(row["normalised_rms"])]

@@ -11,7 +11,7 @@ import pytest
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.telemetry.formats.contents import Contents
-from wfsobs.telemetry.intake import Stated, record_of
+from wfsobs.telemetry.intake import DeclaredFormat, to_record
 from wfsobs.telemetry.records import read_record, record_arrays
 
 RNG = np.random.default_rng(1)
@@ -20,10 +20,10 @@ Y, U = RNG.standard_normal((N, 2)), RNG.standard_normal((N, 2))
 DT = np.array(0.001)
 
 
-def taken(stated: Stated | None = None, scenario: Scenario | None = None, units=None, **arrays):
+def taken(stated: DeclaredFormat | None = None, scenario: Scenario | None = None, units=None, **arrays):
     plain = {"y_lgs": Y, "u": U, "dt": DT} | {k: np.asarray(v) for k, v in arrays.items()}
     present = {k: v for k, v in plain.items() if v.ndim > 0 or v.dtype != object}
-    return record_of(Contents(present, units or {}), scenario or Scenario(), stated or Stated())
+    return to_record(Contents(present, units or {}), scenario or Scenario(), stated or DeclaredFormat())
 
 
 NONE = np.array(None, dtype=object)
@@ -39,10 +39,10 @@ NONE = np.array(None, dtype=object)
 def test_units_by_statement_by_file_and_by_signal(unit: str, factor: float) -> None:
     """On 8 m an angle is 4 / 8 of the tip over the aperture: 2 m of tip in one radian."""
     for record in (
-        taken(Stated(unit=unit)),
+        taken(DeclaredFormat(unit=unit)),
         taken(unit=unit),
         taken(units={"y_lgs": unit, "u": unit}),
-        taken(Stated(unit=unit), units={"y_lgs": unit}),
+        taken(DeclaredFormat(unit=unit), units={"y_lgs": unit}),
     ):
         np.testing.assert_allclose(record.y_lgs, Y * factor, rtol=1e-12)
         np.testing.assert_allclose(record.u, U * factor, rtol=1e-12)
@@ -53,15 +53,15 @@ def test_units_by_statement_by_file_and_by_signal(unit: str, factor: float) -> N
 
 
 def test_100_nm_of_tip_on_8_m_are_10_3133_mas() -> None:
-    record = taken(Stated(unit="mas"), y_lgs=np.full((N, 2), 10.3133))
+    record = taken(DeclaredFormat(unit="mas"), y_lgs=np.full((N, 2), 10.3133))
     np.testing.assert_allclose(record.y_lgs, 0.1, rtol=1e-4)
-    keck = taken(Stated(unit="mas"), Scenario().replace({"telescope.diameter": 10.0}), y_lgs=np.full((N, 2), 10.3133))
+    keck = taken(DeclaredFormat(unit="mas"), Scenario().replace({"telescope.diameter": 10.0}), y_lgs=np.full((N, 2), 10.3133))
     np.testing.assert_allclose(keck.y_lgs, 0.125, rtol=1e-4)
     assert keck.origin == "unit mas, aperture 10 m"
 
 
 def test_the_sign_of_commands() -> None:
-    record = taken(Stated(command_sign=-1), training_y=Y, training_u=U)
+    record = taken(DeclaredFormat(command_sign=-1), training_y=Y, training_u=U)
     np.testing.assert_array_equal(record.u, -U)
     np.testing.assert_array_equal(record.training.u, -U)
     np.testing.assert_array_equal(record.y_lgs, Y)
@@ -74,7 +74,7 @@ def test_the_delay_of_commands(delay: int) -> None:
     """z[k] = y[k] - u[k-delay], and of a frame the mean of u[k-delay] ... u[k-delay-n+1]."""
     ngs = np.full((N, 2), np.nan)
     ngs[5::5] = 1.0
-    for record in (taken(Stated(command_delay=delay), y_ngs=ngs, ratio=5), taken(delay=delay, y_ngs=ngs, ratio=5)):
+    for record in (taken(DeclaredFormat(command_delay=delay), y_ngs=ngs, ratio=5), taken(delay=delay, y_ngs=ngs, ratio=5)):
         for k in range(N):
             np.testing.assert_array_equal(record.z[k], Y[k] - (U[k - delay] if k >= delay else 0.0))
             if k % 5 == 0 and k:
@@ -83,13 +83,13 @@ def test_the_delay_of_commands(delay: int) -> None:
 
 
 def test_what_was_stated_is_kept_and_not_applied_twice() -> None:
-    record = taken(Stated("nm", -1, 3))
-    again = record_of(Contents(record_arrays(record)), Scenario(), Stated())
+    record = taken(DeclaredFormat("nm", -1, 3))
+    again = to_record(Contents(record_arrays(record)), Scenario(), DeclaredFormat())
     np.testing.assert_array_equal(again.y_lgs, record.y_lgs)
     np.testing.assert_array_equal(again.u, record.u)
     assert (again.origin, again.delay) == (record.origin, 3) == ("unit nm, command sign -1", 3)
     with pytest.raises(RecordError, match="y_lgs is in um, but nm is stated"):
-        record_of(Contents(record_arrays(record)), Scenario(), Stated("nm"))
+        to_record(Contents(record_arrays(record)), Scenario(), DeclaredFormat("nm"))
 
 
 # ---------------------------------------------------------------------- clocks
@@ -109,11 +109,11 @@ def test_jumps_of_the_clock_are_missing_frames(start: float, lost: list[int]) ->
 
 
 def test_a_stated_rate_counts_and_must_agree() -> None:
-    assert taken(Stated(rate=500.0), dt=NONE).dt == 0.002
-    assert taken(Stated(rate=1000.0), time=0.001 * np.arange(N), dt=NONE).dt == 0.001
+    assert taken(DeclaredFormat(rate=500.0), dt=NONE).dt == 0.002
+    assert taken(DeclaredFormat(rate=1000.0), time=0.001 * np.arange(N), dt=NONE).dt == 0.001
     for arrays in ({"dt": 0.001}, {"dt": NONE, "time": 0.001 * np.arange(N)}):
         with pytest.raises(RecordError, match="stated"):
-            taken(Stated(rate=500.0), **arrays)
+            taken(DeclaredFormat(rate=500.0), **arrays)
 
 
 def clock(change) -> np.ndarray:
@@ -231,7 +231,7 @@ def test_wrong_tables(text: str, message: str) -> None:
 
 def test_empty_cells_are_missing_samples_and_ends() -> None:
     text = "\ufeffu/tip,y_lgs/tip_nm,training_y/tip,training_u/tip\n1,1000,5,6\n2,,7,8\n\n3,3000,,\n4,nan,,\n"
-    record = read_record(io.BytesIO(text.encode()), "r.csv", stated=Stated(rate=100.0, unit=None))
+    record = read_record(io.BytesIO(text.encode()), "r.csv", stated=DeclaredFormat(rate=100.0, unit=None))
     np.testing.assert_array_equal(record.y_lgs[:, 0], [1.0, np.nan, 3.0, np.nan])
     np.testing.assert_array_equal(record.u[:, 0], [1, 2, 3, 4])
     np.testing.assert_array_equal(record.training.u[:, 0], [6, 8])

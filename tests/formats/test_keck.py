@@ -37,7 +37,7 @@ def test_the_record_of_a_keck_like_loop(tmp_path, capsys) -> None:
     np.save(tmp_path / "OpenLoop_n0001.npy", (commands[:-1] + centroid[1:]).astype("f4"))
     convert(tmp_path, tmp_path / "keck.npz")
     assert "Commands[k] + Centroid[k+1]" in capsys.readouterr().out
-    scenario = configfile.load(DOCS / "keck.toml")
+    scenario = configfile.load_scenario(DOCS / "keck.toml")
     record = load_record(tmp_path / "keck.npz", scenario)
     um_per_arcsec = 1e6 * np.deg2rad(1 / 3600) * 10.0 / 4.0
     assert (record.n_steps, record.delay, record.training.y_lgs.shape) == (3000, 1, (5000, 2))

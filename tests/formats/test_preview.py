@@ -20,7 +20,7 @@ from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry import preview as module
 from wfsobs.telemetry.formats import FORMATS, format_of
-from wfsobs.telemetry.intake import Stated
+from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import MOST_FILE, preview
 from wfsobs.telemetry.records import read_record, record_arrays
 
@@ -67,7 +67,7 @@ def test_what_is_stated_and_what_is_missing() -> None:
         content(".csv", replace(RECORD, y_lgs=y, y_ngs=ngs, turbulence=None, vibration=None)),
         "a.csv",
         Scenario().replace({"telescope.diameter": 10.0}),
-        Stated(command_delay=2),
+        DeclaredFormat(command_delay=2),
     )
     assert found.lines() == [
         "1500 steps at 1000 Hz, 1.5 s, 10 missing",

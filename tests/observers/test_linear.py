@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_lyapunov
 
-from wfsobs.evaluation.bound import bound
+from wfsobs.evaluation.bound import bound_rms
 from wfsobs.observers.ridge import TAPS, fit, predict
 from wfsobs.pipeline import estimated
 from wfsobs.priors_from.scenario import modelled_processes, modelled_turbulence, multi_model, predicted_rms
@@ -131,14 +131,14 @@ def test_where_the_truth_is_its_model_the_filter_reaches_the_bound() -> None:
     s = lines(small({"run.duration": 4.0}), 4)
     model = multi_model(s, 0, s.dt)
     assert model.A.shape == (10, 10)
-    assert predicted_rms(s, 0) == pytest.approx(bound(s, 0, ahead=1)["total"], rel=1e-4)
+    assert predicted_rms(s, 0) == pytest.approx(bound_rms(s, 0, ahead=1)["total"], rel=1e-4)
     errors = []
     for seed in range(12):
         record = simulate(s.replace({"run.seed": seed}))
         values = estimated("kf-multi", record, s)["vibration"]
         errors.append(np.mean((values - record.vibration)[500:, 0] ** 2))
     # 12 records of 3.5 s: some 700 independent samples of an error with a correlation time of 30 ms, 3 % of the rms at one sigma.
-    assert np.sqrt(np.mean(errors)) == pytest.approx(bound(s, 0)["vibration"], rel=0.08)
+    assert np.sqrt(np.mean(errors)) == pytest.approx(bound_rms(s, 0)["vibration"], rel=0.08)
 
 
 def test_more_peaks_in_the_model_than_the_papers_one_help() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from wfsobs.app.report.data import LEVELS, Grid, Pool, Report, bins_for, encode, state_of, window_of
 from wfsobs.app.report.packing import pack, unpack
 from wfsobs.app.work import TRUTH
-from wfsobs.evaluation.rows import rows
+from wfsobs.evaluation.rows import score_rows
 from wfsobs.evaluation.scores import cumulative_rms
 from wfsobs.pipeline import Result
 from wfsobs.scenario import Scenario
@@ -76,7 +76,7 @@ def test_what_two_states_share_is_there_once() -> None:
 
 def test_a_state_has_the_lines_of_the_result(result: Result) -> None:
     state = state_of(result)
-    assert state.rows == rows(result.scores, 1) and state.reasons == () and state.grid.whole
+    assert state.rows == score_rows(result.scores, 1) and state.reasons == () and state.grid.whole
     truth = result.record.vibration
     estimate = result.estimate("gpr-online", "vibration")
     assert truth is not None and estimate is not None

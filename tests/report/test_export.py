@@ -17,7 +17,7 @@ from wfsobs.app.report import maker
 from wfsobs.app.report.maker import ReportError
 from wfsobs.app.work import RunResults
 from wfsobs.cli import main
-from wfsobs.evaluation.rows import TIME, rows
+from wfsobs.evaluation.rows import TIME, score_rows
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.scenario import Scenario
 
@@ -133,7 +133,7 @@ def test_a_run_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: pyt
 
 def test_the_dashboards_report_has_the_numbers_given_to_it(result: Any, parse: Any) -> None:
     it = parse(maker.make(RunResults(result), "paper", QUIET).decode())
-    assert it.data("rows")[0]["rows"] == rows(result.scores, result.scenario.run.seed)
+    assert it.data("rows")[0]["rows"] == score_rows(result.scores, result.scenario.run.seed)
     assert "wfsobs export report.html --preset paper --set" in it.text
 
 

@@ -21,7 +21,7 @@ from wfsobs.app.numbers import number
 from wfsobs.app.report.data import Grid, Report, state_of
 from wfsobs.app.report.page import page
 from wfsobs.app.report.text import FILE, LONGEST, command_of
-from wfsobs.evaluation.rows import TIME, label_of, looks_ahead, stretch_of
+from wfsobs.evaluation.rows import TIME, is_non_causal, row_label, scored_interval
 from wfsobs.pipeline import Result, observe, run
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import from_toml, scenario_from
@@ -78,12 +78,12 @@ def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any)
     for table, state in zip(tables, report.states, strict=True):
         title, got = "", {}
         for first, *cells in table[1:]:
-            title = title if cells else first.removesuffix(f", {stretch_of(state.rows)}")
+            title = title if cells else first.removesuffix(f", {scored_interval(state.rows)}")
             if cells:
                 got[title, first] = cells
         want = {}
         for row in state.rows:
-            name = label_of(row["observer"]) + (" looks ahead" if looks_ahead(row["observer"]) else "")
+            name = row_label(row["observer"]) + (" looks ahead" if is_non_causal(row["observer"]) else "")
             lag = "–" if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−")
             spread = "" if row["interval_um"] is None else " " + " – ".join(number(1e3 * x) for x in row["interval_um"])
             assert (spread == "") == (row["observer"] != "bound")

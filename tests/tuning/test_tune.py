@@ -260,7 +260,7 @@ def test_command_line(tmp_path: Path) -> None:
     result = call("--observer", "kf-lgs", "--setting", "kalman.damping", "--evaluations", "4", "--json", "--out", str(out))
     said = json.loads(result.stdout, parse_constant=pytest.fail)
     assert result.exit_code == 0 and said["observer"] == "kf-lgs" and len(said["evaluations"]) == 4
-    assert configfile.load(out).kalman.damping == said["settings"].get("kalman.damping", 0.03)
+    assert configfile.load_scenario(out).kalman.damping == said["settings"].get("kalman.damping", 0.03)
     shown = call("--observer", "gpr-offline", "--evaluations", "1", "--set", "gpr_offline.training_size=50").stdout
     assert "test, before" in shown and "marginal likelihood" in shown and "nothing that was tried is better" in shown
     for wrong in (

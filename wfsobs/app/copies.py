@@ -52,7 +52,7 @@ def to_command(scenario: Scenario, preset: str, source: Source | None = None, ta
 def _options(scenario: Scenario, preset: str, file: str) -> list[str]:
     words = ["--preset", preset]
     for path, value in changes(scenario, preset).items():
-        words += ["--set", f"{path}={configfile.written(value)}"]
+        words += ["--set", f"{path}={configfile.format_value(value)}"]
     return words if len(shlex.join(words)) <= LONGEST else ["--config", file]
 
 
@@ -78,9 +78,9 @@ def to_python(scenario: Scenario, preset: str, source: Source | None = None, tas
     imports, lines = {"import wfsobs"}, [f"scenario = {_made(scenario, preset, FILE)}"]
     if isinstance(source, LoadedRecord):
         stated = "".join(f"{name}={value!r}, " for name, value in vars(source.stated).items() if value is not None)
-        imports |= {"from wfsobs.telemetry.intake import Stated", "from wfsobs.telemetry.records import load_record"}
+        imports |= {"from wfsobs.telemetry.intake import DeclaredFormat", "from wfsobs.telemetry.records import load_record"}
         check = f", sha256={source.sha256!r}" if source.sha256 else ""
-        lines.append(f"record = load_record({source.name!r}, scenario, Stated({stated.removesuffix(', ')}){check})")
+        lines.append(f"record = load_record({source.name!r}, scenario, DeclaredFormat({stated.removesuffix(', ')}){check})")
     elif isinstance(source, SimulatedRecord):
         lines += [f"simulation = {_made(source.simulation, preset, SIMULATION)}", "record = wfsobs.simulate(simulation)"]
     elif task.what in (LOOP, IDENTIFY):
@@ -98,7 +98,7 @@ def _order(line: str) -> tuple[bool, str]:
 def _made(scenario: Scenario, preset: str, file: str) -> str:
     lines = [f"    {json.dumps(path)}: {value!r},\n" for path, value in changes(scenario, preset).items()]
     made = f'wfsobs.PRESETS["{preset}"]()' + (f".replace({{\n{''.join(lines)}}})" if lines else "")
-    return made if len(made) <= LONGEST else f'configfile.load("{file}")'
+    return made if len(made) <= LONGEST else f'configfile.load_scenario("{file}")'
 
 
 Lines = tuple[set[str], list[str]]
@@ -126,7 +126,7 @@ def _identify(_recorded: bool, arguments: Mapping[str, Any]) -> Lines:
     return {"from wfsobs.identification import identify, report"}, [
         f"found = identify(record, {_arguments(arguments)})",
         "for mode in found.modes:",
-        "    for what, frequency, damping, rms in report.rows(mode):",
+        "    for what, frequency, damping, rms in report.mode_rows(mode):",
         "        print(mode.name, what, *(n.value for n in (frequency, damping, rms) if n is not None))",
         'print("\\n".join(report.verdict(found)))',
     ]

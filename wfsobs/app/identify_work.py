@@ -8,7 +8,7 @@ import numpy as np
 
 from wfsobs.app.jobs.job import Tell
 from wfsobs.app.work import RunResults
-from wfsobs.identification import Identified, identify
+from wfsobs.identification import Identification, identify
 from wfsobs.identification.result import IdentifiedMode
 from wfsobs.observers.missing import bridged
 from wfsobs.prior import Model
@@ -72,7 +72,7 @@ def measure(of: RunResults, _watch: Watch, _tell: Tell) -> MeasuredSpectrum:
     )
 
 
-def fit(mode: IdentifiedMode, result: Identified) -> Fit:
+def fit(mode: IdentifiedMode, result: Identification) -> Fit:
     """Compute the spectrum of the model identified in a mode."""
     s, T = mode.spectrum, result.duration
     centres = [(p.omega / (2 * np.pi), p.damping) for p in s.processes]
@@ -104,6 +104,6 @@ def same(one: Record, other: Record) -> bool:
     )
 
 
-def compute(of: RunResults, level: float, lowest: float, watch: Watch, _tell: Tell) -> tuple[Identified, Record]:
+def compute(of: RunResults, level: float, lowest: float, watch: Watch, _tell: Tell) -> tuple[Identification, Record]:
     """Identify a model in the record shown; return both. Raises RecordError, Cancelled."""
     return identify(of.result.record, level=level, lowest=lowest, watch=watch), of.result.record

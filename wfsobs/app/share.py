@@ -18,7 +18,7 @@ import param
 
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.scenario import Scenario, configfile
-from wfsobs.scenario.configfile import from_toml, parse_toml, pristine, to_toml
+from wfsobs.scenario.configfile import from_toml, parse_toml, reference_preset, to_toml
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.group import SettingError, holds_groups, settings_of
 
@@ -58,7 +58,7 @@ class Link:
 
 def changes(scenario: Scenario, preset: str) -> dict[str, Any]:
     """Dotted path -> plain value of the settings that differ from the preset's."""
-    return configfile.changes(scenario, pristine(preset))
+    return configfile.changed_settings(scenario, reference_preset(preset))
 
 
 # ---------------------------------------------------------------------- links

@@ -10,7 +10,7 @@ from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
-from wfsobs.telemetry.intake import Stated
+from wfsobs.telemetry.intake import DeclaredFormat
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class LoadedRecord:
     name: str
     key: str
     what: str = ""
-    stated: Stated = field(default_factory=Stated)
+    stated: DeclaredFormat = field(default_factory=DeclaredFormat)
     sha256: str = ""
 
     simulation = None

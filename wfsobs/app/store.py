@@ -15,7 +15,7 @@ from wfsobs.app.service import Post, Session
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, same
 from wfsobs.cost import run_seconds
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.configfile import pristine
+from wfsobs.scenario.configfile import reference_preset
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.group import SettingError
 
@@ -134,7 +134,7 @@ class Store(param.Parameterized):
 
     def changed(self) -> list[str]:
         """Dotted paths of the settings that differ from the preset's."""
-        return _paths(self.scenario.difference(pristine(self.preset)))
+        return _paths(self.scenario.difference(reference_preset(self.preset)))
 
     def close(self) -> None:
         """Release what the store holds; called when the session ends."""

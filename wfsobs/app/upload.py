@@ -28,7 +28,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.group import SettingError
 from wfsobs.settings.parameters import hint
-from wfsobs.telemetry.intake import Stated
+from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import Preview, SpectrumPreview, preview_any, safe_name
 from wfsobs.units import UNITS
 
@@ -111,7 +111,7 @@ class Upload:
 
     # ------------------------------------------------------------------ the preview
 
-    def read_fields(self) -> Stated:
+    def read_fields(self) -> DeclaredFormat:
         """Read the fields. Raises RecordError where one holds no number."""
 
         def number(field: Any, kind: type, least: float) -> Any:
@@ -127,7 +127,7 @@ class Upload:
             return value
 
         unit = None if self.unit.value == SILENT else self.unit.value
-        return Stated(unit, self.sign.value or None, number(self.delay, int, 1), number(self.rate, float, 1e-3))
+        return DeclaredFormat(unit, self.sign.value or None, number(self.delay, int, 1), number(self.rate, float, 1e-3))
 
     def look(self) -> None:
         """Read the file, beside the page, as what the fields say."""

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from wfsobs.app.jobs.job import INTERVAL, Tell
 from wfsobs.app.sources import Source
-from wfsobs.evaluation.bound import Bound, bounds
+from wfsobs.evaluation.bound import Bound, record_bounds
 from wfsobs.evaluation.scores import spectra
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Estimate
@@ -148,7 +148,7 @@ class _Work:
                 self.tell(result=shown)
                 self._let_draw()
                 if self.simulation is not None:
-                    self.bounds = bounds(self.simulation, record)
+                    self.bounds = record_bounds(self.simulation, record)
         return self._so_far(record)
 
     def _left(self) -> set[str]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from rich.table import Table
 
 from wfsobs.identification.process import Number
-from wfsobs.identification.report import rows, written
-from wfsobs.identification.result import Identified
+from wfsobs.identification.report import format_number, mode_rows
+from wfsobs.identification.result import Identification
 
 
-def identification_table(result: Identified) -> Table:
+def identification_table(result: Identification) -> Table:
     """Noise, turbulence and peaks of every mode."""
     out = Table(title=f"Identified from {result.duration:.1f} s, with standard deviations")
     for name in ("Mode", "What"):
@@ -18,9 +18,9 @@ def identification_table(result: Identified) -> Table:
         out.add_column(name, justify="right", no_wrap=True)
     for m in result.modes:
         out.add_section()
-        for what, frequency, damping, rms in rows(m):
+        for what, frequency, damping, rms in mode_rows(m):
             numbers = (frequency, damping, None if rms is None else _nm(rms))
-            out.add_row(m.name, what, *("" if n is None else written(n) for n in numbers))
+            out.add_row(m.name, what, *("" if n is None else format_number(n) for n in numbers))
     return out
 
 

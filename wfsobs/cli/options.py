@@ -9,7 +9,7 @@ import click
 from wfsobs.record import DELAY, Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.telemetry.intake import Stated
+from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import load_record
 from wfsobs.units import UNITS
 
@@ -55,7 +55,7 @@ def record_options(command: Callable) -> Callable:
     return command
 
 
-def loaded(record_file: str, scenario: Scenario, stated: Stated, sha256: str | None = None) -> Record:
+def loaded(record_file: str, scenario: Scenario, stated: DeclaredFormat, sha256: str | None = None) -> Record:
     """The record of a file; what was understood of it is said on standard error."""
     record = load_record(record_file, scenario, stated, sha256)
     if record.origin:

@@ -9,8 +9,8 @@ from math import inf
 import numpy as np
 from rich.table import Table
 
-from wfsobs.evaluation.recovery import Pooled, Recovery, recovery, running_rms
-from wfsobs.evaluation.rows import Row, label_of
+from wfsobs.evaluation.recovery import PooledRms, Recovery, recovery, running_rms
+from wfsobs.evaluation.rows import Row, row_label
 from wfsobs.pipeline import Result
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
@@ -33,14 +33,14 @@ class OverTime:
             )
         self.scenario, self.window = scenario, window
         self.rows: list[Row] = []
-        self._pooled: dict[tuple[str, str], Pooled] = {}
+        self._pooled: dict[tuple[str, str], PooledRms] = {}
 
     def add(self, result: Result, seed: int) -> None:
         """One more run."""
         every = max(round(self.window / result.record.dt), 1)
         for e in result.estimates:
             running = running_rms(result.record, e, self.window)
-            self._pooled.setdefault((e.observer, e.target), Pooled()).add(running)
+            self._pooled.setdefault((e.observer, e.target), PooledRms()).add(running)
             for mode, column in zip(self.scenario.modes, running[every - 1 :: every].T, strict=False):
                 self.rows += [
                     {
@@ -92,7 +92,7 @@ class OverTime:
             table.add_column(name, justify="right", no_wrap=True)
         for _, lines in groupby(self.recoveries(), key=lambda line: line[:3]):
             for target, mode, event, name, r in lines:
-                table.add_row(target, mode, event, label_of(name), *recovery_texts(r))
+                table.add_row(target, mode, event, row_label(name), *recovery_texts(r))
             table.add_section()
         return table
 
@@ -108,7 +108,7 @@ class OverTime:
         for _, group in groupby(self._series(), key=lambda s: s[:2]):
             for target, mode, observer, x in group:
                 values = [x[min(end * every, x.size) - 1] for end in ends]
-                table.add_row(target, mode, label_of(observer), *("-" if np.isnan(v) else f"{v * 1e3:.2f}" for v in values))
+                table.add_row(target, mode, row_label(observer), *("-" if np.isnan(v) else f"{v * 1e3:.2f}" for v in values))
             table.add_section()
         return table
 

@@ -13,7 +13,7 @@ from wfsobs.cli.show import progress_bar, show, show_over_time, show_table, show
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
-from wfsobs.evaluation.rows import Row, rows
+from wfsobs.evaluation.rows import Row, score_rows
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
 from wfsobs.progress import Watch
@@ -21,7 +21,7 @@ from wfsobs.scenario import configfile
 from wfsobs.settings.group import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats.psd import load_psd
-from wfsobs.telemetry.intake import Stated
+from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import save_record
 from wfsobs.units import UNITS
 
@@ -69,7 +69,7 @@ def run(
                 save_record(save, record, configfile.to_toml(one))
             result = observe_record(record, one, watch=Watch(progress=lambda f, i=i: update((i + f) / seeds)), simulated=True)
             warn(result)
-            all_rows += rows(result.scores, one.run.seed)
+            all_rows += score_rows(result.scores, one.run.seed)
             if history:
                 history.add(result, one.run.seed)
     if history:
@@ -110,7 +110,7 @@ def loop(
     if record_file is not None:
         if seeds > 1:
             raise SettingError("--seeds: is for simulated records, leave it out with --record")
-        stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
+        stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
         record = loaded(record_file, scenario, stated, sha256)
         scenario = as_stated(record, scenario)
     all_rows: list[Row] = []

@@ -7,7 +7,7 @@ from statistics import median
 
 from rich.table import Table
 
-from wfsobs.evaluation.rows import TIME, Row, interval_text, label_of, looks_ahead, needs_of, own_stretch, stretch_of
+from wfsobs.evaluation.rows import TIME, Row, interval_text, is_non_causal, own_interval, row_label, row_needs, scored_interval
 from wfsobs.evaluation.scores import RESIDUAL
 
 
@@ -35,8 +35,8 @@ def score_table(rows: Sequence[Row]) -> Table:
         table.add_row(
             target,
             mode,
-            label_of(observer) + (" (looks ahead)" if looks_ahead(observer) else "") + _own(same),
-            needs_of(observer),
+            row_label(observer) + (" (looks ahead)" if is_non_causal(observer) else "") + _own(same),
+            row_needs(observer),
             f"{median(errors):.2f}",
             *((f"{min(errors):.2f} - {max(errors):.2f}",) if several else ()),
             *((interval_text(same[0]["interval_um"], 1e3),) if bounded else ()),
@@ -50,12 +50,14 @@ def score_table(rows: Sequence[Row]) -> Table:
 
 def _own(same: Sequence[Row]) -> str:
     """What is said of an observer that stands apart, for some seeds or all."""
-    return f" ({own_stretch(own[0])})" if (own := [r for r in same if r["apart"]]) else ""
+    return f" ({own_interval(own[0])})" if (own := [r for r in same if r["apart"]]) else ""
 
 
 def _caption(rows: Sequence[Row]) -> str:
     """What was scored, target by target where they differ."""
-    found = {target: stretch_of(r for r in rows if r["target"] == target) for target in dict.fromkeys(r["target"] for r in rows)}
+    found = {
+        target: scored_interval(r for r in rows if r["target"] == target) for target in dict.fromkeys(r["target"] for r in rows)
+    }
     spans = {span for span in found.values() if span}
     if len(spans) > 1:
         return "Scored: " + "; ".join(f"{target} {span}" for target, span in found.items() if span)

@@ -9,7 +9,7 @@ import click
 from wfsobs.cli.identification_table import identification_table
 from wfsobs.cli.options import loaded, record_options, scenario_options
 from wfsobs.cli.show import progress_bar, show, show_table, warn
-from wfsobs.evaluation.rows import rows
+from wfsobs.evaluation.rows import score_rows
 from wfsobs.files import check_writable, write_whole
 from wfsobs.identification import identify as identify_record
 from wfsobs.identification import report as identified
@@ -20,7 +20,7 @@ from wfsobs.priors_from.identification import told_by
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
 from wfsobs.spectral.search import LOWEST
-from wfsobs.telemetry.intake import Stated
+from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import save_arrays
 
 
@@ -48,10 +48,10 @@ def observe(
     """Run the observers on a record: .npz, .csv, .fits or AOT (preset paper unless told)."""
     scenario = configfile.scenario_from(preset, config, assignments)
     if prior is not None:
-        scenario = told_by(configfile.load(prior), scenario)
+        scenario = told_by(configfile.load_scenario(prior), scenario)
         for path, value in map(configfile.parse_assignment, assignments):
             scenario.set(path, value)
-    stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
+    stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
     record = loaded(record_file, scenario, stated, sha256)
     with progress_bar() as update:
         result = observe_record(record, scenario, watch=Watch(progress=update))
@@ -61,7 +61,7 @@ def observe(
     if not result.scores and not as_json:
         click.echo(f"wfsobs: {record_file}: {len(result.estimates)} estimates, no scores: nothing after the warm-up", err=True)
         return
-    show(rows(result.scores, None), as_json)
+    show(score_rows(result.scores, None), as_json)
 
 
 @click.command()
@@ -103,17 +103,17 @@ def identify(
 ) -> None:
     """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
     scenario = configfile.scenario_from(preset, config, assignments)
-    stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
+    stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
     record = loaded(record_file, scenario, stated, sha256)
     if out:
         check_writable(out)
     with progress_bar("sweeps") as update:
         result = identify_record(record, level=level, lowest=lowest, watch=Watch(progress=update))
     if out:
-        text = identified.toml(result, result.scenario(as_stated(record, scenario)))
+        text = identified.identification_toml(result, result.scenario(as_stated(record, scenario)))
         write_whole(out, lambda file: file.write(text.encode()))
     if as_json:
-        click.echo(json.dumps(identified.plain(result), allow_nan=False))
+        click.echo(json.dumps(identified.identification_dict(result), allow_nan=False))
         return
     show_table(identification_table(result))
     for line in identified.verdict(result):

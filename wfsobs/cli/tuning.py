@@ -15,7 +15,7 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
 from wfsobs.settings.group import SettingError
-from wfsobs.telemetry.intake import Stated
+from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.tuning import report
 from wfsobs.tuning import tune as search
 from wfsobs.tuning.tuning import EVALUATIONS
@@ -75,7 +75,7 @@ def tune(
     if record_file is not None:
         if validation is not None:
             raise SettingError("--validation: is for simulated records, leave it out with --record")
-        stated = Stated(unit, int(command_sign) if command_sign else None, command_delay, rate)
+        stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
         record = loaded(record_file, scenario, stated, sha256)
     if out:
         check_writable(out)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rich.table import Table
 
-from wfsobs.evaluation.rows import label_of
+from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.tuning.report import nm, settings
 from wfsobs.tuning.tuning import Tuned
@@ -12,7 +12,7 @@ from wfsobs.tuning.tuning import Tuned
 
 def settings_table(tuned: Tuned) -> Table:
     """The settings that were searched, and those that were set by hand for it, before and after."""
-    out = Table(title=f"{label_of(tuned.observer)}: settings after {len(tuned.history)} evaluations")
+    out = Table(title=f"{row_label(tuned.observer)}: settings after {len(tuned.history)} evaluations")
     out.add_column("Setting", no_wrap=True)
     for name in ("before", "after"):
         out.add_column(name, justify="right", no_wrap=True)

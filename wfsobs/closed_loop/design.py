@@ -20,7 +20,7 @@ from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for
 from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
-from wfsobs.simulation.true_spectra import is_known, true_spectra
+from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None) -> Desi
     """
     scenario.validate()
     before, plant = scenario.before_events, plant_of(scenario)
-    true = [true_spectra(before, mode) for mode in range(len(scenario.modes))] if is_known(before) else []
+    true = [true_spectra(before, mode) for mode in range(len(scenario.modes))] if has_known_spectra(before) else []
     spectra = [told_spectra(one) for one in true]
     made = {c.id: _designed(c, before, plant, spectra) for c in chosen(controllers)}
     laws, priors = {name: laws for name, (laws, _) in made.items()}, {name: prior for name, (_, prior) in made.items()}

@@ -26,7 +26,7 @@ from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import rms
 from wfsobs.signal.wiener import advance_spectrum, circle_mean, degrees_of_freedom, error_spectrum, explained_variance, factorise
-from wfsobs.simulation.true_spectra import TrueSpectra, is_known, true_spectra
+from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 from wfsobs.typing import Array
 
 SHARE = 0.95
@@ -132,7 +132,7 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
     }
 
 
-def bound(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:
+def bound_rms(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:
     """Return target -> rms [um] of the minimum error, as `least_errors`, of one mode of a scenario."""
     return {name: error.rms for name, error in least_errors(true_spectra(scenario, mode), ahead).items()}
 
@@ -147,9 +147,9 @@ class Bound:
     error: LeastError
 
 
-def bounds(scenario: Scenario, record: Record) -> list[Bound]:
+def record_bounds(scenario: Scenario, record: Record) -> list[Bound]:
     """Compute the bounds of a record that was simulated from the scenario; none where its spectra are not known."""
-    if not is_known(scenario):
+    if not has_known_spectra(scenario):
         return []
     modes = scenario.modes[: record.n_modes]
     with ThreadPoolExecutor(2) as pool:

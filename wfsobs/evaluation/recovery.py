@@ -69,7 +69,7 @@ def trailing_sum(x: Array, n: int) -> Array:
 
 
 @dataclass
-class Pooled:
+class PooledRms:
     """Running rms of several records of one length together: root of the mean of squares, without NaN."""
 
     total: Array | float = 0.0

@@ -18,7 +18,7 @@ NOT_OBSERVERS = {LOOP: "Recorded loop", BOUND: "Bound, mean of the LGS"}
 """Labels of rows in a table of observers that are not observers."""
 
 
-def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
+def score_rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
     """Return one plain dictionary per score: the keys of `wfsobs run --json`, and TIME."""
     return [
         {
@@ -32,7 +32,7 @@ def rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
             "start_s": s.start,
             "stop_s": s.stop,
             "apart": s.apart,
-            "needs": needs_of(s.observer),
+            "needs": row_needs(s.observer),
             "interval_um": None if s.interval is None else list(s.interval),
             "seed": seed,
             TIME: None if s.observer in NOT_OBSERVERS else s.seconds_per_step * 1e6,
@@ -46,33 +46,33 @@ def interval_text(interval: Sequence[float] | None, scale: float) -> str:
     return "-" if interval is None else f"{interval[0] * scale:.2f} - {interval[1] * scale:.2f}"
 
 
-def label_of(observer: str) -> str:
+def row_label(observer: str) -> str:
     """Return the label of a row."""
     return NOT_OBSERVERS.get(observer) or OBSERVERS[observer].label
 
 
-def needs_of(observer: str) -> str:
+def row_needs(observer: str) -> str:
     """Return what a row needs beside measurements; the bound needs the true spectra."""
     if observer in NOT_OBSERVERS:
         return SPECTRA if observer == BOUND else ""
     return OBSERVERS[observer].told
 
 
-def competes(observer: str, apart: bool) -> bool:
+def can_be_best(observer: str, apart: bool) -> bool:
     """Return whether a row can be the best: not the bound, nor a row that is not causal or was scored on samples of its own."""
-    return observer not in NOT_OBSERVERS and not looks_ahead(observer) and not apart
+    return observer not in NOT_OBSERVERS and not is_non_causal(observer) and not apart
 
 
-def stretch_of(rows: Iterable[Row]) -> str:
+def scored_interval(rows: Iterable[Row]) -> str:
     """Return the interval of the scored samples of comparable rows, empty where there are none.
 
-    >>> stretch_of([{"start_s": 4.001, "stop_s": 9.999, "apart": False}, {"start_s": None, "stop_s": None, "apart": False}])
+    >>> scored_interval([{"start_s": 4.001, "stop_s": 9.999, "apart": False}, {"start_s": None, "stop_s": None, "apart": False}])
     '4.00 to 10.00 s'
     """
     return _span([r for r in rows if not r["apart"]])
 
 
-def own_stretch(row: Row) -> str:
+def own_interval(row: Row) -> str:
     """Return the interval of the scored samples of a row that stands apart, empty for any other."""
     return f"{_span([row])} only" if row["apart"] else ""
 
@@ -82,6 +82,6 @@ def _span(rows: Sequence[Row]) -> str:
     return f"{min(start for start, _ in known):.2f} to {max(stop for _, stop in known):.2f} s" if known else ""
 
 
-def looks_ahead(observer: str) -> bool:
+def is_non_causal(observer: str) -> bool:
     """Return whether an estimate uses later samples."""
     return observer not in NOT_OBSERVERS and not OBSERVERS[observer].causal

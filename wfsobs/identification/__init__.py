@@ -1,15 +1,15 @@
-"""From a record to the model behind it: noise, turbulence, peaks, with errors and a test. docs/identification.md has it all.
+"""Identification of a record: noise, turbulence and peaks, with errors and a test. See docs/identification.md.
 
-`identify` uses the observers, and an observer uses parts of it: it is imported once it is asked for.
+`identify` uses the observers, and an observer uses parts of it: it is imported when first used.
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from wfsobs.identification.identification import identify
-    from wfsobs.identification.result import Identified
+    from wfsobs.identification.result import Identification
 
-__all__ = ["Identified", "identify"]
+__all__ = ["Identification", "identify"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Which resonances are no vibration: they shape the continuum, and no peak of theirs is to be seen in it."""
+"""Resonances that are not vibration: they shape the continuum, without a visible peak."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from wfsobs.signal.ar2 import Ar2
 from wfsobs.spectral.model import Spectrum
 
 BROAD = 0.1
-"""Damping from which a resonance may belong to the continuum: modes of structures have 0.005 to 0.05."""
+"""Minimum damping of a resonance of the continuum: modes of structures have 0.005 to 0.05."""
 STANDS_OUT = 1.25
-"""Density at the maximum of a broad resonance over that of the dip below it, at least, for it to be a vibration."""
+"""Minimum density at the maximum of a broad vibration peak, over that of the dip below it."""
 POINTS = 200
-"""At which the density is looked at."""
+"""Points at which the density is evaluated."""
 
 
-def of_continuum(spectrum: Spectrum, p: Ar2, lowest: float) -> bool:
-    """Whether a resonance of the spectrum is a part of turbulence or background.
+def is_continuum(spectrum: Spectrum, p: Ar2, lowest: float) -> bool:
+    """Return whether a resonance of the spectrum belongs to turbulence or background.
 
-    It is if it lies below `lowest`, the frequency [Hz] from which peaks are looked for; or if it is broad, and the density of the
-    whole model has no maximum where it is that stands out of the dip on its lower side. Likelihood cannot decide: where no model
+    It does if it lies below `lowest`, the minimum frequency of peaks [Hz]; or if it is broad, and the density of the
+    whole model has no maximum there that stands out of the dip on its lower side. Likelihood cannot decide: where no model
     of turbulence fits, a resonance raises it by any amount.
     """
     f0 = p.omega / (2.0 * pi)

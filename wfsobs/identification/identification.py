@@ -1,4 +1,4 @@
-"""From a record to its model: noise, turbulence, then peaks one at a time until the residual is white."""
+"""Identification of a record: noise, turbulence, then peaks one at a time until the residual is white."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.stats import gamma
 
 from wfsobs.identification.one_mode import OneMode
 from wfsobs.identification.remarks import in_time, remarks
-from wfsobs.identification.result import Identified, read_off
+from wfsobs.identification.result import Identification, read_mode
 from wfsobs.identification.whiteness import Whiteness, autocorrelation_test, cumulated_test, innovations
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last, pseudo_open_loop
@@ -24,26 +24,52 @@ from wfsobs.typing import Array
 LEVEL = 0.05
 """Probability of any false peak in a record."""
 EVERY_SWEEP, SELDOM = 8, 4
-"""All numbers are fitted anew after every peak, of many peaks after every so many: each has been fitted alone."""
+"""All parameters are fitted anew after every peak; with many peaks, only after several: each has been fitted alone."""
 MOST_PEAKS = 40
-"""Per mode."""
+"""Maximum number of peaks per mode."""
 SHORTEST = 1000
-"""Samples of a record at least."""
+"""Minimum samples of a record."""
 ALONE = 0.8
-"""Share of the level for modes alone, where there are several: a line in one of them has no power to spare, one in all has."""
+"""Share of the level for single modes, where there are several: a line in one of them is weaker than one in all."""
 LEAST = 0.5
-"""Share of the samples that are measured at least."""
+"""Minimum share of measured samples."""
 RESTING = 1e-9
-"""Rms over largest value of a measurement that is a constant with rounding errors."""
+"""Rms over maximum of a measurement that is constant but for rounding errors."""
 JOINT = 1e-3
 """A candidate of all modes together belongs to those in which white noise would be as high with this probability."""
 
 
-def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, watch: Watch = QUIET) -> Identified:
-    """The model of every mode of a record, from its pseudo-open-loop measurement z; lost samples are told from measured ones.
+def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, watch: Watch = QUIET) -> Identification:
+    """Identify the model of every mode of a record, from its pseudo-open-loop measurement z.
 
-    level : probability of finding any peak where there is none;  lowest : frequency from which peaks are looked for [Hz]
-    Raises RecordError for a record that is too short, lacks too much or does not move, Cancelled.
+    White noise, turbulence and vibration peaks, each number with its standard deviation; missing samples are accounted for.
+
+    Parameters
+    ----------
+    record : Record
+        Measurements and commands.
+    level : float
+        Probability of finding any peak where there is none.
+    lowest : float
+        Minimum frequency of a peak [Hz].
+    watch : Watch, optional
+        Receives the progress, and is asked at every block of work whether to stop.
+
+    Returns
+    -------
+    Identification
+        One model per mode.
+
+    Raises
+    ------
+    RecordError
+        The record is too short, has too few samples or is constant.
+    Cancelled
+        `watch` asks to stop.
+
+    See Also
+    --------
+    wfsobs.observe : Run observers on a record.
     """
     if np.isinf(record.y_lgs).any() or np.isinf(record.u).any():
         raise RecordError("the record has samples that are infinite")
@@ -67,26 +93,26 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     for column in z.T:
         watch.check()
         modes.append(OneMode(column, record.dt))
-    grow(modes, level, lowest, watch)
-    left = unexplained(modes, level, lowest)
+    add_peaks(modes, level, lowest, watch)
+    left = count_unexplained(modes, level, lowest)
     found = tuple(
-        read_off(name, mode, lowest, tested(mode, count)) for name, mode, count in zip(names, modes, left, strict=False)
+        read_mode(name, mode, lowest, check_whiteness(mode, count)) for name, mode, count in zip(names, modes, left, strict=False)
     )
     watch.step(1.0)
-    return Identified(found, record.dt, len(z), level)
+    return Identification(found, record.dt, len(z), level)
 
 
-def grow(modes: Sequence[OneMode], level: float, lowest: float, watch: Watch) -> None:
-    """Add peaks to the modes, one to each at a time, until no test sees any more; then polish, and look once more."""
+def add_peaks(modes: Sequence[OneMode], level: float, lowest: float, watch: Watch) -> None:
+    """Add peaks to the modes, one to each at a time, until no test finds more; then polish, and search once more."""
     for again in (False, True):  # the first spectra are rough: they say what not to fit, not what is a peak
-        look(modes, level, lowest)
+        find_candidates(modes, level, lowest)
         for mode in modes:
             mode.refit(reshape=again)
     polished = False
     for sweep in range(3 * MOST_PEAKS):
         watch.step(1.0 - 1.0 / (1.0 + 0.1 * sweep))
         seen = False
-        for mode, best in zip(modes, look(modes, level, lowest), strict=True):
+        for mode, best in zip(modes, find_candidates(modes, level, lowest), strict=True):
             if best is None or mode.peaks >= MOST_PEAKS:
                 continue
             seen = True
@@ -101,18 +127,18 @@ def grow(modes: Sequence[OneMode], level: float, lowest: float, watch: Watch) ->
         polished = not seen
 
 
-def look(modes: Sequence[OneMode], level: float, lowest: float) -> list[Candidate | None]:
-    """The strongest candidate of every mode, if any; what is strong takes no part in the next fit."""
+def find_candidates(modes: Sequence[OneMode], level: float, lowest: float) -> list[Candidate | None]:
+    """Return the strongest candidate of every mode, if any; bins that would spoil the next fit are excluded from it."""
     out = []
-    for mode, found in zip(modes, candidates(modes, level, lowest), strict=True):
+    for mode, found in zip(modes, search_modes(modes, level, lowest), strict=True):
         mode.strong = np.logical_or.reduce([one.strong for one in found])
         out.append(max((one.best for one in found if one.best), key=lambda c: c.strength, default=None))
     return out
 
 
-def candidates(modes: Sequence[OneMode], level: float, lowest: float) -> list[list[SearchResult]]:
-    """What the search finds in every mode, alone and with all the others."""
-    whitened = [mode.whitened() for mode in modes]
+def search_modes(modes: Sequence[OneMode], level: float, lowest: float) -> list[list[SearchResult]]:
+    """Return the search results of every mode, alone and with all the others."""
+    whitened = [mode.whiten() for mode in modes]
     n, dt, several = modes[0].n, modes[0].dt, len(modes) > 1
     alone = ALONE * level if several else level
     out = [[search_peaks(fine, n, dt, 1, alone / len(modes), lowest)] for fine in whitened]
@@ -125,7 +151,7 @@ def candidates(modes: Sequence[OneMode], level: float, lowest: float) -> list[li
 
 
 def _has_part(fine: Array, T: float, frequency: float, width: int) -> bool:
-    """Whether a mode is high itself where all of them together are."""
+    """Return whether a mode is high itself where all of them together are."""
     if width == 1:
         return bool(fine[max(round(frequency * PAD * T) - 1, 0)] > -np.log(JOINT))
     centre = round(frequency * T)
@@ -133,21 +159,21 @@ def _has_part(fine: Array, T: float, frequency: float, width: int) -> bool:
     return bool(bins.sum() > gamma.isf(JOINT, width))
 
 
-def unexplained(modes: Sequence[OneMode], level: float, lowest: float) -> list[int]:
-    """Per mode, how many of the candidates that no peak explained the search still sees."""
+def count_unexplained(modes: Sequence[OneMode], level: float, lowest: float) -> list[int]:
+    """Return per mode the number of refused candidates that the search still finds."""
     refused = [mode.refused for mode in modes]
     for mode in modes:
         mode.refused = []
     out = []
-    for mode, were, found in zip(modes, refused, candidates(modes, level, lowest), strict=True):
+    for mode, were, found in zip(modes, refused, search_modes(modes, level, lowest), strict=True):
         flagged = mode.f[np.logical_or.reduce([one.flagged for one in found])]
         out.append(sum(bool(np.any(np.abs(flagged - c.frequency) <= (c.width + 1) * mode.f[0])) for c in were))
         mode.refused = were
     return out
 
 
-def tested(mode: OneMode, left: int) -> Whiteness:
-    """The tests of what a mode's model leaves; left : candidates that no peak explains."""
+def check_whiteness(mode: OneMode, left: int) -> Whiteness:
+    """Test the residual of a mode's model; left : candidates that no peak explains."""
     ratio = periodogram(mode.complete, mode.dt) / mode.spectrum.psd(mode.f)
     cumulated = cumulated_test(ratio, mode.n)
     try:

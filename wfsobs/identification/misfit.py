@@ -1,4 +1,4 @@
-"""By how much a smooth spectrum may be too low: what it is seen to be too high by nearby.
+"""Margin for the shape of a smooth spectrum: it may be as much too low as it is too high nearby.
 
 Frozen flow has lobes, a few hertz apart and by tens of percent above and below any smooth curve, which are no peaks. Peaks only
 rise: where a fitted spectrum is too high, its shape is wrong, and it is as likely to be too low by as much within an octave.
@@ -21,11 +21,11 @@ FURTHER, LEVEL = 4.0, 1e-3
 """The same over which dips have to be none of noise: probability at most with which the right spectrum is given a margin at a
 frequency."""
 MEAN, VARIANCE = 0.2772, 0.3543
-"""Of what a dip of the right spectrum is worth in log-likelihood, 0 for means above one; of normal means 0.25 and 0.3125."""
+"""Of the log-likelihood of a dip of the right spectrum, 0 for means above one; of normal means 0.25 and 0.3125."""
 
 
 def margin(ratio: Array) -> Array:
-    """Factor (bins,), 1 or more, by which S may be too low, from I / S (bins,).
+    """Return the factor (bins,), 1 or more, by which S may be too low, from I / S (bins,).
 
     A dip of WIDTH bins is worth d = WIDTH (r - 1 - log r) in log-likelihood, r < 1 their mean. Where the sum of d is unusual over
     an octave on either side, and none of noise over two, all of it is taken for that of log S + a sin: over n means n WIDTH

@@ -1,4 +1,4 @@
-"""The model of one mode as it grows: a spectrum, and the pure lines that have been taken off."""
+"""The growing model of one mode: a spectrum, and the undamped lines that have been subtracted."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from math import pi
 import numpy as np
 
 from wfsobs.identification.misfit import margin
-from wfsobs.identification.order import of_best_order, with_background
+from wfsobs.identification.order import choose_order, with_background
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.spectral.lines import Sinusoid, nearest_line
 from wfsobs.spectral.missing import MissingSamples
@@ -19,29 +19,48 @@ from wfsobs.spectral.whittle import first_guess, fit_spectrum, spectrum_negative
 from wfsobs.typing import Array
 
 NEIGHBOURS = 4.0
-"""Bins, beside half its width, within which something new is no peak of its own: two peaks that near are one."""
+"""Bins, beside half its width, within which a candidate is not a new peak: two peaks that near are one."""
 WIDEST_LINE = 9
-"""Bins over which a pure line may be the best of what was looked at."""
+"""Maximum width of a candidate, in bins, that may be an undamped line."""
 RESOLVED = 0.2
-"""Half width at half maximum of a resonance at least, in bins; what is narrower is a line."""
+"""Minimum half width at half maximum of a resonance, in bins; what is narrower is a line."""
 WIDEST = 0.5
-"""Damping of a resonance at most."""
+"""Maximum damping of a resonance."""
 SURE = 2.0
-"""Standard deviations that the rms of a resonance has at least."""
+"""Minimum rms of a resonance, in standard deviations."""
 WORTH = 6.0
-"""Log-likelihood that three numbers more have to gain: noise gives as much with a probability of 0.7 % (chi squared of 12)."""
+"""Minimum gain of log-likelihood by three parameters: noise gains as much with a probability of 0.7 % (chi squared of 12)."""
 SPLIT = 8.0
-"""The same for two resonances in the place of one, which every wide one is tried for."""
+"""The same for two resonances in place of one, which is tried for every wide one."""
 
 SETTLED = 0.01
-"""Of the error of a fill that repeated filling and fitting leaves: each leaves the share that is missing, about."""
+"""Remaining error of repeated filling and fitting: each round leaves about the share that is missing."""
 
 
 class OneMode:
-    """z (n,) of one mode, mean taken off, and what has been found in it; NaN is a missing sample.
+    """Model of one mode.
 
-    spectrum, lines : the model;  left : z without the lines, filled as the model expects;  I : expected periodogram of that
-        if it were complete;  share : of every bin that is measured, see `missing`;  refused : candidates that no peak explains
+    Parameters
+    ----------
+    z : Array
+        Pseudo-open-loop measurement, (n,) [um]; NaN is a missing sample.
+    dt : float
+        Time step [s].
+    rng : numpy.random.Generator, optional
+        For the draws of missing samples.
+
+    Attributes
+    ----------
+    spectrum, lines
+        The model.
+    left : Array
+        z without mean and lines, filled by the model's expectation, (n,).
+    I : Array
+        Expected periodogram of the complete `left`.
+    share : Array
+        Measured share of every bin, see `missing`.
+    refused : list
+        Candidates that no peak explains.
     """
 
     def __init__(self, z: Array, dt: float, rng: np.random.Generator | None = None):
@@ -51,41 +70,41 @@ class OneMode:
         self.share, self.unknown, self.lost = np.ones(len(self.f)), np.zeros((0, self.n)), np.zeros(len(self.f))
         self.z = self.missing.interpolate(self.measured)
         self.lines: list[Sinusoid] = []
-        self._take_off()
+        self._subtract_lines()
         self.spectrum = first_guess(self.f, self.I, dt)
         self.strong = np.zeros(len(self.f), bool)
         self.refused: list[Candidate] = []
         self._fill()
 
     def _fill(self) -> None:
-        """Fill z as the model expects it now."""
+        """Fill z by the expectation of the present model."""
         if self.missing.any:
             S, lines = self.spectrum.psd(self.f), self._signal()
             self.unknown = self.missing.draw_errors(S)
             self.share = self.missing.measured_share(S, self.unknown)
             self.lost = (1.0 - self.share) * S
             self.z = self.missing.fill(self.measured - lines, S) + lines
-            self._take_off()
+            self._subtract_lines()
 
     def _signal(self) -> Array:
         return sum((line.signal(self.n, self.dt) for line in self.lines), np.zeros(self.n))
 
-    def _take_off(self) -> None:
+    def _subtract_lines(self) -> None:
         self.left = self.z - self._signal()
         self.I = periodogram(self.left, self.dt) + self.lost
 
     @property
     def complete(self) -> Array:
-        """`left` with a sample of what is unknown in its gaps, (n,): as likely as the record that would have been."""
+        """`left` with a random draw of the unknown part in its gaps, (n,): as likely as the complete record."""
         return self.left + self.unknown[0] if self.missing.any else self.left
 
     @property
     def peaks(self) -> int:
-        """How many there are."""
+        """Number of peaks."""
         return len(self.lines) + len(self.spectrum.resonances)
 
-    def whitened(self) -> Array:
-        """I / S at PAD frequencies per bin, 1 at what has been refused; S as high as it may be (`misfit`)."""
+    def whiten(self) -> Array:
+        """Return I / S at PAD frequencies per bin, 1 at refused candidates; S as high as it may be (`misfit`)."""
         f = periodogram_frequencies(self.n, self.dt, PAD)
         S = self.spectrum.psd(self.f)
         S = np.exp(np.interp(f, self.f, np.log(S * self.share * margin(self.I / S))))
@@ -95,7 +114,7 @@ class OneMode:
         return ratio
 
     def cells(self, everything: bool = False) -> Cells:
-        """The bins for a fit: all but those that a test finds far too high and that no resonance is near."""
+        """Return the bins for a fit: all but those far above a test's limit without a resonance near."""
         keep = np.ones(len(self.f)) if everything else np.where(self.strong, 0.0, 1.0)
         for p in self.spectrum.resonances:
             centre, half = p.omega / (2 * pi), max(4.0 * p.damping * p.omega / (2 * pi), 20.0 * self.f[0])
@@ -103,31 +122,35 @@ class OneMode:
         return Cells(self.f, self.I, keep, [p.omega / (2 * pi) for p in self.spectrum.resonances], self.share)
 
     def refit(self, reshape: bool = False, third: bool = False) -> None:
-        """All numbers of the spectrum at once; reshape : whether order of the turbulence and background are chosen anew, third :
-        third order in any case. A resonance that has become as narrow as a line is one from then on; one that has become as
-        wide as turbulence is dropped."""
+        """Fit all parameters of the spectrum at once.
+
+        A resonance that has become as narrow as a line becomes one; one that has become as wide as turbulence is dropped.
+
+        reshape : whether the order of the turbulence and the background are chosen anew; third : third order in any case
+        """
         cells = self.cells()
         self.spectrum = fit_spectrum(self.spectrum, cells)
         if reshape:
-            self.spectrum = with_background(of_best_order(self.spectrum, cells, third), cells)
-        for p in [p for p in self.spectrum.resonances if not self._sound(p)]:
+            self.spectrum = with_background(choose_order(self.spectrum, cells, third), cells)
+        for p in [p for p in self.spectrum.resonances if not self._is_resolved(p)]:
             self.spectrum = replace(self.spectrum, resonances=tuple(q for q in self.spectrum.resonances if q is not p))
             frequency = p.omega / (2 * pi)
             if p.damping < WIDEST and 2.0 * self.f[0] < frequency < self.f[-1]:
                 self.lines = [*self.lines, nearest_line(self.left, self.dt, frequency, 0.75 * self.f[0])]
             self.refused.append(Candidate(frequency, WIDEST_LINE, 0.0))  # or it would come back
-            self._take_off()
+            self._subtract_lines()
         self._fill()
 
-    def _sound(self, p: Ar2) -> bool:
-        """Whether a resonance is wide enough to be told from a line, narrow enough to be told from turbulence, and below half the
-        rate."""
+    def _is_resolved(self, p: Ar2) -> bool:
+        """Return whether a resonance is wider than a line, narrower than turbulence, and below half the rate."""
         frequency = p.omega / (2 * pi)
         return RESOLVED * self.f[0] < p.damping * frequency and p.damping < WIDEST and 2.0 * self.f[0] < frequency < self.f[-1]
 
     def explain(self, candidate: Candidate) -> bool:
-        """Add the line or the resonance that explains the candidate best, or where there are lines beside it make one
-        resonance of them; whether that is worth its numbers."""
+        """Add the line or the resonance that explains the candidate best; return whether it is worth its parameters.
+
+        Where there are lines beside it, they may become one resonance.
+        """
         window = self._window(candidate)
         before = self._misfit(window, self.spectrum, self.I)
         lines, spectrum = self.lines, self.spectrum
@@ -135,7 +158,7 @@ class OneMode:
         trials: list[tuple[list[Sinusoid], Spectrum]] = []
         if beside:
             self.lines = rest = [line for line in lines if line not in beside]
-            self._take_off()
+            self._subtract_lines()
             centre = float(np.mean([line.frequency for line in beside]))
             trials.append((rest, self._with_resonance(Candidate(centre, max(candidate.width, 3), candidate.strength))))
         elif not any(abs(p.omega / (2 * pi) - candidate.frequency) < self._reach(candidate) for p in spectrum.resonances):
@@ -146,8 +169,8 @@ class OneMode:
         outcomes = []
         for some, shape in trials:
             self.lines = some
-            self._take_off()
-            if len(shape.resonances) > len(spectrum.resonances) and not self._sound(shape.resonances[-1]):
+            self._subtract_lines()
+            if len(shape.resonances) > len(spectrum.resonances) and not self._is_resolved(shape.resonances[-1]):
                 continue
             peaks_more = len(some) - len(lines) + len(shape.resonances) - len(spectrum.resonances)
             gain = before - self._misfit(window, shape, self.I) - WORTH * peaks_more
@@ -157,14 +180,14 @@ class OneMode:
             some, shape = lines, spectrum
             self.refused.append(candidate)
         self.lines, self.spectrum = some, shape
-        self._take_off()
+        self._subtract_lines()
         return gain > 0
 
     def _reach(self, candidate: Candidate) -> float:
         return (NEIGHBOURS + candidate.width / 2.0) * self.f[0]
 
     def _window(self, candidate: Candidate) -> Array:
-        """The bins over which explanations of a candidate are compared."""
+        """Return the bins over which explanations of a candidate are compared."""
         half = max(3.0 * self._reach(candidate), 0.03 * candidate.frequency)
         return np.abs(self.f - candidate.frequency) < half
 
@@ -179,7 +202,7 @@ class OneMode:
         return float(self.f[near][np.argmax(self.I[near] / self.spectrum.psd(self.f[near]))])
 
     def _with_resonance(self, candidate: Candidate) -> Spectrum:
-        """A resonance of the candidate's width more, it alone fitted to the bins about it."""
+        """Return the spectrum with a resonance of the candidate's width, it alone fitted to the bins about it."""
         f0, half = candidate.frequency, 0.5 * candidate.width * self.f[0]
         near = np.abs(self.f - f0) <= max(half, self.f[0])
         excess = np.maximum(self.I[near] - self.spectrum.psd(self.f[near]), 0.0)
@@ -201,8 +224,10 @@ class OneMode:
         return best[1]
 
     def polish(self, third: bool = False) -> None:
-        """Every line once more with the others taken off, and all numbers on all bins; third : turbulence of third order in any
-        case, as another mode has it."""
+        """Fit every line once more with the others subtracted, then all parameters on all bins.
+
+        third : turbulence of third order in any case, as another mode has it
+        """
         for again in range(self.missing.rounds(SETTLED)):
             self._polish_lines()
             self.refit(not again, third)
@@ -215,10 +240,10 @@ class OneMode:
             again = nearest_line(alone, self.dt, line.frequency, 0.25 * self.f[0])
             self.left = alone - again.signal(self.n, self.dt)
             self.lines[i] = again
-        self._take_off()
+        self._subtract_lines()
 
     def _split(self, p: Ar2) -> None:
-        """Two resonances in the place of one that is several bins wide, where they are worth it: neighbours look like one."""
+        """Replace one resonance that is several bins wide by two, where they are worth it: neighbours look like one."""
         f0 = p.omega / (2 * pi)
         half = p.damping * f0
         if half < 2.0 * NEIGHBOURS * self.f[0]:
@@ -231,13 +256,15 @@ class OneMode:
         count = len(start.vector)
         shape = fit_spectrum(start, cells, range(count - 6, count))
         gain = spectrum_negative_log_likelihood(self.spectrum, cells) - spectrum_negative_log_likelihood(shape, cells)
-        if gain > SPLIT and all(map(self._sound, shape.resonances[-2:])):
+        if gain > SPLIT and all(map(self._is_resolved, shape.resonances[-2:])):
             self.spectrum = shape
             self.refit()
 
     def prune(self) -> bool:
-        """Take off the resonance whose rms is least certain, if that is below SURE of its standard deviations: a neighbour has
-        its power as well. Whether there was one."""
+        """Remove the resonance whose rms is least certain, if that is below SURE of its standard deviations; return whether.
+
+        A neighbour has its power as well.
+        """
         std, starts = self.errors(), self.spectrum.starts[len(self.spectrum.processes) - len(self.spectrum.resonances) :]
         worst = max(range(len(self.spectrum.resonances)), key=lambda i: std[starts[i] + RMS], default=None)
         if worst is None or std[starts[worst] + RMS] * SURE < 1.0:
@@ -249,5 +276,5 @@ class OneMode:
         return True
 
     def errors(self) -> Array:
-        """Standard deviations of the spectrum's numbers, see `standard_deviations`."""
+        """Return the standard deviations of the spectrum's parameters, see `standard_deviations`."""
         return standard_deviations(self.spectrum, self.cells(everything=True), inflation(self.n))

@@ -1,4 +1,4 @@
-"""What is smooth in the spectrum of a mode: turbulence of second or of third order, and a coloured background or none."""
+"""The smooth part of the spectrum of a mode: turbulence of second or third order, with or without a coloured background."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from wfsobs.spectral.periodogram import Cells
 from wfsobs.spectral.whittle import fit_spectrum, spectrum_negative_log_likelihood
 
 WORTH = 6.0
-"""Log-likelihood that the third corner has to gain: noise gives as much with a probability of 0.05 % (chi squared of 12)."""
+"""Minimum gain of log-likelihood by the third corner: noise gains as much with a probability of 0.05 % (chi squared of 12)."""
 STARTS = (1.5, 6.0)
-"""Third corners, over the first two, that a fit starts from."""
+"""Third corners, over the first two, at which a fit starts."""
 BACKGROUND, DAMPING = 8.0, 0.8
-"""The same for a background, which has two numbers: 0.03 % (chi squared of 16); and its damping."""
+"""The minimum gain for a background, which has two parameters: 0.03 % (chi squared of 16); and its damping."""
 APART = 5.0
-"""Corner of a background over that of turbulence at least."""
+"""Minimum corner of a background over that of turbulence."""
 REACHES = (0.02, 0.08)
-"""Corners of a background, over the rate, that a fit starts from: 20 and 80 Hz at 1 kHz."""
+"""Corners of a background, over the rate, at which a fit starts: 20 and 80 Hz at 1 kHz."""
 
 
-def of_best_order(spectrum: Spectrum, cells: Cells, third: bool = False) -> Spectrum:
-    """A fitted spectrum with its turbulence an AR(2) or, where that is worth one number more or asked for, of third order."""
+def choose_order(spectrum: Spectrum, cells: Cells, third: bool = False) -> Spectrum:
+    """Return a fitted spectrum with turbulence of second order, or of third where that is worth it or asked for."""
     t = spectrum.turbulence
     if t is None or (third and isinstance(t, Ar3)):
         return spectrum
@@ -42,8 +42,11 @@ def of_best_order(spectrum: Spectrum, cells: Cells, third: bool = False) -> Spec
 
 
 def with_background(spectrum: Spectrum, cells: Cells) -> Spectrum:
-    """A fitted spectrum with a background, if that is worth it, or without: an AR(2) so damped that it is flat up to its corner,
-    far above that of turbulence. The aliasing of a Shack-Hartmann sensor is like that."""
+    """Return a fitted spectrum with a background if that is worth it, else without.
+
+    A background is an AR(2) so damped that it is flat up to its corner, far above that of turbulence. The aliasing of a
+    Shack-Hartmann sensor is like that.
+    """
     if spectrum.background:
         without, wide = _smooth(replace(spectrum, background=None), cells), spectrum
     else:
@@ -57,12 +60,12 @@ def with_background(spectrum: Spectrum, cells: Cells) -> Spectrum:
 
 
 def _beyond_turbulence(spectrum: Spectrum) -> bool:
-    """Whether a background is none of the turbulence's own shape."""
+    """Return whether a background differs from the turbulence's own shape."""
     assert spectrum.background is not None
     return spectrum.turbulence is None or spectrum.background.omega > APART * spectrum.turbulence.omega
 
 
 def _smooth(spectrum: Spectrum, cells: Cells) -> Spectrum:
-    """All that is smooth fitted, resonances left as they are."""
+    """Fit the smooth part, without changing resonances."""
     spectrum = spectrum.with_vector(spectrum.vector)  # within the bounds of its numbers
     return fit_spectrum(spectrum, cells, range(spectrum.starts[len(spectrum.processes) - len(spectrum.resonances)]))

@@ -1,4 +1,4 @@
-"""Numbers with their errors, and what has three of them: turbulence and peaks."""
+"""Numbers with their standard deviations, and processes of three of them: turbulence and peaks."""
 
 from __future__ import annotations
 
@@ -15,10 +15,19 @@ class Number(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Process:
-    """Turbulence, background or a peak: natural frequency (omega / 2 pi) [Hz], damping (0 +- 0 for a pure line), rms [um].
+class IdentifiedProcess:
+    """Turbulence, background or a peak.
 
-    third_corner : of turbulence of third order, over `frequency`, or None
+    Attributes
+    ----------
+    frequency : Number
+        Natural frequency, omega / 2 pi [Hz].
+    damping : Number
+        Damping ratio; 0 +- 0 for an undamped line.
+    rms : Number
+        Rms [um].
+    third_corner : Number or None
+        Of turbulence of third order, over `frequency`.
     """
 
     frequency: Number
@@ -28,13 +37,13 @@ class Process:
 
     @property
     def pure(self) -> bool:
-        """Whether it is a pure line."""
+        """Whether it is an undamped line."""
         return self.damping.value == 0
 
 
 @dataclass(frozen=True)
-class Peak:
-    """One peak of the structure in all modes: rms holds one number per mode, None where it was not seen."""
+class IdentifiedPeak:
+    """One peak of the structure in all modes: rms holds one number per mode, None where it was not found."""
 
     frequency: Number
     damping: Number
@@ -42,20 +51,20 @@ class Peak:
 
 
 POOR = 1.0 / 3.0
-"""Standard deviation over the number beyond which it is none: the likelihood of a positive number is not normal then."""
+"""Maximum standard deviation over the number: beyond it, the likelihood of a positive number is not normal."""
 AGREE = 3.0
-"""Standard deviations of their difference within which two numbers are the same."""
+"""Maximum difference of equal numbers, in standard deviations."""
 UNSURE = 0.02, 0.5
 """Standard deviation of a frequency and of a damping, over the number, from which it agrees with none: it could be any."""
 
 
-def known(n: Number) -> Number:
-    """A positive number, without a standard deviation where that is more than POOR of it."""
+def with_reliable_std(n: Number) -> Number:
+    """Return a positive number, without its standard deviation where that is more than POOR of it."""
     return n if n.std <= POOR * n.value else Number(n.value, nan)
 
 
 def mean(numbers: list[Number]) -> Number:
-    """The mean weighted by 1 / std^2, of values of the same thing; of those without a standard deviation where none has one."""
+    """Return the mean weighted by 1 / std^2 of values of the same quantity; without standard deviations where none has one."""
     sure = [n for n in numbers if not isnan(n.std)]
     if not sure:
         return Number(sum(n.value for n in numbers) / len(numbers), nan)
@@ -63,9 +72,9 @@ def mean(numbers: list[Number]) -> Number:
     return Number(sum(w * n.value for w, n in zip(weights, sure, strict=True)) / sum(weights), 1.0 / sqrt(sum(weights)))
 
 
-def merged(modes: list[tuple[Process, ...]]) -> list[Peak]:
-    """The peaks of all modes by frequency; those of several modes that agree in kind, frequency and damping are one."""
-    groups: list[dict[int, Process]] = []
+def merge_peaks(modes: list[tuple[IdentifiedProcess, ...]]) -> list[IdentifiedPeak]:
+    """Merge the peaks of all modes, by frequency: those of several modes that agree in kind, frequency and damping are one."""
+    groups: list[dict[int, IdentifiedProcess]] = []
     for i, peaks in enumerate(modes):
         for peak in peaks:
             near = [g for g in groups if i not in g and _agree(list(g.values()), peak)]
@@ -78,7 +87,7 @@ def merged(modes: list[tuple[Process, ...]]) -> list[Peak]:
         pure = next(iter(group.values())).pure
         damping = Number(0.0, 0.0) if pure else mean([p.damping for p in group.values()])
         out.append(
-            Peak(
+            IdentifiedPeak(
                 mean([p.frequency for p in group.values()]),
                 damping,
                 tuple(group[i].rms if i in group else None for i in range(len(modes))),
@@ -87,8 +96,8 @@ def merged(modes: list[tuple[Process, ...]]) -> list[Peak]:
     return sorted(out, key=lambda p: p.frequency.value)
 
 
-def _agree(group: list[Process], peak: Process) -> bool:
-    """Whether a peak may be the one that a group is."""
+def _agree(group: list[IdentifiedProcess], peak: IdentifiedProcess) -> bool:
+    """Return whether a peak may be the same as a group."""
     if group[0].pure != peak.pure or not all(map(_sure, (*group, peak))):
         return False
     apart = [_apart([p.frequency for p in group], peak.frequency)]
@@ -97,7 +106,7 @@ def _agree(group: list[Process], peak: Process) -> bool:
     return max(apart) <= AGREE
 
 
-def _sure(p: Process) -> bool:
+def _sure(p: IdentifiedProcess) -> bool:
     frequency, damping = UNSURE
     return p.frequency.std < frequency * p.frequency.value and (p.pure or p.damping.std < damping * p.damping.value)
 
@@ -107,6 +116,6 @@ def _logarithm(n: Number) -> Number:
 
 
 def _apart(group: list[Number], number: Number) -> float:
-    """Distance over its standard deviation."""
+    """Return the distance over its standard deviation."""
     at = mean(group)
     return abs(at.value - number.value) / hypot(at.std, number.std)

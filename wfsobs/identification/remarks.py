@@ -1,4 +1,4 @@
-"""What is wrong with a model whose rest is not white: where the spectrum differs, and whether the record is stationary."""
+"""What is wrong with a model whose residual is not white: where the spectrum differs, and whether the record is stationary."""
 
 from __future__ import annotations
 
@@ -10,22 +10,24 @@ from scipy.stats import chi2
 from wfsobs.typing import Array
 
 PARTS = 10
-"""Of a record, of which the innovations should have the same variance."""
+"""Parts of a record whose innovations should have the same variance."""
 LEVEL = 1e-3
-"""Probability with which noise would be called not stationary."""
+"""Probability that noise would be called not stationary."""
 FAR = 6.0
 """Standard deviations beyond which an innovation is no noise: one in 5e8."""
 BANDS = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, np.inf)
-"""Edges [Hz] between which the spectrum is compared."""
+"""Edges of the bands in which the spectrum is compared [Hz]."""
 LAGS = 100
-"""Up to which a correlation is looked for."""
+"""Maximum lag of a correlation."""
 CLEAR, MATTERS = 4.0, 0.05
-"""Standard deviations of a mean over a band, and its difference from one, from which on it is told."""
+"""Minimum standard deviations of a mean over a band, and minimum difference from one, of a remark."""
 
 
 def remarks(f: Array, ratio: Array, e: Array, dt: float) -> tuple[str, ...]:
-    """Of a rest that is not white, one clause each. f, ratio (bins,): frequencies [Hz] and I / S; e (n,): innovations of the
-    Kalman filter of S, every dt [s]."""
+    """Return remarks on a residual that is not white, one clause each.
+
+    f, ratio (bins,) : frequencies [Hz] and I / S; e (n,) : innovations of the Kalman filter of S, every dt [s]
+    """
     found = [*_bands(f, ratio), *in_time(e, dt), *_memory(e, dt)]
     return tuple(found or ["no band, lag or time stands out: it is a little of everything"])
 
@@ -44,7 +46,7 @@ def _bands(f: Array, ratio: Array) -> list[str]:
 
 
 def _memory(e: Array, dt: float) -> list[str]:
-    """The lag of the largest correlation, if noise has none as large."""
+    """Return the lag of the largest correlation, if noise has none as large."""
     e = e - e.mean()
     rho = np.array([e[lag:] @ e[:-lag] for lag in range(1, LAGS + 1)]) / (e @ e)
     lag = int(np.argmax(np.abs(rho)))
@@ -54,7 +56,7 @@ def _memory(e: Array, dt: float) -> list[str]:
 
 
 def in_time(e: Array, dt: float) -> list[str]:
-    """Innovations that are no noise, and whether their variance changes, which no test of whiteness sees."""
+    """Check innovations for outliers and for changes of their variance, which no test of whiteness sees."""
     out = []
     scale = np.median(np.abs(e - np.median(e))) / 0.6745
     far = np.abs(e - np.median(e)) > FAR * scale

@@ -5,25 +5,27 @@ from __future__ import annotations
 from math import isnan, sqrt
 from typing import Any
 
-from wfsobs.identification.process import Number, Process
-from wfsobs.identification.result import Identified, IdentifiedMode
+from wfsobs.identification.process import IdentifiedProcess, Number
+from wfsobs.identification.result import Identification, IdentifiedMode
 from wfsobs.identification.whiteness import LEVEL
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.configfile import annotated, to_toml
+from wfsobs.scenario.configfile import add_comments, to_toml
 
 Row = tuple[str, Number | None, Number | None, Number | None]
-"""What it is, its frequency [Hz], its damping, its rms [um]."""
+"""Name, frequency [Hz], damping, rms [um]."""
 
 
-def plain(result: Identified) -> dict[str, Any]:
-    """What `wfsobs identify --json` prints: every number with its standard deviation as `_std`, null where it has none; rms in
-    um, frequencies in Hz."""
+def identification_dict(result: Identification) -> dict[str, Any]:
+    """Return the output of `wfsobs identify --json`.
+
+    Every number has its standard deviation as `_std`, null where there is none; rms in um, frequencies in Hz.
+    """
 
     def numbers(**named: Number) -> dict[str, float | None]:
         std = {f"{name}_std": None if isnan(n.std) else n.std for name, n in named.items()}
         return {key: (n.value if key == name else std[key]) for name, n in named.items() for key in (name, f"{name}_std")}
 
-    def of(p: Process) -> dict[str, float | None]:
+    def of(p: IdentifiedProcess) -> dict[str, float | None]:
         return numbers(**{name: n for name, n in vars(p).items() if n is not None})
 
     return {
@@ -51,8 +53,8 @@ def plain(result: Identified) -> dict[str, Any]:
     }
 
 
-def rows(mode: IdentifiedMode) -> list[Row]:
-    """Everything in a mode, peaks by frequency."""
+def mode_rows(mode: IdentifiedMode) -> list[Row]:
+    """Return all processes of a mode, peaks by frequency."""
     out: list[Row] = [("white noise", None, None, mode.noise)]
     if (t := mode.turbulence) is not None:
         out.append(("turbulence", t.frequency, t.damping, t.rms))
@@ -64,8 +66,8 @@ def rows(mode: IdentifiedMode) -> list[Row]:
     return out + [("line" if p.pure else "resonance", p.frequency, p.damping, p.rms) for p in mode.peaks]
 
 
-def verdict(result: Identified) -> list[str]:
-    """One line per mode on what is left."""
+def verdict(result: Identification) -> list[str]:
+    """Return one line per mode on the residual."""
     out = []
     for m in result.modes:
         w = m.whiteness
@@ -76,13 +78,14 @@ def verdict(result: Identified) -> list[str]:
     return out
 
 
-def written(n: Number) -> str:
-    """A number to two digits of its standard deviation, to three of its own where it has none; the damping of a pure line, which
-    is not estimated, as 0.
+def format_number(n: Number) -> str:
+    """Format a number to two digits of its standard deviation, or to three of its own where it has none.
 
-    >>> written(Number(47.43812, 0.0264)), written(Number(502.3, 25.1)), written(Number(0.0, 0.0))
+    The damping of an undamped line, which is not estimated, is 0.
+
+    >>> format_number(Number(47.43812, 0.0264)), format_number(Number(502.3, 25.1)), format_number(Number(0.0, 0.0))
     ('47.438 +- 0.026', '502 +- 25', '0')
-    >>> written(Number(0.1412, float("nan")))
+    >>> format_number(Number(0.1412, float("nan")))
     '0.141 +- -'
     """
     if n == (0.0, 0.0):
@@ -93,10 +96,10 @@ def written(n: Number) -> str:
     return f"{n.value:.{digits}f} +- {n.std:.{digits}f}"
 
 
-def toml(result: Identified, scenario: Scenario) -> str:
-    """The scenario of the result as TOML, a standard deviation beside every number that was found."""
+def identification_toml(result: Identification, scenario: Scenario) -> str:
+    """Return the scenario of the result as TOML, with a standard deviation beside every identified number."""
     count = sqrt(scenario.sensors.lgs_count)
-    notes = {path: f"+- {_std(number.std)}" for path, number in result.shared(scenario).items()}
+    notes = {path: f"+- {_std(number.std)}" for path, number in result.shared_settings(scenario).items()}
     notes["sensors.lgs_noise_per_mode"] = "+- " + ", ".join(_std(count * m.noise.std) for m in result.modes)
     smooth = [(m.name, what, p) for m in result.modes for what, p in _smooth(m)]
     for i, (mode, what, p) in enumerate(smooth):
@@ -104,11 +107,11 @@ def toml(result: Identified, scenario: Scenario) -> str:
     for i, (mode, p) in enumerate(result.all_peaks):
         notes |= _notes(f"vibration.peaks.{i}", p, f"{mode}, ")
     head = [f"Identified from {result.duration:.1f} s; +- is one standard deviation.", *verdict(result)]
-    return "\n".join(f"# {line}" for line in head) + "\n\n" + annotated(to_toml(scenario), notes)
+    return "\n".join(f"# {line}" for line in head) + "\n\n" + add_comments(to_toml(scenario), notes)
 
 
-def _smooth(mode: IdentifiedMode) -> list[tuple[str, Process]]:
-    """What a mode has in `turbulence.processes`, in its order."""
+def _smooth(mode: IdentifiedMode) -> list[tuple[str, IdentifiedProcess]]:
+    """Return the processes of a mode in `turbulence.processes`, in its order."""
     named = [("turbulence", mode.turbulence), ("background", mode.background), *(("broad", p) for p in mode.broad)]
     return [(what, p) for what, p in named if p is not None]
 
@@ -117,8 +120,8 @@ def _std(std: float) -> str:
     return "-" if isnan(std) else f"{std:.2g}"
 
 
-def _notes(path: str, p: Process, whose: str) -> dict[str, str]:
-    """Comments of the settings of one process or peak."""
+def _notes(path: str, p: IdentifiedProcess, whose: str) -> dict[str, str]:
+    """Return comments on the settings of one process or peak."""
     numbers = {"frequency": p.frequency, "damping": p.damping, "rms": p.rms, "third_corner": p.third_corner}
     notes = {f"{path}.{name}": f"+- {_std(n.std)}" for name, n in numbers.items() if n is not None and n.std}
     if p.pure:

@@ -1,4 +1,4 @@
-"""What an identification found, with the standard deviation of every number, and the scenario that it is."""
+"""Result of an identification, every number with its standard deviation, and the scenario of it."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.identification.continuum import of_continuum
+from wfsobs.identification.continuum import is_continuum
 from wfsobs.identification.one_mode import OneMode
-from wfsobs.identification.process import Number, Peak, Process, known, mean, merged
-from wfsobs.identification.settings import fitting, told
+from wfsobs.identification.process import IdentifiedPeak, IdentifiedProcess, Number, mean, merge_peaks, with_reliable_std
+from wfsobs.identification.settings import band_settings, model_settings
 from wfsobs.identification.whiteness import Whiteness
 from wfsobs.prior import Line, Lines
 from wfsobs.scenario import Scenario
@@ -24,35 +24,63 @@ from wfsobs.spectral.whittle import NO_NEARER
 from wfsobs.typing import Array
 
 SLOWEST = 10.0
-"""Periods of turbulence in a record at least, or its corner has no standard deviation: a slower one is not seen."""
+"""Minimum periods of turbulence in a record for a standard deviation of its corner: a slower one is not resolved."""
 EDGE = 4.0
-"""Bins from zero and from half the rate within which a line has none: its image overlaps it."""
+"""Minimum distance of a line from zero and from half the rate for a standard deviation, in bins: its image overlaps it."""
 LARGEST = 100.0
-"""Strength of turbulence [um] that a scenario's settings allow."""
+"""Maximum strength of turbulence [um] in a scenario's settings."""
 
 
 @dataclass(frozen=True)
 class IdentifiedMode:
-    """The model of one mode: noise, rms of z's white noise [um]; turbulence, or None; coloured background, or None; peaks by
-    frequency; broad, resonances that are part of the continuum; what the tests say.
+    """The model of one mode.
 
-    spectrum : of all but the pure lines;  prior : what an observer is told of the mode
+    Attributes
+    ----------
+    name : str
+        Name of the mode.
+    noise : Number
+        Rms of z's white noise [um].
+    turbulence, background : IdentifiedProcess or None
+        Coloured noise.
+    peaks : tuple of IdentifiedProcess
+        Peaks by frequency.
+    broad : tuple of IdentifiedProcess
+        Resonances of the continuum.
+    spectrum : Spectrum
+        Of all but the undamped lines.
+    prior : Lines
+        What an observer receives of the mode.
+    whiteness : Whiteness
+        Tests of the residual.
     """
 
     name: str
     noise: Number
-    turbulence: Process | None
-    background: Process | None
-    peaks: tuple[Process, ...]
-    broad: tuple[Process, ...]
+    turbulence: IdentifiedProcess | None
+    background: IdentifiedProcess | None
+    peaks: tuple[IdentifiedProcess, ...]
+    broad: tuple[IdentifiedProcess, ...]
     spectrum: Spectrum
     prior: Lines
     whiteness: Whiteness
 
 
 @dataclass(frozen=True)
-class Identified:
-    """The model of a record: one IdentifiedMode per column; dt [s], samples used, level of the search."""
+class Identification:
+    """The model of a record.
+
+    Attributes
+    ----------
+    modes : tuple of IdentifiedMode
+        One per column.
+    dt : float
+        Time step [s].
+    n_steps : int
+        Samples used.
+    level : float
+        Level of the search.
+    """
 
     modes: tuple[IdentifiedMode, ...]
     dt: float
@@ -61,40 +89,49 @@ class Identified:
 
     @property
     def duration(self) -> float:
-        """What was used of the record [s]."""
+        """Length of the part of the record that was used [s]."""
         return self.n_steps * self.dt
 
     @property
     def white(self) -> bool:
-        """Whether what is left of every mode passes every test."""
+        """Whether the residual of every mode passes every test."""
         return all(mode.whiteness.white for mode in self.modes)
 
     @property
-    def peaks(self) -> list[Peak]:
-        """The peaks of all modes together, those that agree as one."""
-        return merged([mode.peaks for mode in self.modes])
+    def peaks(self) -> list[IdentifiedPeak]:
+        """The peaks of all modes together; those that agree are one."""
+        return merge_peaks([mode.peaks for mode in self.modes])
 
     @property
-    def all_peaks(self) -> list[tuple[str, Process]]:
-        """Name of the mode and peak, of every peak of every mode, in the order that `scenario` has them."""
+    def all_peaks(self) -> list[tuple[str, IdentifiedProcess]]:
+        """(name of the mode, peak) of every mode and peak, in the order of `scenario`."""
         found = [(p.frequency.value, p.damping.value, p.rms.value, i, p) for i, mode in enumerate(self.modes) for p in mode.peaks]
         return [(self.modes[i].name, p) for *_, i, p in sorted(found, key=lambda each: each[:4])]
 
     def scenario(self, base: Scenario | None = None) -> Scenario:
-        """A scenario whose z has the spectra found, every mode with its own noise, turbulence and peaks; the Kalman filters
-        follow it. A background counts as turbulence.
+        """Return a scenario whose z has the identified spectra, every mode with its own noise, turbulence and peaks.
 
-        base : where everything else comes from, but its events, which name peaks by their number, and bands that the rate has no
-            room for. Wind, damping and strength of turbulence become the means over the modes, for who goes on from there.
+        The models of the Kalman filters follow. A background counts as turbulence.
+
+        Parameters
+        ----------
+        base : Scenario, optional
+            All other settings, except its events, which name peaks by their number, and bands above half the rate. Wind, damping
+            and strength of turbulence become the means over the modes.
+
+        Returns
+        -------
+        Scenario
+            The scenario.
         """
         out = (base or Scenario()).before_events.replace(
             {"telescope.radial_order": _order(len(self.modes)), "sensors.lgs_rate": 1.0 / self.dt}
         )
-        changes: dict[str, Any] = {path: number.value for path, number in self.shared(out).items()}
+        changes: dict[str, Any] = {path: number.value for path, number in self.shared_settings(out).items()}
         return out.replace(
             changes
-            | fitting(out, 0.5 / self.dt)
-            | told([mode.prior for mode in self.modes], out)
+            | band_settings(out, 0.5 / self.dt)
+            | model_settings([mode.prior for mode in self.modes], out)
             | {
                 "sensors.noise_from": "nm",
                 "sensors.lgs_combination": "mean",
@@ -106,34 +143,36 @@ class Identified:
             }
         )
 
-    def shared(self, scenario: Scenario) -> dict[str, Number]:
-        """Dotted path -> number of the settings that all modes share, and their errors; within what the settings allow."""
+    def shared_settings(self, scenario: Scenario) -> dict[str, Number]:
+        """Return dotted path -> number of the settings that all modes share, within the limits of the settings."""
         modes = [*zip(self.modes, scenario.modes, strict=False)]
-        noises = [_scaled(m.noise, sqrt(scenario.sensors.lgs_count)) for m in self.modes]
+        noises = [_scale(m.noise, sqrt(scenario.sensors.lgs_count)) for m in self.modes]
         out = {"sensors.lgs_noise": _within(mean(noises), 0.0, 10.0)}
         seen = [(i, m.turbulence, mode.radial_order) for i, (m, mode) in enumerate(modes) if m.turbulence]
         if seen:
             corner = [2 * pi / turbulence_corner(1.0, scenario.telescope.diameter, order) for _, _, order in seen]
-            winds = [_scaled(t.frequency, per) for (_, t, _), per in zip(seen, corner, strict=True)]
+            winds = [_scale(t.frequency, per) for (_, t, _), per in zip(seen, corner, strict=True)]
             out["turbulence.wind_speed"] = _within(mean(winds), 0.1, 100.0)
             out["turbulence.damping"] = _within(mean([t.damping for _, t, _ in seen]), 0.01, 1.0)
-            strengths = [_scaled(t.rms, 1.0 / relative_rms(scenario, i)) for i, t, _ in seen]
+            strengths = [_scale(t.rms, 1.0 / relative_rms(scenario, i)) for i, t, _ in seen]
             if thirds := [t.third_corner for _, t, _ in seen if t.third_corner]:
                 out["turbulence.third_corner"] = _within(mean(thirds), 1.0, 1000.0)
             out["turbulence.rms"] = _within(mean(strengths), 0.0, LARGEST)
         return out
 
 
-def read_off(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> IdentifiedMode:
-    """The numbers of a mode and their standard deviations, those that hold. A resonance that is a part of the continuum is no
-    peak; an observer is told of it as of turbulence. lowest : frequency from which peaks were looked for [Hz]"""
+def read_mode(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> IdentifiedMode:
+    """Return the numbers of a mode and their standard deviations, where they hold.
+
+    A resonance of the continuum is not a peak; an observer receives it as turbulence. lowest : minimum frequency of peaks [Hz]
+    """
     std = mode.errors()
-    noise = _scaled(Number(1.0, float(std[0])), mode.spectrum.noise)
+    noise = _scale(Number(1.0, float(std[0])), mode.spectrum.noise)
     found = [_process(p, std[start:]) for start, p in zip(mode.spectrum.starts, mode.spectrum.processes, strict=False)]
     turbulence, background = (None if p is None else found.pop(0) for p in (mode.spectrum.turbulence, mode.spectrum.background))
     if turbulence is not None and turbulence.frequency.value < SLOWEST * mode.f[0]:
         turbulence = replace(turbulence, frequency=Number(turbulence.frequency.value, nan))
-    smooth = [of_continuum(mode.spectrum, p, lowest) for p in mode.spectrum.resonances]
+    smooth = [is_continuum(mode.spectrum, p, lowest) for p in mode.spectrum.resonances]
     broad = [p for p, is_smooth in zip(found, smooth, strict=True) if is_smooth]
     found = [p for p, is_smooth in zip(found, smooth, strict=True) if not is_smooth]
     for line in mode.lines:
@@ -141,7 +180,13 @@ def read_off(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> I
         in_frequency, in_rms = line.standard_deviations(mode.n, mode.dt, floor)
         if not EDGE * mode.f[0] < line.frequency < mode.f[-1] - EDGE * mode.f[0]:
             in_frequency = in_rms = nan
-        found.append(Process(known(Number(line.frequency, in_frequency)), Number(0.0, 0.0), known(Number(line.rms, in_rms))))
+        found.append(
+            IdentifiedProcess(
+                with_reliable_std(Number(line.frequency, in_frequency)),
+                Number(0.0, 0.0),
+                with_reliable_std(Number(line.rms, in_rms)),
+            )
+        )
     peaks = sorted((p for p in found if p.frequency.value >= lowest), key=lambda p: p.frequency.value)
     s = mode.spectrum
     shapes = (p for p, is_smooth in zip(s.resonances, smooth, strict=True) if is_smooth)
@@ -151,24 +196,26 @@ def read_off(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> I
         tuple(p for p in (s.turbulence, s.background, *shapes) if p is not None),
         tuple(Line(p.frequency.value, p.damping.value, p.rms.value) for p in peaks),
     )
-    return IdentifiedMode(name, known(noise), turbulence, background, tuple(peaks), tuple(broad), s, prior, whiteness)
+    return IdentifiedMode(name, with_reliable_std(noise), turbulence, background, tuple(peaks), tuple(broad), s, prior, whiteness)
 
 
-def _process(p: Ar2 | Ar3, std: Array) -> Process:
-    """With the standard deviations of its numbers, those of frequency, rms and third corner relative, the first of std. A damping
-    at its bound has none."""
+def _process(p: Ar2 | Ar3, std: Array) -> IdentifiedProcess:
+    """Return a process with the standard deviations of its numbers.
+
+    Those of frequency, rms and third corner are relative, the first of std. A damping at its bound has none.
+    """
     at_bound = p.damping > HIGHEST - 1e-4
     beyond = p.corner / p.omega - 1.0 if isinstance(p, Ar3) else 0.0
     third = Number(1.0 + beyond, max(beyond, NO_NEARER - 1.0) * float(std[3])) if isinstance(p, Ar3) else None
-    return Process(
-        known(_scaled(Number(1.0, float(std[0])), p.omega / (2 * pi))),
-        known(Number(p.damping, nan if at_bound else float(std[1]))),
-        known(_scaled(Number(1.0, float(std[2])), p.rms)),
-        third and known(third),
+    return IdentifiedProcess(
+        with_reliable_std(_scale(Number(1.0, float(std[0])), p.omega / (2 * pi))),
+        with_reliable_std(Number(p.damping, nan if at_bound else float(std[1]))),
+        with_reliable_std(_scale(Number(1.0, float(std[2])), p.rms)),
+        third and with_reliable_std(third),
     )
 
 
-def _scaled(n: Number, factor: float) -> Number:
+def _scale(n: Number, factor: float) -> Number:
     return Number(n.value * factor, n.std * factor)
 
 
@@ -177,5 +224,5 @@ def _within(n: Number, low: float, high: float) -> Number:
 
 
 def _order(n_modes: int) -> int:
-    """The lowest radial order of which there are as many modes."""
+    """Return the lowest radial order with as many modes."""
     return next(order for order in range(1, HIGHEST_ORDER + 1) if len(modes_up_to(order)) >= n_modes)

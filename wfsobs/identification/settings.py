@@ -1,4 +1,4 @@
-"""The settings of a scenario that say what was found, mode by mode."""
+"""The settings of a scenario that state an identification, mode by mode."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 
 HIGHEST, LARGEST, LEAST = 50_000.0, 1e4, 1e-6
-"""Highest frequency of a peak [Hz], largest rms [um] and least damping of a process that a scenario's settings allow."""
+"""Limits of a scenario's settings: frequency of a peak [Hz], rms [um], minimum damping of a process."""
 WIDTHS = ("bandwidth_offline", "bandwidth_online")
 
 
-def told(priors: Sequence[Lines], scenario: Scenario) -> dict[str, Any]:
-    """Dotted path -> value of the settings from which the filters get these models, one per mode, of sensors as the scenario has
-    them. No two modes share a process or a peak: as different as their numbers are they stay."""
+def model_settings(priors: Sequence[Lines], scenario: Scenario) -> dict[str, Any]:
+    """Return dotted path -> value of the settings that give the filters these models, one per mode.
+
+    For sensors as in the scenario. No two modes share a process or a peak: they stay as different as their numbers are.
+    """
     modes = len(priors)
     smooth = [_process(p, _alone(p.rms, i, modes)) for i, prior in enumerate(priors) for p in prior.turbulence]
     lines = sorted((line, i) for i, prior in enumerate(priors) for line in prior.lines)
@@ -40,9 +42,11 @@ def told(priors: Sequence[Lines], scenario: Scenario) -> dict[str, Any]:
     return changes
 
 
-def fitting(scenario: Scenario, nyquist: float) -> dict[str, Any]:
-    """Dotted path -> value of the settings that half the rate [Hz] has no room for: bands beyond it are left out, and where none
-    remains there is one in the middle."""
+def band_settings(scenario: Scenario, nyquist: float) -> dict[str, Any]:
+    """Return dotted path -> value of the settings of bands, without those above half the rate [Hz].
+
+    Where none remains there is one in the middle.
+    """
     b = scenario.butterworth
     widest = 0.5 * max(b.bandwidth_offline, b.bandwidth_online)
     inside = [f for f in b.frequencies if widest < f < nyquist - widest]
@@ -64,5 +68,5 @@ def _process(p: Ar2 | Ar3, rms: list[float]) -> dict[str, Any]:
 
 
 def _alone(rms: float, mode: int, modes: int) -> list[float]:
-    """Strength per mode of what one mode has."""
+    """Return the strength per mode of a process of one mode."""
     return [min(rms, LARGEST) if i == mode else 0.0 for i in range(modes)]

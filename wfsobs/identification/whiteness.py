@@ -1,4 +1,4 @@
-"""Is what the model leaves white? Two tests of one mode, both of level LEVEL."""
+"""Whiteness of the residual: two tests of one mode, both of level LEVEL."""
 
 from __future__ import annotations
 
@@ -16,19 +16,25 @@ from wfsobs.typing import Array
 
 LEVEL = 0.01
 LAGS = 100
-"""Of the autocorrelation, beside one for every number of the model."""
+"""Lags of the autocorrelation, beside one for every parameter of the model."""
 MIN_NOISE = 1e-6
-"""Noise that the filter assumes at least, over the rms of z."""
+"""Minimum noise of the filter, over the rms of z."""
 
 
 @dataclass(frozen=True)
 class Whiteness:
-    """cumulated, innovations : probabilities that white noise would look less white than what is left does.
+    """Tests of the residual of one mode; p-values are probabilities that white noise would look less white.
 
-    cumulated   : of the largest distance between the cumulated I / S and a straight line (Bartlett, with Kolmogorov's law)
-    innovations : of the autocorrelation of the Kalman filter's innovations (Ljung and Box, Biometrika 65, 297, 1978)
-    left        : candidates that the search still sees and no peak explains
-    remarks     : what differs, one clause each, where it is not white
+    Attributes
+    ----------
+    cumulated : float
+        p-value of the largest distance between the cumulated I / S and a straight line (Bartlett, with Kolmogorov's law).
+    innovations : float
+        p-value of the autocorrelation of the Kalman filter's innovations (Ljung and Box, Biometrika 65, 297, 1978).
+    left : int
+        Candidates that the search still finds and no peak explains.
+    remarks : tuple of str
+        Differences, one clause each, where it is not white.
     """
 
     cumulated: float
@@ -38,20 +44,22 @@ class Whiteness:
 
     @property
     def white(self) -> bool:
-        """Whether both tests pass at LEVEL and nothing is left."""
+        """Whether both tests pass at LEVEL and no candidate is left."""
         return min(self.cumulated, self.innovations) >= LEVEL and not self.left
 
 
 def cumulated_test(ratio: Array, n: int) -> float:
-    """p-value of I / S, (bins,), of a record of n samples."""
+    """Return the p-value of I / S, (bins,), of a record of n samples."""
     count = len(ratio)
     distance = np.cumsum(ratio) / ratio.sum() - np.arange(1, count + 1) / count
     return float(kstwobign.sf(np.max(np.abs(distance)) * np.sqrt(count / inflation(n))))
 
 
 def innovations(z: Array, spectrum: Spectrum) -> Array:
-    """Of the steady-state Kalman filter of the spectrum on z (n,), one second or a tenth of the record left out, white where
-    the spectrum is that of z."""
+    """Return the innovations of the steady-state Kalman filter of the spectrum on z (n,), without the start.
+
+    One second or a tenth of the record is left out; the rest is white where the spectrum is that of z.
+    """
     settle = min(len(z) // 10, round(1.0 / spectrum.dt))
     if not spectrum.processes:
         return z[settle:]
@@ -62,7 +70,7 @@ def innovations(z: Array, spectrum: Spectrum) -> Array:
 
 
 def autocorrelation_test(e: Array, numbers: int) -> float:
-    """p-value of Ljung and Box's statistic of e (n,); numbers : of the model that made it."""
+    """Return the p-value of Ljung and Box's statistic of e (n,); numbers : parameters of the model that made it."""
     n, lags = len(e), LAGS + numbers
     e = e - e.mean()
     power = np.abs(rfft(e, next_fast_len(2 * n, real=True))) ** 2

@@ -11,7 +11,7 @@ FOUND = ("telescope", "turbulence", "vibration", "sensors", "kalman", "butterwor
 def told_by(found: Scenario, scenario: Scenario) -> Scenario:
     """A scenario from which observers get the priors of an identification, and their own settings from `scenario`.
 
-    found : what `wfsobs identify --out` wrote (`Identified.scenario`)
+    found : what `wfsobs identify --out` wrote (`Identification.scenario`)
     """
     out = scenario.before_events.copy()
     for group in FOUND:

@@ -21,7 +21,7 @@ from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
 from wfsobs.simulation.guide_stars import lgs_error_process, lgs_noise_rms
 from wfsobs.simulation.layers import relative_rms
 from wfsobs.simulation.sensor_noise import noise_rms
-from wfsobs.simulation.true_spectra import TrueSpectra, is_known, seen_turbulence, true_spectra
+from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, lgs_turbulence_spectrum, true_spectra
 from wfsobs.simulation.turbulence import processes, turbulence_process, turbulence_rms
 
 
@@ -66,7 +66,7 @@ def bands_of(scenario: Scenario) -> Bands:
 
 def spectra_of(scenario: Scenario, mode: int) -> Spectra:
     """The true spectra of one mode. Raises ValueError where they are not known."""
-    if not is_known(scenario):
+    if not has_known_spectra(scenario):
         raise ValueError(
             f"the spectrum of turbulence from {scenario.turbulence.source} is not known: set control.integrator "
             "to manual, and control.gain"
@@ -166,7 +166,7 @@ def modelled_turbulence(scenario: Scenario, mode: int, dt: float) -> Ar2 | Ar3:
         return process
     noise, _ = measurement_noise(scenario, mode)
     start = Ar3(process.omega, process.damping, 5.0 * process.omega, process.rms, dt)
-    return fit_ar3(seen_turbulence(scenario, mode), noise**2, start)
+    return fit_ar3(lgs_turbulence_spectrum(scenario, mode), noise**2, start)
 
 
 def predicted_rms(scenario: Scenario, mode: int) -> float:

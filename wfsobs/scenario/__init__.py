@@ -1,4 +1,4 @@
-"""Every setting of a run: what is simulated, and what observers are made with."""
+"""All settings of a run: the simulation, and the models of the observers."""
 
 from wfsobs.scenario.scenario import Scenario
 

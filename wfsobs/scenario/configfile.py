@@ -1,4 +1,4 @@
-"""Scenarios as TOML files, and settings as they are typed on a command line."""
+"""Scenarios as TOML files, and settings in the syntax of the command line."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.group import SettingError, leaves
 
 DEEPEST = 8
-"""Tables and lists inside one another that a text may have; settings have four."""
+"""Maximum depth of nested tables and lists; settings have four levels."""
 
 LONG_NAME = re.compile(rf"(?<![\w\"'-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){{{DEEPEST + 1}}}")
 """Refused before it is parsed, which takes the cube of its length."""
 
 
 class NotToml(SettingError):
-    """A text that is not TOML."""
+    """Error: a text that is not TOML."""
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The tables of a TOML text, from a file, a command line or a link.
+    """Return the tables of a TOML text, from a file, a command line or a link.
 
     Raises NotToml, and SettingError where values are nested more than DEEPEST deep.
     """
@@ -56,12 +56,12 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def to_toml(scenario: Scenario) -> str:
-    """Every setting as TOML, peaks as [[vibration.peaks]] tables; `from_toml` gives back the very same scenario."""
+    """Return every setting as TOML, peaks as [[vibration.peaks]] tables; `from_toml` returns an equal scenario."""
     return tomli_w.dumps(scenario.to_dict())
 
 
-def annotated(text: str, notes: Mapping[str, str]) -> str:
-    """TOML with a comment after the settings that have one, by dotted path."""
+def add_comments(text: str, notes: Mapping[str, str]) -> str:
+    """Return TOML with a comment after some settings, by dotted path."""
     out, where, counts = [], "", dict[str, int]()
     for line in text.splitlines():
         if head := re.fullmatch(r"\[\[([\w.]+)\]\]", line):
@@ -76,9 +76,9 @@ def annotated(text: str, notes: Mapping[str, str]) -> str:
 
 
 def from_toml(text: str, base: Scenario | None = None, where: str = "TOML") -> Scenario:
-    """A scenario with the settings of a (partial) TOML text on top of `base`.
+    """Return a scenario with the settings of a (partial) TOML text on top of `base`.
 
-    Without `base`, a top-level `preset = "name"` says what to start from, else the defaults. Lists are replaced as a
+    Without `base`, a top-level `preset = "name"` gives the base, else the defaults. Lists are replaced as a
     whole. Raises SettingError, its line starting with `where`.
     """
     try:
@@ -91,8 +91,8 @@ def from_toml(text: str, base: Scenario | None = None, where: str = "TOML") -> S
     return scenario
 
 
-def load(path: str | Path, base: Scenario | None = None) -> Scenario:
-    """The scenario of a TOML file (see `from_toml`). Raises SettingError, also where it cannot be read."""
+def load_scenario(path: str | Path, base: Scenario | None = None) -> Scenario:
+    """Return the scenario of a TOML file (see `from_toml`). Raises SettingError, also where it cannot be read."""
     return from_toml(_text(path), base, str(path))
 
 
@@ -103,26 +103,26 @@ def _text(path: str | Path) -> str:
         raise SettingError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from None
 
 
-def save(scenario: Scenario, path: str | Path) -> None:
+def save_scenario(scenario: Scenario, path: str | Path) -> None:
     """Write every setting to a TOML file. Raises OSError."""
     write_whole(path, lambda file: file.write(to_toml(scenario).encode()))
 
 
 @cache
-def pristine(name: str) -> Scenario:
-    """A preset to compare with, made once; not to be changed."""
+def reference_preset(name: str) -> Scenario:
+    """Return a preset to compare with, from a cache; not to be changed."""
     return PRESETS[name]()
 
 
 def preset(name: Any) -> Scenario:
-    """The preset `name`. Raises SettingError for an unknown one."""
+    """Return the preset `name`. Raises SettingError for an unknown one."""
     if not isinstance(name, str) or name not in PRESETS:
         raise SettingError(f"preset = {name!r}: takes one of {', '.join(PRESETS)}")
     return PRESETS[name]()
 
 
 def preset_name(chosen: str | None, config: str | Path | None, default: str = "paper") -> str:
-    """The preset that the arguments of `scenario_from` start from. Raises SettingError where the file cannot be read."""
+    """Return the preset that `scenario_from` starts from. Raises SettingError where the file cannot be read."""
     if chosen is not None or config is None:
         return chosen or default
     try:
@@ -132,7 +132,7 @@ def preset_name(chosen: str | None, config: str | Path | None, default: str = "p
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:
-    """("a.b", value) of "a.b=value"; the value in TOML's syntax, or a bare word.
+    """Return ("a.b", value) of "a.b=value"; the value in TOML's syntax, or a bare word.
 
     >>> parse_assignment("turbulence.wind_speed=20")
     ('turbulence.wind_speed', 20)
@@ -151,15 +151,15 @@ def parse_assignment(text: str) -> tuple[str, Any]:
     return path.strip(), parsed["value"] if set(parsed) == {"value"} else value.strip()
 
 
-def changes(scenario: Scenario, base: Scenario) -> dict[str, Any]:
-    """Dotted path -> plain value of the settings that differ from those of `base`; lists as a whole."""
+def changed_settings(scenario: Scenario, base: Scenario) -> dict[str, Any]:
+    """Return dotted path -> plain value of the settings that differ from those of `base`; lists as a whole."""
     return dict(leaves(scenario.difference(base)))
 
 
-def written(value: Any) -> str:
-    """A plain value as `parse_assignment` reads it: TOML on one line, words bare.
+def format_value(value: Any) -> str:
+    """Format a plain value for `parse_assignment`: TOML on one line, words bare.
 
-    >>> written([{"frequency": 18.1, "rms": [0.02, 0.01]}]), written("ar2")
+    >>> format_value([{"frequency": 18.1, "rms": [0.02, 0.01]}]), format_value("ar2")
     ('[{frequency = 18.1, rms = [0.02, 0.01]}]', 'ar2')
     """
     return value if isinstance(value, str) else _inline(value)
@@ -176,11 +176,13 @@ def _inline(value: Any) -> str:
 def scenario_from(
     preset_name: str | None, config: str | Path | None, assignments: tuple[str, ...], default: str = "paper"
 ) -> Scenario:
-    """What a command line asks for: the preset (or the file's own, or `default`), then the file, then each
-    assignment. Raises SettingError."""
+    """Return the scenario of a command line.
+
+    The preset (or the file's own, or `default`), then the file, then each assignment. Raises SettingError.
+    """
     base = preset(preset_name) if preset_name is not None else None
     if config is not None:
-        scenario = load(config, base)
+        scenario = load_scenario(config, base)
     else:
         scenario = base if base is not None else preset(default)
     for path, value in map(parse_assignment, assignments):

@@ -1,4 +1,4 @@
-"""Some settings varied, each over a list of values, and the scenarios of every combination: `wfsobs export --vary`."""
+"""Settings varied over lists of values, and the scenarios of every combination: `wfsobs export --vary`."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from math import prod
 from typing import Any
 
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.configfile import NotToml, parse_toml, written
+from wfsobs.scenario.configfile import NotToml, format_value, parse_toml
 from wfsobs.settings.group import Plain, SettingError
 
 MOST = 60
-"""Combinations that are run at once."""
+"""Maximum number of combinations of one run."""
 
 
 @dataclass(frozen=True)
 class Variation:
-    """A setting by its dotted path, and the plain values that it takes one after the other."""
+    """A setting by its dotted path, and its plain values in order."""
 
     path: str
     values: tuple[Any, ...]
 
     def __str__(self) -> str:
-        """As `parse_variation` reads it."""
-        return f"{self.path}={','.join(map(written, self.values))}"
+        """Format the variation for `parse_variation`."""
+        return f"{self.path}={','.join(map(format_value, self.values))}"
 
 
 def parse_variation(text: str) -> Variation:
-    """A Variation of "a.b=v1,v2,v3"; values in TOML's syntax, or bare words. Raises SettingError.
+    """Return the Variation of "a.b=v1,v2,v3"; values in TOML's syntax, or bare words. Raises SettingError.
 
     >>> parse_variation("turbulence.wind_speed=5,10,15")
     Variation(path='turbulence.wind_speed', values=(5, 10, 15))
@@ -55,7 +55,7 @@ def parse_variation(text: str) -> Variation:
 
 
 def scenarios(base: Scenario, variations: Sequence[Variation]) -> list[Scenario]:
-    """The scenario of every combination, the last variation running fastest; the base alone where nothing varies.
+    """Return the scenario of every combination, the last variation running fastest; the base alone without variations.
 
     Raises SettingError where there are more than MOST, where two are the same, and for a value that a setting refuses.
     """
@@ -68,7 +68,7 @@ def scenarios(base: Scenario, variations: Sequence[Variation]) -> list[Scenario]
         one.validate()
         plain = one.to_dict()
         if plain in seen:
-            raise SettingError(f"--vary: {_listed(changes.items())} gives the same settings as another combination")
+            raise SettingError(f"--vary: {_join_changes(changes.items())} gives the same settings as another combination")
         seen.append(plain)
         out.append(one)
     return out
@@ -85,7 +85,7 @@ def _check_number(variations: Sequence[Variation]) -> None:
 
 
 def _word(text: str) -> Any:
-    """One value in TOML's syntax, or the bare word."""
+    """Return one value in TOML's syntax, or the bare word."""
     try:
         parsed = parse_toml(f"value = {text}")
     except NotToml:
@@ -93,5 +93,5 @@ def _word(text: str) -> Any:
     return parsed["value"] if set(parsed) == {"value"} else text
 
 
-def _listed(changes: Iterable[tuple[str, Any]]) -> str:
+def _join_changes(changes: Iterable[tuple[str, Any]]) -> str:
     return ", ".join(f"{path} = {value}" for path, value in changes)

@@ -1,4 +1,4 @@
-"""What the settings of a Shack-Hartmann sensor amount to: its lenslets, and how many modes they tell apart."""
+"""From the settings of a Shack-Hartmann sensor to its lenslets and the number of modes that they resolve."""
 
 from __future__ import annotations
 
@@ -12,9 +12,32 @@ from wfsobs.settings.group import SettingError
 Kind = Literal["lgs", "ngs"]
 
 
-def fit(settings: LensletArrays, kind: Kind, diameter: float, wanted: int) -> tuple[Lenslets, int]:
-    """The lenslets on an LGS or on the NGS behind an aperture [m], and the radial order fitted to their slopes.
-    Raises SettingError where that is less than the order wanted."""
+def fit_lenslets(settings: LensletArrays, kind: Kind, diameter: float, wanted: int) -> tuple[Lenslets, int]:
+    """Return the lenslets on an LGS or on the NGS, and the radial order fitted to their slopes.
+
+    Parameters
+    ----------
+    settings : LensletArrays
+        Settings of the sensors.
+    kind : {"lgs", "ngs"}
+        Which sensor.
+    diameter : float
+        Aperture diameter [m].
+    wanted : int
+        Minimum radial order.
+
+    Returns
+    -------
+    lenslets : Lenslets
+        Geometry.
+    order : int
+        Radial order of the fit.
+
+    Raises
+    ------
+    SettingError
+        The slopes determine fewer orders than wanted.
+    """
     across = settings.lgs_subapertures if kind == "lgs" else settings.ngs_subapertures
     lenslets = Lenslets(diameter, across, settings.illumination, settings.obscuration)
     name = f"sensors.lenslets.{kind}_subapertures = {across}"

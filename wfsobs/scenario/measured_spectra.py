@@ -1,6 +1,6 @@
-"""Measured vibration spectra that ship with the package, their lines told apart from a synthetic floor.
+"""Measured vibration spectra of the package, with lines separated from a synthetic floor.
 
-A table in `assets` lists the bins that lie off the floor; the floor and the grid stand in its head, the licence beside it.
+A table in `assets` lists the bins that lie off the floor; its head has the floor and the grid, the licence is beside it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ APART = 0.15
 
 
 @dataclass(frozen=True)
-class Line:
+class MeasuredLine:
     """A measured line: the centroid of its power in both axes [Hz], and its rms in tip and in tilt [um]."""
 
     frequency: float
@@ -33,19 +33,28 @@ class Line:
 
 @dataclass(frozen=True)
 class MeasuredSpectrum:
-    """frequency (n,) [Hz], evenly spaced; density (n, 2) of tip and tilt, and what of it stands above the floor as lines,
-    one-sided [um^2/Hz]."""
+    """A measured spectrum.
+
+    Attributes
+    ----------
+    frequency : Array
+        Evenly spaced, (n,) [Hz].
+    density : Array
+        One-sided density of tip and tilt, (n, 2) [um^2/Hz].
+    above_floor : Array
+        The part of it above the floor, the lines, (n, 2) [um^2/Hz].
+    """
 
     frequency: Array
     density: Array
     above_floor: Array
 
     def part(self, part: str) -> Array:
-        """The density (n, 2) [um^2/Hz] of all, or of the lines."""
+        """Return the density (n, 2) [um^2/Hz] of all, or of the lines."""
         return self.density if part == ALL else self.above_floor
 
-    def lines(self, least: float = 0.0) -> list[Line]:
-        """The lines of more than `least` [um] rms in either axis."""
+    def lines(self, least: float = 0.0) -> list[MeasuredLine]:
+        """Return the lines of more than `least` [um] rms in either axis."""
         power = self.above_floor * (self.frequency[1] - self.frequency[0])
         bins = np.flatnonzero(power.any(axis=1))
         out = []
@@ -53,13 +62,13 @@ class MeasuredSpectrum:
             rms = np.sqrt(power[group].sum(axis=0))
             if group.size and rms.max() > least:
                 centre = np.average(self.frequency[group], weights=power[group].sum(axis=1))
-                out.append(Line(float(centre), tuple(map(float, rms))))
+                out.append(MeasuredLine(float(centre), tuple(map(float, rms))))
         return out
 
 
 @cache
 def measured_spectrum(name: str) -> MeasuredSpectrum:
-    """The spectrum of that name. Raises KeyError for one that is not there."""
+    """Return the spectrum of that name. Raises KeyError for an unknown one."""
     text = files("wfsobs.assets").joinpath(SPECTRA[name]).read_text(encoding="utf-8").splitlines()
     head = dict(line[2:].split(": ", 1) for line in text if line.startswith("# ") and ": " in line)
     table = np.array([line.split(",") for line in text if line[0].isdigit()], dtype=float)

@@ -1,4 +1,4 @@
-"""Ready scenarios: one function each, every number with its source.
+"""Presets: one function each, every number with its source.
 
 "The paper" is Jaufmann et al., "Simulation of Wavefront-based Disturbance Observers for Large
 Telescopes"; the numbers it publishes are the defaults of the settings, each documented there.
@@ -48,7 +48,7 @@ MUSE_LAYERS = (
 
 
 def _system() -> Scenario:
-    """The paper's system, its records made as those of the other presets are."""
+    """Return the paper's system, with records made like those of the other presets."""
     s = paper()
     s.update({"vibration": {"synthesis": "gaussian"}})
     return s
@@ -172,7 +172,7 @@ def higher_orders() -> Scenario:
 
 
 def peak_jump() -> Scenario:
-    """A line at 47.5 Hz, as of a fan, jumps by 3 Hz: filters of fixed lines lose it, who learns does not.
+    """A line at 47.5 Hz, such as that of a fan, jumps by 3 Hz: fixed-model filters lose it, adaptive filters re-acquire it.
 
     - vibration: a pure line of 30 nm on tip and 20 nm on tilt, ten times what two resonances have beside it; all else is the
       paper's;

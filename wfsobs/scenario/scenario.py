@@ -1,7 +1,6 @@
-"""Every setting, declared once: the `Scenario` tree; its groups are declared in `wfsobs.scenario.groups`, one module per topic,
-and by the observers that have settings of their own.
+"""The `Scenario`, the tree of all settings; its groups are declared in `wfsobs.scenario.groups`, one module per topic.
 
-Labels carry the name and the paper's letter, documentation strings the unit in [brackets] and the
+Labels contain the name and the paper's letter, documentation strings the unit in [brackets] and the
 source. "The paper" is Jaufmann et al., "Simulation of Wavefront-based Disturbance Observers for
 Large Telescopes". Wavefronts are Noll-normalised Zernike coefficients in micrometres rms.
 """
@@ -23,8 +22,8 @@ from wfsobs.scenario.groups.priors import Butterworth, Kalman
 from wfsobs.scenario.groups.run import Loop, Run
 from wfsobs.scenario.groups.sensors import Sensors
 from wfsobs.scenario.groups.vibration import Vibration
-from wfsobs.scenario.lenslet_fit import fit
-from wfsobs.scenario.timeline import air_time, shift
+from wfsobs.scenario.lenslet_fit import fit_lenslets
+from wfsobs.scenario.timeline import shift, turbulence_time
 from wfsobs.sensors.modes import Mode, modes_up_to
 from wfsobs.settings.group import Group, Section, SettingError, section
 
@@ -36,14 +35,14 @@ if TYPE_CHECKING:
     from wfsobs.observers.kalman.multirate import MultiRate
 
 HIGHEST = 0.9
-"""Height of a layer over that of the laser guide stars: in a higher one the beam all but ends."""
+"""Maximum height of a layer over that of the laser guide stars: in a higher one the beam nearly vanishes."""
 SMALLEST = 0.25
-"""Outer scale over the aperture: below, variance moves to waves that frozen flow samples coarsely."""
+"""Minimum outer scale over the aperture: below, variance moves to waves that frozen flow samples coarsely."""
 SLOWEST = 4e6
-"""Steps in which a layer crosses the aperture: frozen flow takes Fourier transforms of four times as many."""
+"""Maximum steps in which a layer crosses the aperture: frozen flow takes Fourier transforms of four times as many."""
 
-MOST_AIR = 10.0
-"""How much longer a record of the turbulence may be than the run, for wind that grows."""
+MAX_TURBULENCE_RATIO = 10.0
+"""Maximum duration of turbulence over that of the run, for wind that increases."""
 
 
 class Scenario(Group):
@@ -108,17 +107,17 @@ class Scenario(Group):
 
     @property
     def before_events(self) -> Scenario:
-        """The scenario as it is without its events: what observers were made for, and the training record is of."""
+        """The scenario without its events: the observers' models and the training record are made from it."""
         return self.replace({"events": []}) if self.events else self
 
     @property
-    def air(self) -> float:
-        """How long a piece of turbulence the wind carries past during the record, at the speed that it has without events [s]."""
+    def turbulence_duration(self) -> float:
+        """Duration of turbulence crossing the aperture during the record, at the wind speed without events [s]."""
         wind = [event for event in self.events if event.kind == WIND]
-        return float(air_time(wind, np.linspace(0.0, self.run.duration, 1001))[-1]) if wind else self.run.duration
+        return float(turbulence_time(wind, np.linspace(0.0, self.run.duration, 1001))[-1]) if wind else self.run.duration
 
     def validate(self) -> None:
-        """Check what no single setting can: raises SettingError naming the settings and the limit."""
+        """Check settings against each other: raise SettingError naming the settings and the limit."""
         nyquist = self.sensors.lgs_rate / 2
         if self.run.warm_up >= self.run.duration:
             raise SettingError(f"run.warm_up = {self.run.warm_up:g}: must be below run.duration = {self.run.duration:g} s")
@@ -139,7 +138,7 @@ class Scenario(Group):
             self.turbulence.source == "frozen-flow" and self.sensors.kind == "shack-hartmann"
         ):
             for kind in ("lgs", "ngs"):
-                fit(self.sensors.lenslets, kind, self.telescope.diameter, self.telescope.radial_order)
+                fit_lenslets(self.sensors.lenslets, kind, self.telescope.diameter, self.telescope.radial_order)
         self._validate_events()
         widest = max(self.butterworth.bandwidth_offline, self.butterworth.bandwidth_online) / 2
         for i, f in enumerate(self.butterworth.frequencies):
@@ -160,10 +159,10 @@ class Scenario(Group):
                 raise SettingError(f"events.{i}.lasers = {event.lasers}: takes up to sensors.lgs_count = {stars}")
             if event.kind == PEAK:
                 self._validate_moving_peak(i, event)
-        if self.air > (MOST_AIR + 1e-9) * self.run.duration:
+        if self.turbulence_duration > (MAX_TURBULENCE_RATIO + 1e-9) * self.run.duration:
             raise SettingError(
-                f"events: the wind carries {self.air:.3g} s of turbulence past in {self.run.duration:g} s; at "
-                f"most {MOST_AIR:g} times as much as the record is long"
+                f"events: the wind carries {self.turbulence_duration:.3g} s of turbulence past in {self.run.duration:g} s; at "
+                f"most {MAX_TURBULENCE_RATIO:g} times as much as the record is long"
             )
 
     def _validate_moving_peak(self, i: int, event: Event) -> None:

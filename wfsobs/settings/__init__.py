@@ -1,4 +1,4 @@
-"""What settings are made of: kinds of values, groups of them, and the error that says what is allowed."""
+"""Building blocks of settings: kinds of values, groups of them, and their error."""
 
 from wfsobs.settings.group import Group, Section, SettingError
 from wfsobs.settings.parameters import Real, Reals, Whole

@@ -1,4 +1,4 @@
-"""What a tree of settings can do: dotted paths, strict checks, plain dictionaries, differences.
+"""A tree of settings: dotted paths, strict checks, plain dictionaries, differences.
 
 The settings themselves are declared once, in `wfsobs.scenario.scenario` and by the observers; widgets, command-line settings,
 TOML files and shareable links all go through the functions here.
@@ -14,18 +14,18 @@ import numpy as np
 import param
 
 from wfsobs.notebook import html_table
-from wfsobs.settings.parameters import allowed, hint
+from wfsobs.settings.parameters import allowed_values, hint
 
 Plain = dict[str, Any]
 """A tree as plain values: nested dictionaries, lists, numbers, strings and booleans."""
 
 
 SHOWN = 3
-"""Settings that the representation of a group names."""
+"""Maximum number of settings in the representation of a group."""
 
 
 class SettingError(ValueError):
-    """A setting that cannot be used: one line naming the setting, its value and what is allowed."""
+    """Error: a setting that cannot be used; one line naming the setting, its value and what is allowed."""
 
 
 G = TypeVar("G", bound="Group")
@@ -40,7 +40,7 @@ class Group(param.Parameterized):
     """
 
     def __init_subclass__(cls) -> None:
-        """A declaration is that of the class: without this param copies it for every object whose value is set."""
+        """Make a declaration that of the class: without this param copies it for every object whose value is set."""
         super().__init_subclass__()
         for p in vars(cls).values():
             if isinstance(p, param.Parameter):
@@ -62,11 +62,11 @@ class Group(param.Parameterized):
         super().__setattr__(name, _native(value))
 
     def idle(self) -> tuple[str, ...]:
-        """Settings that mean nothing while the others are as they are."""
+        """Return the settings without effect for the present values of the others."""
         return ()
 
     def __repr__(self) -> str:
-        changed = self._changed()
+        changed = self._changed_settings()
         shown = ", ".join(f"{path}={value}" for path, value in changed[:SHOWN])
         return f"{type(self).__name__}({shown}{f', and {len(changed) - SHOWN} more' if len(changed) > SHOWN else ''})"
 
@@ -74,10 +74,10 @@ class Group(param.Parameterized):
         return repr(self)
 
     def _repr_html_(self) -> str:
-        return html_table((type(self).__name__, "" if (changed := self._changed()) else "default settings"), changed)
+        return html_table((type(self).__name__, "" if (changed := self._changed_settings()) else "default settings"), changed)
 
-    def _changed(self) -> list[tuple[str, str]]:
-        """(dotted path, value, shortened) of the settings that are not at their defaults."""
+    def _changed_settings(self) -> list[tuple[str, str]]:
+        """Return (dotted path, value, shortened) of the settings that are not at their defaults."""
 
         def text(value: Any) -> str:
             return f"[{len(value)} entries]" if isinstance(value, list) and len(value) > 3 else _short(value, 40)
@@ -91,23 +91,23 @@ class Group(param.Parameterized):
         return hash(repr(self.to_dict()))
 
     def copy(self) -> Self:
-        """An independent copy of the whole tree."""
+        """Return an independent copy of the whole tree."""
         return type(self).from_dict(self.to_dict())
 
     # ------------------------------------------------------------------ plain values
 
     @classmethod
     def settings(cls) -> dict[str, param.Parameter]:
-        """Name -> param.Parameter of every setting, in order of declaration."""
+        """Return name -> param.Parameter of every setting, in order of declaration."""
         return {k: p for k, p in cls.param.objects("existing").items() if k != "name"}
 
     def to_dict(self) -> Plain:
-        """The tree as nested plain values."""
+        """Return the tree as nested plain values."""
         return {name: _plain(getattr(self, name)) for name in self.settings()}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """A tree with `values` on top of the defaults. Raises SettingError."""
+        """Return a tree with `values` on top of the defaults. Raises SettingError."""
         tree = cls()
         tree.update(values)
         return tree
@@ -135,10 +135,10 @@ class Group(param.Parameterized):
         try:
             setattr(self, name, value)
         except (ValueError, TypeError, RecursionError) as error:  # the last of param's words for a value nested very deep
-            raise SettingError(f"{path} = {_short(value)}: {allowed(p)}{hint(value)}") from error
+            raise SettingError(f"{path} = {_short(value)}: {allowed_values(p)}{hint(value)}") from error
 
     def difference(self, base: Group) -> Plain:
-        """The settings in which this tree differs from `base`, as a partial dictionary."""
+        """Return the settings in which this tree differs from `base`, as a partial dictionary."""
         out: Plain = {}
         for name in self.settings():
             mine, other = getattr(self, name), getattr(base, name)
@@ -153,9 +153,22 @@ class Group(param.Parameterized):
     # ------------------------------------------------------------------ dotted paths
 
     def set(self, path: str, value: Any) -> None:
-        """Set one setting by its dotted path, list items by number; the number one past the end of a
-        list adds an item. Raises SettingError.
+        """Set one setting by its dotted path.
 
+        Parameters
+        ----------
+        path : str
+            Dotted path, with list items by number; the number one past the end of a list adds an item.
+        value : object
+            New value, plain.
+
+        Raises
+        ------
+        SettingError
+            The setting does not exist, or takes no such value.
+
+        Examples
+        --------
         >>> from wfsobs.scenario import Scenario
         >>> s = Scenario()
         >>> s.set("vibration.peaks.0.frequency", 45)
@@ -167,7 +180,23 @@ class Group(param.Parameterized):
             setattr(self, name, getattr(fresh, name))
 
     def replace(self, changes: Mapping[str, Any]) -> Self:
-        """A copy with some settings (dotted path -> value) changed. Raises SettingError."""
+        """Return a copy with some settings changed.
+
+        Parameters
+        ----------
+        changes : mapping of str to object
+            Dotted path -> plain value.
+
+        Returns
+        -------
+        Group
+            The copy.
+
+        Raises
+        ------
+        SettingError
+            A setting does not exist, or takes no such value.
+        """
         trial = self.to_dict()
         for path, value in changes.items():
             if _put(trial, path.split("."), value, path):
@@ -175,7 +204,7 @@ class Group(param.Parameterized):
         return type(self).from_dict(trial)
 
     def walk(self, prefix: str = "") -> Iterator[tuple[str, Group, param.Parameter]]:
-        """(dotted path, group that owns it, parameter) of every setting that is a value or a list."""
+        """Yield (dotted path, group that owns it, parameter) of every setting that is a value or a list."""
         for name, p in self.settings().items():
             value = getattr(self, name)
             if isinstance(value, Group):
@@ -187,7 +216,7 @@ class Group(param.Parameterized):
                 yield f"{prefix}{name}", self, p
 
     def lists(self, prefix: str = "") -> Iterator[tuple[str, param.List]]:
-        """(dotted path, parameter) of every list of groups."""
+        """Yield (dotted path, parameter) of every list of groups."""
         for name, p in self.settings().items():
             value = getattr(self, name)
             if isinstance(value, Group):
@@ -197,11 +226,16 @@ class Group(param.Parameterized):
 
 
 class Section(NamedTuple):
-    """A group of settings that an observer or a controller brings along.
+    """A group of settings of an observer or a controller.
 
-    name  : its name in a scenario, before the first dot of the paths and in TOML
-    label : what it is called on the page
-    group : the settings
+    Attributes
+    ----------
+    name : str
+        Name in a scenario, before the first dot of the paths and in TOML.
+    label : str
+        Label on the page.
+    group : type of Group
+        The settings.
     """
 
     name: str
@@ -221,12 +255,12 @@ class _Section(param.ClassSelector):
 
 
 def section(kind: type[G], label: str, doc: str = "") -> G:
-    """A setting that is a group of its own; each tree gets a fresh one."""
+    """Declare a setting that is a group of its own; each tree gets a fresh one."""
     return cast(G, _Section(class_=kind, label=label, doc=doc, per_instance=False))
 
 
 def _native(value: Any) -> Any:
-    """Scalars of NumPy, alone or in a list, as Python's own: what is written of a setting is read again without NumPy."""
+    """Convert NumPy scalars, alone or in a list, to Python's own: a setting is read again without NumPy."""
     if isinstance(value, np.generic):
         return value.item()
     return [_native(v) for v in value] if isinstance(value, (list, tuple)) else value
@@ -241,7 +275,7 @@ def _plain(value: Any) -> Any:
 
 
 def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted path, value) of a (partial) dictionary of settings; lists as a whole."""
+    """Yield (dotted path, value) of a (partial) dictionary of settings; lists as a whole."""
     for name, value in tree.items():
         if isinstance(value, dict):
             yield from leaves(value, f"{prefix}{name}.")
@@ -250,12 +284,12 @@ def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
 
 
 def holds_groups(p: param.List) -> bool:
-    """Whether a list's items are groups of settings."""
+    """Return whether a list's items are groups of settings."""
     return isinstance(p.item_type, type) and issubclass(p.item_type, Group)
 
 
 def settings_of(p: param.List) -> dict[str, param.Parameter]:
-    """The settings of an item of a list of groups."""
+    """Return the settings of an item of a list of groups."""
     return cast(type[Group], p.item_type).settings()
 
 
@@ -279,7 +313,7 @@ def _groups(p: param.List, value: Any, path: str) -> list[Group]:
 
 
 def _put(node: Any, keys: list[str], value: Any, path: str) -> bool:
-    """Put `value` into nested plain values; unknown names are left for `update` to refuse. Returns whether a list grew."""
+    """Put `value` into nested plain values, and return whether a list grew; unknown names are left for `update` to refuse."""
     key = keys[0]
     grown = False
     if isinstance(node, list):

@@ -1,4 +1,4 @@
-"""The kinds of value a setting can have, and how to say what one takes."""
+"""Kinds of value of a setting, and the description of its limits."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Reals(param.List):
 
 
 def _as_float(value: Any) -> Any:
-    """A whole number as the float that it is; anything else, and what no float can hold, as it came."""
+    """Return an integer as a float; any other value, and one that no float can hold, unchanged."""
     if isinstance(value, int) and not isinstance(value, bool):
         try:
             return float(value)
@@ -64,8 +64,8 @@ def _as_float(value: Any) -> Any:
     return value
 
 
-def allowed(p: param.Parameter) -> str:
-    """What a setting takes, as the end of a one-line message."""
+def allowed_values(p: param.Parameter) -> str:
+    """Return the values that a setting takes, as the end of a one-line message."""
     unit = f" {u}" if (u := unit_of(p)) else ""
     if isinstance(p, Reals):
         low, high = p.item_bounds
@@ -85,7 +85,7 @@ def allowed(p: param.Parameter) -> str:
 
 
 def hint(value: object) -> str:
-    """What to do about a text that is a number but for its comma, alone or in a list; nothing about any other value.
+    """Return advice on a number typed with a comma, alone or in a list; empty for any other value.
 
     >>> hint("15,5"), hint([1.0, "0,5"]), hint("fast"), hint(15.5)
     ('; use a point: 15.5', '; use a point: 0.5', '', '')
@@ -98,6 +98,6 @@ def hint(value: object) -> str:
 
 
 def unit_of(p: param.Parameter) -> str:
-    """The unit a setting is in: what stands in [brackets] in its documentation, or nothing."""
+    """Return the unit of a setting: the text in [brackets] in its documentation, or nothing."""
     match = re.search(r"(?<=\s)\[([^\]]+)\]", p.doc or "")
     return match.group(1) if match else ""

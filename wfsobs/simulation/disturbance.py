@@ -16,11 +16,11 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.events import PEAK
 from wfsobs.scenario.groups.vibration import Peak
 from wfsobs.scenario.measured_spectra import measured_spectrum
-from wfsobs.scenario.timeline import strength, turns
+from wfsobs.scenario.timeline import phase_turns, strength
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.spectrum import bin_edges, bin_frequencies, gaussian_signal, random_phase_signal, resonance_power, table_power
 from wfsobs.simulation import events
-from wfsobs.simulation.synthesis import damping_at_least, line_width, period_steps, widened
+from wfsobs.simulation.synthesis import damping_for_width, line_width, period_steps, widen_lines
 from wfsobs.simulation.turbulence import SOURCES, ModeSource, columns, mode_power
 from wfsobs.typing import Array
 
@@ -80,14 +80,14 @@ def make_disturbance(scenario: Scenario, n_steps: int, rng: np.random.Generator,
         `watch` asks to stop.
     """
     turbulence_rng, vibration_rng = rng.spawn(2)
-    at = events.clock(scenario, n_steps)
-    air = SOURCES[scenario.turbulence.source](scenario, events.steps_of_air(at, n_steps), turbulence_rng, watch)
+    at = events.turbulence_clock(scenario, n_steps)
+    air = SOURCES[scenario.turbulence.source](scenario, events.turbulence_steps(at, n_steps), turbulence_rng, watch)
     vibration = columns(VIBRATION[scenario.vibration.source], scenario, n_steps, vibration_rng, watch)
     return Disturbance(
-        events.read(air.on_axis, at),
+        events.interpolate_steps(air.on_axis, at),
         vibration,
-        None if air.ngs is None else events.read(air.ngs, at),
-        None if air.lgs is None else tuple(events.read(x, at) for x in air.lgs),
+        None if air.ngs is None else events.interpolate_steps(air.ngs, at),
+        None if air.lgs is None else tuple(events.interpolate_steps(x, at) for x in air.lgs),
     )
 
 
@@ -138,10 +138,10 @@ def _ar2_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generat
     """Draw each peak as an AR(2) process (paper, eq. 2)."""
     out = np.zeros(n)
     for i, (peak, stream) in enumerate(zip(scenario.vibration.peaks, rng.spawn(len(scenario.vibration.peaks)), strict=True)):
-        damping = damping_at_least(line_width(scenario), peak.frequency, peak.damping)
+        damping = damping_for_width(line_width(scenario), peak.frequency, peak.damping)
         process = Ar2(2.0 * np.pi * peak.frequency, damping, peak_rms(peak.rms, mode), scenario.dt)
-        x, changes = process.sample(n, stream), events.of_peak(scenario, i)
-        out += events.moved_process(process, x, changes) if changes else x
+        x, changes = process.sample(n, stream), events.peak_events(scenario, i)
+        out += events.shift_process(process, x, changes) if changes else x
     return out
 
 
@@ -163,13 +163,13 @@ def _dft_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generat
     out = signal(_bin_power(scenario, mode, period, width, without=moving), period, bins)[:n]
     t = np.arange(n) * scenario.dt
     for i, (peak, stream) in enumerate(zip(scenario.vibration.peaks, peak_streams, strict=True)):
-        changes = events.of_peak(scenario, i)
+        changes = events.peak_events(scenario, i)
         if _is_pure_line(scenario, peak):
             amplitude = np.sqrt(2.0) * peak_rms(peak.rms, mode) * strength(changes, t)
-            out += amplitude * np.cos(2.0 * np.pi * (peak.frequency * t + turns(changes, t) + stream.random()))
+            out += amplitude * np.cos(2.0 * np.pi * (peak.frequency * t + phase_turns(changes, t) + stream.random()))
         elif i in moving:
             power = _below_cutoff(scenario, _resonance(scenario, peak, mode, period, width), period)
-            out += events.moved(signal(power, period, stream), changes, scenario.dt)[:n]
+            out += events.shift_peak(signal(power, period, stream), changes, scenario.dt)[:n]
     return out
 
 
@@ -198,7 +198,7 @@ def _bin_power(scenario: Scenario, mode: int, n: int, width: float, without: Col
             power = table_power(spectrum.frequency, spectrum.part(v.part)[:, mode], n, dt)
     power = _below_cutoff(scenario, power, n)
     if width > 0:
-        power = widened(power, width * dt)
+        power = widen_lines(power, width * dt)
         power[bin_frequencies(n, dt) > v.cutoff] = 0.0
     return power
 
@@ -207,7 +207,7 @@ def _resonance(scenario: Scenario, peak: Peak, mode: int, n: int, width: float) 
     """Return the variance [um^2] of one damped peak in each DFT bin up to the cut-off."""
     edges = bin_edges(n, scenario.dt)
     used = min(int(np.searchsorted(edges, scenario.vibration.cutoff)) + 2, edges.size)
-    damping = damping_at_least(width, peak.frequency, peak.damping)
+    damping = damping_for_width(width, peak.frequency, peak.damping)
     power = np.zeros(edges.size - 1)
     power[: used - 1] = peak_rms(peak.rms, mode) ** 2 * resonance_power(peak.frequency, damping, edges[:used])
     return power

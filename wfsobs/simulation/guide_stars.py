@@ -68,7 +68,7 @@ def lgs_weights(scenario: Scenario, stars: int | None = None) -> Array:
 def _best_weights(scenario: Scenario, stars: int) -> Array:
     """Return the minimum-variance weights of the first `stars` stars."""
     modes = len(scenario.modes)
-    seen, noise = seen_turbulence(scenario), noise_covariance(scenario, "lgs")
+    seen, noise = lgs_turbulence_covariance(scenario), noise_covariance(scenario, "lgs")
     for mode in range(modes):
         seen[:, mode, :, mode] += vibration_variance(scenario, mode)
     for star in range(1, stars + 1):
@@ -81,7 +81,7 @@ def _best_weights(scenario: Scenario, stars: int) -> Array:
     return found.reshape(modes, stars, modes)
 
 
-def seen_turbulence(scenario: Scenario) -> Array:
+def lgs_turbulence_covariance(scenario: Scenario) -> Array:
     """Return the covariance [um^2] of the turbulence on the axis and as measured by each LGS, noise excluded.
 
     (1 + n_lgs, n_modes, 1 + n_lgs, n_modes); the errors of the stars are included.
@@ -105,7 +105,7 @@ def lgs_error_variance(scenario: Scenario, mode: int) -> float:
     """Return the variance [um^2] of the combined LGS turbulence minus that on the axis, without noise."""
     combined = np.concatenate([np.zeros((1, len(scenario.modes))), lgs_weights(scenario)[mode]])
     combined[0, mode] = -1.0
-    return float(np.einsum("ij,ijkl,kl->", combined, seen_turbulence(scenario), combined))
+    return float(np.einsum("ij,ijkl,kl->", combined, lgs_turbulence_covariance(scenario), combined))
 
 
 def lgs_error_process(scenario: Scenario, mode: int, dt: float) -> Ar2:

@@ -13,7 +13,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, Training, delay_signal, frame_mean
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.disturbance import make_disturbance
-from wfsobs.simulation.sensing import measure
+from wfsobs.simulation.sensing import measure_open_loop
 from wfsobs.typing import Array
 
 TRAINING_MARGIN = 0.5
@@ -86,7 +86,7 @@ def simulate(scenario: Scenario, *, rng: np.random.Generator | None = None, watc
 def _run(scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch) -> Record:
     disturbance_rng, sensor_rng = rng.spawn(2)
     disturbance = make_disturbance(scenario, n_steps, disturbance_rng, watch)
-    seen = measure(scenario, disturbance, sensor_rng, watch)
+    seen = measure_open_loop(scenario, disturbance, sensor_rng, watch)
     watch.check()
     u = np.zeros_like(seen.lgs)
     if scenario.loop.closed:

@@ -33,7 +33,7 @@ class OpenLoop:
     ngs: Array
 
 
-def measure(scenario: Scenario, disturbance: Disturbance, rng: np.random.Generator, watch: Watch = QUIET) -> OpenLoop:
+def measure_open_loop(scenario: Scenario, disturbance: Disturbance, rng: np.random.Generator, watch: Watch = QUIET) -> OpenLoop:
     """Simulate the open-loop measurements of a disturbance.
 
     LGS at every step, NGS at every n-th, both of the wavefront up to the step before.
@@ -67,10 +67,10 @@ def measure(scenario: Scenario, disturbance: Disturbance, rng: np.random.Generat
     lgs_rng, ngs_rng, lost_rng = rng.spawn(3)
     n_steps, n_modes = disturbance.total.shape
     errors = _lgs_errors(scenario, n_steps, n_modes, lgs_rng, watch)
-    seen = [_without_blind(scenario, x) for x in disturbance.lgs_turbulence or [disturbance.turbulence]]
-    lgs, working = np.full((n_steps, n_modes), np.nan), events.lasers(scenario, n_steps)
+    seen = [_without_tip_tilt(scenario, x) for x in disturbance.lgs_turbulence or [disturbance.turbulence]]
+    lgs, working = np.full((n_steps, n_modes), np.nan), events.laser_count(scenario, n_steps)
     for stars in np.unique(working[working > 0]):
-        lgs[working == stars] = _together(scenario, seen, disturbance.vibration, errors[:stars])[working == stars]
+        lgs[working == stars] = _combine(scenario, seen, disturbance.vibration, errors[:stars])[working == stars]
 
     n = scenario.sensors.exposure_ratio
     noise = white_noise(scenario, "ngs", n_steps, ngs_rng)
@@ -79,12 +79,12 @@ def measure(scenario: Scenario, disturbance: Disturbance, rng: np.random.Generat
     ngs_turbulence = disturbance.turbulence if disturbance.ngs_turbulence is None else disturbance.ngs_turbulence
     total = ngs_turbulence + disturbance.vibration
     ngs = np.where(is_frame[:, None], frame_mean(total, n) + noise, np.nan)
-    lost = events.lost_frames(scenario, n_steps, lost_rng)
+    lost = events.missing_frames(scenario, n_steps, lost_rng)
     lgs[lost["lgs"]], ngs[lost["ngs"]] = np.nan, np.nan
     return OpenLoop(lgs, ngs)
 
 
-def _together(scenario: Scenario, seen: Sequence[Array], vibration: Array, errors: Sequence[Array]) -> Array:
+def _combine(scenario: Scenario, seen: Sequence[Array], vibration: Array, errors: Sequence[Array]) -> Array:
     """Combine the LGS, as many as there are errors, (n_steps, n_modes)."""
     stars = len(errors)
     if scenario.sensors.lgs_combination == MEAN:
@@ -95,7 +95,7 @@ def _together(scenario: Scenario, seen: Sequence[Array], vibration: Array, error
     return np.tensordot(np.stack(each, axis=1), lgs_weights(scenario, stars), ([1, 2], [1, 2]))
 
 
-def _without_blind(scenario: Scenario, turbulence: Array) -> Array:
+def _without_tip_tilt(scenario: Scenario, turbulence: Array) -> Array:
     """Return the turbulence without tip and tilt where an LGS cannot see them."""
     if not scenario.sensors.tip_tilt_indetermination:
         return turbulence
@@ -108,7 +108,7 @@ def _lgs_errors(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.G
 
     White noise, plus the slow LGS error where turbulence has no layers; the wind carries it along with the turbulence.
     """
-    out, at = [], events.clock(scenario, n_steps)
+    out, at = [], events.turbulence_clock(scenario, n_steps)
     for star in rng.spawn(scenario.sensors.lgs_count):
         noise_rng, slow_rng = star.spawn(2)
         error = white_noise(scenario, "lgs", n_steps, noise_rng)
@@ -116,6 +116,6 @@ def _lgs_errors(scenario: Scenario, n_steps: int, n_modes: int, rng: np.random.G
             watch.check()
             process = low_frequency_process(scenario, mode)
             if process.rms > 0:
-                error[:, mode] += events.read(process.sample(events.steps_of_air(at, n_steps), stream), at)
+                error[:, mode] += events.interpolate_steps(process.sample(events.turbulence_steps(at, n_steps), stream), at)
         out.append(error)
     return out

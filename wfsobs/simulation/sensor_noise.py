@@ -8,7 +8,7 @@ import numpy as np
 
 from wfsobs.atmosphere.plane_waves import Sensor
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.lenslet_fit import Kind, fit
+from wfsobs.scenario.lenslet_fit import Kind, fit_lenslets
 from wfsobs.sensors.aliasing import Aliasing
 from wfsobs.sensors.lenslets import Lenslets
 from wfsobs.sensors.shack_hartmann import ShackHartmann
@@ -24,12 +24,12 @@ def sensor(scenario: Scenario, kind: Kind) -> Sensor:
 
 def shack_hartmann(scenario: Scenario, kind: Kind) -> ShackHartmann:
     """Return the Shack-Hartmann sensor on an LGS or on the NGS, see `sensor`."""
-    lenslets, order = fit(scenario.sensors.lenslets, kind, scenario.telescope.diameter, scenario.telescope.radial_order)
-    return _made(lenslets, tuple(mode.noll for mode in scenario.modes), order)
+    lenslets, order = fit_lenslets(scenario.sensors.lenslets, kind, scenario.telescope.diameter, scenario.telescope.radial_order)
+    return _cached_sensor(lenslets, tuple(mode.noll for mode in scenario.modes), order)
 
 
 @lru_cache(maxsize=4)  # tens of megabytes each, for many modes
-def _made(lenslets: Lenslets, nolls: tuple[int, ...], order: int) -> ShackHartmann:
+def _cached_sensor(lenslets: Lenslets, nolls: tuple[int, ...], order: int) -> ShackHartmann:
     return ShackHartmann(lenslets, nolls, order)
 
 

@@ -36,12 +36,12 @@ def period_steps(scenario: Scenario, n: int) -> int:
     return 2 * next_fast_len(max(ceil(0.5 * BINS / (line_width(scenario) * scenario.dt)), n), real=True)
 
 
-def damping_at_least(width: float, frequency: float, damping: float) -> float:
+def damping_for_width(width: float, frequency: float, damping: float) -> float:
     """Return the damping of a resonance, raised where it is narrower than `width` (FWHM); both in [Hz]."""
     return min(max(damping, width / (2.0 * frequency)), 1.0)
 
 
-def widened(spectrum: Array, width: float) -> Array:
+def widen_lines(spectrum: Array, width: float) -> Array:
     """Return a spectrum (n // 2 + 1,) of even n with all lines `width` wider [cycles per sample].
 
     Correlations decay by exp(-pi width |lag|).

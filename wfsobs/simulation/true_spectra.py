@@ -21,7 +21,7 @@ from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.disturbance import peak_rms, pure_lines, vibration_power
 from wfsobs.simulation.flow_spectra import flow_spectra
 from wfsobs.simulation.guide_stars import lgs_noise_rms, lgs_weights, low_frequency_process
-from wfsobs.simulation.synthesis import damping_at_least, line_width, widened
+from wfsobs.simulation.synthesis import damping_for_width, line_width, widen_lines
 from wfsobs.simulation.turbulence import processes, table_variance, third_order_process, turbulence_process
 from wfsobs.typing import Array
 
@@ -118,7 +118,7 @@ def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
     )
 
 
-def seen_turbulence(scenario: Scenario, mode: int) -> Array:
+def lgs_turbulence_spectrum(scenario: Scenario, mode: int) -> Array:
     """Return the spectrum of the turbulence in the combined LGS, on the frequencies of `true_spectra`."""
     return TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n_frequencies(scenario))[1]
 
@@ -128,7 +128,7 @@ def n_frequencies(scenario: Scenario) -> int:
     return min(_wanted_frequencies(scenario), MOST)
 
 
-def is_known(scenario: Scenario) -> bool:
+def has_known_spectra(scenario: Scenario) -> bool:
     """Return whether the spectra are known.
 
     They are not for frozen flow so slow that its low frequencies would not be resolved, nor where events change them.
@@ -166,11 +166,11 @@ def _density(process: Ar2 | Ar3, n: int) -> Array:
     return process.psd(np.fft.rfftfreq(n, process.dt)) / (2.0 * process.dt)
 
 
-Looks = tuple[Array, Array, Complex | Array]
+TurbulenceSpectra = tuple[Array, Array, Complex | Array]
 """S of the turbulence, of the turbulence in the combined LGS, errors included, and between the two."""
 
 
-def _through_lgs(scenario: Scenario, mode: int, own: Array) -> Looks:
+def _through_lgs(scenario: Scenario, mode: int, own: Array) -> TurbulenceSpectra:
     """Return the spectra of turbulence that is common to all stars, each LGS with a slow error of its own."""
     weights = lgs_weights(scenario)[mode, :, mode]
     error = _density(low_frequency_process(scenario, mode), 2 * (own.size - 1)) * np.sum(weights**2)
@@ -179,28 +179,28 @@ def _through_lgs(scenario: Scenario, mode: int, own: Array) -> Looks:
     return own, gain**2 * own + error, gain * own
 
 
-def _ar2_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
+def _ar2_turbulence(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
     return _through_lgs(scenario, mode, _density(turbulence_process(scenario, mode, scenario.dt), n))
 
 
-def _ar3_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
+def _ar3_turbulence(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
     return _through_lgs(scenario, mode, _density(third_order_process(scenario, mode, scenario.dt), n))
 
 
-def _sum_of_processes(scenario: Scenario, mode: int, n: int) -> Looks:
+def _sum_of_processes(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
     own = [_density(p, n) for p in processes(scenario, mode, scenario.dt)]
     return _through_lgs(scenario, mode, sum(own, np.zeros(n // 2 + 1)))
 
 
-def _no_turbulence(scenario: Scenario, mode: int, n: int) -> Looks:
+def _no_turbulence(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
     return _through_lgs(scenario, mode, np.zeros(n // 2 + 1))
 
 
-def _table(scenario: Scenario, mode: int, n: int) -> Looks:
+def _table(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
     return _through_lgs(scenario, mode, 0.5 * n * table_variance(scenario, mode, n))
 
 
-def _frozen_flow(scenario: Scenario, mode: int, n: int) -> Looks:
+def _frozen_flow(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
     own, seen, shared = flow_spectra(scenario, mode, np.fft.rfftfreq(n, scenario.dt))
     per_sample = 0.5 / scenario.dt
     return per_sample * own, per_sample * seen, per_sample * shared
@@ -212,7 +212,7 @@ def _vibration(scenario: Scenario, mode: int, n: int) -> Array:
         out = np.zeros(n // 2 + 1)
         for peak in v.peaks:
             omega = 2.0 * pi * peak.frequency
-            damping = damping_at_least(line_width(scenario), peak.frequency, peak.damping)
+            damping = damping_for_width(line_width(scenario), peak.frequency, peak.damping)
             out += _density(Ar2(omega, damping, peak_rms(peak.rms, mode), dt), n)
         return out
     return 0.5 * n * vibration_power(scenario, mode, n)
@@ -223,10 +223,10 @@ def _pure_lines(scenario: Scenario, mode: int, n: int) -> Array | None:
     power = np.zeros(n // 2 + 1)
     for frequency, variance in pure_lines(scenario, mode):
         power[min(round(frequency * n * scenario.dt), n // 2)] += variance
-    return widened(0.5 * n * power, line_width(scenario) * scenario.dt) if power.any() else None
+    return widen_lines(0.5 * n * power, line_width(scenario) * scenario.dt) if power.any() else None
 
 
-TURBULENCE_SPECTRA: dict[str, Callable[[Scenario, int, int], Looks]] = {
+TURBULENCE_SPECTRA: dict[str, Callable[[Scenario, int, int], TurbulenceSpectra]] = {
     "ar2": _ar2_turbulence,
     "ar3": _ar3_turbulence,
     "processes": _sum_of_processes,

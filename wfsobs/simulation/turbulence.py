@@ -21,12 +21,12 @@ from wfsobs.signal.spectrum import gaussian_signal, table_power
 from wfsobs.signal.statespace import sample_ar3
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.sensor_noise import sensor
-from wfsobs.simulation.synthesis import line_width, period_steps, widened
+from wfsobs.simulation.synthesis import line_width, period_steps, widen_lines
 from wfsobs.typing import Array
 
 
 @dataclass(frozen=True)
-class Turbulence:
+class TurbulenceSignals:
     """Turbulence of one run, each array (n_steps, n_modes) [um].
 
     Attributes
@@ -44,7 +44,7 @@ class Turbulence:
     lgs: tuple[Array, ...] | None = None
 
 
-Source = Callable[[Scenario, int, np.random.Generator, Watch], Turbulence]
+Source = Callable[[Scenario, int, np.random.Generator, Watch], TurbulenceSignals]
 """(scenario, number of steps, generator, watch) -> turbulence."""
 ModeSource = Callable[[Scenario, int, int, np.random.Generator], Array]
 """(scenario, mode index, number of steps, generator) -> one signal [um], shape (n_steps,)."""
@@ -106,7 +106,7 @@ def table_variance(scenario: Scenario, mode: int, n: int) -> Array:
     """Return the variance [um^2] of the turbulence of source psd in each DFT bin of `n` steps, even."""
     power = mode_power(scenario.turbulence.psd, scenario, mode, n)
     power[0] = 0.0
-    return widened(power, line_width(scenario) * scenario.dt)
+    return widen_lines(power, line_width(scenario) * scenario.dt)
 
 
 def columns(source: ModeSource, scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watch) -> Array:
@@ -120,7 +120,7 @@ def columns(source: ModeSource, scenario: Scenario, n_steps: int, rng: np.random
 
 def _mode_by_mode(source: ModeSource) -> Source:
     """Return a source that is the same for all stars."""
-    return lambda scenario, n, rng, watch: Turbulence(columns(source, scenario, n, rng, watch))
+    return lambda scenario, n, rng, watch: TurbulenceSignals(columns(source, scenario, n, rng, watch))
 
 
 def _none(_scenario: Scenario, _mode: int, n: int, _rng: np.random.Generator) -> Array:
@@ -150,7 +150,7 @@ def _psd(scenario: Scenario, mode: int, n: int, rng: np.random.Generator) -> Arr
     return gaussian_signal(table_variance(scenario, mode, period), period, rng)[:n]
 
 
-def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Watch) -> Turbulence:
+def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Watch) -> TurbulenceSignals:
     """Simulate von Karman layers: their modes on the axis, and the signals of the sensors on the NGS and on every LGS."""
     layers = atmosphere.layers(scenario)
     ideal, on_ngs, on_lgs = atmosphere.ideal_sensor(scenario), sensor(scenario, "ngs"), sensor(scenario, "lgs")
@@ -160,7 +160,7 @@ def _frozen_flow(scenario: Scenario, n: int, rng: np.random.Generator, watch: Wa
     on_axis, ngs, *lgs = frozen_flow(
         layers, scenario.turbulence.outer_scale, scenario.telescope.diameter, views, n, scenario.dt, rng, watch
     )
-    return Turbulence(on_axis, ngs, tuple(lgs))
+    return TurbulenceSignals(on_axis, ngs, tuple(lgs))
 
 
 SOURCES: dict[str, Source] = {

@@ -1,4 +1,4 @@
-"""From the named arrays of a file to a `Record`: shapes, units, signs and clocks, each checked here and nowhere else.
+"""From the named arrays of a file to a `Record`: the only check of shapes, units, signs and clocks.
 
 A record has y_lgs and u (n_steps, n_modes) and dt or time; optionally y_ngs (the same shape, NaN where there is no frame, or
 one row per frame) with ratio or time_ngs, the truth turbulence and vibration, open_loop_y, and for the offline GPR training_y,
@@ -21,13 +21,19 @@ from wfsobs.units import ANGLES, micrometres_per, parse_unit
 
 
 @dataclass(frozen=True)
-class Stated:
-    """What is said of a file from outside: it counts where the file is silent, and must not contradict it.
+class DeclaredFormat:
+    """What the user says of a file: used where the file says nothing, and never in contradiction to it.
 
-    unit : of y_lgs, u and the rest, one of wfsobs.units.UNITS; um where nobody says
-    command_sign  : +1, y = disturbance + u, or -1, y = disturbance - u
-    command_delay : steps from a command to the first measurement that sees it, 1 or more
-    rate : of the fast steps [Hz]
+    Attributes
+    ----------
+    unit : str or None
+        Of y_lgs, u and the rest, one of wfsobs.units.UNITS; um by default.
+    command_sign : int or None
+        +1, y = disturbance + u, or -1, y = disturbance - u.
+    command_delay : int or None
+        Steps from a command to the first measurement that sees it, 1 or more.
+    rate : float or None
+        Rate of the fast steps [Hz].
     """
 
     unit: str | None = None
@@ -36,8 +42,8 @@ class Stated:
     rate: float | None = None
 
 
-def record_of(contents: Contents, scenario: Scenario, stated: Stated) -> Record:
-    """The record of a file's contents. Raises RecordError with one line saying what, where and what is expected."""
+def to_record(contents: Contents, scenario: Scenario, stated: DeclaredFormat) -> Record:
+    """Return the record of a file's contents. Raises RecordError with one line naming what, where and what is expected."""
     arrays = contents.arrays
     for name in ("y_lgs", "u"):
         if name not in arrays:
@@ -56,7 +62,7 @@ def record_of(contents: Contents, scenario: Scenario, stated: Stated) -> Record:
     signals["u"] *= sign
     if "training_u" in signals:
         signals["training_u"] *= sign
-    dt, ratio = _timed(signals, arrays, stated)
+    dt, ratio = _apply_timestamps(signals, arrays, stated)
     if np.isnan(signals["y_lgs"]).all(axis=0).any():
         raise RecordError("y_lgs holds no measurement of one of its modes")
     delay = _whole("delay", arrays, stated.command_delay, DELAY)
@@ -67,7 +73,7 @@ def record_of(contents: Contents, scenario: Scenario, stated: Stated) -> Record:
 
 
 def _signal(name: str, raw: Array) -> Array:
-    """A signal as native float64 of its own, NaN where a sample is missing."""
+    """Return a signal as native float64 of its own, NaN where a sample is missing."""
     if raw.dtype.kind not in "fiu":
         raise RecordError(f"{name} holds {raw.dtype}, not numbers")
     if raw.ndim != 2:
@@ -80,8 +86,8 @@ def _signal(name: str, raw: Array) -> Array:
     return out
 
 
-def _into_micrometres(signals: dict[str, Array], contents: Contents, stated: Stated, diameter: float) -> tuple[str, int]:
-    """Scale every signal to um; returns (what to keep of unit, sign and aperture as one line, sign of the commands)."""
+def _into_micrometres(signals: dict[str, Array], contents: Contents, stated: DeclaredFormat, diameter: float) -> tuple[str, int]:
+    """Scale every signal to um; return (unit, sign and aperture as one line, sign of the commands)."""
     arrays, own = contents.arrays, contents.units
     if "unit" in arrays:
         unit = parse_unit(str(arrays["unit"]))
@@ -107,8 +113,8 @@ def _into_micrometres(signals: dict[str, Array], contents: Contents, stated: Sta
     return ", ".join(before + said), sign
 
 
-def _timed(signals: dict[str, Array], arrays: Mapping[str, Array], stated: Stated) -> tuple[float, int | None]:
-    """Put the rows where their time stamps say, and NGS frames beside them; returns the fast step [s] and the ratio."""
+def _apply_timestamps(signals: dict[str, Array], arrays: Mapping[str, Array], stated: DeclaredFormat) -> tuple[float, int | None]:
+    """Place the rows by their time stamps, and NGS frames beside them; return the fast step [s] and the ratio."""
     n = signals["y_lgs"].shape[0]
     dt = None if "dt" not in arrays else _number("dt", arrays["dt"])
     if stated.rate is not None:
@@ -122,7 +128,7 @@ def _timed(signals: dict[str, Array], arrays: Mapping[str, Array], stated: State
         start = float(time[0])
         for name, values in signals.items():
             if name not in TRAINING and values.shape[0] == n:
-                signals[name] = clock.spread(values, steps)
+                signals[name] = clock.place_rows(values, steps)
     if dt is None:
         raise RecordError("has no dt and no time; a record needs y_lgs, u and dt")
     if NGS not in signals:
@@ -137,7 +143,7 @@ def _timed(signals: dict[str, Array], arrays: Mapping[str, Array], stated: State
 
 
 def _numbered_frames(frames: Array, n: int, ratio: int) -> Array:
-    """Frames with a row per fast step, or else one row per frame, given a row per fast step."""
+    """Return frames with a row per fast step, from one row per step or per frame."""
     if frames.shape[0] == n:
         return frames
     out = np.full((n, frames.shape[1]), np.nan)
@@ -149,7 +155,7 @@ def _numbered_frames(frames: Array, n: int, ratio: int) -> Array:
 
 
 def _stamped_frames(signals: dict[str, Array], arrays: Mapping[str, Array], start: float, dt: float) -> int:
-    """Put the frames at their stamps, and let the record start `ratio` steps before a frame; returns the ratio."""
+    """Place the frames by their stamps, start the record `ratio` steps before a frame, and return the ratio."""
     frames, n = signals[NGS], signals["y_lgs"].shape[0]
     steps = clock.frames_at(_clock("time_ngs", arrays["time_ngs"], frames.shape[0]), start, dt)
     between = int(np.median(np.diff(steps))) if steps.size > 1 else None
@@ -186,7 +192,7 @@ def _number(name: str, raw: Array) -> float:
 
 
 def _whole(name: str, arrays: Mapping[str, Array], stated: int | None = None, default: int | None = None) -> int:
-    """A whole number of the file, else the one stated, else the default."""
+    """Return an integer of the file, else the declared one, else the default."""
     if name not in arrays:
         if stated is None and default is None:
             raise RecordError("y_ngs needs ratio, the number of fast steps per NGS frame")
@@ -200,8 +206,7 @@ def _whole(name: str, arrays: Mapping[str, Array], stated: int | None = None, de
 
 
 def _frames(y_ngs: Array, ratio: int) -> Array:
-    """Check that frames are where the ratio says, at k = n, 2n, ...; a frame at k = 0 saw nothing and is dropped, as is
-    what is left of one in which a mode is missing."""
+    """Check that frames are at k = n, 2n, ...; drop a frame at k = 0, which saw nothing, and frames without all modes."""
     steps = np.arange(y_ngs.shape[0])
     due = (steps % ratio == 0) & (steps >= ratio)
     wrong = ~due & ~np.isnan(y_ngs).all(axis=1) & (steps > 0)

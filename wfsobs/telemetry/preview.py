@@ -1,7 +1,7 @@
-"""What a record or a spectrum from a stranger is, before anything is done with it: rate, unit, gaps, rms, or one line.
+"""Preview of an uploaded record or spectrum: rate, unit, gaps and rms, or one line of error.
 
-The bytes may be anything. Nothing is unpickled, no path is opened, and what a file would grow to in memory is known before
-it grows.
+The bytes may be anything. Nothing is unpickled, no path is opened, and the memory of the contents is known before
+it is used.
 """
 
 from __future__ import annotations
@@ -16,25 +16,35 @@ from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import rms, welch_psd
 from wfsobs.telemetry.formats.psd import NoSpectrumError, read_psd
-from wfsobs.telemetry.intake import Stated
+from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import read_record
 from wfsobs.typing import Array
 
 MOST_FILE = 64_000_000
-"""Bytes of an uploaded file."""
+"""Maximum bytes of an uploaded file."""
 
 MOST_NUMBERS = 256_000_000
-"""Bytes of numbers in it."""
+"""Maximum bytes of numbers in it."""
 
 LONGEST_NAME = 80
 
 
 @dataclass(frozen=True)
 class Preview:
-    """record : what was read, in um and in our sign
-    name      : of the file, fit to be shown
-    rms       : signal (y_lgs, u, z) -> rms of every mode [um], of the samples that are there
-    frequency : (n,) [Hz]; spectrum : (n, n_modes) power spectral density of z [um^2/Hz], gaps held
+    """Preview of a record.
+
+    Attributes
+    ----------
+    record : Record
+        The record in um, with our sign of commands.
+    name : str
+        Name of the file, safe to show.
+    rms : dict of str to tuple
+        Signal (y_lgs, u, z) -> rms of every mode, without missing samples [um].
+    frequency : Array
+        Frequencies, (n,) [Hz].
+    spectrum : Array
+        Power spectral density of z, gaps held, (n, n_modes) [um^2/Hz].
     """
 
     record: Record
@@ -54,7 +64,7 @@ class Preview:
         return self.record.n_steps * self.record.dt
 
     def lines(self) -> list[str]:
-        """What to confirm, in words."""
+        """Return the lines to confirm."""
         r = self.record
         ngs = "none"
         if r.y_ngs is not None and r.ratio is not None:
@@ -72,7 +82,7 @@ class Preview:
 
 @dataclass(frozen=True)
 class SpectrumPreview:
-    """A vibration spectrum. table : as vibration.psd takes it; the rest as in `Preview`."""
+    """Preview of a vibration spectrum; table : the setting vibration.psd, the rest as in `Preview`."""
 
     table: dict[str, list[float]]
     name: str
@@ -80,7 +90,7 @@ class SpectrumPreview:
     spectrum: Array
 
     def lines(self) -> list[str]:
-        """What to confirm, in words."""
+        """Return the lines to confirm."""
         tip, tilt = np.sqrt(np.trapezoid(self.spectrum, self.frequency, axis=0)) * 1e3
         low, high = self.frequency[[0, -1]]
         return [
@@ -90,9 +100,9 @@ class SpectrumPreview:
 
 
 def preview_any(
-    data: bytes, name: str, scenario: Scenario | None = None, stated: Stated | None = None
+    data: bytes, name: str, scenario: Scenario | None = None, stated: DeclaredFormat | None = None
 ) -> Preview | SpectrumPreview:
-    """A record, or where it is none a vibration spectrum. Raises RecordError with one clear line."""
+    """Preview the bytes of a record, or of a vibration spectrum. Raises RecordError with one clear line."""
     try:
         return preview(data, name, scenario, stated)
     except RecordError as error:
@@ -107,8 +117,8 @@ def preview_any(
     return SpectrumPreview(table, shown, np.array(table["frequency"]), np.column_stack([table["tip"], table["tilt"]]))
 
 
-def preview(data: bytes, name: str, scenario: Scenario | None = None, stated: Stated | None = None) -> Preview:
-    """Read the bytes of a file; its name says the format. Raises RecordError with one clear line."""
+def preview(data: bytes, name: str, scenario: Scenario | None = None, stated: DeclaredFormat | None = None) -> Preview:
+    """Preview the bytes of a record; its name gives the format. Raises RecordError with one clear line."""
     shown = safe_name(name)
     if len(data) > MOST_FILE:
         raise RecordError(f"{shown}: has {len(data) / 1e6:.0f} MB, at most {MOST_FILE / 1e6:.0f} MB are taken")
@@ -121,9 +131,9 @@ def preview(data: bytes, name: str, scenario: Scenario | None = None, stated: St
 
 
 def safe_name(name: str) -> str:
-    """The last part of a name that a stranger gave, its odd characters replaced.
+    r"""Return the last part of a file name, with unusual characters replaced.
 
-    >>> safe_name("../../etc/pass\\x00wd<b>.csv")
+    >>> safe_name("../../etc/pass\x00wd<b>.csv")
     'pass_wd_b_.csv'
     """
     return re.sub(r"[^\w.+ -]", "_", re.split(r"[/\\]", name)[-1])[-LONGEST_NAME:] or "unnamed"

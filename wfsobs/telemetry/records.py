@@ -1,4 +1,4 @@
-"""The one door by which records come in and go out: files of any format, in one form and checked. docs/data.md has it all."""
+"""Reading and writing of records: files of any format, checked, in one form. See docs/data.md."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.telemetry.formats import format_of
 from wfsobs.telemetry.formats.npz import write as write_npz
-from wfsobs.telemetry.intake import Stated, record_of
+from wfsobs.telemetry.intake import DeclaredFormat, to_record
 from wfsobs.typing import Array
 
 MOST_BYTES = 4_000_000_000
-"""Of numbers in a file."""
+"""Maximum bytes of numbers in a file."""
 
 
 def save_record(path: str | Path, record: Record, scenario_toml: str | None = None) -> None:
-    """Write a record in the format that the name ends in. Raises OSError, RecordError."""
+    """Write a record in the format of the name's ending. Raises OSError, RecordError."""
     try:
         fmt = format_of(str(path))
         write_whole(path, lambda file: fmt.write(file, record_arrays(record, scenario_toml)))
@@ -31,7 +31,7 @@ def save_record(path: str | Path, record: Record, scenario_toml: str | None = No
 
 
 def record_arrays(record: Record, scenario_toml: str | None = None) -> dict[str, Array]:
-    """What the file of a record holds, by name."""
+    """Return the contents of a record's file, by name."""
     arrays = {name: np.asarray(value) for name, value in vars(record).items() if name != "training" and value is not None}
     arrays |= {"unit": np.array("um"), "command_sign": np.array(1)}
     if not record.origin:
@@ -52,9 +52,9 @@ def save_arrays(path: str | Path, arrays: Mapping[str, Array]) -> None:
 
 
 def load_record(
-    path: str | Path, scenario: Scenario | None = None, stated: Stated | None = None, sha256: str | None = None
+    path: str | Path, scenario: Scenario | None = None, stated: DeclaredFormat | None = None, sha256: str | None = None
 ) -> Record:
-    """Read and check the record of a file. Raises RecordError with one line saying what, where and what is expected.
+    """Read and check the record of a file. Raises RecordError with one line naming what, where and what is expected.
 
     sha256 : of the file, in hexadecimal digits; another file is refused
     """
@@ -81,21 +81,39 @@ def load(
 ) -> Record:
     """Read the record of a file: .npz, .csv, .fits or AOT (docs/data.md).
 
-    scenario      : its telescope and modes, where the file needs them to be understood; the defaults unless given
-    unit          : of the signals where the file states none, one of `wfsobs.units.UNITS`; um unless given
-    command_sign  : +1 where a command adds to what the sensor sees, -1 where it is taken off
-    command_delay : steps from a command to the first measurement that sees it
-    rate          : of the rows where they have no time [Hz]
-    Raises RecordError with one line saying what, where and what is expected.
+    Parameters
+    ----------
+    path : str or Path
+        The file; its ending gives the format.
+    scenario : Scenario, optional
+        Telescope and modes, where the file needs them; by default the defaults.
+    unit : str, optional
+        Unit of the signals where the file gives none, one of `wfsobs.units.UNITS`; um by default.
+    command_sign : {1, -1}, optional
+        +1 where y = disturbance + u, -1 where y = disturbance - u.
+    command_delay : int, optional
+        Steps from a command to the first measurement that sees it.
+    rate : float, optional
+        Rate of rows without time stamps [Hz].
+
+    Returns
+    -------
+    Record
+        Measurements and commands [um], and the truth where the file has it.
+
+    Raises
+    ------
+    RecordError
+        The file cannot be used; one line naming what, where and what is expected.
     """
-    return load_record(path, scenario, Stated(unit, command_sign, command_delay, rate))
+    return load_record(path, scenario, DeclaredFormat(unit, command_sign, command_delay, rate))
 
 
 def read_record(
-    file: IO[bytes], name: str, scenario: Scenario | None = None, stated: Stated | None = None, most: int = MOST_BYTES
+    file: IO[bytes], name: str, scenario: Scenario | None = None, stated: DeclaredFormat | None = None, most: int = MOST_BYTES
 ) -> Record:
-    """The record of an open file; its name says the format and is never opened. most : bytes of numbers."""
+    """Read the record of an open file; its name gives the format and is never opened. most : maximum bytes of numbers."""
     try:
-        return record_of(format_of(name).read(file, most), scenario or Scenario(), stated or Stated())
+        return to_record(format_of(name).read(file, most), scenario or Scenario(), stated or DeclaredFormat())
     except RecordError as error:
         raise RecordError(f"{name}: {error}") from None

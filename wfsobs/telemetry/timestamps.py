@@ -1,4 +1,4 @@
-"""From time stamps to steps: jumps become missing frames, what is no clock is refused."""
+"""From time stamps to steps: jumps become missing frames, an unusable clock is refused."""
 
 from __future__ import annotations
 
@@ -8,20 +8,38 @@ from wfsobs.record import RecordError
 from wfsobs.typing import Array
 
 JITTER = 0.3
-"""How far a stamp may be from its step, in steps."""
+"""Maximum distance of a stamp from its step, in steps."""
 
 AGREE = 1e-3
-"""How far the step of the stamps may be from one that is stated, relative."""
+"""Maximum relative difference of the step of the stamps and a declared one."""
 
 DIGITS = 10
-"""Digits of a step worked out from stamps, which have rounding of their own."""
+"""Digits of a step computed from stamps, which have rounding errors."""
 
 
 def steps_of(time: Array, dt: float | None = None) -> tuple[Array, float]:
-    """(step of every row, whole numbers from 0; time step [s]) of stamps (n,) [s].
+    """Return the step of every row, and the time step, of time stamps.
 
-    A difference of several steps is a gap. Raises RecordError where time goes backwards, where the rate is not constant,
-    where more frames are missing than are there, or where the rate is not the one stated.
+    A difference of several steps is a gap.
+
+    Parameters
+    ----------
+    time : Array
+        Time stamps, (n,) [s].
+    dt : float, optional
+        Declared time step [s].
+
+    Returns
+    -------
+    steps : Array
+        Integers from 0, (n,).
+    dt : float
+        Time step [s].
+
+    Raises
+    ------
+    RecordError
+        Time goes backwards, the rate is not constant or not the declared one, or most frames are missing.
     """
     bad = np.flatnonzero(~np.isfinite(time))
     if bad.size:
@@ -38,7 +56,7 @@ def steps_of(time: Array, dt: float | None = None) -> tuple[Array, float]:
         )
     jump = np.rint(difference / np.median(difference))
     steps = np.concatenate([[0.0], np.cumsum(np.maximum(jump, 1.0))])
-    step = _rounded((time[-1] - time[0]) / steps[-1])
+    step = _round_step((time[-1] - time[0]) / steps[-1])
     off = np.abs(time - time[0] - steps * step) / step
     uneven = np.abs(difference / step - np.diff(steps))
     if max(off.max(), uneven.max()) > JITTER:
@@ -51,15 +69,15 @@ def steps_of(time: Array, dt: float | None = None) -> tuple[Array, float]:
     return steps.astype(int), step if dt is None else dt
 
 
-def spread(values: Array, steps: Array) -> Array:
-    """Rows put where they belong, NaN where a step has none."""
+def place_rows(values: Array, steps: Array) -> Array:
+    """Return an array with the rows at their steps, NaN where a step has none."""
     out = np.full((steps[-1] + 1, values.shape[1]), np.nan)
     out[steps] = values
     return out
 
 
 def frames_at(time: Array, start: float, dt: float) -> Array:
-    """Fast steps (n,) of frames stamped `time` [s], where step 0 is at `start`. Raises RecordError off the steps."""
+    """Return the fast steps (n,) of frames stamped `time` [s], where step 0 is at `start`. Raises RecordError between steps."""
     exact = (time - start) / dt
     steps = np.rint(exact)
     wrong = np.flatnonzero(~(np.abs(exact - steps) <= JITTER))
@@ -71,5 +89,5 @@ def frames_at(time: Array, start: float, dt: float) -> Array:
     return steps.astype(int)
 
 
-def _rounded(step: float) -> float:
+def _round_step(step: float) -> float:
     return float(f"{step:.{DIGITS}g}")

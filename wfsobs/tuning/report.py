@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import reduce
 from typing import Any
 
-from wfsobs.evaluation.rows import label_of
+from wfsobs.evaluation.rows import row_label
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.configfile import annotated, changes, to_toml
+from wfsobs.scenario.configfile import add_comments, changed_settings, to_toml
 from wfsobs.tuning.judge import Errors
 from wfsobs.tuning.records import TRUTH
 from wfsobs.tuning.tuning import Stage, Tuned
@@ -30,7 +30,7 @@ def plain(tuned: Tuned) -> dict[str, Any]:
         "observer": tuned.observer,
         "target": tuned.target,
         "against": tuned.against,
-        "settings": changes(tuned.scenario, tuned.before.scenario),
+        "settings": changed_settings(tuned.scenario, tuned.before.scenario),
         "start": tuned.start,
         "before": stage(tuned.before),
         "after": stage(tuned.after),
@@ -47,7 +47,7 @@ def _modes(errors: Errors | None) -> dict[str, float] | None:
 
 def settings(tuned: Tuned) -> list[tuple[str, str, str]]:
     """(dotted path, before, after) of every setting that was searched or set by hand."""
-    changed = [path for path in changes(tuned.scenario, tuned.before.scenario) if path not in tuned.start]
+    changed = [path for path in changed_settings(tuned.scenario, tuned.before.scenario) if path not in tuned.start]
     before = {path: _before(tuned, path) for path in (*changed, *tuned.start)}
     if tuned.scenario == tuned.before.scenario:
         return [(path, text, text) for path, text in before.items()]
@@ -91,10 +91,10 @@ def toml(tuned: Tuned) -> str:
     base = tuned.before.scenario
     notes = {
         path: f"{'tuned' if path in tuned.paths else 'with it'}, {_before(tuned, path)} before"
-        for path in changes(tuned.scenario, base)
+        for path in changed_settings(tuned.scenario, base)
     }
     head = [
-        f"{label_of(tuned.observer)} tuned for {tuned.target}, against {tuned.against}, in {len(tuned.history)} evaluations.",
+        f"{row_label(tuned.observer)} tuned for {tuned.target}, against {tuned.against}, in {len(tuned.history)} evaluations.",
         *(
             f"{tuned.measure}, {name}: {_of(before)} before, {_of(after)} after"
             for name, before, after in (
@@ -103,7 +103,7 @@ def toml(tuned: Tuned) -> str:
             )
         ),
     ]
-    return "\n".join(f"# {line}" for line in head) + "\n\n" + annotated(to_toml(tuned.scenario), notes)
+    return "\n".join(f"# {line}" for line in head) + "\n\n" + add_comments(to_toml(tuned.scenario), notes)
 
 
 def _of(errors: Errors | None) -> str:

@@ -21,9 +21,9 @@ from wfsobs.app.pages.identify_table import table_html, verdict_html
 from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
 from wfsobs.app.sources import SimulatedRecord, Source
 from wfsobs.app.store import Store
-from wfsobs.identification import Identified
+from wfsobs.identification import Identification
 from wfsobs.identification.identification import LEVEL
-from wfsobs.identification.report import toml
+from wfsobs.identification.report import identification_toml
 from wfsobs.pipeline import as_stated
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
@@ -127,7 +127,7 @@ class IdentifyPage(PageActions):
         result, record = self._identified()
         if result is None or record is None:
             return {"Model as TOML": None}
-        text = toml(result, result.scenario(as_stated(record, self.store.scenario)))
+        text = identification_toml(result, result.scenario(as_stated(record, self.store.scenario)))
         return {"Model as TOML": Save("wfsobs-model.toml", "application/toml", text.encode)}
 
     def _take(self, source: Source | None) -> None:
@@ -158,7 +158,7 @@ class IdentifyPage(PageActions):
         if task.state != RUNNING:
             self._redraw()
 
-    def _identified(self) -> tuple[Identified, Record] | tuple[None, None]:
+    def _identified(self) -> tuple[Identification, Record] | tuple[None, None]:
         """Return the model and the record from which it was identified."""
         return self.work.result or (None, None)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.render import Row, macro, table
-from wfsobs.identification import Identified
+from wfsobs.identification import Identification
 from wfsobs.identification.process import Number
-from wfsobs.identification.report import rows, verdict, written
+from wfsobs.identification.report import format_number, mode_rows, verdict
 from wfsobs.identification.result import IdentifiedMode
 
 WHITE, COLOURED = macro("tag", "best", "white"), macro("tag", "above", "not white")
@@ -22,7 +22,7 @@ def table_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
         f"Rms [{display.unit_label}]": "standard deviation of it in z",
     }
     body = []
-    for what, frequency, damping, rms in rows(mode):
+    for what, frequency, damping, rms in mode_rows(mode):
         scaled = None if rms is None else Number(rms.value * scale, rms.std * scale)
         body.append(Row(what, ["" if n is None else deviation_text(n) for n in (frequency, damping, scaled)]))
     return str(table(f"Identified in {mode.name}", columns, [("", body)]))
@@ -34,10 +34,10 @@ def deviation_text(number: Number) -> str:
     >>> deviation_text(Number(47.43812, 0.0264))
     '47.438 ± 0.026'
     """
-    return written(number).replace("+-", "±").replace("-", "−")
+    return format_number(number).replace("+-", "±").replace("-", "−")
 
 
-def verdict_html(result: Identified) -> str:
+def verdict_html(result: Identification) -> str:
     """Whether anything is left, mode by mode."""
     lines = [
         (WHITE if mode.whiteness.white else COLOURED) + f"{line}."

@@ -23,7 +23,7 @@ from wfsobs.app.tune_work import CHOICES, MOST, best_so_far, compute, measure, r
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION
 from wfsobs.record import RecordError
-from wfsobs.scenario.configfile import changes
+from wfsobs.scenario.configfile import changed_settings
 from wfsobs.settings.group import SettingError
 from wfsobs.settings.parameters import hint
 from wfsobs.tuning import Evaluation, Tuned
@@ -107,7 +107,7 @@ class TunePage(PageActions):
         tuned = self._tuned()
         if tuned is not None:
             try:
-                self.store.replace(changes(tuned.scenario, tuned.before.scenario))
+                self.store.replace(changed_settings(tuned.scenario, tuned.before.scenario))
             except SettingError as error:
                 self.work.refuse(str(error))
 

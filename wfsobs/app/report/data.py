@@ -19,7 +19,7 @@ from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows as controller_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.rows import Row, rows
+from wfsobs.evaluation.rows import Row, score_rows
 from wfsobs.evaluation.scores import cumulative_rms, spectra
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -164,7 +164,7 @@ def state_of(result: Result, states: int = 1) -> State:
                 lines |= _frequencies(found[0])
                 for suffix, density in zip(("", "-error") if "error" in signals else ("",), found[1:], strict=False):
                     lines[f"psd{suffix}/{where}"], lines[f"cumulative{suffix}/{where}"] = _spectra(found[0], density[:, i])
-    return State(scenario, rows(result.scores, scenario.run.seed), tuple(_reasons(result)), grid, lines, loop_rows(result))
+    return State(scenario, score_rows(result.scores, scenario.run.seed), tuple(_reasons(result)), grid, lines, loop_rows(result))
 
 
 def loop_rows(result: Result) -> list[Row]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from wfsobs.app.numbers import NOTHING
 from wfsobs.app.report.data import State
-from wfsobs.evaluation.rows import TIME, Row, competes, label_of, looks_ahead, own_stretch, stretch_of
+from wfsobs.evaluation.rows import TIME, Row, can_be_best, is_non_causal, own_interval, row_label, scored_interval
 from wfsobs.evaluation.scores import RESIDUAL
 
 COLUMNS = {
@@ -52,18 +52,18 @@ def _order(rows: list[Row]):
 
 def _body(rows: list[Row], dt: float) -> dict[str, Any]:
     target, mode = _group(rows[0])
-    best = min((row["rms_um"] for row in rows if competes(row["observer"], row["apart"])), default=math.inf)
+    best = min((row["rms_um"] for row in rows if can_be_best(row["observer"], row["apart"])), default=math.inf)
     return {
         "target": target,
         "mode": mode,
-        "title": ", ".join((target.capitalize(), mode, *filter(None, [stretch_of(rows)]))),
+        "title": ", ".join((target.capitalize(), mode, *filter(None, [scored_interval(rows)]))),
         "rows": [
             {
                 **row,
-                "label": label_of(row["observer"]),
-                "looks_ahead": looks_ahead(row["observer"]),
-                "stretch": own_stretch(row),
-                "best": row["rms_um"] == best and competes(row["observer"], row["apart"]),
+                "label": row_label(row["observer"]),
+                "looks_ahead": is_non_causal(row["observer"]),
+                "stretch": own_interval(row),
+                "best": row["rms_um"] == best and can_be_best(row["observer"], row["apart"]),
                 "lag": NOTHING if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−"),
                 "time": row[TIME],
                 "factor": None if row[TIME] is None else 1e-6 * row[TIME] / dt,

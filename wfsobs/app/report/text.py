@@ -14,7 +14,7 @@ from wfsobs.app.report.data import Report, State, window_of
 from wfsobs.bench.measure import machine
 from wfsobs.evaluation.scores import BOUND, RESIDUAL
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.configfile import changes, pristine, to_toml, written
+from wfsobs.scenario.configfile import changed_settings, format_value, reference_preset, to_toml
 
 LONGEST = 8000
 """Characters of a command line; settings that need more go by file."""
@@ -24,7 +24,7 @@ FILE = "wfsobs.toml"
 
 def summary(report: Report, made: datetime) -> str:
     """Say in one line what this is."""
-    base, count = report.base, len(changes(report.base, pristine(report.preset)))
+    base, count = report.base, len(changed_settings(report.base, reference_preset(report.preset)))
     length = report.states[0].grid.n * report.states[0].grid.dt
     parts = [
         f"Preset {report.preset}" + (f", {count} setting{'s' * (count > 1)} changed" if count else ""),
@@ -49,7 +49,7 @@ def value_of(value: Any) -> str:
     """Write a setting's value for people."""
     if isinstance(value, bool):
         return "on" if value else "off"
-    text = f"{value:.6g}" if isinstance(value, (int, float)) else written(value)
+    text = f"{value:.6g}" if isinstance(value, (int, float)) else format_value(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
@@ -76,12 +76,12 @@ def values_of(report: Report, index: int) -> list[Any]:
 
 def scenario_values(report: Report) -> dict[str, Any]:
     """Collect what differs from the preset, what varies, and every setting."""
-    preset = pristine(report.preset)
+    preset = reference_preset(report.preset)
     toml = f'preset = "{report.preset}"\n{to_toml(report.base)}'
     return {
         "changed": [
             {"name": name_of(report.base, path), "path": path, "before": value_of(_at(preset, path)), "now": value_of(value)}
-            for path, value in changes(report.base, preset).items()
+            for path, value in changed_settings(report.base, preset).items()
         ],
         "variations": [
             {"name": name_of(report.states[0].scenario, v.path), "path": v.path, "texts": [value_of(value) for value in v.values]}
@@ -124,9 +124,11 @@ def origin_values(report: Report, made: datetime) -> dict[str, Any]:
 
 def command_of(report: Report) -> tuple[str, bool]:
     """Write the command line of a report; say whether it takes its settings from FILE, being too long otherwise."""
-    changed = changes(report.base, pristine(report.preset))
+    changed = changed_settings(report.base, reference_preset(report.preset))
     ends = _words("--vary", report.variations)
-    command = _command(["--preset", report.preset, *_words("--set", (f"{k}={written(v)}" for k, v in changed.items())), *ends])
+    command = _command(
+        ["--preset", report.preset, *_words("--set", (f"{k}={format_value(v)}" for k, v in changed.items())), *ends]
+    )
     return (command, False) if len(command) <= LONGEST else (_command(["--config", FILE, *ends]), True)
 
 

@@ -14,7 +14,7 @@ from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, RunResults
-from wfsobs.evaluation.rows import NOT_OBSERVERS, own_stretch, rows
+from wfsobs.evaluation.rows import NOT_OBSERVERS, own_interval, score_rows
 from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL, Score
 
 
@@ -57,7 +57,7 @@ class Strip:
 
     def _scored(self, name: str, score: Score, shown: RunResults, base: str) -> dict[str, Any]:
         relative = f"{score.normalised_rms:.2f} × {base}" if score.normalised_rms is not None else ""
-        return self._card(name, self._scaled(score.rms, shown), own_stretch(rows([score], None)[0]) or relative)
+        return self._card(name, self._scaled(score.rms, shown), own_interval(score_rows([score], None)[0]) or relative)
 
     def _without_truth(self, name: str, shown: RunResults) -> dict[str, Any]:
         """How well the next measurement is predicted, by whoever says what it will be."""

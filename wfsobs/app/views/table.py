@@ -14,7 +14,16 @@ from wfsobs.app.numbers import NOTHING, change, number
 from wfsobs.app.render import Row, macro, table
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import RunResults
-from wfsobs.evaluation.rows import NOT_OBSERVERS, competes, label_of, looks_ahead, needs_of, own_stretch, rows, stretch_of
+from wfsobs.evaluation.rows import (
+    NOT_OBSERVERS,
+    can_be_best,
+    is_non_causal,
+    own_interval,
+    row_label,
+    row_needs,
+    score_rows,
+    scored_interval,
+)
 from wfsobs.evaluation.scores import BOUND, LOOP, RESIDUAL, Score
 from wfsobs.observers.base import TARGETS
 
@@ -82,17 +91,17 @@ class Table:
             return []
         if self.display.best_first:
             scores.sort(key=lambda s: (s.target == RESIDUAL, s.apart, s.rms))
-        best = min((s.rms for s in scores if competes(s.observer, s.apart)), default=None)
+        best = min((s.rms for s in scores if can_be_best(s.observer, s.apart)), default=None)
         scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
         found = []
         for score in scores:
-            is_best = score.rms == best and competes(score.observer, score.apart)
+            is_best = score.rms == best and can_be_best(score.observer, score.apart)
             cells = [
                 (BEST if is_best else "") + number(score.rms * scale),
                 *self._pinned(score.observer, score.target, score),
                 number(score.truth_rms * scale),
                 number(score.normalised_rms),
-                needs_of(score.observer),
+                row_needs(score.observer),
                 NOTHING,
                 *_times(score, shown.result.record.dt),
             ]
@@ -107,7 +116,7 @@ class Table:
             name: find(shown, name, target, self.display.mode) if shown else None
             for name in (*observers_of(target, hidden=True), BOUND)
         }
-        best = min((s.rms for n, s in scores.items() if s and competes(n, s.apart)), default=None)
+        best = min((s.rms for n, s in scores.items() if s and can_be_best(n, s.apart)), default=None)
         order = list(scores.items())
         if self.display.best_first:
             order.sort(key=lambda item: (item[1].apart, item[1].rms) if item[1] else (True, math.inf))
@@ -116,24 +125,24 @@ class Table:
 
     def _row(self, name: str, target: str, score: Score | None, best: float | None) -> Row:
         shown, pinned = self.run.result, self._pinned(name, target, score)
-        cells = [NOTHING, *pinned, *[NOTHING] * 2, needs_of(name), *[NOTHING] * 3]
+        cells = [NOTHING, *pinned, *[NOTHING] * 2, row_needs(name), *[NOTHING] * 3]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
-            is_best = score.rms == best and competes(name, score.apart)
+            is_best = score.rms == best and can_be_best(name, score.apart)
             cells = [
                 (BEST if is_best else "") + number(score.rms * scale) + _interval(score.interval, scale),
                 *pinned,
                 number(score.truth_rms * scale),
                 (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
-                needs_of(name),
+                row_needs(name),
                 NOTHING if score.lag is None else f"{1e3 * score.lag:.2f}".replace("-", "−"),
                 *_times(score, shown.result.record.dt),
             ]
-        head = self._head(name) + macro("note", "looks ahead" if looks_ahead(name) else "") + _own(score)
+        head = self._head(name) + macro("note", "looks ahead" if is_non_causal(name) else "") + _own(score)
         return Row(head, cells, {"observer": name, "target": target})
 
     def _head(self, name: str) -> Markup:
-        return swatch(name, self.display.dark) + label_of(name)
+        return swatch(name, self.display.dark) + row_label(name)
 
     def _pinned(self, name: str, target: str, score: Score | None) -> list[str]:
         """Write the pinned run's error and the change since; nothing while nothing is pinned."""
@@ -149,13 +158,13 @@ class Table:
 
 def _scored(scores: list[Score]) -> str:
     """Write the stretch over which comparable rows were scored, for the end of a heading."""
-    stretch = stretch_of(rows(scores, None))
+    stretch = scored_interval(score_rows(scores, None))
     return f", {stretch}" if stretch else ""
 
 
 def _own(score: Score | None) -> Markup:
     """Write the stretch of an observer that was scored on samples of its own, to stand beside its name."""
-    return macro("note", own_stretch(rows([score], None)[0]) if score and score.apart else "")
+    return macro("note", own_interval(score_rows([score], None)[0]) if score and score.apart else "")
 
 
 def _interval(interval: Sequence[float] | None, scale: float) -> Markup:

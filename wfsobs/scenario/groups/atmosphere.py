@@ -10,7 +10,7 @@ from wfsobs.settings.parameters import Real, Reals, Whole
 
 
 class Telescope(Group):
-    """The aperture, where it points, and the modes that are looked at."""
+    """The aperture, its pointing, and the simulated modes."""
 
     diameter = Real(8.0, bounds=(0.1, 100.0), label="Aperture diameter D", doc="Diameter of the aperture [m] (paper, Table 1).")
     radial_order = Whole(
@@ -18,8 +18,8 @@ class Telescope(Group):
         bounds=(1, HIGHEST_ORDER),
         softbounds=(1, HIGHEST_ORDER),
         label="Highest radial order",
-        doc="Zernike modes up to this radial order, piston left out: 1 is tip and tilt (paper), 2 to 6 are 5, "
-        "9, 14, 20 and 27 modes.",
+        doc="Zernike modes up to this radial order, without piston: 1 is tip and tilt (paper), 2 to 6 are 5, 9, 14, 20 "
+        "and 27 modes.",
     )
     zenith_angle = Real(
         0.0,
@@ -27,8 +27,8 @@ class Telescope(Group):
         softbounds=(0.0, 60.0),
         step=1.0,
         label="Zenith angle",
-        doc="Angle of the line of sight to the zenith [deg]; of frozen flow, the airmass 1 / cos strengthens the "
-        "turbulence and lengthens the way to layers and guide stars.",
+        doc="Zenith angle of the line of sight [deg]. With frozen flow, the airmass 1 / cos strengthens the turbulence "
+        "and lengthens the path to layers and guide stars.",
     )
 
 
@@ -71,7 +71,7 @@ class Layer(Group):
         softbounds=(0.0, 1.0),
         step=0.01,
         label="Share of the turbulence",
-        doc="Share of the turbulence, of r0^(-5/3); the shares of all layers are divided by their sum.",
+        doc="Share of the turbulence, of r0^(-5/3); the shares of all layers are normalised to a sum of one.",
     )
     wind_factor = Real(
         1.0,
@@ -79,15 +79,15 @@ class Layer(Group):
         softbounds=(0.2, 4.0),
         step=0.05,
         label="Wind over V₀",
-        doc="The layer's wind speed as a multiple of turbulence.wind_speed.",
+        doc="Wind speed of the layer over turbulence.wind_speed.",
     )
     wind_direction = Real(
         0.0,
         bounds=(-360.0, 360.0),
         softbounds=(-180.0, 180.0),
         step=5.0,
-        label="Wind to",
-        doc="Direction that the wind blows to [deg], from the axis of tip to that of tilt.",
+        label="Wind direction",
+        doc="Direction that the wind blows to, from the axis of tip to that of tilt [deg].",
     )
 
 
@@ -100,10 +100,10 @@ class Process(Group):
         softbounds=(0.1, 10.0),
         step=0.1,
         label="Corner",
-        doc="Corner of the AR(2) process, its omega over 2 pi [Hz].",
+        doc="Corner frequency of the AR(2) process, omega / 2 pi [Hz].",
     )
     damping = Real(
-        0.9, bounds=(1e-6, 1.0), softbounds=(0.1, 1.0), step=0.01, label="Damping ξ", doc="Damping factor of the process."
+        0.9, bounds=(1e-6, 1.0), softbounds=(0.1, 1.0), step=0.01, label="Damping ξ", doc="Damping ratio of the process."
     )
     third_corner = Real(
         0.0,
@@ -111,14 +111,14 @@ class Process(Group):
         softbounds=(0.0, 10.0),
         step=0.1,
         label="Third corner / first",
-        doc="Corner beyond which the spectrum falls as f^-6 in the place of f^-4, over the frequency; 0 is none.",
+        doc="Corner beyond which the spectrum falls as f^-6 instead of f^-4, over the frequency; 0 is none.",
     )
     rms = Reals(
         [0.5, 0.5],
         item_bounds=(0.0, 1e4),
         bounds=(1, 64),
         label="Strength per mode, rms",
-        doc="Standard deviation of the process [um], one number per mode: tip, tilt; modes beyond the list have none.",
+        doc="Standard deviation of the process [um], one number per mode: tip, tilt, ...; zero for modes beyond the list.",
     )
 
 
@@ -129,9 +129,9 @@ class Turbulence(Group):
         default="ar2",
         objects=["ar2", "ar3", "processes", "frozen-flow", "psd", "none"],
         label="Source",
-        doc="How turbulence is made: the AR(2) process of the paper, eq. 1; the same with a third corner; a sum of such in "
-        "every mode; von Karman layers that the wind carries along, every guide star with a view of its own; "
-        "inverse DFT of the PSD table; or none.",
+        doc="Model of the turbulence. ar2: the AR(2) process of the paper, eq. 1; ar3: the same with a third corner; "
+        "processes: a sum of such processes in every mode; frozen-flow: von Karman layers, with a beam of its own "
+        "for every guide star; psd: inverse DFT of the PSD table; none: no turbulence.",
     )
     wind_speed = Real(
         15.0,
@@ -143,7 +143,7 @@ class Turbulence(Group):
         "scales the wind of every layer of frozen flow.",
     )
     damping = Real(
-        0.9, bounds=(0.01, 1.0), step=0.01, label="Damping ξ", doc="Damping factor of the AR(2) process (paper, Table 1)."
+        0.9, bounds=(0.01, 1.0), step=0.01, label="Damping ξ", doc="Damping ratio of the AR(2) process (paper, Table 1)."
     )
     third_corner = Real(
         3.0,
@@ -151,8 +151,8 @@ class Turbulence(Group):
         softbounds=(1.0, 10.0),
         step=0.1,
         label="Third corner / w₀",
-        doc="Corner beyond which the spectrum falls as f^-6 in the place of f^-4, over the corner w0, for source "
-        "ar3; not in the paper.",
+        doc="Corner beyond which the spectrum falls as f^-6 instead of f^-4, over the corner w0, for source ar3; not "
+        "in the paper.",
     )
     rms = Real(
         0.5,
@@ -160,8 +160,8 @@ class Turbulence(Group):
         softbounds=(0.0, 2.0),
         step=0.01,
         label="Strength, rms",
-        doc="Standard deviation of tip and of tilt [um], for ar2 and ar3; the paper gives none, r0 = 0.157 m, L0 = 25 m "
-        "on 8 m give 0.529 um. A higher order has it in the ratio that r0 and L0 give.",
+        doc="Standard deviation of tip and of tilt [um], for sources ar2 and ar3. Not given in the paper; r0 = 0.157 m "
+        "and L0 = 25 m on 8 m give 0.529 um. Higher orders follow from the ratio that r0 and L0 give.",
     )
     r0 = Real(
         0.157,
@@ -169,7 +169,7 @@ class Turbulence(Group):
         softbounds=(0.05, 0.4),
         step=0.001,
         label="Fried parameter r₀",
-        doc="r0 at 500 nm at the zenith [m], for source frozen-flow. The seeing is 0.98 x 500 nm / r0: 0.64 arcsec.",
+        doc="Fried parameter at 500 nm at the zenith [m], for source frozen-flow. The seeing is 0.98 x 500 nm / r0: 0.64 arcsec.",
     )
     outer_scale = Real(
         25.0,
@@ -179,17 +179,19 @@ class Turbulence(Group):
         label="Outer scale L₀",
         doc="Outer scale of the von Karman spectrum [m].",
     )
-    layers = param.List([Layer()], item_type=Layer, bounds=(0, 40), label="Layers", doc="The layers of frozen flow.")
+    layers = param.List(
+        [Layer()], item_type=Layer, bounds=(0, 40), label="Layers", doc="Layers of frozen flow, for source frozen-flow."
+    )
     processes = param.List(
         [Process()],
         item_type=Process,
         bounds=(0, 500),
         label="Processes",
-        doc="Whose sum the turbulence of a mode is, for source processes.",
+        doc="Processes whose sum is the turbulence, for source processes.",
     )
-    psd = section(PsdTable, "PSD table", "The spectrum of turbulence as a table, for source psd.")
+    psd = section(PsdTable, "PSD table", "Spectrum of the turbulence as a table, for source psd.")
 
     def idle(self) -> tuple[str, ...]:
-        """What other sources are made of; r0 and L0 set the ratio of the modes in all of them."""
+        """Return the settings of other sources; r0 and L0 set the ratio of the modes in all of them."""
         of_one = {"third_corner": "ar3", "processes": "processes", "layers": "frozen-flow", "psd": "psd"}
         return tuple(name for name, source in of_one.items() if source != self.source)

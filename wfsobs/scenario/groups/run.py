@@ -30,4 +30,4 @@ class Run(Group):
     warm_up = Real(
         1.0, bounds=(0.0, 600.0), softbounds=(0.0, 5.0), label="Warm-up", doc="Start of the record that no score counts [s]."
     )
-    seed = Whole(1, bounds=(0, 2**32 - 1), softbounds=(0, 1000), label="Seed", doc="Seed of every random number of the run.")
+    seed = Whole(1, bounds=(0, 2**32 - 1), softbounds=(0, 1000), label="Seed", doc="Seed of all random numbers of the run.")

@@ -25,27 +25,27 @@ class Sensors(Group):
         label="Exposure ratio n",
         doc="NGS exposure over LGS exposure, n = T_NGS / T_LGS (paper: 5 ms over 1 ms).",
     )
-    lgs_count = Whole(2, bounds=(1, 16), label="Number of LGS", doc="Laser guide stars (paper: 2).")
+    lgs_count = Whole(2, bounds=(1, 16), label="Number of LGS", doc="Number of laser guide stars (paper: 2).")
     lgs_combination = param.Selector(
         default="mean",
         objects=["mean", "minimum-variance"],
         label="LGS combined by",
-        doc="mean: the plain mean over the LGS (paper); minimum-variance: the linear combination of all their modes that is "
-        "nearest to the disturbance on the axis, from the covariances of the model.",
+        doc="Guide-star combination. mean: the mean over the LGS (paper); minimum-variance: the linear combination of "
+        "all their modes that is nearest to the disturbance on the axis, from the covariances of the model.",
     )
     kind = param.Selector(
         default="shack-hartmann",
         objects=["shack-hartmann", "zernike"],
         label="Kind",
-        doc="What sees frozen flow: shack-hartmann, modes fitted to slopes; zernike, the modes themselves. Turbulence that is "
-        "made mode by mode is seen as it is.",
+        doc="Sensor of frozen flow. shack-hartmann: modes fitted to slopes; zernike: the modes themselves. Turbulence "
+        "from other sources is measured without a sensor model.",
     )
     noise_from = param.Selector(
         default="nm",
         objects=["nm", "photons"],
         label="Noise from",
-        doc="nm: white noise of the rms below in every mode; photons: the noise that photons and read noise have in the slopes "
-        "of the Shack-Hartmann sensors, correlated between modes.",
+        doc="nm: white noise of the rms below in every mode; photons: photon and read noise of the slopes of the "
+        "Shack-Hartmann sensors, correlated between modes.",
     )
     lgs_noise = Real(
         0.02,
@@ -60,7 +60,7 @@ class Sensors(Group):
         item_bounds=(0.0, 1e4),
         bounds=(0, 64),
         label="LGS noise per mode",
-        doc="The same where modes differ, rms [um]: a number per mode, modes beyond the list have the one above.",
+        doc="Noise of each LGS per mode, rms [um], where modes differ; modes beyond the list have the noise above.",
     )
     ngs_noise = Real(
         0.01,
@@ -76,9 +76,9 @@ class Sensors(Group):
         softbounds=(0.0, 0.2),
         step=0.005,
         label="LGS low-frequency error",
-        doc="Slow tip-tilt error of each LGS, rms [um], independent between LGS: the stand-in for cone effect and "
-        "uplink turbulence where turbulence is not frozen flow. 0.049 um is the cone effect of one layer at 8 km and a "
-        "guide star at 90 km.",
+        doc="Slow error of each LGS in tip and tilt, rms [um], independent between LGS. It stands for cone effect and "
+        "uplink turbulence where turbulence is not frozen flow. 0.049 um is the cone effect of one layer at 8 km "
+        "and a guide star at 90 km.",
     )
     lgs_altitude = Real(
         90_000.0,
@@ -86,8 +86,8 @@ class Sensors(Group):
         softbounds=(80_000.0, 100_000.0),
         step=1000.0,
         label="LGS altitude H",
-        doc="Height of the laser guide stars above the telescope [m], for frozen flow: they see a layer at "
-        "height h through a beam narrower by 1 - h / H.",
+        doc="Height of the laser guide stars above the telescope [m], for frozen flow: a beam is narrower by 1 - h / H "
+        "in a layer at height h.",
     )
     lgs_radius = Real(
         0.0,
@@ -95,7 +95,7 @@ class Sensors(Group):
         softbounds=(0.0, 70.0),
         step=0.5,
         label="LGS asterism, radius",
-        doc="Angle between each LGS and the axis [arcsec], for frozen flow; 0 puts all on the axis.",
+        doc="Angle between each LGS and the axis [arcsec], for frozen flow; 0 is on the axis.",
     )
     lgs_angle = Real(
         0.0,
@@ -103,7 +103,7 @@ class Sensors(Group):
         softbounds=(-180.0, 180.0),
         step=5.0,
         label="LGS asterism, first at",
-        doc="Direction of the first LGS from the axis of tip to that of tilt [deg]; the others follow evenly.",
+        doc="Direction of the first LGS from the axis of tip to that of tilt [deg]; the others are evenly spaced.",
     )
     ngs_direction = Reals(
         [0.0, 0.0],
@@ -115,8 +115,7 @@ class Sensors(Group):
     tip_tilt_indetermination = param.Boolean(
         False,
         label="Tip-tilt indetermination",
-        doc="An LGS that cannot see turbulent tip and tilt at all, as in reality; off in the paper, whose "
-        "simulator does not model it.",
+        doc="The LGS cannot see turbulent tip and tilt, as in reality; off in the paper, whose simulator does not model it.",
     )
     lenslets = section(LensletArrays, "Shack-Hartmann", "Lenslets of the Shack-Hartmann sensors, and the fit to their slopes.")
     spots = section(Spots, "Spots", "Light and detectors of the Shack-Hartmann sensors, for noise from photons.")

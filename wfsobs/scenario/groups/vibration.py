@@ -9,11 +9,11 @@ from wfsobs.settings.group import Group, section
 from wfsobs.settings.parameters import Real, Reals
 
 PAPER_PEAK_HZ = 47.4969
-"""The dominant natural frequency of VLT UT4 (paper, Table 2)."""
+"""Dominant natural frequency of VLT UT4 (paper, Table 2)."""
 
 
 class Peak(Group):
-    """One line of the vibration spectrum: a damped resonance, or a pure line at damping 0."""
+    """One vibration peak: a damped resonance, or a line at damping 0."""
 
     frequency = Real(
         PAPER_PEAK_HZ,
@@ -21,7 +21,7 @@ class Peak(Group):
         softbounds=(5.0, 80.0),
         step=0.1,
         label="Frequency f",
-        doc="Natural frequency [Hz]. The paper's dominant one is 47.4969 Hz (Table 2).",
+        doc="Natural frequency [Hz]. The dominant one of the paper is 47.4969 Hz (Table 2).",
     )
     damping = Real(
         0.03,
@@ -29,14 +29,14 @@ class Peak(Group):
         softbounds=(0.0, 0.1),
         step=0.001,
         label="Damping ξ",
-        doc="Damping ratio; 0 is a pure line. The paper has 0.03 (Table 2).",
+        doc="Damping ratio; 0 is a line. The paper has 0.03 (Table 2).",
     )
     rms = Reals(
         [0.01, 0.01],
         item_bounds=(0.0, 1e4),
         bounds=(1, 64),
         label="Strength per mode, rms",
-        doc="Standard deviation of the line [um], one number per mode: tip, tilt; modes beyond the list have none.",
+        doc="Standard deviation of the peak [um], one number per mode: tip, tilt, ...; zero for modes beyond the list.",
     )
 
 
@@ -47,42 +47,42 @@ class Vibration(Group):
         default="peaks",
         objects=["peaks", "psd", "measured", "ar2", "none"],
         label="Source",
-        doc="How vibration is made: inverse DFT of the peak list (paper, Algorithm 4), of the PSD table or "
-        "of a measured spectrum, each peak as an AR(2) process (paper, eq. 2), or none.",
+        doc="Model of the vibration. peaks: inverse DFT of the peak list (paper, Algorithm 4); psd: of the PSD table; "
+        "measured: of a measured spectrum; ar2: each peak as an AR(2) process (paper, eq. 2); none: no vibration.",
     )
     synthesis = param.Selector(
         default="gaussian",
         objects=["gaussian", "random-phase"],
         label="Synthesis",
-        doc="How an inverse DFT makes a record. gaussian: a piece of a stationary Gaussian process, cut from a period many times "
-        "as long; random-phase: fixed amplitudes and random phases, as long as the record and periodic with it (paper, "
-        "Algorithm 4).",
+        doc="Signal of an inverse DFT. gaussian: a section of a stationary Gaussian process, cut from a period many "
+        "times as long; random-phase: fixed amplitudes and random phases, as long as the record and periodic with "
+        "it (paper, Algorithm 4).",
     )
     spectrum = param.Selector(
         default="eris-ut4",
         objects=["eris-ut4"],
         label="Measured spectrum",
-        doc="For source measured: eris-ut4, measured at VLT UT4 with ERIS (astro-tiptop/TIPTOP, MIT).",
+        doc="Measured spectrum, for source measured. eris-ut4: measured at VLT UT4 with ERIS (astro-tiptop/TIPTOP, MIT).",
     )
     part = param.Selector(
         default="lines",
         objects=["lines", "all"],
         label="Part of the spectrum",
-        doc="For source measured: the lines that stand above its synthetic floor 4e4 / f^2 nm^2/Hz, from "
-        "7.5 Hz up, or all of it.",
+        doc="Part of the measured spectrum, for source measured. lines: above its synthetic floor 4e4 / f^2 nm^2/Hz, "
+        "from 7.5 Hz up; all: the whole spectrum.",
     )
     cutoff = Real(
         80.0,
         bounds=(0.1, 50_000.0),
         softbounds=(10.0, 200.0),
         label="Cut-off f_c",
-        doc="Nothing above this frequency in an inverse DFT [Hz] (paper, section 2.4).",
+        doc="Cut-off frequency of an inverse DFT [Hz]; no vibration above it (paper, section 2.4).",
     )
-    peaks = param.List([Peak()], item_type=Peak, bounds=(0, 2000), label="Peaks", doc="The lines of the spectrum.")
-    psd = section(PsdTable, "PSD table", "The spectrum as a table, for source psd.")
+    peaks = param.List([Peak()], item_type=Peak, bounds=(0, 2000), label="Peaks", doc="Peaks of the vibration spectrum.")
+    psd = section(PsdTable, "PSD table", "Spectrum of the vibration as a table, for source psd.")
 
     def idle(self) -> tuple[str, ...]:
-        """What other sources are made of."""
+        """Return the settings of other sources."""
         uses = {
             "peaks": ("synthesis", "peaks"),
             "ar2": ("peaks",),

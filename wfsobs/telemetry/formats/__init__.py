@@ -1,6 +1,6 @@
-"""File formats of records: each a small module with `read` and `write`, one table from name to format.
+"""File formats of records: each a small module with `read` and `write`, and one table from name to format.
 
-A format turns a file into named arrays and back (`Contents`); what they mean and whether they make a record is checked
+A format turns a file into named arrays and back (`Contents`); their meaning is checked
 in one place, `wfsobs.telemetry.records`. A new format is one more module and one more line here.
 """
 
@@ -18,7 +18,17 @@ from wfsobs.typing import Array
 
 @dataclass(frozen=True)
 class Format:
-    """endings : of file names; read : (open file, most bytes of numbers) -> Contents; write : (open file, arrays)."""
+    """A file format.
+
+    Attributes
+    ----------
+    endings : tuple of str
+        Endings of file names.
+    read : callable
+        (open file, maximum bytes of numbers) -> Contents.
+    write : callable
+        (open file, arrays) -> None.
+    """
 
     endings: tuple[str, ...]
     read: Callable[[IO[bytes], int], Contents]
@@ -34,7 +44,7 @@ FORMATS = (
 
 
 def format_of(name: str) -> Format:
-    """The format that a file name asks for by its ending. Raises RecordError."""
+    """Return the format of a file name, by its ending. Raises RecordError."""
     for fmt in FORMATS:
         if name.lower().endswith(fmt.endings):
             return fmt

@@ -1,10 +1,10 @@
-"""Records as AOT, the Adaptive Optics Telemetry format (T. Gomes et al., J. Astron. Telesc. Instrum. Syst. 10, 2024), through
-aotpy (the extra wfsobs[aot]).
+"""Records as AOT, the Adaptive Optics Telemetry format, through aotpy (the extra wfsobs[aot]).
 
-Read is the first control loop of a file. y_lgs are its sensor's measurements, turned into modes by measurements_to_modes where
-the file has it and otherwise taken as they are, tip and tilt of one subaperture; u are its modal coefficients, or its commands
-turned by commands_to_modes. y_ngs are the measurements of a second sensor, that of a natural guide star. Written are
-measurements and commands: AOT has no place for a truth, an open-loop twin or a training record.
+T. Gomes et al., J. Astron. Telesc. Instrum. Syst. 10, 2024. The first control loop of a file is read. y_lgs are its sensor's
+measurements, turned into modes by measurements_to_modes where the file has it, otherwise tip and tilt of one subaperture;
+u are its modal coefficients, or its commands turned by commands_to_modes. y_ngs are the measurements of a second sensor, that
+of a natural guide star. Measurements and commands are written: AOT has no place for a truth, an open-loop measurement or a
+training record.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import IO, Any
 import numpy as np
 
 from wfsobs.record import DELAY, RecordError
-from wfsobs.telemetry.formats.contents import NUMBERS, Contents, TooMuch, numbers_and_texts
-from wfsobs.telemetry.formats.fits import opened, read_whole
+from wfsobs.telemetry.formats.contents import NUMBERS, Contents, TooLargeError, numbers_and_texts
+from wfsobs.telemetry.formats.fits import open_fits, read_whole
 from wfsobs.typing import Array
 
 PREFIX = "WFSOBS-"
-"""Of the names of images and metadata written here."""
+"""Prefix of the names of images and metadata written here."""
 
 
 def _aotpy() -> Any:
@@ -33,9 +33,12 @@ def _aotpy() -> Any:
 
 
 def read(file: IO[bytes], most: int) -> Contents:
-    """Raises RecordError, TooMuch. Images outside the file are refused: nothing but the file is opened."""
+    """Read an AOT file. Raises RecordError, TooLargeError.
+
+    Images outside the file are refused: nothing but the file is opened.
+    """
     aotpy = _aotpy()
-    with opened(file, most) as hdus:  # checks the sizes
+    with open_fits(file, most) as hdus:  # checks the sizes
         for hdu in hdus[1:]:
             _check_lists(hdu, most)
     from aotpy.io.fits._file import AOTFITSErrorLevel
@@ -53,14 +56,14 @@ def read(file: IO[bytes], most: int) -> Contents:
 
 
 def _check_lists(hdu: Any, most: int) -> None:
-    """Lists of a table lie in a heap that many rows may point to: count what they would be in memory."""
+    """Check the memory that the lists of a table would take: many rows may point to one heap."""
     if getattr(hdu, "columns", None) is None or hdu.data is None:
         return
     for column in hdu.columns:
         if ("P" in column.format or "Q" in column.format) and len(hdu.data):
             raw = np.asarray(hdu.data.view(np.ndarray)[column.name])
             if raw.reshape(len(hdu.data), -1)[:, 0].astype(float).sum() * 8 > most:
-                raise TooMuch(most)
+                raise TooLargeError(most)
 
 
 def _contents(system: Any, aotpy: Any) -> Contents:
@@ -105,7 +108,7 @@ def _contents(system: Any, aotpy: Any) -> Contents:
 
 
 def _take(contents: Contents, name: str, image: Any, matrix: Array | None) -> None:
-    """Rows of an image as modes, through a matrix (m, ...) where there is one."""
+    """Read the rows of an image as modes, through a matrix (m, ...) where there is one."""
     data = np.asarray(image.data, dtype=np.float64)
     rows = data.reshape(data.shape[0], -1)
     if matrix is not None:

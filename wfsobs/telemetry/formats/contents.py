@@ -1,4 +1,4 @@
-"""What a file of a record holds, by name, whatever its format."""
+"""Contents of a record file by name, whatever its format."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from wfsobs.typing import Array
 from wfsobs.units import parse_unit
 
 FAST = ("y_lgs", "u", "turbulence", "vibration", "open_loop_y")
-"""One row per fast step."""
+"""Arrays with one row per fast step."""
 
 NGS = "y_ngs"
 TRAINING = ("training_y", "training_u", "training_open_loop_y")
@@ -30,20 +30,26 @@ TEXTS = ("unit", "origin", "scenario")
 NAMES = (*SIGNALS, *CLOCKS, *NUMBERS, *TEXTS)
 
 COLUMN = re.compile(r"(?:truth/)?(?P<array>[a-z_]+)/(?P<mode>[A-Za-z0-9 -]+?)(?:_(?P<unit>[A-Za-zµμ]+))?$")
-"""A column of one mode, such as y_lgs/tip_um."""
+"""Name of a column of one mode, such as y_lgs/tip_um."""
 
 
 @dataclass
 class Contents:
-    """arrays : name (of NAMES) -> array as it was in the file, numbers and texts of no dimension
-    units    : name of a signal -> its unit, where the file states one for it alone
+    """Arrays and units of a file.
+
+    Attributes
+    ----------
+    arrays : dict of str to Array
+        Name (of NAMES) -> array as in the file; numbers and texts have no dimension.
+    units : dict of str to str
+        Name of a signal -> its unit, where the file gives one for it alone.
     """
 
     arrays: dict[str, Array] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
 
     def state_unit(self, name: str, text: str) -> None:
-        """Note the unit of a signal. Raises RecordError for one that is not known, or not that of its other modes."""
+        """Note the unit of a signal. Raises RecordError for an unknown one, or one that differs from that of its other modes."""
         unit = parse_unit(text)
         if unit is None:
             raise RecordError(f"{name} is in {text!r}, which is no unit of a wavefront")
@@ -52,7 +58,7 @@ class Contents:
 
 
 def from_columns(columns: Mapping[str, Array]) -> Contents:
-    """Contents of columns (n,) named as COLUMN says, time_s or time_ngs_s; others are left aside.
+    """Return the contents of columns (n,) named as COLUMN, time_s or time_ngs_s; others are ignored.
 
     Modes are in the order of the columns of y_lgs. Raises RecordError where an array lacks one of them.
     """
@@ -77,36 +83,36 @@ def from_columns(columns: Mapping[str, Array]) -> Contents:
         if set(by_mode) != set(modes):
             raise RecordError(f"{name} has the modes {', '.join(by_mode)}; y_lgs has {', '.join(modes)}")
         longest = max(map(len, by_mode.values()))
-        contents.arrays[name] = np.column_stack([_padded(by_mode[mode], longest) for mode in modes])
+        contents.arrays[name] = np.column_stack([_pad(by_mode[mode], longest) for mode in modes])
     return contents
 
 
 def to_columns(arrays: Mapping[str, Array], unit: str = "um") -> dict[str, Array]:
-    """The signals and clocks as columns (n,), named as COLUMN says."""
+    """Return the signals and clocks as columns (n,), named as COLUMN."""
     columns = {f"{name}_s": np.asarray(arrays[name]) for name in CLOCKS if name in arrays}
     for name in SIGNALS:
         if name in arrays:
             for i, values in enumerate(np.asarray(arrays[name]).T):
-                columns[f"{name}/{mode_name(i)}_{unit}"] = values
+                columns[f"{name}/{column_mode(i)}_{unit}"] = values
     return columns
 
 
-def mode_name(column: int) -> str:
-    """The name of a column's mode: tip, tilt, then Noll's numbers, Z4 and up."""
+def column_mode(column: int) -> str:
+    """Return the name of a column's mode: tip, tilt, then Noll's numbers, Z4 and up."""
     return TIP_TILT[column].name if column < len(TIP_TILT) else f"Z{column + 2}"
 
 
 def numbers_and_texts(arrays: Mapping[str, Array]) -> dict[str, float | int | str]:
-    """What is not a signal or a clock, as plain values."""
+    """Return all that is neither a signal nor a clock, as plain values."""
     return {name: np.asarray(arrays[name]).item() for name in (*NUMBERS, *TEXTS) if name in arrays}
 
 
-def _padded(x: Array, n: int) -> Array:
+def _pad(x: Array, n: int) -> Array:
     return np.concatenate([x, np.full(n - len(x), np.nan)])
 
 
-class TooMuch(RecordError):
-    """A file that holds more than it may."""
+class TooLargeError(RecordError):
+    """Error: a file that exceeds the limit of memory."""
 
     def __init__(self, most: int):
         super().__init__(f"holds more than {most / 1e6:.4g} MB of numbers, which is the most that is read here")

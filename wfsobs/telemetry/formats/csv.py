@@ -19,7 +19,7 @@ from wfsobs.telemetry.formats.contents import (
     TEXTS,
     TIME,
     Contents,
-    TooMuch,
+    TooLargeError,
     from_columns,
     numbers_and_texts,
     to_columns,
@@ -27,11 +27,11 @@ from wfsobs.telemetry.formats.contents import (
 from wfsobs.typing import Array
 
 LONGEST_LINE = 65_536
-"""Bytes."""
+"""Maximum length of a line [bytes]."""
 
 
 def read(file: IO[bytes], most: int) -> Contents:
-    """Raises RecordError naming the line, TooMuch."""
+    """Read a CSV file. Raises RecordError naming the line, TooLargeError."""
     plain, heading, rows = _head(file)
     if len(set(heading)) < len(heading):
         raise RecordError("two columns have the same heading")
@@ -41,7 +41,7 @@ def read(file: IO[bytes], most: int) -> Contents:
         if len(cells) != width:
             raise RecordError(f"line {line} has {len(cells)} cells, the heading {width}; cells are separated by commas")
         if (step + 1) * width * 8 > most:
-            raise TooMuch(most)
+            raise TooLargeError(most)
         for i, cell in enumerate(cells):
             text = cell.strip()
             if text:
@@ -56,8 +56,8 @@ def read(file: IO[bytes], most: int) -> Contents:
     return contents
 
 
-def lines_of(file: IO[bytes]) -> Iterator[tuple[int, str]]:
-    """(number, text) of every line that is not blank."""
+def numbered_lines(file: IO[bytes]) -> Iterator[tuple[int, str]]:
+    """Yield (number, text) of every line that is not blank."""
     number = 0
     while line := file.readline(LONGEST_LINE + 1):
         number += 1
@@ -74,9 +74,9 @@ def lines_of(file: IO[bytes]) -> Iterator[tuple[int, str]]:
 
 
 def _head(file: IO[bytes]) -> tuple[dict[str, Array], list[str], Iterator[tuple[int, list[str]]]]:
-    """Numbers and texts of the comments, the heading, and the rows to come as (line, cells)."""
+    """Return numbers and texts of the comments, the heading, and the rows as (line, cells)."""
     plain: dict[str, Array] = {}
-    lines = lines_of(file)
+    lines = numbered_lines(file)
     for number, text in lines:
         if not text.startswith("#"):
             heading = [cell.strip().strip('"') for cell in text.split(",")]
@@ -93,7 +93,7 @@ def _head(file: IO[bytes]) -> tuple[dict[str, Array], list[str], Iterator[tuple[
 
 
 def _level(contents: Contents) -> None:
-    """Give all signals of the fast steps the length of the longest: frames that are missing at the end are empty cells."""
+    """Extend all fast signals to the length of the longest: empty cells at the end are missing samples."""
     fast = [name for name in FAST if name in contents.arrays]
     n = max((len(contents.arrays[name]) for name in (*fast, *((TIME,) if TIME in contents.arrays else ()))), default=0)
     for name in fast:
@@ -102,7 +102,7 @@ def _level(contents: Contents) -> None:
 
 
 def write(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
-    """Write the arrays; every number with as many digits as bring it back."""
+    """Write the arrays, every number with enough digits to read it back exactly."""
     plain = numbers_and_texts(arrays)
     scenario = str(plain.pop("scenario", ""))
     head = [f"# {name}: {value}" for name, value in plain.items()]

@@ -1,7 +1,7 @@
 """Records as FITS, through astropy (the extra wfsobs[fits]).
 
-Read are binary tables, their columns named as the arrays (y_lgs with one element per mode) or as in CSV (y_lgs/tip_um), and
-images whose EXTNAME is an array's name; units from TUNITn or BUNIT. Written is a table RECORD, and a table TRAINING.
+It reads binary tables, their columns named as the arrays (y_lgs with one element per mode) or as in CSV (y_lgs/tip_um), and
+images whose EXTNAME is an array's name; units from TUNITn or BUNIT. It writes a table RECORD, and a table TRAINING.
 FITS is big-endian and may scale integers: both are undone here.
 """
 
@@ -22,28 +22,28 @@ from wfsobs.telemetry.formats.contents import (
     SIGNALS,
     TRAINING,
     Contents,
-    TooMuch,
+    TooLargeError,
     from_columns,
     numbers_and_texts,
 )
 from wfsobs.typing import Array
 
 HDUList = Any
-"""Astropy's, which is imported only where it is needed."""
+"""Astropy's, which is imported only when needed."""
 
 KEYWORDS = {"dt": "DT", "ratio": "RATIO", "delay": "DELAY", "command_sign": "CMDSIGN", "unit": "BUNIT", "origin": "STATED"}
 EXACT = "DTEXACT"
-"""The time step as text: a number in a header has sixteen digits, one less than it may need."""
+"""The time step as text: a number in a header has sixteen digits, one less than needed."""
 
 AOT = "AOT-VERS"
-"""The keyword by which a file says that it is an AOT file."""
+"""Keyword of an AOT file."""
 
 DAMAGED = "damaged, or not a FITS file of tables and images"
 MOST_HDUS = 200
 
 
 def astropy_fits() -> Any:
-    """astropy.io.fits. Raises RecordError naming the extra where it is not installed."""
+    """Return astropy.io.fits. Raises RecordError naming the extra where it is not installed."""
     try:
         from astropy.io import fits
     except ModuleNotFoundError:
@@ -52,8 +52,8 @@ def astropy_fits() -> Any:
 
 
 def read(file: IO[bytes], most: int) -> Contents:
-    """Raises RecordError, TooMuch; an AOT file is read as one."""
-    with opened(file, most) as hdus:
+    """Read a FITS file, or an AOT file. Raises RecordError, TooLargeError."""
+    with open_fits(file, most) as hdus:
         if AOT not in hdus[0].header:
             return _contents(hdus)
     from wfsobs.telemetry.formats import aot
@@ -62,8 +62,8 @@ def read(file: IO[bytes], most: int) -> Contents:
 
 
 @contextmanager
-def opened(file: IO[bytes], most: int) -> Iterator[HDUList]:
-    """The HDUs of a file whose parts are checked to be as long as they say, and not too long."""
+def open_fits(file: IO[bytes], most: int) -> Iterator[HDUList]:
+    """Yield the HDUs of a file, after a check that their stated lengths fit the file and the limit."""
     fits = astropy_fits()
     content = read_whole(file)
     length = len(content)
@@ -95,7 +95,7 @@ def opened(file: IO[bytes], most: int) -> Iterator[HDUList]:
 
 
 def read_whole(file: IO[bytes]) -> bytes:
-    """All of a file from its beginning: astropy closes what it is given."""
+    """Return all bytes of a file from its beginning: astropy closes the file it is given."""
     file.seek(0)
     return file.read()
 
@@ -104,7 +104,7 @@ def _check_sizes(hdus: HDUList, length: int, most: int) -> None:
     if len(hdus) > MOST_HDUS:
         raise RecordError(f"has {len(hdus)} parts, at most {MOST_HDUS} are read")
     if sum(hdu.size for hdu in hdus) > most:
-        raise TooMuch(most)
+        raise TooLargeError(most)
     for hdu in hdus:
         if hdu.size < 0 or hdu._data_offset + hdu.size > length:
             raise RecordError("ends before its data do")
@@ -151,7 +151,7 @@ def _read_table(hdu: Any, contents: Contents, flat: dict[str, Array]) -> None:
 
 
 def _native(data: Any, name: str, blank: int | None) -> Array:
-    """Numbers in the machine's own byte order, integers scaled as the header says; the integer `blank` is a missing one."""
+    """Return numbers in native byte order, integers scaled as the header says; the integer `blank` is a missing one."""
     if data is None or np.asarray(data).dtype.kind not in "fiu":
         raise RecordError(f"{name} does not hold numbers")
     out = np.array(data, dtype=np.float64)

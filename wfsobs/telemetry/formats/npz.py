@@ -1,4 +1,4 @@
-"""Records as numpy's `.npz`, one array per name. Nothing is unpickled, and nothing grows beyond what it may."""
+"""Records as numpy's `.npz`, one array per name. Nothing is unpickled, and nothing grows beyond its limit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from wfsobs.record import RecordError
-from wfsobs.telemetry.formats.contents import NAMES, Contents, TooMuch
+from wfsobs.telemetry.formats.contents import NAMES, Contents, TooLargeError
 from wfsobs.typing import Array
 
 KINDS = "fiuUb"
@@ -20,11 +20,11 @@ KINDS = "fiuUb"
 
 DAMAGED = "damaged, or holds more than plain arrays"
 HEADER = 10_000
-"""The longest header of an array [bytes]."""
+"""Maximum header of an array [bytes]."""
 
 
 def read(file: IO[bytes], most: int) -> Contents:
-    """The arrays of known names; others stay unread. Raises RecordError, TooMuch before there is too much in memory."""
+    """Read the arrays of known names, and no others. Raises RecordError, and TooLargeError before the memory is used."""
     if not zipfile.is_zipfile(file):
         raise RecordError("not an .npz file; a record is an .npz with y_lgs, u and dt")
     try:
@@ -32,7 +32,7 @@ def read(file: IO[bytes], most: int) -> Contents:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             known = {name: members[name] for name in NAMES if name in members}
             if sum(info.file_size for info in known.values()) > most:
-                raise TooMuch(most)
+                raise TooLargeError(most)
             return Contents({name: _array(_member(archive, info), name) for name, info in known.items()})
     except RecordError:
         raise
@@ -41,13 +41,13 @@ def read(file: IO[bytes], most: int) -> Contents:
 
 
 def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    """As much of a member as the directory says, and no more: a read without a size would unpack all that is there."""
+    """Return the bytes of a member, at most the size in the directory: a read without a size would unpack everything."""
     with archive.open(info) as stream:
         return stream.read(info.file_size)
 
 
 def _array(content: bytes, name: str) -> Array:
-    """An array whose header says neither more nor less than follows."""
+    """Return an array whose header agrees with the data after it."""
     stream = io.BytesIO(content)
     version = npy.read_magic(stream)
     read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0

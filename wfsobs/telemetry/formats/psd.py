@@ -13,29 +13,45 @@ from typing import IO
 import numpy as np
 
 from wfsobs.record import RecordError
-from wfsobs.telemetry.formats.csv import lines_of
-from wfsobs.telemetry.formats.fits import opened
+from wfsobs.telemetry.formats.csv import numbered_lines
+from wfsobs.telemetry.formats.fits import open_fits
 from wfsobs.typing import Array
 from wfsobs.units import UNITS, micrometres_per, parse_unit
 
 COLUMNS = ("frequency", "tip", "tilt")
 MOST = 64_000_000
-"""Bytes of numbers in a file; a scenario takes 100 000 frequencies."""
+"""Maximum bytes of numbers in a file; a scenario takes 100 000 frequencies."""
 
 SQUARED = re.compile(r"(?P<unit>[A-Za-zµμ]+)\s*(?:\^|\*\*)?2\s*(?:/\s*|\s)Hz(?:\^?-1)?")
 Table = tuple[dict[str, Array], dict[str, str]]
-"""Columns, and the units stated for them."""
+"""Columns, and their units in the file."""
 
 
 class NoSpectrumError(RecordError):
-    """A file without the columns or rows of a spectrum."""
+    """Error: a file without the columns or rows of a spectrum."""
 
 
 def load_psd(path: str | Path, unit: str | None = None, diameter: float = 8.0) -> dict[str, list[float]]:
-    """The table as vibration.psd takes it, {frequency, tip, tilt}, densities in [um^2/Hz].
+    """Read a vibration spectrum.
 
-    unit : of the amplitude (one of UNITS), where the file states none; diameter [m] of the aperture, for angles.
-    Raises RecordError.
+    Parameters
+    ----------
+    path : str or Path
+        CSV or FITS file.
+    unit : str, optional
+        Unit of the amplitude, one of UNITS, where the file gives none.
+    diameter : float
+        Aperture diameter, for angles [m].
+
+    Returns
+    -------
+    dict of str to list of float
+        The setting vibration.psd: frequency [Hz], tip and tilt [um^2/Hz].
+
+    Raises
+    ------
+    RecordError
+        The file cannot be used; one line naming what, where and what is expected.
     """
     try:
         with open(path, "rb") as file:
@@ -45,17 +61,17 @@ def load_psd(path: str | Path, unit: str | None = None, diameter: float = 8.0) -
 
 
 def read_psd(file: IO[bytes], name: str, unit: str | None = None, diameter: float = 8.0) -> dict[str, list[float]]:
-    """The same of an open file; its name says the format and is never opened."""
+    """Read a vibration spectrum from an open file, as `load_psd`; its name gives the format and is never opened."""
     try:
         fits = name.lower().endswith((".fits", ".fit", ".fts"))
         columns, units = _from_fits(file) if fits else _from_csv(file)
-        return _scaled(columns, units, unit, diameter)
+        return _to_table(columns, units, unit, diameter)
     except RecordError as error:
         raise type(error)(f"{name}: {error}") from None
 
 
 def _from_csv(file: IO[bytes]) -> Table:
-    rows = [(n, text.split(",")) for n, text in lines_of(file) if not text.startswith("#")]
+    rows = [(n, text.split(",")) for n, text in numbered_lines(file) if not text.startswith("#")]
     if not rows:
         raise NoSpectrumError("holds no table")
     found: dict[str, int] = {}
@@ -78,7 +94,7 @@ def _from_csv(file: IO[bytes]) -> Table:
 
 
 def _from_fits(file: IO[bytes]) -> Table:
-    with opened(file, MOST) as hdus:
+    with open_fits(file, MOST) as hdus:
         for hdu in hdus:
             names = {c.name.lower(): c for c in getattr(hdu, "columns", None) or ()}
             if all(name in names for name in COLUMNS):
@@ -91,7 +107,7 @@ def _from_fits(file: IO[bytes]) -> Table:
     raise NoSpectrumError("has neither a table of frequency, tip and tilt nor an image of three rows")
 
 
-def _scaled(columns: dict[str, Array], units: dict[str, str], unit: str | None, diameter: float) -> dict[str, list[float]]:
+def _to_table(columns: dict[str, Array], units: dict[str, str], unit: str | None, diameter: float) -> dict[str, list[float]]:
     if units["frequency"] not in ("", "Hz", "hz"):
         raise RecordError(f"frequency is in {units['frequency']!r}; it takes Hz")
     for name, values in columns.items():
