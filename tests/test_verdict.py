@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wfsobs.evaluation.rows import competes, label_of
+from wfsobs.evaluation.rows import can_be_best, row_label
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.evaluation.verdict import BATCHES, LEVEL, differs, verdict
 from wfsobs.pipeline import Result, run
@@ -47,13 +47,13 @@ def test_the_best_is_the_least_error_of_the_table_and_the_sentence_has_its_numbe
     for target in ("turbulence", "vibration"):
         for mode in ("tip", "tilt"):
             of = [s for s in result.scores if (s.target, s.mode) == (target, mode)]
-            rivals = {s.observer: s.rms for s in of if competes(s.observer, s.apart) and s.observer != "zero"}
+            rivals = {s.observer: s.rms for s in of if can_be_best(s.observer, s.apart) and s.observer != "zero"}
             found = verdict(
                 result.scenario, result.record, result.estimates, result.scores, target, mode, simulation=result.scenario
             )
             assert found is not None and found.best.observer == min(rivals, key=rivals.__getitem__)
             first = found.sentences()[0]
-            assert first.startswith(f"{target.capitalize()}, {mode}: {label_of(found.best.observer)} ")
+            assert first.startswith(f"{target.capitalize()}, {mode}: {row_label(found.best.observer)} ")
             # Three digits, so that half of the last is at most 0.5 %.
             said = re.search(r"(?:best|error), ([\d.]+) nm", first)
             assert said and float(said[1]) == pytest.approx(found.best.rms * 1e3, rel=5e-3)
@@ -64,7 +64,7 @@ def test_the_best_is_the_least_error_of_the_table_and_the_sentence_has_its_numbe
                 percent = re.search(r"(\d+) % (above|below) the bound", first)
                 signed = 0.0 if percent is None else float(percent[1]) * (1 if percent[2] == "above" else -1)
                 assert signed == pytest.approx(100.0 * (found.best.rms / bound - 1.0), abs=0.51)
-            assert ("tied" in first) == bool(found.tied) and all(label_of(name) in first for name in found.tied)
+            assert ("tied" in first) == bool(found.tied) and all(row_label(name) in first for name in found.tied)
 
 
 def test_who_does_harm_is_named_with_where_its_error_lies(result: Result) -> None:
@@ -81,7 +81,7 @@ def test_who_does_harm_is_named_with_where_its_error_lies(result: Result) -> Non
         lines = [line[0] for line in vibration_lines(result.scenario, 0)]
         for harm in found.harms:
             estimate = result.estimate(harm.observer, target)
-            assert estimate is not None and label_of(harm.observer) in said
+            assert estimate is not None and row_label(harm.observer) in said
             error = (estimate.values - truth)[1000:, 0]
             # The same windows: rounding alone.
             whole = power_near(error[~np.isnan(error)], result.record.dt, lines)

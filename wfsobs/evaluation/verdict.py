@@ -9,7 +9,7 @@ from math import sqrt
 import numpy as np
 from scipy.stats import t as student
 
-from wfsobs.evaluation.rows import competes, label_of
+from wfsobs.evaluation.rows import can_be_best, row_label
 from wfsobs.evaluation.scores import BOUND, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate
@@ -89,7 +89,7 @@ def verdict(
     simulation : what the record was made from, so that the lines of the vibration are known
     """
     of = [s for s in scores if (s.target, s.mode) == (target, mode)]
-    ranked = sorted((s for s in of if competes(s.observer, s.apart) and s.observer != NO_ESTIMATE), key=lambda s: s.rms)
+    ranked = sorted((s for s in of if can_be_best(s.observer, s.apart) and s.observer != NO_ESTIMATE), key=lambda s: s.rms)
     truth = record.truth(target)
     if not ranked or truth is None or not ranked[0].truth_rms > 0:
         return None
@@ -186,7 +186,7 @@ def told_of(observer: str, lines: int) -> str:
 
 
 def _best_sentence(it: Verdict, scale: float, unit: str) -> str:
-    target, mode, name = it.best.target.capitalize(), it.best.mode, label_of(it.best.observer)
+    target, mode, name = it.best.target.capitalize(), it.best.mode, row_label(it.best.observer)
     size = f"{_rounded(it.best.rms * scale)} {unit}"
     if it.tied:
         start = f"{name} has the smallest error, {size}, tied with {_listed(it.tied)} on this record"
@@ -227,7 +227,7 @@ def _listed(observers: Sequence[str]) -> str:
     >>> _listed(["kf-lgs", "ridge", "kf-multi"])
     'LGS KF, Ridge and Multi-peak KF'
     """
-    names = [label_of(observer) for observer in observers]
+    names = [row_label(observer) for observer in observers]
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
