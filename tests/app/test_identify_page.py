@@ -148,7 +148,7 @@ def test_as_a_new_simulation(page: IdentifyPage, dashboard: Dashboard, loop: Any
     assert dashboard.store.scenario == expected != before and dashboard.store.source is None
     loop.finish(dashboard.store)
     loop.until(lambda: page.stale.visible)  # the simulation of the model is another record
-    assert "is replaced by a simulation of the model" in page.stale.object
+    assert "A simulation of the model has replaced the record" in page.stale.object
     dashboard.store.change("run.seed", 99)
     loop.finish(dashboard.store)
     loop.until(lambda: page.stale.object == EARLIER)

@@ -97,7 +97,7 @@ def test_a_gpr_and_its_likelihood(page: TunePage, dashboard: Dashboard, loop: An
     cells = row(page.table.object, "likelihood", "tilt")
     assert cells == [number(found.before.likelihood[1], 4), number(found.after.likelihood[1], 4), ""]
     dashboard.display.unit = "mas"
-    assert "test record, which it does not [mas]" in page.table.object
+    assert "test record, not used in the search [mas]" in page.table.object
     focus = Errors({"tip": 0.01, "defocus": 0.01})
     assert unit_for(replace(found, before=replace(found.before, validation=focus)), dashboard.display) == "nm", "it has no angle"
     assert unit_for(found, dashboard.display) == unit_for(None, dashboard.display) == "mas"

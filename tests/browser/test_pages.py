@@ -94,7 +94,7 @@ def test_pin_and_compare(open_page: Any) -> None:
     value, pinned, change = (text.split()[-1] for text in row.all_inner_texts()[:3])
     assert pinned == before
     assert abs(float(change) - 100 * (float(value) / float(pinned) - 1)) < 1
-    page.get_by_role("button", name="Unpin the run compared with").click()
+    page.get_by_role("button", name="Unpin the reference run").click()
     expect(page.get_by_role("columnheader", name="Change [%]")).to_have_count(0, timeout=SLOW)
     page.wait_for_function(f"({PINNED})().every(n => n === 0)")
 

@@ -25,7 +25,7 @@ def test_identify_and_use_it(open_page: Any, server: Any) -> None:
     expect(wind).not_to_have_value(before)
     expect(page.get_by_text("The simulation with 15 peaks is kept; the settings")).to_be_visible()
     page.get_by_role("button", name="As a new simulation").click()
-    expect(page.get_by_text(re.compile("is replaced by a simulation of the model"))).to_be_visible()
+    expect(page.get_by_text(re.compile("A simulation of the model has replaced the record"))).to_be_visible()
     expect(page.get_by_text("is kept; the settings")).to_have_count(0)
     page.get_by_role("button", name="Undo", exact=True).click()
     expect(page.get_by_text("is kept; the settings")).to_be_visible()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import param
 
@@ -51,6 +53,26 @@ def label_of(p: param.Parameter) -> str:
     """Write a setting's label with its unit in [brackets]."""
     unit = unit_text(unit_of(p))
     return f"{p.label} [{unit}]" if unit else str(p.label)
+
+
+def score_columns(unit: str, base: str = "truth", pinned: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
+    """List the headings of a table of scores, and an explanation of each.
+
+    base   : what an error is divided by: "truth", or "z" for a record without truth
+    pinned : columns that go beside the error
+    """
+    error = "of the estimate" if base == "truth" else "of the prediction of z one step ahead, or residual of the recorded loop"
+    return {
+        "Observer": "and its line in the figures",
+        f"RMS error [{unit}]": f"{error}, after the warm-up, over the samples that all have",
+        **pinned,
+        f"RMS {base} [{unit}]": "error of an estimate of zero",
+        f"error / {base}": "above 1: worse than an estimate of zero",
+        "Needs": "inputs beside measurements",
+        "Lag [ms]": "delay of the estimate",
+        "Time per step [µs]": "computing time per step and mode",
+        "Real-time factor": "time per step over the period of the loop; below 1: fast enough for it",
+    }
 
 
 def short_name(mode: Mode) -> str:

@@ -45,7 +45,7 @@ class Upload:
         self.picker = Picker(sizing_mode="stretch_width", margin=0)
         self.picker.on_message = self.handle
         self.unit = self._select("Unit", [SILENT, *UNITS])
-        self.sign = self._select("Commands", {SILENT: 0, "add to what is seen (+1)": 1, "are taken off (-1)": -1})
+        self.sign = self._select("Commands", {SILENT: 0, "are added to the measurement (+1)": 1, "are subtracted (-1)": -1})
         self.delay, self.rate = self._text("Delay of commands [steps]"), self._text("Rate [Hz]")
         self.use = pmui.Button(label="Use this record", color="primary", size="small", margin=4)
         self.drop = pmui.Button(label="Discard", variant="outlined", size="small", margin=4)

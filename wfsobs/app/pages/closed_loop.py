@@ -31,13 +31,13 @@ GRID = """
 @media (max-width: 1000px) { :host { grid-template-columns: minmax(0, 1fr); } }
 """
 INTRO = (
-    "The disturbance and the noise are those of the results shown, the same for every controller, with the delay and the "
-    "limits of the mirror set under Controllers. Strehl counts the simulated modes alone."
+    "Every controller runs on the disturbance and the noise of the results shown, with the delay and the "
+    "limits of the mirror set under Controllers. The Strehl ratio counts the simulated modes alone."
 )
 ABOUT = (
-    "Rejection |E| bold, noise transfer faint. L is the loop gain: how far it stays from −1 is how far the loop is from "
+    "Rejection |E| bold, noise transfer faint. The distance of the loop gain L from −1 is the distance of the loop from "
     "instability; ○ marks the gain margin, □ the phase margin. Multi-rate loops change from step to step, and a GPR is not "
-    "linear: they have neither."
+    "linear: neither has such curves."
 )
 
 

@@ -14,6 +14,7 @@ from wfsobs.app.controls.fields import SOON
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.parts import WIDE, box
+from wfsobs.app.render import macro
 from wfsobs.app.style import HEARD, asset
 from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.plots import call
@@ -30,10 +31,7 @@ GRID = """
 """
 GAP = ":host { gap: 10px; }"
 ZOOMS: Mapping[str, float | None] = MappingProxyType({"Whole record": None, "2 s": 2.0, "0.2 s": 0.2})
-MARKS = (
-    f'<span class="mark" style="border-left:2px solid {PEAKS}">peaks</span>'
-    f'<span class="mark" style="border-left:2px dashed {MODEL}">peak in the Kalman filters</span>'
-)
+MARKS = macro("marks", PEAKS, MODEL)
 
 
 class Explore:

@@ -32,20 +32,20 @@ from wfsobs.settings.parameters import hint
 from wfsobs.spectral.search import LOWEST
 
 INTRO = (
-    "From the pseudo-open-loop measurement z of the record shown, simulated or loaded: white noise, turbulence, then "
-    "vibration peaks one at a time until nothing is left that the tests see. “Filters only” keeps the record and tells the "
-    "filters this model. “As a new simulation” replaces the record by a simulation of this model, which the filters then know "
-    "exactly."
+    "A model is fitted to the pseudo-open-loop measurement z of the record shown, simulated or loaded: white noise, turbulence, "
+    "then vibration peaks one at a time until the tests find no further peak. “Filters only” keeps the record and sets the "
+    "filters to this model. “As a new simulation” replaces the record by a simulation of this model; the filters then know the "
+    "simulated spectra exactly."
 )
 ABOUT = (
-    "± is one standard deviation. What is left is called white where, in a mode, two tests of level 1 % pass and no candidate "
-    "remains unexplained: Bartlett's on the cumulated ratio of the measured to the fitted spectrum, and Ljung and Box's on the "
-    "innovations of the Kalman filter that the model gives. p is how likely white noise is to look less white than what is left."
+    "± is one standard deviation. The residual of a mode is called white if no candidate peak remains and it passes two tests "
+    "of level 1 %: Bartlett's on the cumulated ratio of the measured to the fitted spectrum, and Ljung and Box's on the "
+    "innovations of the model's Kalman filter. p is the probability that white noise deviates from whiteness by more."
 )
-EARLIER = "This model is of an earlier record than the one shown now."
+EARLIER = "This model was identified from an earlier record than the one shown."
 REPLACED = (
-    "The record that this model was identified from is replaced by a simulation of the model. Errors are now those of filters "
-    "that know the simulated spectra, and cannot be compared with errors on the record before. Undo brings it back."
+    "A simulation of the model has replaced the record from which it was identified. The filters now know the simulated "
+    "spectra: do not compare their errors with those on the earlier record. Undo brings that record back."
 )
 
 

@@ -17,7 +17,7 @@ NAMES = {
     "highest": "and highest of every bin",
     "fitted": "model",
     "parts": "its processes and noise",
-    "found": "peaks, and the height of pure lines",
+    "found": "peaks, and the height of lines",
 }
 """Look -> what it is called in the legend."""
 

@@ -18,7 +18,7 @@ def table_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
     columns = {
         "What": "by frequency",
         "Frequency [Hz]": "natural frequency; of turbulence the corner",
-        "Damping": "0 is a pure line",
+        "Damping": "0 for a line",
         f"Rms [{display.unit_label}]": "standard deviation of it in z",
     }
     body = []

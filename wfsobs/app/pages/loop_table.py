@@ -31,11 +31,11 @@ def table_html(shown: LoopResults, display: Display) -> str:
     columns = {
         "Controller": "and its line in the figures",
         f"Residual [{unit}]": "rms after the warm-up",
-        f"Theory [{unit}]": "by the true spectra, for an endless record",
-        f"Strehl at {shown.result.scenario.control.wavelength:g} µm": "of all simulated modes together, of nothing else",
+        f"Theory [{unit}]": "from the true spectra, for an endless record",
+        f"Strehl at {shown.result.scenario.control.wavelength:g} µm": "of all simulated modes together",
         "Gain": "of the integrator",
         "At a limit [%]": "steps in which a limit of the mirror changed the command",
-        "Needs": "what it must be given beside measurements",
+        "Needs": "inputs beside measurements",
     }
     rows = of_mode(shown, display)
     best = next((r["controller"] for r in rows if r["controller"] != BOUND and r["residual_rms_nm"] is not None), None)
@@ -76,9 +76,9 @@ def margins_html(shown: LoopResults, display: Display) -> str:
     """Margins of the loops that have a transfer function."""
     columns = {
         "Controller": "",
-        "Gain margin [dB]": "by which the loop gain may rise",
-        "Phase margin [°]": "by which it may turn",
-        "Delay margin [ms]": "by which it may come later",
+        "Gain margin [dB]": "factor that the loop gain can rise by before the loop is unstable",
+        "Phase margin [°]": "phase lag that can be added before the loop is unstable",
+        "Delay margin [ms]": "delay that can be added before the loop is unstable",
     }
     rows = [r for r in of_mode(shown, display) if r["phase_margin_deg"] is not None]
     keys = ("gain_margin_db", "phase_margin_deg", "delay_margin_ms")

@@ -37,7 +37,7 @@ INTRO = (
     "records are simulated; a loaded record is cut into pieces, and without truth the least is sought of the one-step prediction "
     "error of z, or of the distance to a Butterworth reference. “Use it” takes the tuned settings into the drawer."
 )
-EARLIER = "The settings of the drawer have changed since: this was tuned for others."
+EARLIER = "The settings in the drawer have changed since this tuning."
 START = "gpr-online"
 COLUMNS: tuple[str, ...] = ("section", "name", "before", "after")
 

@@ -22,12 +22,12 @@ from wfsobs.tuning.report import remarks
 
 TITLES = {
     SETTING: "Settings",
-    VALIDATION: "{measure} on the validation record, which the search sees [{unit}]",
-    TEST: "{measure} on the test record, which it does not [{unit}]",
-    OTHER: "The same of what it was not tuned for, turbulence or vibration [{unit}]",
+    VALIDATION: "{measure} on the validation record, used in the search [{unit}]",
+    TEST: "{measure} on the test record, not used in the search [{unit}]",
+    OTHER: "The same for the other target, turbulence or vibration [{unit}]",
     LIKELIHOOD: "Log marginal likelihood of the training targets, for information",
 }
-LEGEND = {"tried": "what was tried", "fitted": "least so far"}
+LEGEND = {"tried": "evaluations", "fitted": "best so far"}
 
 AXES = {MEASURES[TRUTH]: "rms error", MEASURES[NEXT]: "prediction error", MEASURES[REFERENCE]: "rms distance"}
 """What a tuning makes small, short enough for an axis."""

@@ -6,27 +6,11 @@ import math
 from itertools import groupby
 from typing import Any
 
+from wfsobs.app.display import score_columns
 from wfsobs.app.numbers import NOTHING
 from wfsobs.app.report.data import State
 from wfsobs.evaluation.rows import TIME, Row, can_be_best, is_non_causal, own_interval, row_label, scored_interval
 from wfsobs.evaluation.scores import RESIDUAL
-
-COLUMNS = {
-    "Observer": "and its line in the figures",
-    "RMS error [nm]": "of the estimate, after the warm-up, on samples that all have",
-    "RMS truth [nm]": "the error of answering zero",
-    "error / truth": "above 1 is worse than answering zero",
-    "Needs": "what has to be given beside measurements",
-    "Lag [ms]": "how late the estimate is",
-    "Time per step [µs]": "computing time per step and mode",
-    "Real-time factor": "time per step over the step of the loop; below 1 keeps up with it",
-}
-"""Heading -> explanation."""
-
-WITHOUT_TRUTH = {name.replace("truth", "z"): why for name, why in COLUMNS.items()} | {
-    "RMS error [nm]": "of z one step ahead, on samples that all have, or what the loop left"
-}
-"""The same where there is no truth."""
 
 
 def state_table(state: State, name: str) -> dict[str, Any]:
@@ -34,7 +18,7 @@ def state_table(state: State, name: str) -> dict[str, Any]:
     groups = [list(rows) for _, rows in groupby(sorted(state.rows, key=_order(state.rows)), _group)]
     return {
         "name": name,
-        "columns": WITHOUT_TRUTH if any(row["target"] == RESIDUAL for row in state.rows) else COLUMNS,
+        "columns": score_columns("nm", "z" if any(row["target"] == RESIDUAL for row in state.rows) else "truth"),
         "groups": [_body(rows, state.grid.dt) for rows in groups],
         "reasons": state.reasons,
     }

@@ -12,7 +12,7 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pin import name_of, pin
 from wfsobs.app.style import asset
 
-PIN, UNPIN = "Pin this run to compare others with it", "Unpin the run compared with"
+PIN, UNPIN = "Pin this run to compare others with it", "Unpin the reference run"
 
 
 class Pinning:

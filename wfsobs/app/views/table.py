@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import panel as pn
 from markupsafe import Markup
 
-from wfsobs.app.display import IN_MOST, Display, per_micrometre
+from wfsobs.app.display import IN_MOST, Display, per_micrometre, score_columns
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.numbers import NOTHING, change, number
 from wfsobs.app.render import Row, macro, table
@@ -57,26 +57,8 @@ class Table:
     def _columns(self) -> dict[str, str]:
         """Heading -> explanation."""
         unit = self.display.unit_label
-        pinned = (
-            {
-                f"Pinned [{unit}]": "RMS error in the pinned run",
-                "Change [%]": "from the pinned run to this one",
-            }
-            if self.display.pinned
-            else {}
-        )
-        base = "z" if self._without_truth() else "truth"
-        return {
-            "Observer": "and its line in the figures",
-            f"RMS error [{unit}]": "of the estimate, after the warm-up, on samples that all have",
-            **pinned,
-            f"RMS {base} [{unit}]": "the error of answering zero",
-            f"error / {base}": "above 1 is worse than answering zero",
-            "Needs": "what has to be given beside measurements",
-            "Lag [ms]": "how late the estimate is",
-            "Time per step [µs]": "computing time per step and mode",
-            "Real-time factor": "time per step over the step of the loop; below 1 keeps up with it",
-        }
+        pinned = {f"Pinned [{unit}]": "RMS error in the pinned run", "Change [%]": "from the pinned run to this one"}
+        return score_columns(unit, "z" if self._without_truth() else "truth", pinned if self.display.pinned else {})
 
     def _without_truth(self) -> list[Score]:
         """Select the scores of a record without truth, of the mode shown."""
