@@ -82,6 +82,16 @@ def test_a_report_has_its_line_and_its_setting(python: Run, tmp_path: Path) -> N
     assert '"label":"Low-pass"' in page and "low_pass.corner" in page
 
 
+def test_its_controller_closes_the_loop(python: Run) -> None:
+    """With the same gain it is the integrator."""
+    gains = ("--set", "fixed_gain.gain=0.2", "--set", "control.integrator=manual", "--set", "control.gain=0.2")
+    chosen = ("--controller", "fixed-gain", "--controller", "integrator")
+    rows = json.loads(said(python("-m", "wfsobs", "loop", *chosen, *SHORT, *gains, "--json")))
+    left = {(row["controller"], row["mode"]): row["residual_rms_nm"] for row in rows}
+    assert left["fixed-gain", "tip"] == left["integrator", "tip"] > 0
+    assert "Fixed gain" in said(python("-m", "wfsobs", "loop", *chosen, *SHORT))
+
+
 DASHBOARD = """
 from wfsobs.app.cache import frozen
 from wfsobs.app.controls.names import name_of
@@ -93,7 +103,7 @@ from wfsobs.app.service import Service
 from wfsobs.app.share import from_query, to_query
 from wfsobs.app.store import Store
 from wfsobs.app.style import look, observers_of
-from wfsobs.app.tune_work import CHOICES
+from wfsobs.app.tune_work import choices
 from wfsobs.app.work import compute
 from wfsobs.cost import part_seconds
 from wfsobs.progress import QUIET
@@ -116,7 +126,7 @@ assert query == "preset=paper&low_pass.corner=80" and from_query(query).scenario
 service.close(20.0)
 assert "low_pass.corner=80.0" in to_command(store.scenario, "paper")
 assert "low-pass" in observers_of("turbulence") and look("low-pass").label == "Low-pass"
-assert look("low-pass").colour(dark=True) == "#E0A050" and CHOICES["Low-pass"] == "low-pass"
+assert look("low-pass").colour(dark=True) == "#E0A050" and choices()["Low-pass"] == "low-pass"
 
 scenario = configfile.scenario_from("paper", None, ASSIGNMENTS)
 shown = compute(scenario, QUIET, lambda **_: None)
@@ -167,7 +177,7 @@ def test_help_and_the_list_of_presets_do_not_import_it(python: Run) -> None:
     code = (
         "import sys\nfrom wfsobs.cli import main\n"
         "for words in (['--help'], ['presets']):\n    main(words, standalone_mode=False)\n"
-        "print({'wfsobs_example', 'wfsobs.observers', 'scipy'} & set(sys.modules))\n"
+        "print({'wfsobs_example', 'wfsobs_example_controller', 'wfsobs.observers', 'scipy'} & set(sys.modules))\n"
     )
     assert said(python("-c", code)).splitlines()[-1] == "set()"
 
@@ -191,7 +201,7 @@ def test_what_cannot_be_registered_is_named_and_left_out(python: Run, tmp_path: 
     )
     (tmp_path / "taken.py").write_text(
         "from dataclasses import replace\nfrom wfsobs.observers import BUILT_IN\nfrom wfsobs.settings import Group, Section\n"
-        "X = replace(BUILT_IN[0], id='mine', settings=Section('run', 'Mine', Group))\n"
+        "X = replace(BUILT_IN[0], id='mine', label='Mine', settings=Section('run', 'Mine', Group))\n"
     )
     info = tmp_path / "broken-1.0.dist-info"
     info.mkdir()

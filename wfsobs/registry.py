@@ -124,6 +124,8 @@ class Registry(MutableMapping[str, E]):
             raise RegistrationError(f"{where}: the id is taken, by {self._entries[entry.id].label}")
         if entry.id in self.reserved:
             raise RegistrationError(f"{where}: the id is taken, by a row of the tables")
+        if entry.label in (other.label for other in self._entries.values()):
+            raise RegistrationError(f"{where}: the label {entry.label!r} is taken")
         for own in _settings(entry):
             _check_settings(own, where)
 

@@ -18,7 +18,7 @@ from wfsobs.app.pages.pages import TUNE
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.pages.tune_views import unit_for
 from wfsobs.app.sources import LoadedRecord
-from wfsobs.app.tune_work import CHOICES, best_so_far, seconds
+from wfsobs.app.tune_work import best_so_far, choices, seconds
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
@@ -136,4 +136,4 @@ def test_progress_cancel_and_errors(page: TunePage, dashboard: Dashboard, loop: 
 def test_the_least_so_far() -> None:
     errors = (Evaluation({}, None), *(Evaluation({}, Errors({"tip": x})) for x in (3.0, 5.0, 2.0)), Evaluation({}, None))
     assert best_so_far(errors) == [inf, 3.0, 3.0, 2.0, 2.0]
-    assert set(OBSERVERS) - set(CHOICES.values()) == {"persistence", "zero"}, "they have nothing to tune"
+    assert set(OBSERVERS) - set(choices().values()) == {"persistence", "zero"}, "they have nothing to tune"

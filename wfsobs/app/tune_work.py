@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from time import monotonic
-from types import MappingProxyType
 
 from wfsobs.app.jobs.job import INTERVAL, Tell
 from wfsobs.app.work import RunResults
@@ -17,9 +16,6 @@ from wfsobs.tuning.judge import Errors
 from wfsobs.tuning.records import MEASURES, TRUTH, judged_by
 from wfsobs.tuning.report import settings
 
-CHOICES: Mapping[str, str] = MappingProxyType({o.label: o.id for o in OBSERVERS.values() if o.tunable.usual})
-"""Label -> observer, of those that have something to tune."""
-
 MOST = 1000
 """Evaluations."""
 
@@ -27,6 +23,11 @@ Rows = list[tuple[str, str, float | str | None, float | str | None]]
 """(section, name, before, after)."""
 
 SETTING, VALIDATION, TEST, OTHER, LIKELIHOOD = "setting", "validation", "test", "other target", "likelihood"
+
+
+def choices() -> dict[str, str]:
+    """Label -> observer, of those that have something to tune."""
+    return {o.label: o.id for o in OBSERVERS.values() if o.tunable.usual}
 
 
 def seconds(of: RunResults, scenario: Scenario, observer: str, evaluations: int) -> float:

@@ -40,9 +40,6 @@ DELIVERY_INTERVAL = 0.4
 DRAWING = 0.15
 """What the page takes to draw a delivery [s]."""
 
-LEARNING = frozenset(o.id for o in OBSERVERS.values() if o.slow)
-"""The observers that no other waits for: those that learn during the run."""
-
 
 @dataclass(frozen=True)
 class Spectrum:
@@ -140,7 +137,7 @@ class _Work:
                 else:
                     self._add(record, item)
                 self.news = True
-                quick = not handed_over and self._left() <= LEARNING
+                quick = not handed_over and all(OBSERVERS[name].slow for name in self._left())
                 shown = self._deliver(record) if quick else None
             if shown is not None:
                 handed_over = True

@@ -19,7 +19,7 @@ from wfsobs.app.numbers import number
 from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
 from wfsobs.app.pages.tune_views import LEGEND, HistoryFigure, table_html, unit_for
 from wfsobs.app.store import Store
-from wfsobs.app.tune_work import CHOICES, MOST, best_so_far, compute, measure, rows, seconds
+from wfsobs.app.tune_work import MOST, best_so_far, choices, compute, measure, rows, seconds
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION
 from wfsobs.record import RecordError
@@ -49,7 +49,7 @@ class TunePage(PageActions):
         self.store, self.run, self.display = store, store.run, display
         self.work = BackgroundTask(store.session)
         self.starter = Starter(self.work, "Start tuning", "Progress of the tuning", self._so_far)
-        self.observer = pmui.Select(label="Observer", options=dict(CHOICES), value=START, size="small", width=190, margin=0)
+        self.observer = pmui.Select(label="Observer", options=choices(), value=START, size="small", width=190, margin=0)
         self.target = pmui.Select(label="Error of", options=[], size="small", width=130, margin=0)
         self.evaluations = pmui.TextInput(label="Evaluations", value=str(EVALUATIONS), size="small", width=110, margin=0)
         self.inputs = (self.observer, self.target, self.evaluations)
