@@ -93,7 +93,6 @@ def test_its_controller_closes_the_loop(python: Run) -> None:
 
 
 DASHBOARD = """
-from wfsobs.app.cache import frozen
 from wfsobs.app.controls.names import name_of
 from wfsobs.app.controls.panel import Controls
 from wfsobs.app.copies import to_command, to_python
