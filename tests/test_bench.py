@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from wfsobs import bench, cli
 from wfsobs.bench import external, textbook
-from wfsobs.bench.measure import OURS, max_error, row, timed, with_ratios
+from wfsobs.bench.measure import OURS, max_error, measure_time, row, with_ratios
 from wfsobs.bench.sizes import Sizes
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.gpr.kernels import SquaredExponential
@@ -133,12 +133,12 @@ def test_textbook_offline_is_ours():
     signals, targets, kernel = _problem(m, depth, m + depth)
     model = train(signals, targets, depth, m, kernel)
     X, f = textbook.windows(signals, depth)[:m], targets[depth - 1 : depth - 1 + m]
-    weights, (exact, constant) = textbook.train(X, f, kernel), textbook.exact_weights(X, f, kernel)
+    weights, (exact, constant) = textbook.train_textbook(X, f, kernel), textbook.exact_weights(X, f, kernel)
     np.testing.assert_allclose(weights, exact, rtol=1e-8)
     np.testing.assert_allclose(model.weights, exact, rtol=1e-8)
     test = np.random.default_rng(5).normal(size=(400, 2))
     T, mean = textbook.windows(test, depth), model.predict(test)[depth - 1 :]
-    np.testing.assert_allclose(textbook.predict(T, X, weights, kernel), mean, rtol=1e-8, atol=1e-11)
+    np.testing.assert_allclose(textbook.predict_textbook(T, X, weights, kernel), mean, rtol=1e-8, atol=1e-11)
     np.testing.assert_allclose(textbook.exact_predict(T, X, exact, constant, kernel), mean, rtol=1e-8, atol=1e-11)
 
 
@@ -167,7 +167,7 @@ def test_ratios_are_per_step_and_per_size():
 
 def test_timed_is_a_median_of_repeats():
     calls: list[int] = []
-    seconds, last = timed(lambda: calls.append(1) or len(calls), 3)
+    seconds, last = measure_time(lambda: calls.append(1) or len(calls), 3)
     assert seconds >= 0 and last == len(calls) >= 3
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wfsobs.evaluation.description import Description, describe
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -23,7 +23,7 @@ def impulse_response(observer: str, scenario: Scenario, steps: int, lgs: int | N
     if ngs is not None:
         y_ngs[ngs] = 1.0
     record = Record(y_lgs, np.zeros((steps, 2)), scenario.dt, y_ngs, n)
-    values = estimated(observer, record, scenario)
+    values = run_observer(observer, record, scenario)
     return np.column_stack([v[:, 0] for v in values.values()])
 
 

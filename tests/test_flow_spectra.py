@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import csd, welch
 
 from wfsobs.evaluation.bound import bound_rms, record_bounds
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import circle_mean
 from wfsobs.simulation.flow_spectra import flow_spectra
@@ -101,7 +101,7 @@ def test_on_frozen_flow_a_third_order_model_is_within_a_tenth_of_the_bound() -> 
         record = simulate(s.replace({"run.seed": seed}))
         assert record.turbulence is not None
         for order, found in errors.items():
-            values = estimated("kf-multi", record, s.replace({"multipeak.turbulence_order": order}))
+            values = run_observer("kf-multi", record, s.replace({"multipeak.turbulence_order": order}))
             found.append(np.mean((values["turbulence"] - record.turbulence)[500:] ** 2))
     least = np.sqrt(np.mean([bound_rms(s, mode)["turbulence"] ** 2 for mode in (0, 1)]))
     # 12 signals of 3.5 s, errors with a correlation time of about 50 ms: 4 % at one sigma.

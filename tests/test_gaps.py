@@ -11,8 +11,8 @@ from wfsobs import PRESETS, observe, simulate
 from wfsobs.evaluation.scores import PREDICTION, RESIDUAL
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.missing import bridged
-from wfsobs.pipeline import each_estimate, estimated
+from wfsobs.observers.missing import fill_missing
+from wfsobs.pipeline import each_estimate, run_observer
 from wfsobs.prior import Lines, Model, Prior
 from wfsobs.priors_from.scenario import kalman_model, measurement_noise, prior_of
 from wfsobs.record import Record, hold_last, pseudo_open_loop
@@ -52,14 +52,14 @@ def gappy(record: Record = WHOLE) -> Record:
 
 
 def test_nothing_missing_nothing_changed() -> None:
-    again = bridged(WHOLE, told(scenario()))
+    again = fill_missing(WHOLE, told(scenario()))
     for name in ("y_lgs", "u", "y_ngs", "open_loop_y"):
         np.testing.assert_array_equal(getattr(again, name), getattr(WHOLE, name))
 
 
 def test_all_is_bridged_and_the_rest_stays() -> None:
     record, n = gappy(), WHOLE.ratio
-    out = bridged(record, told(scenario()))
+    out = fill_missing(record, told(scenario()))
     assert record.missing == LOST.size + 1
     for name in ("y_lgs", "u", "open_loop_y"):
         was, now = getattr(record, name), getattr(out, name)
@@ -94,7 +94,7 @@ def test_prediction_beats_holding() -> None:
     y = WHOLE.y_lgs.copy()
     y[lost] = np.nan
     record = replace(WHOLE, y_lgs=y)
-    predicted, simple = bridged(record, told(scenario().replace({"kalman.process_noise": "matched"}))).z, hold_last(record.z)
+    predicted, simple = fill_missing(record, told(scenario().replace({"kalman.process_noise": "matched"}))).z, hold_last(record.z)
     error, worse = rms((predicted - WHOLE.z)[lost]), rms((simple - WHOLE.z)[lost])
     noise = scenario().sensors.lgs_noise / np.sqrt(2)
     assert noise < error and np.sqrt(0.5) < error / worse < 0.95
@@ -115,7 +115,7 @@ def test_bridging_is_causal(k: int) -> None:
     ngs = record.y_ngs.copy()
     ngs[k + 1 :][np.arange(k + 1, 1500) % n == 0] = 0.1
     other = replace(record, y_lgs=later(record.y_lgs, k + 1), u=later(record.u, k), y_ngs=ngs)
-    a, b = bridged(record, told(s)), bridged(other, told(s))
+    a, b = fill_missing(record, told(s)), fill_missing(other, told(s))
     np.testing.assert_array_equal(a.y_lgs[: k + 1], b.y_lgs[: k + 1])
     np.testing.assert_array_equal(a.u[:k], b.u[:k])
     np.testing.assert_array_equal(a.y_ngs[: k + 1], b.y_ngs[: k + 1])
@@ -172,20 +172,20 @@ def test_holding() -> None:
 def test_what_is_told_nothing_holds_the_last_value() -> None:
     """Of z, as the mirror's part is known; and of the mean over a frame. Estimates on a record held by hand are the same."""
     record = gappy()
-    by_hand = bridged(record, Prior())
+    by_hand = fill_missing(record, Prior())
     u, n = hold_last(record.u), record.ratio
     np.testing.assert_allclose(by_hand.z, hold_last(pseudo_open_loop(record.y_lgs, u)), atol=1e-12)
     np.testing.assert_allclose(by_hand.z_ngs[n::n], hold_last(replace(record, u=u).z_ngs[n::n]), atol=1e-12)
     for name in ("persistence", "butterworth-cl", "kf-adaptive", "gpr-online"):
-        for target, values in estimated(name, record, scenario()).items():
-            np.testing.assert_array_equal(values, estimated(name, by_hand, scenario())[target])
+        for target, values in run_observer(name, record, scenario()).items():
+            np.testing.assert_array_equal(values, run_observer(name, by_hand, scenario())[target])
 
 
 def test_what_knows_every_line_bridges_with_all_of_them() -> None:
     """In a gap of the two-line model the filter of that model predicts; that of one peak would say something else."""
     s, record = scenario(), replace(gappy(), u=WHOLE.u)
     prior = prior_of(s, record, (Lines,))
-    got = estimated("kf-multi", record, s)
+    got = run_observer("kf-multi", record, s)
     for mode in range(2):
         model = prior.lines[mode].disturbance(s.multipeak.line_width)
         L = steady_state(model.A, model.C, model.Q, np.array(prior.lines[mode].noise ** 2)).L[:, 0]
@@ -202,4 +202,4 @@ def test_what_knows_every_line_bridges_with_all_of_them() -> None:
 def test_a_model_of_nothing_predicts_nothing() -> None:
     s = scenario().replace({"turbulence.source": "none", "vibration.source": "none", "kalman.process_noise": "matched"})
     record = gappy()
-    np.testing.assert_allclose(bridged(record, told(s)).z[LOST], 0.0, atol=1e-12)
+    np.testing.assert_allclose(fill_missing(record, told(s)).z[LOST], 0.0, atol=1e-12)

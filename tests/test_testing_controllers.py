@@ -158,7 +158,7 @@ def test_the_truth_in_an_argument_would_be_found(monkeypatch: pytest.MonkeyPatch
     """The door itself, left open: measurements that are the record."""
     from wfsobs.testing import controllers as module
 
-    real = module.arguments
+    real = module.controller_arguments
     monkeypatch.setattr(module, "arguments", lambda c, record, *rest: (record, real(c, record, *rest)[1]))
     with pytest.raises(CheckError, match="it reaches Record, turbulence, vibration"):
         check_controller(CONTROLLERS["lqg-kf-lgs"], alone=False)

@@ -260,7 +260,7 @@ def _only_forward(tell: Callable[[float], None]) -> Callable[[float], None]:
     return told
 
 
-def estimated(name: str, record: Record, scenario: Scenario, watch: Watch = QUIET) -> dict[str, Array]:
+def run_observer(name: str, record: Record, scenario: Scenario, watch: Watch = QUIET) -> dict[str, Array]:
     """Return {target: (n_steps, n_modes) [um]} of one observer.
 
     Raises ValueError with the reason where there is none, Cancelled.

@@ -178,15 +178,15 @@ def register(entry: Any) -> None:
 
 
 def sections() -> Mapping[str, Section]:
-    """The groups of settings that observers and controllers bring along, by name, in the order of the registries."""
+    """Return the groups of settings of observers and controllers, by name, in the order of the registries."""
     _registry(OBSERVERS).complete()
-    if _installed(CONTROLLERS):  # else none has to be imported: those of wfsobs bring no settings
+    if _is_installed(CONTROLLERS):  # else none has to be imported: those of wfsobs bring no settings
         _registry(CONTROLLERS).complete()
     return dict(_SECTIONS)
 
 
 @cache
-def _installed(group: str) -> bool:
+def _is_installed(group: str) -> bool:
     return bool(entry_points(group=group))
 
 
@@ -200,7 +200,7 @@ def _scenario() -> Any:
 
 
 def _settings(entry: Entry) -> tuple[Any, ...]:
-    """What an entry says of its settings: sections that it brings along, or names of groups that a scenario has."""
+    """Return the settings of an entry: its own sections, or names of groups of a scenario."""
     own = getattr(entry, "settings", None)
     if own is None:
         return ()
@@ -208,7 +208,7 @@ def _settings(entry: Entry) -> tuple[Any, ...]:
 
 
 def _check_settings(own: Any, where: str) -> None:
-    """Raises RegistrationError where a scenario cannot have these settings."""
+    """Raise RegistrationError where a scenario cannot have these settings."""
     if isinstance(own, str) and own in _scenario().settings():
         return
     if isinstance(own, str):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs import PRESETS, Record, Scenario, simulate
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 
 KNOWING, NAMES = "kf-multi", ("kf-adaptive", "kf-multi", "kf-lgs")
 CASES = (("paper", 4.0), ("strong-turbulence", 4.0), ("ut4", 4.0), ("ut4", 8.0))
@@ -25,7 +25,7 @@ def errors(scenario: Scenario, name: str, record: Record, target: str) -> np.nda
     """Estimate minus truth, (n_steps, n_modes) [um]."""
     truth = record.truth(target)
     assert truth is not None
-    return estimated(name, record, scenario)[target] - truth
+    return run_observer(name, record, scenario)[target] - truth
 
 
 def rms(x: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import click
 from settings_table import changes
 
 from wfsobs.cli import main
-from wfsobs.closed_loop.rows import needed
+from wfsobs.closed_loop.rows import controller_needs
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
@@ -112,7 +112,7 @@ def observers() -> str:
     for o in OBSERVERS.values():
         rows = (
             ("Estimates", ", ".join(o.targets)),
-            ("Needs beside measurements", o.told),
+            ("Needs beside measurements", o.needs_text),
             ("Needs of a record", listed(("y_lgs", "u", *o.needs) if o.id != "zero" else ())),
             ("Causal", "yes" if o.causal else "no: a reference that looks ahead"),
             ("Computing time, Kalman filter = 1", f"{o.weight:g}"),
@@ -128,7 +128,8 @@ def observers() -> str:
 def controllers() -> str:
     """Every controller: what it needs and costs."""
     rows = (
-        (f"`{c.id}`", c.label, needed(c.id, Scenario()), "yes" if c.ngs else "no", f"{c.weight:g}") for c in CONTROLLERS.values()
+        (f"`{c.id}`", c.label, controller_needs(c.id, Scenario()), "yes" if c.ngs else "no", f"{c.weight:g}")
+        for c in CONTROLLERS.values()
     )
     head = ("Id", "Name", "Needs beside measurements", "Uses the NGS", "Computing time, linear law = 1")
     about = (

@@ -9,16 +9,16 @@ import numpy as np
 from scipy.optimize import minimize
 
 from wfsobs import PRESETS, Scenario, observe, simulate
-from wfsobs.tuning import Tuned, tune
+from wfsobs.tuning import TuningResult, tune
 from wfsobs.tuning.likelihood import likelihood
 
 SEEDS, FEW = range(1, 11), range(1, 5)
 KERNEL = ["gpr_online.length_scale", "gpr_online.noise_std", "gpr_online.depth"]
 BANDWIDTH = ["butterworth.bandwidth_online", "gpr_online.noise_std"]
-RMS = Callable[[Tuned], float]
+RMS = Callable[[TuningResult], float]
 
 
-def row(name: str, tuned: list[Tuned]) -> str:
+def row(name: str, tuned: list[TuningResult]) -> str:
     """Medians over seeds and, of the ratios, the range; in how many seeds the test error fell."""
 
     def column(of: RMS, scale: float = 1e3) -> list[float]:
@@ -35,7 +35,7 @@ def row(name: str, tuned: list[Tuned]) -> str:
     return " | ".join(["", name, *cells, f"{better} of {len(tuned)}", ""]).strip()
 
 
-def of_seeds(preset: str, observer: str, seeds: range, names: list[str] | None = None, **more: float) -> list[Tuned]:
+def of_seeds(preset: str, observer: str, seeds: range, names: list[str] | None = None, **more: float) -> list[TuningResult]:
     """A tuning per seed."""
     return [tune(PRESETS[preset]().replace({"run.seed": seed}), observer, names, **more) for seed in seeds]  # type: ignore[arg-type]
 

@@ -153,8 +153,8 @@ def test_tune(board: Dashboard, loop: Any) -> None:
     page.observer.value, page.evaluations.value = "kf-lgs", "4"
     page.start()
     loop.until(lambda: page.work.state != RUNNING, 120)
-    expected = tunings.plain(page.work.result)
-    for found in (shell(board), tunings.plain(script(board)["tuned"])):
+    expected = tunings.tuning_dict(page.work.result)
+    for found in (shell(board), tunings.tuning_dict(script(board)["tuned"])):
         assert found["settings"] == pytest.approx(expected["settings"], rel=CLOSE)
         for stage in ("before", "after"):
             assert found[stage]["test_um"] == pytest.approx(expected[stage]["test_um"], rel=CLOSE)

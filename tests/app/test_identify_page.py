@@ -22,7 +22,7 @@ from wfsobs.app.style import LOOKS
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.identification import Identification, identify
 from wfsobs.identification.process import Number
-from wfsobs.identification.report import format_number, verdict
+from wfsobs.identification.report import format_number, whiteness_lines
 from wfsobs.pipeline import observe
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
@@ -64,7 +64,7 @@ def test_it_shows_what_the_core_finds(page: IdentifyPage, dashboard: Dashboard, 
     assert of is not None and page.of is not None and not len(page.figure.total.data["x"]) and page.starter.uses[0].disabled
     found, expected = identified(page, loop), identify(of.result.record)
     assert found.modes == expected.modes and not page.stale.visible
-    for line in verdict(expected):
+    for line in whiteness_lines(expected):
         assert line.replace("<", "&lt;") in page.verdict.object
     (line,) = (p for p in expected.modes[0].peaks if p.pure)
     assert line.frequency.value == pytest.approx(LINE, abs=0.1)

@@ -23,7 +23,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import changed_settings
 from wfsobs.simulation.loop import simulate
-from wfsobs.tuning import Evaluation, Tuned, tune
+from wfsobs.tuning import Evaluation, TuningResult, tune
 from wfsobs.tuning.judge import Errors
 
 
@@ -36,7 +36,7 @@ def page(dashboard: Dashboard) -> TunePage:
     return page
 
 
-def tuned(page: TunePage, loop: Any) -> Tuned:
+def tuned(page: TunePage, loop: Any) -> TuningResult:
     """What the page came to, once it has."""
     page.starter.start.param.trigger("clicks")
     assert page.work.state == RUNNING and page.starter.uses[0].disabled
@@ -76,7 +76,7 @@ def test_it_shows_what_the_core_finds(page: TunePage, dashboard: Dashboard, loop
     using_it_leaves_the_other_settings(page, dashboard, found)
 
 
-def using_it_leaves_the_other_settings(page: TunePage, dashboard: Dashboard, found: Tuned) -> None:
+def using_it_leaves_the_other_settings(page: TunePage, dashboard: Dashboard, found: TuningResult) -> None:
     store = dashboard.store
     assert not page.stale.visible
     store.change("run.seed", 5)

@@ -17,7 +17,7 @@ from wfsobs.control.integrator import best_gain, highest_stable_gain, integrator
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.residual import residual_variance
 from wfsobs.observers.baselines import online_reference
-from wfsobs.priors_from.controllers import arguments, own_settings
+from wfsobs.priors_from.controllers import controller_arguments, own_settings
 from wfsobs.priors_from.scenario import bands_of, kalman_model, measurement_noise, modelled_processes, spectra_of
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, RecordError
@@ -128,7 +128,7 @@ def test_an_integrator_in_a_simulated_loop_commands_the_same(delay: float) -> No
 
 def test_an_integrator_at_its_limits_goes_on_from_what_the_mirror_took() -> None:
     z, mirror = np.random.default_rng(4).standard_normal(400), Mirror(2.0, stroke=0.8, slew=0.3)
-    u = feedback(z, mirror, lambda k, y, u: mirror.allowed(at(u, k - 1) - 0.5 * y, at(u, k - 1)))
+    u = feedback(z, mirror, lambda k, y, u: mirror.clip_command(at(u, k - 1) - 0.5 * y, at(u, k - 1)))
     taken, wanted = limited_integrator(mirror, 0.5, 1.0, z, np.zeros(400))
     assert np.allclose(taken, u, rtol=0, atol=1e-12)
     assert np.abs(taken).max() == 0.8 and np.mean(taken != wanted) > 0.1
@@ -165,7 +165,7 @@ def predicted(record: Record, scenario: Scenario, plan: Design) -> Array:
     controller = CONTROLLERS["integrator+gpr-offline"]
     assert controller.predict is not None
     settings = own_settings(controller, scenario)
-    measured, prior = arguments(controller, record, settings, plan.priors[controller.id])
+    measured, prior = controller_arguments(controller, record, settings, plan.priors[controller.id])
     return controller.predict(measured, prior, plan.plant, settings, QUIET)
 
 
@@ -178,14 +178,14 @@ def test_a_vibration_that_is_predicted_is_not_corrected_twice(changes: dict[str,
     known = ~np.isnan(ahead)
     ahead = np.where(known, ahead, 0.0)
     f = np.where(known, online_reference(bands_of(scenario), record.z, record.dt)[:, 0], 0.0)
-    commanded = plan.mirror.seen(ahead)  # vib_hat[k-1] with two frames of delay
+    commanded = plan.mirror.in_measurement(ahead)  # vib_hat[k-1] with two frames of delay
     law = plan.laws["integrator+gpr-offline"][0].law
     assert law is not None and law.gain is not None
     own = np.zeros(record.n_steps)
 
     def control(k: int, y: float, u: Array) -> float:
         own[k] = at(own, k - 1) - law.gain * (y - (f[k] - commanded[k]))
-        taken = plan.mirror.allowed(own[k] - ahead[k], at(u, k - 1))
+        taken = plan.mirror.clip_command(own[k] - ahead[k], at(u, k - 1))
         own[k] = taken + ahead[k]
         return taken
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.priors_from.controllers import arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.progress import QUIET
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -47,7 +47,7 @@ def test_a_prediction_is_the_vibration_while_the_command_acts(name: str, delay: 
     assert record.vibration is not None
     scenario, controller = LINE.replace({"control.delay": delay, "control.integrator": "manual"}), CONTROLLERS[name]
     settings, plant = own_settings(controller, scenario), plant_of(scenario)
-    measured, prior = arguments(controller, record, settings, prior_for(controller, scenario))
+    measured, prior = controller_arguments(controller, record, settings, prior_for(controller, scenario))
     assert controller.predict is not None
     got = controller.predict(measured, prior, plant, settings, QUIET)
     command = np.zeros(20)

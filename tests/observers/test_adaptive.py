@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from wfsobs.observers.kalman import adaptive as kalman_adaptive
 from wfsobs.observers.kalman.adaptive import filter_of
 from wfsobs.observers.kalman.single import steady_filter
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record, RecordError, delay_signal
 from wfsobs.scenario import Scenario
@@ -135,7 +135,7 @@ def test_filters_of_given_models_by_hand(monkeypatch: pytest.MonkeyPatch) -> Non
     models = [MODEL, Spectrum(0.02, DT, TURBULENCE, (Ar2(2 * pi * 33.0, 0.02, 0.01, DT),)), Spectrum(0.02, DT, None, (PEAK,))]
     given_models = iter(models)
     monkeypatch.setattr(kalman_adaptive, "quick_spectrum", lambda *_: next(given_models))
-    got = estimated("kf-adaptive", record, with_window(1.0, 0.25))
+    got = run_observer("kf-adaptive", record, with_window(1.0, 0.25))
     z, expected = record.z[2:, 0], np.full((1700, 2), np.nan)
     for i, spectrum in enumerate(models):
         model = disturbance_model([spectrum.turbulence] if spectrum.turbulence else [], spectrum.resonances)
@@ -156,7 +156,7 @@ def test_filters_of_given_models_by_hand(monkeypatch: pytest.MonkeyPatch) -> Non
 def _jump() -> tuple[Record, dict[str, np.ndarray]]:
     """Eight modes in which the peak moves by 3 Hz at 10 s, and the adaptive estimate."""
     record = made(20_000, 8, 5, PEAK, Ar2(2 * pi * 33.0, 0.01, 0.02, DT))
-    return record, estimated("kf-adaptive", record, with_window(4.0, 0.5))
+    return record, run_observer("kf-adaptive", record, with_window(4.0, 0.5))
 
 
 def test_error_on_a_stationary_record_is_near_what_theory_says_of_the_true_model(
@@ -203,9 +203,9 @@ def test_what_fails_leaves_the_filter_before_in_charge(monkeypatch: pytest.Monke
         return it
 
     monkeypatch.setattr(kalman_adaptive, "quick_spectrum", some)
-    got = estimated("kf-adaptive", record, s)
+    got = run_observer("kf-adaptive", record, s)
     monkeypatch.setattr(kalman_adaptive, "quick_spectrum", lambda *_: MODEL)
-    expected = estimated("kf-adaptive", record, s)
+    expected = run_observer("kf-adaptive", record, s)
     for target, values in expected.items():
         assert np.isfinite(values[1001:]).all()
         np.testing.assert_array_equal(got[target], values)
@@ -213,24 +213,24 @@ def test_what_fails_leaves_the_filter_before_in_charge(monkeypatch: pytest.Monke
 
 def test_a_window_that_does_not_move_is_estimated_as_it_is() -> None:
     record = Record(np.full((600, 1), 0.25), np.zeros((600, 1)), DT)
-    got = estimated("kf-adaptive", record, with_window(0.5, 0.1))
+    got = run_observer("kf-adaptive", record, with_window(0.5, 0.1))
     assert np.allclose(got["turbulence"][501:], 0.25, rtol=1e-12) and not got["vibration"][501:].any()
 
 
 def test_records_that_are_too_short() -> None:
     record = made(1001, 1, 7)
     with pytest.raises(RecordError, match=r"the record has 1001 steps; adaptive.window = 1 s needs 1002"):
-        estimated("kf-adaptive", record, with_window(1.0, 0.5))
+        run_observer("kf-adaptive", record, with_window(1.0, 0.5))
     with pytest.raises(RecordError, match=r"adaptive.window = 0.1: takes 1 s or more, 100 samples"):
-        estimated("kf-adaptive", Record(record.y_lgs, record.u, 0.01), with_window(0.1, 0.5))
+        run_observer("kf-adaptive", Record(record.y_lgs, record.u, 0.01), with_window(0.1, 0.5))
 
 
 def test_progress_and_cancelling() -> None:
     record, told = made(3000, 2, 8, PEAK), list[float]()
-    estimated("kf-adaptive", record, with_window(1.0, 0.25), Watch(progress=told.append))
+    run_observer("kf-adaptive", record, with_window(1.0, 0.25), Watch(progress=told.append))
     assert len(told) == 16 and min(told) == 0.0 and 0.5 < max(told) < 1.0
     with pytest.raises(Cancelled):
-        estimated("kf-adaptive", record, with_window(1.0, 0.25), Watch(cancelled=lambda: True))
+        run_observer("kf-adaptive", record, with_window(1.0, 0.25), Watch(cancelled=lambda: True))
 
 
 @pytest.mark.parametrize(
@@ -252,7 +252,7 @@ def test_estimates_are_sensible_whatever_the_record_is_like(changes: dict[str, f
     truth = {"turbulence": scale * record.turbulence + changes.get("offset", 0.0), "vibration": scale * record.vibration + line}
     noise = record.z - delay_signal(record.turbulence + record.vibration, 1)
     z = delay_signal(truth["turbulence"] + truth["vibration"], 1) + scale * changes.get("noise", 1.0) * noise
-    got = estimated("kf-adaptive", Record(z, np.zeros_like(z), DT), with_window(1.5, 0.5))
+    got = run_observer("kf-adaptive", Record(z, np.zeros_like(z), DT), with_window(1.5, 0.5))
     for target, values in got.items():
         assert np.isfinite(values[1501:]).all()
         assert rms(values[1501:] - truth[target][1501:]) < 1.1 * rms(truth[target][1501:])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from wfsobs.observers import OBSERVERS
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -79,7 +79,7 @@ def test_nothing_after_a_step_changes_its_estimate(name: str, k: int, record: Re
         u = later.u.copy()
         u[k] = record.u[k]
         later = replace(later, u=u)
-    base, other = estimated(name, record, s), estimated(name, later, s)
+    base, other = run_observer(name, record, s), run_observer(name, later, s)
     assert set(base) >= set(OBSERVERS[name].targets)
     for target, values in base.items():
         if name in GPR:
@@ -97,7 +97,7 @@ def test_nothing_after_a_step_changes_its_estimate(name: str, k: int, record: Re
 def test_the_change_is_seen_afterwards(name: str, record: Record) -> None:
     """So that the test above can fail: some 60 steps later every estimate has moved."""
     s, later = scenario(), changed_after(record, 400)
-    base, other = estimated(name, record, s), estimated(name, later, s)
+    base, other = run_observer(name, record, s), run_observer(name, later, s)
     for target, values in base.items():
         assert (np.abs(other[target] - values)[405:460] > 1e-6).mean() > 0.9
 
@@ -109,8 +109,8 @@ def test_the_command_of_the_step_itself_is_used_only_where_the_paper_has_it(name
     s, k = scenario(inputs), 500
     u = record.u.copy()
     u[k] += 3.0
-    base = estimated(name, record, s)
-    other = estimated(name, replace(record, u=u), s)
+    base = run_observer(name, record, s)
+    other = run_observer(name, replace(record, u=u), s)
     for target, values in base.items():
         moved = np.abs(other[target][k] - values[k]).max() > 1e-9 * np.nanstd(values)
         assert moved == (name in WINDOWS and inputs == "u-y")
@@ -120,13 +120,13 @@ def test_the_command_of_the_step_itself_is_used_only_where_the_paper_has_it(name
 def test_no_observer_reads_the_truth(name: str, record: Record) -> None:
     """Poisoned with NaN, or absent, it makes no difference at all."""
     s = scenario()
-    base = estimated(name, record, s)
+    base = run_observer(name, record, s)
     poison = np.full_like(record.y_lgs, np.nan)
     for other in (
         replace(record, turbulence=poison, vibration=poison),
         replace(record, turbulence=None, vibration=None),
     ):
-        found = estimated(name, other, s)
+        found = run_observer(name, other, s)
         assert all(np.array_equal(found[target], values, equal_nan=True) for target, values in base.items())
 
 
@@ -146,7 +146,7 @@ def test_what_an_observer_does_not_need_it_does_not_read(name: str, field: str, 
         assert observer.missing(bare) == (field,)
     else:
         assert observer.missing(bare) == ()
-        base, found = estimated(observer.id, record, scenario()), estimated(observer.id, bare, scenario())
+        base, found = run_observer(observer.id, record, scenario()), run_observer(observer.id, bare, scenario())
         assert all(np.array_equal(found[target], values, equal_nan=True) for target, values in base.items())
 
 
@@ -164,7 +164,7 @@ def test_a_record_that_ends_early_gives_the_same_beginning(name: str, record: Re
         turbulence=None,
         vibration=None,
     )
-    base, found = estimated(name, record, s), estimated(name, short, s)
+    base, found = run_observer(name, record, s), run_observer(name, short, s)
     for target, values in base.items():
         # matrix products of another width round in another order: 1e-9 as above for the GPR, 1e-12 for the filters
         bound = (1e-9 if name in GPR else 1e-12) * max(np.nanstd(values), 1e-30)
@@ -177,6 +177,6 @@ def test_modes_do_not_mix(name: str, record: Record) -> None:
     """Each mode alone is what it is beside the other, and a loud neighbour changes nothing."""
     s = scenario()
     loud = replace(record, y_lgs=record.y_lgs * [1.0, 10.0], u=record.u * [1.0, 10.0])
-    base, found = estimated(name, record, s), estimated(name, loud, s)
+    base, found = run_observer(name, record, s), run_observer(name, loud, s)
     for target, values in base.items():
         assert np.array_equal(found[target][:, 0], values[:, 0], equal_nan=True)

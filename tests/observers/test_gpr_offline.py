@@ -14,7 +14,7 @@ from scipy.signal import butter, lfilter, sosfilt
 from wfsobs.evaluation.scores import lag
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
 from wfsobs.observers.gpr.offline import train, training_targets
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.record import RecordError, Training
 from wfsobs.scenario import Scenario
@@ -149,7 +149,7 @@ def test_pairs_of_window_and_target_on_a_record(inputs: str, twin: bool) -> None
     assert t is not None and t.open_loop_y is not None
     if not twin:
         record = replace(record, training=Training(t.y_lgs, t.u))
-    got = estimated("gpr-offline", record, s)["vibration"]
+    got = run_observer("gpr-offline", record, s)["vibration"]
     g = s.gpr_offline
     m, d = g.training_size, g.depth
     kernel = SquaredExponential(g.signal_std, g.length_scale, g.noise_std)
@@ -212,7 +212,7 @@ def test_the_estimate_of_step_k_is_the_vibration_of_step_k() -> None:
             }
         )
         record = simulate(s)
-        values = estimated("gpr-offline", record, s)["vibration"][200:]
+        values = run_observer("gpr-offline", record, s)["vibration"][200:]
         assert record.vibration is not None
         truth = record.vibration[200:]
         for mode in range(2):
@@ -227,4 +227,4 @@ def test_training_must_be_long_enough() -> None:
     assert record.training is not None
     short = Training(*(x[:109] for x in (record.training.y_lgs, record.training.u, record.training.open_loop_y)))  # type: ignore[index]
     with pytest.raises(RecordError, match="110"):
-        estimated("gpr-offline", replace(record, training=short), s)
+        run_observer("gpr-offline", replace(record, training=short), s)

@@ -15,7 +15,7 @@ from scipy.signal import butter, lfilter, sosfilt
 from wfsobs.evaluation.scores import lag
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
 from wfsobs.observers.gpr.online import predict_sliding
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
@@ -276,7 +276,7 @@ def test_pairs_of_window_and_target_on_a_record(inputs: str) -> None:
     phi_dist[j] + noise; step k learns from the pairs k - m ... k - 1. All of it written out here."""
     s = scenario({"gpr_online.inputs": inputs})
     record = simulate(s)
-    got = estimated("gpr-online", record, s)["vibration"]
+    got = run_observer("gpr-online", record, s)["vibration"]
     g, b = s.gpr_online, s.butterworth
     m, d = g.training_size, g.depth
     kernel = SquaredExponential(g.signal_std, g.length_scale, g.noise_std)
@@ -315,7 +315,7 @@ def test_the_estimate_of_step_k_is_the_vibration_of_step_k() -> None:
         }
     )
     record = simulate(s)
-    values = estimated("gpr-online", record, s)["vibration"][2500:]  # the band of 2 Hz has settled to exp(-15)
+    values = run_observer("gpr-online", record, s)["vibration"][2500:]  # the band of 2 Hz has settled to exp(-15)
     assert record.vibration is not None
     truth = record.vibration[2500:]
     for mode in range(2):
@@ -327,7 +327,7 @@ def test_the_estimate_of_step_k_is_the_vibration_of_step_k() -> None:
 def test_too_short_a_record_says_so() -> None:
     s = scenario({"gpr_online.training_size": 990})
     with pytest.raises(RecordError, match="1015") as caught:
-        estimated("gpr-online", simulate(s), s)
+        run_observer("gpr-online", simulate(s), s)
     assert "\n" not in str(caught.value)
 
 
@@ -335,10 +335,10 @@ def test_cancelling_stops_it_and_partial_results_come_before() -> None:
     s = scenario({"run.duration": 3.0})
     record = simulate(s)
     partial: list[np.ndarray] = []
-    estimated("gpr-online", record, s, Watch(partial=lambda target, values: partial.append(values.copy())))
+    run_observer("gpr-online", record, s, Watch(partial=lambda target, values: partial.append(values.copy())))
     counts = [int(np.isfinite(values).sum()) for values in partial]
     # the two modes tell on their own threads, in any order between them
     assert len(counts) > 10 and min(counts) < 500 and max(counts) == 2 * (3000 - 84)
     asked = iter([False] * 5 + [True] * 10_000)
     with pytest.raises(Cancelled):
-        estimated("gpr-online", record, s, Watch(cancelled=lambda: next(asked)))
+        run_observer("gpr-online", record, s, Watch(cancelled=lambda: next(asked)))

@@ -8,7 +8,7 @@ from wfsobs.observers.gpr.inputs import scale_of
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
 from wfsobs.observers.gpr.online import predict_sliding
 from wfsobs.observers.gpr.stream import OnlineGprStream, SlidingRegression
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
@@ -69,7 +69,7 @@ def test_the_stream_gives_the_numbers_of_the_record_version(inputs, kind):
         }
     )
     record = simulate(scenario)
-    expected = estimated("gpr-online", record, scenario)["vibration"][:, 1]
+    expected = run_observer("gpr-online", record, scenario)["vibration"][:, 1]
     scale = scale_of(scenario.gpr_online, record.training, record.delay, 1)
     observer = OnlineGprStream(scenario.gpr_online, bands_of(scenario), scenario.dt, scale)
     got = np.array([observer.step(y, u) for y, u in zip(record.y_lgs[:, 1], record.u[:, 1], strict=True)])

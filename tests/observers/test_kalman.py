@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.observers.kalman.single import between_frames, steady_filter
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 from wfsobs.priors_from.scenario import kalman_model, measurement_noise, modelled_processes
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -64,7 +64,7 @@ LGS_VARIANTS: list[dict[str, Any]] = [
 def test_lgs_filter_is_the_textbook_filter_of_six_states(changes: dict[str, Any]) -> None:
     s = scenario(changes)
     record = simulate(s)
-    got = estimated("kf-lgs", record, s)
+    got = run_observer("kf-lgs", record, s)
     r = 0.1**2 if "kalman.lgs_noise" in changes else s.sensors.lgs_noise**2 / s.sensors.lgs_count
     for mode in range(2):
         wanted = textbook_lgs(record, s, mode, r)
@@ -104,7 +104,7 @@ def test_ngs_filter_is_the_textbook_filter_held_between_frames(changes: dict[str
     s = scenario(changes)
     record = simulate(s)
     n = s.sensors.exposure_ratio
-    got = estimated("kf-ngs", record, s)
+    got = run_observer("kf-ngs", record, s)
     r = (0.05 if "kalman.ngs_noise" in changes else s.sensors.ngs_noise) ** 2
     for mode in range(2):
         states = textbook_ngs(record, s, mode, r)
@@ -148,7 +148,7 @@ def test_propagated_estimates_use_both_slow_states(ratio: int) -> None:
     """The previous slow mean as the newest frame shows it, not as it was estimated before that frame."""
     s = scenario({"kalman.ngs_between_frames": "propagate", "sensors.exposure_ratio": ratio, "run.duration": 1.003})
     record = simulate(s)
-    got = estimated("kf-ngs", record, s)
+    got = run_observer("kf-ngs", record, s)
     for mode in range(2):
         states = textbook_ngs(record, s, mode, s.sensors.ngs_noise**2)
         for i, (target, process) in enumerate(zip(got, modelled_processes(s, mode, record.dt), strict=True)):
@@ -177,7 +177,7 @@ def test_propagating_beats_holding_where_the_model_is_true() -> None:
             )
             record = simulate(s)
             assert record.turbulence is not None
-            found.append(np.nanstd(estimated("kf-ngs", record, s)["turbulence"] - record.turbulence))
+            found.append(np.nanstd(run_observer("kf-ngs", record, s)["turbulence"] - record.turbulence))
     assert (np.array(errors["propagate"]) < 0.98 * np.array(errors["hold"])).all()
 
 
@@ -198,7 +198,7 @@ def test_error_of_the_matched_filter_is_what_the_riccati_equation_says() -> None
     ratios = []
     for seed in range(16):
         record = simulate(s.replace({"run.seed": seed}))
-        values = estimated("kf-lgs", record, s)
+        values = run_observer("kf-lgs", record, s)
         one = []
         for mode in range(2):
             model = kalman_model(s, mode, record.dt)
@@ -246,8 +246,8 @@ def test_model_floors() -> None:
     assert modelled_processes(s, 0, 1e-3)[1].damping == 1e-4
     assert measurement_noise(s, 0) == (1e-6, 1e-6)
     record = simulate(s)
-    assert all(np.isfinite(v).all() for v in estimated("kf-lgs", record, s).values())
-    assert all(np.isfinite(v[5:]).all() for v in estimated("kf-ngs", record, s).values())
+    assert all(np.isfinite(v).all() for v in run_observer("kf-lgs", record, s).values())
+    assert all(np.isfinite(v[5:]).all() for v in run_observer("kf-ngs", record, s).values())
 
 
 def test_matched_and_manual() -> None:
@@ -260,7 +260,7 @@ def test_matched_and_manual() -> None:
     silent = s.replace({"turbulence.source": "none", "vibration.source": "none"})
     assert [p.rms for p in modelled_processes(silent, 1, 1e-3)] == [0.0, 0.0]
     record = simulate(silent)
-    assert not any(v.any() for v in estimated("kf-lgs", record, silent).values())
+    assert not any(v.any() for v in run_observer("kf-lgs", record, silent).values())
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -278,8 +278,8 @@ def test_records_shorter_than_a_frame(n_steps: int) -> None:
     assert record.y_ngs is not None
     short = Record(record.y_lgs[:n_steps], record.u[:n_steps], record.dt, record.y_ngs[:n_steps], record.ratio)
     for name, first in (("kf-lgs", 0), ("kf-ngs", 5)):
-        whole = estimated(name, record, s)
-        for target, value in estimated(name, short, s).items():
+        whole = run_observer(name, record, s)
+        for target, value in run_observer(name, short, s).items():
             assert value.shape == (n_steps, 2)
             assert np.isnan(value[:first]).all() and np.isfinite(value[first:]).all()
             assert np.allclose(value, whole[target][:n_steps], rtol=1e-9, atol=1e-13, equal_nan=True)

@@ -10,7 +10,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.observers.ridge import TAPS, fit, predict
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 from wfsobs.priors_from.scenario import modelled_processes, modelled_turbulence, multi_model, predicted_rms
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
@@ -50,9 +50,9 @@ def test_ridge_is_the_penalised_least_squares_fit(depth: int, channels: int, m: 
 def test_ridge_is_what_the_gpr_becomes_for_a_long_length_scale() -> None:
     s = small()
     record = simulate(s)
-    gpr, ridge = (estimated(name, record, s)["vibration"] for name in ("gpr-offline", "ridge"))
+    gpr, ridge = (run_observer(name, record, s)["vibration"] for name in ("gpr-offline", "ridge"))
     far = s.replace({"gpr_offline.length_scale": 30_000.0, "gpr_offline.noise_std": s.gpr_offline.noise_std / 100})
-    limit = estimated("gpr-offline", record, far)["vibration"]
+    limit = run_observer("gpr-offline", record, far)["vibration"]
     scale = np.nanstd(ridge)
     # Same penalty, windows of norm |x| < 10: the kernel is linear up to |x|^2 / 2 l^2, 6e-4 at l = 300 and 6e-8 at 30000; the
     # GPR's free constant has the prior sigma_SE^2, 1e6 times the variance of the targets.
@@ -67,13 +67,13 @@ def test_too_short_a_training_record_is_said() -> None:
 
 def test_thirty_taps_are_thirty() -> None:
     record = simulate(small())
-    values = estimated("ridge-30", record, small())["vibration"]
+    values = run_observer("ridge-30", record, small())["vibration"]
     assert np.isnan(values[: TAPS - 1]).all() and np.isfinite(values[TAPS - 1 :]).all()
 
 
 def test_persistence_is_the_newest_measurement() -> None:
     record = simulate(small())
-    assert np.array_equal(estimated("persistence", record, small())["turbulence"], record.z)
+    assert np.array_equal(run_observer("persistence", record, small())["turbulence"], record.z)
 
 
 @settings(max_examples=50)
@@ -135,7 +135,7 @@ def test_where_the_truth_is_its_model_the_filter_reaches_the_bound() -> None:
     errors = []
     for seed in range(12):
         record = simulate(s.replace({"run.seed": seed}))
-        values = estimated("kf-multi", record, s)["vibration"]
+        values = run_observer("kf-multi", record, s)["vibration"]
         errors.append(np.mean((values - record.vibration)[500:, 0] ** 2))
     # 12 records of 3.5 s: some 700 independent samples of an error with a correlation time of 30 ms, 3 % of the rms at one sigma.
     assert np.sqrt(np.mean(errors)) == pytest.approx(bound_rms(s, 0)["vibration"], rel=0.08)
@@ -144,7 +144,7 @@ def test_where_the_truth_is_its_model_the_filter_reaches_the_bound() -> None:
 def test_more_peaks_in_the_model_than_the_papers_one_help() -> None:
     s = lines(small(), 4)
     record = simulate(s)
-    errors = [np.std((estimated(name, record, s)["vibration"] - record.vibration)[400:, 0]) for name in ("kf-multi", "kf-lgs")]
+    errors = [np.std((run_observer(name, record, s)["vibration"] - record.vibration)[400:, 0]) for name in ("kf-multi", "kf-lgs")]
     assert errors[0] < 0.8 * errors[1]
 
 
@@ -165,7 +165,7 @@ def test_every_mode_is_filtered_for_its_own_noise() -> None:
     noise = np.sqrt(np.diagonal(noise_covariance(s, "lgs")) / s.sensors.lgs_count)
     assert noise.max() > 1.2 * noise.min()  # else the test would say nothing
     record = simulate(s)
-    values = estimated("kf-multi", record, s)["vibration"]
+    values = run_observer("kf-multi", record, s)["vibration"]
     for mode in range(5):
         turbulence, _ = modelled_processes(s, mode, s.dt)
         peaks = [Ar2(2.0 * np.pi * f, damping, rms, s.dt) for f, damping, rms in vibration_lines(s, mode)]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from wfsobs.observers.kalman.multirate import UnstableCycle, multirate_filter, multirate_noise
-from wfsobs.pipeline import estimated, run
+from wfsobs.pipeline import run, run_observer
 from wfsobs.priors_from.scenario import kalman_model, model_of, modelled_processes
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -74,7 +74,7 @@ def test_every_step_is_the_textbook_recursion(changes: dict[str, Any]) -> None:
     matched = (s.sensors.lgs_noise / np.sqrt(2), s.sensors.ngs_noise)
     noise = (0.03, 0.01) if "multirate.lgs_noise" in changes else matched
     assert multirate_noise(s.multirate, model_of(s, 0)) == pytest.approx(noise)
-    got = estimated("multirate", record, s)
+    got = run_observer("multirate", record, s)
     assert list(got) == ["turbulence"] and got["turbulence"].shape == record.y_lgs.shape
     for mode in range(2):
         wanted = textbook(record, s, mode, *noise)
@@ -185,7 +185,7 @@ def test_the_optimal_filter_is_the_time_varying_one_once_that_has_settled(ratio:
         }
     )
     record = simulate(s)
-    got = estimated("multirate-optimal", record, s)
+    got = run_observer("multirate-optimal", record, s)
     wanted = time_varying(record, s, 0, *multirate_noise(s.multirate, model_of(s, 0)), with_error)
     for i, target in enumerate(("turbulence", "vibration")):
         # the start (covariance 0 instead of the steady one) is forgotten after 2.5 s of a loop with 20 ms memory and,
@@ -198,7 +198,7 @@ def test_with_a_frame_at_every_step_both_multirate_filters_are_the_two_sensor_fi
     s = scenario({"sensors.exposure_ratio": 1, "multirate.model_lgs_error": False})
     record = simulate(s)
     lgs, ngs = multirate_noise(s.multirate, model_of(s, 0))
-    one, other = (estimated(name, record, s)["turbulence"] for name in ("multirate", "multirate-optimal"))
+    one, other = (run_observer(name, record, s)["turbulence"] for name in ("multirate", "multirate-optimal"))
     # step 0 has no frame; the two differ in the gain there, forgotten after 0.5 s
     assert np.abs(one - other)[500:].max() < 1e-8 * one.std()
     model = kalman_model(s, 0, record.dt)
@@ -225,7 +225,7 @@ def test_the_optimal_filter_is_at_least_as_good_as_any_other_on_its_model() -> N
     record = simulate(s)
     assert record.turbulence is not None
     errors = {
-        name: np.std((estimated(name, record, s)["turbulence"] - record.turbulence)[1000:])
+        name: np.std((run_observer(name, record, s)["turbulence"] - record.turbulence)[1000:])
         for name in ("multirate-optimal", "multirate", "kf-lgs", "kf-ngs")
     }
     assert min(errors, key=lambda name: errors[name]) == "multirate-optimal"
@@ -234,7 +234,7 @@ def test_the_optimal_filter_is_at_least_as_good_as_any_other_on_its_model() -> N
 def test_no_noise_at_all_still_has_a_filter() -> None:
     s = scenario({"sensors.lgs_noise": 0.0, "sensors.ngs_noise": 0.0})
     record = simulate(s)
-    got = estimated("multirate", record, s)["turbulence"]
+    got = run_observer("multirate", record, s)["turbulence"]
     assert np.isfinite(got).all()
 
 
@@ -251,6 +251,6 @@ def test_short_records(n_steps: int) -> None:
     assert record.y_ngs is not None
     short = Record(record.y_lgs[:n_steps], record.u[:n_steps], record.dt, record.y_ngs[:n_steps], record.ratio)
     for name in ("multirate", "multirate-optimal"):
-        whole, part = estimated(name, record, s), estimated(name, short, s)
+        whole, part = run_observer(name, record, s), run_observer(name, short, s)
         for target, value in part.items():
             assert np.allclose(value, whole[target][:n_steps], rtol=1e-9, atol=1e-13)

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from wfsobs.observers.kalman.multirate_optimal import optimal_cycle, optimal_filter, optimal_model
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 from wfsobs.prior import LgsError, Model, Prior
 from wfsobs.priors_from.scenario import kalman_model, lgs_error_of, model_of, modelled_processes, prior_of
 from wfsobs.scenario import Scenario
@@ -150,7 +150,7 @@ def test_never_worse_than_the_better_single_sensor_filter(ratio, lgs, ngs, wind,
 def test_over_a_record_it_matches_its_textbook_recursion():
     scenario = paper().replace({"run.duration": 1.5})
     record = simulate(scenario)
-    got = estimated("multirate-optimal", record, scenario)
+    got = run_observer("multirate-optimal", record, scenario)
     for mode in range(2):
         cycle, rows = optimal_model(scenario.multirate, prior_of(scenario, record, PARTS), mode, 5)
         states = periodic_steady_state(cycle)
@@ -175,7 +175,7 @@ def test_the_error_state_is_what_makes_it_useful_with_a_slow_lgs_error():
     for known in (True, False):
         scenario = base.replace({"multirate.model_lgs_error": known})
         record = simulate(scenario)
-        error = (estimated("multirate-optimal", record, scenario)["turbulence"] - record.turbulence)[1000:]
+        error = (run_observer("multirate-optimal", record, scenario)["turbulence"] - record.turbulence)[1000:]
         realised[known] = np.sqrt(np.mean(error**2))
         cycle, rows = optimal_model(scenario.multirate, prior_of(scenario, record, PARTS), 0, 5)
         predicted[known] = np.sqrt(np.mean([(rows @ s.filtered @ rows.T)[0, 0] for s in periodic_steady_state(cycle)]))

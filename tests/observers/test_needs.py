@@ -10,7 +10,7 @@ import pytest
 
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import BANDS, LINES, MODEL, TRAINING, Observer
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -51,7 +51,7 @@ def _record() -> Record:
 
 
 def estimates(observer: Observer, record: Record, s: Scenario) -> np.ndarray:
-    return np.concatenate([values.ravel() for values in estimated(observer.id, record, s).values()])
+    return np.concatenate([values.ravel() for values in run_observer(observer.id, record, s).values()])
 
 
 @pytest.mark.parametrize("name", OBSERVERS)
@@ -67,9 +67,9 @@ def test_an_observer_depends_on_what_it_is_said_to_need(name: str, record: Recor
     learnt = replace(record, training=replace(record.training, y_lgs=record.training.y_lgs[::-1].copy()))
     if not np.array_equal(estimates(observer, learnt, scenario()), base, equal_nan=True):
         depends.add(TRAINING)
-    assert depends == set(observer.given)
+    assert depends == set(observer.needed_parts)
 
 
 def test_what_learns_from_a_record_needs_it_in_the_record() -> None:
     for observer in OBSERVERS.values():
-        assert (TRAINING in observer.given) == ("training" in observer.needs)
+        assert (TRAINING in observer.needed_parts) == ("training" in observer.needs)

@@ -18,7 +18,7 @@ from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
-from wfsobs.testing.reach import SEED, given_away, reached
+from wfsobs.testing.reach import SEED, given_away, walk_references
 
 
 def scenario(inputs_filter: str = "raw") -> Scenario:
@@ -85,7 +85,7 @@ def test_what_reached_the_truth_would_be_found(record: Record, monkeypatch: pyte
 @pytest.mark.parametrize("observer", OBSERVERS.values(), ids=OBSERVERS)
 def test_arguments_have_memory_of_their_own(observer: Observer, record: Record) -> None:
     measured, prior, settings = door.arguments(observer, record, scenario())
-    arrays = [x for x in reached(measured, prior, settings) if isinstance(x, np.ndarray)]
+    arrays = [x for x in walk_references(measured, prior, settings) if isinstance(x, np.ndarray)]
     assert len(arrays) >= 3
     assert all(x.base is None and x.flags.owndata and x.flags.c_contiguous for x in arrays)
     assert (measured.open_loop_y is None) == ("open_loop_y" not in observer.needs)

@@ -12,7 +12,7 @@ from scipy.signal import butter, freqz_sos, lfilter
 
 from wfsobs.evaluation.scores import lag
 from wfsobs.observers.baselines import open_loop_reference
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -101,10 +101,10 @@ def test_both_references_on_a_record() -> None:
     r = simulate(s)
     assert r.open_loop_y is not None
     b = s.butterworth
-    ol = estimated("butterworth-ol", r, s)["vibration"]
+    ol = run_observer("butterworth-ol", r, s)["vibration"]
     assert np.array_equal(ol[:-1], filter_zero_phase(bandpass_bank(b.frequencies, 3.0, 1, 1e-3), r.open_loop_y)[1:])
     z = r.y_lgs - np.vstack([np.zeros((2, 2)), r.u[:-2]])
-    cl = estimated("butterworth-cl", r, s)["vibration"]
+    cl = run_observer("butterworth-cl", r, s)["vibration"]
     wanted = sum(lfilter(*one_band(f, 2.0, 1e-3), z, axis=0) for f in b.frequencies)
     assert np.abs(cl - wanted).max() < 1e-11
 
@@ -123,7 +123,7 @@ def test_the_causal_reference_is_one_step_late_on_a_settled_tone(f: float) -> No
     )
     r = simulate(s)
     assert r.vibration is not None
-    found = lag(r.vibration[3000:, 0], estimated("butterworth-cl", r, s)["vibration"][3000:, 0], r.dt)
+    found = lag(r.vibration[3000:, 0], run_observer("butterworth-cl", r, s)["vibration"][3000:, 0], r.dt)
     # the band's phase at its arithmetic centre (the geometric one has none) is below 2 (bandwidth / 8 f) rad
     assert found is not None and abs(found - 1e-3) < 2.0 / 8 / f / (np.pi * f) + 2e-5
 
@@ -141,6 +141,6 @@ def test_order_reaches_the_filter() -> None:
 
 def test_zero_is_zero_for_both_targets() -> None:
     r = simulate(scenario())
-    found = estimated("zero", r, scenario())
+    found = run_observer("zero", r, scenario())
     assert sorted(found) == ["turbulence", "vibration"]
     assert all(v.shape == r.y_lgs.shape and not v.any() for v in found.values())

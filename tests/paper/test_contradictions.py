@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 from wfsobs.observers.kalman.multirate import multirate_noise
 from wfsobs.observers.kalman.single import steady_filter
-from wfsobs.pipeline import estimated
+from wfsobs.pipeline import run_observer
 from wfsobs.priors_from.scenario import kalman_model, model_of, modelled_processes
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -86,7 +86,7 @@ def test_printed_input_matrix_makes_the_filter_worse(case: tuple[Scenario, Recor
             x = A @ x + B_u * record.u[k, 0]
         assert record.turbulence is not None
         errors.append(np.std((out - record.turbulence[:, 0])[1000:]))
-    built = np.std((estimated("kf-lgs", record, s)["turbulence"] - record.turbulence)[1000:, 0])
+    built = np.std((run_observer("kf-lgs", record, s)["turbulence"] - record.turbulence)[1000:, 0])
     assert errors[0] == pytest.approx(built, rel=1e-6)
     assert errors[1] > 1.02 * errors[0]
 
@@ -134,7 +134,7 @@ def test_a_predicted_state_is_corrected_with_the_filter_gain(case: tuple[Scenari
         return out
 
     built = run(one.L, both.L)
-    assert np.abs(built - estimated("multirate", record, s)["turbulence"][:, 0]).max() < 1e-9
+    assert np.abs(built - run_observer("multirate", record, s)["turbulence"][:, 0]).max() < 1e-9
     printed = run(one.K, both.K)
     errors = [np.std((out - record.turbulence[:, 0])[1000:]) for out in (built, printed)]
     assert errors[1] > 1.01 * errors[0]

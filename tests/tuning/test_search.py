@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.tuning.search import Spent, search
+from wfsobs.tuning.search import NoEvaluationLeft, minimise
 from wfsobs.tuning.space import numbers, space
 
 BASES = {name: PRESETS[name]() for name in ("paper", "ut4", "strong-turbulence")}
@@ -27,7 +27,7 @@ class Asked:
 
     def __call__(self, point):
         if len(self.points) == self.most:
-            raise Spent
+            raise NoEvaluationLeft
         self.points.append(np.array(point))
         self.values.append(self.f(point))
         return self.values[-1]
@@ -37,7 +37,7 @@ class Asked:
 def test_finds_the_bottom_of_a_bowl(d: int) -> None:
     where = np.linspace(0.2, 0.7, d)
     asked = Asked(lambda x: 1.0 + float(np.sum(np.arange(1, d + 1) * (x - where) ** 2)), 60)
-    search(asked, np.full(d, 0.95), 60, np.random.default_rng(1))
+    minimise(asked, np.full(d, 0.95), 60, np.random.default_rng(1))
     # A start of no use is up to 4.6 above 1, a random point of the cube 0.1 d^2 or so
     assert min(asked.values) < 1.0 + 0.01 * d
     assert all(np.all((p >= 0.0) & (p <= 1.0)) for p in asked.points)
@@ -45,10 +45,10 @@ def test_finds_the_bottom_of_a_bowl(d: int) -> None:
 
 def test_failures_are_no_end() -> None:
     asked = Asked(lambda x: inf if x[0] > 0.4 else 1.0 + (x[0] - 0.3) ** 2 + (x[1] - 0.6) ** 2, 60)
-    search(asked, np.array([0.9, 0.9]), 60, np.random.default_rng(2))
+    minimise(asked, np.array([0.9, 0.9]), 60, np.random.default_rng(2))
     assert asked.values[0] == inf and min(asked.values) < 1.001
     nothing = Asked(lambda x: inf, 60)
-    search(nothing, np.array([0.5]), 60, np.random.default_rng(2))
+    minimise(nothing, np.array([0.5]), 60, np.random.default_rng(2))
     assert len(nothing.values) == 21  # start and hypercube
 
 

@@ -25,8 +25,8 @@ from wfsobs.settings.group import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.sensor_noise import noise_covariance
 from wfsobs.tuning import Evaluation, tune
-from wfsobs.tuning.records import NEXT, REFERENCE, TRUTH, cut, piece, simulated, stream
-from wfsobs.tuning.report import plain, toml
+from wfsobs.tuning.records import NEXT, REFERENCE, TRUTH, cut_record, piece, simulate_records, stream
+from wfsobs.tuning.report import tuning_dict, tuning_toml
 from wfsobs.tuning.space import space
 
 
@@ -53,7 +53,7 @@ def test_before_and_after_on_test_are_what_a_run_prints(tuned) -> None:
 
 
 def test_saved_settings_give_the_tuned_scenario(tuned) -> None:
-    text = toml(tuned)
+    text = tuning_toml(tuned)
     assert configfile.from_toml(text) == tuned.scenario
     assert f"frequency = {tuned.scenario.kalman.frequency}  # tuned, 47.4969 before" in text
 
@@ -137,7 +137,7 @@ def test_a_filter_of_wrong_numbers_is_tuned_to_the_error_of_the_right_one() -> N
 
 def test_records_share_nothing() -> None:
     s = short()
-    found = simulated(s, space(s, "kf-lgs"), "vibration", None, QUIET)
+    found = simulate_records(s, space(s, "kf-lgs"), "vibration", None, QUIET)
     records = [found.validation, found.test(s)]
     training = found.validation.training
     assert training is not None and training.open_loop_y is not None
@@ -182,11 +182,11 @@ def test_telemetry_is_judged_by_what_there_is() -> None:
 def test_a_record_too_short_says_how_long_it_has_to_be(observer: str) -> None:
     record, s = telemetry(), short()
     with pytest.raises(RecordError, match="takes") as told:
-        cut(piece(record, 0, 2500), s, observer, "vibration")
+        cut_record(piece(record, 0, 2500), s, observer, "vibration")
     least = float(str(told.value).split("takes ")[1].split()[0])
-    cut(piece(record, 0, round(1000 * (least + 0.1))), s, observer, "vibration")
+    cut_record(piece(record, 0, round(1000 * (least + 0.1))), s, observer, "vibration")
     with pytest.raises(RecordError):
-        cut(piece(record, 0, round(1000 * (least - 0.1))), s, observer, "vibration")
+        cut_record(piece(record, 0, round(1000 * (least - 0.1))), s, observer, "vibration")
 
 
 @pytest.mark.parametrize("delay", [1, 2, 4])
@@ -205,7 +205,7 @@ def test_a_start_that_fails_is_no_end() -> None:
     tuned = tune(s, "gpr-online", ["gpr_online.depth"], evaluations=6)
     assert tuned.before.validation is None and "depth + training size" in tuned.history[0].reason
     assert tuned.after.test is not None and tuned.scenario.gpr_online.depth < 1100
-    assert "fails" in toml(tuned) and plain(tuned)["before"]["test_rms_um"] is None
+    assert "fails" in tuning_toml(tuned) and tuning_dict(tuned)["before"]["test_rms_um"] is None
     with pytest.raises(RecordError, match="depth"):
         tune(s.replace({"gpr_online.training_size": 1500}), "gpr-online", ["gpr_online.depth"], evaluations=6)
 

@@ -128,7 +128,7 @@ def _identify(_recorded: bool, arguments: Mapping[str, Any]) -> Lines:
         "for mode in found.modes:",
         "    for what, frequency, damping, rms in report.mode_rows(mode):",
         "        print(mode.name, what, *(n.value for n in (frequency, damping, rms) if n is not None))",
-        'print("\\n".join(report.verdict(found)))',
+        'print("\\n".join(report.whiteness_lines(found)))',
     ]
 
 

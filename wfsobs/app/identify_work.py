@@ -10,7 +10,7 @@ from wfsobs.app.jobs.job import Tell
 from wfsobs.app.work import RunResults
 from wfsobs.identification import Identification, identify
 from wfsobs.identification.result import IdentifiedMode
-from wfsobs.observers.missing import bridged
+from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Model
 from wfsobs.priors_from.scenario import prior_of
 from wfsobs.progress import Watch
@@ -55,7 +55,7 @@ class Fit:
 def measure(of: RunResults, _watch: Watch, _tell: Tell) -> MeasuredSpectrum:
     """Estimate the spectrum of the record shown, with the taper that the identification uses. Raises RecordError."""
     record = of.result.record
-    z = bridged(record, prior_of(of.result.scenario.before_events, record, (Model,))).z[record.delay :]
+    z = fill_missing(record, prior_of(of.result.scenario.before_events, record, (Model,))).z[record.delay :]
     z = z[: fast_length(len(z))]
     if len(z) < 100:
         raise RecordError(f"the record has {record.n_steps} samples, too few for a spectrum")

@@ -11,7 +11,7 @@ from wfsobs.cost import part_seconds
 from wfsobs.observers import OBSERVERS
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
-from wfsobs.tuning import Evaluation, Stage, Tuned, tune
+from wfsobs.tuning import Evaluation, Stage, TuningResult, tune
 from wfsobs.tuning.judge import Errors
 from wfsobs.tuning.records import MEASURES, TRUTH, judged_by
 from wfsobs.tuning.report import settings
@@ -47,7 +47,9 @@ def measure(of: RunResults, observer: str, target: str) -> str:
     return MEASURES[judged_by(of.result.record, observer, target)[1] if of.recorded else TRUTH]
 
 
-def compute(of: RunResults, scenario: Scenario, observer: str, target: str, evaluations: int, watch: Watch, tell: Tell) -> Tuned:
+def compute(
+    of: RunResults, scenario: Scenario, observer: str, target: str, evaluations: int, watch: Watch, tell: Tell
+) -> TuningResult:
     """Tune on simulated records, or on the pieces of a record that was loaded; tells of all evaluations so far.
 
     Raises SettingError, RecordError, Cancelled.
@@ -74,7 +76,7 @@ def best_so_far(history: Sequence[Evaluation]) -> list[float]:
     return out
 
 
-def rows(tuned: Tuned) -> Rows:
+def rows(tuned: TuningResult) -> Rows:
     """List settings as text, errors [um] by mode and together, a GPR's log marginal likelihoods by mode; None for failures."""
     out: Rows = [(SETTING, *row) for row in settings(tuned)]
     stages = tuned.before, tuned.after

@@ -1,5 +1,7 @@
-"""The same tasks with scikit-learn, filterpy and statsmodels (the extra `bench`), each as its users would write it
-when they care for speed: fixed hyper-parameters, steady gains."""
+"""The same tasks with scikit-learn, filterpy and statsmodels (the extra `bench`), as their users would write them for speed.
+
+Fixed hyper-parameters, steady gains.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +19,13 @@ LIBRARIES = {SKLEARN: "sklearn", FILTERPY: "filterpy", STATSMODELS: "statsmodels
 """Library -> the module it is imported as."""
 
 
-def installed() -> tuple[str, ...]:
+def is_installed() -> tuple[str, ...]:
     """Those of LIBRARIES that can be imported."""
     return tuple(name for name, module in LIBRARIES.items() if find_spec(module))
 
 
 def sklearn_regressor(kernel: SquaredExponential) -> Any:
-    """A GaussianProcessRegressor with the kernel's numbers, which it keeps."""
+    """Return a GaussianProcessRegressor with fixed numbers of the kernel."""
     from sklearn.gaussian_process import GaussianProcessRegressor  # pyright: ignore[reportMissingImports]
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel  # pyright: ignore[reportMissingImports]
 
@@ -72,8 +74,10 @@ def _filterpy_steps() -> tuple[Callable[..., Array], Callable[..., Array]]:
 
 
 def statsmodels_kalman(A: Array, C: Array, Q: Array, R: float, P: Array, z: Array) -> Array:
-    """Filtered states (n_steps, n) of the disturbance's model (n = 4, the mirror taken off: z (n_steps,)), started in
-    the steady state P (n, n), so that statsmodels finds it converged; its loop is compiled."""
+    """Return the filtered states (n_steps, n) of the disturbance model, with n = 4, of z (n_steps,).
+
+    It starts in the steady state P (n, n), so that statsmodels finds it converged; its loop is compiled.
+    """
     from statsmodels.tsa.statespace.kalman_filter import KalmanFilter  # pyright: ignore[reportMissingImports]
 
     n = len(A)

@@ -8,10 +8,10 @@ import numpy as np
 
 from wfsobs.bench import external, textbook
 from wfsobs.bench.external import FILTERPY, STATSMODELS
-from wfsobs.bench.measure import OURS, Row, max_error, row, timed
+from wfsobs.bench.measure import OURS, Row, max_error, measure_time, row
 from wfsobs.bench.sizes import Sizes
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.adaptive import adapting
+from wfsobs.observers.kalman.adaptive import adapt
 from wfsobs.observers.kalman.multirate import multirate_filter, multirate_noise
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.priors_from.scenario import model_of, modelled_processes
@@ -30,7 +30,7 @@ PHI = np.array([0, 2])
 
 
 def kalman_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
-    """The steady-state Kalman filter on LGS, one mode over a long record."""
+    """Time the steady-state Kalman filter on LGS, one mode over a long record."""
     scenario = sizes.scenario(sizes.filter_duration)
     record = simulate(scenario)
     y, u, n = record.y_lgs[:, 0], record.u[:, 0], record.n_steps
@@ -41,32 +41,32 @@ def kalman_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
     A, B, C, Q = paper_model(scenario, record.dt)
     steady = steady_state(A[:4, :4], C[:4], Q, np.array(noise**2))
     arguments = A, B, C, _with_mirror(steady.L[:, 0]), y, u
-    exact = _extended(textbook.kalman_loop, *arguments)[:, PHI]
+    exact = _extend(textbook.kalman_loop, *arguments)[:, PHI]
 
-    seconds, values = timed(lambda: ours.run(pseudo_open_loop(y, u)[:, None, None])[:, :, 0], sizes.repeats)
+    seconds, values = measure_time(lambda: ours.run(pseudo_open_loop(y, u)[:, None, None])[:, :, 0], sizes.repeats)
     yield row(task, size, OURS, seconds, n, error=_error(values, exact))
-    seconds, states = timed(lambda: textbook.kalman_loop(*arguments), sizes.repeats)
+    seconds, states = measure_time(lambda: textbook.kalman_loop(*arguments), sizes.repeats)
     yield row(task, size, "numpy-loop", seconds, n, error=_error(states[:, PHI], exact))
     if FILTERPY in libraries:
-        seconds, states = timed(lambda: external.filterpy_kalman(*arguments), sizes.repeats)
+        seconds, states = measure_time(lambda: external.filterpy_kalman(*arguments), sizes.repeats)
         yield row(task, size, FILTERPY, seconds, n, error=_error(states[:, PHI], exact))
     if STATSMODELS in libraries:
-        seconds, states = timed(
+        seconds, states = measure_time(
             lambda: external.statsmodels_kalman(A[:4, :4], C[:4], Q, noise**2, steady.P, pseudo_open_loop(y, u)), sizes.repeats
         )
         yield row(task, size, STATSMODELS, seconds, n, error=_error(states[:, PHI], exact))
 
 
 def adaptive_record(sizes: Sizes, _libraries: Collection[str]) -> Iterator[Row]:
-    """The adaptive Kalman filter, one mode over a long record: identification, Riccati equation and filter of every window."""
+    """Time the adaptive Kalman filter, one mode over a long record: identification and filter of every window."""
     scenario = sizes.scenario(sizes.filter_duration)
     z, a = simulate(scenario).z[:, 0], scenario.adaptive
-    seconds, _ = timed(lambda: adapting(z, scenario.dt, a, lambda _fraction: None), sizes.repeats)
+    seconds, _ = measure_time(lambda: adapt(z, scenario.dt, a, lambda _fraction: None), sizes.repeats)
     yield row("adaptive-record", f"{len(z)} steps, {a.window:g} s every {a.interval:g} s", OURS, seconds, len(z))
 
 
 def multirate_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
-    """The paper's multi-rate filter, one mode over a long record. statsmodels has no filter with given gains."""
+    """Time the paper's multi-rate filter, one mode over a long record. statsmodels has no filter with given gains."""
     scenario = sizes.scenario(sizes.filter_duration)
     record = simulate(scenario)
     assert record.ratio is not None
@@ -80,34 +80,34 @@ def multirate_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
     L = steady_state(A[:4, :4], C[:4], Q, np.array(lgs**2)).L[:, 0]
     L_both = steady_state(A[:4, :4], np.vstack([C[:4], C[:4]]), Q, np.diag([lgs**2, ngs**2])).L
     arguments = A, B, C, C_ngs, _with_mirror(L), _with_mirror(L_both), y, z_ngs, u
-    exact = _extended(textbook.multirate_loop, *arguments)[:, PHI]
+    exact = _extend(textbook.multirate_loop, *arguments)[:, PHI]
 
     def run_ours() -> Array:
         return ours.run(np.column_stack([pseudo_open_loop(y, u), np.nan_to_num(z_ngs)]))
 
-    seconds, values = timed(run_ours, sizes.repeats)
+    seconds, values = measure_time(run_ours, sizes.repeats)
     yield row(task, size, OURS, seconds, n, error=_error(values, exact))
-    seconds, states = timed(lambda: textbook.multirate_loop(*arguments), sizes.repeats)
+    seconds, states = measure_time(lambda: textbook.multirate_loop(*arguments), sizes.repeats)
     yield row(task, size, "numpy-loop", seconds, n, error=_error(states[:, PHI], exact))
     if FILTERPY in libraries:
-        seconds, states = timed(lambda: external.filterpy_multirate(*arguments), sizes.repeats)
+        seconds, states = measure_time(lambda: external.filterpy_multirate(*arguments), sizes.repeats)
         yield row(task, size, FILTERPY, seconds, n, error=_error(states[:, PHI], exact))
 
 
 def paper_model(scenario: Scenario, dt: float) -> tuple[Array, Array, Array, Array]:
-    """A (6, 6), B (6,), C (6,) of the paper's state, and Q (4, 4) [um^2] of its disturbances."""
+    """Return A (6, 6), B (6,), C (6,) of the paper's state, and Q (4, 4) [um^2] of its disturbances."""
     turbulence, vibration = modelled_processes(scenario, 0, dt)
     drives = np.array([turbulence.drive_variance, 0.0, vibration.drive_variance, 0.0])
     return *paper_matrices(turbulence, vibration), np.diag(drives)
 
 
 def _with_mirror(L: Array) -> Array:
-    """A gain (4, ...) of the disturbances for the paper's state, of which the mirror's part is known, (6, ...)."""
+    """Extend a gain (4, ...) of the disturbances to the paper's state, (6, ...), whose commands are known."""
     return np.concatenate([L, np.zeros((2, *L.shape[1:]))])
 
 
-def _extended(loop: Callable[..., Array], *arguments: Array) -> Array:
-    """The first steps of a loop in extended precision."""
+def _extend(loop: Callable[..., Array], *arguments: Array) -> Array:
+    """Return the first steps of a loop in extended precision."""
     return loop(*(a.astype(np.longdouble)[:EXACT_STEPS] for a in arguments))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from wfsobs.bench import external, textbook
 from wfsobs.bench.external import SKLEARN
-from wfsobs.bench.measure import OURS, Row, max_error, row, timed
+from wfsobs.bench.measure import OURS, Row, max_error, measure_time, row
 from wfsobs.bench.sizes import Sizes
 from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.baselines import online_reference
@@ -55,7 +55,7 @@ class Online:
 
 
 def online_problem(record: Record, scenario: Scenario, mode: int, count: int) -> Online:
-    """The problem of one mode, with `count` rows for the others."""
+    """Return the problem of one mode, with `count` rows for the others."""
     g = scenario.gpr_online
     X = textbook.windows(window_signals(g, record.y_lgs, record.u, record.z, mode, record.dt), g.depth)
     f = np.append(online_reference(bands_of(scenario), record.z, record.dt)[g.depth :, mode], 0.0)
@@ -63,21 +63,21 @@ def online_problem(record: Record, scenario: Scenario, mode: int, count: int) ->
     return Online(X, f, g.training_size, g.depth, kernel_of(g), rows)
 
 
-def cut(record: Record, n_steps: int, n_modes: int) -> Record:
-    """The start of a record, its measurements and commands alone."""
+def cut_windows(record: Record, n_steps: int, n_modes: int) -> Record:
+    """Return the start of a record, its measurements and commands alone."""
     part = np.s_[:n_steps, :n_modes]
     return Record(y_lgs=record.y_lgs[part], u=record.u[part], dt=record.dt)
 
 
 def online_record(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
-    """The online GPR over a record; `ours` is one mode, `ours-two-modes` both at the same time."""
+    """Time the online GPR over a record; `ours` is one mode, `ours-two-modes` both at the same time."""
     scenario = sizes.scenario(sizes.duration)
     record = simulate(scenario)
     yield from _online_record(record, scenario, sizes, libraries, sizes.textbook_steps, both=True)
     for m, depth in sizes.more_online:
         changes = {"gpr_online.training_size": m, "gpr_online.depth": depth}
         scenario = sizes.scenario(sizes.duration, changes)
-        part = cut(record, m + depth - 1 + sizes.more_steps, 1)
+        part = cut_windows(record, m + depth - 1 + sizes.more_steps, 1)
         yield from _online_record(part, scenario, sizes, (), max(1, sizes.textbook_steps // 4), both=False)
 
 
@@ -89,9 +89,9 @@ def _online_record(
     steps = record.n_steps - g.depth - g.training_size + 1
     ours = []
     for variant, n_modes in ((OURS, 1), ("ours-two-modes", 2)) if both else ((OURS, 1),):
-        part = cut(record, record.n_steps, n_modes)
+        part = cut_windows(record, record.n_steps, n_modes)
         given = part.measurements(), prior_of(scenario, part, (Bands,)), g
-        seconds, result = timed(lambda given=given: gpr_online(*given, QUIET)[VIBRATION], sizes.repeats)
+        seconds, result = measure_time(lambda given=given: gpr_online(*given, QUIET)[VIBRATION], sizes.repeats)
         ours.append((variant, seconds, result[:, 0]))
     problem = online_problem(record, scenario, 0, count)  # only now: much memory held slows down the allocation of more
     std = float(np.nanstd(ours[0][2]))
@@ -103,16 +103,16 @@ def _online_record(
         others.append((SKLEARN, external.sklearn_online, sizes.library_steps))
     for variant, predict, n in others:
         p = replace(problem, rows=problem.rows[:: -(-len(problem.rows) // n)])
-        seconds, values = timed(lambda p=p, predict=predict: predict(p.X, p.f, p.rows, p.m, p.kernel), sizes.repeats)
+        seconds, values = measure_time(lambda p=p, predict=predict: predict(p.X, p.f, p.rows, p.m, p.kernel), sizes.repeats)
         yield row(task, size, variant, seconds, len(p.rows), error=p.error(values, std, sizes.exact_steps))
 
 
 def online_stream(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
-    """The online GPR of one mode one sample at a time. Both do beforehand what does not need the sample."""
+    """Time the online GPR of one mode one sample at a time. Both prepare what does not need the sample."""
     scenario = sizes.scenario(sizes.duration)
     g = scenario.gpr_online
     task, size = "online-gpr-stream", f"m={g.training_size} d={g.depth}"
-    record = cut(simulate(scenario), scenario.n_steps, 1)
+    record = cut_windows(simulate(scenario), scenario.n_steps, 1)
     runs = [_stream(scenario, record) for _ in range(sizes.repeats)]
     values = runs[-1][0]
     problem = online_problem(record, scenario, 0, sizes.textbook_steps)
@@ -139,7 +139,7 @@ def _stream(scenario: Scenario, record: Record) -> tuple[Array, Array]:
 
 
 def _textbook_stream(problem: Online) -> tuple[Array, Array]:
-    """The same for the problem's rows; what comes before the sample counts for the whole step."""
+    """Time the textbook's version for the problem's rows; the preparation counts for the whole step."""
     stream = textbook.OnlineStream(problem.X, problem.m, problem.kernel)
     values, times = np.empty(len(problem.rows)), np.empty((len(problem.rows), 2))
     for k, r in enumerate(problem.rows):
@@ -169,7 +169,7 @@ def _stream_row(task: str, size: str, variant: str, runs: list[Array], error: fl
 
 
 def offline(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
-    """The offline GPR of one mode: training, then prediction at every step of a record."""
+    """Time the offline GPR of one mode: training, then prediction at every step of a record."""
     scenario = sizes.scenario(sizes.duration)
     record, g = simulate(scenario), scenario.gpr_offline
     training, kernel, d, m = record.training, kernel_of(g), g.depth, g.training_size
@@ -183,21 +183,21 @@ def offline(sizes: Sizes, libraries: Collection[str]) -> Iterator[Row]:
     some = slice(None, None, -(-len(T) // (50 * sizes.library_steps)))
     exact_mean = textbook.exact_predict(T[some], X, exact, constant, kernel)
 
-    seconds, model = timed(lambda: train(learn, targets, d, m, kernel), sizes.repeats)
+    seconds, model = measure_time(lambda: train(learn, targets, d, m, kernel), sizes.repeats)
     yield row(task, size, OURS, seconds, error=max_error(model.weights, exact))
-    seconds, weights = timed(lambda: textbook.train(X, f, kernel), sizes.repeats)
+    seconds, weights = measure_time(lambda: textbook.train_textbook(X, f, kernel), sizes.repeats)
     yield row(task, size, "gemm-cholesky", seconds, error=max_error(weights, exact))
     regressor = None
     if SKLEARN in libraries:
-        seconds, regressor = timed(lambda: external.sklearn_regressor(kernel).fit(X, f), sizes.repeats)
+        seconds, regressor = measure_time(lambda: external.sklearn_regressor(kernel).fit(X, f), sizes.repeats)
         yield row(task, size, SKLEARN, seconds, error=max_error(regressor.alpha_, exact))
 
     task = "offline-gpr-predict"
-    seconds, values = timed(lambda: model.predict(signals)[d - 1 :], sizes.repeats)
+    seconds, values = measure_time(lambda: model.predict(signals)[d - 1 :], sizes.repeats)
     yield row(task, size, OURS, seconds, len(T), error=max_error(values[some], exact_mean))
-    seconds, values = timed(lambda: textbook.predict(T, X, weights, kernel), sizes.repeats)
+    seconds, values = measure_time(lambda: textbook.predict_textbook(T, X, weights, kernel), sizes.repeats)
     yield row(task, size, "gemm-stored-weights", seconds, len(T), error=max_error(values[some], exact_mean))
     if regressor is not None:
         part = T[some]
-        seconds, values = timed(lambda: regressor.predict(part), sizes.repeats)
+        seconds, values = measure_time(lambda: regressor.predict(part), sizes.repeats)
         yield row(task, size, SKLEARN, seconds, len(part), error=max_error(values, exact_mean))

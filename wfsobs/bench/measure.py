@@ -37,7 +37,7 @@ ENOUGH = 0.25
 T = TypeVar("T")
 
 
-def timed(work: Callable[[], T], repeats: int) -> tuple[float, T]:
+def measure_time(work: Callable[[], T], repeats: int) -> tuple[float, T]:
     """Median time of the work [s] over at least `repeats` calls, and what the last one returned."""
     seconds: list[float] = []
     while True:
@@ -61,7 +61,7 @@ def row(
     error: float | None = None,
     peak_memory_mb: float | None = None,
 ) -> Row:
-    """A measurement, its ratio still open."""
+    """Return a measurement, without its ratio."""
     if per_step_us is None and steps is not None:
         per_step_us = seconds / steps * 1e6
     return {
@@ -80,7 +80,7 @@ def row(
 
 
 def with_ratios(rows: Sequence[Row]) -> list[Row]:
-    """The rows with their ratio to `ours` of the same task and size."""
+    """Return the rows with their ratio to `ours` of the same task and size."""
     ours = {(r["task"], r["size"]): _cost(r) for r in rows if r["variant"] == OURS}
     return [{**r, "ratio_to_ours": _cost(r) / ours[r["task"], r["size"]]} for r in rows]
 

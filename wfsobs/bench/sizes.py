@@ -41,7 +41,7 @@ class Sizes:
     longest_duration: float | None = None
 
     def scenario(self, duration: float, changes: Mapping[str, Any] | None = None) -> Scenario:
-        """The scenario of a task: preset, settings, duration [s], and the task's own changes."""
+        """Return the scenario of a task: preset, settings, duration [s], and the task's own changes."""
         return paper().replace({**self.settings, "run.duration": duration, **(changes or {})})
 
 

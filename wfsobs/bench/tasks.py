@@ -10,11 +10,11 @@ from threadpoolctl import threadpool_limits
 from wfsobs.bench import external
 from wfsobs.bench.filters import adaptive_record, kalman_record, multirate_record
 from wfsobs.bench.gpr import offline, online_record, online_stream
-from wfsobs.bench.measure import OURS, Row, peak_memory_mb, row, timed, with_ratios
+from wfsobs.bench.measure import OURS, Row, measure_time, peak_memory_mb, row, with_ratios
 from wfsobs.bench.sizes import Sizes
 from wfsobs.bench.turbulence import frozen
 from wfsobs.observers import OBSERVERS
-from wfsobs.pipeline import estimated, run
+from wfsobs.pipeline import run, run_observer
 from wfsobs.simulation.loop import simulate
 
 
@@ -26,23 +26,23 @@ class Task(NamedTuple):
 
 
 def longest_run(sizes: Sizes, _libraries: Collection[str]) -> Iterator[Row]:
-    """A long run; first of all, so that the memory is its own."""
+    """Time a long run; the first task, so that the memory is its own."""
     if sizes.longest_duration is not None:
         scenario = sizes.scenario(sizes.longest_duration)
-        seconds, _ = timed(lambda: run(scenario), 1)
+        seconds, _ = measure_time(lambda: run(scenario), 1)
         size = _length(sizes.longest_duration)
         yield row("whole-run", size, OURS, seconds, scenario.n_steps, peak_memory_mb=peak_memory_mb())
 
 
 def whole_run(sizes: Sizes, _libraries: Collection[str]) -> Iterator[Row]:
-    """Simulation, every observer on two modes, scores."""
+    """Time simulation, every observer on two modes, and scores."""
     scenario, size = sizes.scenario(sizes.duration), _length(sizes.duration)
-    seconds, _ = timed(lambda: run(scenario), sizes.repeats)
+    seconds, _ = measure_time(lambda: run(scenario), sizes.repeats)
     yield row("whole-run", size, OURS, seconds, scenario.n_steps)
     learning = tuple(name for name, observer in OBSERVERS.items() if observer.slow)
     for variant, left_out in (("without-online-gpr", ("gpr-online",)), ("without-learning", learning)):
         quick = [name for name in OBSERVERS if name not in left_out]
-        seconds, _ = timed(lambda quick=quick: run(scenario, observers=quick), sizes.repeats)
+        seconds, _ = measure_time(lambda quick=quick: run(scenario, observers=quick), sizes.repeats)
         yield row("whole-run", size, variant, seconds, scenario.n_steps)
 
 
@@ -52,7 +52,7 @@ def each_observer(sizes: Sizes, _libraries: Collection[str]) -> Iterator[Row]:
     record = simulate(scenario)
     for name in OBSERVERS:
         try:
-            seconds, _ = timed(lambda name=name: estimated(name, record, scenario), sizes.repeats)
+            seconds, _ = measure_time(lambda name=name: run_observer(name, record, scenario), sizes.repeats)
         except ValueError:
             continue
         yield row("observer", f"{name}, {size}", OURS, seconds, record.n_steps)
@@ -81,7 +81,7 @@ def measure_all(
     sizes: Sizes, progress: Callable[[float], None] | None = None, libraries: Sequence[str] | None = None
 ) -> list[Row]:
     """Every row. progress: told the fraction done; libraries: to compare with, by default those that are installed."""
-    libraries = external.installed() if libraries is None else libraries
+    libraries = external.is_installed() if libraries is None else libraries
     total, done = sum(task.weight for task in TASKS), 0.0
     found: list[list[Row]] = []
     with threadpool_limits(1, user_api="blas"):

@@ -1,13 +1,11 @@
-"""The textbook versions that ours are compared with: correct, vectorised where a textbook is, nothing shared
-between steps.
+"""Textbook versions for comparison: correct, vectorised where a textbook is, nothing shared between steps.
 
-`windows` are handed to them ready made, one per row, which costs them nothing in the comparison. The kernel is
-written as in any textbook,
+`windows` are prepared, one per row, at no cost in the comparison. The kernel is written as in any textbook,
 
     K = s2 exp(-|x - x'|^2 / 2 l^2),    |x - x'|^2 = |x|^2 + |x'|^2 - 2 <x, x'>,
 
-with all the inner products from one matrix product (gemm). The `exact_` functions are what errors are measured
-against: the same regression in the split form of `observers.kernels`, which is well conditioned, from direct products.
+with all the inner products from one matrix product (gemm). The `exact_` functions are the reference of errors:
+the same regression in the split form of `observers.kernels`, which is well conditioned, from direct products.
 """
 
 from __future__ import annotations
@@ -24,13 +22,13 @@ BLOCK = 256
 
 
 def windows(signals: Array, depth: int) -> Array:
-    """The window ending at every step from depth - 1 on, (n - depth + 1, channels * depth); signals (n, channels)."""
+    """Return the window ending at every step from depth - 1 on, (n - depth + 1, channels * depth), of signals (n, channels)."""
     view = sliding_window_view(signals, depth, axis=0)
     return view.reshape(len(view), -1)
 
 
 def covariance(X: Array, Z: Array, kernel: SquaredExponential) -> Array:
-    """The squared-exponential kernel between the rows of X (n, p) and of Z (m, p), (n, m), by one gemm."""
+    """Return the squared-exponential kernel between the rows of X (n, p) and of Z (m, p), (n, m), by one gemm."""
     K = X @ Z.T
     K *= -2.0
     K += np.einsum("ij,ij->i", X, X)[:, None]
@@ -41,7 +39,7 @@ def covariance(X: Array, Z: Array, kernel: SquaredExponential) -> Array:
     return K
 
 
-def factorise(X: Array, kernel: SquaredExponential) -> tuple[Array, bool]:
+def cholesky_factor(X: Array, kernel: SquaredExponential) -> tuple[Array, bool]:
     """Cholesky factor of K + sigma_n^2 I of the windows X (m, p)."""
     K = covariance(X, X, kernel)
     K.flat[:: len(X) + 1] += kernel.noise_std**2
@@ -49,12 +47,12 @@ def factorise(X: Array, kernel: SquaredExponential) -> tuple[Array, bool]:
     return cho_factor(K.T, lower=True, overwrite_a=True, check_finite=False)
 
 
-def train(X: Array, f: Array, kernel: SquaredExponential) -> Array:
+def train_textbook(X: Array, f: Array, kernel: SquaredExponential) -> Array:
     """Weights (K + sigma_n^2 I)^-1 f, (m,), of windows X (m, p) and targets f (m,)."""
-    return cho_solve(factorise(X, kernel), f, check_finite=False)
+    return cho_solve(cholesky_factor(X, kernel), f, check_finite=False)
 
 
-def predict(X: Array, trained_on: Array, weights: Array, kernel: SquaredExponential) -> Array:
+def predict_textbook(X: Array, trained_on: Array, weights: Array, kernel: SquaredExponential) -> Array:
     """Mean at the windows X (n, p) from stored weights (m,) of the windows `trained_on` (m, p), (n,)."""
     out = np.empty(len(X))
     for start in range(0, len(X), BLOCK):
@@ -65,7 +63,12 @@ def predict(X: Array, trained_on: Array, weights: Array, kernel: SquaredExponent
 
 def predict_online(X: Array, f: Array, rows: Array, m: int, kernel: SquaredExponential) -> Array:
     """Mean at some rows of X (n, p), each trained anew on the m rows before it and their targets in f (n,)."""
-    return np.array([predict(X[r : r + 1], X[r - m : r], train(X[r - m : r], f[r - m : r], kernel), kernel)[0] for r in rows])
+    return np.array(
+        [
+            predict_textbook(X[r : r + 1], X[r - m : r], train_textbook(X[r - m : r], f[r - m : r], kernel), kernel)[0]
+            for r in rows
+        ]
+    )
 
 
 class OnlineStream:
@@ -77,7 +80,7 @@ class OnlineStream:
     def prepare(self, row: int) -> None:
         """Kernel and Cholesky factor of the training windows of a row of X."""
         self._trained_on = self.X[row - self.m : row]
-        self._factor = factorise(self._trained_on, self.kernel)
+        self._factor = cholesky_factor(self._trained_on, self.kernel)
 
     def estimate(self, row: int, f: Array) -> float:
         """Mean at the row, from targets f (m,) of which the newest has come with the sample."""
@@ -86,7 +89,7 @@ class OnlineStream:
 
 
 def kalman_loop(A: Array, B: Array, C: Array, L: Array, y: Array, u: Array) -> Array:
-    """The steady-state Kalman filter of the paper's eq. 8 and 9, step by step; filtered states (n_steps, n).
+    """Run the steady-state Kalman filter of the paper's eq. 8 and 9, step by step; return the filtered states (n_steps, n).
 
     A (n, n), B (n,), C (n,), filter gain L (n,), y, u (n_steps,). Works in the precision of its arguments.
     """
@@ -101,7 +104,7 @@ def kalman_loop(A: Array, B: Array, C: Array, L: Array, y: Array, u: Array) -> A
 def multirate_loop(
     A: Array, B: Array, C: Array, C_ngs: Array, L: Array, L_both: Array, y: Array, z_ngs: Array, u: Array
 ) -> Array:
-    """The paper's multi-rate filter (eq. 11), step by step; filtered states (n_steps, n).
+    """Run the paper's multi-rate filter (eq. 11), step by step; return the filtered states (n_steps, n).
 
     L (n,) where there is an LGS measurement alone, L_both (n, 2) where z_ngs (n_steps,) is not NaN.
     """
@@ -131,7 +134,7 @@ def exact_predict(X: Array, trained_on: Array, w: Array, c: float, kernel: Squar
 
 
 def exact_online(X: Array, f: Array, rows: Array, m: int, kernel: SquaredExponential) -> Array:
-    """What `predict_online` approximates."""
+    """Return the exact values of `predict_online`."""
     trained = [exact_weights(X[r - m : r], f[r - m : r], kernel) for r in rows]
     return np.array([exact_predict(X[r : r + 1], X[r - m : r], w, c, kernel)[0] for r, (w, c) in zip(rows, trained, strict=True)])
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.bench.measure import OURS, Row, peak_memory_mb, row, timed
+from wfsobs.bench.measure import OURS, Row, measure_time, peak_memory_mb, row
 from wfsobs.bench.sizes import Sizes
 from wfsobs.progress import QUIET
 from wfsobs.scenario import Scenario
@@ -37,7 +37,7 @@ def frozen(sizes: Sizes, _libraries: Collection[str]) -> Iterator[Row]:
         scenario = sizes.scenario(sizes.duration, changes)
         for variant, kind in ((OURS, "shack-hartmann"), ("ideal-sensors", "zernike")):
             made = scenario.replace({"sensors.kind": kind})
-            seconds, _ = timed(lambda made=made: _make(made), repeats)
+            seconds, _ = measure_time(lambda made=made: _make(made), repeats)
             yield row("frozen-flow", _size(scenario), variant, seconds, scenario.n_steps, peak_memory_mb=peak_memory_mb())
 
 

@@ -19,7 +19,7 @@ def bench(full: bool, as_json: bool) -> None:
     """Time the observers beside textbook versions, and other libraries if installed (wfsobs[bench])."""
     with progress_bar("benchmarks") as update:
         measured = benches.measure_all(benches.FULL if full else benches.QUICK, update)
-    missing = [name for name in benches.LIBRARIES if name not in benches.installed()]
+    missing = [name for name in benches.LIBRARIES if name not in benches.is_installed()]
     if missing:
         click.echo(f"wfsobs: bench: without {', '.join(missing)}; the extra wfsobs[bench] installs them", err=True)
     if as_json:

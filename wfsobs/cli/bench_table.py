@@ -11,7 +11,7 @@ from wfsobs.bench.measure import Row
 
 
 def bench_table(rows: Sequence[Row], markdown: bool = False) -> Table:
-    """The rows for people; `markdown` draws the table as Markdown does."""
+    """Return the table of the rows; `markdown` draws it as Markdown."""
     table = Table(box=box.MARKDOWN if markdown else box.HEAVY_HEAD)
     memory = any(r["peak_memory_mb"] is not None for r in rows)
     for name in ("Task", "Size", "Variant"):

@@ -35,11 +35,11 @@ class Commands(click.Group):
     """Imports a command when it is called, and turns the errors a user can cause into one line and exit status 2."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names of all commands."""
+        """Return the names of all commands."""
         return sorted(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The command of this name."""
+        """Return the command of this name."""
         if cmd_name not in COMMANDS:
             return None
         return getattr(import_module(f"wfsobs.cli.{COMMANDS[cmd_name].module}"), cmd_name)

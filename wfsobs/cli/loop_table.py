@@ -12,7 +12,7 @@ from wfsobs.evaluation.rows import Row
 
 
 def loop_table(rows: Sequence[Row]) -> Table:
-    """The residual table, best controller first; over several seeds the medians, with the spread (smallest to largest)."""
+    """Return the residual table, best controller first; over several seeds the medians, with the smallest and the largest."""
     several = len({r["seed"] for r in rows}) > 1
     out = Table(title="Residual in closed loop after warm-up" + (", median over seeds" if several else ""))
     for name in ("Mode", "Controller", "Needs"):

@@ -32,7 +32,7 @@ def scenario_options(command: Callable) -> Callable:
 
 
 def record_options(command: Callable) -> Callable:
-    """--unit, --command-sign, --command-delay and --rate, what a record does not say of itself; --sha256, which one it is."""
+    """Add --unit, --command-sign, --command-delay, --rate and --sha256, the declarations on a record file."""
     for option in (
         click.option("--sha256", metavar="HEX", help="Refuse the record unless its file has this SHA-256."),
         click.option(
@@ -55,8 +55,8 @@ def record_options(command: Callable) -> Callable:
     return command
 
 
-def loaded(record_file: str, scenario: Scenario, stated: DeclaredFormat, sha256: str | None = None) -> Record:
-    """The record of a file; what was understood of it is said on standard error."""
+def load_declared(record_file: str, scenario: Scenario, stated: DeclaredFormat, sha256: str | None = None) -> Record:
+    """Read the record of a file; print its interpretation on standard error."""
     record = load_record(record_file, scenario, stated, sha256)
     if record.origin:
         click.echo(f"wfsobs: {record_file}: read as {record.origin}", err=True)

@@ -55,7 +55,7 @@ class OverTime:
                 ]
 
     def table(self) -> Table:
-        """What every event did to every observer; the error at some times where there is no event."""
+        """Return the table of recoveries after events; without events, the error at some times."""
         return self._recoveries() if self.scenario.events else self._times()
 
     def _series(self) -> list[tuple[str, str, str, np.ndarray]]:

@@ -59,7 +59,7 @@ def warn(result: Result) -> None:
 
 @contextmanager
 def progress_bar(what: str = "observers") -> Iterator[Callable[[float], None]]:
-    """A progress bar on standard error where that is a terminal; gives the function that moves it."""
+    """Show a progress bar on standard error where that is a terminal; yield the function that moves it."""
     console = Console(stderr=True)
     columns = (TextColumn(what), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:

@@ -7,7 +7,7 @@ import json
 import click
 
 from wfsobs.cli.loop_table import loop_table
-from wfsobs.cli.options import loaded, record_options, scenario_options
+from wfsobs.cli.options import load_declared, record_options, scenario_options
 from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.show import progress_bar, show, show_over_time, show_table, show_verdicts, warn
 from wfsobs.closed_loop.design import design
@@ -111,7 +111,7 @@ def loop(
         if seeds > 1:
             raise SettingError("--seeds: is for simulated records, leave it out with --record")
         stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
-        record = loaded(record_file, scenario, stated, sha256)
+        record = load_declared(record_file, scenario, stated, sha256)
         scenario = as_stated(record, scenario)
     all_rows: list[Row] = []
     with progress_bar("controllers") as update:

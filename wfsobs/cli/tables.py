@@ -12,9 +12,11 @@ from wfsobs.evaluation.scores import RESIDUAL
 
 
 def score_table(rows: Sequence[Row]) -> Table:
-    """The RMS table, of errors or, without truth, of predictions; over several seeds the medians, with the spread (smallest
-    to largest) of the error. The bound has the interval in which an optimal observer's error lies in 95 % of records. Its
-    caption says which samples were scored."""
+    """Return the RMS table, of errors or, without truth, of predictions.
+
+    Over several seeds the medians, with the smallest and the largest error. The bound has the interval of an optimal observer's
+    error in 95 % of records. The caption gives the interval of the scored samples.
+    """
     several = len({r["seed"] for r in rows}) > 1
     unknown = any(r["target"] == RESIDUAL for r in rows)
     title, base = ("One-step prediction error of z, and residual,", "z") if unknown else ("RMS error", "truth")
@@ -49,12 +51,12 @@ def score_table(rows: Sequence[Row]) -> Table:
 
 
 def _own(same: Sequence[Row]) -> str:
-    """What is said of an observer that stands apart, for some seeds or all."""
+    """Return the remark on an observer that stands apart, for some seeds or all."""
     return f" ({own_interval(own[0])})" if (own := [r for r in same if r["apart"]]) else ""
 
 
 def _caption(rows: Sequence[Row]) -> str:
-    """What was scored, target by target where they differ."""
+    """Return the interval of the scored samples, target by target where they differ."""
     found = {
         target: scored_interval(r for r in rows if r["target"] == target) for target in dict.fromkeys(r["target"] for r in rows)
     }

@@ -7,7 +7,7 @@ import json
 import click
 
 from wfsobs.cli.identification_table import identification_table
-from wfsobs.cli.options import loaded, record_options, scenario_options
+from wfsobs.cli.options import load_declared, record_options, scenario_options
 from wfsobs.cli.show import progress_bar, show, show_table, warn
 from wfsobs.evaluation.rows import score_rows
 from wfsobs.files import check_writable, write_whole
@@ -52,7 +52,7 @@ def observe(
         for path, value in map(configfile.parse_assignment, assignments):
             scenario.set(path, value)
     stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
-    record = loaded(record_file, scenario, stated, sha256)
+    record = load_declared(record_file, scenario, stated, sha256)
     with progress_bar() as update:
         result = observe_record(record, scenario, watch=Watch(progress=update))
     warn(result)
@@ -104,7 +104,7 @@ def identify(
     """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
     scenario = configfile.scenario_from(preset, config, assignments)
     stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
-    record = loaded(record_file, scenario, stated, sha256)
+    record = load_declared(record_file, scenario, stated, sha256)
     if out:
         check_writable(out)
     with progress_bar("sweeps") as update:
@@ -116,5 +116,5 @@ def identify(
         click.echo(json.dumps(identified.identification_dict(result), allow_nan=False))
         return
     show_table(identification_table(result))
-    for line in identified.verdict(result):
+    for line in identified.whiteness_lines(result):
         click.echo(line)

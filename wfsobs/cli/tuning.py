@@ -6,7 +6,7 @@ import json
 
 import click
 
-from wfsobs.cli.options import loaded, record_options, scenario_options
+from wfsobs.cli.options import load_declared, record_options, scenario_options
 from wfsobs.cli.show import progress_bar, show_table
 from wfsobs.cli.tuning_tables import errors_table, settings_table
 from wfsobs.files import check_writable, write_whole
@@ -76,7 +76,7 @@ def tune(
         if validation is not None:
             raise SettingError("--validation: is for simulated records, leave it out with --record")
         stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
-        record = loaded(record_file, scenario, stated, sha256)
+        record = load_declared(record_file, scenario, stated, sha256)
     if out:
         check_writable(out)
     with progress_bar("evaluations") as update:
@@ -91,12 +91,12 @@ def tune(
             watch=Watch(progress=update),
         )
     if out:
-        text = report.toml(tuned)
+        text = report.tuning_toml(tuned)
         write_whole(out, lambda file: file.write(text.encode()))
     if as_json:
-        click.echo(json.dumps(report.plain(tuned), allow_nan=False))
+        click.echo(json.dumps(report.tuning_dict(tuned), allow_nan=False))
         return
     show_table(settings_table(tuned))
     show_table(errors_table(tuned))
-    for line in report.remarks(tuned):
+    for line in report.tuning_remarks(tuned):
         click.echo(line)

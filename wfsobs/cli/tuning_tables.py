@@ -7,11 +7,11 @@ from rich.table import Table
 from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.tuning.report import nm, settings
-from wfsobs.tuning.tuning import Tuned
+from wfsobs.tuning.tuning import TuningResult
 
 
-def settings_table(tuned: Tuned) -> Table:
-    """The settings that were searched, and those that were set by hand for it, before and after."""
+def settings_table(tuned: TuningResult) -> Table:
+    """Return the table of searched settings, and of those set by hand for the search, before and after."""
     out = Table(title=f"{row_label(tuned.observer)}: settings after {len(tuned.history)} evaluations")
     out.add_column("Setting", no_wrap=True)
     for name in ("before", "after"):
@@ -21,7 +21,7 @@ def settings_table(tuned: Tuned) -> Table:
     return out
 
 
-def errors_table(tuned: Tuned) -> Table:
+def errors_table(tuned: TuningResult) -> Table:
     """Errors, or what takes their place, on validation and test record, mode by mode and together."""
     out = Table(title=f"{tuned.measure}{'' if tuned.target == PREDICTION else f' in {tuned.target}'}, nm")
     out.add_column("", no_wrap=True)

@@ -24,7 +24,7 @@ from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
 
 
 @dataclass(frozen=True)
-class Designed:
+class LawDesign:
     """A law in one mode and what theory says of it.
 
     law       : None for control by nothing, and where there is none
@@ -53,7 +53,7 @@ class Design:
 
     scenario: Scenario
     plant: Plant
-    laws: dict[str, tuple[Designed, ...]]
+    laws: dict[str, tuple[LawDesign, ...]]
     bound: tuple[float, ...] | None
     priors: dict[str, Prior] = field(default_factory=dict, repr=False)
 
@@ -72,7 +72,7 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None) -> Desi
     before, plant = scenario.before_events, plant_of(scenario)
     true = [true_spectra(before, mode) for mode in range(len(scenario.modes))] if has_known_spectra(before) else []
     spectra = [told_spectra(one) for one in true]
-    made = {c.id: _designed(c, before, plant, spectra) for c in chosen(controllers)}
+    made = {c.id: _design_one(c, before, plant, spectra) for c in select_controllers(controllers)}
     laws, priors = {name: laws for name, (laws, _) in made.items()}, {name: prior for name, (_, prior) in made.items()}
     if scenario.events:
         laws = {name: tuple(replace(one, predicted=None) for one in designed) for name, designed in laws.items()}
@@ -82,41 +82,41 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None) -> Desi
     return Design(scenario, plant, laws, least or None, priors)
 
 
-def chosen(controllers: Sequence[str] | None) -> list[Controller]:
-    """The controllers of these ids, in the order of the registry; all for None. Raises SettingError."""
+def select_controllers(controllers: Sequence[str] | None) -> list[Controller]:
+    """Return the controllers of these ids, in the order of the registry; all for None. Raises SettingError."""
     unknown = set(controllers or ()) - set(CONTROLLERS)
     if unknown:
         raise SettingError(f"controller {sorted(unknown)[0]!r}: no such controller; there are {', '.join(CONTROLLERS)}")
     return [c for c in CONTROLLERS.values() if controllers is None or c.id in controllers]
 
 
-def _designed(
+def _design_one(
     controller: Controller, scenario: Scenario, plant: Plant, spectra: Sequence[Spectra]
-) -> tuple[tuple[Designed, ...], Prior]:
+) -> tuple[tuple[LawDesign, ...], Prior]:
     """(one per mode, the prior that they were made with less its spectra)."""
     settings, modes = own_settings(controller, scenario), range(len(scenario.modes))
     try:
         prior = prior_for(controller, scenario, spectra)
     except ValueError as error:
-        return tuple(Designed(None, None, note=str(error)) for _ in modes), Prior()
+        return tuple(LawDesign(None, None, note=str(error)) for _ in modes), Prior()
     designed = (_of_mode(controller, prior, mode, plant, settings, spectra[mode] if spectra else None) for mode in modes)
     return tuple(designed), replace(prior, spectra=())
 
 
 def _of_mode(
     controller: Controller, prior: Prior, mode: int, plant: Plant, settings: Settings, spectra: Spectra | None
-) -> Designed:
+) -> LawDesign:
     if controller.law is None:
-        return Designed(None, True)
+        return LawDesign(None, True)
     try:
         law = controller.law(prior, mode, plant, settings)
     except UnstableCycle as error:
-        return Designed(None, False, note=str(error))
+        return LawDesign(None, False, note=str(error))
     except ValueError as error:
-        return Designed(None, None, note=str(error))
+        return LawDesign(None, None, note=str(error))
     stable, mirror = law.stable, plant.mirror
     if not stable or controller.predict is not None or not law.time_invariant:
-        return Designed(law, stable)
+        return LawDesign(law, stable)
     predicted = None if spectra is None else float(np.sqrt(residual_variance(law, spectra, mirror)))
     known = margins(lambda omega: mirror.response(omega) * law.response(omega), frequencies(law.poles), plant.dt)
-    return Designed(law, stable, predicted, known)
+    return LawDesign(law, stable, predicted, known)

@@ -66,7 +66,7 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
             out.append(
                 row(
                     outcome.controller,
-                    needed(outcome.controller, result.scenario),
+                    controller_needs(outcome.controller, result.scenario),
                     mode,
                     outcome.stable[mode],
                     left,
@@ -84,16 +84,16 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
     return out
 
 
-def needed(controller: str, scenario: Scenario) -> str:
-    """What a controller has to be given beside measurements, for people."""
-    return CONTROLLERS[controller].needed(own_settings(CONTROLLERS[controller], scenario))
+def controller_needs(controller: str, scenario: Scenario) -> str:
+    """Return what a controller needs beside measurements, for people."""
+    return CONTROLLERS[controller].needs_text(own_settings(CONTROLLERS[controller], scenario))
 
 
 def label(controller: str) -> str:
-    """A controller's name for people."""
+    """Return a controller's label."""
     return NOT_OBSERVERS[BOUND] if controller == BOUND else CONTROLLERS[controller].label
 
 
 def linear(same: Sequence[Row], value: str) -> str:
-    """What is shown of the linear loop: not applicable where a limit of the mirror acts in any of the rows."""
+    """Return the text of a number of the linear loop: not applicable where a limit of the mirror acts in any of the rows."""
     return NOT_APPLICABLE if any(r["limited"] for r in same) else value

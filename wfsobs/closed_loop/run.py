@@ -13,11 +13,11 @@ from math import pi
 
 import numpy as np
 
-from wfsobs.closed_loop.design import Design, Designed, design
+from wfsobs.closed_loop.design import Design, LawDesign, design
 from wfsobs.control.base import Controller
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.pipeline import as_stated
-from wfsobs.priors_from.controllers import arguments, own_settings
+from wfsobs.priors_from.controllers import controller_arguments, own_settings
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
@@ -59,9 +59,32 @@ class ClosedLoop:
 
 
 def close_loop(scenario: Scenario, *, controllers: Sequence[str] | None = None, watch: Watch = QUIET) -> ClosedLoop:
-    """Simulate a disturbance and close the loop on it with every controller (all unless named).
+    """Simulate a disturbance and close the loop on it with every controller.
 
-    Raises SettingError where settings do not go together or a controller is unknown, Cancelled.
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings of the run.
+    controllers : sequence of str, optional
+        Ids of the controllers; by default all.
+    watch : Watch, optional
+        Receives the progress, and is asked at every block of work whether to stop.
+
+    Returns
+    -------
+    ClosedLoop
+        Design, record and outcomes, in the order of the registry.
+
+    Raises
+    ------
+    SettingError
+        Two settings exclude each other, or a controller is unknown.
+    Cancelled
+        `watch` asks to stop.
+
+    See Also
+    --------
+    wfsobs.run : Run observers, which do not act on the loop.
     """
     plan = design(scenario, controllers)
     return closed_loop(simulate(scenario, watch=Watch(cancelled=watch.cancelled)), plan, watch)
@@ -107,7 +130,7 @@ def truth(record: Record) -> Array:
 
 
 def _outcome(
-    controller: Controller, designed: Sequence[Designed], record: Record, disturbance: Array, plan: Design, watch: Watch
+    controller: Controller, designed: Sequence[LawDesign], record: Record, disturbance: Array, plan: Design, watch: Watch
 ) -> Outcome:
     stable = tuple(d.stable for d in designed)
     notes = [d.note for d in designed if d.note]
@@ -116,7 +139,7 @@ def _outcome(
         return Outcome(controller.id, stable, note=note)
     laws, settings = [d.law for d in designed if d.law is not None], own_settings(controller, plan.scenario)
     try:
-        measured, prior = arguments(controller, record, settings, plan.priors[controller.id])
+        measured, prior = controller_arguments(controller, record, settings, plan.priors[controller.id])
         with detach_watch(watch) as alone:
             u, limited = controller.commands(laws, measured, prior, plan.plant, settings, alone)
     except ValueError as error:
@@ -127,15 +150,16 @@ def _outcome(
 
 
 def residual_rms(outcome: Outcome, record: Record, warm_up: float) -> list[float] | None:
-    """rms [um] of the residual after the warm-up [s], one per mode; None without a residual."""
+    """Return the rms [um] of the residual after the warm-up [s], one per mode; None without a residual."""
     if outcome.residual is None:
         return None
     return [rms(column) for column in outcome.residual[round(warm_up / record.dt) :].T]
 
 
 def strehl(rms_per_mode: Sequence[float], wavelength: float) -> float:
-    """exp(-(2 pi sigma / lambda)^2), the extended Marechal approximation (Mahajan 1983), sigma^2 the variance of the
-    simulated modes together: no other error counts. rms and wavelength [um].
+    """Return the Strehl ratio exp(-(2 pi sigma / lambda)^2), the extended Marechal approximation (Mahajan 1983).
+
+    sigma^2 is the variance of the simulated modes together: no other error counts. rms and wavelength [um].
 
     >>> round(strehl([0.1, 0.1], 2.2), 4)
     0.8495

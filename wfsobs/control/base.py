@@ -24,7 +24,7 @@ from wfsobs.control.law import Law
 from wfsobs.control.mirror import Plant
 from wfsobs.observers.base import NOTHING, PLAIN, Look
 from wfsobs.observers.baselines import online_reference
-from wfsobs.observers.missing import LINE_WIDTH, bridged
+from wfsobs.observers.missing import LINE_WIDTH, fill_missing
 from wfsobs.prior import PARTS, Bands, Part, Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError
@@ -48,21 +48,37 @@ def _nothing(_settings: Settings) -> tuple[Part, ...]:
 
 @dataclass(frozen=True)
 class Controller:
-    """An entry of the registry: a linear law, or a linear law beside a prediction of the vibration, or nothing; and all else that
-    wfsobs knows of a controller.
+    """A controller in the registry: a linear law, one with a prediction of the vibration, or none.
 
-    id, label : for tables and files, and for people
-    law       : of one mode, made before there is a record; of one with a prediction, that of the rest
-    predict   : of the vibration
-    help      : a line on what it is
-    prior     : what it has to be told beside measurements, see `wfsobs.prior`; a prediction takes Bands
-    settings  : the groups of settings that are its own, brought along or named as those that every scenario has
-    asks      : settings -> what it has to be told besides for these
-    ngs       : whether it uses NGS frames
-    weight    : its computing time relative to a linear law's
-    seconds   : (settings, n_steps, n_modes) -> about how long it takes at most [s]; None for one as quick as a linear law
-    look      : how it is drawn
-    Raises ValueError where it predicts and is told no bands.
+    Attributes
+    ----------
+    id, label : str
+        For tables and files, and for people.
+    law : callable or None
+        Law of one mode, designed before there is a record; with a prediction, of the rest.
+    predict : callable or None
+        Prediction of the vibration.
+    help : str
+        One line of description.
+    prior : tuple
+        What it needs beside measurements, see `wfsobs.prior`; a prediction needs Bands.
+    settings : tuple
+        Its groups of settings, its own or names of groups of every scenario.
+    asks : callable
+        Settings -> further needs for these.
+    ngs : bool
+        Whether it uses NGS frames.
+    weight : float
+        Computing time relative to a linear law.
+    seconds : callable or None
+        (settings, n_steps, n_modes) -> maximum time [s]; None for one as fast as a linear law.
+    look : Look
+        Line in figures.
+
+    Raises
+    ------
+    ValueError
+        It predicts without bands in its prior.
     """
 
     id: str
@@ -89,11 +105,11 @@ class Controller:
         return tuple(own.name if isinstance(own, Section) else own for own in self.settings)
 
     def parts(self, settings: Settings) -> tuple[Part, ...]:
-        """What it has to be told beside measurements for these settings."""
+        """Return what it needs beside measurements for these settings."""
         return tuple(dict.fromkeys((*self.asks(settings), *self.prior)))
 
-    def needed(self, settings: Settings) -> str:
-        """The same for people."""
+    def needs_text(self, settings: Settings) -> str:
+        """Return what it needs beside measurements, for people."""
         return ", ".join(dict.fromkeys(word for part in self.parts(settings) for word in PARTS[part])) or NOTHING
 
     def laws(self, prior: Prior, plant: Plant, settings: Settings, n_modes: int) -> tuple[Law, ...]:
@@ -111,7 +127,7 @@ class Controller:
         if self.ngs and measured.y_ngs is None:
             raise RecordError("the record has no NGS measurement")
         width = getattr(getattr(settings, "multipeak", None), "line_width", LINE_WIDTH)
-        measured = bridged(measured, prior, width)
+        measured = fill_missing(measured, prior, width)
         z = measured.z
         forward = np.zeros_like(z)
         if self.law is None:
@@ -125,11 +141,11 @@ class Controller:
             forward = -np.where(known, ahead, 0.0)
             z = z - np.where(known, online_reference(prior.bands, z, measured.dt), 0.0)
         inputs = np.stack([z, np.nan_to_num(measured.z_ngs)], axis=1) if self.ngs else z[:, None]
-        modes = [_taken(law, plant, inputs[:, :, mode], forward[:, mode]) for mode, law in enumerate(laws)]
+        modes = [_limit_commands(law, plant, inputs[:, :, mode], forward[:, mode]) for mode, law in enumerate(laws)]
         return np.column_stack([u for u, _ in modes]), np.column_stack([u != wanted for u, wanted in modes])
 
 
-def _taken(law: Law, plant: Plant, inputs: Array, forward: Array) -> tuple[Array, Array]:
+def _limit_commands(law: Law, plant: Plant, inputs: Array, forward: Array) -> tuple[Array, Array]:
     """(commands that the mirror takes, commands wanted) of one mode, (n_steps,).
 
     inputs : (n_steps, n_inputs); forward : (n_steps,)

@@ -17,14 +17,14 @@ from wfsobs.registry import Registry
 
 
 def integrator(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
-    """The integrator with the gain of the settings, or the best one for the spectra that it is told."""
+    """Return the integrator with the gain of the settings, or with the optimal gain for the given spectra."""
     c = settings.control
     gain = c.gain if c.integrator == "manual" else best_gain(prior.spectra[mode], plant.mirror, c.leak)
     return integrator_law(plant.mirror, gain, c.leak)
 
 
 def _gain(settings: Any) -> tuple[Part, ...]:
-    """An optimised gain takes the spectra."""
+    """Return the spectra for an optimised gain."""
     return (Spectra,) if settings.control.integrator == "optimised" else ()
 
 

@@ -20,7 +20,7 @@ GRID = 40
 
 
 def integrator_law(mirror: Mirror, gain: float, leak: float) -> Law:
-    """The integrator on y = z + P u, as a filter of z: its state is the last commands."""
+    """Return the integrator on y = z + P u as a filter of z: its state is the last commands."""
     taps = mirror.taps
     row = -gain * taps[1:]
     row[0] += leak
@@ -32,7 +32,7 @@ def integrator_law(mirror: Mirror, gain: float, leak: float) -> Law:
 
 
 def highest_stable_gain(mirror: Mirror, leak: float) -> float:
-    """The gain at which the loop becomes unstable, by bisection on the poles: they only grow with it."""
+    """Return the gain at which the loop becomes unstable, by bisection on the poles, which grow with it."""
     low, high = 0.0, 5.0  # the limit is highest, 4, for a pure integrator and a delay of 1.25
     for _ in range(50):
         middle = 0.5 * (low + high)
@@ -41,8 +41,8 @@ def highest_stable_gain(mirror: Mirror, leak: float) -> float:
 
 
 def best_gain(spectra: Spectra, mirror: Mirror, leak: float) -> float:
-    """The stable gain of least residual variance for the spectra of a mode."""
-    omega, weight, target, cross, measured = _binned(spectra)
+    """Return the stable gain of minimum residual variance for the spectra of a mode."""
+    omega, weight, target, cross, measured = _bin_spectra(spectra)
     P, one = mirror.response(omega), 1.0 - leak * np.exp(-1j * omega)
 
     def variance(gain: float) -> float:
@@ -56,7 +56,7 @@ def best_gain(spectra: Spectra, mirror: Mirror, leak: float) -> float:
     return float(minimize_scalar(variance, bounds=around, method="bounded", options={"xatol": 1e-5}).x)
 
 
-def _binned(spectra: Spectra) -> tuple[Array, Array, Array, Array, Array]:
+def _bin_spectra(spectra: Spectra) -> tuple[Array, Array, Array, Array, Array]:
     """(omega, weight in the mean over the circle, and the three spectra of `residual_density`) on fewer points."""
     n = spectra.measured.size
     weight = np.full(n, 1.0 / (n - 1))
@@ -82,7 +82,7 @@ def limited_integrator(mirror: Mirror, gain: float, leak: float, z: Array, forwa
     for measured, ahead in zip(z.tolist(), forward.tolist(), strict=True):
         y = measured + sum(tap * u for tap, u in zip(taps, own, strict=True))
         wanted.append(leak * own[0] - gain * y + ahead)
-        last = mirror.allowed(wanted[-1], last)
+        last = mirror.clip_command(wanted[-1], last)
         taken.append(last)
         own = [last - ahead, *own[:-1]]
     return np.array(taken), np.array(wanted)

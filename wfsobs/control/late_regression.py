@@ -58,5 +58,5 @@ class LateRegression(SlidingRegression):
             self._weights[0] += target * self._column(window % self.m)
 
     def _column(self, s: int) -> Array:
-        """What a target of 1 in slot s adds to the weights a."""
+        """Return the effect of a target of 1 in slot s on the weights a."""
         return np.concatenate([self._N[s, :s], self._N[s:, s]])

@@ -56,13 +56,15 @@ class Law:
 
 
 def steady_law(cycle: PeriodicFilter, gain: float | None = None, leak: float = 1.0) -> Law:
-    """The law of a filter of the LGS alone."""
+    """Return the law of a filter of the LGS alone."""
     return Law(cycle, lambda z: cycle.run(z[:, :1, None])[:, 0, 0], gain, leak)
 
 
 def transfer(F: Array, G: Array, H: Array, J: float, z: Complex) -> Complex:
-    """H (z I - F)^-1 G + J at all z (n,) at once: by the triangular form of F, since nearly equal poles have no
-    eigenvectors to speak of."""
+    """Return H (z I - F)^-1 G + J at all z (n,) at once.
+
+    By the triangular form of F, since nearly equal poles have no well-defined eigenvectors.
+    """
     if not len(F):
         return np.full(z.shape, complex(J))
     T, Q = schur(F.astype(complex), output="complex")

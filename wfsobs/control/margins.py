@@ -22,8 +22,16 @@ Response = Callable[[Array], Complex]
 
 @dataclass(frozen=True)
 class Margins:
-    """gain, least_gain : factors above and below 1 by which the loop gain may be multiplied, None if by any
-    phase : by which the loop gain may be turned, either way [rad]; delay : that it may be delayed more [s]; None if by any
+    """Stability margins; None where there is no limit.
+
+    Attributes
+    ----------
+    gain, least_gain : float or None
+        Factors above and below 1 by which the loop gain may be multiplied.
+    phase : float or None
+        Phase by which the loop gain may be turned, either way [rad].
+    delay : float or None
+        Additional delay [s].
     """
 
     gain: float | None
@@ -68,8 +76,10 @@ def crossings(f: Callable[[Array], Array], x: Array, values: Array) -> Array:
 
 
 def frequencies(poles: Complex, n: int = 400) -> Array:
-    """Points from 0 to pi [rad per step] for a filter with these poles: even, on a logarithmic scale, and close
-    together near its poles."""
+    """Return points from 0 to pi [rad per step] for a filter with these poles.
+
+    Even, on a logarithmic scale, and close together near its poles.
+    """
     spread = np.concatenate([[0.0], np.geomspace(0.05, 40.0, 24)])
     angle, width = np.abs(np.angle(poles)), np.maximum(-np.log(np.maximum(np.abs(poles), 1e-3)), 1e-9)
     near = (angle[:, None] + width[:, None] * np.concatenate([-spread, spread])).ravel()

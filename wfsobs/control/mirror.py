@@ -40,7 +40,7 @@ class Mirror:
         return out
 
     @property
-    def limited(self) -> bool:
+    def has_limits(self) -> bool:
         """Whether there is a limit at all."""
         return min(self.stroke, self.slew) < inf
 
@@ -48,16 +48,16 @@ class Mirror:
         """phi_corr (n_steps, ...) [um] of commands u of that shape."""
         return lfilter(self.taps[1:], [1.0], u, axis=0)
 
-    def seen(self, u: Array) -> Array:
-        """What the measurements see of the commands, one step later; same shape."""
+    def in_measurement(self, u: Array) -> Array:
+        """Return the commands as the measurements see them, one step later; same shape."""
         return lfilter(self.taps, [1.0], u, axis=0)
 
     def response(self, omega: Array) -> Complex:
         """P, from a command to the measurement, at omega [rad per step]; same shape."""
         return np.exp(-1j * np.multiply.outer(omega, np.arange(self.taps.size))) @ self.taps
 
-    def allowed(self, wanted: float, last: float) -> float:
-        """The command nearest to `wanted` that the limits allow after `last` [um]."""
+    def clip_command(self, wanted: float, last: float) -> float:
+        """Return the command nearest to `wanted` within the limits after `last` [um]."""
         near = min(max(wanted, last - self.slew), last + self.slew)
         return min(max(near, -self.stroke), self.stroke)
 
@@ -66,12 +66,12 @@ class Mirror:
         return bool(np.abs(u).max() <= self.stroke and np.abs(np.diff(u, prepend=0.0)).max() <= self.slew)
 
     def follow(self, u: Array) -> Array:
-        """The commands (n_steps,) [um] that the mirror takes of the wanted ones, from rest."""
+        """Return the commands (n_steps,) [um] that the mirror takes for the wanted ones, from rest."""
         if self.within(u):
             return u
         out, last = [], 0.0
         for wanted in u.tolist():
-            last = self.allowed(wanted, last)
+            last = self.clip_command(wanted, last)
             out.append(last)
         return np.array(out)
 

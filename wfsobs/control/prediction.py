@@ -27,8 +27,10 @@ G = TypeVar("G", OfflineGpr, OnlineGpr)
 
 
 def gpr_offline_ahead(measured: Measurements, prior: Prior, plant: Plant, settings: Any, watch: Watch) -> Array:
-    """Prediction of the vibration during the time that u[k] acts, (n_steps, n_modes) [um], NaN before the first full
-    window; trained once on the training record, its targets as many steps later."""
+    """Predict the vibration while u[k] acts, (n_steps, n_modes) [um], NaN before the first full window.
+
+    The GPR is trained once on the training record, with targets as many steps later.
+    """
     g, training = of_z(settings.gpr_offline), prior.training
     if training is None:
         raise RecordError("the record has no training record")
@@ -48,14 +50,14 @@ def gpr_offline_ahead(measured: Measurements, prior: Prior, plant: Plant, settin
 
 
 def of_z(settings: G) -> G:
-    """The settings of a GPR with windows of z."""
+    """Return the settings of a GPR with windows of z."""
     out = settings.copy()
     out.inputs = "z"
     return out
 
 
 def _ahead(x: Array, mirror: Mirror) -> Array:
-    """What x (n, ...) is on average while u[k] acts; NaN at the end, where it is not known."""
+    """Return the mean of x (n, ...) while u[k] acts; NaN at the end, where it is not known."""
     out = np.zeros_like(x)
     for steps, tap in enumerate(mirror.taps[1:]):
         if tap:

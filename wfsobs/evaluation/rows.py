@@ -55,7 +55,7 @@ def row_needs(observer: str) -> str:
     """Return what a row needs beside measurements; the bound needs the true spectra."""
     if observer in NOT_OBSERVERS:
         return SPECTRA if observer == BOUND else ""
-    return OBSERVERS[observer].told
+    return OBSERVERS[observer].needs_text
 
 
 def can_be_best(observer: str, apart: bool) -> bool:

@@ -66,7 +66,7 @@ class Verdict:
     harms: tuple[Harm, ...]
 
     def sentences(self, scale: float = 1e3, unit: str = "nm") -> list[str]:
-        """The verdict in words; scale: from micrometres to the unit."""
+        """Return the verdict in words; scale: from micrometres to the unit."""
         groups: dict[tuple[bool, str], list[Harm]] = {}
         for harm in self.harms:
             groups.setdefault((harm.worse, told_of(harm.observer, self.lines)), []).append(harm)
@@ -95,7 +95,7 @@ def verdict(
         return None
     column = [m.name for m in scenario.modes].index(mode)
     values = {e.observer: e.values[:, column] for e in estimates if e.target == target}
-    errors = {s.observer: _scored(record, values[s.observer] - truth[:, column], s) for s in ranked}
+    errors = {s.observer: _keep_scored(record, values[s.observer] - truth[:, column], s) for s in ranked}
     lines = () if simulation is None else tuple(line[0] for line in vibration_lines(simulation, column))
     first = ranked[0]
     return Verdict(
@@ -106,8 +106,8 @@ def verdict(
         tuple(
             Harm(
                 s.observer,
-                differs(_scored(record, truth[:, column], s), errors[s.observer]),
-                *_shares(errors[s.observer], record.dt, lines, _given(scenario, s.observer, column, lines)),
+                differs(_keep_scored(record, truth[:, column], s), errors[s.observer]),
+                *_shares(errors[s.observer], record.dt, lines, _given_lines(scenario, s.observer, column, lines)),
             )
             for s in reversed(ranked)
             if s.rms >= s.truth_rms
@@ -130,8 +130,8 @@ def differs(one: Array, other: Array) -> bool:
     return bool(abs(means.mean()) > student.ppf(1.0 - LEVEL / 2.0, means.size - 1) * scatter)
 
 
-def _scored(record: Record, error: Array, score: Score) -> Array:
-    """A signal where it was scored, NaN elsewhere."""
+def _keep_scored(record: Record, error: Array, score: Score) -> Array:
+    """Return a signal where it was scored, NaN elsewhere."""
     assert score.start is not None and score.stop is not None
     out = np.full_like(error, np.nan)
     scored = slice(round(score.start / record.dt), round(score.stop / record.dt))
@@ -157,8 +157,8 @@ def _near(frequency: Array, lines: Sequence[float]) -> Array:
     return np.any(apart <= HALF_WIDTH, axis=1)
 
 
-def _given(scenario: Scenario, observer: str, column: int, lines: Sequence[float]) -> Sequence[float]:
-    """The lines [Hz] that an observer is given."""
+def _given_lines(scenario: Scenario, observer: str, column: int, lines: Sequence[float]) -> Sequence[float]:
+    """Return the lines [Hz] that an observer is given."""
     prior = OBSERVERS[observer].prior
     if Lines in prior or not lines:
         return lines
@@ -187,9 +187,9 @@ def told_of(observer: str, lines: int) -> str:
 
 def _best_sentence(it: Verdict, scale: float, unit: str) -> str:
     target, mode, name = it.best.target.capitalize(), it.best.mode, row_label(it.best.observer)
-    size = f"{_rounded(it.best.rms * scale)} {unit}"
+    size = f"{_format_number(it.best.rms * scale)} {unit}"
     if it.tied:
-        start = f"{name} has the smallest error, {size}, tied with {_listed(it.tied)} on this record"
+        start = f"{name} has the smallest error, {size}, tied with {_join_labels(it.tied)} on this record"
     else:
         start = f"{name} is best, {size}"
     return f"{target}, {mode}: {start}{_to_bound(it, scale, unit)}; it is given {told_of(it.best.observer, it.lines)}."
@@ -200,14 +200,14 @@ def _to_bound(it: Verdict, scale: float, unit: str) -> str:
     if not it.bound:
         return ""
     if "y_ngs" in OBSERVERS[it.best.observer].needs:
-        return f", with the NGS (bound of the LGS alone {_rounded(it.bound * scale)} {unit})"
+        return f", with the NGS (bound of the LGS alone {_format_number(it.bound * scale)} {unit})"
     percent = round(100.0 * (it.best.rms / it.bound - 1.0))
     return f", {'at' if percent == 0 else f'{abs(percent)} % ' + ('above' if percent > 0 else 'below')} the bound of the LGS"
 
 
 def _harm_sentence(it: Verdict, harms: Sequence[Harm], told: str) -> str:
     """Observers that are told the same, together; shares are the mean of theirs."""
-    names = _listed([harm.observer for harm in harms])
+    names = _join_labels([harm.observer for harm in harms])
     be, they, their = ("is", "it", "its") if len(harms) == 1 else ("are", "they", "their")
     tell = "is" if len(harms) == 1 else "are"
     known, others = (float(np.mean([getattr(harm, name) for harm in harms])) for name in ("at_known", "at_others"))
@@ -221,16 +221,16 @@ def _harm_sentence(it: Verdict, harms: Sequence[Harm], told: str) -> str:
     return f"{names} {be} {'worse' if harms[0].worse else 'no better'} than no estimate: {they} {tell} given {told}{reason}."
 
 
-def _listed(observers: Sequence[str]) -> str:
+def _join_labels(observers: Sequence[str]) -> str:
     """Labels as a person lists them.
 
-    >>> _listed(["kf-lgs", "ridge", "kf-multi"])
+    >>> _join_labels(["kf-lgs", "ridge", "kf-multi"])
     'LGS KF, Ridge and Multi-peak KF'
     """
     names = [row_label(observer) for observer in observers]
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
-def _rounded(x: float) -> str:
+def _format_number(x: float) -> str:
     """Three digits, as a person would say them."""
     return f"{x:.3g}" if x < 1000.0 else f"{x:.0f}"

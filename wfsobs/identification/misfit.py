@@ -36,15 +36,17 @@ def margin(ratio: Array) -> Array:
         return np.ones(len(ratio))
     r = np.clip(ratio[: n * WIDTH].reshape(n, WIDTH).mean(axis=1), 1e-6, 1.0)
     worth = np.concatenate([[0.0], np.cumsum(WIDTH * (r - 1.0 - np.log(r)))])
-    near, count, unusual = _gathered(worth, ABOUT, UNUSUAL)
-    *_, no_noise = _gathered(worth, FURTHER, LEVEL)
+    near, count, unusual = _sum_dips(worth, ABOUT, UNUSUAL)
+    *_, no_noise = _sum_dips(worth, FURTHER, LEVEL)
     a = np.where(unusual & no_noise, np.sqrt(8.0 * near / (WIDTH * count)), 0.0)
     return np.exp(np.interp(np.arange(len(ratio)), WIDTH * (np.arange(n) + 0.5), a))
 
 
-def _gathered(worth: Array, about: float, level: float) -> tuple[Array, NDArray[np.intp], NDArray[np.bool_]]:
-    """Sum of what dips are worth, from `worth` cumulated, a factor `about` around each mean; of how many means; and whether noise
-    gives as much with a probability of less than `level`."""
+def _sum_dips(worth: Array, about: float, level: float) -> tuple[Array, NDArray[np.intp], NDArray[np.bool_]]:
+    """Sum the log-likelihood of dips within a factor `about` of each mean, from the cumulated `worth`.
+
+    Also return the number of means, and whether noise gives as much with a probability of less than `level`.
+    """
     n = len(worth) - 1
     centre = np.arange(n) + 0.5
     low, high = (centre / about).astype(int), np.minimum(np.ceil(centre * about).astype(int), n)

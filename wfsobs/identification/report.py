@@ -66,7 +66,7 @@ def mode_rows(mode: IdentifiedMode) -> list[Row]:
     return out + [("line" if p.pure else "resonance", p.frequency, p.damping, p.rms) for p in mode.peaks]
 
 
-def verdict(result: Identification) -> list[str]:
+def whiteness_lines(result: Identification) -> list[str]:
     """Return one line per mode on the residual."""
     out = []
     for m in result.modes:
@@ -106,7 +106,7 @@ def identification_toml(result: Identification, scenario: Scenario) -> str:
         notes |= _notes(f"turbulence.processes.{i}", p, f"{mode}, {what}, ")
     for i, (mode, p) in enumerate(result.all_peaks):
         notes |= _notes(f"vibration.peaks.{i}", p, f"{mode}, ")
-    head = [f"Identified from {result.duration:.1f} s; +- is one standard deviation.", *verdict(result)]
+    head = [f"Identified from {result.duration:.1f} s; +- is one standard deviation.", *whiteness_lines(result)]
     return "\n".join(f"# {line}" for line in head) + "\n\n" + add_comments(to_toml(scenario), notes)
 
 

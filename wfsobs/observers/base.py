@@ -1,7 +1,7 @@
-"""What an observer is: a name, what it estimates, what it needs, and a function.
+"""The type of an observer: a name, targets, needs and a function.
 
-phi_hat[k], its estimate of the target at step k, may use y[0..k] and u[0..k-1], nothing later. It receives measurements, what
-it asked to be told and settings of its own: the truth is out of reach.
+phi_hat[k], its estimate of the target at step k, may use y[0..k] and u[0..k-1], nothing later. It receives measurements,
+the prior that it asked for and its own settings: the truth is out of reach.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, NamedTuple
 
-from wfsobs.observers.missing import LINE_WIDTH, bridged
+from wfsobs.observers.missing import LINE_WIDTH, fill_missing
 from wfsobs.prior import PARTS, Part, Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Record
@@ -56,7 +56,7 @@ class Look:
     drawn: bool = True
 
     def colour(self, dark: bool) -> str:
-        """The colour for the mode."""
+        """Return the colour for the mode."""
         return self.dark if dark else self.light
 
 
@@ -105,14 +105,38 @@ class Observer:
     look: Look = PLAIN
 
     def missing(self, record: Record) -> tuple[str, ...]:
-        """The needed fields that a record does not have."""
+        """Return the needed fields that a record does not have."""
         return tuple(name for name in self.needs if getattr(record, name) is None)
 
     def estimate(
         self, measurements: Measurements, prior: Prior, settings: Group | None = None, watch: Watch = QUIET
     ) -> dict[str, Array]:
-        """{target: (n_steps, n_modes) [um]}, missing samples bridged by what it is told. Raises ValueError, Cancelled."""
-        whole = bridged(measurements, prior, getattr(settings, "line_width", LINE_WIDTH))
+        """Run the observer on measurements; missing samples are filled by the model of its prior.
+
+        Parameters
+        ----------
+        measurements : Measurements
+            Signals of a record.
+        prior : Prior
+            What it needs beside measurements.
+        settings : Group, optional
+            Its own settings.
+        watch : Watch
+            Receives the progress, and is asked at every block of work whether to stop.
+
+        Returns
+        -------
+        dict of str to Array
+            Target -> estimate, (n_steps, n_modes) [um]; NaN where there is none.
+
+        Raises
+        ------
+        ValueError
+            There is no estimate; one line with the reason.
+        Cancelled
+            `watch` asks to stop.
+        """
+        whole = fill_missing(measurements, prior, getattr(settings, "line_width", LINE_WIDTH))
         return self.run(whole, prior, settings, watch)
 
     @property
@@ -126,20 +150,22 @@ class Observer:
         return self.weight >= SLOW
 
     @property
-    def given(self) -> tuple[str, ...]:
+    def needed_parts(self) -> tuple[str, ...]:
         """What it has to be told beside measurements, of the words above."""
         return tuple(dict.fromkeys(word for part in self.prior for word in PARTS[part]))
 
     @property
-    def told(self) -> str:
+    def needs_text(self) -> str:
         """What it has to be told beside measurements, for people."""
-        return ", ".join(self.given) or NOTHING
+        return ", ".join(self.needed_parts) or NOTHING
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What one observer says of one target: values (n_steps, n_modes) [um], NaN where it says nothing,
-    and its computing time per step and mode [s]."""
+    """Estimate of one target by one observer: values (n_steps, n_modes) [um] and computing time per step and mode [s].
+
+    NaN where there is no estimate.
+    """
 
     observer: str
     target: str

@@ -25,7 +25,7 @@ def open_loop_reference(bands: Bands, open_loop_y: Array, dt: float) -> Array:
 
 
 def online_reference(bands: Bands, z: Array, dt: float) -> Array:
-    """The causal bank on the pseudo-open-loop measurement z, (n_steps, n_modes) [um]."""
+    """Filter the pseudo-open-loop measurement z by the causal bank, (n_steps, n_modes) [um]."""
     return filter_causal(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, dt), z)
 
 
@@ -44,13 +44,13 @@ def butterworth_cl(measured: Measurements, prior: Prior, _settings: None, watch:
 
 
 def persistence(measured: Measurements, _prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
-    """The newest measurement taken for the turbulence: no model, all of the noise and the vibration, one step late."""
+    """Return the newest measurement as the turbulence: no model, all of the noise and the vibration, one step late."""
     watch.step(0.0)
     return {TURBULENCE: measured.z}
 
 
 def zero(measured: Measurements, _prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
-    """The trivial baseline: nothing disturbs."""
+    """Return zero, the trivial baseline."""
     watch.step(0.0)
     return {target: np.zeros_like(measured.y_lgs) for target in TARGETS}
 

@@ -33,34 +33,36 @@ class Predictor(NamedTuple):
     noise: float
 
 
-def bridged(signals: S, prior: Prior, line_width: float = LINE_WIDTH) -> S:
-    """The signals without NaN, but in y_ngs at steps without a frame. line_width : of lines, at least [Hz]"""
+def fill_missing(signals: S, prior: Prior, line_width: float = LINE_WIDTH) -> S:
+    """Return the signals without NaN, except in y_ngs at steps without a frame. line_width : minimum of lines [Hz]"""
     u = hold_last(signals.u)
     y_lgs, open_loop_y, y_ngs = signals.y_lgs, signals.open_loop_y, signals.y_ngs
     if np.isnan(y_lgs).any():
         mirror = delay_signal(u, signals.delay)
-        y_lgs = predicted(y_lgs - mirror, _of_lgs(prior, line_width)) + mirror
+        y_lgs = predict_missing(y_lgs - mirror, _of_lgs(prior, line_width)) + mirror
     if open_loop_y is not None and np.isnan(open_loop_y).any():
-        open_loop_y = predicted(open_loop_y, _of_lgs(prior, line_width))
+        open_loop_y = predict_missing(open_loop_y, _of_lgs(prior, line_width))
     if y_ngs is not None and signals.ratio is not None and np.isnan(y_ngs[signals.ratio :: signals.ratio]).any():
         n = signals.ratio
         mirror = frame_mean(delay_signal(u, signals.delay - 1), n)[n::n]
         y_ngs = y_ngs.copy()
         frames = [Predictor(m.at(n * signals.dt).disturbance(), m.ngs_noise) for m in prior.model]
-        y_ngs[n::n] = predicted(y_ngs[n::n] - mirror, frames) + mirror
+        y_ngs[n::n] = predict_missing(y_ngs[n::n] - mirror, frames) + mirror
     return replace(signals, y_lgs=y_lgs, u=u, y_ngs=y_ngs, open_loop_y=open_loop_y)
 
 
 def _of_lgs(prior: Prior, line_width: float) -> list[Predictor]:
-    """What the LGS measure, of every mode; nothing where the prior has no model."""
+    """Return the LGS model of every mode; empty where the prior has no model."""
     if prior.model:
         return [Predictor(m.disturbance(), m.lgs_noise) for m in prior.model]
     return [Predictor(m.disturbance(line_width), m.noise) for m in prior.lines]
 
 
-def predicted(z: Array, predictors: Sequence[Predictor]) -> Array:
-    """z (n, n_modes) with every NaN replaced by the prediction of the steady-state Kalman filter of that mode's model. Without
-    models, or where a model has no such filter, the last measurement is held."""
+def predict_missing(z: Array, predictors: Sequence[Predictor]) -> Array:
+    """Replace every NaN of z (n, n_modes) by the prediction of the steady-state Kalman filter of that mode's model.
+
+    Without models, or where a model has no such filter, the last measurement is held.
+    """
     out = hold_last(z).copy()
     for mode, (model, noise) in enumerate(predictors):
         try:

@@ -30,8 +30,10 @@ PLAIN = 1e-6
 
 
 def fit(signals: Array, targets: Array, depth: int, m: int, penalty: float) -> tuple[Array, float]:
-    """Weights (depth, channels), the newest sample first, and constant, of the first m windows of signals (n, channels)
-    with targets (n,), one per step. Raises RecordError where the record is too short."""
+    """Fit weights (depth, channels), the newest sample first, and a constant to the first m windows of signals (n, channels).
+
+    targets (n,), one per step. Raises RecordError where the record is too short.
+    """
     if signals.shape[0] < depth + m:
         raise RecordError(f"the training record has {signals.shape[0]} steps, depth + training size need {depth + m}")
     f = targets[depth - 1 : depth - 1 + m]
@@ -39,7 +41,7 @@ def fit(signals: Array, targets: Array, depth: int, m: int, penalty: float) -> t
     middle = windows.mean(axis=0)
     if m <= 2 * depth * signals.shape[1]:  # which of the two is cheaper
         S = np.empty((m + 1, m + 1), order="F")  # the inner products with the targets as one more row
-        S[:m, :m] = _centred(_inner_products(signals, depth, m))
+        S[:m, :m] = _centre(_inner_products(signals, depth, m))
         S.flat[: m * (m + 1) : m + 2] += penalty
         S[m, :m] = f - f.mean()
         eliminate(S, m, QUIET.check)
@@ -59,14 +61,14 @@ def _inner_products(signals: Array, depth: int, m: int) -> Array:
     return lower + np.tril(lower, -1).T
 
 
-def _centred(gram: Array) -> Array:
-    """The inner products of windows less their mean."""
+def _centre(gram: Array) -> Array:
+    """Return the inner products of windows minus their mean."""
     mean = gram.mean(axis=0)
     return gram - mean - mean[:, None] + mean.mean()
 
 
 def predict(signals: Array, weights: Array, constant: float) -> Array:
-    """The linear prediction at every step of signals (n, channels), (n,); NaN before the first full window."""
+    """Return the linear prediction at every step of signals (n, channels), (n,); NaN before the first full window."""
     n, depth = signals.shape[0], weights.shape[0]
     out = np.full(n, np.nan)
     if n >= depth:
@@ -76,7 +78,7 @@ def predict(signals: Array, weights: Array, constant: float) -> Array:
 
 
 def ridge(measured: Measurements, prior: Prior, settings: OfflineGpr, watch: Watch) -> dict[str, Array]:
-    """The linear limit of the offline GPR: its windows, its training size, its penalty."""
+    """Run the linear limit of the offline GPR: its windows, its training size, its penalty."""
     g, training, bands = settings, prior.training, prior.bands
     assert training is not None and bands is not None
     targets = training_targets(training, bands, measured.dt, measured.delay)

@@ -1,4 +1,4 @@
-"""What observers and controllers are told beside measurements."""
+"""Priors: what observers and controllers receive beside measurements."""
 
 from __future__ import annotations
 

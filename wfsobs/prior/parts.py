@@ -1,5 +1,4 @@
-"""What an observer may be told of a mode, or of all of them, beside measurements: numbers, and nothing that leads to where they
-come from.
+"""Parts of a prior, of one mode or of all: numbers, without a reference to their source.
 
 Made from a scenario (`wfsobs.priors_from.scenario`), or from telemetry (`IdentifiedMode.prior`).
 """
@@ -31,11 +30,11 @@ class Model:
     ngs_noise: float
 
     def at(self, dt: float) -> Model:
-        """The same processes sampled every `dt` [s]."""
+        """Return the same processes sampled every `dt` [s]."""
         return Model(self.turbulence.at(dt), self.vibration.at(dt), self.lgs_noise, self.ngs_noise)
 
     def disturbance(self) -> DisturbanceModel:
-        """The state-space model of the two processes."""
+        """Return the state-space model of the two processes."""
         return disturbance_model([self.turbulence], [self.vibration])
 
 
@@ -69,7 +68,7 @@ class Lines:
     lines: tuple[Line, ...] = ()
 
     def disturbance(self, line_width: float) -> DisturbanceModel:
-        """The state-space model, every line at least `line_width` wide at half maximum [Hz]."""
+        """Return the state-space model, with `line_width` the minimum line width (FWHM) [Hz]."""
         least = pi * line_width  # as xi w
         peaks = []
         for frequency, damping, rms in self.lines:

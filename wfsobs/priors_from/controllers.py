@@ -15,26 +15,26 @@ from wfsobs.scenario import Scenario
 
 
 def plant_of(scenario: Scenario) -> Plant:
-    """The plant of a scenario's closed loop."""
+    """Return the plant of a scenario's closed loop."""
     c = scenario.control
     mirror = Mirror(c.delay, c.stroke or inf, c.rate * scenario.dt * 1e3 or inf)
     return Plant(mirror, scenario.dt, scenario.sensors.exposure_ratio)
 
 
 def own_settings(controller: Controller, scenario: Scenario) -> Settings:
-    """Copies of the groups of settings that are the controller's own."""
+    """Return copies of the controller's own groups of settings."""
     return Settings(**{name: getattr(scenario, name).copy() for name in controller.groups})
 
 
 def prior_for(controller: Controller, scenario: Scenario, spectra: Sequence[Spectra] = ()) -> Prior:
-    """What a controller is told before there is a record. spectra : one per mode, where they have been made already
+    """Return the prior of a controller before there is a record. spectra : one per mode, where already computed
 
     Raises ValueError where the scenario has no such prior.
     """
     return prior_of(scenario.before_events, None, controller.parts(own_settings(controller, scenario)), spectra)
 
 
-def arguments(controller: Controller, record: Record, settings: Settings, prior: Prior) -> tuple[Measurements, Prior]:
-    """What a controller receives of a record: measurements, and its prior with the training record where it asks for one."""
+def controller_arguments(controller: Controller, record: Record, settings: Settings, prior: Prior) -> tuple[Measurements, Prior]:
+    """Return the arguments of a controller from a record: measurements and prior, with the training record where it needs one."""
     asked = record.training is not None and Training in controller.parts(settings)
     return record.measurements(), replace(prior, training=record.training.copy() if asked and record.training else None)

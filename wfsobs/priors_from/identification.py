@@ -9,9 +9,9 @@ FOUND = ("telescope", "turbulence", "vibration", "sensors", "kalman", "butterwor
 
 
 def told_by(found: Scenario, scenario: Scenario) -> Scenario:
-    """A scenario from which observers get the priors of an identification, and their own settings from `scenario`.
+    """Return a scenario with the models of an identification, and all other settings of `scenario`.
 
-    found : what `wfsobs identify --out` wrote (`Identification.scenario`)
+    found : the file of `wfsobs identify --out` (`Identification.scenario`)
     """
     out = scenario.before_events.copy()
     for group in FOUND:

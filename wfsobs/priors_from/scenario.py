@@ -36,15 +36,14 @@ def arguments(observer: Observer, record: Record, scenario: Scenario) -> tuple[M
 
 
 def settings_of(observer: Observer, scenario: Scenario) -> Group | None:
-    """A copy of the settings that are an observer's own, or None."""
+    """Return a copy of an observer's own settings, or None."""
     return None if observer.group is None else getattr(scenario, observer.group).copy()
 
 
 def prior_of(scenario: Scenario, record: Record | None, parts: Iterable[Part], spectra: Sequence[Spectra] = ()) -> Prior:
-    """These parts of what a scenario tells of the modes of a record; without a record, of its own modes.
+    """Return these parts of a scenario's prior for the modes of a record, or without a record for its own.
 
-    spectra : one per mode, where they have been made already
-    Raises ValueError where the scenario does not have a part.
+    spectra : one per mode, where already computed. Raises ValueError where the scenario does not have a part.
     """
     asked, modes = set(parts), range(record.n_modes if record else len(scenario.modes))
     dt = record.dt if record else scenario.dt
@@ -59,13 +58,13 @@ def prior_of(scenario: Scenario, record: Record | None, parts: Iterable[Part], s
 
 
 def bands_of(scenario: Scenario) -> Bands:
-    """The bands that the vibration is looked for in."""
+    """Return the bands of the vibration."""
     b = scenario.butterworth
     return Bands(tuple(b.frequencies), b.bandwidth_offline, b.bandwidth_online, b.order)
 
 
 def spectra_of(scenario: Scenario, mode: int) -> Spectra:
-    """The true spectra of one mode. Raises ValueError where they are not known."""
+    """Return the true spectra of one mode. Raises ValueError where they are not known."""
     if not has_known_spectra(scenario):
         raise ValueError(
             f"the spectrum of turbulence from {scenario.turbulence.source} is not known: set control.integrator "
@@ -75,7 +74,7 @@ def spectra_of(scenario: Scenario, mode: int) -> Spectra:
 
 
 def told_spectra(known: TrueSpectra) -> Spectra:
-    """What is told of true spectra: those of the disturbance as a whole."""
+    """Return the part of true spectra in a prior: those of the disturbance as a whole."""
     disturbance, cross = known.total
     return Spectra(disturbance, known.measured, cross)
 
@@ -84,17 +83,17 @@ def told_spectra(known: TrueSpectra) -> Spectra:
 
 
 def model_of(scenario: Scenario, mode: int, dt: float | None = None) -> Model:
-    """The model of one mode with one peak; dt [s]: that of the scenario unless given."""
+    """Return the model of one mode with one peak; dt [s]: by default that of the scenario."""
     return Model(*modelled_processes(scenario, mode, dt or scenario.dt), *measurement_noise(scenario, mode))
 
 
 def lgs_error_of(scenario: Scenario, mode: int, dt: float | None = None) -> LgsError:
-    """The slow error of the LGS together in one mode."""
+    """Return the slow error of the combined LGS in one mode."""
     return LgsError(lgs_error_process(scenario, mode, dt or scenario.dt))
 
 
 def modelled_processes(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2, Ar2]:
-    """The turbulence and the one vibration peak of the model, sampled every `dt` [s] (paper, Tables 1 and 2)."""
+    """Return the turbulence and the one vibration peak of the model, sampled every `dt` [s] (paper, Tables 1 and 2)."""
     k, tip_tilt = scenario.kalman, scenario.modes[mode].radial_order == 1
     manual = k.process_noise == "manual"
     turbulence = turbulence_process(scenario, mode, dt)
@@ -115,12 +114,12 @@ def modelled_peak(scenario: Scenario, mode: int) -> tuple[float, float]:
 
 
 def kalman_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
-    """The state-space model of the two processes."""
+    """Return the state-space model of the two processes."""
     return model_of(scenario, mode, dt).disturbance()
 
 
 def measurement_noise(scenario: Scenario, mode: int) -> tuple[float, float]:
-    """Standard deviation of the modelled noise [um] of the LGS together and of an NGS frame in one mode."""
+    """Return the rms of the modelled noise [um] of the combined LGS and of an NGS frame in one mode."""
     k = scenario.kalman
     if k.measurement_noise == "manual":
         return k.lgs_noise, k.ngs_noise
@@ -144,12 +143,12 @@ def lines_of(scenario: Scenario, mode: int, dt: float | None = None) -> Lines:
 
 
 def multi_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
-    """The state-space model of that. Raises ValueError where the vibration names no lines."""
+    """Return the state-space model of all peaks. Raises ValueError where the vibration names no lines."""
     return lines_of(scenario, mode, dt).disturbance(scenario.multipeak.line_width)
 
 
 def _turbulence(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2 | Ar3, ...]:
-    """A scenario's own processes, in the strength that the model has; else one process."""
+    """Return a scenario's own processes, in the strength of the model; else one process."""
     found = processes(scenario, mode, dt) if scenario.turbulence.source == "processes" else []
     if not found:
         return (modelled_turbulence(scenario, mode, dt),)
@@ -160,7 +159,7 @@ def _turbulence(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2 | Ar3, ..
 
 
 def modelled_turbulence(scenario: Scenario, mode: int, dt: float) -> Ar2 | Ar3:
-    """The turbulence of the model: that of one peak, or of third order and nearest to the true spectrum that the LGS see."""
+    """Return the turbulence of the model: that of one peak, or of third order and nearest to the true spectrum of the LGS."""
     process, _ = modelled_processes(scenario, mode, dt)
     if scenario.multipeak.turbulence_order == 2 or process.rms == 0:
         return process
@@ -170,7 +169,7 @@ def modelled_turbulence(scenario: Scenario, mode: int, dt: float) -> Ar2 | Ar3:
 
 
 def predicted_rms(scenario: Scenario, mode: int) -> float:
-    """What the filter of every line believes its error of the next phi_dist to be, rms [um]."""
+    """Return the predicted error of the multi-peak filter for the next phi_dist, rms [um]."""
     model = multi_model(scenario, mode, scenario.dt)
     row = np.sum(list(model.outputs.values()), axis=0)
     _, steady = steady_filter(model, measurement_noise(scenario, mode)[0])

@@ -33,7 +33,7 @@ class CheckError(AssertionError):
     """An observer or a controller that does not keep a rule: one line naming it and the rule."""
 
 
-def moved(x: Array, start: int, rng: np.random.Generator) -> Array:
+def change_from(x: Array, start: int, rng: np.random.Generator) -> Array:
     """Return x (n_steps, n_modes) with other numbers from the step `start` on."""
     out = x.copy()
     out[start:] += 3.0 * np.std(hold_last(x)) * rng.standard_normal(out[start:].shape)

@@ -16,20 +16,20 @@ from wfsobs.control.base import Controller, Settings
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Plant
 from wfsobs.prior import Prior
-from wfsobs.priors_from.controllers import arguments, own_settings, plant_of, prior_for
+from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
-from wfsobs.testing.common import QUICK, SAME, CheckError, in_a_fresh_process, moved
-from wfsobs.testing.reach import SEED, given_away, reached
+from wfsobs.testing.common import QUICK, SAME, CheckError, change_from, in_a_fresh_process
+from wfsobs.testing.reach import SEED, given_away, walk_references
 from wfsobs.typing import Array
 
 LOST = 7
 """Measurements in a row that are missing."""
 
 
-class Given(NamedTuple):
+class ControllerInputs(NamedTuple):
     """All that a controller receives."""
 
     measured: Measurements
@@ -63,16 +63,16 @@ def check_controller(controller: Controller, scenario: Scenario | None = None, a
     """
     s = (scenario or PRESETS["paper"]().replace(QUICK)).replace({"run.seed": SEED})
     record = simulate(s)
-    given = _given(controller, record, s)
+    given = _inputs(controller, record, s)
     laws = _check_laws(controller, given)
     if found := given_away(record, controller, laws, *given):
         raise CheckError(f"{controller.id}: knows more than it is told: it reaches {', '.join(sorted(found))}")
     base = _commands(controller, given)
     _check_shape(controller, base, given.measured)
-    again = _given(controller, record, s)
+    again = _inputs(controller, record, s)
     twice = "run twice on the same measurements it gives two results: it keeps something between runs, or draws random numbers"
     _compare(controller, _commands(controller, again), base, twice, exact=True)
-    _check_untouched(controller, given, _given(controller, record, s))
+    _check_untouched(controller, given, _inputs(controller, record, s))
     _check_causal(controller, given, base)
     _check_gaps(controller, given)
     if alone:
@@ -81,17 +81,17 @@ def check_controller(controller: Controller, scenario: Scenario | None = None, a
         _compare(controller, there, base, what)
 
 
-def _given(controller: Controller, record: Record, scenario: Scenario) -> Given:
+def _inputs(controller: Controller, record: Record, scenario: Scenario) -> ControllerInputs:
     settings = own_settings(controller, scenario)
-    measured, prior = arguments(controller, record, settings, prior_for(controller, scenario))
-    return Given(measured, prior, plant_of(scenario), settings)
+    measured, prior = controller_arguments(controller, record, settings, prior_for(controller, scenario))
+    return ControllerInputs(measured, prior, plant_of(scenario), settings)
 
 
-def _laws(controller: Controller, given: Given) -> tuple[Law, ...]:
+def _laws(controller: Controller, given: ControllerInputs) -> tuple[Law, ...]:
     return controller.laws(given.prior, given.plant, given.settings, given.measured.n_modes)
 
 
-def _commands(controller: Controller, given: Given) -> Array:
+def _commands(controller: Controller, given: ControllerInputs) -> Array:
     laws = _laws(controller, given)
     try:
         return controller.commands(laws, *given)[0]
@@ -99,7 +99,7 @@ def _commands(controller: Controller, given: Given) -> Array:
         raise CheckError(f"{controller.id}: cannot run: {error}") from error
 
 
-def _check_laws(controller: Controller, given: Given) -> tuple[Law, ...]:
+def _check_laws(controller: Controller, given: ControllerInputs) -> tuple[Law, ...]:
     laws = _laws(controller, given)
     for law in laws:
         if not isinstance(law, Law):
@@ -116,37 +116,37 @@ def _check_shape(controller: Controller, u: Any, measured: Measurements) -> None
         raise CheckError(f"{controller.id}: a command is NaN or infinite")
 
 
-def _check_untouched(controller: Controller, given: Given, fresh: Given) -> None:
-    for name, now, was in zip(Given._fields, given, fresh, strict=True):
+def _check_untouched(controller: Controller, given: ControllerInputs, fresh: ControllerInputs) -> None:
+    for name, now, was in zip(ControllerInputs._fields, given, fresh, strict=True):
         same = not isinstance(was, Settings) or _settings(now) == _settings(was)
         if not same or not all(np.array_equal(a, b, equal_nan=True) for a, b in zip(_arrays(now), _arrays(was), strict=True)):
             raise CheckError(f"{controller.id}: changes its arguments ({name})")
 
 
 def _arrays(root: Any) -> list[Array]:
-    return [x for x in reached(root) if isinstance(x, np.ndarray) and x.dtype == float]
+    return [x for x in walk_references(root) if isinstance(x, np.ndarray) and x.dtype == float]
 
 
 def _settings(own: Any) -> dict[str, Any]:
     return {name: group.to_dict() for name, group in vars(own).items()}
 
 
-def _check_causal(controller: Controller, given: Given, base: Array) -> None:
+def _check_causal(controller: Controller, given: ControllerInputs, base: Array) -> None:
     """Check that u[k] uses y[0..k] and u[0..k-1] alone."""
     measured, n = given.measured, given.measured.n_steps
     for k in (n // 2, n // 2 + 3, n - 5):
         rng = np.random.default_rng(k)
         later = replace(
             measured,
-            y_lgs=moved(measured.y_lgs, k + 1, rng),
-            u=moved(measured.u, k, rng),
-            y_ngs=None if measured.y_ngs is None else moved(measured.y_ngs, k + 1, rng),
+            y_lgs=change_from(measured.y_lgs, k + 1, rng),
+            u=change_from(measured.u, k, rng),
+            y_ngs=None if measured.y_ngs is None else change_from(measured.y_ngs, k + 1, rng),
         )
         what = f"looks ahead: measurements after step {k} change its command of that step or an earlier one"
         _compare(controller, _commands(controller, given._replace(measured=later)), base, what, stop=k + 1)
 
 
-def _check_gaps(controller: Controller, given: Given) -> None:
+def _check_gaps(controller: Controller, given: ControllerInputs) -> None:
     y, start = given.measured.y_lgs.copy(), given.measured.n_steps // 2
     y[start : start + LOST] = np.nan
     u = _commands(controller, given._replace(measured=replace(given.measured, y_lgs=y)))

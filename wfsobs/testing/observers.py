@@ -19,7 +19,7 @@ from wfsobs.record import Measurements
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
-from wfsobs.testing.common import QUICK, SAME, CheckError, in_a_fresh_process, moved
+from wfsobs.testing.common import QUICK, SAME, CheckError, change_from, in_a_fresh_process
 from wfsobs.typing import Array
 
 Estimates = dict[str, Array]
@@ -86,9 +86,9 @@ def _check_causal(observer: Observer, given: tuple[Measurements, Prior, Any], ba
         rng = np.random.default_rng(k)
         later = replace(
             measured,
-            y_lgs=moved(measured.y_lgs, k + 1, rng),
-            u=moved(measured.u, k + 1, rng),
-            y_ngs=None if measured.y_ngs is None else moved(measured.y_ngs, k + 1, rng),
+            y_lgs=change_from(measured.y_lgs, k + 1, rng),
+            u=change_from(measured.u, k + 1, rng),
+            y_ngs=None if measured.y_ngs is None else change_from(measured.y_ngs, k + 1, rng),
         )
         _compare(
             observer,

@@ -18,7 +18,7 @@ SEED = 918_273_645
 """A seed that is found where it should not be: no other number is likely to be the same."""
 
 
-def reached(*roots: Any) -> Iterator[Any]:
+def walk_references(*roots: Any) -> Iterator[Any]:
     """Yield everything reachable from the roots, by references, bases of arrays, closures, defaults and partials.
 
     Classes and modules are the program, and so are the globals of a function.
@@ -44,7 +44,7 @@ def reached(*roots: Any) -> Iterator[Any]:
 def given_away(record: Record, *roots: Any, seed: int = SEED) -> set[str]:
     """Find what can be reached from the roots that should not: names of types, of signals of the truth, or "seed"."""
     found = set()
-    for x in reached(*roots):
+    for x in walk_references(*roots):
         if isinstance(x, (Scenario, Run, Record)):
             found.add(type(x).__name__)
         elif isinstance(x, int) and x == seed:

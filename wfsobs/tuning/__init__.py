@@ -1,5 +1,5 @@
 """Settings of an observer from a search: `tune`."""
 
-from wfsobs.tuning.tuning import Evaluation, Stage, Tuned, tune
+from wfsobs.tuning.tuning import Evaluation, Stage, TuningResult, tune
 
-__all__ = ["Evaluation", "Stage", "Tuned", "tune"]
+__all__ = ["Evaluation", "Stage", "TuningResult", "tune"]

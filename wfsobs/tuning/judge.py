@@ -37,7 +37,7 @@ class Judge:
     target: str
 
     def estimates(self, record: Record, scenario: Scenario, watch: Watch) -> list[Estimate]:
-        """What the observer makes of a record. Raises ValueError in one line where it cannot, Cancelled."""
+        """Run the observer on a record. Raises ValueError in one line where it cannot, Cancelled."""
         scenario.validate()
         out = []
         for item in each_estimate(record, scenario, watch, [self.observer]):
@@ -59,13 +59,13 @@ class Judge:
         return Errors(modes)
 
     def begins(self, estimates: list[Estimate]) -> int:
-        """The step from which on there are estimates."""
+        """Return the first step with estimates."""
         silent = np.logical_or.reduce([np.isnan(e.values).any(axis=1) for e in estimates])[:-1]  # a reference lacks the last
         return int(silent.size - np.argmax(silent[::-1])) if silent.any() else 0
 
 
 def target_of(observer: str, target: str | None) -> str:
-    """The target that is asked for, or vibration where the observer estimates it. Raises SettingError."""
+    """Return the given target, by default vibration where the observer estimates it. Raises SettingError."""
     known = OBSERVERS[observer].targets
     if target is None:
         return VIBRATION if VIBRATION in known else known[0]

@@ -16,7 +16,7 @@ from wfsobs.observers.gpr.inputs import scale_of, window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
 from wfsobs.observers.gpr.offline import training_targets
 from wfsobs.observers.gpr.online import kernel_of, online_targets
-from wfsobs.observers.missing import bridged
+from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Bands
 from wfsobs.priors_from.scenario import bands_of, prior_of
 from wfsobs.progress import QUIET, Watch
@@ -55,7 +55,7 @@ def likelihood(observer: str, record: Record, scenario: Scenario, watch: Watch =
     if observer not in GPRS:
         return None
     try:
-        whole = bridged(record, prior_of(scenario, record, (Bands,)))
+        whole = fill_missing(record, prior_of(scenario, record, (Bands,)))
         return tuple(_of_mode(observer, whole, scenario, mode, watch) for mode in range(record.n_modes))
     except ValueError:
         return None

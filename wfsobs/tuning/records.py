@@ -16,7 +16,7 @@ from wfsobs.evaluation.scores import PREDICTION
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.observers.baselines import open_loop_reference
-from wfsobs.observers.missing import bridged
+from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Model
 from wfsobs.priors_from.scenario import bands_of, prior_of, settings_of
 from wfsobs.progress import Watch
@@ -52,10 +52,18 @@ LENGTHS = ("gpr_offline.training_size", "gpr_offline.depth")
 
 @dataclass(frozen=True)
 class Records:
-    """validation : the record that the search sees, training record included
-    test   : a scenario -> the record that it is scored on, once before and once after
-    target : what the errors are those of: "turbulence", "vibration" or PREDICTION
-    against: what stands for the truth, in words
+    """The records of a tuning.
+
+    Attributes
+    ----------
+    validation : Record
+        The record of the search, training record included.
+    test : callable
+        Scenario -> the record that it is scored on, once before and once after.
+    target : str
+        Target of the errors: "turbulence", "vibration" or PREDICTION.
+    against : str
+        What stands for the truth, in words.
     """
 
     validation: Record
@@ -65,15 +73,15 @@ class Records:
 
 
 def stream(scenario: Scenario, purpose: int) -> np.random.Generator:
-    """A random stream of a tuning, independent of those of the scenario's own record."""
+    """Return a random stream of a tuning, independent of those of the scenario's own record."""
     return np.random.default_rng([scenario.run.seed, purpose])
 
 
-def simulated(scenario: Scenario, space: Space, target: str, duration: float | None, watch: Watch) -> Records:
-    """The records of a scenario; duration: of the validation record [s], that of the scenario unless given.
+def simulate_records(scenario: Scenario, space: Space, target: str, duration: float | None, watch: Watch) -> Records:
+    """Simulate the records of a tuning; duration: of the validation record [s], by default that of the scenario.
 
-    Where the search moves the lengths of windows or training set, the training record that it sees is as long as the largest
-    need. Those of the test are as long as `wfsobs run` makes them.
+    Where the search changes the lengths of windows or training set, its training record is as long as the largest
+    need. Those of the test are as long as in `wfsobs run`.
     """
     made: dict[tuple[int, int], Record] = {}
 
@@ -91,10 +99,10 @@ def simulated(scenario: Scenario, space: Space, target: str, duration: float | N
 
 
 def judged_by(record: Record, observer: str, target: str) -> tuple[str, str]:
-    """What the errors on a record are those of, and what stands for the truth where the record has none of the target.
+    """Return the target of the errors on a record, and what stands for the truth where the record has none.
 
-    An observer of turbulence and vibration together is judged by its prediction of the next z of the LGS, which has all their
-    errors; one of vibration alone by the zero-phase Butterworth reference of the piece. Raises RecordError for one that knows
+    An observer of turbulence and vibration together is scored by its prediction of the next z of the LGS, which has all their
+    errors; one of vibration alone by the zero-phase Butterworth reference of the piece. Raises RecordError for one that is
     better than the LGS, and for one of turbulence alone.
     """
     if record.truth(target) is not None:
@@ -105,9 +113,11 @@ def judged_by(record: Record, observer: str, target: str) -> tuple[str, str]:
     return (PREDICTION, NEXT) if of_both else (target, REFERENCE)
 
 
-def cut(record: Record, scenario: Scenario, observer: str, target: str) -> Records:
-    """The pieces of telemetry, and what they are judged by. Raises RecordError where there is nothing to judge by, and where the
-    record is too short."""
+def cut_record(record: Record, scenario: Scenario, observer: str, target: str) -> Records:
+    """Cut telemetry into pieces for training, validation and test.
+
+    Raises RecordError where there is nothing to compare with, and where the record is too short.
+    """
     target, against = judged_by(record, observer, target)
     entry = OBSERVERS[observer]
     learns = Training in (*entry.prior, *entry.asks(settings_of(entry, scenario)))
@@ -139,9 +149,9 @@ def _cuts(record: Record, scenario: Scenario, learns: bool) -> list[tuple[int, i
 
 
 def piece(record: Record, start: int, stop: int) -> Record:
-    """Steps start ... stop - 1 as a record of its own, with the same z. `start` must be a multiple of the ratio.
+    """Return steps start ... stop - 1 as a record of its own, with the same z. `start` must be a multiple of the ratio.
 
-    A record begins with the mirror at rest; so what older commands did is taken off the measurements that still see it.
+    A record begins with the mirror at rest; so the effect of older commands is subtracted from the measurements.
     """
     u = record.u[start:stop]
     y_ngs = None
@@ -164,7 +174,7 @@ def piece(record: Record, start: int, stop: int) -> Record:
 
 
 def reference(record: Record, scenario: Scenario) -> Array:
-    """The zero-phase Butterworth reference of a record, (n_steps, n_modes) [um], NaN where a measurement is missing."""
-    whole = bridged(record, prior_of(scenario, record, (Model,)))
+    """Return the zero-phase Butterworth reference of a record, (n_steps, n_modes) [um], NaN where a measurement is missing."""
+    whole = fill_missing(record, prior_of(scenario, record, (Model,)))
     twin = whole.z if whole.open_loop_y is None else whole.open_loop_y
     return np.where(np.isnan(record.z), np.nan, open_loop_reference(bands_of(scenario), twin, record.dt))

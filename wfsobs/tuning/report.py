@@ -10,11 +10,14 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import add_comments, changed_settings, to_toml
 from wfsobs.tuning.judge import Errors
 from wfsobs.tuning.records import TRUTH
-from wfsobs.tuning.tuning import Stage, Tuned
+from wfsobs.tuning.tuning import Stage, TuningResult
 
 
-def plain(tuned: Tuned) -> dict[str, Any]:
-    """What `wfsobs tune --json` prints: errors in um, null where the observer failed; likelihoods in nats, null for no GPR."""
+def tuning_dict(tuned: TuningResult) -> dict[str, Any]:
+    """Return the output of `wfsobs tune --json`.
+
+    Errors in um, null where the observer failed; likelihoods in nats, null where there is no GPR.
+    """
 
     def stage(s: Stage) -> dict[str, Any]:
         return {
@@ -45,34 +48,34 @@ def _modes(errors: Errors | None) -> dict[str, float] | None:
     return dict(errors.modes) if errors else None
 
 
-def settings(tuned: Tuned) -> list[tuple[str, str, str]]:
+def settings(tuned: TuningResult) -> list[tuple[str, str, str]]:
     """(dotted path, before, after) of every setting that was searched or set by hand."""
     changed = [path for path in changed_settings(tuned.scenario, tuned.before.scenario) if path not in tuned.start]
     before = {path: _before(tuned, path) for path in (*changed, *tuned.start)}
     if tuned.scenario == tuned.before.scenario:
         return [(path, text, text) for path, text in before.items()]
-    return [(path, text, _shown(_value(tuned.scenario, path))) for path, text in before.items()]
+    return [(path, text, _format(_value(tuned.scenario, path))) for path, text in before.items()]
 
 
-def _before(tuned: Tuned, path: str) -> str:
-    return _shown(tuned.start.get(path, _value(tuned.before.scenario, path)))
+def _before(tuned: TuningResult, path: str) -> str:
+    return _format(tuned.start.get(path, _value(tuned.before.scenario, path)))
 
 
 def _value(scenario: Scenario, path: str) -> Any:
     return reduce(getattr, path.split("."), scenario)
 
 
-def _shown(value: Any) -> str:
+def _format(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def nm(rms: float) -> str:
-    """An error in [nm], to two digits."""
+    """Format an error in [nm], to two digits."""
     return f"{rms * 1e3:.2f}"
 
 
-def remarks(tuned: Tuned) -> list[str]:
-    """One line on each thing that the tables do not say."""
+def tuning_remarks(tuned: TuningResult) -> list[str]:
+    """Return one line on each fact that is not in the tables."""
     out = [] if tuned.against == TRUTH else [f"compared with {tuned.against}, no truth being known"]
     known = [s.likelihood for s in (tuned.before, tuned.after)]
     if all(known):
@@ -86,8 +89,8 @@ def remarks(tuned: Tuned) -> list[str]:
     return out
 
 
-def toml(tuned: Tuned) -> str:
-    """The tuned scenario as TOML, with what was changed beside its settings."""
+def tuning_toml(tuned: TuningResult) -> str:
+    """Return the tuned scenario as TOML, with the former values beside changed settings."""
     base = tuned.before.scenario
     notes = {
         path: f"{'tuned' if path in tuned.paths else 'with it'}, {_before(tuned, path)} before"

@@ -18,11 +18,11 @@ CLOSE, LEVEL = 2e-3, 1e-4
 """Where a descent ends: simplex of this size, values this near to each other (relative)."""
 
 
-class Spent(Exception):
+class NoEvaluationLeft(Exception):
     """No evaluation is left."""
 
 
-def search(f: Callable[[Array], float], start: Array, evaluations: int, rng: np.random.Generator) -> None:
+def minimise(f: Callable[[Array], float], start: Array, evaluations: int, rng: np.random.Generator) -> None:
     """Ask f at points (d,) of the unit cube, `start` first, until it raises Spent or nothing is left to gain.
 
     f gives infinity where it fails; it keeps what it was asked.
@@ -43,10 +43,10 @@ def search(f: Callable[[Array], float], start: Array, evaluations: int, rng: np.
             )
             points.append(found.x)
             values.append(float(found.fun))
-    except Spent:
+    except NoEvaluationLeft:
         return
 
 
 def _simplex(point: Array, size: float) -> Array:
-    """The point, and one beside it along every axis, on the side with more room."""
+    """Return the point, and one beside it along every axis, on the side with more room."""
     return np.vstack([point, point + size * np.diag(np.where(point < 0.5, 1.0, -1.0))])

@@ -1,4 +1,4 @@
-"""What of an observer is tuned: which of the settings that it names, between which numbers, on which scale.
+"""The search space of each observer: its tuned settings, their ranges and scales.
 
 The world (turbulence, vibration, sensors, loop) is not tuned.
 """
@@ -41,19 +41,19 @@ class Axis:
     whole: bool
 
     def value(self, x: float) -> float:
-        """The number at x, from 0 to 1."""
-        low, high = self._scaled(self.low), self._scaled(self.high)
+        """Return the number at x, from 0 to 1."""
+        low, high = self._to_scale(self.low), self._to_scale(self.high)
         value = low + (high - low) * x
         value = float(f"{np.exp(value) if self.low > 0 else value:.{DIGITS}g}")
         return min(max(round(value) if self.whole else value, self.low), self.high)
 
     def place(self, value: float) -> float:
         """Where a number is, from 0 to 1; what lies outside is at an end."""
-        low, high = self._scaled(self.low), self._scaled(self.high)
-        inside = self._scaled(min(max(value, self.low), self.high))
+        low, high = self._to_scale(self.low), self._to_scale(self.high)
+        inside = self._to_scale(min(max(value, self.low), self.high))
         return (inside - low) / (high - low) if high > low else 0.0
 
-    def _scaled(self, value: float) -> float:
+    def _to_scale(self, value: float) -> float:
         return float(np.log(value)) if self.low > 0 else value
 
 
@@ -65,7 +65,7 @@ class Space:
     by_hand: dict[str, Any]
 
     def changes(self, point: Array) -> dict[str, Any]:
-        """The settings (dotted path -> value) at a point (len(axes),) of the unit cube."""
+        """Return the settings (dotted path -> value) at a point (len(axes),) of the unit cube."""
         return {**self.by_hand, **{a.path: a.value(float(x)) for a, x in zip(self.axes, point, strict=True)}}
 
     def values(self, scenario: Scenario) -> dict[str, float]:
@@ -85,10 +85,10 @@ def numbers(scenario: Scenario) -> dict[str, float]:
 
 
 def space(scenario: Scenario, observer: str, names: Sequence[str] | None = None) -> Space:
-    """What is searched for an observer: its usual settings, or those named.
+    """Return the search space of an observer: its usual settings, or those named.
 
     A range is that of the sliders (soft bounds), wide enough for the scenario's own number.
-    Raises SettingError for a name that is no setting, is not one number, or is not read by the observer.
+    Raises SettingError for a name that is no setting, is not one number, or is not used by the observer.
     """
     if observer not in OBSERVERS:
         raise SettingError(f"observer {observer!r}: no such observer; there are {', '.join(OBSERVERS)}")
@@ -105,7 +105,10 @@ def space(scenario: Scenario, observer: str, names: Sequence[str] | None = None)
     by_hand = {}
     for switch, (paths, matched) in BY_HAND.items():
         if set(paths) & set(chosen) and _value(scenario, switch) == "matched":
-            by_hand |= {switch: "manual", **{p: _allowed(scenario, p, v) for p, v in zip(paths, matched(scenario), strict=True)}}
+            by_hand |= {
+                switch: "manual",
+                **{p: _clip_to_limits(scenario, p, v) for p, v in zip(paths, matched(scenario), strict=True)},
+            }
     values = {**numbers(scenario), **by_hand}
     return Space(tuple(_axis(scenario, path, values[path]) for path in chosen), by_hand)
 
@@ -125,7 +128,7 @@ def _check(scenario: Scenario, observer: str, path: str) -> None:
 
 
 def _value(group: Any, path: str) -> Any:
-    """The value of a setting, or of an item of a list, by its dotted path."""
+    """Return the value of a setting, or of an item of a list, by its dotted path."""
     return reduce(lambda node, key: node[int(key)] if isinstance(node, list) else getattr(node, key), path.split("."), group)
 
 
@@ -139,7 +142,7 @@ def _limits(bounds: tuple[Any, Any] | None) -> tuple[float, float]:
     return float(bounds[0]), float(bounds[1])
 
 
-def _allowed(scenario: Scenario, path: str, value: float) -> float:
+def _clip_to_limits(scenario: Scenario, path: str, value: float) -> float:
     low, high = _limits(_parameter(scenario, path).bounds)
     return min(max(float(f"{value:.{DIGITS}g}"), low), high)
 

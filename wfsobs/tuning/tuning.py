@@ -16,8 +16,8 @@ from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.tuning.judge import Errors, Judge, target_of
 from wfsobs.tuning.likelihood import likelihood
-from wfsobs.tuning.records import DESIGN, MEASURES, Records, cut, simulated, stream
-from wfsobs.tuning.search import Spent, search
+from wfsobs.tuning.records import DESIGN, MEASURES, Records, cut_record, simulate_records, stream
+from wfsobs.tuning.search import NoEvaluationLeft, minimise
 from wfsobs.tuning.space import Space, space
 from wfsobs.typing import Array
 
@@ -62,7 +62,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Tuned:
+class TuningResult:
     """What a tuning gives.
 
     target  : what the errors are those of: "turbulence", "vibration", or "next z" where there is no truth
@@ -108,16 +108,49 @@ def tune(
     validation: float | None = None,
     told: Callable[[Evaluation], None] | None = None,
     watch: Watch = QUIET,
-) -> Tuned:
-    """Search for the settings of an observer with the least error on a validation record; the test record is scored after that.
+) -> TuningResult:
+    """Search for the settings of an observer with the minimum error on a validation record.
 
-    names       : dotted paths of the settings, the observer's usual ones unless given
-    evaluations : runs of the observer on the validation record, at most; settings that come up again cost none
-    record      : telemetry, cut into pieces (`records.cut`); else the records are simulated
-    target      : of an observer that has both, "vibration" unless given
-    validation  : length of the simulated validation record [s], that of the scenario unless given
-    told        : given every evaluation as it is done; what stays of a tuning that is cancelled
-    Raises SettingError, RecordError where the observer has no estimate whatever its settings, Cancelled.
+    The test record is scored after that.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings to start from.
+    observer : str
+        Id of the observer.
+    names : sequence of str, optional
+        Dotted paths of the settings; by default the observer's usual ones.
+    evaluations : int
+        Maximum runs of the observer on the validation record; repeated settings cost none.
+    record : Record, optional
+        Telemetry, cut into pieces; by default the records are simulated.
+    target : {"turbulence", "vibration"}, optional
+        Target of the errors; by default vibration where the observer estimates it.
+    validation : float, optional
+        Length of the simulated validation record [s]; by default that of the scenario.
+    told : callable, optional
+        Receives every evaluation as it is done: what remains of a tuning that is cancelled.
+    watch : Watch, optional
+        Receives the progress, and is asked at every block of work whether to stop.
+
+    Returns
+    -------
+    TuningResult
+        The observer before and after, with the history of the search.
+
+    Raises
+    ------
+    SettingError
+        A setting or the observer cannot be tuned.
+    RecordError
+        The observer has no estimate whatever its settings.
+    Cancelled
+        `watch` asks to stop.
+
+    See Also
+    --------
+    wfsobs.run : Run observers with given settings.
     """
     if evaluations < 1:
         raise SettingError(f"evaluations = {evaluations}: takes a whole number from 1")
@@ -126,19 +159,19 @@ def tune(
     scenario.validate()
     searched, target = space(scenario, observer, names), target_of(observer, target)
     if record is None:
-        records = simulated(scenario, searched, target, validation, watch)
+        records = simulate_records(scenario, searched, target, validation, watch)
     else:
-        records = cut(record, scenario, observer, target)
+        records = cut_record(record, scenario, observer, target)
     trials = _Trials(scenario, searched, records, Judge(observer, records.target), evaluations, watch, told)
     trials.run({})
-    search(trials.at, searched.start(scenario), evaluations, stream(scenario, DESIGN))
+    minimise(trials.at, searched.start(scenario), evaluations, stream(scenario, DESIGN))
     first, best = trials.history[0], min(trials.history, key=lambda e: e.rms)
     if not isfinite(best.rms):
         raise RecordError(first.reason)
     before, after = (trials.stage(e) for e in (first, best))
     watch.step(1.0)
     start = {path: v for path, v in {**searched.by_hand, **searched.values(scenario)}.items() if not isinstance(v, str)}
-    return Tuned(
+    return TuningResult(
         observer,
         records.target,
         records.against,
@@ -170,14 +203,14 @@ class _Trials:
         self.warm_up = max(self.scenario.run.warm_up, LEARNING * record.n_steps * record.dt)
 
     def at(self, point: Array) -> float:
-        """The error at a point of the unit cube. Raises Spent where that takes one evaluation too many, Cancelled."""
+        """Return the error at a point of the unit cube. Raises NoEvaluationLeft where evaluations are used up, Cancelled."""
         changes = self.space.changes(point)
         key = tuple(changes.values())
         if not self.space.by_hand and changes == self.space.values(self.scenario):
             self.known[key] = self.history[0].rms  # the scenario itself
         if key not in self.known:
             if len(self.history) >= self.most:
-                raise Spent
+                raise NoEvaluationLeft
             self.known[key] = self.run(changes).rms
         return self.known[key]
 
@@ -207,7 +240,7 @@ class _Trials:
         return self.judge.errors(record, scenario, estimates, self.warm_up)
 
     def stage(self, evaluation: Evaluation) -> Stage:
-        """The scenario of an evaluation on the test record."""
+        """Score the scenario of an evaluation on the test record."""
         scenario = self.scenario.replace(evaluation.changes)
         record, judge, errors, other = self.records.test(scenario), self.judge, None, None
         others = {*OBSERVERS[judge.observer].targets} - {judge.target} if judge.target != PREDICTION else set[str]()
@@ -221,6 +254,6 @@ class _Trials:
         return Stage(scenario, evaluation.errors, errors, other, likelihood(judge.observer, record, scenario, self.watch))
 
     def _inner(self) -> Watch:
-        """The part of the progress that one run is."""
+        """Return the watch of one run, a part of the whole progress."""
         done, all_of_it = len(self.history), self.most + 2
         return Watch(lambda f: self.watch.progress((done + f) / all_of_it), self.watch.cancelled)

@@ -6,7 +6,7 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.render import Row, macro, table
 from wfsobs.identification import Identification
 from wfsobs.identification.process import Number
-from wfsobs.identification.report import format_number, mode_rows, verdict
+from wfsobs.identification.report import format_number, mode_rows, whiteness_lines
 from wfsobs.identification.result import IdentifiedMode
 
 WHITE, COLOURED = macro("tag", "best", "white"), macro("tag", "above", "not white")
@@ -41,6 +41,6 @@ def verdict_html(result: Identification) -> str:
     """Whether anything is left, mode by mode."""
     lines = [
         (WHITE if mode.whiteness.white else COLOURED) + f"{line}."
-        for mode, line in zip(result.modes, verdict(result), strict=True)
+        for mode, line in zip(result.modes, whiteness_lines(result), strict=True)
     ]
     return f'<div role="status">{macro("texts", "text", lines)}</div>'

@@ -26,9 +26,9 @@ from wfsobs.record import RecordError
 from wfsobs.scenario.configfile import changed_settings
 from wfsobs.settings.group import SettingError
 from wfsobs.settings.parameters import hint
-from wfsobs.tuning import Evaluation, Tuned
+from wfsobs.tuning import Evaluation, TuningResult
 from wfsobs.tuning.records import MEASURES, TRUTH
-from wfsobs.tuning.report import toml
+from wfsobs.tuning.report import tuning_toml
 from wfsobs.tuning.tuning import EVALUATIONS
 
 INTRO = (
@@ -124,7 +124,7 @@ class TunePage(PageActions):
         table = [dict(zip(COLUMNS, row, strict=True)) for row in rows(tuned)]
         return {
             "Tuning table as CSV": Save("wfsobs-tuning.csv", "text/csv", lambda: table_csv(table)),
-            "Tuned settings as TOML": Save("wfsobs-tuned.toml", "application/toml", toml(tuned).encode),
+            "Tuned settings as TOML": Save("wfsobs-tuned.toml", "application/toml", tuning_toml(tuned).encode),
         }
 
     def _choose(self, *_: object) -> None:
@@ -134,7 +134,7 @@ class TunePage(PageActions):
         self.target.param.update(options=targets, value=VIBRATION if VIBRATION in targets else targets[0])
         self.searched.object = f'<p class="text">Searched: {", ".join(OBSERVERS[name].tunable.usual)}.</p>'
 
-    def _tuned(self) -> Tuned | None:
+    def _tuned(self) -> TuningResult | None:
         return self.work.result
 
     def _history(self) -> tuple[Evaluation, ...]:

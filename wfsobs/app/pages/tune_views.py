@@ -16,9 +16,9 @@ from wfsobs.app.style import look
 from wfsobs.app.tune_work import LIKELIHOOD, OTHER, SETTING, TEST, TOGETHER, VALIDATION, best_so_far, rows
 from wfsobs.app.views.plots import call, new_figure
 from wfsobs.sensors.modes import TIP_TILT
-from wfsobs.tuning import Evaluation, Tuned
+from wfsobs.tuning import Evaluation, TuningResult
 from wfsobs.tuning.records import MEASURES, NEXT, REFERENCE, TRUTH
-from wfsobs.tuning.report import remarks
+from wfsobs.tuning.report import tuning_remarks
 
 TITLES = {
     SETTING: "Settings",
@@ -62,14 +62,14 @@ class HistoryFigure:
         self._best.glyph.update(line_color=look("fitted").colour(dark))
 
 
-def unit_for(tuned: Tuned | None, display: Display) -> str:
+def unit_for(tuned: TuningResult | None, display: Display) -> str:
     """Choose the unit: the one shown, or nm where it is an angle and the modes have none."""
     modes = (tuned.before.validation or tuned.after.validation) if tuned else None
     angles = modes is None or set(modes.modes) <= {mode.name for mode in TIP_TILT}
     return "nm" if display.unit in NO_ANGLE and not angles else display.unit
 
 
-def table_html(tuned: Tuned, display: Display, diameter: float) -> str:
+def table_html(tuned: TuningResult, display: Display, diameter: float) -> str:
     """Write settings, errors and likelihoods before and after."""
     unit = unit_for(tuned, display)
     scale = per_micrometre(unit, diameter)
@@ -78,7 +78,7 @@ def table_html(tuned: Tuned, display: Display, diameter: float) -> str:
         for section, found in groupby(rows(tuned), key=lambda row: row[0])
     ]
     columns = {"What": "", "Before": "", "After": "", "Change [%]": ""}
-    notes = [f"{line}." for line in remarks(tuned) if "likelihood" not in line]
+    notes = [f"{line}." for line in tuning_remarks(tuned) if "likelihood" not in line]
     return f"{table('Before and after', columns, groups)}{macro('texts', 'text', notes)}"
 
 

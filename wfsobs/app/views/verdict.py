@@ -26,7 +26,7 @@ class VerdictLine:
         self.pane.object = self.html()
 
     def html(self) -> str:
-        """The sentences, nothing while observers are at work or where there is no truth."""
+        """Return the sentences; empty while observers are at work or where there is no truth."""
         shown = self.run.result
         if shown is None or self.run.state != DONE:
             return ""

@@ -80,7 +80,7 @@ class Scale(NamedTuple):
 
 
 def window_signals(settings: Gpr, y: Array, u: Array, z: Array, mode: int, dt: float, scale: Scale | None = None) -> Array:
-    """The channels of a window, (n_steps, channels): u and y_lgs (paper, eq. 14), or z, as they are, high-passed or standardised.
+    """Return the channels of a window, (n_steps, channels): u and y_lgs (paper, eq. 14), or z; raw, high-passed or standardised.
 
     scale : for standardised ones, from `scale_of`
     """
@@ -95,7 +95,7 @@ def window_signals(settings: Gpr, y: Array, u: Array, z: Array, mode: int, dt: f
 
 
 def scale_of(settings: Gpr, training: Training | None, delay: int, mode: int) -> Scale | None:
-    """What standardised inputs are divided by, from the training record; None for others. Raises RecordError without one."""
+    """Return the scale of standardised inputs, from the training record; None for others. Raises RecordError without one."""
     if settings.inputs_filter != "standardised":
         return None
     if training is None:
@@ -132,7 +132,7 @@ class StreamingInputs:
         self._state: Array | None = None
 
     def step(self, sample: Array) -> Array:
-        """The inputs (channels,) of this step's sample (channels,)."""
+        """Return the inputs (channels,) of this step's sample (channels,)."""
         if self._sos is not None:
             state = at_rest(self._sos, sample) if self._state is None else self._state
             out, self._state = sosfilt(self._sos, sample[None], axis=0, zi=state)
@@ -143,5 +143,5 @@ class StreamingInputs:
 
 
 def tunable(group: str) -> tuple[str, ...]:
-    """Settings of a group of a GPR that are tuned only if they are named."""
+    """Return the settings of a group of a GPR that are tuned only if they are named."""
     return tuple(f"{group}.{name}" for name in ("signal_std", "training_size", "highpass"))

@@ -43,7 +43,7 @@ class SquaredExponential:
         return self.signal_std**2
 
     def points(self, norm2: Array) -> Points:
-        """The windows with these squared norms [l^2]."""
+        """Return the windows with these squared norms [l^2]."""
         return Points(norm2, np.exp(-0.5 * norm2), float(norm2.max(initial=0.0)))
 
     def split(self, G: Array, i: Points, j: Points) -> None:
@@ -65,7 +65,7 @@ class SquaredExponential:
         """M w from inner products G (rows, columns) [l^2] of points i (rows,) and j (columns,); uses up G."""
         if max(i.largest, j.largest) < 1.0:  # the factors of `split`, taken out of the matrix
             return i.delta * (np.expm1(G, out=G) @ (self.variance * j.delta * w))
-        self.split(G, i.seen(lambda p: p[:, None]), j)
+        self.split(G, i.select(lambda p: p[:, None]), j)
         return G @ w
 
     def own(self, points: Points) -> Array:
@@ -74,15 +74,17 @@ class SquaredExponential:
 
 
 class Points(NamedTuple):
-    """Windows by what the kernel needs beside their inner products: |x|^2 [l^2] and delta, of equal shape, and the
-    largest |x|^2 among them or more."""
+    """Windows by the numbers that the kernel needs beside inner products.
+
+    |x|^2 [l^2] and delta, of equal shape, and an upper limit of |x|^2.
+    """
 
     norm2: Array
     delta: Array
     largest: float
 
-    def seen(self, part: Callable[[Array], Array]) -> Points:
-        """Some of the points, or all of them in another shape."""
+    def select(self, part: Callable[[Array], Array]) -> Points:
+        """Return some of the points, or all of them in another shape."""
         return Points(part(self.norm2), part(self.delta), self.largest)
 
 
@@ -143,8 +145,10 @@ TILE = 64
 
 
 def restart_interval(depth: int) -> int:
-    """Steps after which sliding inner products start anew from direct ones: as many as a window has, so that
-    rounding never grows beyond that of a direct product and the cost stays independent of depth."""
+    """Return the steps after which sliding inner products restart from direct ones: the samples of a window.
+
+    Rounding never grows beyond that of a direct product, and the cost stays independent of depth.
+    """
     return max(16, depth)
 
 
@@ -197,17 +201,19 @@ def band(signals: Array, depth: int, kernel: SquaredExponential, first: int, row
     V = sliding_products(signals, signals, depth, first, first, rows, reach + 1, triangle=True)
     samples = np.column_stack([_cut(channel, first - depth + 1, depth - 1 + rows + reach) for channel in signals.T])
     points = kernel.points(squared_norms(samples, depth)[depth - 1 :])
-    later = points.seen(lambda p: sliding_window_view(p, reach + 1)[:rows])
+    later = points.select(lambda p: sliding_window_view(p, reach + 1)[:rows])
     for top in range(0, rows, TILE):
         part, wide = slice(top, min(top + TILE, rows)), min(reach + 1, rows - top)
-        here = points.seen(lambda p, part=part: p[part, None])
-        kernel.split(V[part, :wide], here, later.seen(lambda p, part=part, wide=wide: p[part, :wide]))
+        here = points.select(lambda p, part=part: p[part, None])
+        kernel.split(V[part, :wide], here, later.select(lambda p, part=part, wide=wide: p[part, :wide]))
     V[:, 0] += kernel.noise_std**2
-    return V, points.seen(lambda p: p[:rows])
+    return V, points.select(lambda p: p[:rows])
 
 
 def square_from_band(V: Array, start: int, n: int) -> Array:
-    """View of V as the symmetric matrix of points start ... start + n - 1, column-major, its lower triangle valid
-    down to V's largest lag; what lies beyond is meaningless. Read only."""
+    """Return a view of V as the symmetric matrix of points start ... start + n - 1, column-major, read-only.
+
+    Its lower triangle is valid down to V's largest lag; the rest is meaningless.
+    """
     row, item = V.strides
     return as_strided(V[start:], (n, n), (item, row - item), writeable=False)

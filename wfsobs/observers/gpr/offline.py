@@ -48,8 +48,7 @@ OFFLINE = Section("gpr_offline", "Offline GPR", OfflineGpr)
 
 @dataclass(frozen=True)
 class TrainedGpr:
-    """What training leaves: signals (d + m - 1, channels) [l] that the m windows are cut from, the windows as points,
-    their weights (m,), and the constant c."""
+    """A trained GPR: the signals (d + m - 1, channels) [l] of its m windows, the windows as points, their weights (m,), and c."""
 
     signals: Array
     depth: int
@@ -71,7 +70,7 @@ class TrainedGpr:
             products = sliding_products(signals, self.signals, d, start, d - rows, rows, m + rows - 1)
             row, item = products.strides
             G = as_strided(products[:, rows - 1 :], (rows, m), (row - item, item))
-            here = tests.seen(lambda p, start=start, rows=rows: p[start : start + rows])
+            here = tests.select(lambda p, start=start, rows=rows: p[start : start + rows])
             known = self.kernel.split_times(G, here, self.points, self.weights)
             out[start : start + rows] = known + here.delta * self.constant
         return out
@@ -98,7 +97,7 @@ def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExp
 
 
 def training_targets(training: Training, bands: Bands, dt: float, delay: int = DELAY) -> Array:
-    """The vibration reference of the training record, (n, n_modes) [um]; NaN at the last step."""
+    """Return the vibration reference of the training record, (n, n_modes) [um]; NaN at the last step."""
     twin = training.open_loop_y
     return open_loop_reference(bands, pseudo_open_loop(training.y_lgs, training.u, delay) if twin is None else twin, dt)
 

@@ -49,18 +49,18 @@ BAND_ENTRIES, BAND_ROWS = 4_000_000, 8192
 
 
 def kernel_of(settings: Gpr) -> SquaredExponential:
-    """The kernel with the numbers of the settings."""
+    """Return the kernel with the numbers of the settings."""
     return SquaredExponential(settings.signal_std, settings.length_scale, settings.noise_std)
 
 
 def online_targets(record: Signals, bands: Bands) -> Array:
-    """The vibration at every step, as far as the causal bank tells it one step later, (n, n_modes) [um]; 0 at the last step."""
+    """Return the vibration at every step, from the causal bank one step later, (n, n_modes) [um]; 0 at the last step."""
     f = online_reference(bands, record.z, record.dt)
     return np.vstack([f[1:], np.zeros((1, record.n_modes))])
 
 
 def gpr_online(measured: Measurements, prior: Prior, settings: OnlineGpr, watch: Watch) -> dict[str, Array]:
-    """The online GPR over a record, all modes at the same time, delivered block by block."""
+    """Run the online GPR over a record, all modes at the same time, in blocks."""
     if measured.n_steps < settings.depth + settings.training_size:
         needed = settings.depth + settings.training_size
         raise RecordError(f"the record has {measured.n_steps} steps; depth + training size need {needed}")
@@ -130,7 +130,7 @@ def predict_sliding(
 def _whole_run(
     V: Array, delta: Array, targets: Array, kernel: SquaredExponential, at: int, row: int, m: int, run: int
 ) -> tuple[Array, Array]:
-    """The matrix over [m + run points | f | delta] of the steps at ... at + run - 1, and the points' targets."""
+    """Return the matrix over [m + run points | f | delta] of the steps at ... at + run - 1, and the points' targets."""
     n = m + run
     S = np.zeros((n + 2, n + 2), order="F")
     S[:n, :n] = square_from_band(V, row, n)
@@ -142,7 +142,7 @@ def _whole_run(
     return S, f
 
 
-def standardised(settings: Gpr) -> tuple[Part, ...]:
+def standardised_parts(settings: Gpr) -> tuple[Part, ...]:
     """Standardised inputs are divided by the deviations of a training record."""
     return (Training,) if settings.inputs_filter == "standardised" else ()
 
@@ -161,7 +161,7 @@ GPR_ONLINE = Observer(
     help="trained anew at every step on the last windows",
     prior=(Bands,),
     settings=Section("gpr_online", "Online GPR", OnlineGpr),
-    asks=standardised,
+    asks=standardised_parts,
     # Its targets are what the causal band-passes make of turbulence, too.
     tunable=Tunable(
         ("gpr_online.noise_std", "gpr_online.depth", "butterworth.bandwidth_online"),

@@ -31,8 +31,10 @@ def _go_on() -> None:
 
 
 def run_lengths(window: int) -> list[int]:
-    """How many steps share an elimination on each level, each length a multiple of the next; for a window
-    below LEAF nothing is shared."""
+    """Return the number of steps that share an elimination on each level, each a multiple of the next.
+
+    For a window below LEAF nothing is shared.
+    """
     if window < LEAF:
         return []
     largest = 2 ** int(np.log2((window + 1) / 2))
@@ -63,7 +65,7 @@ def slide(
 
 
 def _eliminate_common(S: Array, f: Array, window: int, start: int, b: int, check: Callable[[], None]) -> tuple[Array, Array]:
-    """The sliding problem of steps start ... start + b - 1 with the training points they share eliminated."""
+    """Eliminate the shared training points of steps start ... start + b - 1; return the remaining sliding problem."""
     n = window - b + 1
     common = slice(start + b - 1, start + window)
     going = slice(start, start + b - 1)

@@ -142,7 +142,7 @@ class SlidingRegression:
         return out
 
     def _renew_products(self) -> None:
-        """Some inner products from their samples at every step, in turn: rounding of the others has no time to grow."""
+        """Recompute some inner products from their samples, in turn: rounding of the others has no time to grow."""
         turns = -(-(self.m + 1) // len(self._renewal))
         first = min(self.step % turns * len(self._renewal), self.m + 1 - len(self._renewal))
         d, e, H = self.depth, self._end, self._history
@@ -180,8 +180,10 @@ class OnlineGprStream:
         self._pending = False
 
     def estimate(self, y: float, u: float | None = None) -> float:
-        """Estimate of the vibration at this step [um], from its LGS measurement y [um] and, unless the windows
-        are of z, its command u [um]. NaN until the training set is full. `update` must follow."""
+        """Estimate the vibration at this step [um] from its LGS measurement y [um].
+
+        And from its command u [um], unless the windows are of z. NaN until the training set is full. `update` must follow.
+        """
         if self._pending:
             raise RuntimeError("estimate was called twice without update")
         z = y - self._u[1]

@@ -1,8 +1,8 @@
-"""The Kalman filter of a model that is identified anew from the last seconds of z, again and again.
+"""Adaptive Kalman filter: its model is identified anew from the last seconds of z, again and again.
 
-Nothing has to be known beforehand, and what changes is followed: noise, turbulence and peaks of every window are found
+It needs no prior and follows changes: noise, turbulence and peaks of every window are identified
 (`wfsobs.spectral.quick`), and the steady-state filter of that model runs until the next. A new filter starts at rest at the
-beginning of its window, so that its state has converged when it takes over, and what it says is kept from there on.
+beginning of its window, so that its state has converged when its estimates begin.
 """
 
 from __future__ import annotations
@@ -62,8 +62,10 @@ STILL = PeriodicFilter([(np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((2, 1)), n
 
 
 def kf_adaptive(measured: Measurements, _prior: Prior, settings: Adaptive, watch: Watch) -> dict[str, Array]:
-    """The filter on the LGS measurement, at every fast step; NaN until the first window is full. Raises RecordError for a
-    record shorter than a window, or a window of too few samples."""
+    """Run the filter on the LGS measurement, at every fast step; NaN until the first window is full.
+
+    Raises RecordError for a record shorter than a window, or a window of too few samples.
+    """
     window = round(settings.window / measured.dt)
     if window < SHORTEST:
         least = SHORTEST * measured.dt
@@ -79,11 +81,11 @@ def kf_adaptive(measured: Measurements, _prior: Prior, settings: Adaptive, watch
             watch.step((mode + fraction) / measured.n_modes)
 
         before = np.full((measured.delay, len(TARGETS)), np.nan)
-        columns.append(np.vstack([before, adapting(z[:, mode], measured.dt, settings, tell)]))
+        columns.append(np.vstack([before, adapt(z[:, mode], measured.dt, settings, tell)]))
     return by_target(columns)
 
 
-def adapting(z: Array, dt: float, settings: Adaptive, tell: Callable[[float], None]) -> Array:
+def adapt(z: Array, dt: float, settings: Adaptive, tell: Callable[[float], None]) -> Array:
     """Turbulence and vibration (n, 2) [um] of one mode's z (n,) [um]; tell : told the fraction done.
 
     A window whose model or filter cannot be found leaves the filter before it in charge.
@@ -108,7 +110,7 @@ def adapting(z: Array, dt: float, settings: Adaptive, tell: Callable[[float], No
 
 
 def filter_of(spectrum: Spectrum) -> PeriodicFilter:
-    """The steady-state filter of a spectrum: z -> turbulence, vibration. Raises ValueError where there is none."""
+    """Return the steady-state filter of a spectrum: z -> turbulence, vibration. Raises ValueError where there is none."""
     if not spectrum.processes:
         return STILL
     model = disturbance_model([] if spectrum.turbulence is None else [spectrum.turbulence], spectrum.resonances)

@@ -33,7 +33,7 @@ class MultiPeak(Group):
 
 
 def kf_multi(measured: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> dict[str, Array]:
-    """The filter on the LGS measurement, at every fast step."""
+    """Run the filter on the LGS measurement, at every fast step."""
     z = measured.z
     columns = []
     for mode, model in enumerate(prior.lines):

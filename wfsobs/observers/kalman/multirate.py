@@ -92,10 +92,9 @@ class MultiRateFilter:
 def multirate_filter(
     model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, outputs: Array | None = None
 ) -> MultiRateFilter:
-    """The filter for an NGS frame every `ratio` steps; lgs_noise, ngs_noise: square roots of r [um].
+    """Return the filter for an NGS frame every `ratio` steps; lgs_noise, ngs_noise: square roots of r [um].
 
-    outputs : rows wanted of the state x_hat[k], (p, n); every target by default.
-    Raises UnstableCycle.
+    outputs : rows of the state x_hat[k] to return, (p, n); every target by default. Raises UnstableCycle.
     """
     C_lgs, C_both = np.atleast_2d(model.C), np.vstack([model.C, model.C])
     L_lgs = steady_state(model.A, C_lgs, model.Q, np.array(lgs_noise**2)).L
@@ -123,7 +122,7 @@ def run_modes(measured: Measurements, watch: Watch, make: Callable[[int], MultiR
 
 
 def multirate(measured: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> dict[str, Array]:
-    """The multi-rate filter over a record, for turbulence."""
+    """Run the multi-rate filter over a record, for turbulence."""
     assert measured.ratio is not None
     ratio = measured.ratio
 

@@ -29,7 +29,7 @@ from wfsobs.typing import Array
 def optimal_cycle(
     model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, lgs_error: Ar2 | None = None
 ) -> list[Step]:
-    """(A, C, Q, R) of the steps k = 1 ... n, the NGS frame at the last; noises as standard deviations [um].
+    """Return (A, C, Q, R) of the steps k = 1 ... n, the NGS frame at the last; noises as standard deviations [um].
 
     State (disturbance model, slow LGS error if any, frame). C has two rows at every step, LGS and NGS; where there is no
     frame the second is zero.
@@ -55,7 +55,7 @@ def optimal_cycle(
 
 
 def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[MultiRateFilter, list[SteadyState]]:
-    """The filter of a cycle, and its covariances at steps 1 ... n; outputs (p, n_states) rows wanted of the state.
+    """Return the filter of a cycle, and its covariances at steps 1 ... n; outputs (p, n_states) rows of the state.
 
     Step 0, before the first frame, measures the LGS alone and starts the frame anew.
     """
@@ -70,7 +70,7 @@ def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[MultiRateFilter, 
 def optimal_model(
     settings: MultiRate, prior: Prior, mode: int, ratio: int, model: DisturbanceModel | None = None
 ) -> tuple[list[Step], Array]:
-    """The cycle and output rows of one mode; model: of the disturbance, that of one peak unless given."""
+    """Return the cycle and output rows of one mode; model: of the disturbance, by default that of one peak."""
     model = model or prior.model[mode].disturbance()
     error = prior.lgs_error[mode].process if settings.model_lgs_error else None
     cycle = optimal_cycle(model, ratio, *multirate_noise(settings, prior.model[mode]), error)
@@ -79,7 +79,7 @@ def optimal_model(
 
 
 def multirate_optimal(measured: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> dict[str, Array]:
-    """The optimal multi-rate filter over a record."""
+    """Run the optimal multi-rate filter over a record."""
     assert measured.ratio is not None
     ratio = measured.ratio
     columns = run_modes(measured, watch, lambda mode: optimal_filter(*optimal_model(settings, prior, mode, ratio))[0])

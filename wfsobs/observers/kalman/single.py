@@ -36,16 +36,18 @@ MIN_NOISE = 1e-6
 
 
 def filter_step(A: Array, C: Array, L: Array, outputs: Array) -> tuple[Array, Array, Array, Array]:
-    """(F, G, H, J) of one step with transition A (n, n), measurement rows C (m, n) and filter gain L (n, m): the state
-    is x_pred[k], the result outputs (p, n) times x_hat[k]."""
+    """Return (F, G, H, J) of one step with transition A (n, n), measurement rows C (m, n) and filter gain L (n, m).
+
+    The state is x_pred[k], the result outputs (p, n) times x_hat[k].
+    """
     reduced = np.eye(len(A)) - L @ C
     return A @ reduced, A @ L, outputs @ reduced, outputs @ L
 
 
 def steady_filter(model: DisturbanceModel, noise: float, outputs: Array | None = None) -> tuple[PeriodicFilter, SteadyState]:
-    """The steady-state filter of z (1 input), and its covariances; noise [um].
+    """Return the steady-state filter of z (1 input), and its covariances; noise [um].
 
-    outputs : rows wanted of the state x_hat[k], (p, n); every target by default.
+    outputs : rows of the state x_hat[k] to return, (p, n); every target by default
     """
     steady = steady_state(model.A, model.C, model.Q, np.array(noise**2))
     rows = model.output_rows(TARGETS) if outputs is None else outputs
@@ -53,7 +55,7 @@ def steady_filter(model: DisturbanceModel, noise: float, outputs: Array | None =
 
 
 def kf_lgs(measured: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
-    """The Kalman filter on the LGS measurement, at every fast step."""
+    """Run the Kalman filter on the LGS measurement, at every fast step."""
     z = measured.z
     columns = []
     for mode, model in enumerate(prior.model):
@@ -64,10 +66,10 @@ def kf_lgs(measured: Measurements, prior: Prior, _settings: None, watch: Watch) 
 
 
 def kf_ngs(measured: Measurements, prior: Prior, settings: Kalman, watch: Watch) -> dict[str, Array]:
-    """The Kalman filter on NGS frames, with the coefficients for T_NGS.
+    """Run the Kalman filter on NGS frames, with the coefficients for T_NGS.
 
     A frame at k = n i measures slow step i - 1 (fast steps k - n ... k - 1); the estimate is that of slow
-    step i, the fast steps k ... k + n - 1. It is held over them, or spread by the fast model.
+    step i, the fast steps k ... k + n - 1. It is held over them, or propagated by the fast model.
     """
     assert measured.ratio is not None
     n = measured.ratio
