@@ -54,9 +54,10 @@ test-fast: $(TEST)  ## the quick tests alone: no dashboard, no report, none that
 setup: $(TEST)  ## install all that the tests need, the browser included
 	@scripts/need_browser.sh $(VENV)
 
-check: $(TEST)  ## ruff, pyright, the walls between the rooms, and calls that go up
+check: $(TEST)  ## ruff, pyright, names, the walls between the rooms, and calls that go up
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python scripts/check_names.py
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-logo --no-cache
 	$(BIN)/python scripts/count_jumps.py

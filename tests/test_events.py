@@ -25,7 +25,7 @@ from wfsobs.signal.spectrum import bin_frequencies, random_phase_signal
 from wfsobs.simulation.disturbance import make_disturbance
 from wfsobs.simulation.events import interpolate_steps, shift_peak, shift_process
 from wfsobs.simulation.guide_stars import lgs_weights
-from wfsobs.simulation.loop import integrator
+from wfsobs.simulation.loop import integrate_commands
 from wfsobs.telemetry.records import load_record, save_record
 
 SHORT = {"run.duration": 3.0, "run.warm_up": 0.5, "gpr_online.training_size": 100, "gpr_offline.training_size": 100}
@@ -234,9 +234,11 @@ def test_frames_are_lost_at_random_in_their_time() -> None:
 def test_the_integrator_holds_its_command_where_a_frame_is_lost() -> None:
     rng = np.random.default_rng(8)
     y, nothing = rng.standard_normal((400, 2)), np.full((1, 2), np.nan)
-    np.testing.assert_allclose(integrator(np.vstack([y, nothing]), 0.3, 0.99)[:400], integrator(y, 0.3, 0.99), atol=1e-12)
+    np.testing.assert_allclose(
+        integrate_commands(np.vstack([y, nothing]), 0.3, 0.99)[:400], integrate_commands(y, 0.3, 0.99), atol=1e-12
+    )
     y[rng.random(y.shape) < 0.3] = np.nan
-    u = integrator(y, 0.3, 0.99)
+    u = integrate_commands(y, 0.3, 0.99)
     for mode in (0, 1):
         for k in range(2, 400):
             measured = y[k, mode] + u[k - 2, mode]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from wfsobs.record import Record, RecordError, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
-from wfsobs.simulation.loop import TRAINING_MARGIN, integrator, simulate
+from wfsobs.simulation.loop import TRAINING_MARGIN, integrate_commands, simulate
 
 NOISELESS = {"sensors.lgs_noise": 0.0, "sensors.ngs_noise": 0.0, "sensors.lgs_low_frequency_rms": 0.0}
 
@@ -37,7 +37,7 @@ def test_integrator_is_the_plain_recursion(gain: float, leak: float, n: int, see
         y = y_open[k] + at(u, k - 2)
         u[k] = leak * at(u, k - 1) - gain * y
     # the same operations in another order; a loop of gain 0.999 rings for 1000 steps, summing n rounding errors
-    assert np.allclose(integrator(y_open, gain, leak), u, rtol=1e-12, atol=1e-14 * n)
+    assert np.allclose(integrate_commands(y_open, gain, leak), u, rtol=1e-12, atol=1e-14 * n)
 
 
 @pytest.mark.parametrize(("gain", "leak"), [(0.999, 1.0), (0.999, 0.0), (0.5, 1.0), (0.0, 1.0), (0.3, 0.999)])
@@ -45,7 +45,7 @@ def test_every_gain_that_can_be_set_is_stable(gain: float, leak: float) -> None:
     """Poles of q^2 - leak q + g; without gain the pole at leak is not driven."""
     radius = np.abs(np.roots([1.0, -leak, gain])).max()
     assert radius < 1.0 or gain == 0.0
-    assert np.isfinite(integrator(np.ones((5000, 1)), gain, leak)).all()
+    assert np.isfinite(integrate_commands(np.ones((5000, 1)), gain, leak)).all()
 
 
 @pytest.mark.parametrize("closed", [True, False])
@@ -95,7 +95,7 @@ def test_a_record_without_ngs_says_so() -> None:
 def test_the_loop_reduces_what_it_sees() -> None:
     """A pure integrator cancels a slow disturbance to the residual that its slope leaves: slope / g per step."""
     ramp = np.arange(2000.0)[:, None] * 1e-3
-    u = integrator(ramp, 0.3, 1.0)
+    u = integrate_commands(ramp, 0.3, 1.0)
     residual = ramp[-1] + u[-3]
     assert residual == pytest.approx(1e-3 / 0.3, rel=1e-9)
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from wfsobs.atmosphere.von_karman import FIELD
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.per_mode import AT_ONCE
-from wfsobs.priors_from.scenario import settings_of
+from wfsobs.priors_from.scenario import observer_settings
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import TRAINING_MARGIN
 
@@ -34,7 +34,7 @@ def part_seconds(scenario: Scenario) -> dict[str, float]:
     air = _steps_of_air(scenario)
     return {
         **{
-            o.id: o.seconds(settings_of(o, scenario), n, n_modes, scenario.dt)
+            o.id: o.seconds(observer_settings(o, scenario), n, n_modes, scenario.dt)
             for o in OBSERVERS.values()
             if o.seconds is not None
         },

@@ -21,11 +21,11 @@ UNDERLINE = re.compile(r"^-{3,}$", flags=re.M)
 
 
 def as_markdown(text: str) -> str:
-    """The text with its examples as blocks and its fields as a list of Markdown.
+    r"""Return the text with its examples as blocks and its fields as a list of Markdown.
 
-    >>> as_markdown("Twice.\\n\\n>>> 2 * 1\\n2\\n\\nMore.").splitlines()
+    >>> as_markdown("Twice.\n\n>>> 2 * 1\n2\n\nMore.").splitlines()
     ['Twice.', '', '```pycon', '>>> 2 * 1', '2', '```', '', 'More.']
-    >>> as_markdown("A\\n\\nx, y : of a\\n  point\\nn    : how many").splitlines()
+    >>> as_markdown("A\n\nx, y : of a\n  point\nn    : how many").splitlines()
     ['A', '', '- `x, y`: of a', '  point', '- `n`: how many']
     """
     if not UNDERLINE.search(text):

@@ -34,7 +34,7 @@ class Predictor(NamedTuple):
 
 
 def fill_missing(signals: S, prior: Prior, line_width: float = LINE_WIDTH) -> S:
-    """Return the signals without NaN, except in y_ngs at steps without a frame. line_width : minimum of lines [Hz]"""
+    """Return the signals without NaN, except in y_ngs at steps without a frame; line_width : minimum of lines [Hz]."""
     u = hold_last(signals.u)
     y_lgs, open_loop_y, y_ngs = signals.y_lgs, signals.open_loop_y, signals.y_ngs
     if np.isnan(y_lgs).any():

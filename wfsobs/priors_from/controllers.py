@@ -27,7 +27,7 @@ def own_settings(controller: Controller, scenario: Scenario) -> Settings:
 
 
 def prior_for(controller: Controller, scenario: Scenario, spectra: Sequence[Spectra] = ()) -> Prior:
-    """Return the prior of a controller before there is a record. spectra : one per mode, where already computed
+    """Return the prior of a controller before there is a record; spectra : one per mode, where already computed.
 
     Raises ValueError where the scenario has no such prior.
     """

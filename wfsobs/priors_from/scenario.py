@@ -30,12 +30,12 @@ def arguments(observer: Observer, record: Record, scenario: Scenario) -> tuple[M
 
     Raises ValueError where the scenario has no such prior.
     """
-    settings = settings_of(observer, scenario)
+    settings = observer_settings(observer, scenario)
     prior = prior_of(scenario, record, (*observer.prior, *observer.asks(settings)))
     return record.measurements(open_loop="open_loop_y" in observer.needs), prior, settings
 
 
-def settings_of(observer: Observer, scenario: Scenario) -> Group | None:
+def observer_settings(observer: Observer, scenario: Scenario) -> Group | None:
     """Return a copy of an observer's own settings, or None."""
     return None if observer.group is None else getattr(scenario, observer.group).copy()
 

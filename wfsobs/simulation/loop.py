@@ -20,7 +20,7 @@ TRAINING_MARGIN = 0.5
 """Time after the last window of a training record [s]; it keeps the end of the zero-phase filter out of the targets."""
 
 
-def integrator(open_loop_y: Array, gain: float, leak: float) -> Array:
+def integrate_commands(open_loop_y: Array, gain: float, leak: float) -> Array:
     """Compute the commands of the integrator u[k] = leak u[k-1] - g y[k] on y[k] = open_loop_y[k] + u[k-2].
 
     The loop is linear, so it is one recursive filter of the open-loop measurement,
@@ -90,7 +90,7 @@ def _run(scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watc
     watch.check()
     u = np.zeros_like(seen.lgs)
     if scenario.loop.closed:
-        u = integrator(seen.lgs, scenario.loop.gain, scenario.loop.leak)
+        u = integrate_commands(seen.lgs, scenario.loop.gain, scenario.loop.leak)
     n = scenario.sensors.exposure_ratio
     return Record(
         y_lgs=seen.lgs + delay_signal(u, 2),

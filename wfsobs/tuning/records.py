@@ -18,7 +18,7 @@ from wfsobs.observers.base import TARGETS, VIBRATION
 from wfsobs.observers.baselines import open_loop_reference
 from wfsobs.observers.missing import fill_missing
 from wfsobs.prior import Model
-from wfsobs.priors_from.scenario import bands_of, prior_of, settings_of
+from wfsobs.priors_from.scenario import bands_of, observer_settings, prior_of
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError, Training, delay_signal, frame_mean
 from wfsobs.scenario import Scenario
@@ -120,7 +120,7 @@ def cut_record(record: Record, scenario: Scenario, observer: str, target: str) -
     """
     target, against = judged_by(record, observer, target)
     entry = OBSERVERS[observer]
-    learns = Training in (*entry.prior, *entry.asks(settings_of(entry, scenario)))
+    learns = Training in (*entry.prior, *entry.asks(observer_settings(entry, scenario)))
     cuts = _cuts(record, scenario, learns and record.training is None)
     training, validation, test = (piece(record, start, stop) for start, stop in cuts)
     known = record.training or (Training(training.y_lgs, training.u, training.open_loop_y) if learns else None)
