@@ -63,7 +63,12 @@ def tex(formula: str, display: str = "block") -> Markup:
 
 
 ENVIRONMENT = Environment(
-    loader=PackageLoader("wfsobs.app"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    loader=PackageLoader("wfsobs.app"),
+    autoescape=True,
+    auto_reload=False,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
 )
 ENVIRONMENT.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
 ENVIRONMENT.filters.update(number=number, short=short, matrix=matrix, tex=tex)

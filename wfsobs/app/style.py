@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 from importlib.resources import files
 from types import MappingProxyType
 from typing import Any
@@ -82,4 +83,9 @@ def asset(name: str) -> str:
 
 def swatch(name: str, dark: bool, dashed: bool = True) -> Markup:
     """Draw a short line as in the figures, as SVG; solid if not to be dashed."""
-    return macro("swatch", look(name), dark, dashed)
+    return _swatch(look(name), dark, dashed)
+
+
+@cache
+def _swatch(look: Look, dark: bool, dashed: bool) -> Markup:
+    return macro("swatch", look, dark, dashed)
