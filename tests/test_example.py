@@ -154,10 +154,12 @@ import sys
 from types import SimpleNamespace
 from wfsobs.bench.sizes import Sizes
 from wfsobs.bench.tasks import each_observer
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
-from wfsobs.testing import check_observer
+from wfsobs.testing import check_controller, check_observer
 
 check_observer(OBSERVERS["low-pass"])
+check_controller(CONTROLLERS["fixed-gain"])
 sizes = Sizes({"gpr_online.training_size": 20, "gpr_offline.training_size": 20, "adaptive.window": 0.2, "run.warm_up": 0.1},
               duration=0.5, repeats=1)
 assert [r["size"] for r in each_observer(sizes, ())][-1] == "low-pass, 0.5 s, 2 modes"
@@ -165,6 +167,7 @@ sys.path.insert(0, SCRIPTS)
 import reference, settings_table
 assert "## Low-pass (`low-pass`)\\n\\nThe slow part of z." in reference.observers()
 assert "| `low_pass.corner` | 150 | 0.1 to 10000 | Hz | Cut-off frequency. |" in settings_table.page()
+assert "fixed-gain" in reference.controllers()
 """
 
 
