@@ -97,7 +97,7 @@ class Installed:
 def test_every_thread_finds_the_registry_full(monkeypatch: pytest.MonkeyPatch) -> None:
     """While one reads what is installed, the others wait."""
     point, found = Installed(), list[int]()
-    monkeypatch.setattr("wfsobs.registry.entry_points", lambda group: [point])
+    monkeypatch.setattr("wfsobs.registry.entry_points", lambda group: [point] if group == "wfsobs.nothing" else [])
     registry = Registry(Observer, "wfsobs.nothing", BUILT_IN)
     first, second = (threading.Thread(target=lambda: found.append(len(registry))) for _ in range(2))
     first.start()
