@@ -13,7 +13,7 @@ from wfsobs.cli.show import progress_bar
 
 
 @click.command()
-@click.option("--full", is_flag=True, help="Also m up to 2048, d up to 1000 and a run of 60 s.")
+@click.option("--full", is_flag=True, help="Include m up to 2048, d up to 1000 and a run of 60 s.")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def bench(full: bool, as_json: bool) -> None:
     """Time the observers beside textbook versions, and other libraries if installed (wfsobs[bench])."""

@@ -35,9 +35,7 @@ def record_options(command: Callable) -> Callable:
     """Add --unit, --command-sign, --command-delay, --rate and --sha256, the declarations on a record file."""
     for option in (
         click.option("--sha256", metavar="HEX", help="Refuse the record unless its file has this SHA-256."),
-        click.option(
-            "--rate", type=click.FloatRange(0, min_open=True), metavar="HZ", help="Rate of the rows where they have no time."
-        ),
+        click.option("--rate", type=click.FloatRange(0, min_open=True), metavar="HZ", help="Rate of rows without time stamps."),
         click.option(
             "--command-delay",
             type=click.IntRange(1, 100),
@@ -47,9 +45,9 @@ def record_options(command: Callable) -> Callable:
         click.option(
             "--command-sign",
             type=click.Choice(["+1", "-1"]),
-            help="+1 where a command adds to what the sensor sees (the default), -1 where it is taken off.",
+            help="+1 where y = disturbance + u (the default), -1 where y = disturbance - u.",
         ),
-        click.option("--unit", type=click.Choice(UNITS), help="Unit of the record where it states none; um unless told."),
+        click.option("--unit", type=click.Choice(UNITS), help="Unit of the record where the file gives none; um by default."),
     ):
         command = option(command)
     return command

@@ -20,38 +20,42 @@ from wfsobs.settings.group import SettingError
     "origins",
     multiple=True,
     metavar="HOST[:PORT]",
-    help="Name that browsers reach the page by, behind a proxy; can be given many times.",
+    help="Host name of the page behind a proxy; can be given many times.",
 )
-@click.option("--prefix", default="", metavar="PATH", help="Path of the page, behind a proxy that serves other things too.")
+@click.option("--prefix", default="", metavar="PATH", help="Path of the page behind a proxy.")
 @click.option(
     "--public/--local",
     default=None,
-    help="Limit what a visitor may ask for, or do not; limits are on unless only this machine reaches the page.",
+    help="Switch the limits on or off; they are on unless only this machine reaches the page.",
 )
-@click.option("--max-duration", type=click.FloatRange(0, min_open=True), metavar="S", help="Longest record.")
-@click.option("--max-training-size", type=click.IntRange(2), metavar="M", help="Largest training set of a GPR.")
-@click.option("--max-depth", type=click.IntRange(1), metavar="D", help="Deepest windows of a GPR.")
-@click.option("--max-seconds", type=click.FloatRange(0, min_open=True), metavar="S", help="Longest run, as estimated.")
-@click.option("--max-memory", type=click.FloatRange(0, min_open=True), metavar="MB", help="Memory of a run, as estimated.")
-@click.option("--max-sessions", type=click.IntRange(1), metavar="N", help="Open pages.")
-@click.option("--runs", type=click.IntRange(1), metavar="N", help="Jobs at once, as many as processors unless told.")
-@click.option("--cache-mb", type=click.IntRange(0), default=256, show_default=True, metavar="MB", help="Results kept.")
+@click.option("--max-duration", type=click.FloatRange(0, min_open=True), metavar="S", help="Maximum length of a record.")
+@click.option("--max-training-size", type=click.IntRange(2), metavar="M", help="Maximum training size of a GPR.")
+@click.option("--max-depth", type=click.IntRange(1), metavar="D", help="Maximum window length of a GPR.")
+@click.option("--max-seconds", type=click.FloatRange(0, min_open=True), metavar="S", help="Maximum estimated time of a run.")
+@click.option("--max-memory", type=click.FloatRange(0, min_open=True), metavar="MB", help="Maximum estimated memory of a run.")
+@click.option("--max-sessions", type=click.IntRange(1), metavar="N", help="Maximum number of open pages.")
+@click.option(
+    "--runs", type=click.IntRange(1), metavar="N", help="Maximum number of jobs at once; by default the number of processors."
+)
+@click.option(
+    "--cache-mb", type=click.IntRange(0), default=256, show_default=True, metavar="MB", help="Size of the cache of results."
+)
 @click.option(
     "--lifetime",
     type=click.FloatRange(0.1),
     default=60.0,
     show_default=True,
     metavar="S",
-    help="How long the settings are kept of a page that has lost its connection.",
+    help="Time to keep the settings of a page that has lost its connection.",
 )
 @click.option(
     "--log-level",
     type=click.Choice(["debug", "info", "warning", "error"]),
     default="info",
     show_default=True,
-    help="What is written to standard error.",
+    help="Minimum level of messages on standard error.",
 )
-@click.option("--log-requests", is_flag=True, help="Also a line per request, with address and query.")
+@click.option("--log-requests", is_flag=True, help="Log every request, with address and query.")
 def serve(**options: Any) -> None:
     """Serve the dashboard (docs/serving.md)."""
     try:

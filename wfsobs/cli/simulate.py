@@ -38,9 +38,9 @@ from wfsobs.units import UNITS
     "--over-time",
     type=click.FloatRange(0, min_open=True),
     metavar="SECONDS",
-    help="Print the error over the last so many seconds against time in place of the one number (docs/events.md).",
+    help="Print the running error over this time against time (docs/events.md).",
 )
-@click.option("--psd-unit", type=click.Choice(UNITS), help="Its unit, squared per Hz, where it states none.")
+@click.option("--psd-unit", type=click.Choice(UNITS), help="Unit of the spectrum, squared per Hz, where the file gives none.")
 def run(
     preset: str | None,
     config: str | None,
@@ -88,7 +88,7 @@ def run(
 @click.option(
     "--seeds", type=click.IntRange(1, 100_000), default=1, metavar="N", help="Repeat with seeds run.seed ... run.seed + N - 1."
 )
-@click.option("--record", "record_file", metavar="RECORD", help="On the disturbance and noise of a record with its truth.")
+@click.option("--record", "record_file", metavar="RECORD", help="Use the disturbance and noise of a record with truth.")
 @record_options
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def loop(

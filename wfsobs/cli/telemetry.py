@@ -28,7 +28,7 @@ from wfsobs.telemetry.records import save_arrays
 @click.argument("record_file", metavar="RECORD")
 @scenario_options
 @record_options
-@click.option("--prior", metavar="FOUND.toml", help="What observers are told: the file of `wfsobs identify --out`.")
+@click.option("--prior", metavar="FOUND.toml", help="Prior of the observers: the file of `wfsobs identify --out`.")
 @click.option("--out", metavar="ESTIMATES.npz", help="Save every estimate under the key observer/target.")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def observe(
@@ -82,9 +82,9 @@ def observe(
     default=LOWEST,
     show_default=True,
     metavar="HZ",
-    help="Frequency from which peaks are looked for.",
+    help="Minimum frequency of a peak.",
 )
-@click.option("--out", metavar="F.toml", help="Save what was found as settings, on top of the preset.")
+@click.option("--out", metavar="F.toml", help="Save the model as settings, on top of the preset.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 def identify(
     record_file: str,

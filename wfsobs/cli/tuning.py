@@ -24,31 +24,33 @@ NAMES = [o.id for o in OBSERVERS.values() if o.tunable.usual]
 
 
 @click.command()
-@click.option("--observer", required=True, type=click.Choice(NAMES), help="What is tuned.")
+@click.option("--observer", required=True, type=click.Choice(NAMES), help="Observer to tune.")
 @scenario_options
 @click.option(
     "--setting",
     "settings",
     multiple=True,
     metavar="NAME",
-    help="Tune this setting in the place of the usual ones; can be given many times.",
+    help="Tune this setting instead of the usual ones; can be given many times.",
 )
-@click.option("--target", type=click.Choice(TARGETS), help="Whose error counts; vibration where the observer estimates it.")
+@click.option(
+    "--target", type=click.Choice(TARGETS), help="Target of the error; by default vibration where the observer estimates it."
+)
 @click.option(
     "--evaluations",
     type=click.IntRange(1, 10_000),
     default=EVALUATIONS,
     show_default=True,
     metavar="N",
-    help="Runs of the observer at most.",
+    help="Maximum runs of the observer.",
 )
 @click.option(
     "--validation",
     type=click.FloatRange(0, min_open=True),
     metavar="S",
-    help="Length of the validation record, that of the scenario unless told.",
+    help="Length of the validation record; by default that of the scenario.",
 )
-@click.option("--record", "record_file", metavar="RECORD", help="Tune on telemetry, cut in three, not on simulated records.")
+@click.option("--record", "record_file", metavar="RECORD", help="Tune on telemetry, cut in three, instead of simulated records.")
 @record_options
 @click.option("--out", metavar="F.toml", help="Save all settings, the tuned ones with a comment.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")

@@ -29,7 +29,7 @@ a model with numbers, of one vibration peak; every line of the vibration; where 
 
 
 class Tunable(NamedTuple):
-    """Dotted paths of the settings that are tuned unless others are named, and of what else it reads that could be."""
+    """Dotted paths of the settings that are tuned by default, and of others that can be."""
 
     usual: tuple[str, ...] = ()
     others: tuple[str, ...] = ()
@@ -40,12 +40,20 @@ NOT_TUNED = Tunable()
 
 @dataclass(frozen=True)
 class Look:
-    """How an observer or a controller is drawn.
+    """Line of an observer or a controller in figures.
 
-    label       : its name in legends, where the full one is too long; the full one if empty
-    light, dark : colour in light and dark mode
-    dash        : pattern [px], empty is solid; width : of the line [px]
-    drawn       : false for one that stands in tables only: its line would be the axis, or hide the others
+    Attributes
+    ----------
+    label : str
+        Name in legends, where the full one is too long; empty for the full one.
+    light, dark : str
+        Colour in light and dark mode.
+    dash : tuple of int
+        Pattern, empty for solid [px].
+    width : float
+        Line width [px].
+    drawn : bool
+        False for a row of tables only: its line would be the axis, or hide the others.
     """
 
     label: str = ""
@@ -61,7 +69,7 @@ class Look:
 
 
 PLAIN = Look(dash=(4, 2))
-"""Of one that says nothing of its look."""
+"""Default look."""
 
 
 def _nothing(_settings: Group | None) -> tuple[Part, ...]:
@@ -70,22 +78,36 @@ def _nothing(_settings: Group | None) -> tuple[Part, ...]:
 
 @dataclass(frozen=True)
 class Observer:
-    """An entry of the registry: all that wfsobs knows of an observer.
+    """An observer in the registry.
 
-    id, label : for tables and files, and for people
-    targets   : what it estimates, of "turbulence" and "vibration"
-    run       : (measurements without gaps, prior, settings, watch) -> {target: (n_steps, n_modes) [um]}, NaN where there is
-        no estimate yet
-    help      : a line on what it is
-    prior     : what it has to be told beside measurements, see `wfsobs.prior`
-    settings  : the group of settings that it brings along, or the name of one that every scenario has
-    needs     : record fields without which it cannot run
-    asks      : settings -> what it has to be told besides for these
-    causal    : false only for a reference that looks ahead
-    tunable   : what of the settings can be tuned
-    weight    : its computing time relative to a Kalman filter's, for progress and to run the quick ones first
-    seconds   : (settings, n_steps, n_modes, dt [s]) -> about how long it takes [s]; None for one as quick as a Kalman filter
-    look      : how it is drawn
+    Attributes
+    ----------
+    id, label : str
+        For tables and files, and for people.
+    targets : tuple of str
+        What it estimates, of "turbulence" and "vibration".
+    run : callable
+        (measurements without gaps, prior, settings, watch) -> {target: (n_steps, n_modes) [um]}, NaN without an estimate.
+    help : str
+        One line of description.
+    prior : tuple
+        What it needs beside measurements, see `wfsobs.prior`.
+    settings : Section or str or None
+        Its own group of settings, or the name of a group of every scenario.
+    needs : tuple of str
+        Fields of the record without which it cannot run.
+    asks : callable
+        Settings -> further needs for these.
+    causal : bool
+        False only for a reference that uses later samples.
+    tunable : Tunable
+        Settings that can be tuned.
+    weight : float
+        Computing time relative to a Kalman filter, for progress and to run fast ones first.
+    seconds : callable or None
+        (settings, n_steps, n_modes, dt [s]) -> estimated time [s]; None for one as fast as a Kalman filter.
+    look : Look
+        Line in figures.
     """
 
     id: str

@@ -46,8 +46,20 @@ MAX_TURBULENCE_RATIO = 10.0
 
 
 class Scenario(Group):
-    """Every setting of a run.
+    """All settings of a run, in groups.
 
+    Parameters
+    ----------
+    **values
+        Groups or settings; the others have their defaults.
+
+    See Also
+    --------
+    wfsobs.PRESETS : Functions that return ready scenarios.
+    Scenario.replace : A copy with some settings changed.
+
+    Examples
+    --------
     >>> s = Scenario()
     >>> s.set("turbulence.wind_speed", 200)
     Traceback (most recent call last):

@@ -1,4 +1,4 @@
-"""A check of observers written elsewhere, in the manner of scikit-learn's `check_estimator`.
+"""Checks of observers from other packages, like scikit-learn's `check_estimator`.
 
 >>> from wfsobs.observers import OBSERVERS
 >>> from wfsobs.testing import check_observer
@@ -26,16 +26,27 @@ Estimates = dict[str, Array]
 
 
 def check_observer(observer: Observer, scenario: Scenario | None = None, alone: bool = True) -> None:
-    """Run an observer on a short simulated record and check what holds for all of them.
+    """Run an observer on a short simulated record and check the rules for all observers.
 
-    It gives every target it names, as numbers of the shape of the measurements; the same twice; unless it is marked as not
-    causal, nothing that comes after a step changes its estimate of the step; it leaves its arguments as they are; it gets over
-    missing samples; and in a fresh process, which has never seen the truth, it gives the same.
+    It returns every target that it names, as numbers of the shape of the measurements; the same twice; unless it is marked as not
+    causal, no later sample changes an estimate; it does not change its arguments; it works with
+    missing samples; and in a fresh process, which has never had the truth, its estimates are the same.
 
-    scenario : what is simulated, 1.5 s of the preset paper unless given
-    alone    : whether to start the fresh process; a script that does needs the guard `if __name__ == "__main__"`.
+    Parameters
+    ----------
+    observer : Observer
+        The observer.
+    scenario : Scenario, optional
+        Settings of the simulation; by default 1.5 s of the preset paper.
+    alone : bool
+        Whether to start the fresh process; a script that does needs the guard `if __name__ == "__main__"`.
 
-    Raises CheckError, and ValueError where the observer has no estimate for the scenario.
+    Raises
+    ------
+    CheckError
+        The observer breaks a rule; one line naming the observer and the rule.
+    ValueError
+        The observer has no estimate for the scenario.
     """
     s = scenario or PRESETS["paper"]().replace(QUICK)
     record = simulate(s)

@@ -24,12 +24,31 @@ def export(
     watch: Watch = QUIET,
     done: Callable[[Result], None] = lambda result: None,
 ) -> None:
-    """Run a scenario and write the report: one HTML file with figures and numbers that opens without a network.
+    """Run a scenario and write a report: one HTML file with figures and numbers that opens without a network.
 
-    vary   : settings and their values (`wfsobs.scenario.grid.parse_variation`); every combination is run
-    preset : what the report compares the settings with
-    done   : called with every result
-    Raises SettingError, OSError where the file cannot be written, Cancelled.
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    scenario : Scenario
+        Settings of the run.
+    vary : sequence of Variation, optional
+        Settings and their values (`wfsobs.scenario.grid.parse_variation`); every combination is run.
+    preset : str
+        Preset that the report compares the settings with.
+    watch : Watch, optional
+        Receives the progress, and is asked at every block of work whether to stop.
+    done : callable, optional
+        Receives every result.
+
+    Raises
+    ------
+    SettingError
+        Two settings exclude each other.
+    OSError
+        The file cannot be written.
+    Cancelled
+        `watch` asks to stop.
     """
     chosen = scenarios(scenario, vary)
     check_writable(path)

@@ -25,13 +25,13 @@ class Gpr(Group):
         default="u-y",
         objects=["u-y", "z"],
         label="Inputs",
-        doc="What a window holds: commands and LGS measurements (paper, eq. 14) or pseudo-open-loop measurements z.",
+        doc="Contents of a window: commands and LGS measurements (paper, eq. 14) or pseudo-open-loop measurements z.",
     )
     inputs_filter = param.Selector(
         default="raw",
         objects=["raw", "high-pass", "standardised"],
         label="Inputs are",
-        doc="What is done to the inputs first. raw: nothing (paper); high-pass: turbulence taken out below the corner; "
+        doc="Processing of the inputs. raw: none (paper); high-pass: without turbulence below the corner; "
         "standardised: each channel over its standard deviation in the training record, so that l has no unit.",
     )
     highpass = Real(
@@ -40,7 +40,7 @@ class Gpr(Group):
         softbounds=(1.0, 30.0),
         step=0.5,
         label="High-pass corner",
-        doc="Corner of the inputs' high-pass [Hz], a Butterworth of second order; not in the paper.",
+        doc="Corner of the inputs' high-pass, a second-order Butterworth filter [Hz]; not in the paper.",
     )
     training_size = Whole(1000, bounds=(2, 2048), label="Training size m", doc="Number of training windows (paper, Table 4).")
     depth = Whole(407, bounds=(1, 2000), label="Depth d", doc="Samples in a window (paper, Table 4).")
@@ -49,22 +49,22 @@ class Gpr(Group):
         bounds=(1e-3, 1e4),
         softbounds=(0.1, 100.0),
         label="Output scale σ_SE",
-        doc="sigma_SE of the squared-exponential kernel [um] (paper, eq. 13 and Table 4).",
+        doc="Output scale sigma_SE of the squared-exponential kernel [um] (paper, eq. 13 and Table 4).",
     )
     length_scale = Real(
         300.0,
         bounds=(0.1, 1e5),
         softbounds=(1.0, 1000.0),
         label="Length scale l",
-        doc="l of the squared-exponential kernel [um] (paper, eq. 13 and Table 4). Far above the windows' norm the "
-        "kernel is linear: ridge regression with weight (sigma_n l / sigma_SE)^2.",
+        doc="Length scale l of the squared-exponential kernel [um] (paper, eq. 13 and Table 4). Far above the norm of "
+        "the windows the kernel is linear: ridge regression with weight (sigma_n l / sigma_SE)^2.",
     )
     noise_std = Real(
         0.13,
         bounds=(1e-4, 10.0),
         softbounds=(0.01, 1.0),
         label="Noise σ_awgn",
-        doc="sigma_awgn on the diagonal of the covariance [um] (paper, Table 4).",
+        doc="Noise sigma_awgn on the diagonal of the covariance [um] (paper, Table 4).",
     )
 
 

@@ -33,8 +33,8 @@ class Adaptive(Group):
         softbounds=(0.5, 10.0),
         step=0.5,
         label="Window",
-        doc="How much of z a model is identified from [s]: peaks closer than two over it are one, and for that long a "
-        "peak that has moved is not what the filter knows.",
+        doc="Length of the identification window [s]. Peaks closer than two over it are one; a peak that moves is "
+        "followed after this time.",
     )
     interval = Real(
         0.5,
@@ -45,15 +45,15 @@ class Adaptive(Group):
         doc="Time from one identification to the next [s].",
     )
     peak_count = Whole(
-        20, bounds=(0, 60), label="Peaks at most", doc="How many vibration peaks the model of one mode has at most."
+        20, bounds=(0, 60), label="Maximum peaks", doc="Maximum number of vibration peaks in the model of one mode."
     )
     lowest = Real(
         5.0,
         bounds=(0.1, 1000.0),
         softbounds=(1.0, 20.0),
         step=0.5,
-        label="Peaks from",
-        doc="Frequency from which peaks are looked for [Hz]; from 15 over the window at least.",
+        label="Minimum frequency",
+        doc="Minimum frequency of a peak [Hz]; at least 15 over the window.",
     )
 
 

@@ -27,8 +27,8 @@ class MultiPeak(Group):
         0.025,
         bounds=(1e-4, 10.0),
         softbounds=(0.005, 1.0),
-        label="Least line width",
-        doc="Width at half maximum that lines have at least [Hz]; the filter averages over the inverse of it.",
+        label="Minimum line width",
+        doc="Minimum line width (FWHM) in the model [Hz]; the filter averages over its inverse.",
     )
 
 

@@ -35,7 +35,7 @@ class MultiRate(Group):
         default="matched",
         objects=["matched", "manual"],
         label="Measurement noise R",
-        doc="matched: as the Kalman filters; manual: the two numbers below, r_NGS < r_LGS (paper, section 2.2.1).",
+        doc="matched: as in the Kalman filters; manual: the two numbers below, r_NGS < r_LGS (paper, section 2.2.1).",
     )
     lgs_noise = Real(
         0.05,
@@ -54,8 +54,8 @@ class MultiRate(Group):
     model_lgs_error = param.Boolean(
         True,
         label="LGS error in the optimal filter",
-        doc="Whether the optimal multi-rate filter knows of the slow LGS error (a state of its own); without it the filter "
-        "trusts the LGS far too much.",
+        doc="Include the slow LGS error in the model of the optimal multi-rate filter, as a state of its own; without "
+        "it the filter relies far too much on the LGS.",
     )
 
 
