@@ -212,7 +212,7 @@ def coverage(count: int, duration: float) -> None:
 
 
 def spread(scenario: Scenario, seeds: range) -> dict[str, Any]:
-    """Standard deviation of (estimate - truth) over the standard deviation that is stated, by quantity, tip."""
+    """Standard deviation of (estimate - truth) over the standard deviation that is stated, where one is, by quantity, tip."""
     truth = turbulence_process(scenario, 0, scenario.dt)
     scores: dict[str, list[float]] = {}
     for seed in seeds:
@@ -230,7 +230,7 @@ def spread(scenario: Scenario, seeds: range) -> dict[str, Any]:
                     pairs += [(f"{kind}, frequency", p.frequency, peak.frequency), (f"{kind}, rms", p.rms, peak.rms[0])]
                     pairs += [] if p.pure else [("resonance, damping", p.damping, peak.damping)]
         for name, n, value in pairs:
-            scores.setdefault(name, []).append((n.value - value) / n.std)
+            scores.setdefault(name, []).extend([(n.value - value) / n.std] * bool(np.isfinite(n.std)))
     return {name: f"{np.sqrt(np.mean(np.square(x))):.2f}" for name, x in scores.items()}
 
 

@@ -82,8 +82,8 @@ def take(page: Page, address: str, picture: Picture, path: Path) -> None:
     expect(page.locator(picture.seen).first).to_be_visible(timeout=SLOW)
     page.wait_for_timeout(3000)  # figures are drawn after their data have come
     path.parent.mkdir(exist_ok=True)
-    box = page.get_by_role("main").bounding_box()
-    left, top = (0.0, 0.0) if picture.drawer or box is None else (box["x"], box["y"])
+    box, header = page.get_by_role("main").bounding_box(), page.locator("header").first.bounding_box()
+    left, top = (0.0, 0.0) if picture.drawer or box is None or header is None else (box["x"], header["y"] + header["height"])
     page.screenshot(path=path, clip={"x": left, "y": top, "width": picture.size[0] - left, "height": picture.size[1] - top})
 
 
