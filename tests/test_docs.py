@@ -374,8 +374,7 @@ def test_closed_loop_page_prints_what_the_theory_says(capsys: pytest.CaptureFixt
     assert len(lines) > 5
     for line in lines:
         assert line in page
-    (code,) = blocks(ROOT / "docs" / "closed_loop.md", "python")
-    exec(compile(code, "closed_loop.md", "exec"), {})
+    run_page(ROOT / "docs" / "closed_loop.md")
     said = capsys.readouterr().out
     assert "Margins(gain=" in said and "lqg-kf-multi tilt" in said and "bound tip" in said
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from wfsobs.evaluation.bound import Bound, bound_scores, record_bounds
 from wfsobs.evaluation.rows import score_rows
@@ -13,7 +15,9 @@ from wfsobs.evaluation.scores import Score, score
 from wfsobs.notebook import html_table
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Observer
+from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.scenario import arguments
+from wfsobs.priors_from.training import trained_until, with_training
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -23,6 +27,8 @@ from wfsobs.typing import Array
 
 if TYPE_CHECKING:
     import pandas
+
+    from wfsobs.identification.result import Identification
 
 
 @dataclass(frozen=True)
@@ -141,7 +147,14 @@ def run(scenario: Scenario, *, observers: Sequence[str] | None = None, watch: Wa
 
 
 def observe(
-    record: Record, scenario: Scenario, *, observers: Sequence[str] | None = None, watch: Watch = QUIET, simulated: bool = False
+    record: Record,
+    scenario: Scenario | None = None,
+    *,
+    observers: Sequence[str] | None = None,
+    prior: Identification | Scenario | None = None,
+    train: Record | float | None = None,
+    watch: Watch = QUIET,
+    simulated: bool = False,
 ) -> Result:
     """Run observers on a record.
 
@@ -151,10 +164,16 @@ def observe(
     ----------
     record : Record
         Measurements, and the truth where there is one.
-    scenario : Scenario
-        Settings; the models of the observers are made from it.
+    scenario : Scenario, optional
+        Settings; the models of the observers are made from it unless there is a `prior`. By default those of `Scenario()`.
     observers : sequence of str, optional
         Ids of the observers; by default all.
+    prior : Identification or Scenario, optional
+        What observers are told: what `identify` found, or the settings that were made of it. Their own settings stay those of
+        `scenario`.
+    train : Record or float, optional
+        Training data in place of the record's own, for observers that learn: another record of the same loop; or the duration
+        [s] of the first part of this one. There are then estimates and scores only after it.
     watch : Watch, optional
         Receives the progress, and is asked at every block of work whether to stop.
     simulated : bool
@@ -169,17 +188,34 @@ def observe(
     ------
     SettingError
         Two settings exclude each other, or an observer is unknown.
+    RecordError
+        The training data does not fit the record, or is too short.
     Cancelled
         `watch` asks to stop.
     """
-    scenario = as_stated(record, scenario)
+    scenario = as_stated(record, scenario or Scenario())
+    if prior is not None:
+        scenario = as_stated(record, told_by(prior, scenario))
     scenario.validate()
+    if train is not None:
+        record = with_training(record, train, scenario)
+    start = trained_until(train)
     estimates: list[Estimate] = []
     failures: list[Failure] = []
     for item in each_estimate(record, scenario, watch, observers):
-        (failures if isinstance(item, Failure) else estimates).append(item)  # type: ignore[arg-type]
+        if isinstance(item, Failure):
+            failures.append(item)
+        else:
+            estimates.append(_from(item, round(start / record.dt)))
     least = record_bounds(scenario, record) if simulated else []
-    return collect(scenario, record, estimates, failures, watch, least)
+    return collect(scenario, record, estimates, failures, watch, least, start)
+
+
+def _from(estimate: Estimate, first: int) -> Estimate:
+    """Return the estimate without its first steps."""
+    if first == 0:
+        return estimate
+    return replace(estimate, values=np.vstack([np.full_like(estimate.values[:first], np.nan), estimate.values[first:]]))
 
 
 def as_stated(record: Record, scenario: Scenario) -> Scenario:
@@ -199,17 +235,22 @@ def collect(
     failures: Sequence[Failure],
     watch: Watch = QUIET,
     least: Sequence[Bound] = (),
+    start: float = 0.0,
 ) -> Result:
-    """Score estimates, and return a Result in the order of the registry, the bounds last. Raises Cancelled."""
+    """Score estimates, and return a Result in the order of the registry, the bounds last. Raises Cancelled.
+
+    start : from which samples count [s], or from the end of the warm-up
+    """
+    warm_up = max(scenario.run.warm_up, start)
     order = {name: i for i, name in enumerate(OBSERVERS)}
     names = [m.name for m in scenario.modes][: record.n_modes]
     ordered = sorted(estimates, key=lambda e: (order[e.observer], e.target))
     watch.check()
     known = record.turbulence is not None or record.vibration is not None
-    scores = score(record, ordered, warm_up=scenario.run.warm_up, mode_names=names)
+    scores = score(record, ordered, warm_up=warm_up, mode_names=names)
     if known:
         scores.sort(key=lambda s: (order[s.observer], s.target))
-    scores += bound_scores(least, record, scores, scenario.run.warm_up)
+    scores += bound_scores(least, record, scores, warm_up)
     return Result(scenario, record, tuple(ordered), tuple(scores), tuple(sorted(failures, key=lambda f: order[f.observer])))
 
 

@@ -20,7 +20,7 @@ from wfsobs.observers.baselines import online_reference
 from wfsobs.priors_from.controllers import controller_arguments, own_settings
 from wfsobs.priors_from.scenario import bands_of, kalman_model, measurement_noise, modelled_processes, spectra_of
 from wfsobs.progress import QUIET
-from wfsobs.record import Record, RecordError
+from wfsobs.record import Record, RecordError, Training
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.group import SettingError
@@ -309,6 +309,12 @@ def test_what_cannot_run_says_why() -> None:
         "the record has no NGS measurement",
         "the record has no training record",
     ]
+    assert record.training is not None
+    exact = 20 + 60 + 1  # of the last window the target is known a step later
+    for steps, reason in ((exact, ""), (exact - 1, "has 80 steps, depth + training size + 1 need 81")):
+        cut = Training(record.training.y_lgs[:steps], record.training.u[:steps])
+        (*_, one) = closed_loop(replace(record, training=cut), plan).outcomes
+        assert (one.residual is None) == bool(reason) and reason in one.note
     with pytest.raises(RecordError, match="no truth"):
         closed_loop(replace(record, turbulence=None), plan)
     with pytest.raises(RecordError, match="another rate"):

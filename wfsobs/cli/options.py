@@ -9,6 +9,7 @@ import click
 from wfsobs.record import DELAY, Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
+from wfsobs.settings.group import SettingError
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import load_record
 from wfsobs.units import UNITS
@@ -51,6 +52,37 @@ def record_options(command: Callable) -> Callable:
     ):
         command = option(command)
     return command
+
+
+def training_options(command: Callable) -> Callable:
+    """Add --train and --train-until."""
+    for option in (
+        click.option(
+            "--train-until",
+            type=click.FloatRange(0, min_open=True),
+            metavar="S",
+            help="Train on the first S seconds of the record; estimates and scores begin after them.",
+        ),
+        click.option("--train", metavar="RECORD", help="Train on another record of the same loop."),
+    ):
+        command = option(command)
+    return command
+
+
+def training(
+    train: str | None, train_until: float | None, record: Record, scenario: Scenario, stated: DeclaredFormat
+) -> Record | float | None:
+    """Read what --train and --train-until name, and say it on standard error. Raises SettingError, RecordError."""
+    if train is not None and train_until is not None:
+        raise SettingError("--train and --train-until: give one of them")
+    if train is not None:
+        other = load_declared(train, scenario, stated)
+        click.echo(f"wfsobs: training data: {train}, {other.n_steps * other.dt:g} s; no score is of it", err=True)
+        return other
+    if train_until is not None:
+        what = f"the first {train_until:g} s of {record.n_steps * record.dt:g} s"
+        click.echo(f"wfsobs: training data: {what}; estimates and scores begin after", err=True)
+    return train_until
 
 
 def load_declared(record_file: str, scenario: Scenario, stated: DeclaredFormat, sha256: str | None = None) -> Record:

@@ -7,7 +7,7 @@ import json
 import click
 
 from wfsobs.cli.loop_table import loop_table
-from wfsobs.cli.options import load_declared, record_options, scenario_options
+from wfsobs.cli.options import load_declared, record_options, scenario_options, training, training_options
 from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.show import progress_bar, show, show_over_time, show_table, show_verdicts, warn
 from wfsobs.closed_loop.design import design
@@ -16,6 +16,7 @@ from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.rows import Row, score_rows
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
+from wfsobs.priors_from.training import trained_until, with_training
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
 from wfsobs.settings.group import SettingError
@@ -90,6 +91,7 @@ def run(
 )
 @click.option("--record", "record_file", metavar="RECORD", help="Use the disturbance and noise of a record with truth.")
 @record_options
+@training_options
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
 def loop(
     preset: str | None,
@@ -103,19 +105,25 @@ def loop(
     command_delay: int | None,
     rate: float | None,
     sha256: str | None,
+    train: str | None,
+    train_until: float | None,
     as_json: bool,
 ) -> None:
     """Close the loop with every controller on the same disturbance and print what is left of it (docs/closed_loop.md)."""
-    scenario, record = configfile.scenario_from(preset, config, assignments), None
+    scenario, record, start = configfile.scenario_from(preset, config, assignments), None, 0.0
+    if record_file is None and (train is not None or train_until is not None):
+        raise SettingError("--train, --train-until: go with --record, a simulated record has its own training data")
     if record_file is not None:
         if seeds > 1:
             raise SettingError("--seeds: is for simulated records, leave it out with --record")
         stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
         record = load_declared(record_file, scenario, stated, sha256)
         scenario = as_stated(record, scenario)
+        learnt = training(train, train_until, record, scenario, stated)
+        record, start = record if learnt is None else with_training(record, learnt, scenario), trained_until(learnt)
     all_rows: list[Row] = []
     with progress_bar("controllers") as update:
-        plan = design(scenario, controllers or None)
+        plan = design(scenario, controllers or None, start)
         for i in range(seeds):
             one = scenario.replace({"run.seed": scenario.run.seed + i})
             given = simulate(one) if record is None else record

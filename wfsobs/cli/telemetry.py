@@ -7,7 +7,7 @@ import json
 import click
 
 from wfsobs.cli.identification_table import identification_table
-from wfsobs.cli.options import load_declared, record_options, scenario_options
+from wfsobs.cli.options import load_declared, record_options, scenario_options, training, training_options
 from wfsobs.cli.show import progress_bar, show, show_table, warn
 from wfsobs.evaluation.rows import score_rows
 from wfsobs.files import check_writable, write_whole
@@ -28,6 +28,7 @@ from wfsobs.telemetry.records import save_arrays
 @click.argument("record_file", metavar="RECORD")
 @scenario_options
 @record_options
+@training_options
 @click.option("--prior", metavar="FOUND.toml", help="Prior of the observers: the file of `wfsobs identify --out`.")
 @click.option("--out", metavar="ESTIMATES.npz", help="Save every estimate under the key observer/target.")
 @click.option("--json", "as_json", is_flag=True, help="Print a list of rows instead of a table.")
@@ -41,6 +42,8 @@ def observe(
     command_delay: int | None,
     rate: float | None,
     sha256: str | None,
+    train: str | None,
+    train_until: float | None,
     prior: str | None,
     out: str | None,
     as_json: bool,
@@ -53,8 +56,9 @@ def observe(
             scenario.set(path, value)
     stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
     record = load_declared(record_file, scenario, stated, sha256)
+    learnt = training(train, train_until, record, scenario, stated)
     with progress_bar() as update:
-        result = observe_record(record, scenario, watch=Watch(progress=update))
+        result = observe_record(record, scenario, train=learnt, watch=Watch(progress=update))
     warn(result)
     if out:
         save_arrays(out, {f"{e.observer}/{e.target}": e.values for e in result.estimates})

@@ -49,6 +49,7 @@ class Design:
     bound  : per mode, rms [um] of the least residual of any causal controller of the mean of the LGS; None where the spectrum of
         the turbulence is not known
     priors : controller -> what it is told, spectra aside, of which only laws are made
+    start  : from which the residuals count [s]: after the warm-up, and after what is trained on
     """
 
     scenario: Scenario
@@ -56,6 +57,7 @@ class Design:
     laws: dict[str, tuple[LawDesign, ...]]
     bound: tuple[float, ...] | None
     priors: dict[str, Prior] = field(default_factory=dict, repr=False)
+    start: float = 0.0
 
     @property
     def mirror(self) -> Mirror:
@@ -63,9 +65,10 @@ class Design:
         return self.plant.mirror
 
 
-def design(scenario: Scenario, controllers: Sequence[str] | None = None) -> Design:
+def design(scenario: Scenario, controllers: Sequence[str] | None = None, start: float = 0.0) -> Design:
     """Make the laws of the controllers (all unless named) and judge them by theory. Raises SettingError.
 
+    start : from which a residual counts [s], or from the end of the warm-up
     Laws are those of the scenario before its events. What they will leave is then not known by theory, nor a bound.
     """
     scenario.validate()
@@ -76,10 +79,10 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None) -> Desi
     laws, priors = {name: laws for name, (laws, _) in made.items()}, {name: prior for name, (_, prior) in made.items()}
     if scenario.events:
         laws = {name: tuple(replace(one, predicted=None) for one in designed) for name, designed in laws.items()}
-        return Design(scenario, plant, laws, None, priors)
+        return Design(scenario, plant, laws, None, priors, max(scenario.run.warm_up, start))
     # A fraction of a frame comes on top of the whole ones, which alone bound what can be known.
     least = tuple(least_errors(one, ahead=int(plant.mirror.delay) - 1)["total"].rms for one in true)
-    return Design(scenario, plant, laws, least or None, priors)
+    return Design(scenario, plant, laws, least or None, priors, max(scenario.run.warm_up, start))
 
 
 def select_controllers(controllers: Sequence[str] | None) -> list[Controller]:

@@ -32,7 +32,7 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
     limited : share of the steps in which a limit of the mirror changed the command. Where it is above 0 the loop is not the
         linear one that theory and margins are of: these are null, and `note` says why
     """
-    plan, warm_up = result.design, result.scenario.run.warm_up
+    plan, warm_up = result.design, result.design.start
     modes = result.scenario.modes
     mas = micrometres_per("mas", result.scenario.telescope.diameter)
     wavelength = result.scenario.control.wavelength

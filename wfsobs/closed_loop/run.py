@@ -144,7 +144,7 @@ def _outcome(
             u, limited = controller.commands(laws, measured, prior, plan.plant, settings, alone)
     except ValueError as error:
         return Outcome(controller.id, tuple(None for _ in stable), note=str(error))
-    start = round(plan.scenario.run.warm_up / record.dt)
+    start = round(plan.start / record.dt)
     residual = disturbance + plan.mirror.correction(u)
     return Outcome(controller.id, stable, residual, u, tuple(limited[start:].mean(axis=0).tolist()))
 

@@ -37,6 +37,9 @@ def gpr_offline_ahead(measured: Measurements, prior: Prior, plant: Plant, settin
     assert prior.bands is not None
     if measured.n_steps < g.depth:
         raise RecordError(f"the record has {measured.n_steps} steps; depth needs {g.depth}")
+    steps, ahead = training.y_lgs.shape[0], plant.mirror.taps.size - 2  # by which the targets end earlier
+    if steps < (needed := g.depth + g.training_size + ahead):
+        raise RecordError(f"the training record has {steps} steps, depth + training size + {ahead} need {needed}")
     targets = _ahead(training_targets(training, prior.bands, measured.dt, measured.delay), plant.mirror)
     training_z = pseudo_open_loop(training.y_lgs, training.u, measured.delay)
 

@@ -1,20 +1,46 @@
-"""What observers are told of telemetry: the file of an identification in place of a simulation's settings."""
+"""What observers are told of telemetry: an identification, or the file of one, in place of a simulation's settings."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from wfsobs.prior import Bands, LgsError, Lines, Model, Part, Prior
+from wfsobs.priors_from import scenario as priors
 from wfsobs.scenario import Scenario
+
+if TYPE_CHECKING:
+    from wfsobs.identification.result import Identification
 
 FOUND = ("telescope", "turbulence", "vibration", "sensors", "kalman", "butterworth")
 """Groups of settings of which priors are made."""
 
 
-def told_by(found: Scenario, scenario: Scenario) -> Scenario:
+def told_by(found: Scenario | Identification, scenario: Scenario) -> Scenario:
     """Return a scenario with the models of an identification, and all other settings of `scenario`.
 
-    found : the file of `wfsobs identify --out` (`Identification.scenario`)
+    found : an identification, or the file of one (`wfsobs identify --out`)
     """
+    if not isinstance(found, Scenario):
+        found = found.scenario(scenario)
     out = scenario.before_events.copy()
     for group in FOUND:
         setattr(out, group, getattr(found, group).copy())
     out.kalman.ngs_between_frames = scenario.kalman.ngs_between_frames  # what a filter does, not what it is told
     return out
+
+
+KNOWN: tuple[Part, ...] = (Model, LgsError, Lines, Bands)
+"""What an identification tells."""
+
+
+def prior_of(found: Identification, parts: Iterable[Part] = KNOWN, scenario: Scenario | None = None) -> Prior:
+    """Return what an identification tells of each of its modes: a prior without a file.
+
+    scenario : where sensors and bands come from, which telemetry does not tell; the defaults unless given
+    Raises ValueError for a part that cannot be made from an identification.
+    """
+    prior, n = priors.prior_of(told_by(found, scenario or Scenario()), None, parts), len(found.modes)
+    lines = tuple(mode.prior for mode in found.modes) if prior.lines else ()
+    return replace(prior, model=prior.model[:n], lgs_error=prior.lgs_error[:n], lines=lines, spectra=prior.spectra[:n])

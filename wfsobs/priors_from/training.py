@@ -1,0 +1,75 @@
+"""Training data from telemetry: another record of the same loop, or the first part of the record itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from wfsobs.observers.missing import fill_missing
+from wfsobs.prior import Prior
+from wfsobs.record import Record, RecordError, Training
+from wfsobs.scenario import Scenario
+
+SAME_RATE = 1e-6
+"""Relative difference of two rates that is none: time stamps are rounded."""
+
+
+def with_training(record: Record, train: Record | float, scenario: Scenario) -> Record:
+    """Return the record with training data from telemetry in place of its own.
+
+    Parameters
+    ----------
+    record : Record
+        What observers are run on.
+    train : Record or float
+        Another record of the same loop; or the duration [s] of the first part of the record, which is then not to be scored.
+    scenario : Scenario
+        Its settings of the offline GPR say how many samples are needed.
+
+    Returns
+    -------
+    Record
+        With the same measurements. Missing samples of the training data are bridged by the last value.
+
+    Raises
+    ------
+    RecordError
+        The other record has another rate, number of modes or delay, is the record itself, or either has too few samples or an
+        impossible duration.
+    """
+    other = _other(record, train) if isinstance(train, Record) else _first(record, train)
+    g = scenario.gpr_offline
+    if other.n_steps < (needed := g.depth + g.training_size):
+        raise RecordError(f"the training data has {other.n_steps} steps; gpr_offline.depth + training_size need {needed}")
+    whole = fill_missing(other, Prior())
+    return replace(record, training=Training(whole.y_lgs, whole.u, whole.open_loop_y).copy())
+
+
+def trained_until(train: Record | float | None) -> float:
+    """Return the end [s] of the part of the record that is training data."""
+    return 0.0 if train is None or isinstance(train, Record) else train
+
+
+def _other(record: Record, train: Record) -> Record:
+    if abs(train.dt / record.dt - 1.0) > SAME_RATE:
+        raise RecordError(f"the training record has a rate of {1 / train.dt:g} Hz, the record {1 / record.dt:g} Hz")
+    for what in ("n_modes", "delay"):
+        theirs, ours = getattr(train, what), getattr(record, what)
+        if theirs != ours:
+            word = "modes" if what == "n_modes" else "steps of delay"
+            raise RecordError(f"the training record has {theirs} {word}, the record {ours}")
+    if train.y_lgs.shape == record.y_lgs.shape and np.array_equal(train.y_lgs, record.y_lgs, equal_nan=True):
+        raise RecordError(
+            "the training record is the record itself: training and test must differ; train until S seconds instead"
+        )
+    return train
+
+
+def _first(record: Record, seconds: float) -> Record:
+    length = record.n_steps * record.dt
+    if not 0.0 < seconds < length:
+        raise RecordError(f"the first {seconds:g} s as training data: takes more than 0 and less than the record's {length:g} s")
+    end = round(seconds / record.dt)
+    twin = None if record.open_loop_y is None else record.open_loop_y[:end]
+    return Record(record.y_lgs[:end], record.u[:end], record.dt, open_loop_y=twin, delay=record.delay)
