@@ -159,7 +159,7 @@ def test_the_truth_in_an_argument_would_be_found(monkeypatch: pytest.MonkeyPatch
     from wfsobs.testing import controllers as module
 
     real = module.controller_arguments
-    monkeypatch.setattr(module, "arguments", lambda c, record, *rest: (record, real(c, record, *rest)[1]))
+    monkeypatch.setattr(module, "controller_arguments", lambda c, record, *rest: (record, real(c, record, *rest)[1]))
     with pytest.raises(CheckError, match="it reaches Record, turbulence, vibration"):
         check_controller(CONTROLLERS["lqg-kf-lgs"], alone=False)
 
