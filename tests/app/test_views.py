@@ -263,7 +263,7 @@ class TestHigherModes:
         units.buttons.value = "mas"
         assert display.unit == "mas"
         switch.list.value = "defocus"
-        dashboard.explore.pinning._pressed(None)
+        dashboard.explore.pinning._on_press(None)
         store.change("telescope.radial_order", 1)
         loop.finish(store)
         assert display.mode == "tip" and switch.buttons.visible and not switch.list.visible

@@ -38,7 +38,7 @@ def to_command(scenario: Scenario, preset: str, source: Source | None = None, ta
     more = [word for name, value in task.arguments.items() for word in (f"--{name}", str(value))]
     if source is None and task.what != IDENTIFY:
         return shlex.join(["wfsobs", "run" if task.what == OBSERVE else task.what, *more, *given])
-    file, said = (source.name, _said(source)) if isinstance(source, LoadedRecord) else (RECORD, [])
+    file, said = (source.name, _stated_options(source)) if isinstance(source, LoadedRecord) else (RECORD, [])
     # a name that starts with a dash would be read as an option
     file = f"./{file}" if file.startswith("-") else file
     positional = [file] if task.what in (OBSERVE, IDENTIFY) else ["--record", file]
@@ -56,7 +56,7 @@ def _options(scenario: Scenario, preset: str, file: str) -> list[str]:
     return words if len(shlex.join(words)) <= LONGEST else ["--config", file]
 
 
-def _said(source: LoadedRecord) -> list[str]:
+def _stated_options(source: LoadedRecord) -> list[str]:
     """List what the user stated about a file, and what tells the file from others."""
     stated = source.stated
     sign = None if stated.command_sign is None else f"{stated.command_sign:+d}"
@@ -75,14 +75,14 @@ def _said(source: LoadedRecord) -> list[str]:
 
 def to_python(scenario: Scenario, preset: str, source: Source | None = None, task: Task = EXPLORED) -> str:
     """Write a script that computes and prints what a page shows."""
-    imports, lines = {"import wfsobs"}, [f"scenario = {_made(scenario, preset, FILE)}"]
+    imports, lines = {"import wfsobs"}, [f"scenario = {_scenario_code(scenario, preset, FILE)}"]
     if isinstance(source, LoadedRecord):
         stated = "".join(f"{name}={value!r}, " for name, value in vars(source.stated).items() if value is not None)
         imports |= {"from wfsobs.telemetry.intake import DeclaredFormat", "from wfsobs.telemetry.records import load_record"}
         check = f", sha256={source.sha256!r}" if source.sha256 else ""
         lines.append(f"record = load_record({source.name!r}, scenario, DeclaredFormat({stated.removesuffix(', ')}){check})")
     elif isinstance(source, SimulatedRecord):
-        lines += [f"simulation = {_made(source.simulation, preset, SIMULATION)}", "record = wfsobs.simulate(simulation)"]
+        lines += [f"simulation = {_scenario_code(source.simulation, preset, SIMULATION)}", "record = wfsobs.simulate(simulation)"]
     elif task.what in (LOOP, IDENTIFY):
         lines.append("record = wfsobs.simulate(scenario)")
     more_imports, more_lines = _DOES[task.what](source is not None, task.arguments)
@@ -95,7 +95,7 @@ def _order(line: str) -> tuple[bool, str]:
     return line.startswith("from"), line
 
 
-def _made(scenario: Scenario, preset: str, file: str) -> str:
+def _scenario_code(scenario: Scenario, preset: str, file: str) -> str:
     lines = [f"    {json.dumps(path)}: {value!r},\n" for path, value in changes(scenario, preset).items()]
     made = f'wfsobs.PRESETS["{preset}"]()' + (f".replace({{\n{''.join(lines)}}})" if lines else "")
     return made if len(made) <= LONGEST else f'configfile.load_scenario("{file}")'

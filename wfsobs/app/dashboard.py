@@ -113,7 +113,7 @@ class Dashboard:
         with edit_readonly(page):
             # Tied to what all sessions do, each change walks all models of the page, and the page outlives its session.
             page.busy = Idle().param.busy
-        page.param.watch(self._themed, "dark_theme")
+        page.param.watch(self._on_theme, "dark_theme")
         self.frame.param.watch(lambda event: self._post(partial(setattr, page, "dark_theme", event.new)), "wants_dark")
         return page
 
@@ -126,7 +126,7 @@ class Dashboard:
         """Release what the session holds; called when it ends."""
         self.store.close()
 
-    def _themed(self, event: param.parameterized.Event) -> None:
+    def _on_theme(self, event: param.parameterized.Event) -> None:
         self.display.dark = self.frame.dark = event.new
 
     def _top(self) -> pn.FlexBox:

@@ -134,10 +134,10 @@ class TextField(Field):
 
     def _text(self, **options: Any) -> pmui.TextInput:
         text = pmui.TextInput(size="small", **options)
-        text.param.watch(self._typed, "value")
+        text.param.watch(self._on_text, "value")
         return text
 
-    def _typed(self, event: param.parameterized.Event) -> None:
+    def _on_text(self, event: param.parameterized.Event) -> None:
         if self.path in self.store.errors or event.new != self.to_text(self.store.value(self.path)):
             self.store.change(self.path, self.from_text(event.new))
 
@@ -194,7 +194,7 @@ class SliderField(TextField):
             **ROOM,
         )
         slider._debounce = SOON  # type: ignore[misc]
-        slider.param.watch(self._released, "value_throttled")
+        slider.param.watch(self._on_release, "value_throttled")
         text = self._text(
             label=names["label"], tags=[TAG + self.path], width=NUMBER_WIDTH, margin=(4, 0, 4, 8), align="end", sx=UNNAMED
         )
@@ -203,7 +203,7 @@ class SliderField(TextField):
     def _row(self) -> Any:
         return pn.Row(*self.widgets, sizing_mode="stretch_width", margin=0)
 
-    def _released(self, event: param.parameterized.Event) -> None:
+    def _on_release(self, event: param.parameterized.Event) -> None:
         self._value = event.new
         if event.new is not None and event.new != self.store.value(self.path):
             self.store.change(self.path, event.new)

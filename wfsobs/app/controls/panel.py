@@ -171,23 +171,23 @@ class Controls:
         return self.fields[path]
 
     def _watch(self) -> None:
-        self.preset.param.watch(self._chosen, "value")
+        self.preset.param.watch(self._on_choice, "value")
         self.reset.on_click(lambda _event: self.store.choose(self.store.preset))
         self.undo.on_click(lambda _event: self.store.undo())
         self.redo.on_click(lambda _event: self.store.redo())
         self.run.on_click(lambda _event: self.store.start())
         self.cancel.on_click(lambda _event: self.store.run.cancel())
-        self.accordion.param.watch(self._opened, "active")
+        self.accordion.param.watch(self._on_open, "active")
         self.store.param.watch(self._refresh_preset, ["scenario", "preset", "can_undo", "can_redo"])
         self.store.param.watch(self._refresh_parts, "scenario")
         self.store.param.watch(self._refresh_run, ["errors", "waiting"])
         self.store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"])
 
-    def _chosen(self, event: param.parameterized.Event) -> None:
+    def _on_choice(self, event: param.parameterized.Event) -> None:
         if event.new != self.store.preset:
             self.store.choose(event.new)
 
-    def _opened(self, event: param.parameterized.Event) -> None:
+    def _on_open(self, event: param.parameterized.Event) -> None:
         names = list(self.topics)
         for index in event.new:
             self.open_topic(names[index])

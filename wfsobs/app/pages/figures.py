@@ -121,7 +121,7 @@ class _Sheet:
     def __init__(self, figure: PaperFigure):
         self.figure = figure
         self.names = (*figure.observers, TRUTH)  # the reference on top
-        self.plots = [_Drawn(plot, self.names, figure) for plot in figure.plots]
+        self.plots = [_PlotLines(plot, self.names, figure) for plot in figure.plots]
         sheet = [asset("style.css")]
         self.head = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, stylesheets=sheet)
         self.caption = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, stylesheets=sheet)
@@ -134,7 +134,7 @@ class _Sheet:
     def draw(self, shown: RunResults, display: Display) -> None:
         """Every plot and the texts."""
         legend = "".join(
-            f'<span class="mark">{swatch(n, display.dark, dashed=_dashed(n, self.figure))}{escape(_label(n))}</span>'
+            f'<span class="mark">{swatch(n, display.dark, dashed=_is_dashed(n, self.figure))}{escape(_label(n))}</span>'
             for n in self.names
         )
         self.head.object = f'<h2 class="title">{escape(self.figure.title)}</h2><div class="caption legend">{legend}</div>'
@@ -155,7 +155,7 @@ class _Sheet:
         return " ".join([*parts, self.figure.printed]).strip()
 
 
-class _Drawn:
+class _PlotLines:
     """One plot."""
 
     def __init__(self, plot: Plot, names: tuple[str, ...], of: PaperFigure):
@@ -171,7 +171,12 @@ class _Drawn:
         self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
         self.lines: dict[str, GlyphRenderer] = {
             name: self.figure.line(
-                "x", "y", source=source, line_width=1.6, line_dash=list(look(name).dash) if _dashed(name, of) else [], name=name
+                "x",
+                "y",
+                source=source,
+                line_width=1.6,
+                line_dash=list(look(name).dash) if _is_dashed(name, of) else [],
+                name=name,
             )
             for name, source in self.sources.items()
         }
@@ -225,6 +230,6 @@ def _label(name: str) -> str:
     return "Reference" if name == TRUTH else look(name).label
 
 
-def _dashed(name: str, of: PaperFigure) -> bool:
+def _is_dashed(name: str, of: PaperFigure) -> bool:
     """Whether a line has its dashes; one alone with the reference needs none."""
     return name == TRUTH or len(of.observers) > 1

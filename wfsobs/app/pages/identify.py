@@ -124,14 +124,14 @@ class IdentifyPage(PageActions):
 
     def saves(self) -> Mapping[str, Save | None]:
         """Offer the model as `wfsobs identify --out` writes it."""
-        result, record = self._identified()
+        result, record = self._model_and_record()
         if result is None or record is None:
             return {"Model as TOML": None}
         text = identification_toml(result, result.scenario(as_stated(record, self.store.scenario)))
         return {"Model as TOML": Save("wfsobs-model.toml", "application/toml", text.encode)}
 
     def _take(self, source: Source | None) -> None:
-        result, _ = self._identified()
+        result, _ = self._model_and_record()
         if result is not None:
             try:
                 self.store.run_on(source, result.scenario(self.store.scenario))
@@ -158,7 +158,7 @@ class IdentifyPage(PageActions):
         if task.state != RUNNING:
             self._redraw()
 
-    def _identified(self) -> tuple[Identification, Record] | tuple[None, None]:
+    def _model_and_record(self) -> tuple[Identification, Record] | tuple[None, None]:
         """Return the model and the record from which it was identified."""
         return self.work.result or (None, None)
 
@@ -167,7 +167,7 @@ class IdentifyPage(PageActions):
         if not self.visible or of is None or shown is None or self.display.column >= of.mean.shape[1]:
             return
         diameter, column = shown.scenario.telescope.diameter, self.display.column
-        result, record = self._identified()
+        result, record = self._model_and_record()
         mode = result.modes[column] if result and column < len(result.modes) else None
         with pn.io.hold():
             self.legend.object = legend(NAMES, self.display.dark)

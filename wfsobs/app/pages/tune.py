@@ -104,7 +104,7 @@ class TunePage(PageActions):
 
     def use(self) -> None:
         """Take what was tuned into the settings, and leave the others as they are by now."""
-        tuned = self._tuned()
+        tuned = self._tuning_result()
         if tuned is not None:
             try:
                 self.store.replace(changed_settings(tuned.scenario, tuned.before.scenario))
@@ -119,7 +119,7 @@ class TunePage(PageActions):
 
     def saves(self) -> Mapping[str, Save | None]:
         """Offer the table, errors in [um], and the settings as `wfsobs tune --out` writes them."""
-        if (tuned := self._tuned()) is None:
+        if (tuned := self._tuning_result()) is None:
             return {"Tuning table as CSV": None, "Tuned settings as TOML": None}
         table = [dict(zip(COLUMNS, row, strict=True)) for row in rows(tuned)]
         return {
@@ -134,18 +134,18 @@ class TunePage(PageActions):
         self.target.param.update(options=targets, value=VIBRATION if VIBRATION in targets else targets[0])
         self.searched.object = f'<p class="text">Searched: {", ".join(OBSERVERS[name].tunable.usual)}.</p>'
 
-    def _tuned(self) -> TuningResult | None:
+    def _tuning_result(self) -> TuningResult | None:
         return self.work.result
 
     def _history(self) -> tuple[Evaluation, ...]:
         """Of the tuning under way, or of the last one."""
         if self.work.state == RUNNING:
             return self.work.latest or ()
-        tuned = self._tuned()
+        tuned = self._tuning_result()
         return tuned.history if tuned else self.work.latest or ()
 
     def _scale(self) -> tuple[str, float]:
-        return unit_for(self._tuned(), self.display), self.store.scenario.telescope.diameter
+        return unit_for(self._tuning_result(), self.display), self.store.scenario.telescope.diameter
 
     def _so_far(self) -> str:
         """Describe what the search has reached."""
@@ -159,7 +159,7 @@ class TunePage(PageActions):
     def _redraw(self, *_: object) -> None:
         if not self.visible:
             return
-        tuned, (unit, diameter) = self._tuned(), self._scale()
+        tuned, (unit, diameter) = self._tuning_result(), self._scale()
         with pn.io.hold():
             self.legend.object = legend(LEGEND, self.display.dark)
             self.figure.draw(self._history(), self.measure, unit, diameter)
@@ -171,7 +171,7 @@ class TunePage(PageActions):
 
     def _compare(self, *_: Any) -> None:
         """Whether the settings are still those that were tuned, before or after."""
-        tuned, now = self._tuned(), self.store.scenario
+        tuned, now = self._tuning_result(), self.store.scenario
         self.stale.visible = tuned is not None and now not in (tuned.before.scenario, tuned.scenario)
 
 

@@ -189,17 +189,19 @@ def _frequencies(frequency: Array) -> dict[str, Floats]:
     high = envelope_times(min(SPECTRUM, n), n, SPECTRUM_BINS, step)
     return {
         "frequency": np.concatenate([frequency[1:SPECTRUM], high]).astype(np.float32),
-        "frequency-cumulative": frequency[_spaced(n)].astype(np.float32),
+        "frequency-cumulative": frequency[_spread_indices(n)].astype(np.float32),
     }
 
 
 def _spectra(frequency: Array, density: Array) -> tuple[Floats, Floats]:
     """Select the points kept of a density and of its cumulative rms."""
     thin = np.concatenate([density[1:SPECTRUM], envelope(density[SPECTRUM:], SPECTRUM_BINS)])
-    return thin.astype(np.float32), cumulative_rms(frequency[1:], density[1:])[_spaced(density.size) - 1].astype(np.float32)
+    return thin.astype(np.float32), cumulative_rms(frequency[1:], density[1:])[_spread_indices(density.size) - 1].astype(
+        np.float32
+    )
 
 
-def _spaced(n: int) -> NDArray[np.int64]:
+def _spread_indices(n: int) -> NDArray[np.int64]:
     """Choose indices from 1 to n - 1, evenly on a logarithmic axis."""
     return np.unique(np.round(np.geomspace(1, n - 1, CUMULATIVE)).astype(np.int64))
 

@@ -50,7 +50,7 @@ def page(report: Report, made: datetime) -> str:
         scripts={name: Markup(script) for name, script in scripts.items()},
         sheets={"shared": Markup(asset("style.css") + asset("strip.css")), "own": Markup(asset("report.css"))},
         primary=PRIMARY,
-        looks={name: look(name) for name in _drawn()},
+        looks={name: look(name) for name in _line_names()},
         marks=(PEAKS, MODEL),
         shades=SHADES,
         targets=TARGETS,
@@ -92,7 +92,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _drawn() -> list[str]:
+def _line_names() -> list[str]:
     return [TRUTH, *OBSERVERS, BOUND]
 
 
@@ -119,7 +119,7 @@ def _data(report: Report) -> dict[str, Any]:
     return {
         "looks": {
             name: {"label": look(name).label, "light": look(name).light, "dark": look(name).dark, "dash": look(name).dash}
-            for name in _drawn()
+            for name in _line_names()
         },
         "names": {target: [TRUTH, *observers_of(target)] for target in TARGETS},
         "modes": _modes(report),

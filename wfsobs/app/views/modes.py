@@ -28,7 +28,7 @@ class ModeSwitch:
             label="Mode", options=options, value=display.mode, size="small", margin=0, width=190, visible=False
         )
         for widget in (self.buttons, self.list):
-            widget.param.watch(self._chosen, "value")
+            widget.param.watch(self._on_choice, "value")
         run.param.watch(self._fit, "result")
         display.param.watch(self._follow, ["mode", "unit"])
 
@@ -36,7 +36,7 @@ class ModeSwitch:
         """Return the buttons and the list, one of them visible."""
         return [self.buttons, self.list]
 
-    def _chosen(self, event: object) -> None:
+    def _on_choice(self, event: object) -> None:
         value = event.new  # type: ignore[attr-defined]
         if value is not None:
             self.display.mode = value
@@ -82,7 +82,7 @@ class UnitSwitch:
         )
         self.buttons._debounce = SOON  # type: ignore[misc]
         self.note = pn.pane.HTML(NO_MAS, visible=False, margin=0)
-        self.buttons.param.watch(self._chosen, "value")
+        self.buttons.param.watch(self._on_choice, "value")
         display.param.watch(self._follow, ["mode", "unit"])
 
     def view(self) -> list[object]:
@@ -92,7 +92,7 @@ class UnitSwitch:
     def _options(self) -> dict[str, str]:
         return {UNITS[unit]: unit for unit in self.display.units}
 
-    def _chosen(self, event: object) -> None:
+    def _on_choice(self, event: object) -> None:
         value = event.new  # type: ignore[attr-defined]
         if value in self.display.units:
             self.display.unit = value

@@ -24,7 +24,7 @@ class Pinning:
             label="Pin", icon="push_pin", size="small", variant="outlined", margin=0, disabled=True, description=PIN
         )
         self.note = pn.pane.HTML("", margin=0, visible=False, stylesheets=[asset("style.css")])
-        self.button.on_click(self._pressed)
+        self.button.on_click(self._on_press)
         run.param.watch(self._refresh, "result")
         display.param.watch(self._refresh, "pinned")
 
@@ -32,7 +32,7 @@ class Pinning:
         """Return the button and the line."""
         return [self.button, self.note]
 
-    def _pressed(self, _event: object) -> None:
+    def _on_press(self, _event: object) -> None:
         if self.display.pinned is not None:
             self.display.pinned = None
         elif self.run.result is not None:

@@ -53,16 +53,16 @@ class Strip:
                 return self._without_truth(name, shown)
             waiting = self.run.state == RUNNING
             return self._card(name, None, "computing …" if waiting else "no result")
-        return self._scored(name, score, shown, "truth")
+        return self._score_fields(name, score, shown, "truth")
 
-    def _scored(self, name: str, score: Score, shown: RunResults, base: str) -> dict[str, Any]:
+    def _score_fields(self, name: str, score: Score, shown: RunResults, base: str) -> dict[str, Any]:
         relative = f"{score.normalised_rms:.2f} × {base}" if score.normalised_rms is not None else ""
-        return self._card(name, self._scaled(score.rms, shown), own_interval(score_rows([score], None)[0]) or relative)
+        return self._card(name, self._in_unit(score.rms, shown), own_interval(score_rows([score], None)[0]) or relative)
 
     def _without_truth(self, name: str, shown: RunResults) -> dict[str, Any]:
         """How well the next measurement is predicted, by whoever says what it will be."""
         score = find(shown, name, PREDICTION, self.display.mode)
-        return self._scored(name, score, shown, "z, next z") if score else self._card(name, None, "no truth")
+        return self._score_fields(name, score, shown, "z, next z") if score else self._card(name, None, "no truth")
 
     def _truth(self, shown: RunResults | None) -> dict[str, Any]:
         of = (self.target, self.display.mode)
@@ -70,13 +70,13 @@ class Strip:
         if shown is None or not scores:
             left = find(shown, LOOP, RESIDUAL, self.display.mode) if shown else None
             return self._loop(left, shown) if shown and left else self._card(TRUTH, None, "")
-        return self._card(TRUTH, self._scaled(scores[0].truth_rms, shown), "rms")
+        return self._card(TRUTH, self._in_unit(scores[0].truth_rms, shown), "rms")
 
     def _loop(self, left: Score, shown: RunResults) -> dict[str, Any]:
         """Describe the recorded loop's residual, in the place of the truth, which has no line either."""
-        return self._scored(TRUTH, left, shown, "z, residual") | {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
+        return self._score_fields(TRUTH, left, shown, "z, residual") | {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
 
-    def _scaled(self, value: float, shown: RunResults) -> float:
+    def _in_unit(self, value: float, shown: RunResults) -> float:
         return value * per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
 
     def _card(self, name: str, value: float | None, note: str) -> dict[str, Any]:

@@ -49,7 +49,7 @@ class Table:
 
     def html(self) -> str:
         """Write the table."""
-        groups = self._measured() or [self._target(target) for target in TARGETS]
+        groups = self._truthless() or [self._target(target) for target in TARGETS]
         shown = self.run.result
         failures = [failure.reason for failure in shown.result.failures] if shown else []
         return f"{table('RMS errors', self._columns(), groups)}{macro('texts', 'failure', failures)}"
@@ -66,7 +66,7 @@ class Table:
         scores = [s for s in shown.result.scores if s.mode == self.display.mode] if shown else []
         return scores if any(s.target == RESIDUAL for s in scores) else []
 
-    def _measured(self) -> list[tuple[str, list[Row]]]:
+    def _truthless(self) -> list[tuple[str, list[Row]]]:
         """List the rows of a record without truth: predictions of the next measurement, and what the recorded loop left."""
         scores, shown = self._without_truth(), self.run.result
         if not scores or shown is None:
@@ -80,7 +80,7 @@ class Table:
             is_best = score.rms == best and can_be_best(score.observer, score.apart)
             cells = [
                 (BEST if is_best else "") + number(score.rms * scale),
-                *self._pinned(score.observer, score.target, score),
+                *self._pinned_cells(score.observer, score.target, score),
                 number(score.truth_rms * scale),
                 number(score.normalised_rms),
                 row_needs(score.observer),
@@ -89,7 +89,7 @@ class Table:
             ]
             head = "Recorded loop, residual" if score.observer == LOOP else self._head(score.observer) + _own(score)
             found.append(Row(head, cells, {"observer": score.observer, "target": score.target}))
-        return [(f"Next measurement z, {self.display.mode}{_scored(scores)}, one step ahead: the record has no truth", found)]
+        return [(f"Next measurement z, {self.display.mode}{_stretch(scores)}, one step ahead: the record has no truth", found)]
 
     def _target(self, target: str) -> tuple[str, list[Row]]:
         """List the rows of a target, best first if asked for, those without a score last."""
@@ -102,11 +102,11 @@ class Table:
         order = list(scores.items())
         if self.display.best_first:
             order.sort(key=lambda item: (item[1].apart, item[1].rms) if item[1] else (True, math.inf))
-        title = f"{target.capitalize()}, {self.display.mode}{_scored([s for s in scores.values() if s])}"
+        title = f"{target.capitalize()}, {self.display.mode}{_stretch([s for s in scores.values() if s])}"
         return title, [self._row(name, target, score, best) for name, score in order]
 
     def _row(self, name: str, target: str, score: Score | None, best: float | None) -> Row:
-        shown, pinned = self.run.result, self._pinned(name, target, score)
+        shown, pinned = self.run.result, self._pinned_cells(name, target, score)
         cells = [NOTHING, *pinned, *[NOTHING] * 2, row_needs(name), *[NOTHING] * 3]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
@@ -126,7 +126,7 @@ class Table:
     def _head(self, name: str) -> Markup:
         return swatch(name, self.display.dark) + row_label(name)
 
-    def _pinned(self, name: str, target: str, score: Score | None) -> list[str]:
+    def _pinned_cells(self, name: str, target: str, score: Score | None) -> list[str]:
         """Write the pinned run's error and the change since; nothing while nothing is pinned."""
         kept = self.display.pinned
         if kept is None:
@@ -138,7 +138,7 @@ class Table:
         return [number(before.rms * scale), change(before.rms, score.rms if score else None)]
 
 
-def _scored(scores: list[Score]) -> str:
+def _stretch(scores: list[Score]) -> str:
     """Write the stretch over which comparable rows were scored, for the end of a heading."""
     stretch = scored_interval(score_rows(scores, None))
     return f", {stretch}" if stretch else ""

@@ -46,7 +46,7 @@ class Traces(TargetFigures):
         self.traces = {target: _Trace(target, self.x_range, crosshair) for target in TARGETS}
         super().__init__(run, display, self.traces, ["mode", "show", "unit", "pinned"])
         for end in ("start", "end"):
-            self.x_range.on_change(end, self._moved)
+            self.x_range.on_change(end, self._on_move)
 
     def _draw(self, shown: RunResults) -> None:
         record = shown.result.record
@@ -65,12 +65,12 @@ class Traces(TargetFigures):
         first = max(int((start - margin) / dt), 0)
         return min(first, n_steps - 2), min(max(int((end + margin) / dt) + 2, 2), n_steps)
 
-    def _moved(self, attr: str, old: object, new: object) -> None:
+    def _on_move(self, attr: str, old: object, new: object) -> None:
         if not self._waiting:
             self._waiting = True
-            later(self._settled, SETTLE_MS)
+            later(self._on_settle, SETTLE_MS)
 
-    def _settled(self) -> None:
+    def _on_settle(self) -> None:
         self._waiting = False
         self._redraw()
 
@@ -124,7 +124,7 @@ class _Trace:
         if kept is not None and not display.running:  # what is kept of it are extremes
             first, last = np.searchsorted(kept.times, [times[0], times[-1]])
             cut = slice(first, last + 1)
-            x = _thinned(kept.times[cut])
+            x = _times_of_envelope(kept.times[cut])
             scale = per_micrometre(display.unit, kept.scenario.telescope.diameter)
             for name, line in self.lines.items():
                 values = (kept.errors if display.error else kept.signals).get((name, self.target))
@@ -148,7 +148,7 @@ class _Trace:
             self.figure.y_range.update(start=low - pad, end=high + pad + above * (high - low))
 
 
-def _thinned(times: Array) -> Array:
+def _times_of_envelope(times: Array) -> Array:
     """Compute the times of an envelope of samples that are a run of times themselves."""
     if times.size <= 2 * BINS:
         return times
