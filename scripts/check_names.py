@@ -29,6 +29,7 @@ PARTICIPLES = {
 """Allowed, and why."""
 
 DOUBLES = {
+    "prior_of": "the same of a scenario and of an identification: the module says of which",
     "read": "every file format has a function of this name: `Format.read`",
     "write": "every file format has a function of this name: `Format.write`",
     "main": "the usual name of an entry point",
