@@ -65,10 +65,10 @@ def test_public_functions_stay_functions_whatever_is_imported() -> None:
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_options_are_keyword_only(name: str) -> None:
-    """All that has a default, but for the names of the settings that are tuned."""
+    """All that has a default, but for the names of settings that are tuned and the scenario that a record is observed with."""
     parameters = inspect.signature(getattr(wfsobs, name)).parameters.values()
     positional = {p.name for p in parameters if p.default is not p.empty and p.kind is not p.KEYWORD_ONLY}
-    assert positional <= {"names"}
+    assert positional <= ({"scenario"} if name == "observe" else {"names"})
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["presets"]])
