@@ -3,7 +3,7 @@
     python scripts/check_names.py
 
 A function is a verb with a noun (`fit_ar3`), or the noun of what it returns (`rms`); `fitted` says neither what is fitted nor
-that anything is done. The dashboard is left out: its methods are named by the events that call them.
+that anything is done.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ DOUBLES = {
     "prior_of": "the same of a scenario and of an identification: the module says of which",
     "read": "every file format has a function of this name: `Format.read`",
     "write": "every file format has a function of this name: `Format.write`",
+    "compute": "what a kind of job of the dashboard does: the module says which kind",
     "main": "the usual name of an entry point",
     "export": "the command, and the function that it calls",
     "identify": "the command, and the function that it calls",
@@ -69,8 +70,6 @@ def faults() -> list[str]:
     homes: dict[str, list[str]] = defaultdict(list)
     out = []
     for path in sorted(PACKAGE.rglob("*.py")):
-        if PACKAGE / "app" in path.parents:
-            continue
         where = path.relative_to(PACKAGE.parent).as_posix()
         for name, is_top in names(path):
             if is_participle(name) and name not in PARTICIPLES:

@@ -93,7 +93,7 @@ def test_its_controller_closes_the_loop(python: Run) -> None:
 
 
 DASHBOARD = """
-from wfsobs.app.controls.names import name_of
+from wfsobs.app.controls.names import setting_name
 from wfsobs.app.controls.panel import Controls
 from wfsobs.app.copies import to_command, to_python
 from wfsobs.app.limits import NONE
@@ -119,7 +119,7 @@ box.value = "80"
 assert store.scenario.low_pass.corner == 80.0 and store.changed() == ["low_pass.corner"]
 box.value = "0"
 assert store.errors["low_pass.corner"].endswith("takes a number from 0.1 to 10000 Hz")
-assert name_of("low_pass.corner") == "Low-pass: Corner"
+assert setting_name("low_pass.corner") == "Low-pass: Corner"
 query = to_query(store.scenario, "paper")
 assert query == "preset=paper&low_pass.corner=80" and from_query(query).scenario == store.scenario
 service.close(20.0)

@@ -23,6 +23,9 @@ from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 
+WAIT = 60.0
+"""How long a page is waited for [s]: a busy machine takes ten times as long as a quiet one."""
+
 SHORT = {
     "run.duration": 2.0,
     "run.warm_up": 0.5,
@@ -41,11 +44,11 @@ class Loop:
         self.queue: queue.Queue[Callable[[], None]] = queue.Queue()
         self.closing: list[Any] = []
 
-    def land(self, timeout: float = 20.0) -> None:
+    def land(self, timeout: float = WAIT) -> None:
         """Do the next thing that was posted."""
         self.queue.get(timeout=timeout)()
 
-    def until(self, condition: Callable[[], bool], timeout: float = 20.0) -> None:
+    def until(self, condition: Callable[[], bool], timeout: float = WAIT) -> None:
         """Do what is posted until a condition holds."""
         end = monotonic() + timeout
         while not condition():

@@ -17,14 +17,14 @@ from wfsobs.app.cache import Cache, arrays_in, key_of, size_of
 from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Tell
 from wfsobs.app.limits import NONE
 from wfsobs.app.service import Service
-from wfsobs.app.work import RunResults, Spectrum, compute
+from wfsobs.app.work import RunResults, SignalAndError, compute
 from wfsobs.pipeline import Result
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 
-WAIT = 20.0
+WAIT = 60.0
 
 
 def answer(scenario: Scenario) -> RunResults:
@@ -131,7 +131,7 @@ def test_what_is_kept_cannot_be_changed() -> None:
 def test_size_is_of_the_memory_held() -> None:
     base = np.zeros((10, 4))
     assert size_of({"whole": base, "part": base[:, 1], "again": (base, [base.T])}) == base.nbytes
-    assert size_of(Spectrum(np.zeros(3), np.zeros((3, 2)), np.zeros((3, 2)))) == 8 * (3 + 6 + 6)
+    assert size_of(SignalAndError(np.zeros(3), np.zeros((3, 2)), np.zeros((3, 2)))) == 8 * (3 + 6 + 6)
 
 
 def test_every_array_of_a_run_is_found(short: Scenario) -> None:

@@ -33,7 +33,7 @@ def done(page: ClosedLoopPage, loop: Any) -> ClosedLoopPage:
     """The page once all controllers have run on the results shown."""
     of = page.run.result
     assert of is not None
-    loop.until(lambda: page.shown is not None and page.shown.done and page.shown.result.scenario is of.scenario)
+    loop.until(lambda: page.results is not None and page.results.done and page.results.result.scenario is of.scenario)
     return page
 
 
@@ -49,9 +49,9 @@ def page(dashboard: Dashboard, loop: Any) -> ClosedLoopPage:
 
 def test_it_says_what_the_command_says(page: ClosedLoopPage, dashboard: Dashboard) -> None:
     of = dashboard.store.run.result
-    assert of is not None and page.shown is not None
+    assert of is not None and page.results is not None
     expected = rows(closed_loop(of.result.record, design(of.scenario)), None)
-    assert list(page.shown.rows) == expected
+    assert list(page.results.rows) == expected
     cards = {card["name"]: card for card in page.cards.items}
     assert list(cards) == list(CONTROLLERS)
     for row in (r for r in expected if r["mode"] == "tip" and r["controller"] != BOUND):
@@ -65,7 +65,7 @@ def test_it_says_what_the_command_says(page: ClosedLoopPage, dashboard: Dashboar
 
 def the_lines_are_the_results(page: ClosedLoopPage, dashboard: Dashboard) -> None:
     dashboard.display.param.update(mode="tilt", unit="mas")
-    shown = page.shown
+    shown = page.results
     assert shown is not None
     scale = per_micrometre("mas", 8.0)
     start = round(shown.result.scenario.run.warm_up / shown.result.record.dt)
@@ -114,10 +114,10 @@ def test_it_follows_the_settings_while_it_is_seen(page: ClosedLoopPage, dashboar
     assert {c["note"] for c in page.cards.items if "integrator" in c["name"]} == {"unstable"}
     assert not len(page.whole.sources["integrator"].data["x"])
     dashboard.pages.current = EXPLORE
-    before = page.shown
+    before = page.results
     dashboard.store.change("control.gain", 0.5)
     loop.finish(dashboard.store)
-    assert page.shown is before
+    assert page.results is before
     done(opened(dashboard), loop)
     assert "unstable</span>" not in page.table.object
 

@@ -9,7 +9,7 @@ import param
 import pytest
 
 from wfsobs.app.controls.fields import SliderField, label_of, parse_number, unit_text
-from wfsobs.app.controls.names import name_of
+from wfsobs.app.controls.names import setting_name
 from wfsobs.app.controls.panel import FIRST, Controls, status_of
 from wfsobs.app.work import RunResults
 from wfsobs.pipeline import Result
@@ -169,7 +169,7 @@ def test_a_bad_value_shows_beside_its_setting(controls: Controls, path: str, tex
     assert says in error_of(controls, path)
     assert field.widgets[-1].error_state and field.widgets[-1].value == text, "what was typed stays, to be corrected"
     assert controls.store.run.result is shown and controls.store.scenario is scenario
-    assert status_of(controls.store)[1] == f"Not accepted: {name_of(path)}" == controls.status.note
+    assert status_of(controls.store)[1] == f"Not accepted: {setting_name(path)}" == controls.status.note
 
 
 def test_correcting_a_bad_value_clears_the_message(controls: Controls, loop: Any) -> None:

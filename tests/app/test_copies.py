@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.app.copies import LOOP, OBSERVE, TUNE, Task, to_command
+from wfsobs.app.copies import LOOP, OBSERVE, TUNE, CopiedTask, to_command
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs.job import RUNNING
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
@@ -119,13 +119,13 @@ def test_closed_loop(board: Dashboard, loop: Any) -> None:
     board.pages.current = "loop"
     page = board.pages.made["loop"]
     assert isinstance(page, ClosedLoopPage)
-    loop.until(lambda: page.shown is not None and page.shown.done, 120)
-    assert page.shown is not None
+    loop.until(lambda: page.results is not None and page.results.done, 120)
+    assert page.results is not None
 
     def residuals(given: Any) -> dict[tuple[str, str], float]:
         return {(r["controller"], r["mode"]): r["residual_rms_nm"] for r in given if r["residual_rms_nm"] is not None}
 
-    expected = residuals(page.shown.rows)
+    expected = residuals(page.results.rows)
     assert len(expected) > 10
     assert residuals(shell(board)) == pytest.approx(expected, rel=CLOSE)
     assert residuals(rows(script(board)["result"], None)) == pytest.approx(expected, rel=CLOSE)
@@ -187,7 +187,7 @@ def test_another_file_of_the_same_name_is_refused(tmp_path: Path, short: Scenari
 def test_names_that_are_no_words_of_a_shell() -> None:
     for name in ("a b.npz", "-x.npz", "$(touch x).npz", "it's.npz"):
         source = LoadedRecord(simulate(PRESETS["paper"]().replace({"run.duration": 1.2})), name, "key")
-        for task in (Task(OBSERVE), Task(LOOP), Task(TUNE, {"observer": "kf-lgs"})):
+        for task in (CopiedTask(OBSERVE), CopiedTask(LOOP), CopiedTask(TUNE, {"observer": "kf-lgs"})):
             command = to_command(PRESETS["paper"](), "paper", source, task)
             words = subprocess.run(f"printf '%s\\n' {command}", shell=True, capture_output=True, text=True)
             assert f"./{name}" in words.stdout.splitlines() or name in words.stdout.splitlines()
@@ -238,13 +238,13 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
 
     dashboard.pages.current = "loop"
     page = dashboard.pages.made["loop"]
-    loop.until(lambda: page.shown is not None and page.shown.done, 120)
+    loop.until(lambda: page.results is not None and page.results.done, 120)
     files = saved(dashboard, loop, sent)
     table = [*csv.DictReader(io.StringIO(files["wfsobs-controllers.csv"].decode()))]
     assert [(r["controller"], r["mode"], r["residual_rms_nm"]) for r in table] == [
-        (r["controller"], r["mode"], "" if r["residual_rms_nm"] is None else str(r["residual_rms_nm"])) for r in page.shown.rows
+        (r["controller"], r["mode"], "" if r["residual_rms_nm"] is None else str(r["residual_rms_nm"])) for r in page.results.rows
     ]
-    outcomes = {o.controller: o.residual for o in page.shown.result.outcomes if o.residual is not None}
+    outcomes = {o.controller: o.residual for o in page.results.result.outcomes if o.residual is not None}
     with np.load(io.BytesIO(files["wfsobs-residuals.npz"]), allow_pickle=False) as arrays:
         assert {n for n in arrays.files if "/" in n} == {f"residual/{name}" for name in outcomes}
         np.testing.assert_array_equal(arrays["residual/integrator"], outcomes["integrator"])

@@ -11,7 +11,7 @@ import pytest
 
 from wfsobs.app import dashboard as module
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.session import page
+from wfsobs.app.session import session_page
 from wfsobs.app.work import RunResults, compute
 from wfsobs.scenario import Scenario
 
@@ -24,7 +24,7 @@ def test_error_page(caplog: pytest.LogCaptureFixture) -> None:
     def build(post: Any) -> Dashboard:
         raise RuntimeError("<no> room")
 
-    html = page(build)[0].object
+    html = session_page(build)[0].object
     assert "could not be built" in html and "RuntimeError: &lt;no&gt; room" in html
     assert "no> room" in caplog.text
 
@@ -40,7 +40,7 @@ def test_a_page_that_cannot_be_assembled(monkeypatch: pytest.MonkeyPatch, loop: 
         made.append(Dashboard(loop.queue.put, enter(), short))
         return made[0]
 
-    assert "ValueError: no page" in page(build)[0].object
+    assert "ValueError: no page" in session_page(build)[0].object
     assert made[0].store.run.state == "idle"
     made[0].close()
 

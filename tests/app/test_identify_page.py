@@ -11,7 +11,7 @@ import pytest
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import per_micrometre
-from wfsobs.app.identify_work import same, seconds
+from wfsobs.app.identify_work import same_measurements, seconds
 from wfsobs.app.jobs.job import DONE, FAILED, RUNNING
 from wfsobs.app.limits import PUBLIC, Limits
 from wfsobs.app.pages import identify as module
@@ -118,7 +118,7 @@ def test_filters_only(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> No
     assert dashboard.upload.picker.loaded.startswith("The simulation with 1 peak is kept")
     loop.finish(store)
     shown = store.run.result
-    assert shown is not None and shown.recorded and not store.stale and not page.stale.visible
+    assert shown is not None and shown.is_recorded and not store.stale and not page.stale.visible
     for name in ("y_lgs", "u", "turbulence", "vibration"):
         np.testing.assert_array_equal(getattr(shown.result.record, name), getattr(before.result.record, name))
     expected = {(s.observer, s.target, s.mode): s.rms for s in observe(before.result.record, told).scores}
@@ -178,7 +178,7 @@ def test_a_loaded_record_stays(page: IdentifyPage, dashboard: Dashboard, loop: A
     page.starter.uses[0].param.trigger("clicks")
     loop.finish(dashboard.store)
     shown = dashboard.store.run.result
-    assert shown is not None and shown.recorded and shown.result.record is loaded
+    assert shown is not None and shown.is_recorded and shown.result.record is loaded
     assert shown.scenario.kalman.process_noise == "matched" and not page.stale.visible
 
 
@@ -232,6 +232,6 @@ def test_same_records(short: Scenario) -> None:
     y = record.y_lgs.copy()
     y[3] = np.nan
     lost = replace(record, y_lgs=y)
-    assert same(lost, replace(lost, y_lgs=y.copy())) and same(record, record)
+    assert same_measurements(lost, replace(lost, y_lgs=y.copy())) and same_measurements(record, record)
     for other in (lost, replace(record, delay=3), replace(record, dt=2e-3), replace(record, y_lgs=y[:-1])):
-        assert not same(record, other)
+        assert not same_measurements(record, other)

@@ -10,7 +10,7 @@ import pytest
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.numbers import change, number
-from wfsobs.app.pin import differences, name_of, pin
+from wfsobs.app.pin import differences, name_of_difference, pin
 from wfsobs.app.style import observers_of
 from wfsobs.app.work import TRUTH
 from wfsobs.observers.base import TARGETS
@@ -106,8 +106,8 @@ class TestWords:
             "Process noise Q matched → manual",
             "Centre frequencies changed",
         ]
-        assert name_of(one, other).endswith("and 2 more")
-        assert name_of(one, one.copy()) == "the same settings"
+        assert name_of_difference(one, other).endswith("and 2 more")
+        assert name_of_difference(one, one.copy()) == "the same settings"
         assert "Peaks changed" in differences(PRESETS["paper"](), PRESETS["ut4"]())
 
     def test_change(self) -> None:

@@ -22,7 +22,7 @@ from wfsobs.app.limits import NONE
 from wfsobs.app.service import Service
 from wfsobs.progress import Watch
 
-WAIT = 20.0
+WAIT = 60.0
 KINDS = ("run", "loop", "identify", "tune", "upload", "report")
 
 

@@ -264,9 +264,9 @@ def test_a_preset_replaces_every_setting(make_store: Any, loop: Any) -> None:
     store.change("turbulence.wind_speed", 200)
     store.choose("ut4")
     assert store.scenario == PRESETS["ut4"]() and store.preset == "ut4"
-    assert store.errors == {} and store.changed() == []
+    assert store.errors == {} and store.changed_paths() == []
     store.change("loop.gain", 0.1)
-    assert store.changed() == ["loop.gain"]
+    assert store.changed_paths() == ["loop.gain"]
     loop.finish(store)
 
 

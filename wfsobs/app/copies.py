@@ -19,20 +19,20 @@ OBSERVE, LOOP, IDENTIFY, TUNE = "observe", "loop", "identify", "tune"
 
 
 @dataclass(frozen=True)
-class Task:
+class CopiedTask:
     """What a page does with the record: one of the above, and its arguments by name."""
 
     what: str = OBSERVE
     arguments: Mapping[str, Any] = field(default_factory=dict)
 
 
-EXPLORED = Task()
+EXPLORED = CopiedTask()
 
 
 # ---------------------------------------------------------------------- command lines
 
 
-def to_command(scenario: Scenario, preset: str, source: Source | None = None, task: Task = EXPLORED) -> str:
+def to_command(scenario: Scenario, preset: str, source: Source | None = None, task: CopiedTask = EXPLORED) -> str:
     """Write the command that prints what a page shows; two where the record has to be simulated first."""
     given = _options(scenario, preset, FILE)
     more = [word for name, value in task.arguments.items() for word in (f"--{name}", str(value))]
@@ -73,7 +73,7 @@ def _stated_options(source: LoadedRecord) -> list[str]:
 # ---------------------------------------------------------------------- Python
 
 
-def to_python(scenario: Scenario, preset: str, source: Source | None = None, task: Task = EXPLORED) -> str:
+def to_python(scenario: Scenario, preset: str, source: Source | None = None, task: CopiedTask = EXPLORED) -> str:
     """Write a script that computes and prints what a page shows."""
     imports, lines = {"import wfsobs"}, [f"scenario = {_scenario_code(scenario, preset, FILE)}"]
     if isinstance(source, LoadedRecord):

@@ -112,7 +112,7 @@ class Display(param.Parameterized):
         return [unit for unit in UNITS if unit not in NO_ANGLE or self.mode in [m.name for m in TIP_TILT]]
 
     @property
-    def compared(self) -> Pin | None:
+    def pin_compared(self) -> Pin | None:
         """The pinned run, where it has the mode shown."""
         return self.pinned if self.pinned is not None and self.column < len(self.pinned.scenario.modes) else None
 

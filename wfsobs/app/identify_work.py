@@ -25,7 +25,7 @@ PER_SAMPLE = 40e-6
 
 
 @dataclass(frozen=True)
-class MeasuredSpectrum:
+class RecordSpectrum:
     """The periodogram of z in the bins of an axis: mean and highest, (bins, n_modes) [um^2/Hz], at frequency (bins,) [Hz].
 
     duration [s]
@@ -52,7 +52,7 @@ class Fit:
     lines: tuple[tuple[float, float, float], ...]
 
 
-def measure(of: RunResults, _watch: Watch, _tell: Tell) -> MeasuredSpectrum:
+def estimate_record_spectrum(of: RunResults, _watch: Watch, _tell: Tell) -> RecordSpectrum:
     """Estimate the spectrum of the record shown, with the taper that the identification uses. Raises RecordError."""
     record = of.result.record
     z = fill_missing(record, prior_of(of.result.scenario.before_events, record, (Model,))).z[record.delay :]
@@ -63,7 +63,7 @@ def measure(of: RunResults, _watch: Watch, _tell: Tell) -> MeasuredSpectrum:
     start = np.flatnonzero(np.diff(np.floor(np.log(f / f[0]) / np.log(f[-1] / f[0]) * BINS), prepend=-1.0))
     count = np.diff(start, append=len(f))
     density = np.column_stack([periodogram(column - column.mean(), record.dt) for column in z.T])
-    return MeasuredSpectrum(
+    return RecordSpectrum(
         record,
         np.add.reduceat(f, start) / count,
         np.add.reduceat(density, start) / count[:, None],
@@ -72,7 +72,7 @@ def measure(of: RunResults, _watch: Watch, _tell: Tell) -> MeasuredSpectrum:
     )
 
 
-def fit(mode: IdentifiedMode, result: Identification) -> Fit:
+def fitted_spectrum(mode: IdentifiedMode, result: Identification) -> Fit:
     """Compute the spectrum of the model identified in a mode."""
     s, T = mode.spectrum, result.duration
     centres = [(p.omega / (2 * np.pi), p.damping) for p in s.processes]
@@ -93,7 +93,7 @@ def seconds(record: Record) -> float:
     return PER_SAMPLE * record.n_steps * record.n_modes
 
 
-def same(one: Record, other: Record) -> bool:
+def same_measurements(one: Record, other: Record) -> bool:
     """Whether two records hold the same measurements."""
     return one is other or (
         one.y_lgs.shape == other.y_lgs.shape

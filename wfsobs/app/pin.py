@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
-from wfsobs.app.work import TRUTH, Key, RunResults, Spectrum
+from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
 from wfsobs.evaluation.scores import Score
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
@@ -35,7 +35,7 @@ class Pin:
 
     scenario: Scenario
     scores: tuple[Score, ...]
-    spectra: Mapping[Key, Spectrum]
+    spectra: Mapping[Key, SignalAndError]
     times: Array
     signals: Mapping[Key, NDArray[np.float32]]
     errors: Mapping[Key, NDArray[np.float32]]
@@ -103,7 +103,7 @@ def _word(value: Any) -> str:
     return {True: "on", False: "off"}[value] if isinstance(value, bool) else str(value)
 
 
-def name_of(pinned: Scenario, now: Scenario) -> str:
+def name_of_difference(pinned: Scenario, now: Scenario) -> str:
     """Name a pinned run by the settings in which the present one differs."""
     words = differences(pinned, now)
     if not words:

@@ -26,7 +26,7 @@ from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.limits import NONE, PUBLIC, Limits
 from wfsobs.app.logs import event, to_stream
 from wfsobs.app.service import Full, Service
-from wfsobs.app.session import page
+from wfsobs.app.session import session_page
 from wfsobs.app.share import LONGEST
 from wfsobs.app.work import one_blas_thread
 
@@ -150,7 +150,7 @@ def new_page(service: Service) -> Any:
     except Full as error:
         return pn.pane.HTML(full_html(str(error)), margin=40)
     pn.state.on_session_destroyed(lambda _context: session.leave())
-    return page(lambda post: Dashboard(post, session))
+    return session_page(lambda post: Dashboard(post, session))
 
 
 def make_server(options: Options, service: Service) -> Server:

@@ -21,16 +21,16 @@ from wfsobs.app.service import Post
 log = logging.getLogger(__name__)
 
 
-def page(build: Callable[[Post], Dashboard]) -> Any:
+def session_page(build: Callable[[Post], Dashboard]) -> Any:
     """Build the page of a new session; one with the error where it cannot be built."""
     try:
         dashboard = build(post_to_session())
         if query := page_query():
             dashboard.actions.open_link(query)
-        page = dashboard.page()
+        session_page = dashboard.page()
         dashboard.start()
         pn.state.on_session_destroyed(lambda _context: dashboard.close())
-        return page
+        return session_page
     except Exception as error:
         log.exception("the page could not be built")
         return error_page(error)

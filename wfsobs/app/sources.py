@@ -76,6 +76,6 @@ class SimulatedRecord:
 Source = LoadedRecord | SimulatedRecord
 
 
-def same(one: Source | None, other: Source | None) -> bool:
+def give_same_record(one: Source | None, other: Source | None) -> bool:
     """Whether two give the same record; None is the simulation of the settings."""
     return one is other or (one is not None and other is not None and one.key == other.key)

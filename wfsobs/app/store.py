@@ -12,7 +12,7 @@ import param
 
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.service import Post, Session
-from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, same
+from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, give_same_record
 from wfsobs.cost import run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import reference_preset
@@ -132,7 +132,7 @@ class Store(param.Parameterized):
         """Start again from a preset."""
         self.load(PRESETS[name](), name)
 
-    def changed(self) -> list[str]:
+    def changed_paths(self) -> list[str]:
         """Dotted paths of the settings that differ from the preset's."""
         return _paths(self.scenario.difference(reference_preset(self.preset)))
 
@@ -153,7 +153,7 @@ class Store(param.Parameterized):
     def _accept(self, to: Step, refused: dict[str, Any], step: bool = True) -> None:
         """Accept new settings, the one way in. step : whether it is a change of its own, to be undone later."""
         scenario, preset, source = to
-        unchanged, stays = scenario == self.scenario, same(source, self.source)
+        unchanged, stays = scenario == self.scenario, give_same_record(source, self.source)
         if step and not (unchanged and stays and preset == self.preset):
             self._past = _of_one_file([*self._past, self._step], source)[-STEPS_BACK:]
             self._future = []
@@ -174,14 +174,14 @@ class Store(param.Parameterized):
 
     def _compare(self, *_: object) -> None:
         shown = self.run.result
-        self.stale = shown is not None and (shown.scenario != self.scenario or not same(shown.source, self.source))
+        self.stale = shown is not None and (shown.scenario != self.scenario or not give_same_record(shown.source, self.source))
 
 
 def _of_one_file(steps: list[Step], source: Source | None) -> list[Step]:
     """Without those on another file than the one that is loaded: a session holds one."""
 
     def other(step: Step) -> bool:
-        return isinstance(step[2], LoadedRecord) and isinstance(source, LoadedRecord) and not same(step[2], source)
+        return isinstance(step[2], LoadedRecord) and isinstance(source, LoadedRecord) and not give_same_record(step[2], source)
 
     return [step for step in steps if not other(step)]
 

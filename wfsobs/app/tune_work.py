@@ -37,14 +37,14 @@ def seconds(of: RunResults, scenario: Scenario, observer: str, evaluations: int)
     most half of a record that was loaded.
     """
     each = max((e.seconds_per_step for e in of.result.estimates if e.observer == observer), default=0.0)
-    record, share = of.result.record, 0.5 if of.recorded else 1.0
-    simulation = 0.0 if of.recorded else 3.0 * part_seconds(scenario)["rest"]
+    record, share = of.result.record, 0.5 if of.is_recorded else 1.0
+    simulation = 0.0 if of.is_recorded else 3.0 * part_seconds(scenario)["rest"]
     return (evaluations + 2) * each * share * record.n_steps * record.n_modes + simulation
 
 
-def measure(of: RunResults, observer: str, target: str) -> str:
+def minimised_measure(of: RunResults, observer: str, target: str) -> str:
     """Say what a tuning minimises. Raises RecordError where a loaded record has nothing to judge by."""
-    return MEASURES[judged_by(of.result.record, observer, target)[1] if of.recorded else TRUTH]
+    return MEASURES[judged_by(of.result.record, observer, target)[1] if of.is_recorded else TRUTH]
 
 
 def compute(
@@ -64,7 +64,7 @@ def compute(
             last = monotonic()
             tell(latest=tuple(history))
 
-    record = of.result.record if of.recorded else None
+    record = of.result.record if of.is_recorded else None
     return tune(scenario, observer, evaluations=evaluations, record=record, target=target, told=told, watch=watch)
 
 
@@ -76,7 +76,7 @@ def best_so_far(history: Sequence[Evaluation]) -> list[float]:
     return out
 
 
-def rows(tuned: TuningResult) -> Rows:
+def tuning_rows(tuned: TuningResult) -> Rows:
     """List settings as text, errors [um] by mode and together, a GPR's log marginal likelihoods by mode; None for failures."""
     out: Rows = [(SETTING, *row) for row in settings(tuned)]
     stages = tuned.before, tuned.after

@@ -42,7 +42,7 @@ DRAWING = 0.15
 
 
 @dataclass(frozen=True)
-class Spectrum:
+class SignalAndError:
     """Power spectral densities [um^2/Hz], one column per mode, of a signal and of its error; frequency in [Hz]."""
 
     frequency: Array
@@ -61,12 +61,12 @@ class RunResults:
 
     result: Result
     partial: Mapping[Key, Array] = field(default_factory=dict)
-    spectra: Mapping[Key, Spectrum] = field(default_factory=dict)
+    spectra: Mapping[Key, SignalAndError] = field(default_factory=dict)
     seconds: float = 0.0
     source: Source | None = None
 
     @property
-    def recorded(self) -> bool:
+    def is_recorded(self) -> bool:
         """Whether the record stays whatever the settings."""
         return self.source is not None
 
@@ -111,7 +111,7 @@ class _Work:
         self.failures: list[Failure] = []
         self.bounds: list[Bound] = []
         self.growing: dict[Key, Array] = {}  # written to by the observers' threads
-        self.spectra: dict[Key, Spectrum] = {}
+        self.spectra: dict[Key, SignalAndError] = {}
         self.started = self.told = self.delivered = perf_counter()
         self.news = False  # since the last delivery
         self.fraction = 0.0
@@ -207,7 +207,7 @@ class _Work:
             if spectrum is not None:
                 self.spectra[TRUTH, target] = spectrum
 
-    def _spectrum(self, record: Record, target: str, values: Array) -> Spectrum | None:
+    def _spectrum(self, record: Record, target: str, values: Array) -> SignalAndError | None:
         """Over the samples that count for the scores; None where there are too few."""
         found = spectra(record, target, values, self.scenario.run.warm_up)
-        return Spectrum(*found) if found else None
+        return SignalAndError(*found) if found else None

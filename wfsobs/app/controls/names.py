@@ -34,7 +34,7 @@ def name_settings(line: str) -> str:
     >>> name_settings("night.toml: turbulence.wind_speed = 200")
     'night.toml: Wind speed V₀ = 200'
     """
-    return PATH.sub(lambda match: name_of(match[0]), line)
+    return PATH.sub(lambda match: setting_name(match[0]), line)
 
 
 def column_of(key: str) -> str:
@@ -48,10 +48,10 @@ def column_of(key: str) -> str:
 
 
 @cache
-def name_of(path: str) -> str:
+def setting_name(path: str) -> str:
     """Name a setting as the page does, its topic in front where several share a name; an unknown path stays as it is.
 
-    >>> name_of("gpr_online.depth"), name_of("vibration.peaks.14"), name_of("vibration.peaks.0.height")
+    >>> setting_name("gpr_online.depth"), setting_name("vibration.peaks.14"), setting_name("vibration.peaks.0.height")
     ('Online GPR: Depth d', 'Peak 15', 'vibration.peaks.0.height')
     """
     node: Group = Scenario()

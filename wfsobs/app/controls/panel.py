@@ -12,7 +12,7 @@ import param
 from panel.custom import JSComponent
 
 from wfsobs.app.controls.fields import ROOM, TAG, Field, make_field
-from wfsobs.app.controls.names import name_of
+from wfsobs.app.controls.names import setting_name
 from wfsobs.app.controls.rows import RowEditor
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.store import Store
@@ -193,7 +193,7 @@ class Controls:
             self.open_topic(names[index])
 
     def _refresh_preset(self, *_: object) -> None:
-        changed = self.store.changed()
+        changed = self.store.changed_paths()
         self.preset.value = self.store.preset
         self.preset.helper_text = f"{len(changed)} changed: {', '.join(changed)}" if changed else NO_CHANGES
         self.reset.disabled = not changed
@@ -219,7 +219,7 @@ def status_of(store: Store) -> tuple[str, str]:
     }.get(run.state, "")
     if store.waiting:
         text = waiting_text(store.waiting)
-    note = f"Not accepted: {', '.join(map(name_of, store.errors))}" if store.errors else ""
+    note = f"Not accepted: {', '.join(map(setting_name, store.errors))}" if store.errors else ""
     return text, note
 
 

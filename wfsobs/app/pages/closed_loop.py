@@ -9,15 +9,15 @@ from typing import Any
 
 import panel as pn
 
-from wfsobs.app.copies import LOOP, Task
+from wfsobs.app.copies import LOOP, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save, residuals_csv, residuals_npz, table_csv
 from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
 from wfsobs.app.numbers import NOTHING, number
-from wfsobs.app.pages.loop_figures import Nyquist, Response, Spectrum, Trace
-from wfsobs.app.pages.loop_table import margins_html, table_html
+from wfsobs.app.pages.loop_figures import LoopSpectrum, Nyquist, Response, Trace
+from wfsobs.app.pages.loop_table import loop_html, margins_html
 from wfsobs.app.pages.parts import WIDE, PageActions, box, figure_with_caption, html, text
 from wfsobs.app.style import look
 from wfsobs.app.views.strip import Cards
@@ -51,7 +51,7 @@ class ClosedLoopPage(PageActions):
         self.note, self.table, self.margins = html(), html(), html()
         self.cards = Cards(items=[], hidden=[], sizing_mode="stretch_width", margin=0)
         self.whole, self.zoomed = Trace("whole record"), Trace("zoomed")
-        self.spectrum, self.response, self.nyquist = Spectrum(), Response(), Nyquist()
+        self.spectrum, self.response, self.nyquist = LoopSpectrum(), Response(), Nyquist()
         self._drawn = (self.whole, self.zoomed, self.spectrum, self.response, self.nyquist)
         self.work.param.watch(self._say, ["state", "place", "message"])
         self.work.param.watch(self._redraw, "result")
@@ -96,13 +96,13 @@ class ClosedLoopPage(PageActions):
         self._redraw()  # mode or unit may have changed
 
     @property
-    def task(self) -> Task:
+    def task(self) -> CopiedTask:
         """To close the loop."""
-        return Task(LOOP)
+        return CopiedTask(LOOP)
 
     def saves(self) -> Mapping[str, Save | None]:
         """Offer the table of `wfsobs loop --json`, and the residuals."""
-        shown = self.shown
+        shown = self.results
         if shown is None:
             return {"Controllers as CSV": None, "Residuals as CSV": None, "Residuals as NPZ": None}
         return {
@@ -125,7 +125,7 @@ class ClosedLoopPage(PageActions):
         self.work.start(Job("loop", partial(compute, of), cost=cost(of.scenario)))
 
     @property
-    def shown(self) -> LoopResults | None:
+    def results(self) -> LoopResults | None:
         """What the loop has given so far, or the one before."""
         return self.work.result
 
@@ -136,7 +136,7 @@ class ClosedLoopPage(PageActions):
         self.note.object = f'<p class="text" role="status">{escape(said)}</p>' if said else ""
 
     def _redraw(self, *_: object) -> None:
-        shown = self.shown
+        shown = self.results
         if shown is None or not self.visible or self.display.column >= len(shown.result.scenario.modes):
             return
         with pn.io.hold():
@@ -156,10 +156,10 @@ class ClosedLoopPage(PageActions):
                 drawn.restyle(self.display.dark, self.cards.hidden)
             for trace in (self.whole, self.zoomed):
                 trace.fit(self.cards.hidden)
-            if self.shown is not None:
-                self.table.object = table_html(self.shown, self.display)
-                self.margins.object = margins_html(self.shown, self.display)
-                self.cards.items = self._items(self.shown)
+            if self.results is not None:
+                self.table.object = loop_html(self.results, self.display)
+                self.margins.object = margins_html(self.results, self.display)
+                self.cards.items = self._items(self.results)
 
     def _items(self, shown: LoopResults) -> list[dict[str, Any]]:
         """Describe a card per controller."""

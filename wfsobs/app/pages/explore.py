@@ -18,7 +18,7 @@ from wfsobs.app.render import macro
 from wfsobs.app.style import HEARD, asset
 from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.plots import call
-from wfsobs.app.views.spectra import MODEL, PEAKS, Spectra
+from wfsobs.app.views.spectra import MODEL, PEAKS, SpectraFigures
 from wfsobs.app.views.strip import Strip
 from wfsobs.app.views.table import Table
 from wfsobs.app.views.traces import Traces
@@ -39,7 +39,7 @@ class Explore:
 
     def __init__(self, run: BackgroundTask, display: Display):
         self.display = display
-        self.traces, self.spectra = Traces(run, display), Spectra(run, display)
+        self.traces, self.spectra = Traces(run, display), SpectraFigures(run, display)
         self.strips = {target: Strip(target, run, display) for target in TARGETS}
         self.verdicts = {target: VerdictLine(target, run, display) for target in TARGETS}
         self.table = Table(run, display)

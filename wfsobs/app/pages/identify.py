@@ -10,14 +10,21 @@ import panel as pn
 import panel_material_ui as pmui
 
 from wfsobs.app.controls.fields import parse_number
-from wfsobs.app.copies import IDENTIFY, Task
+from wfsobs.app.copies import IDENTIFY, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
-from wfsobs.app.identify_work import MeasuredSpectrum, compute, fit, measure, same, seconds
+from wfsobs.app.identify_work import (
+    RecordSpectrum,
+    compute,
+    estimate_record_spectrum,
+    fitted_spectrum,
+    same_measurements,
+    seconds,
+)
 from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.identify_figure import NAMES, SpectrumFigure
-from wfsobs.app.pages.identify_table import table_html, verdict_html
+from wfsobs.app.pages.identify_table import identification_html, verdict_html
 from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
 from wfsobs.app.sources import SimulatedRecord, Source
 from wfsobs.app.store import Store
@@ -63,7 +70,7 @@ class IdentifyPage(PageActions):
         self.figure = SpectrumFigure()
         self.legend, self.table, self.verdict, self.note = html(), html(), html(), html()
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
-        self.of: MeasuredSpectrum | None = None
+        self.of: RecordSpectrum | None = None
         self.measuring = BackgroundTask(store.session)
         self._made: Scenario | None = None
         self.visible, self._measured = False, object()
@@ -118,9 +125,11 @@ class IdentifyPage(PageActions):
         self._take(None)
 
     @property
-    def task(self) -> Task:
+    def task(self) -> CopiedTask:
         """To identify the record."""
-        return Task(IDENTIFY, {"level": parse_number(str(self.level.value)), "lowest": parse_number(str(self.lowest.value))})
+        return CopiedTask(
+            IDENTIFY, {"level": parse_number(str(self.level.value)), "lowest": parse_number(str(self.lowest.value))}
+        )
 
     def saves(self) -> Mapping[str, Save | None]:
         """Offer the model as `wfsobs identify --out` writes it."""
@@ -147,7 +156,7 @@ class IdentifyPage(PageActions):
         if not self.visible or of is None or self.run.state == RUNNING or of is self._measured:
             return
         self._measured = of
-        self.measuring.start(Job("identify", partial(measure, of), refusal=RecordError))
+        self.measuring.start(Job("identify", partial(estimate_record_spectrum, of), refusal=RecordError))
 
     def _land(self, *_: object) -> None:
         task = self.measuring
@@ -172,13 +181,15 @@ class IdentifyPage(PageActions):
         with pn.io.hold():
             self.legend.object = legend(NAMES, self.display.dark)
             self.figure.draw_measured(of, self.display, diameter)
-            self.figure.draw_fit(mode, fit(mode, result) if mode and result else None, self.display, diameter)
+            self.figure.draw_fit(mode, fitted_spectrum(mode, result) if mode and result else None, self.display, diameter)
             self.figure.restyle(self.display.dark)
             if result and record:
                 self.verdict.object = verdict_html(result)
-                self.table.object = table_html(mode, self.display, diameter) if mode else ""
+                self.table.object = identification_html(mode, self.display, diameter) if mode else ""
                 replaced = self.store.source is None and self._made == self.store.scenario
-                self.stale.param.update(object=REPLACED if replaced else EARLIER, visible=not same(record, of.record))
+                self.stale.param.update(
+                    object=REPLACED if replaced else EARLIER, visible=not same_measurements(record, of.record)
+                )
 
 
 def _number(label: str, value: float) -> pmui.TextInput:

@@ -6,7 +6,7 @@ import numpy as np
 from bokeh.models import ColumnDataSource, HoverTool, Range1d
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.identify_work import Fit, MeasuredSpectrum
+from wfsobs.app.identify_work import Fit, RecordSpectrum
 from wfsobs.app.style import look
 from wfsobs.app.views.plots import call, new_figure
 from wfsobs.identification.result import IdentifiedMode
@@ -49,7 +49,7 @@ class SpectrumFigure:
         self._coloured["found"] = [marks, spikes]
         fig.add_tools(HoverTool(renderers=[marks], tooltips="@text"))
 
-    def draw_measured(self, of: MeasuredSpectrum, display: Display, diameter: float) -> None:
+    def draw_measured(self, of: RecordSpectrum, display: Display, diameter: float) -> None:
         """Send what was measured, and have the axes hold it."""
         scale, column = per_micrometre(display.unit, diameter) ** 2, display.column
         mean, highest = scale * of.mean[:, column], scale * of.highest[:, column]

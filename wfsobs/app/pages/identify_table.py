@@ -12,7 +12,7 @@ from wfsobs.identification.result import IdentifiedMode
 WHITE, COLOURED = macro("tag", "best", "white"), macro("tag", "above", "not white")
 
 
-def table_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
+def identification_html(mode: IdentifiedMode, display: Display, diameter: float) -> str:
     """Noise, turbulence and peaks of a mode, each number with its standard deviation."""
     scale = per_micrometre(display.unit, diameter)
     columns = {

@@ -27,7 +27,7 @@ CURVES = tuple(c.id for c in CONTROLLERS.values() if c.law and not c.predict and
 NOWHERE = (np.empty(0), np.empty(0, dtype=complex), np.empty(0, dtype=complex))
 
 
-class Lines:
+class LoopLines:
     """A figure with a line per controller."""
 
     def __init__(self, fig: figure, names: tuple[str, ...]):
@@ -44,7 +44,7 @@ class Lines:
         return max((float(np.max(s.data["y"])) for s in self.sources.values() if len(s.data["y"])), default=0.0)
 
 
-class Trace(Lines):
+class Trace(LoopLines):
     """The residual of every controller over time; that of none would dwarf the rest."""
 
     def __init__(self, what: str):
@@ -77,7 +77,7 @@ class Trace(Lines):
         self.figure.y_range.update(start=-top, end=top, reset_start=-top, reset_end=top)
 
 
-class Spectrum(Lines):
+class LoopSpectrum(LoopLines):
     """The power spectral density of every residual."""
 
     def __init__(self) -> None:
@@ -102,7 +102,7 @@ class Spectrum(Lines):
         self.figure.yaxis.axis_label = f"PSD of residual, {display.mode_label} [{display.unit_label}²/Hz]"
 
 
-class Response(Lines):
+class Response(LoopLines):
     """Rejection and noise transfer of the loops that have them."""
 
     def __init__(self) -> None:
@@ -137,7 +137,7 @@ def _decibel(x: Complex) -> Array:
     return 20.0 * np.log10(np.maximum(np.abs(x), 1e-6))
 
 
-class Nyquist(Lines):
+class Nyquist(LoopLines):
     """The loop gain in the complex plane, the unit circle, and where the margins are measured."""
 
     def __init__(self) -> None:

@@ -25,7 +25,7 @@ def of_mode(shown: LoopResults, display: Display) -> list[Score]:
     return sorted(rows, key=lambda r: float("inf") if r["residual_rms_nm"] is None else r["residual_rms_nm"])
 
 
-def table_html(shown: LoopResults, display: Display) -> str:
+def loop_html(shown: LoopResults, display: Display) -> str:
     """Residual and Strehl of every controller, and the bound."""
     unit = display.unit_label
     columns = {

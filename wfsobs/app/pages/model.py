@@ -14,7 +14,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.typing import Array
 
 
-class Model:
+class ModelPage:
     """The page; follows the settings and the mode while it is visible."""
 
     def __init__(self, store: Store, display: Display):
@@ -39,10 +39,10 @@ class Model:
         if self.visible:
             scenario = self.store.scenario
             mode = min(self.display.column, len(scenario.modes) - 1)
-            self.pane.object = html(describe(scenario, mode), self.display.dark)
+            self.pane.object = model_html(describe(scenario, mode), self.display.dark)
 
 
-def html(it: Description, dark: bool) -> str:
+def model_html(it: Description, dark: bool) -> str:
     """Write the whole page."""
     return render(
         "model.html",

@@ -14,7 +14,7 @@ from wfsobs.app.display import Display
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.figures import Figures
 from wfsobs.app.pages.identify import IdentifyPage
-from wfsobs.app.pages.model import Model
+from wfsobs.app.pages.model import ModelPage
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.store import Store
 from wfsobs.app.style import HEARD
@@ -50,7 +50,7 @@ class Pages(param.Parameterized):
             TUNE: lambda: TunePage(store, display),
             LOOP: lambda: ClosedLoopPage(store.run, display),
             FIGURES: lambda: Figures(store.run, display),
-            MODEL: lambda: Model(store, display),
+            MODEL: lambda: ModelPage(store, display),
         }
         self.made: dict[str, Page] = {EXPLORE: explore}
         self.rooms = {

@@ -13,7 +13,7 @@ from bokeh.plotting import figure
 
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.panel import Status
-from wfsobs.app.copies import EXPLORED, Task
+from wfsobs.app.copies import EXPLORED, CopiedTask
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs.job import CANCELLED, DONE, RUNNING
 from wfsobs.app.jobs.task import IDLE, BackgroundTask
@@ -28,7 +28,7 @@ class PageActions:
     """Fields that the task depends on."""
 
     @property
-    def task(self) -> Task:
+    def task(self) -> CopiedTask:
         """What the page does with the record."""
         return EXPLORED
 

@@ -10,16 +10,16 @@ import panel as pn
 import panel_material_ui as pmui
 
 from wfsobs.app.controls.fields import parse_number
-from wfsobs.app.copies import TUNE, Task
+from wfsobs.app.copies import TUNE, CopiedTask
 from wfsobs.app.display import UNITS, Display, per_micrometre
 from wfsobs.app.downloads import Save, table_csv
 from wfsobs.app.jobs.job import RUNNING, SWEEP, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.numbers import number
 from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
-from wfsobs.app.pages.tune_views import LEGEND, HistoryFigure, table_html, unit_for
+from wfsobs.app.pages.tune_views import LEGEND, HistoryFigure, tuning_html, unit_for
 from wfsobs.app.store import Store
-from wfsobs.app.tune_work import MOST, best_so_far, choices, compute, measure, rows, seconds
+from wfsobs.app.tune_work import MOST, best_so_far, choices, compute, minimised_measure, seconds, tuning_rows
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION
 from wfsobs.record import RecordError
@@ -95,7 +95,7 @@ class TunePage(PageActions):
             evaluations = _whole(self.evaluations, MOST)
             cost = seconds(of, scenario, observer, evaluations)
             self.store.limits.check_seconds(cost, "tuning")
-            self.measure = measure(of, observer, target)
+            self.measure = minimised_measure(of, observer, target)
         except (SettingError, RecordError) as error:
             self.work.refuse(str(error))
         else:
@@ -112,16 +112,16 @@ class TunePage(PageActions):
                 self.work.refuse(str(error))
 
     @property
-    def task(self) -> Task:
+    def task(self) -> CopiedTask:
         """To tune the chosen observer."""
         evaluations = parse_number(str(self.evaluations.value))
-        return Task(TUNE, {"observer": self.observer.value, "target": self.target.value, "evaluations": evaluations})
+        return CopiedTask(TUNE, {"observer": self.observer.value, "target": self.target.value, "evaluations": evaluations})
 
     def saves(self) -> Mapping[str, Save | None]:
         """Offer the table, errors in [um], and the settings as `wfsobs tune --out` writes them."""
         if (tuned := self._tuning_result()) is None:
             return {"Tuning table as CSV": None, "Tuned settings as TOML": None}
-        table = [dict(zip(COLUMNS, row, strict=True)) for row in rows(tuned)]
+        table = [dict(zip(COLUMNS, row, strict=True)) for row in tuning_rows(tuned)]
         return {
             "Tuning table as CSV": Save("wfsobs-tuning.csv", "text/csv", lambda: table_csv(table)),
             "Tuned settings as TOML": Save("wfsobs-tuned.toml", "application/toml", tuning_toml(tuned).encode),
@@ -166,7 +166,7 @@ class TunePage(PageActions):
             self.figure.restyle(self.display.dark)
             self.history.visible, self.outcome.visible = bool(self._history()), tuned is not None
             if tuned is not None:
-                self.table.object = table_html(tuned, self.display, diameter)
+                self.table.object = tuning_html(tuned, self.display, diameter)
         self._compare()
 
     def _compare(self, *_: Any) -> None:

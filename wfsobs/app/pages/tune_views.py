@@ -13,7 +13,7 @@ from wfsobs.app.display import NO_ANGLE, UNITS, Display, per_micrometre
 from wfsobs.app.numbers import NOTHING, change, number
 from wfsobs.app.render import Row, macro, table
 from wfsobs.app.style import look
-from wfsobs.app.tune_work import LIKELIHOOD, OTHER, SETTING, TEST, TOGETHER, VALIDATION, best_so_far, rows
+from wfsobs.app.tune_work import LIKELIHOOD, OTHER, SETTING, TEST, TOGETHER, VALIDATION, best_so_far, tuning_rows
 from wfsobs.app.views.plots import call, new_figure
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.tuning import Evaluation, TuningResult
@@ -69,13 +69,13 @@ def unit_for(tuned: TuningResult | None, display: Display) -> str:
     return "nm" if display.unit in NO_ANGLE and not angles else display.unit
 
 
-def table_html(tuned: TuningResult, display: Display, diameter: float) -> str:
+def tuning_html(tuned: TuningResult, display: Display, diameter: float) -> str:
     """Write settings, errors and likelihoods before and after."""
     unit = unit_for(tuned, display)
     scale = per_micrometre(unit, diameter)
     groups = [
         (TITLES[section].format(measure=tuned.measure, unit=UNITS[unit]), [_row(*row, scale) for row in found])
-        for section, found in groupby(rows(tuned), key=lambda row: row[0])
+        for section, found in groupby(tuning_rows(tuned), key=lambda row: row[0])
     ]
     columns = {"What": "", "Before": "", "After": "", "Change [%]": ""}
     notes = [f"{line}." for line in tuning_remarks(tuned) if "likelihood" not in line]

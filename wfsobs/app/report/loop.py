@@ -11,7 +11,7 @@ from wfsobs.closed_loop.rows import NOT_APPLICABLE, label
 from wfsobs.evaluation.rows import Row
 
 
-def loop_table(state: State, name: str) -> dict[str, Any]:
+def loop_state_table(state: State, name: str) -> dict[str, Any]:
     """Collect what the table of a state shows: a group per mode, least residual first."""
     modes = list(dict.fromkeys(row["mode"] for row in state.loop))
 

@@ -19,9 +19,9 @@ from wfsobs.app.display import IN_MOST, NO_ANGLE, UNITS, per_micrometre
 from wfsobs.app.render import render
 from wfsobs.app.report.data import Pool, Report, State, encode, window_of
 from wfsobs.app.report.figures import SHADES, all_figures
-from wfsobs.app.report.loop import loop_table
+from wfsobs.app.report.loop import loop_state_table
 from wfsobs.app.report.table import state_table
-from wfsobs.app.report.text import meaning_values, name_of, origin_values, scenario_values, state_name, summary, value_of
+from wfsobs.app.report.text import meaning_values, origin_values, scenario_values, setting_label, state_name, summary, value_of
 from wfsobs.app.style import PRIMARY, asset, look, observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, marked_peaks
 from wfsobs.app.work import TRUTH
@@ -56,10 +56,10 @@ def page(report: Report, made: datetime) -> str:
         targets=TARGETS,
         modes={name: name[0].upper() + name[1:] for name in _modes(report)},
         units=UNITS,
-        sweeps={i: name_of(report.base, report.variations[i].path) for i in _sweeps(report)},
+        sweeps={i: setting_label(report.base, report.variations[i].path) for i in _sweeps(report)},
         errors=[state_table(state, name) for state, name in states],
         in_most=IN_MOST,
-        loops=[loop_table(state, name) for state, name in states] if any(state.loop for state in report.states) else [],
+        loops=[loop_state_table(state, name) for state, name in states] if any(state.loop for state in report.states) else [],
         not_applicable=NOT_APPLICABLE,
         limited=LIMITED,
         embedded={"rows": _rows(report), "data": _data(report), "figures": _figures(report)},
@@ -128,7 +128,9 @@ def _data(report: Report) -> dict[str, Any]:
         "units": UNITS,
         "start": report.start,
         "variations": [[value_of(value) for value in v.values] for v in report.variations],
-        "sweeps": {i: [name_of(report.base, report.variations[i].path), report.variations[i].values] for i in _sweeps(report)},
+        "sweeps": {
+            i: [setting_label(report.base, report.variations[i].path), report.variations[i].values] for i in _sweeps(report)
+        },
         "window": window_of(report.states),
         "states": states,
         "arrays": [base64.b64encode(array).decode() for array in pool.all()],

@@ -39,7 +39,7 @@ def summary(report: Report, made: datetime) -> str:
 # ---------------------------------------------------------------------- settings in words
 
 
-def name_of(scenario: Scenario, path: str) -> str:
+def setting_label(scenario: Scenario, path: str) -> str:
     """Write a setting's label with its unit in [brackets]; the path itself if it has no label."""
     p = {known: p for known, _, p in scenario.walk()}.get(path)
     return path if p is None else label_of(p)
@@ -57,7 +57,7 @@ def state_name(report: Report, state: State, index: int) -> str:
     """Name a state by the values of what varies."""
     parts = []
     for variation, value in zip(report.variations, values_of(report, index), strict=True):
-        label, bracket, unit = name_of(state.scenario, variation.path).partition(" [")
+        label, bracket, unit = setting_label(state.scenario, variation.path).partition(" [")
         parts.append(f"{label} {value_of(value)}{' ' + unit.rstrip(']') if bracket else ''}")
     return ", ".join(parts)
 
@@ -80,11 +80,20 @@ def scenario_values(report: Report) -> dict[str, Any]:
     toml = f'preset = "{report.preset}"\n{to_toml(report.base)}'
     return {
         "changed": [
-            {"name": name_of(report.base, path), "path": path, "before": value_of(_at(preset, path)), "now": value_of(value)}
+            {
+                "name": setting_label(report.base, path),
+                "path": path,
+                "before": value_of(_at(preset, path)),
+                "now": value_of(value),
+            }
             for path, value in changed_settings(report.base, preset).items()
         ],
         "variations": [
-            {"name": name_of(report.states[0].scenario, v.path), "path": v.path, "texts": [value_of(value) for value in v.values]}
+            {
+                "name": setting_label(report.states[0].scenario, v.path),
+                "path": v.path,
+                "texts": [value_of(value) for value in v.values],
+            }
             for v in report.variations
         ],
         "file": FILE,

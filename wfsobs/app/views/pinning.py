@@ -9,7 +9,7 @@ import panel_material_ui as pmui
 
 from wfsobs.app.display import Display
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.pin import name_of, pin
+from wfsobs.app.pin import name_of_difference, pin
 from wfsobs.app.style import asset
 
 PIN, UNPIN = "Pin this run to compare others with it", "Unpin the reference run"
@@ -45,5 +45,5 @@ class Pinning:
             self.note.visible = kept is not None
         self.button.disabled = shown is None
         if kept is not None and shown is not None:
-            name = escape(name_of(kept.scenario, shown.scenario))
+            name = escape(name_of_difference(kept.scenario, shown.scenario))
             self.note.object = f'<span class="pinned" role="status">Pinned, faint in the figures: {name}</span>'

@@ -11,7 +11,7 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, PinnedLines, add_line, marked_peaks, new_figure, send
 from wfsobs.app.views.target_figures import TargetFigures
-from wfsobs.app.work import TRUTH, Array, RunResults, Spectrum
+from wfsobs.app.work import TRUTH, Array, RunResults, SignalAndError
 from wfsobs.evaluation.scores import cumulative_rms
 from wfsobs.observers.base import TARGETS, VIBRATION
 
@@ -19,7 +19,7 @@ DECADES = 8
 """The most that an axis of densities spans; one of amplitudes spans half of it."""
 
 
-class Spectra(TargetFigures):
+class SpectraFigures(TargetFigures):
     """The figures, redrawn when the results or the switches change."""
 
     def __init__(self, run: BackgroundTask, display: Display):
@@ -92,7 +92,7 @@ class _Spectrum:
 
     def draw_pinned(self, display: Display) -> list[Array]:
         """Send the pinned run's visible lines; what was sent."""
-        kept, lines = display.compared, {}
+        kept, lines = display.pin_compared, {}
         if kept is not None:
             diameter = kept.scenario.telescope.diameter
             for name, line in self.lines.items():
@@ -129,7 +129,7 @@ class _Spectrum:
         )
 
 
-def _curve(spectrum: Spectrum, name: str, display: Display, diameter: float) -> Array:
+def _curve(spectrum: SignalAndError, name: str, display: Display, diameter: float) -> Array:
     """Compute what is drawn of a spectrum above zero frequency. In error plots the truth stays: the error of answering zero."""
     scale = per_micrometre(display.unit, diameter)
     density = (spectrum.error if display.error and name != TRUTH else spectrum.signal)[1:, display.column]

@@ -120,7 +120,7 @@ class _Trace:
 
     def _draw_pinned(self, display: Display, times: Array) -> dict[str, tuple[Array, Array]]:
         """Send the pinned run's visible lines between the first and the last of the times; what was sent."""
-        kept, lines = display.compared, {}
+        kept, lines = display.pin_compared, {}
         if kept is not None and not display.running:  # what is kept of it are extremes
             first, last = np.searchsorted(kept.times, [times[0], times[-1]])
             cut = slice(first, last + 1)
