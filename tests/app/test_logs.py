@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from tornado.websocket import WebSocketClosedError
 
 from wfsobs.app.jobs.job import Job
 from wfsobs.app.limits import NONE
@@ -103,3 +104,12 @@ def test_faults_of_our_own_keep_their_traceback(written: io.StringIO) -> None:
     assert " ERROR error handling message" in written.getvalue()
     assert "Traceback" in written.getvalue() and "no such setting" in written.getvalue()
     assert "my secret" not in written.getvalue()
+
+
+def test_a_page_that_closed_while_it_was_written_to_leaves_no_traceback_and_another_fault_does(written: io.StringIO) -> None:
+    """As the loop of events reports tasks that nobody waited for."""
+    for error in (WebSocketClosedError(), RuntimeError("no such luck")):
+        logging.getLogger("asyncio").error("Task exception was never retrieved", exc_info=error)
+    said = written.getvalue()
+    assert "WebSocketClosedError" not in said and said.count("never retrieved") == 1
+    assert " ERROR Task exception was never retrieved" in said and "RuntimeError: no such luck" in said

@@ -8,6 +8,8 @@ import sys
 import traceback
 from typing import Any, TextIO
 
+from tornado.websocket import WebSocketClosedError
+
 log = logging.getLogger("wfsobs.serve")
 
 FORMAT = "%(asctime)s %(levelname)s %(message)s"
@@ -46,8 +48,11 @@ def to_stream(level: str, requests: bool = False, stream: TextIO | None = None) 
 def without_visitors_data(record: logging.LogRecord) -> bool:
     """Cuts what Bokeh and Tornado say of a visitor's message or request down to what happened.
 
-    Where no code of this package was under way it is the visitor's mistake: a warning, without a traceback.
+    Where no code of this package was under way it is the visitor's mistake: a warning, without a traceback. That a page was
+    closed while it was written to is said once, by Panel, and not again with a traceback by the loop of events.
     """
+    if record.name == "asyncio" and record.exc_info and isinstance(record.exc_info[1], WebSocketClosedError):
+        return False
     if record.name.startswith(("bokeh.", "tornado.")) and record.name != "tornado.access":
         text = " ".join(record.getMessage().split())
         for after in (" HTTPServerRequest(", ": "):
