@@ -13,7 +13,9 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-FLAGS = ["--public", "--runs", "1", "--max-duration", "100"]
+FLAGS = ["--public", "--runs", "1", "--max-duration", "100", "--lifetime", "5"]
+"""Runs of a page that is gone stop with its session, and only then the next one begins."""
+
 LONG = "?run.duration=90&gpr_online.training_size=1000&run.seed="
 
 
