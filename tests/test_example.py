@@ -116,7 +116,7 @@ controls.open_topic("low_pass")
 slider, box = controls.fields["low_pass.corner"].widgets
 assert controls.topics["low_pass"] == "Low-pass" and (slider.start, slider.end) == (10.0, 400.0)
 box.value = "80"
-assert store.scenario.low_pass.corner == 80.0 and store.changed() == ["low_pass.corner"]
+assert store.scenario.low_pass.corner == 80.0 and store.changed_paths() == ["low_pass.corner"]
 box.value = "0"
 assert store.errors["low_pass.corner"].endswith("takes a number from 0.1 to 10000 Hz")
 assert setting_name("low_pass.corner") == "Low-pass: Corner"
