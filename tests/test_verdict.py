@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from wfsobs.evaluation.rows import can_be_best, row_label
 from wfsobs.evaluation.scores import BOUND
@@ -114,10 +115,7 @@ def test_without_truth_there_is_no_verdict_and_without_a_simulation_no_lines() -
 
 def errors_of(rng: np.random.Generator, scale: float) -> tuple[Array, Array]:
     """Two records of 10 s of equally distributed errors, correlated over 20 ms and with each other; the other scaled."""
-    noise = rng.standard_normal((3, 10_000))
-    for k in range(1, noise.shape[1]):
-        noise[:, k] = 0.95 * noise[:, k - 1] + np.sqrt(1.0 - 0.95**2) * noise[:, k]
-    shared, one, other = noise
+    shared, one, other = lfilter([np.sqrt(1.0 - 0.95**2)], [1.0, -0.95], rng.standard_normal((3, 10_000)))
     return 0.8 * shared + 0.6 * one, scale * (0.8 * shared + 0.6 * other)
 
 
