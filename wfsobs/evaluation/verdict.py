@@ -22,7 +22,7 @@ from wfsobs.simulation.disturbance import vibration_lines
 from wfsobs.typing import Array
 
 BATCHES = 20
-"""Pieces of the record whose mean squared errors are compared; longer than the correlation of an error by far."""
+"""Pieces of the record whose mean squared errors are compared."""
 
 LEVEL = 0.05
 """Of two equally good observers, the share of records in which a difference is called significant."""
@@ -118,16 +118,24 @@ def verdict(
 def differs(one: Array, other: Array) -> bool:
     """Whether two errors (n,), step by step of one record, differ significantly in their mean squares.
 
-    The difference of the squares is averaged over BATCHES pieces, whose means are nearly independent, and compared with their
-    scatter by a t-test (batch means: Law and Kelton, Simulation Modeling and Analysis, ch. 9). NaN where a step does not count.
+    The difference of the squares is averaged over BATCHES pieces and compared with the scatter of their means by a t-test (batch
+    means: Law and Kelton, Simulation Modeling and Analysis, ch. 9). Slow errors make neighbouring means alike, which counts as
+    fewer of them, those of a first-order autoregression with their correlation. NaN where a step does not count.
     """
     difference = other**2 - one**2
     pieces = np.array_split(difference[~np.isnan(difference)], BATCHES)
     means = np.array([piece.mean() for piece in pieces if piece.size])
-    if means.size < 2:
+    deviation = means - means.mean() if means.size else means
+    power = float(deviation @ deviation)
+    if means.size < 3:
         return False
-    scatter = means.std(ddof=1) / sqrt(means.size)
-    return bool(abs(means.mean()) > student.ppf(1.0 - LEVEL / 2.0, means.size - 1) * scatter)
+    if not power > 0:
+        return bool(means[0] != 0.0)
+    # The estimate of a correlation from n values is low by about 1 / n.
+    alike = max(float(deviation[1:] @ deviation[:-1]) / power + 1.0 / means.size, 0.0)
+    independent = max(means.size * (1.0 - alike) / (1.0 + alike), 2.0)
+    scatter = means.std(ddof=1) / sqrt(independent)
+    return bool(abs(means.mean()) > student.ppf(1.0 - LEVEL / 2.0, independent - 1.0) * scatter)
 
 
 def _keep_scored(record: Record, error: Array, score: Score) -> Array:
