@@ -31,4 +31,6 @@ def test_the_verdict_names_the_best_of_the_table_in_the_mode_and_unit_shown(open
             said = re.search(rf"([\d.]+) {unit}[,;]", start.inner_text())
             # Three digits either way.
             assert said and abs(float(said[1]) / error - 1.0) < 0.006
-    expect(sentences(page, "vibration")).to_contain_text("than no estimate: they are given a model with one line")
+    expect(sentences(page, "vibration")).to_contain_text(
+        re.compile("than no estimate: (they are|it is) given a model with one line")
+    )
