@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
@@ -95,6 +96,7 @@ def test_a_link_with_one_bad_field(open_short: Any, open_page: Any) -> None:
     expect(other.locator('input[data-cell="1.frequency"]')).to_have_value("20")
     expect(other.get_by_text("Not used")).to_have_count(0)
     cell = 'tr[data-observer="kf-lgs"][data-target="turbulence"] td'
+    expect(other.locator(cell).first).to_have_text(re.compile(r"^\d"))
     expect(page.locator(cell).first).to_have_text(other.locator(cell).first.inner_text())
 
 
