@@ -1,6 +1,7 @@
-"""The figures of docs/identification.md, over seeds: `identification.py [seeds] [duration] [parts]`.
+"""The figures of docs/identification.md, over seeds: `identification.py [seeds] [duration] [parts] [presets]`.
 
 parts : which of search, flow, filters, coverage, all unless told. Every seed that went wrong is printed.
+presets : which of paper, ut4, galacsi-nfm, of flow and filters, all unless told.
 """
 
 from __future__ import annotations
@@ -277,7 +278,9 @@ def twins(scenario: Scenario, seeds: range) -> str:
 
 if __name__ == "__main__":
     count, duration = int(sys.argv[1]) if len(sys.argv) > 1 else 100, float(sys.argv[2]) if len(sys.argv) > 2 else 60.0
-    parts = sys.argv[3:] or ["search", "flow", "filters", "coverage"]
+    parts = [word for word in sys.argv[3:] if word not in PRESETS] or ["search", "flow", "filters", "coverage"]
+    presets = [word for word in sys.argv[3:] if word in PRESETS] or ["paper", "ut4", "galacsi-nfm"]
+    measured = [name for name in ("ut4", "galacsi-nfm") if name in presets]
     seeds, few = range(1, count + 1), range(1, max(count // 2, 2) + 1)
     quiet = PRESETS["paper"]().replace({**QUIET, "run.duration": duration})
     resonant = PRESETS["paper"]().replace({"run.duration": duration, "vibration.source": "ar2"})
@@ -294,16 +297,17 @@ if __name__ == "__main__":
         print("Closed against open loop:", twins(known_peaks(duration), range(1, 4)), flush=True)
         print("Error over stated standard deviation:", spread(known_peaks(duration, 2, 40.0), seeds), flush=True)
     if "flow" in parts:
-        for name in ("ut4", "galacsi-nfm"):
+        for name in measured:
             scenario = PRESETS[name]().replace({"run.duration": duration})
             short = scenario.replace({"run.duration": duration / 2})
             print(f"| frozen flow of {name} without vibration |", flow(scenario, seeds), "|", flush=True)
             print("| tip of it alone, half as long |", flow(short, seeds, 1), "|", flush=True)
     if "filters" in parts:
-        for name in ("ut4", "galacsi-nfm"):
+        for name in measured:
             scenario = PRESETS[name]().replace({"run.duration": duration})
             print(f"Filters, {name} with its vibration:", filters(scenario, range(1, 6)), flush=True)
-        print("Filters, known peaks:", filters(known_peaks(duration), few), flush=True)
-        print("Filters, peaks of the paper:", filters(resonant, few), flush=True)
+        if "paper" in presets:
+            print("Filters, known peaks:", filters(known_peaks(duration), few), flush=True)
+            print("Filters, peaks of the paper:", filters(resonant, few), flush=True)
     if "coverage" in parts:
         coverage(count, duration)

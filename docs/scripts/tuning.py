@@ -1,9 +1,12 @@
-"""The figures of docs/tuning.md: what tuning gains, and what of it carries over. `tuning.py [gains] [lengths] [likelihood]`."""
+"""The figures of docs/tuning.md: what tuning gains, and what of it carries over.
+
+`tuning.py [gains] [lengths] [likelihood] [presets]`: all tables unless told, of the presets named alone where any is.
+"""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.optimize import minimize
@@ -13,6 +16,8 @@ from wfsobs.tuning import TuningResult, tune
 from wfsobs.tuning.likelihood import likelihood
 
 SEEDS, FEW = range(1, 11), range(1, 5)
+USUAL = ("paper", "strong-turbulence", "ut4")
+"""Presets of the tables."""
 KERNEL = ["gpr_online.length_scale", "gpr_online.noise_std", "gpr_online.depth"]
 BANDWIDTH = ["butterworth.bandwidth_online", "gpr_online.noise_std"]
 RMS = Callable[[TuningResult], float]
@@ -40,20 +45,20 @@ def of_seeds(preset: str, observer: str, seeds: range, names: list[str] | None =
     return [tune(PRESETS[preset]().replace({"run.seed": seed}), observer, names, **more) for seed in seeds]  # type: ignore[arg-type]
 
 
-def gains() -> None:
+def gains(presets: Sequence[str]) -> None:
     """Usual settings by preset and observer; of the online GPR kernel and depth, and the width of its bands."""
-    for preset in ("paper", "strong-turbulence", "ut4"):
+    for preset in presets:
         for observer in ("kf-lgs", "gpr-offline", "butterworth-cl"):
             print(row(f"`{preset}` | `{observer}`", of_seeds(preset, observer, SEEDS)), flush=True)
         print(row(f"`{preset}` | `gpr-online`, kernel and depth", of_seeds(preset, "gpr-online", FEW, KERNEL)), flush=True)
-    for preset in ("paper", "strong-turbulence"):
+    for preset in [p for p in presets if p != "ut4"]:
         found = of_seeds(preset, "gpr-online", FEW, BANDWIDTH, evaluations=20)
         print(row(f"`{preset}` | `gpr-online`, bandwidth and noise", found), flush=True)
 
 
-def lengths() -> None:
+def lengths(presets: Sequence[str]) -> None:
     """Validation records of several lengths, `paper`."""
-    for seconds in (1.5, 2.5, 5.0, 10.0):
+    for seconds in (1.5, 2.5, 5.0, 10.0) if "paper" in presets else ():
         for observer in ("kf-lgs", "gpr-offline"):
             print(row(f"{seconds:g} s | `{observer}`", of_seeds("paper", observer, SEEDS, validation=seconds)), flush=True)
 
@@ -78,9 +83,9 @@ def likeliest(scenario: Scenario) -> Scenario:
     return at(min(found, key=lambda f: f.fun).x)
 
 
-def likelihoods() -> None:
-    """The offline GPR of `paper` with the paper's kernel, the tuned one, the likeliest."""
-    for preset in ("paper", "strong-turbulence"):
+def likelihoods(presets: Sequence[str]) -> None:
+    """The offline GPR with the paper's kernel, the tuned one, the likeliest."""
+    for preset in [p for p in presets if p != "ut4"]:
         for seed in (1, 2, 3):
             s = PRESETS[preset]().replace({"run.seed": seed})
             names = ["gpr_offline.length_scale", "gpr_offline.noise_std"]
@@ -97,6 +102,6 @@ def likelihoods() -> None:
 
 
 if __name__ == "__main__":
-    for name, table in {"gains": gains, "lengths": lengths, "likelihood": likelihoods}.items():
-        if not sys.argv[1:] or name in sys.argv[1:]:
-            table()
+    tables, words = {"gains": gains, "lengths": lengths, "likelihood": likelihoods}, sys.argv[1:]
+    for name in [name for name in tables if name in words] or tables:
+        tables[name]([preset for preset in USUAL if preset in words] or USUAL)
