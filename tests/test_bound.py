@@ -69,11 +69,11 @@ def best_estimates(spectra: TrueSpectra, z: Array) -> dict[str, Array]:
     def covariance(spectrum: Array) -> Array:
         return np.fft.irfft(spectrum, 2 * (spectrum.size - 1))
 
-    factor = cholesky(toeplitz(covariance(known.measured)[:n] + spectra.gain**2 * lines[:n]), lower=True)
+    factor = cholesky(toeplitz(covariance(known.measurement)[:n] + spectra.gain**2 * lines[:n]), lower=True)
     innovations = solve_triangular(factor, z[1:], lower=True)
     out = {}
     for target in TARGETS:
-        shared = covariance(known.shared[target])  # at lag j: E s[k] z[k + 1 - j]
+        shared = covariance(known.cross[target])  # at lag j: E s[k] z[k + 1 - j]
         later, earlier = shared[1 : n + 1], np.concatenate([shared[1:2], shared[0:1], shared[:-n:-1][: n - 2]])
         cross = toeplitz(later, earlier)  # E s[k] z[j], lag k - j + 1
         if target == "vibration":

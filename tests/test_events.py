@@ -308,7 +308,7 @@ def test_the_loop_runs_with_the_laws_of_before(broken: tuple[Scenario, Record]) 
         for one, other in zip(plan.laws[name], before.laws[name], strict=True):
             assert one.law and other.law and one.law.gain == other.law.gain
             np.testing.assert_array_equal(one.law.poles, other.law.poles)
-            assert one.predicted is None
+            assert one.predicted_rms is None
     found = rows(closed_loop(record, plan), 1)
     assert record.turbulence is not None
     assert all(0 < r["residual_rms_nm"] < 1e3 * record.turbulence.std() for r in found) and len(found) == 6

@@ -89,8 +89,8 @@ def test_a_step_is_the_mean_of_the_steps_of_a_faster_sensor() -> None:
 def test_true_spectra_carry_them() -> None:
     spectra = true_spectra(FLOW, 0)
     assert np.sqrt(circle_mean(spectra.signal["turbulence"])) == pytest.approx(turbulence_rms(FLOW, 0), rel=5e-3)
-    noise = circle_mean(spectra.measured[:] * 0 + 0.02**2 / FLOW.sensors.lgs_count)
-    assert spectra.measured.min() == pytest.approx(noise, rel=0.01), "beyond the knee there is nothing but noise"
+    noise = circle_mean(spectra.measurement[:] * 0 + 0.02**2 / FLOW.sensors.lgs_count)
+    assert spectra.measurement.min() == pytest.approx(noise, rel=0.01), "beyond the knee there is nothing but noise"
 
 
 def test_on_frozen_flow_a_third_order_model_is_within_a_tenth_of_the_bound() -> None:

@@ -295,7 +295,7 @@ def test_lobes_of_frozen_flow_are_no_peaks(name: str) -> None:
     """Tip drawn from the closed form of its spectrum: of many layers a peak in each of these records where lobes count; with a
     margin not more than the level allows."""
     s, found = PRESETS[name]().replace({"vibration.source": "none", "run.duration": 60.0}), 0
-    S = true_spectra(s, 0).measured
+    S = true_spectra(s, 0).measurement
     n = 2 * (len(S) - 1)
     for seed in range(1001, 1005):
         rng = np.random.default_rng(seed)
@@ -391,7 +391,7 @@ def test_cancel_and_progress(record: Record) -> None:
     identify(replace(record, y_lgs=record.y_lgs[:8000], u=record.u[:8000]), watch=Watch(progress=told.append))
     assert told == sorted(told) and told[-1] == 1.0
     with pytest.raises(Cancelled):
-        identify(record, watch=Watch(cancelled=lambda: True))
+        identify(record, watch=Watch(is_cancelled=lambda: True))
 
 
 def test_written_and_annotated() -> None:

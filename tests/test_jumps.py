@@ -27,8 +27,8 @@ def script() -> Any:
 def test_a_call_that_goes_up_is_found_and_one_that_goes_down_is_not(script: Any) -> None:
     """`progress` is the lowest room: whatever it calls back stands above it, also where foreign code lies between."""
     scenario = PRESETS["paper"]()
-    direct = Watch(cancelled=scenario.validate)
-    behind = Watch(cancelled=lambda: np.vectorize(lambda _: bool(scenario.validate()), otypes=[bool])([0]).any())
+    direct = Watch(is_cancelled=scenario.validate)
+    behind = Watch(is_cancelled=lambda: np.vectorize(lambda _: bool(scenario.validate()), otypes=[bool])([0]).any())
     for watch in (direct, behind):
         ((caller, callee, times),) = [j for j in script.jumps(script.traced(watch.check)) if j[0].room == "progress"]
         assert (callee.room, times) == ("scenario", 1)

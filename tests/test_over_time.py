@@ -58,9 +58,9 @@ def test_recovery_is_read_off_a_curve() -> None:
     x[1500:1600] = 1.0
     x[1100] = np.nan
     first, last = recovery(x, dt, [10.0, 5.0, 5.0], window, 1.0)
-    assert first is not None and (first.start, first.settled, first.worst) == (5.0, 1.0, 3.0)
+    assert first is not None and (first.start, first.before, first.worst) == (5.0, 1.0, 3.0)
     assert first.back == pytest.approx(2.5, abs=dt / 2)
-    assert last is not None and last.settled == pytest.approx(1.09) and last.worst == last.last == 2.0 and last.back is None
+    assert last is not None and last.before == pytest.approx(1.09) and last.worst == last.last == 2.0 and last.back is None
     unmoved, unknown = recovery(np.where(t < 12, 1.0, np.nan), dt, [5.0, 15.0], window, 1.0)
     assert unmoved is not None and unmoved.back == 0.0 and unknown is None
 
@@ -122,9 +122,9 @@ def test_after_a_jump_who_learns_is_back_and_who_is_fixed_is_not() -> None:
     for name, pool in pools.items():
         both = np.sqrt(np.mean(pool.rms**2, axis=1))
         [found] = recovery(both, s.dt, [start], window, s.run.warm_up)
-        assert found is not None and found.settled < 0.01, name
+        assert found is not None and found.before < 0.01, name
         if name in adapt:
             assert found.back is not None and found.back <= adapt[name] + window + 0.1, name
-            assert name == "gpr-online" or found.worst > 1.5 * found.settled
+            assert name == "gpr-online" or found.worst > 1.5 * found.before
         else:
-            assert found.back is None and found.last > 2 * found.settled, name
+            assert found.back is None and found.last > 2 * found.before, name

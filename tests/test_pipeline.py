@@ -195,7 +195,7 @@ def test_cancelling_stops_the_work(after: int) -> None:
         return len(asked) > after
 
     with pytest.raises(Cancelled):
-        run(s, watch=Watch(cancelled=cancelled))
+        run(s, watch=Watch(is_cancelled=cancelled))
     # both modes of a GPR may ask once more before they see that the other has stopped
     assert len(asked) <= after + 3
 

@@ -51,7 +51,7 @@ def check(model: DisturbanceModel, noise: float, found: SteadyState, tolerance: 
     # (I - L C) P (I - L C)' + L R L' is rounded at eps of what it sums, and an eigenvalue moves as much as all entries.
     reduced = np.eye(len(P)) - found.L @ C
     rounding = 8 * len(P) * EPS * max(1.0, float(np.linalg.norm(reduced, 2)) ** 2) * size
-    for covariance in (P, found.filtered):
+    for covariance in (P, found.posterior):
         assert np.abs(covariance - covariance.T).max() <= rounding
         assert np.linalg.eigvalsh(0.5 * (covariance + covariance.T)).min() >= -rounding
     # An inner product of n numbers is rounded at n eps of the sum of their sizes (Higham, Accuracy and Stability, section 3.1),
@@ -63,8 +63,8 @@ def check(model: DisturbanceModel, noise: float, found: SteadyState, tolerance: 
     assert np.all(np.abs(found.L - P @ C.T / variance) <= gain_rounding)
     assert np.all(np.abs(found.K - A @ found.L) <= once * np.abs(A) @ np.abs(found.L))
     assert np.abs(np.linalg.eigvals(A - found.K @ C)).max() < 1.0
-    assert np.abs(found.filtered - (P - found.L @ C @ P)).max() <= 1e-12 * size + 4 * rounding
-    assert np.trace(found.filtered) <= np.trace(P) * (1 + 1e-12) + rounding
+    assert np.abs(found.posterior - (P - found.L @ C @ P)).max() <= 1e-12 * size + 4 * rounding
+    assert np.trace(found.posterior) <= np.trace(P) * (1 + 1e-12) + rounding
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -211,7 +211,7 @@ def test_no_disturbance_needs_no_gain() -> None:
     found = steady_state(model.A, model.C, model.Q, np.array(1e-4))
     # A state of variance one that nothing is seen of: no gain, its own covariance, and outputs of zero.
     assert not found.L.any()
-    assert np.allclose(found.P, np.eye(4), atol=1e-12) and np.allclose(found.filtered, found.P, atol=1e-12)
+    assert np.allclose(found.P, np.eye(4), atol=1e-12) and np.allclose(found.posterior, found.P, atol=1e-12)
     assert not any(row.any() for row in model.outputs.values())
 
 

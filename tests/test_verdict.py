@@ -65,7 +65,7 @@ def test_the_best_is_the_least_error_of_the_table_and_the_sentence_has_its_numbe
                 percent = re.search(r"(\d+) % (above|below) the bound", first)
                 signed = 0.0 if percent is None else float(percent[1]) * (1 if percent[2] == "above" else -1)
                 assert signed == pytest.approx(100.0 * (found.best.rms / bound - 1.0), abs=0.51)
-            assert ("tied" in first) == bool(found.tied) and all(row_label(name) in first for name in found.tied)
+            assert ("tied" in first) == bool(found.ties) and all(row_label(name) in first for name in found.ties)
 
 
 def test_who_does_harm_is_named_with_where_its_error_lies(result: Result) -> None:
@@ -102,7 +102,7 @@ def test_a_filter_of_one_line_does_harm_at_the_others_and_not_where_there_are_no
     assert harm.observer == "kf-lgs" and harm.worse and harm.at_others > 0.6 > 0.3 > harm.at_known
     assert "LGS KF is worse than no estimate: it is given a model with one line" in by_name["paper"].sentences()[1]
     # With one line both filters have the same model.
-    assert not by_name["one line"].harms and by_name["one line"].tied
+    assert not by_name["one line"].harms and by_name["one line"].ties
 
 
 def test_without_truth_there_is_no_verdict_and_without_a_simulation_no_lines() -> None:

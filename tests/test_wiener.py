@@ -39,7 +39,7 @@ def riccati_errors(scenario: Scenario) -> tuple[dict[str, float], dict[str, floa
     model = kalman_model(scenario, 0, scenario.dt)
     steady = steady_state(model.A, model.C, model.Q, np.array(measurement_noise(scenario, 0)[0] ** 2))
     rows = model.outputs | {"total": sum(model.outputs.values())}
-    filtered = {name: float(np.sqrt(row @ steady.filtered @ row)) for name, row in rows.items()}
+    filtered = {name: float(np.sqrt(row @ steady.posterior @ row)) for name, row in rows.items()}
     return filtered, {name: float(np.sqrt(row @ steady.P @ row)) for name, row in rows.items()}
 
 
@@ -119,7 +119,7 @@ def autocovariance(spectrum: Array) -> Array:
 def fir_error(spectra: TrueSpectra, taps: int, ahead: int) -> float:
     """rms error of the best FIR filter of z[k] ... z[k - taps + 1] for phi[k + ahead], from the normal equations."""
     signal, shared = spectra.total
-    r, c, s = autocovariance(spectra.measured), autocovariance(shared), autocovariance(signal)
+    r, c, s = autocovariance(spectra.measurement), autocovariance(shared), autocovariance(signal)
     wanted = c[1 + ahead : 1 + ahead + taps]
     return float(np.sqrt(s[0] - wanted @ solve_toeplitz(r[:taps], wanted)))
 
@@ -142,7 +142,7 @@ def test_the_spectra_have_the_variances_of_the_scenario(name: str) -> None:
     scenario = PRESETS[name]().replace({"turbulence.source": "ar2"})
     for mode in range(2):
         spectra = true_spectra(scenario, mode)
-        assert spectra.measured.size == n_frequencies(scenario) // 2 + 1
+        assert spectra.measurement.size == n_frequencies(scenario) // 2 + 1
         # The record's own bins and the finer ones here cut a spectrum at the cut-off a little differently.
         assert circle_mean(spectra.signal["vibration"]) == pytest.approx(vibration_variance(scenario, mode), rel=1e-3)
         assert circle_mean(spectra.signal["turbulence"]) == pytest.approx(scenario.turbulence.rms**2, rel=1e-6)

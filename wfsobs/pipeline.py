@@ -280,7 +280,7 @@ def each_estimate(
         base, share = done / total, weights[observer.id] / total
         inner = Watch(
             progress=lambda f, base=base, share=share: progress(base + share * f),
-            cancelled=watch.cancelled,
+            is_cancelled=watch.is_cancelled,
             partial=lambda target, values, o=observer: on_partial(o.id, target, values) if on_partial else None,
         )
         yield from _one(observer, record, scenario, inner)

@@ -35,19 +35,19 @@ class Watch:
     ----------
     progress : callable
         Receives the fraction done, 0 to 1.
-    cancelled : callable
+    is_cancelled : callable
         Asked at every block of work; true stops it.
     partial : callable
         Receives (target, values so far, with NaN where not yet computed) from observers that compute in blocks.
     """
 
     progress: Callable[[float], None] = _silent
-    cancelled: Callable[[], bool] = _never
+    is_cancelled: Callable[[], bool] = _never
     partial: Callable[[str, NDArray[np.float64]], None] = _keep
 
     def check(self) -> None:
         """Raise `Cancelled` if the computation is to stop."""
-        if self.cancelled():
+        if self.is_cancelled():
             raise Cancelled
 
     def step(self, fraction: float) -> None:
@@ -69,7 +69,7 @@ def detach_watch(watch: Watch) -> Iterator[Watch]:
     try:
         yield Watch(
             lambda fraction: _LISTENING[key].progress(fraction),
-            lambda: _LISTENING[key].cancelled(),
+            lambda: _LISTENING[key].is_cancelled(),
             lambda target, values: _LISTENING[key].partial(target, values),
         )
     finally:

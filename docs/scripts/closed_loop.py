@@ -55,7 +55,7 @@ def two_frames() -> None:
         plan = design(MATCHED.replace(changes), [controller])
         one = plan.laws[controller][0]
         gain = f" (g = {one.law.gain:.2f})" if one.law and one.law.gain and not changes else ""
-        simulated, theory = _pooled(left), (one.predicted or 0.0) * 1e3
+        simulated, theory = _pooled(left), (one.predicted_rms or 0.0) * 1e3
         print(f"| {name}{gain} | {theory:.2f} | {simulated:.2f} | {simulated / theory:.3f} |")
     print(f"| Bound | {(plan.bound or (0.0,))[0] * 1e3:.2f} | | |")
 
@@ -78,10 +78,17 @@ def delays() -> None:
     for delay in (1.0, 1.5, 2.0, 2.5, 3.0, 4.0):
         plan = design(MATCHED.replace({"control.delay": delay}), ["integrator", "lqg-kf-lgs"])
         integrator, lqg = plan.laws["integrator"][0], plan.laws["lqg-kf-lgs"][0]
-        assert integrator.law and integrator.law.gain and integrator.predicted and lqg.predicted and lqg.margins and plan.bound
+        assert (
+            integrator.law
+            and integrator.law.gain
+            and integrator.predicted_rms
+            and lqg.predicted_rms
+            and lqg.margins
+            and plan.bound
+        )
         m = lqg.margins
         highest = highest_stable_gain(Mirror(delay), 1.0)
-        left = " | ".join(f"{x * 1e3:.2f}" for x in (integrator.predicted, lqg.predicted, plan.bound[0]))
+        left = " | ".join(f"{x * 1e3:.2f}" for x in (integrator.predicted_rms, lqg.predicted_rms, plan.bound[0]))
         db, turn, late = 20 * np.log10(m.gain or np.inf), np.degrees(m.phase or 0.0), (m.delay or 0.0) * 1e3
         print(f"| {delay:g} | {highest:.3f} | {integrator.law.gain:.3f} | {left} | {db:.1f} dB, {turn:.0f}°, {late:.2f} ms |")
 

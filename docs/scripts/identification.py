@@ -123,7 +123,7 @@ def drawn(scenario: Scenario, seed: int) -> Record:
     rng, steps = np.random.default_rng(1000 + seed), round(scenario.run.duration / scenario.dt)
     z = []
     for mode in (0, 1):
-        S = true_spectra(scenario, mode).measured
+        S = true_spectra(scenario, mode).measurement
         n = 2 * (len(S) - 1)
         z.append(np.fft.irfft(np.sqrt(S) * np.fft.rfft(rng.standard_normal(n)), n)[:steps])
     return Record(np.column_stack(z), np.zeros((steps, 2)), scenario.dt)

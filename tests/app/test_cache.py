@@ -215,7 +215,7 @@ def test_one_who_leaves_does_not_stop_it_for_others(make_service: Any, short: Sc
     assert work.entered.acquire(timeout=WAIT)
     follower = Asked(service, short)
     leader.leave()
-    assert not work.calls[0][1].cancelled()
+    assert not work.calls[0][1].is_cancelled()
     work.gate.set()
     assert follower.end()["result"].scenario == short and len(work.calls) == 1
     assert not leader.over.is_set(), "who has left hears nothing more"
@@ -227,7 +227,7 @@ def test_what_nobody_wants_stops_at_once_and_starts_anew_for_the_next(make_servi
     leader = Asked(service, short)
     assert work.entered.acquire(timeout=WAIT)
     leader.leave()
-    assert work.calls[0][1].cancelled()
+    assert work.calls[0][1].is_cancelled()
     after = Asked(service, short)
     work.gate.set()
     assert after.end()["result"].scenario == short and len(work.calls) == 2

@@ -33,7 +33,7 @@ def done(page: ClosedLoopPage, loop: Any) -> ClosedLoopPage:
     """The page once all controllers have run on the results shown."""
     of = page.run.result
     assert of is not None
-    loop.until(lambda: page.results is not None and page.results.done and page.results.result.scenario is of.scenario)
+    loop.until(lambda: page.results is not None and page.results.complete and page.results.result.scenario is of.scenario)
     return page
 
 

@@ -119,7 +119,7 @@ def test_closed_loop(board: Dashboard, loop: Any) -> None:
     board.pages.current = "loop"
     page = board.pages.made["loop"]
     assert isinstance(page, ClosedLoopPage)
-    loop.until(lambda: page.results is not None and page.results.done, 120)
+    loop.until(lambda: page.results is not None and page.results.complete, 120)
     assert page.results is not None
 
     def residuals(given: Any) -> dict[tuple[str, str], float]:
@@ -165,7 +165,7 @@ def test_a_link_has_the_simulation_that_is_kept(dashboard: Dashboard, loop: Any,
     simulation = short.replace({"run.seed": 4, "vibration.peaks": [{"frequency": 20.0}, {"frequency": 30.0}]})
     store.run_on(SimulatedRecord(simulation), short.replace({"turbulence.wind_speed": 11.0}))
     link = from_query(dashboard.actions.toolbar.query)
-    assert (link.scenario, link.simulation, link.rejected) == (store.scenario, simulation, ())
+    assert (link.scenario, link.simulation, link.errors) == (store.scenario, simulation, ())
     store.load(short)
     assert "simulation" not in dashboard.actions.toolbar.query
     dashboard.actions.open_link("?preset=paper&run.duration=2&simulation&simulation.run.duration=2&simulation.loop.gain=9")
@@ -238,7 +238,7 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
 
     dashboard.pages.current = "loop"
     page = dashboard.pages.made["loop"]
-    loop.until(lambda: page.results is not None and page.results.done, 120)
+    loop.until(lambda: page.results is not None and page.results.complete, 120)
     files = saved(dashboard, loop, sent)
     table = [*csv.DictReader(io.StringIO(files["wfsobs-controllers.csv"].decode()))]
     assert [(r["controller"], r["mode"], r["residual_rms_nm"]) for r in table] == [

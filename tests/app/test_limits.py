@@ -130,7 +130,7 @@ def test_a_link_and_a_file_say_it(loop: Any, short: Scenario, enter: Any) -> Non
 
 
 def test_links_are_limited_only_where_asked() -> None:
-    assert from_query("?run.duration=500").rejected == ()
+    assert from_query("?run.duration=500").errors == ()
 
 
 def test_a_service_refuses_what_has_passed_by_the_page(short: Scenario) -> None:

@@ -74,7 +74,7 @@ def test_every_setting_survives_a_link_and_a_file(path: str, p: Any, data: st.Da
     query = to_query(scenario, preset)
     assert query is not None
     link = from_query(f"?{query}")
-    assert (link.scenario, link.preset, link.rejected) == (scenario, preset if query else "paper", ())
+    assert (link.scenario, link.preset, link.errors) == (scenario, preset if query else "paper", ())
     assert from_file(to_file(scenario, preset)) == link
 
 
@@ -118,7 +118,7 @@ def test_a_link_holds_what_differs_and_can_be_read() -> None:
 def test_a_bad_field_is_named_and_the_rest_applies() -> None:
     link = from_query("?preset=ut4&turbulence.wind_speed=200&loop.gain=0.2&nonsense=1&run.seed=7")
     assert changes(link.scenario, "ut4") == {"loop.gain": 0.2, "run.seed": 7}
-    first, second = link.rejected
+    first, second = link.errors
     assert first == "turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s"
     assert second.startswith("nonsense: no such setting")
 
@@ -159,15 +159,15 @@ def test_a_bad_field_is_named_and_the_rest_applies() -> None:
 def test_what_cannot_be_used_changes_nothing_and_has_one_line(query: str) -> None:
     link = from_query(query)
     assert link.scenario == PRESETS["paper"]() and link.preset == "paper"
-    assert len(link.rejected) == 1
-    assert "\n" not in link.rejected[0] and len(link.rejected[0]) <= 200
+    assert len(link.errors) == 1
+    assert "\n" not in link.errors[0] and len(link.errors[0]) <= 200
 
 
 def test_fields_that_only_go_together_in_any_order_beside_one_that_never_does() -> None:
     for query in ("run.warm_up=20&run.duration=30&loop.gain=0.1", "loop.gain=0.1&run.duration=30&run.warm_up=20"):
         link = from_query(f"{query}&kalman.frequency=600")
         assert changes(link.scenario, "paper") == {"run.warm_up": 20.0, "run.duration": 30.0, "loop.gain": 0.1}
-        assert len(link.rejected) == 1 and "kalman.frequency = 600" in link.rejected[0]
+        assert len(link.errors) == 1 and "kalman.frequency = 600" in link.errors[0]
 
 
 def test_settings_too_long_for_a_link_travel_as_a_file() -> None:
@@ -220,7 +220,7 @@ def test_settings_from_an_identification_are_written_in_plain_numbers(capsys: py
     for text in (query, to_command(found, "paper"), to_python(found, "paper"), to_file(found, "paper")):
         assert "np." not in text and "float64" not in text
     link = from_query(query)
-    assert (link.scenario, link.rejected) == (found, ())
+    assert (link.scenario, link.errors) == (found, ())
     made: dict[str, Any] = {}
     exec(to_python(found, "paper"), made)
     assert made["scenario"] == found and capsys.readouterr().out
@@ -254,5 +254,5 @@ def test_a_file_without_a_preset_leaves_that_open() -> None:
 @pytest.mark.parametrize("path", ["turbulence.wind_speed", "vibration.peaks", "butterworth.frequencies", "vibration"])
 def test_a_name_of_a_thousand_parts_is_a_line(path: str) -> None:
     link = from_query(f"?{path}{'.a' * 3000}=1&turbulence.wind_speed=20")
-    assert len(link.rejected) == 1 and link.rejected[0].startswith(path) and len(link.rejected[0]) <= 200
+    assert len(link.errors) == 1 and link.errors[0].startswith(path) and len(link.errors[0]) <= 200
     assert link.scenario == PRESETS["paper"]().replace({"turbulence.wind_speed": 20.0})

@@ -47,7 +47,7 @@ class Gated:
         self.telling[speed] = tell
         self.entered[speed].set()
         assert self.gates[speed].wait(20)
-        self.told_to_stop[speed] = watch.cancelled()
+        self.told_to_stop[speed] = watch.is_cancelled()
         try:
             return answer(scenario)
         finally:

@@ -79,7 +79,7 @@ def test_spectra_are_of_what_is_scored(reports: Any) -> None:
 
 def test_a_run_that_is_not_wanted_stops(short: Scenario) -> None:
     with pytest.raises(Cancelled):
-        compute(short, Watch(cancelled=lambda: True), lambda **_: None)
+        compute(short, Watch(is_cancelled=lambda: True), lambda **_: None)
 
 
 def test_a_record_too_short_for_an_observer_says_so(short: Scenario) -> None:

@@ -75,12 +75,12 @@ def pooled(results: list[ClosedLoop], controller: str) -> float:
 def test_the_two_frame_loop_leaves_what_theory_says() -> None:
     """21.63 nm is the bound, 34.1 the integrator at its best, g = 0.64, and 36.9 at g = 0.5, by theory."""
     several = [run({"run.seed": seed, "run.duration": 60.0}, ("integrator", "lqg-kf-lgs")) for seed in range(1, 6)]
-    (lqg,) = {d.predicted for d in several[0].design.laws["lqg-kf-lgs"]}
+    (lqg,) = {d.predicted_rms for d in several[0].design.laws["lqg-kf-lgs"]}
     (best,) = {d.law.gain for d in several[0].design.laws["integrator"] if d.law}
     assert lqg == pytest.approx(21.63e-3, abs=0.005e-3) and best == pytest.approx(0.64, abs=0.005)
     half = design(MATCHED.replace({"control.integrator": "manual", "control.gain": 0.5}), ("integrator",))
-    assert half.laws["integrator"][0].predicted == pytest.approx(36.9e-3, abs=0.05e-3)
-    assert several[0].design.laws["integrator"][0].predicted == pytest.approx(34.1e-3, abs=0.05e-3)
+    assert half.laws["integrator"][0].predicted_rms == pytest.approx(36.9e-3, abs=0.05e-3)
+    assert several[0].design.laws["integrator"][0].predicted_rms == pytest.approx(34.1e-3, abs=0.05e-3)
     # Two modes of 295 s each: the mean over seeds spreads by 0.16 % and 0.38 % (40 seeds).
     assert pooled(several, "lqg-kf-lgs") == pytest.approx(21.63, rel=0.01)
     assert pooled(several, "integrator") == pytest.approx(34.1, rel=0.02)
@@ -94,10 +94,10 @@ def test_lqg_leaves_what_its_covariance_predicts() -> None:
     covariance = float(np.sqrt(row @ steady.P @ row))
     for delay in (1.0, 2.0, 3.0):
         scenario = MATCHED.replace({"control.delay": delay, "run.duration": 60.0})
-        P = steady.filtered if delay == 1.0 else steady.P if delay == 2.0 else model.A @ steady.P @ model.A.T + model.Q
+        P = steady.posterior if delay == 1.0 else steady.P if delay == 2.0 else model.A @ steady.P @ model.A.T + model.Q
         expected = float(np.sqrt(row @ P @ row))
         plan = design(scenario, ("lqg-kf-lgs",))
-        assert plan.laws["lqg-kf-lgs"][0].predicted == pytest.approx(expected, rel=1e-6)
+        assert plan.laws["lqg-kf-lgs"][0].predicted_rms == pytest.approx(expected, rel=1e-6)
         assert plan.bound is not None and plan.bound[0] == pytest.approx(expected, rel=1e-6)
         assert pooled([closed_loop(simulate(scenario), plan)], "lqg-kf-lgs") == pytest.approx(expected * 1e3, rel=0.02)
     assert covariance == pytest.approx(21.63e-3, abs=0.005e-3)
@@ -192,7 +192,7 @@ def test_a_vibration_that_is_predicted_is_not_corrected_twice(changes: dict[str,
     u = feedback(record.z[:, 0], plan.mirror, control)
     got = outcome(closed_loop(record, plan), "integrator+gpr-offline")
     assert got.u is not None and np.allclose(got.u[:, 0], u, rtol=0, atol=1e-10)
-    assert (got.limited[0] > 0.01) == ("control.stroke" in changes)
+    assert (got.limited_share[0] > 0.01) == ("control.stroke" in changes)
 
 
 @pytest.mark.parametrize("controller", list(CONTROLLERS))
@@ -200,11 +200,11 @@ def test_limits_that_are_never_reached_change_nothing_and_others_do(controller: 
     free = outcome(run(QUICK, (controller,)), controller)
     wide = outcome(run(QUICK | {"control.stroke": 50.0, "control.rate": 50.0}, (controller,)), controller)
     assert free.u is not None and wide.u is not None and np.array_equal(free.u, wide.u)
-    assert wide.limited == (0.0, 0.0)
+    assert wide.limited_share == (0.0, 0.0)
     tight = outcome(run(QUICK | {"control.stroke": 0.3, "control.rate": 0.05}, (controller,)), controller)
     assert tight.u is not None
     assert np.abs(tight.u).max() <= 0.3 and np.abs(np.diff(tight.u, axis=0)).max() <= 0.05 * (1 + 1e-12)
-    assert (max(tight.limited) > 0.0) == (controller != "none")
+    assert (max(tight.limited_share) > 0.0) == (controller != "none")
 
 
 @pytest.mark.parametrize("controller", list(CONTROLLERS))
@@ -270,7 +270,7 @@ def test_the_gain_is_the_best_of_all() -> None:
 def test_no_controller_of_the_lgs_beats_the_bound(delay: float, noise: float) -> None:
     plan = design(MATCHED.replace({"control.delay": delay, "sensors.lgs_noise": noise}), ("integrator", "lqg-kf-lgs"))
     assert plan.bound is not None
-    integrator, lqg = (plan.laws[name][0].predicted for name in ("integrator", "lqg-kf-lgs"))
+    integrator, lqg = (plan.laws[name][0].predicted_rms for name in ("integrator", "lqg-kf-lgs"))
     assert integrator is not None and lqg is not None
     assert plan.bound[0] * (1 - 1e-6) <= lqg <= integrator
     if delay == int(delay):
@@ -291,7 +291,7 @@ def test_an_unstable_loop_is_said_to_be_one(changes: dict[str, Any]) -> None:
         if one.controller.startswith("integrator"):
             assert one.stable == (False, False) and one.residual is None and one.u is None
             assert "not within the unit circle" in one.note
-            assert all(d.predicted is None and d.margins is None for d in result.design.laws[one.controller])
+            assert all(d.predicted_rms is None and d.margins is None for d in result.design.laws[one.controller])
         else:
             assert one.stable == (True, True) and one.residual is not None and not one.note
 
@@ -343,7 +343,7 @@ def test_on_ut4_lqg_on_every_peak_leaves_a_quarter_less_than_the_best_integrator
     theory = design(seen, ("integrator", "lqg-kf-multi"))
     assert theory.bound is not None
     for mode in range(2):
-        integrator, lqg = (theory.laws[name][mode].predicted for name in ("integrator", "lqg-kf-multi"))
+        integrator, lqg = (theory.laws[name][mode].predicted_rms for name in ("integrator", "lqg-kf-multi"))
         assert integrator is not None and lqg is not None
         assert theory.bound[mode] * (1 - 1e-6) < lqg < 0.75 * integrator
         assert lqg < 1.05 * theory.bound[mode]

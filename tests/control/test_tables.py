@@ -49,8 +49,8 @@ def test_rows_are_those_of_the_library() -> None:
     for mode in range(2):
         of, margins = plan.laws["integrator"][mode], plan.laws["integrator"][mode].margins
         assert rows[mode]["residual_rms_nm"] == pytest.approx(1e3 * squares[mode] ** 0.5)
-        assert margins and margins.gain and margins.phase and margins.delay and of.law and of.predicted
-        assert rows[mode]["gain"] == of.law.gain and rows[mode]["predicted_rms_nm"] == pytest.approx(1e3 * of.predicted)
+        assert margins and margins.gain and margins.phase and margins.delay and of.law and of.predicted_rms
+        assert rows[mode]["gain"] == of.law.gain and rows[mode]["predicted_rms_nm"] == pytest.approx(1e3 * of.predicted_rms)
         assert rows[mode]["gain_margin_db"] == pytest.approx(20 * log10(margins.gain))
         assert rows[mode]["phase_margin_deg"] == pytest.approx(degrees(margins.phase))
         assert rows[mode]["delay_margin_ms"] == pytest.approx(1e3 * margins.delay)

@@ -172,7 +172,7 @@ def test_error_on_a_stationary_record_is_near_what_theory_says_of_the_true_model
     for i, target in enumerate(("turbulence", "vibration")):
         truth, row = record.truth(target), model.outputs[target]
         assert truth is not None
-        theory = float(np.sqrt(row @ steady.filtered @ row))
+        theory = float(np.sqrt(row @ steady.posterior @ row))
         best, adaptive = (rms((x - truth)[4100:10_000]) for x in (ideal[:, i], got[target]))
         assert best == pytest.approx(theory, rel=0.13)
         assert 0.98 < adaptive / best < 1.08
@@ -230,7 +230,7 @@ def test_progress_and_cancelling() -> None:
     run_observer("kf-adaptive", record, with_window(1.0, 0.25), Watch(progress=told.append))
     assert len(told) == 16 and min(told) == 0.0 and 0.5 < max(told) < 1.0
     with pytest.raises(Cancelled):
-        run_observer("kf-adaptive", record, with_window(1.0, 0.25), Watch(cancelled=lambda: True))
+        run_observer("kf-adaptive", record, with_window(1.0, 0.25), Watch(is_cancelled=lambda: True))
 
 
 @pytest.mark.parametrize(

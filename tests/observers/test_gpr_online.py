@@ -341,4 +341,4 @@ def test_cancelling_stops_it_and_partial_results_come_before() -> None:
     assert len(counts) > 10 and min(counts) < 500 and max(counts) == 2 * (3000 - 84)
     asked = iter([False] * 5 + [True] * 10_000)
     with pytest.raises(Cancelled):
-        run_observer("gpr-online", record, s, Watch(cancelled=lambda: next(asked)))
+        run_observer("gpr-online", record, s, Watch(is_cancelled=lambda: next(asked)))

@@ -207,7 +207,7 @@ def test_error_of_the_matched_filter_is_what_the_riccati_equation_says() -> None
                 truth = record.truth(target)
                 assert truth is not None
                 error = (values[target] - truth)[1000:, mode]
-                one.append(np.mean(error**2) / (model.outputs[target] @ steady.filtered @ model.outputs[target]))
+                one.append(np.mean(error**2) / (model.outputs[target] @ steady.posterior @ model.outputs[target]))
         ratios.append(one)
     mean, standard_error = np.mean(ratios, axis=0), np.std(ratios, axis=0, ddof=1) / np.sqrt(len(ratios))
     assert (standard_error < 0.005).all(), standard_error  # else the next line would say nothing

@@ -39,4 +39,4 @@ def test_a_cancelled_watch_reaches_every_mode():
         return np.zeros(1)
 
     with pytest.raises(Cancelled):
-        over_modes(2, work, Watch(cancelled=lambda: True))
+        over_modes(2, work, Watch(is_cancelled=lambda: True))

@@ -89,7 +89,7 @@ def test_innovations_are_white_and_errors_as_predicted(with_error):
     assert chi2.ppf(0.005, lags) < ljung_box < chi2.ppf(0.995, lags)
     errors = (estimates - x @ outputs.T)[settled]
     for phase, state in enumerate(states):
-        expected = np.diag(outputs @ state.filtered @ outputs.T)
+        expected = np.diag(outputs @ state.posterior @ outputs.T)
         squares = errors[(np.arange(settled.start, len(x)) % 5) == phase] ** 2
         # Errors are correlated over tens of steps: the standard error from means of long batches.
         batches = np.array([b.mean(axis=0) for b in np.array_split(squares, 100)])
@@ -104,7 +104,7 @@ def test_with_ratio_one_it_is_the_filter_of_two_sensors():
     C = np.vstack([MODEL.C, MODEL.C])
     both = steady_state(MODEL.A, C, MODEL.Q, np.diag([0.02**2, 0.01**2]))
     # The frame state equals phi_dist[k-1], so the covariance of the rest is the two-sensor one; rounding only.
-    np.testing.assert_allclose(OUTPUTS @ state.filtered[:4, :4] @ OUTPUTS.T, OUTPUTS @ both.filtered @ OUTPUTS.T, rtol=1e-9)
+    np.testing.assert_allclose(OUTPUTS @ state.posterior[:4, :4] @ OUTPUTS.T, OUTPUTS @ both.posterior @ OUTPUTS.T, rtol=1e-9)
     z = np.random.default_rng(3).standard_normal((500, 2))
     got = optimal_filter(cycle, padded(OUTPUTS, cycle))[0].run(z)
     x, expected = np.zeros(4), []
@@ -140,7 +140,7 @@ def test_never_worse_than_the_better_single_sensor_filter(ratio, lgs, ngs, wind,
 
     def mean_error(rows_kept):
         steps = [(A, C * rows_kept[:, None], Q, R) for A, C, Q, R in cycle]
-        return np.mean([np.diag(rows @ s.filtered @ rows.T) for s in periodic_steady_state(steps)], axis=0)
+        return np.mean([np.diag(rows @ s.posterior @ rows.T) for s in periodic_steady_state(steps)], axis=0)
 
     both, lgs_only, ngs_only = (mean_error(np.array(keep)) for keep in ([1.0, 1.0], [1.0, 0.0], [0.0, 1.0]))
     # 1e-7: the Riccati residual times the condition of a slow process' state.
@@ -178,7 +178,7 @@ def test_the_error_state_is_what_makes_it_useful_with_a_slow_lgs_error():
         error = (run_observer("multirate-optimal", record, scenario)["turbulence"] - record.turbulence)[1000:]
         realised[known] = np.sqrt(np.mean(error**2))
         cycle, rows = optimal_model(scenario.multirate, prior_of(scenario, record, PARTS), 0, 5)
-        predicted[known] = np.sqrt(np.mean([(rows @ s.filtered @ rows.T)[0, 0] for s in periodic_steady_state(cycle)]))
+        predicted[known] = np.sqrt(np.mean([(rows @ s.posterior @ rows.T)[0, 0] for s in periodic_steady_state(cycle)]))
     # A minute of a process with a correlation time of 0.1 s: the rms is good to about 5 %.
     assert realised[True] == pytest.approx(predicted[True], rel=0.1)
     assert realised[False] > 2 * predicted[False]

@@ -104,7 +104,7 @@ def test_to_another_process_and_back(result: Result, short: Scenario) -> None:
     report = Report("paper", short, (Variation("loop.gain", (0.3, 0.2)),), (state, replace(state, reasons=("why",))), True)
     again = unpack(pack(report))
     assert again.base == short and again.variations == report.variations and again.preset == "paper"
-    assert again.start == 0 and again.recorded
+    assert again.start == 0 and again.is_recorded
     for ours, theirs in zip(report.states, again.states, strict=True):
         assert (theirs.rows, theirs.reasons, theirs.grid, theirs.scenario) == (ours.rows, ours.reasons, ours.grid, ours.scenario)
         assert theirs.lines.keys() == ours.lines.keys()

@@ -147,7 +147,7 @@ def test_what_nobody_wants_any_more_is_stopped(result: Any, monkeypatch: pytest.
 
     monkeypatch.setattr(maker.subprocess, "Popen", Noted)
     with pytest.raises(Cancelled):
-        maker.make(RunResults(result), "paper", Watch(cancelled=lambda: bool(begun)))
+        maker.make(RunResults(result), "paper", Watch(is_cancelled=lambda: bool(begun)))
     (process,) = begun
     assert process.returncode == -signal.SIGKILL
 

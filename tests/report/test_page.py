@@ -185,7 +185,7 @@ def test_errors_are_drawn_over_what_varies_in_numbers(report: Report, text: str,
 def test_a_loaded_record_promises_no_simulation(result: Result, parse: Any) -> None:
     record = replace(result.record, turbulence=None, vibration=None)
     state = state_of(observe(record, result.scenario, observers=["kf-lgs", "zero"]))
-    said = parse(page(Report("paper", result.scenario, (), (state,), recorded=True), MADE)).text
+    said = parse(page(Report("paper", result.scenario, (), (state,), is_recorded=True), MADE)).text
     assert "of a loaded record" in said and f"wfsobs observe RECORD --config {FILE}" in said and "wfsobs export" not in said
     assert {row["target"] for row in state.rows} == {"next z", "residual y"}
     assert "Next z, tip" in said and "psd/vibration/kf-lgs/tip" in state.lines and "error/vibration/kf-lgs/tip" not in state.lines

@@ -82,7 +82,7 @@ def test_every_evaluation_is_told_until_it_is_cancelled() -> None:
     seen: list[Evaluation] = []
     fractions: list[float] = []
     with pytest.raises(Cancelled):
-        tune(short(), "kf-lgs", watch=Watch(fractions.append, lambda: len(seen) == 3), told=seen.append)
+        tune(short(), "kf-lgs", watch=Watch(fractions.append, lambda: len(seen) == 3), on_evaluation=seen.append)
     assert len(seen) == 3 and fractions == sorted(fractions) and seen[0].changes == {}
     best = min(seen, key=lambda e: e.rms)
     assert all(reduce(getattr, path.split("."), short().replace(best.changes)) == v for path, v in best.changes.items())
@@ -129,7 +129,7 @@ def test_a_filter_of_wrong_numbers_is_tuned_to_the_error_of_the_right_one() -> N
     _, steady = steady_filter(model, measurement_noise(right, 0)[0])
     row = model.outputs["vibration"]
     # The error is that of 2 x 19 s of a signal with a bandwidth of a few Hz: about 100 independent squares, 7 % in rms
-    assert best == pytest.approx(np.sqrt(row @ steady.filtered @ row), rel=0.2)
+    assert best == pytest.approx(np.sqrt(row @ steady.posterior @ row), rel=0.2)
     assert tuned.before.test.rms > 1.2 * best
     assert 0.99 * best < tuned.after.test.rms < 1.03 * best  # tuned, not given: a little above, or by chance below
     assert tuned.scenario.kalman.frequency == pytest.approx(40.0, abs=0.5)

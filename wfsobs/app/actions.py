@@ -116,7 +116,7 @@ class Actions:
         link = from_query(query, self.store.validate)
         kept = SimulatedRecord(link.simulation) if link.simulation and link.simulation != link.scenario else None
         self.store.load(link.scenario, link.preset, kept)
-        self.toolbar.notes = [f"Not used from the link: {line}" for line in link.rejected]
+        self.toolbar.notes = [f"Not used from the link: {line}" for line in link.errors]
 
     def open_file(self, name: str, text: object) -> None:
         """Take the settings of a TOML file, read in a thread, or say in one line why not; then nothing changes."""

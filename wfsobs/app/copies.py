@@ -58,7 +58,7 @@ def _options(scenario: Scenario, preset: str, file: str) -> list[str]:
 
 def _stated_options(source: LoadedRecord) -> list[str]:
     """List what the user stated about a file, and what tells the file from others."""
-    stated = source.stated
+    stated = source.declaration
     sign = None if stated.command_sign is None else f"{stated.command_sign:+d}"
     named = {
         "unit": stated.unit,
@@ -77,7 +77,7 @@ def to_python(scenario: Scenario, preset: str, source: Source | None = None, tas
     """Write a script that computes and prints what a page shows."""
     imports, lines = {"import wfsobs"}, [f"scenario = {_scenario_code(scenario, preset, FILE)}"]
     if isinstance(source, LoadedRecord):
-        stated = "".join(f"{name}={value!r}, " for name, value in vars(source.stated).items() if value is not None)
+        stated = "".join(f"{name}={value!r}, " for name, value in vars(source.declaration).items() if value is not None)
         imports |= {"from wfsobs.telemetry.intake import DeclaredFormat", "from wfsobs.telemetry.records import load_record"}
         check = f", sha256={source.sha256!r}" if source.sha256 else ""
         lines.append(f"record = load_record({source.name!r}, scenario, DeclaredFormat({stated.removesuffix(', ')}){check})")

@@ -36,7 +36,7 @@ class LoopResults:
     rows: tuple[Row, ...] = ()
     spectra: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
     curves: Mapping[str, tuple[Curves, ...]] = field(default_factory=dict)
-    done: bool = False
+    complete: bool = False
 
     def residual(self, controller: str) -> Array | None:
         """(n_steps, n_modes) [um], or None."""
@@ -64,7 +64,7 @@ def compute(of: RunResults, watch: Watch, tell: Tell) -> LoopResults | None:
         if outcome.controller not in quick[:-1]:
             result = ClosedLoop(plan, record, tuple(outcomes))
             shown = LoopResults(result, tuple(rows(result, None)), dict(spectra), linear, outcome.controller == names[-1])
-            if not shown.done:
+            if not shown.complete:
                 tell(result=shown)
     return shown
 

@@ -47,12 +47,12 @@ FILE = "wfsobs.toml"
 class Link:
     """What a query asks for.
 
-    rejected : a line for every field that could not be used;  simulation : of other settings, which is kept
+    errors : a line for every field that could not be used;  simulation : of other settings, which is kept
     """
 
     scenario: Scenario
     preset: str
-    rejected: tuple[str, ...] = field(default=())
+    errors: tuple[str, ...] = field(default=())
     simulation: Scenario | None = None
 
 

@@ -17,15 +17,15 @@ from wfsobs.telemetry.intake import DeclaredFormat
 class LoadedRecord:
     """A record that was loaded.
 
-    key    : names its content and what was said of it
-    what   : one line on it;  stated : what was said of it;  sha256 : of the file, in hexadecimal digits
+    key  : names its content and what was said of it
+    what : one line on it;  declaration : what was said of it;  sha256 : of the file, in hexadecimal digits
     """
 
     record: Record
     name: str
     key: str
     what: str = ""
-    stated: DeclaredFormat = field(default_factory=DeclaredFormat)
+    declaration: DeclaredFormat = field(default_factory=DeclaredFormat)
     sha256: str = ""
 
     simulation = None

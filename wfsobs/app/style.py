@@ -73,7 +73,7 @@ def labels() -> dict[str, str]:
 
 def observers_of(target: str, hidden: bool = False) -> list[str]:
     """List the observers that estimate a target, in the order of the registry. hidden : also those that stand in tables only."""
-    return [o.id for o in OBSERVERS.values() if target in o.targets and (hidden or o.look.drawn)]
+    return [o.id for o in OBSERVERS.values() if target in o.targets and (hidden or o.look.in_figures)]
 
 
 def asset(name: str) -> str:

@@ -65,7 +65,7 @@ def compute(
             tell(latest=tuple(history))
 
     record = of.result.record if of.is_recorded else None
-    return tune(scenario, observer, evaluations=evaluations, record=record, target=target, told=told, watch=watch)
+    return tune(scenario, observer, evaluations=evaluations, record=record, target=target, on_evaluation=told, watch=watch)
 
 
 def best_so_far(history: Sequence[Evaluation]) -> list[float]:

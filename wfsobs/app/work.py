@@ -106,7 +106,7 @@ class _Work:
         self.scenario, self.tell, self.source = scenario, tell, source
         self.simulation = scenario if source is None else source.simulation
         self.report = watch.progress
-        self.watch = Watch(progress=self._progress, cancelled=watch.cancelled)
+        self.watch = Watch(progress=self._progress, is_cancelled=watch.is_cancelled)
         self.estimates: list[Estimate] = []
         self.failures: list[Failure] = []
         self.bounds: list[Bound] = []

@@ -117,7 +117,7 @@ def recovery_texts(r: Recovery | None) -> tuple[str, str, str, str]:
     """Error before, at its worst and at the end [nm], and the time to be back [s], as texts."""
     if r is None:
         return "-", "-", "-", "-"
-    before, worst, last = (f"{value * 1e3:.2f}" for value in (r.settled, r.worst, r.last))
+    before, worst, last = (f"{value * 1e3:.2f}" for value in (r.before, r.worst, r.last))
     return before, worst, last, "never" if r.back is None else f"{r.back:.2f}"
 
 

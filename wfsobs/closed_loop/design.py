@@ -27,16 +27,16 @@ from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
 class LawDesign:
     """A law in one mode and what theory says of it.
 
-    law       : None for control by nothing, and where there is none
-    stable    : None where there is no law
-    predicted : rms [um] of the residual by the true spectra; None where the law has no frequency response or is not stable
-    margins   : the same
-    note      : why there is no law
+    law           : None for control by nothing, and where there is none
+    stable        : None where there is no law
+    predicted_rms : rms [um] of the residual by the true spectra; None where the law has no frequency response or is not stable
+    margins       : the same
+    note          : why there is no law
     """
 
     law: Law | None
     stable: bool | None
-    predicted: float | None = None
+    predicted_rms: float | None = None
     margins: Margins | None = None
     note: str = ""
 
@@ -78,7 +78,7 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None, start: 
     made = {c.id: _design_one(c, before, plant, spectra) for c in select_controllers(controllers)}
     laws, priors = {name: laws for name, (laws, _) in made.items()}, {name: prior for name, (_, prior) in made.items()}
     if scenario.events:
-        laws = {name: tuple(replace(one, predicted=None) for one in designed) for name, designed in laws.items()}
+        laws = {name: tuple(replace(one, predicted_rms=None) for one in designed) for name, designed in laws.items()}
         return Design(scenario, plant, laws, None, priors, max(scenario.run.warm_up, start))
     # A fraction of a frame comes on top of the whole ones, which alone bound what can be known.
     least = tuple(least_errors(one, ahead=int(plant.mirror.delay) - 1)["total"].rms for one in true)

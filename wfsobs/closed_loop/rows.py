@@ -59,9 +59,9 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
     for outcome in result.outcomes:
         left = residual_rms(outcome, result.record, warm_up)
         for mode, designed in enumerate(plan.laws[outcome.controller]):
-            limited = outcome.limited[mode] if outcome.limited else None
+            limited = outcome.limited_share[mode] if outcome.limited_share else None
             if limited:
-                designed = replace(designed, predicted=None, margins=None)
+                designed = replace(designed, predicted_rms=None, margins=None)
             m = designed.margins
             out.append(
                 row(
@@ -70,7 +70,7 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
                     mode,
                     outcome.stable[mode],
                     left,
-                    predicted_rms_nm=None if designed.predicted is None else designed.predicted * 1e3,
+                    predicted_rms_nm=None if designed.predicted_rms is None else designed.predicted_rms * 1e3,
                     gain=designed.law.gain if designed.law else None,
                     gain_margin_db=20 * log10(m.gain) if m and m.gain else None,
                     phase_margin_deg=degrees(m.phase) if m and m.phase is not None else None,

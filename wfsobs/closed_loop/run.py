@@ -30,17 +30,17 @@ from wfsobs.typing import Array
 class Outcome:
     """What one controller left.
 
-    residual : (n_steps, n_modes) [um], or None where the loop is not stable or could not run
-    u        : (n_steps, n_modes) commands that the mirror took [um], or None
-    limited  : share of the steps after the warm-up in which a limit changed a command, per mode
-    note     : why there is no residual
+    residual      : (n_steps, n_modes) [um], or None where the loop is not stable or could not run
+    u             : (n_steps, n_modes) commands that the mirror took [um], or None
+    limited_share : share of the steps after the warm-up in which a limit changed a command, per mode
+    note          : why there is no residual
     """
 
     controller: str
     stable: tuple[bool | None, ...]
     residual: Array | None = None
     u: Array | None = None
-    limited: tuple[float, ...] = ()
+    limited_share: tuple[float, ...] = ()
     note: str = ""
 
 
@@ -87,7 +87,7 @@ def close_loop(scenario: Scenario, *, controllers: Sequence[str] | None = None, 
     wfsobs.run : Run observers, which do not act on the loop.
     """
     plan = design(scenario, controllers)
-    return closed_loop(simulate(scenario, watch=Watch(cancelled=watch.cancelled)), plan, watch)
+    return closed_loop(simulate(scenario, watch=Watch(is_cancelled=watch.is_cancelled)), plan, watch)
 
 
 def closed_loop(record: Record, plan: Design, watch: Watch = QUIET) -> ClosedLoop:
@@ -98,7 +98,7 @@ def closed_loop(record: Record, plan: Design, watch: Watch = QUIET) -> ClosedLoo
     total = sum(CONTROLLERS[name].weight for name in plan.laws)
     outcomes, done = [], 0.0
     for name, weight in ((name, CONTROLLERS[name].weight) for name in plan.laws):
-        inner = Watch(lambda f, at=done, w=weight: watch.progress((at + f * w) / total), watch.cancelled)
+        inner = Watch(lambda f, at=done, w=weight: watch.progress((at + f * w) / total), watch.is_cancelled)
         outcomes += each_outcome(record, plan, inner, [name])
         done += weight
     return ClosedLoop(plan, record, tuple(outcomes))

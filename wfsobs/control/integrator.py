@@ -58,7 +58,7 @@ def best_gain(spectra: Spectra, mirror: Mirror, leak: float) -> float:
 
 def _bin_spectra(spectra: Spectra) -> tuple[Array, Array, Array, Array, Array]:
     """(omega, weight in the mean over the circle, and the three spectra of `residual_density`) on fewer points."""
-    n = spectra.measured.size
+    n = spectra.measurement.size
     weight = np.full(n, 1.0 / (n - 1))
     weight[[0, -1]] *= 0.5
     starts = np.concatenate([np.arange(min(FINE, n)), np.arange(FINE, n, COARSE)])
@@ -68,7 +68,7 @@ def _bin_spectra(spectra: Spectra) -> tuple[Array, Array, Array, Array, Array]:
         return np.add.reduceat(weight * x, starts) / total
 
     omega = np.pi * np.arange(n) / (n - 1)
-    return mean(omega), total, mean(spectra.disturbance), mean(spectra.cross), mean(spectra.measured)
+    return mean(omega), total, mean(spectra.disturbance), mean(spectra.cross), mean(spectra.measurement)
 
 
 def limited_integrator(mirror: Mirror, gain: float, leak: float, z: Array, forward: Array) -> tuple[Array, Array]:

@@ -33,10 +33,10 @@ def residual_variance(law: Law, spectra: Spectra, mirror: Mirror) -> float:
     """
     points = frequencies(law.poles)
     T = CubicSpline(points, mirror.response(points) * law.response(points))
-    n, total = spectra.measured.size, 0.0
+    n, total = spectra.measurement.size, 0.0
     for start in range(0, n, AT_A_TIME):
         part = slice(start, min(start + AT_A_TIME, n))
         omega = np.pi * np.arange(part.start, part.stop) / (n - 1)
-        density = residual_density(T(omega), spectra.disturbance[part], spectra.cross[part], spectra.measured[part])
+        density = residual_density(T(omega), spectra.disturbance[part], spectra.cross[part], spectra.measurement[part])
         total += 2.0 * float(density.sum()) - float(density[0]) * (start == 0) - float(density[-1]) * (part.stop == n)
     return total / (2 * (n - 1))

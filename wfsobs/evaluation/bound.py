@@ -49,14 +49,14 @@ class LeastError:
     ----------
     covariance : Array
         Autocovariance after an infinitely long record, (n_lags,) [um^2].
-    started : Array
+    transient : Array
         Variance after 0, 1, 2, ... measurements, (n_past,) [um^2].
     n_lines : int
         Number of undamped lines, whose phases and amplitudes are learnt from the record.
     """
 
     covariance: Array
-    started: Array
+    transient: Array
     n_lines: int = 0
 
     @property
@@ -67,8 +67,8 @@ class LeastError:
     def interval(self, first: int, last: int) -> tuple[float, float]:
         """Return the range of the rms [um] over the steps `first` to `last` of a record, in SHARE of records."""
         least = float(self.covariance[0])
-        excess, past = np.maximum(self.started[first:last] - least, 0.0), self.started.size
-        later = max(self.started[-1] - least, 0.0) * past / np.arange(max(first, past) + 1, last + 1)
+        excess, past = np.maximum(self.transient[first:last] - least, 0.0), self.transient.size
+        later = max(self.transient[-1] - least, 0.0) * past / np.arange(max(first, past) + 1, last + 1)
         learning = float(excess.sum() + later.sum()) / (last - first)
         mean = least + learning
         if not mean > 0:
@@ -109,8 +109,8 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
         Target -> error; TOTAL is that of both together.
     """
     past, known = min(n_steps, MOST_PAST), spectra.without_lines
-    whitener = factorise(known.measured)
-    wanted = {name: (known.signal[name], advance_spectrum(known.shared[name], 1 + ahead)) for name in known.signal}
+    whitener = factorise(known.measurement)
+    wanted = {name: (known.signal[name], advance_spectrum(known.cross[name], 1 + ahead)) for name in known.signal}
     wanted[TOTAL] = known.total[0], advance_spectrum(known.total[1], 1 + ahead)
     lines = spectra.line_covariance(past + 1 + ahead)
     of_lines = {"vibration": 1.0, TOTAL: 1.0}
@@ -120,7 +120,7 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
             for name, (_, shared) in wanted.items()
         ]
     )
-    measured = np.fft.irfft(known.measured, whitener.n)[:past] + spectra.gain**2 * lines[:past]
+    measured = np.fft.irfft(known.measurement, whitener.n)[:past] + spectra.gain**2 * lines[:past]
     gained = np.hstack([np.zeros((len(wanted), 1)), explained_variance(measured, cross)])
     return {
         name: LeastError(

@@ -96,7 +96,7 @@ class Recovery:
     ----------
     start : float
         Start of the event [s].
-    settled : float
+    before : float
         Rms of the error before it [um].
     worst : float
         Maximum running rms from it to the next [um].
@@ -107,7 +107,7 @@ class Recovery:
     """
 
     start: float
-    settled: float
+    before: float
     worst: float
     last: float
     back: float | None

@@ -53,14 +53,14 @@ class Verdict:
     """What the scores of one target and mode amount to.
 
     best  : the score with the least error of those that can be compared
-    tied  : observers whose error is larger, but not significantly so on this record
+    ties  : observers whose error is larger, but not significantly so on this record
     bound : the least error possible [um], None where it is not known
     lines : how many lines the vibration has
     harms : observers that are worse than no estimate, the worst first
     """
 
     best: Score
-    tied: tuple[str, ...]
+    ties: tuple[str, ...]
     bound: float | None
     lines: int
     harms: tuple[Harm, ...]
@@ -196,8 +196,8 @@ def told_of(observer: str, lines: int) -> str:
 def _best_sentence(it: Verdict, scale: float, unit: str) -> str:
     target, mode, name = it.best.target.capitalize(), it.best.mode, row_label(it.best.observer)
     size = f"{_format_number(it.best.rms * scale)} {unit}"
-    if it.tied:
-        start = f"{name} has the smallest error, {size}, tied with {_join_labels(it.tied)} on this record"
+    if it.ties:
+        start = f"{name} has the smallest error, {size}, tied with {_join_labels(it.ties)} on this record"
     else:
         start = f"{name} is best, {size}"
     return f"{target}, {mode}: {start}{_to_bound(it, scale, unit)}; it is given {told_of(it.best.observer, it.lines)}."

@@ -166,7 +166,7 @@ def count_unexplained(modes: Sequence[OneMode], level: float, lowest: float) -> 
         mode.refused = []
     out = []
     for mode, were, found in zip(modes, refused, search_modes(modes, level, lowest), strict=True):
-        flagged = mode.f[np.logical_or.reduce([one.flagged for one in found])]
+        flagged = mode.f[np.logical_or.reduce([one.above_limit for one in found])]
         out.append(sum(bool(np.any(np.abs(flagged - c.frequency) <= (c.width + 1) * mode.f[0])) for c in were))
         mode.refused = were
     return out

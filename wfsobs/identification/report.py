@@ -41,7 +41,7 @@ def identification_dict(result: Identification) -> dict[str, Any]:
                 "broad": [of(p) for p in m.broad],
                 "peaks": [{**of(p), "pure": p.pure} for p in m.peaks],
                 "whiteness": {
-                    "cumulated_p": m.whiteness.cumulated,
+                    "cumulated_p": m.whiteness.periodogram,
                     "innovations_p": m.whiteness.innovations,
                     "unexplained": m.whiteness.left,
                     "white": m.whiteness.white,
@@ -71,7 +71,7 @@ def whiteness_lines(result: Identification) -> list[str]:
     out = []
     for m in result.modes:
         w = m.whiteness
-        tests = f"cumulated spectrum p = {w.cumulated:.2g}, innovations p = {w.innovations:.2g}"
+        tests = f"cumulated spectrum p = {w.periodogram:.2g}, innovations p = {w.innovations:.2g}"
         rest = f"; {w.left} candidates that no peak explains" if w.left else ""
         why = "".join(f"; {remark}" for remark in w.remarks)
         out.append(f"{m.name}: what is left is {'white' if w.white else 'NOT white'} at {LEVEL:.0%} ({tests}{rest}){why}")

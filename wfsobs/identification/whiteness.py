@@ -27,8 +27,8 @@ class Whiteness:
 
     Attributes
     ----------
-    cumulated : float
-        p-value of the largest distance between the cumulated I / S and a straight line (Bartlett, with Kolmogorov's law).
+    periodogram : float
+        p-value of the largest distance between the cumulative I / S and a straight line (Bartlett, with Kolmogorov's law).
     innovations : float
         p-value of the autocorrelation of the Kalman filter's innovations (Ljung and Box, Biometrika 65, 297, 1978).
     left : int
@@ -37,7 +37,7 @@ class Whiteness:
         Differences, one clause each, where it is not white.
     """
 
-    cumulated: float
+    periodogram: float
     innovations: float
     left: int
     remarks: tuple[str, ...] = ()
@@ -45,7 +45,7 @@ class Whiteness:
     @property
     def white(self) -> bool:
         """Whether both tests pass at LEVEL and no candidate is left."""
-        return min(self.cumulated, self.innovations) >= LEVEL and not self.left
+        return min(self.periodogram, self.innovations) >= LEVEL and not self.left
 
 
 def cumulated_test(ratio: Array, n: int) -> float:

@@ -52,7 +52,7 @@ class Look:
         Pattern, empty for solid [px].
     width : float
         Line width [px].
-    drawn : bool
+    in_figures : bool
         False for a row of tables only: its line would be the axis, or hide the others.
     """
 
@@ -61,7 +61,7 @@ class Look:
     dark: str = "#BBBBDD"
     dash: tuple[int, ...] = ()
     width: float = 1.4
-    drawn: bool = True
+    in_figures: bool = True
 
     def colour(self, dark: bool) -> str:
         """Return the colour for the mode."""

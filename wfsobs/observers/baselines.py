@@ -86,7 +86,7 @@ PERSISTENCE = Observer(
     persistence,
     help="the newest measurement taken for the turbulence",
     weight=0.1,
-    look=Look("Persistence", "#707070", "#A8A8A8", (1, 3), drawn=False),
+    look=Look("Persistence", "#707070", "#A8A8A8", (1, 3), in_figures=False),
 )
 
 ZERO = Observer(
@@ -96,5 +96,5 @@ ZERO = Observer(
     zero,
     help="the trivial baseline",
     weight=0.1,
-    look=Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4), drawn=False),
+    look=Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4), in_figures=False),
 )

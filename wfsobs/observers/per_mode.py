@@ -31,7 +31,7 @@ def over_modes(n_modes: int, work: Callable[[int, Watch], Array], watch: Watch) 
     If one fails, or the wait for them is interrupted, the others are told to stop by the watch they were given.
     """
     stop = threading.Event()
-    told = replace(watch, cancelled=lambda: stop.is_set() or watch.cancelled())
+    told = replace(watch, is_cancelled=lambda: stop.is_set() or watch.is_cancelled())
     with ThreadPoolExecutor(min(n_modes, AT_ONCE)) as pool:
         try:
             return np.column_stack(list(pool.map(lambda mode: work(mode, told), range(n_modes))))

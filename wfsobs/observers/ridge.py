@@ -125,7 +125,7 @@ RIDGE = Observer(
         ("gpr_offline.noise_std", "gpr_offline.depth"),
         ("gpr_offline.length_scale", *tunable("gpr_offline"), "butterworth.bandwidth_offline", "butterworth.order"),
     ),
-    look=Look("Ridge", "#6B6B00", "#C8C84D", (4, 2), drawn=False),
+    look=Look("Ridge", "#6B6B00", "#C8C84D", (4, 2), in_figures=False),
 )
 
 RIDGE_30 = Observer(
@@ -137,5 +137,5 @@ RIDGE_30 = Observer(
     prior=(Training, Bands),
     needs=("training",),
     tunable=Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
-    look=Look("30-tap predictor", "#8A5A00", "#D8A44D", (2, 3), drawn=False),
+    look=Look("30-tap predictor", "#8A5A00", "#D8A44D", (2, 3), in_figures=False),
 )

@@ -95,10 +95,10 @@ class Bands:
 class Spectra:
     """The spectra of one mode at frequencies that are evenly spaced from 0 to half the rate, (n,) [um^2 per sample].
 
-    disturbance : of phi_dist;  measured : of z, noise and all
+    disturbance : of phi_dist;  measurement : of z, noise and all
     cross       : between phi_dist[k] and z[k + 1], complex where the sensor sees other turbulence
     """
 
     disturbance: Array
-    measured: Array
+    measurement: Array
     cross: Complex | Array

@@ -76,7 +76,7 @@ def spectra_of(scenario: Scenario, mode: int) -> Spectra:
 def told_spectra(known: TrueSpectra) -> Spectra:
     """Return the part of true spectra in a prior: those of the disturbance as a whole."""
     disturbance, cross = known.total
-    return Spectra(disturbance, known.measured, cross)
+    return Spectra(disturbance, known.measurement, cross)
 
 
 # ---------------------------------------------------------------------- one vibration peak

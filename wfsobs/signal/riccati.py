@@ -47,7 +47,7 @@ class SteadyState:
         Filter gain, (n, m).
     K : Array
         Predictor gain A L, (n, m).
-    filtered : Array
+    posterior : Array
         Covariance after the measurement, (n, n).
     residual : float
         Residual of the Riccati equation, relative to P.
@@ -56,7 +56,7 @@ class SteadyState:
     P: Array
     L: Array
     K: Array
-    filtered: Array
+    posterior: Array
     residual: float
 
 

@@ -32,11 +32,11 @@ RIPPLES = 24
 
 
 class FlowSpectra(NamedTuple):
-    """One-sided spectra of one mode: own, on the axis; seen, of the mean of the LGS [um^2/Hz]; shared, between the two."""
+    """One-sided spectra of one mode: own, on the axis; measurement, of the mean of the LGS [um^2/Hz]; cross, between the two."""
 
     own: Array
-    seen: Array
-    shared: NDArray[np.complex128]
+    measurement: Array
+    cross: NDArray[np.complex128]
 
 
 def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra:

@@ -44,11 +44,11 @@ class TrueSpectra:
 
     Attributes
     ----------
-    measured : Array
+    measurement : Array
         S_z of the pseudo-open-loop LGS measurement, with noise.
     signal : dict of str to Array
         Target -> S_s.
-    shared : dict of str to Array
+    cross : dict of str to Array
         Target -> cross spectrum of s[k] and z[k + 1].
     lines : Array or None
         Spectrum of the undamped lines of the vibration, `line_width` wide.
@@ -58,9 +58,9 @@ class TrueSpectra:
         (frequency [cycles per step], variance [um^2]) of each line.
     """
 
-    measured: Array
+    measurement: Array
     signal: dict[str, Array]
-    shared: dict[str, Complex | Array]
+    cross: dict[str, Complex | Array]
     lines: Array | None = None
     gain: float = 1.0
     pure: tuple[tuple[float, float], ...] = ()
@@ -68,7 +68,7 @@ class TrueSpectra:
     @property
     def total(self) -> tuple[Array, Complex | Array]:
         """(signal, shared) of the whole disturbance; turbulence and vibration are independent."""
-        return sum(self.signal.values(), np.zeros(1)), sum(self.shared.values(), np.zeros(1))
+        return sum(self.signal.values(), np.zeros(1)), sum(self.cross.values(), np.zeros(1))
 
     @property
     def without_lines(self) -> TrueSpectra:
@@ -76,9 +76,9 @@ class TrueSpectra:
         if self.lines is None:
             return self
         return TrueSpectra(
-            self.measured - self.gain**2 * self.lines,
+            self.measurement - self.gain**2 * self.lines,
             self.signal | {"vibration": self.signal["vibration"] - self.lines},
-            self.shared | {"vibration": self.shared["vibration"] - self.gain * self.lines},
+            self.cross | {"vibration": self.cross["vibration"] - self.gain * self.lines},
         )
 
     def line_covariance(self, n: int) -> Array:
@@ -109,9 +109,9 @@ def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
     if lines is not None:
         vibration = vibration + lines
     return TrueSpectra(
-        measured=seen + gain**2 * vibration + max(lgs_noise_rms(scenario, mode), FLOOR) ** 2,
+        measurement=seen + gain**2 * vibration + max(lgs_noise_rms(scenario, mode), FLOOR) ** 2,
         signal={"turbulence": turbulence, "vibration": vibration},
-        shared={"turbulence": shared, "vibration": gain * vibration},
+        cross={"turbulence": shared, "vibration": gain * vibration},
         lines=lines,
         gain=float(gain),
         pure=tuple((f * scenario.dt, variance) for f, variance in pure_lines(scenario, mode)),

@@ -53,14 +53,14 @@ class SearchResult:
     ----------
     best : Candidate or None
         The strongest candidate.
-    flagged : Array
+    above_limit : Array
         Bins above their limit at some width, bool (bins,).
     strong : Array
         Those so far above it that they would spoil a fit.
     """
 
     best: Candidate | None
-    flagged: Array
+    above_limit: Array
     strong: Array
 
 

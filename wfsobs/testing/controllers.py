@@ -32,7 +32,7 @@ LOST = 7
 class ControllerInputs(NamedTuple):
     """All that a controller receives."""
 
-    measured: Measurements
+    measurements: Measurements
     prior: Prior
     plant: Plant
     settings: Settings
@@ -68,7 +68,7 @@ def check_controller(controller: Controller, scenario: Scenario | None = None, a
     if found := given_away(record, controller, laws, *given):
         raise CheckError(f"{controller.id}: knows more than it is told: it reaches {', '.join(sorted(found))}")
     base = _commands(controller, given)
-    _check_shape(controller, base, given.measured)
+    _check_shape(controller, base, given.measurements)
     again = _inputs(controller, record, s)
     twice = "run twice on the same measurements it gives two results: it keeps something between runs, or draws random numbers"
     _compare(controller, _commands(controller, again), base, twice, exact=True)
@@ -88,7 +88,7 @@ def _inputs(controller: Controller, record: Record, scenario: Scenario) -> Contr
 
 
 def _laws(controller: Controller, given: ControllerInputs) -> tuple[Law, ...]:
-    return controller.laws(given.prior, given.plant, given.settings, given.measured.n_modes)
+    return controller.laws(given.prior, given.plant, given.settings, given.measurements.n_modes)
 
 
 def _commands(controller: Controller, given: ControllerInputs) -> Array:
@@ -133,7 +133,7 @@ def _settings(own: Any) -> dict[str, Any]:
 
 def _check_causal(controller: Controller, given: ControllerInputs, base: Array) -> None:
     """Check that u[k] uses y[0..k] and u[0..k-1] alone."""
-    measured, n = given.measured, given.measured.n_steps
+    measured, n = given.measurements, given.measurements.n_steps
     for k in (n // 2, n // 2 + 3, n - 5):
         rng = np.random.default_rng(k)
         later = replace(
@@ -143,13 +143,13 @@ def _check_causal(controller: Controller, given: ControllerInputs, base: Array) 
             y_ngs=None if measured.y_ngs is None else change_from(measured.y_ngs, k + 1, rng),
         )
         what = f"looks ahead: measurements after step {k} change its command of that step or an earlier one"
-        _compare(controller, _commands(controller, given._replace(measured=later)), base, what, stop=k + 1)
+        _compare(controller, _commands(controller, given._replace(measurements=later)), base, what, stop=k + 1)
 
 
 def _check_gaps(controller: Controller, given: ControllerInputs) -> None:
-    y, start = given.measured.y_lgs.copy(), given.measured.n_steps // 2
+    y, start = given.measurements.y_lgs.copy(), given.measurements.n_steps // 2
     y[start : start + LOST] = np.nan
-    u = _commands(controller, given._replace(measured=replace(given.measured, y_lgs=y)))
+    u = _commands(controller, given._replace(measurements=replace(given.measurements, y_lgs=y)))
     if not np.isfinite(u).all():
         raise CheckError(f"{controller.id}: a command is NaN or infinite after missing samples")
     if controller.law is not None and not np.ptp(u[start + LOST :], axis=0).any():

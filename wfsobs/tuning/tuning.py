@@ -106,7 +106,7 @@ def tune(
     record: Record | None = None,
     target: str | None = None,
     validation: float | None = None,
-    told: Callable[[Evaluation], None] | None = None,
+    on_evaluation: Callable[[Evaluation], None] | None = None,
     watch: Watch = QUIET,
 ) -> TuningResult:
     """Search for the settings of an observer with the minimum error on a validation record.
@@ -129,7 +129,7 @@ def tune(
         Target of the errors; by default vibration where the observer estimates it.
     validation : float, optional
         Length of the simulated validation record [s]; by default that of the scenario.
-    told : callable, optional
+    on_evaluation : callable, optional
         Receives every evaluation as it is done: what remains of a tuning that is cancelled.
     watch : Watch, optional
         Receives the progress, and is asked at every block of work whether to stop.
@@ -162,7 +162,7 @@ def tune(
         records = simulate_records(scenario, searched, target, validation, watch)
     else:
         records = cut_record(record, scenario, observer, target)
-    trials = _Trials(scenario, searched, records, Judge(observer, records.target), evaluations, watch, told)
+    trials = _Trials(scenario, searched, records, Judge(observer, records.target), evaluations, watch, on_evaluation)
     trials.run({})
     minimise(trials.at, searched.start(scenario), evaluations, stream(scenario, DESIGN))
     first, best = trials.history[0], min(trials.history, key=lambda e: e.rms)
@@ -193,9 +193,9 @@ class _Trials:
     judge: Judge
     most: int
     watch: Watch
-    told: Callable[[Evaluation], None] | None
+    on_evaluation: Callable[[Evaluation], None] | None
     history: list[Evaluation] = field(default_factory=list)
-    known: dict[tuple[Any, ...], float] = field(default_factory=dict)
+    errors: dict[tuple[Any, ...], float] = field(default_factory=dict)
     warm_up: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -207,12 +207,12 @@ class _Trials:
         changes = self.space.changes(point)
         key = tuple(changes.values())
         if not self.space.by_hand and changes == self.space.values(self.scenario):
-            self.known[key] = self.history[0].rms  # the scenario itself
-        if key not in self.known:
+            self.errors[key] = self.history[0].rms  # the scenario itself
+        if key not in self.errors:
             if len(self.history) >= self.most:
                 raise NoEvaluationLeft
-            self.known[key] = self.run(changes).rms
-        return self.known[key]
+            self.errors[key] = self.run(changes).rms
+        return self.errors[key]
 
     def run(self, changes: dict[str, Any]) -> Evaluation:
         """One evaluation; scores begin where the first has its estimates, if that is later. Raises Cancelled."""
@@ -223,8 +223,8 @@ class _Trials:
             reason = str(error)
         done = Evaluation(changes, errors, reason)
         self.history.append(done)
-        if self.told:
-            self.told(done)
+        if self.on_evaluation:
+            self.on_evaluation(done)
         return done
 
     def _errors(self, scenario: Scenario) -> Errors:
@@ -256,4 +256,4 @@ class _Trials:
     def _inner(self) -> Watch:
         """Return the watch of one run, a part of the whole progress."""
         done, all_of_it = len(self.history), self.most + 2
-        return Watch(lambda f: self.watch.progress((done + f) / all_of_it), self.watch.cancelled)
+        return Watch(lambda f: self.watch.progress((done + f) / all_of_it), self.watch.is_cancelled)

@@ -170,7 +170,7 @@ class ClosedLoopPage(PageActions):
             it, row = look(name), left.get(name)
             value, unit = NOTHING, ""
             if row is None:
-                note = f"left out, {seconds(name, shown.result.scenario):.0f} s" if shown.done else "computing …"
+                note = f"left out, {seconds(name, shown.result.scenario):.0f} s" if shown.complete else "computing …"
             elif row["residual_rms_nm"] is None:
                 note = "unstable" if row["stable"] is False else "could not run"
             else:

@@ -39,14 +39,14 @@ class Plot:
 
 @dataclass(frozen=True)
 class PaperFigure:
-    """A figure of the paper: its lines beside the reference, its plots from the top; printed: the paper's RMS errors."""
+    """A figure of the paper: its lines beside the reference, its plots from the top; paper_errors: the paper's RMS errors."""
 
     title: str
     caption: str
     target: str
     observers: tuple[str, ...]
     plots: tuple[Plot, ...]
-    printed: str = ""
+    paper_errors: str = ""
 
 
 FIGURES = (
@@ -152,7 +152,7 @@ class _Sheet:
             found = ", ".join(f"{_label(n)} {number(s.rms * scale)}" for n, s in scores.items() if s)
             if found:
                 parts.append(f"RMS error of {mode} [{display.unit_label}]: {found}.")
-        return " ".join([*parts, self.figure.printed]).strip()
+        return " ".join([*parts, self.figure.paper_errors]).strip()
 
 
 class _PlotLines:

@@ -118,7 +118,7 @@ class State:
 class Report:
     """All of a report: states are the product of the variations, the last one running fastest.
 
-    preset : what the settings are compared with; base : the settings that were varied; recorded : whether on a record
+    preset : what the settings are compared with; base : the settings that were varied; is_recorded : whether on a record
     that was loaded, not simulated
     """
 
@@ -126,7 +126,7 @@ class Report:
     base: Scenario
     variations: tuple[Variation, ...]
     states: tuple[State, ...]
-    recorded: bool = False
+    is_recorded: bool = False
 
     @property
     def start(self) -> int:

@@ -54,7 +54,7 @@ def export(
     check_writable(path)
     kept = []
     for i, one in enumerate(chosen):
-        result = run(one, watch=Watch(lambda f, i=i: watch.progress((i + f) / len(chosen)), watch.cancelled))
+        result = run(one, watch=Watch(lambda f, i=i: watch.progress((i + f) / len(chosen)), watch.is_cancelled))
         done(result)
         kept.append(state_of(result, len(chosen)))
     content = page(Report(preset, scenario, tuple(vary), tuple(kept)), datetime.now().astimezone()).encode()

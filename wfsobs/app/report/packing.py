@@ -17,7 +17,7 @@ def pack(report: Report) -> bytes:
     words = {
         "preset": report.preset,
         "base": to_toml(report.base),
-        "recorded": report.recorded,
+        "recorded": report.is_recorded,
         "variations": [[v.path, v.values] for v in report.variations],
         "states": [
             {

@@ -29,7 +29,7 @@ def summary(report: Report, made: datetime) -> str:
     parts = [
         f"Preset {report.preset}" + (f", {count} setting{'s' * (count > 1)} changed" if count else ""),
         f"{length:g} s at {base.sensors.lgs_rate:g} Hz",
-        "of a loaded record" if report.recorded else f"seed {base.run.seed}",
+        "of a loaded record" if report.is_recorded else f"seed {base.run.seed}",
         *([f"{len(report.states)} variations"] if len(report.states) > 1 else []),
         f"made {made:%Y-%m-%d %H:%M %Z}".rstrip() + f" with wfsobs {__version__}",
     ]
@@ -124,9 +124,9 @@ def meaning_values(report: Report) -> dict[str, Any]:
 
 def origin_values(report: Report, made: datetime) -> dict[str, Any]:
     """Collect versions, date, seed, and the command that makes the report again."""
-    command, by_file = (f"wfsobs observe RECORD --config {FILE}", True) if report.recorded else command_of(report)
+    command, by_file = (f"wfsobs observe RECORD --config {FILE}", True) if report.is_recorded else command_of(report)
     facts = {"Program": f"wfsobs {__version__}, {machine(('bokeh',))}", "Made": f"{made:%Y-%m-%d %H:%M:%S %Z}".rstrip()}
-    if not report.recorded:
+    if not report.is_recorded:
         facts["Seed"] = str(report.base.run.seed)
     return {"facts": facts, "command": command, "by_file": by_file}
 
