@@ -148,6 +148,6 @@ def test_the_loop_is_closed_on_what_is_simulated() -> None:
 
 def test_a_report_is_written(tmp_path: Path) -> None:
     done: list[wfsobs.Result] = []
-    wfsobs.export(tmp_path / "report.html", wfsobs.PRESETS["paper"]().replace(QUICK), done=done.append)
+    wfsobs.export(tmp_path / "report.html", wfsobs.PRESETS["paper"]().replace(QUICK), on_result=done.append)
     assert len(done) == 1
     assert (tmp_path / "report.html").read_text(encoding="utf-8").startswith("<!doctype html>")

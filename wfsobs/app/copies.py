@@ -105,15 +105,15 @@ Lines = tuple[set[str], list[str]]
 """Imports, and lines of a script."""
 
 
-def _observe(recorded: bool, _arguments: Mapping[str, Any]) -> Lines:
+def _observe(has_record: bool, _arguments: Mapping[str, Any]) -> Lines:
     return set(), [
-        f"result = {'wfsobs.observe(record, scenario)' if recorded else 'wfsobs.run(scenario)'}",
+        f"result = {'wfsobs.observe(record, scenario)' if has_record else 'wfsobs.run(scenario)'}",
         "for s in result.scores:",
         '    print(f"{s.target:10} {s.mode:4} {s.observer:17} {1e3 * s.rms:8.2f} nm")',
     ]
 
 
-def _loop(_recorded: bool, _arguments: Mapping[str, Any]) -> Lines:
+def _loop(_has_record: bool, _arguments: Mapping[str, Any]) -> Lines:
     modules = {"design": "design", "run": "closed_loop", "rows": "rows"}
     return {f"from wfsobs.closed_loop.{module} import {name}" for module, name in modules.items()}, [
         "result = closed_loop(record, design(scenario))",
@@ -122,7 +122,7 @@ def _loop(_recorded: bool, _arguments: Mapping[str, Any]) -> Lines:
     ]
 
 
-def _identify(_recorded: bool, arguments: Mapping[str, Any]) -> Lines:
+def _identify(_has_record: bool, arguments: Mapping[str, Any]) -> Lines:
     return {"from wfsobs.identification import identify, report"}, [
         f"found = identify(record, {_arguments(arguments)})",
         "for mode in found.modes:",
@@ -132,9 +132,9 @@ def _identify(_recorded: bool, arguments: Mapping[str, Any]) -> Lines:
     ]
 
 
-def _tune(recorded: bool, arguments: Mapping[str, Any]) -> Lines:
+def _tune(has_record: bool, arguments: Mapping[str, Any]) -> Lines:
     named = {k: v for k, v in arguments.items() if k != "observer"}
-    record = ", record=record" if recorded else ""
+    record = ", record=record" if has_record else ""
     return {"from wfsobs.tuning import report, tune"}, [
         f"tuned = tune(scenario, {arguments['observer']!r}, {_arguments(named)}{record})",
         "for path, before, after in report.settings(tuned):",

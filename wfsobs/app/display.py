@@ -55,17 +55,17 @@ def label_of(p: param.Parameter) -> str:
     return f"{p.label} [{unit}]" if unit else str(p.label)
 
 
-def score_columns(unit: str, base: str = "truth", pinned: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
+def score_columns(unit: str, base: str = "truth", pin_columns: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
     """List the headings of a table of scores, and an explanation of each.
 
-    base   : what an error is divided by: "truth", or "z" for a record without truth
-    pinned : columns that go beside the error
+    base        : what an error is divided by: "truth", or "z" for a record without truth
+    pin_columns : columns that go beside the error
     """
     error = "of the estimate" if base == "truth" else "of the prediction of z one step ahead, or residual of the recorded loop"
     return {
         "Observer": "and its line in the figures",
         f"RMS error [{unit}]": f"{error}, after the warm-up, over the samples that all have",
-        **pinned,
+        **pin_columns,
         f"RMS {base} [{unit}]": "error of an estimate of zero",
         f"error / {base}": "above 1: worse than an estimate of zero",
         "Needs": "inputs beside measurements",

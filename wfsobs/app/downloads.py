@@ -34,41 +34,41 @@ class TooLarge(ValueError):
     """More than a browser should be sent: one line saying so."""
 
 
-def data_npz(shown: RunResults) -> bytes:
+def data_npz(results: RunResults) -> bytes:
     """Write the record as `wfsobs observe` reads it, finished estimates as observer/target, the scenario. Raises TooLarge."""
-    result = shown.result
-    _check(shown)
-    arrays = record_arrays(result.record, to_toml(shown.scenario))
+    result = results.result
+    _check(results)
+    arrays = record_arrays(result.record, to_toml(results.scenario))
     arrays |= {f"{e.observer}/{e.target}": e.values for e in result.estimates}
     return _npz(arrays)
 
 
-def data_csv(shown: RunResults) -> bytes:
+def data_csv(results: RunResults) -> bytes:
     """Time, truth, measurements, commands and finished estimates, one row per step, the scenario as comments.
 
     Numbers have nine digits; NaN where there is none. Raises TooLarge.
     """
-    _check(shown)
-    record = shown.result.record
+    _check(results)
+    record = results.result.record
     # comments of the TOML text too, and what a record is read by
     head = [f"# # dt: {record.dt!r}", *([f"# # ratio: {record.ratio}"] if record.ratio else [])]
-    head += [f"# {line}".rstrip() for line in to_toml(shown.scenario).splitlines()]
-    return _csv(head, dict(_columns(shown)))
+    head += [f"# {line}".rstrip() for line in to_toml(results.scenario).splitlines()]
+    return _csv(head, dict(_columns(results)))
 
 
-def residuals_npz(shown: LoopResults) -> bytes:
+def residuals_npz(results: LoopResults) -> bytes:
     """Write the residuals of the controllers, (n_steps, n_modes) [um], as residual/controller; dt; the scenario."""
-    arrays = {f"residual/{o.controller}": o.residual for o in shown.result.outcomes if o.residual is not None}
-    return _npz(arrays | {"dt": np.array(shown.result.record.dt), "scenario": np.array(to_toml(shown.result.scenario))})
+    arrays = {f"residual/{o.controller}": o.residual for o in results.result.outcomes if o.residual is not None}
+    return _npz(arrays | {"dt": np.array(results.result.record.dt), "scenario": np.array(to_toml(results.result.scenario))})
 
 
-def residuals_csv(shown: LoopResults) -> bytes:
+def residuals_csv(results: LoopResults) -> bytes:
     """Time and the residual of every controller that has one, a row per step; nine digits; the scenario as comments."""
-    record, scenario = shown.result.record, shown.result.scenario
+    record, scenario = results.result.record, results.result.scenario
     modes = [m.name for m in scenario.modes][: record.n_modes]
     columns = {"time_s": np.asarray(np.arange(record.n_steps) * record.dt, dtype=np.float64)} | {
         f"{o.controller}/{mode}_um": o.residual[:, i]
-        for o in shown.result.outcomes
+        for o in results.result.outcomes
         if o.residual is not None
         for i, mode in enumerate(modes)
     }
@@ -96,10 +96,10 @@ def _csv(head: Sequence[str], columns: Mapping[str, Array]) -> bytes:
     return "\n".join([*head, ",".join(columns), *lines, ""]).encode()
 
 
-def _columns(shown: RunResults) -> Iterator[tuple[str, Array]]:
+def _columns(results: RunResults) -> Iterator[tuple[str, Array]]:
     """(name with its unit, values) of every column."""
-    result, record = shown.result, shown.result.record
-    modes = [m.name for m in shown.scenario.modes][: record.n_modes]
+    result, record = results.result, results.result.record
+    modes = [m.name for m in results.scenario.modes][: record.n_modes]
     signals = {f"truth/{target}": record.truth(target) for target in TARGETS}
     signals |= {"y_lgs": record.y_lgs, "y_ngs": record.y_ngs, "u": record.u}
     signals |= {f"{e.observer}/{e.target}": e.values for e in result.estimates}
@@ -109,8 +109,8 @@ def _columns(shown: RunResults) -> Iterator[tuple[str, Array]]:
             yield from ((f"{name}/{mode}_um", values[:, i]) for i, mode in enumerate(modes))
 
 
-def _check(shown: RunResults) -> None:
-    result = shown.result
+def _check(results: RunResults) -> None:
+    result = results.result
     numbers = result.record.n_steps * (1 + result.record.n_modes * (5 + len(result.estimates)))
     if numbers > MOST:
         raise TooLarge(

@@ -45,21 +45,21 @@ class Pin:
         return next((s for s in self.scores if (s.observer, s.target, s.mode) == (observer, target, mode)), None)
 
 
-def pin(shown: RunResults) -> Pin:
+def pin(results: RunResults) -> Pin:
     """Keep what is compared of the results shown."""
     signals: dict[Key, NDArray[np.float32]] = {}
     errors: dict[Key, NDArray[np.float32]] = {}
     for target in TARGETS:
-        truth = shown.values(TRUTH, target)
+        truth = results.values(TRUTH, target)
         for name in (TRUTH, *observers_of(target)):
-            values = shown.values(name, target)
+            values = results.values(name, target)
             if values is not None:
                 signals[name, target] = _thin(values)
                 if truth is not None and name != TRUTH:
                     errors[name, target] = _thin(values - truth)
-    record = shown.result.record
+    record = results.result.record
     times = envelope_times(0, record.n_steps, KEPT, record.dt)
-    return Pin(shown.scenario, shown.result.scores, dict(shown.spectra), times, signals, errors)
+    return Pin(results.scenario, results.result.scores, dict(results.spectra), times, signals, errors)
 
 
 def _thin(values: Array) -> NDArray[np.float32]:
@@ -103,9 +103,9 @@ def _word(value: Any) -> str:
     return {True: "on", False: "off"}[value] if isinstance(value, bool) else str(value)
 
 
-def name_of_difference(pinned: Scenario, now: Scenario) -> str:
+def name_of_difference(before: Scenario, now: Scenario) -> str:
     """Name a pinned run by the settings in which the present one differs."""
-    words = differences(pinned, now)
+    words = differences(before, now)
     if not words:
         return "the same settings"
     more = f" and {len(words) - NAMED} more" if len(words) > NAMED else ""

@@ -70,7 +70,7 @@ class Options:
     log_requests: bool = False
 
 
-def options(*, public: bool | None = None, runs: int | None = None, **given: Any) -> Options:
+def options(*, public: bool | None = None, runs: int | None = None, **values: Any) -> Options:
     """Options as the command line gives them; those of the limits start with max_ and are None where not given.
 
     public : whether there are limits; None for where more than this machine reaches the page
@@ -78,11 +78,11 @@ def options(*, public: bool | None = None, runs: int | None = None, **given: Any
     >>> options(origins=("ao.example.org",), max_duration=30.0, max_depth=None).limits.duration
     30.0
     """
-    own = {key.removeprefix("max_").replace("memory", "megabytes"): given.pop(key) for key in list(given) if key[:4] == "max_"}
+    own = {key.removeprefix("max_").replace("memory", "megabytes"): values.pop(key) for key in list(values) if key[:4] == "max_"}
     if public is None:
-        public = bool(given.get("origins")) or not is_local(given.get("address", "localhost"))
+        public = bool(values.get("origins")) or not is_local(values.get("address", "localhost"))
     limits = replace(PUBLIC if public else NONE, **{key: value for key, value in own.items() if value is not None})
-    return Options(limits=limits, runs=runs or 0, **given)
+    return Options(limits=limits, runs=runs or 0, **values)
 
 
 def serve(options: Options) -> None:

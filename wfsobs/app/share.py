@@ -78,8 +78,8 @@ def to_query(scenario: Scenario, preset: str, simulation: Scenario | None = None
     return query if len(query) <= LONGEST else None
 
 
-def _fields(changed: Mapping[str, Any], prefix: str = "") -> list[str]:
-    return [f"{prefix}{path}={quote(value_text(path, value), safe=',;:+-.')}" for path, value in changed.items()]
+def _fields(values: Mapping[str, Any], prefix: str = "") -> list[str]:
+    return [f"{prefix}{path}={quote(value_text(path, value), safe=',;:+-.')}" for path, value in values.items()]
 
 
 def from_query(query: str, check: Check = Scenario.validate) -> Link:
@@ -118,9 +118,9 @@ def value_text(path: str, value: Any) -> str:
     return _word(value)
 
 
-def read_value(path: str, text: str, known: Mapping[str, param.Parameter]) -> Any:
+def read_value(path: str, text: str, settings: Mapping[str, param.Parameter]) -> Any:
     """Read a value of a link; what makes no sense stays text, for the setting itself to refuse."""
-    p = known.get(path)
+    p = settings.get(path)
     if isinstance(p, param.List) and holds_groups(p):
         return [_item(part, settings_of(p)) for part in text.split(";")] if text else []
     if isinstance(p, param.List):

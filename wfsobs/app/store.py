@@ -113,12 +113,12 @@ class Store(param.Parameterized):
         scenario.validate()
         self.limits.check(scenario)
 
-    def load(self, scenario: Scenario, preset: str | None = None, kept: SimulatedRecord | None = None) -> None:
+    def load(self, scenario: Scenario, preset: str | None = None, simulation: SimulatedRecord | None = None) -> None:
         """Replace every setting and run; a loaded record stays. Raises SettingError where they do not go together.
 
         preset : the one that they are to be compared with from now on; as it was if not given
         """
-        self._put(scenario, preset or self.preset, self.source if isinstance(self.source, LoadedRecord) else kept)
+        self._put(scenario, preset or self.preset, self.source if isinstance(self.source, LoadedRecord) else simulation)
 
     def replace(self, changes: Mapping[str, Any]) -> None:
         """Set several settings (dotted path -> value) in one step and run. Raises SettingError."""
@@ -150,15 +150,15 @@ class Store(param.Parameterized):
             source.check(self.limits)
         self._accept((scenario, preset, source), {})
 
-    def _accept(self, to: Step, refused: dict[str, Any], step: bool = True) -> None:
+    def _accept(self, to: Step, refusals: dict[str, Any], step: bool = True) -> None:
         """Accept new settings, the one way in. step : whether it is a change of its own, to be undone later."""
         scenario, preset, source = to
         unchanged, stays = scenario == self.scenario, give_same_record(source, self.source)
         if step and not (unchanged and stays and preset == self.preset):
             self._past = _of_one_file([*self._past, self._step], source)[-STEPS_BACK:]
             self._future = []
-        self._refused = refused
-        errors = {path: reason for path, reason in self.errors.items() if path in refused}
+        self._refused = refusals
+        errors = {path: reason for path, reason in self.errors.items() if path in refusals}
         self.param.update(
             scenario=self.scenario if unchanged else scenario,
             source=self.source if stays else source,

@@ -71,9 +71,12 @@ def labels() -> dict[str, str]:
     return {name: look(name).label for name in (*LOOKS, *OBSERVERS, *CONTROLLERS)}
 
 
-def observers_of(target: str, hidden: bool = False) -> list[str]:
-    """List the observers that estimate a target, in the order of the registry. hidden : also those that stand in tables only."""
-    return [o.id for o in OBSERVERS.values() if target in o.targets and (hidden or o.look.in_figures)]
+def observers_of(target: str, with_hidden: bool = False) -> list[str]:
+    """List the observers that estimate a target, in the order of the registry.
+
+    with_hidden : also those that stand in tables only
+    """
+    return [o.id for o in OBSERVERS.values() if target in o.targets and (with_hidden or o.look.in_figures)]
 
 
 def asset(name: str) -> str:
@@ -81,11 +84,11 @@ def asset(name: str) -> str:
     return files("wfsobs.assets").joinpath(name).read_text(encoding="utf-8")
 
 
-def swatch(name: str, dark: bool, dashed: bool = True) -> Markup:
+def swatch(name: str, dark: bool, with_dash: bool = True) -> Markup:
     """Draw a short line as in the figures, as SVG; solid if not to be dashed."""
-    return _swatch(look(name), dark, dashed)
+    return _swatch(look(name), dark, with_dash)
 
 
 @cache
-def _swatch(look: Look, dark: bool, dashed: bool) -> Markup:
-    return macro("swatch", look, dark, dashed)
+def _swatch(look: Look, dark: bool, with_dash: bool) -> Markup:
+    return macro("swatch", look, dark, with_dash)

@@ -76,10 +76,10 @@ def best_so_far(history: Sequence[Evaluation]) -> list[float]:
     return out
 
 
-def tuning_rows(tuned: TuningResult) -> Rows:
+def tuning_rows(result: TuningResult) -> Rows:
     """List settings as text, errors [um] by mode and together, a GPR's log marginal likelihoods by mode; None for failures."""
-    out: Rows = [(SETTING, *row) for row in settings(tuned)]
-    stages = tuned.before, tuned.after
+    out: Rows = [(SETTING, *row) for row in settings(result)]
+    stages = result.before, result.after
     for section, before, after in (
         (VALIDATION, *(s.validation for s in stages)),
         (TEST, *(s.test for s in stages)),

@@ -158,14 +158,14 @@ class Upload:
         elif self._content and task.state != CANCELLED:
             self._show(RecordError(task.message) if task.state == FAILED else task.result)
 
-    def _show(self, found: Preview | SpectrumPreview | RecordError) -> None:
-        self._preview = None if isinstance(found, RecordError) else found
-        spectrum = isinstance(found, SpectrumPreview)
+    def _show(self, preview: Preview | SpectrumPreview | RecordError) -> None:
+        self._preview = None if isinstance(preview, RecordError) else preview
+        spectrum = isinstance(preview, SpectrumPreview)
         self.use.label = "Use this spectrum" if spectrum else "Use this record"
         self.figure.yaxis.axis_label = "PSD [µm²/Hz]" if spectrum else "PSD of z [µm²/Hz]"
-        self.picker.said = "" if self._preview else str(found)
+        self.picker.said = "" if self._preview else str(preview)
         self.use.disabled = self._preview is None
-        lines = self._preview.lines() if self._preview else [str(found)]
+        lines = self._preview.lines() if self._preview else [str(preview)]
         self.text.object = f"<p><b>{escape(self._name)}</b></p><ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
         for mode, source in enumerate(self.sources):
             there = self._preview is not None and mode < self._preview.spectrum.shape[1]
@@ -198,14 +198,14 @@ class Upload:
         else:
             self.discard()
 
-    def _vibrate(self, found: SpectrumPreview) -> None:
+    def _vibrate(self, preview: SpectrumPreview) -> None:
         """Take a spectrum as that of the vibration."""
         try:
-            self.store.replace({"vibration.source": "psd", "vibration.psd": found.table})
+            self.store.replace({"vibration.source": "psd", "vibration.psd": preview.table})
         except SettingError as error:
-            self._say(f"{found.name}: {str(error)[:300]}")
+            self._say(f"{preview.name}: {str(error)[:300]}")
         else:
-            self.discard(f"The vibration has the spectrum of {found.name}.")
+            self.discard(f"The vibration has the spectrum of {preview.name}.")
 
     def simulate(self) -> None:
         """Go back to the simulation; to the settings of one that was kept."""

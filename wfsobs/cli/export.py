@@ -30,4 +30,11 @@ def export(out: str, preset: str | None, config: str | None, assignments: tuple[
     except ModuleNotFoundError as error:
         raise SettingError(f"export: a report needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
     with progress_bar("runs") as update:
-        write(out, base, vary=variations, preset=configfile.preset_name(preset, config), watch=Watch(progress=update), done=warn)
+        write(
+            out,
+            base,
+            vary=variations,
+            preset=configfile.preset_name(preset, config),
+            watch=Watch(progress=update),
+            on_result=warn,
+        )

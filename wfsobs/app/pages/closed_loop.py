@@ -161,16 +161,16 @@ class ClosedLoopPage(PageActions):
                 self.margins.object = margins_html(self.results, self.display)
                 self.cards.items = self._items(self.results)
 
-    def _items(self, shown: LoopResults) -> list[dict[str, Any]]:
+    def _items(self, results: LoopResults) -> list[dict[str, Any]]:
         """Describe a card per controller."""
-        scale = 1e-3 * per_micrometre(self.display.unit, shown.result.scenario.telescope.diameter)
-        left = {r["controller"]: r for r in shown.rows if r["mode"] == self.display.mode}
+        scale = 1e-3 * per_micrometre(self.display.unit, results.result.scenario.telescope.diameter)
+        left = {r["controller"]: r for r in results.rows if r["mode"] == self.display.mode}
         out = []
         for name in CONTROLLERS:
             it, row = look(name), left.get(name)
             value, unit = NOTHING, ""
             if row is None:
-                note = f"left out, {seconds(name, shown.result.scenario):.0f} s" if shown.complete else "computing …"
+                note = f"left out, {seconds(name, results.result.scenario):.0f} s" if results.complete else "computing …"
             elif row["residual_rms_nm"] is None:
                 note = "unstable" if row["stable"] is False else "could not run"
             else:

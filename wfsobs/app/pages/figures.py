@@ -131,24 +131,24 @@ class _Sheet:
         panes = [pn.pane.Bokeh(drawn.figure, sizing_mode="stretch_width", margin=0) for drawn in self.plots]
         return pn.Column(self.head, *panes, self.caption, sizing_mode="stretch_width", margin=0, stylesheets=[asset("box.css")])
 
-    def draw(self, shown: RunResults, display: Display) -> None:
+    def draw(self, results: RunResults, display: Display) -> None:
         """Every plot and the texts."""
         legend = "".join(
-            f'<span class="mark">{swatch(n, display.dark, dashed=_is_dashed(n, self.figure))}{escape(_label(n))}</span>'
+            f'<span class="mark">{swatch(n, display.dark, with_dash=_is_dashed(n, self.figure))}{escape(_label(n))}</span>'
             for n in self.names
         )
         self.head.object = f'<h2 class="title">{escape(self.figure.title)}</h2><div class="caption legend">{legend}</div>'
-        self.caption.object = f'<p class="text">{escape(self.figure.caption)} {escape(self._errors(shown, display))}</p>'
+        self.caption.object = f'<p class="text">{escape(self.figure.caption)} {escape(self._errors(results, display))}</p>'
         for drawn in self.plots:
-            drawn.draw(shown, display)
+            drawn.draw(results, display)
 
-    def _errors(self, shown: RunResults, display: Display) -> str:
+    def _errors(self, results: RunResults, display: Display) -> str:
         """List the RMS errors of the lines, mode by mode."""
-        scale = per_micrometre(display.unit, shown.scenario.telescope.diameter)
+        scale = per_micrometre(display.unit, results.scenario.telescope.diameter)
         parts = []
         for column in sorted({plot.column for plot in self.figure.plots}):
             mode = TIP_TILT[column].name
-            scores = {name: find(shown, name, self.figure.target, mode) for name in self.figure.observers}
+            scores = {name: find(results, name, self.figure.target, mode) for name in self.figure.observers}
             found = ", ".join(f"{_label(n)} {number(s.rms * scale)}" for n, s in scores.items() if s)
             if found:
                 parts.append(f"RMS error of {mode} [{display.unit_label}]: {found}.")
@@ -184,37 +184,37 @@ class _PlotLines:
         if plot.what == WHOLE and any(p.what == ZOOMED for p in of.plots):
             self.figure.add_layout(self.window)
 
-    def draw(self, shown: RunResults, display: Display) -> None:
+    def draw(self, results: RunResults, display: Display) -> None:
         """Send every line in the colours of the paper."""
-        scale = per_micrometre(display.unit, shown.scenario.telescope.diameter)
+        scale = per_micrometre(display.unit, results.scenario.telescope.diameter)
         for name, line in self.lines.items():
             line.glyph.line_color = look(name).colour(display.dark)  # type: ignore[union-attr]
         mode = TIP_TILT[self.plot.column].name
         if self.plot.what == SPECTRUM:
             self.figure.yaxis.axis_label = f"PSD, {mode} [{display.unit_label}²/Hz]"
-            self._draw_spectra(shown, scale**2)
+            self._draw_spectra(results, scale**2)
         else:
             self.figure.yaxis.axis_label = f"{mode} [{display.unit_label}]"
-            self._draw_traces(shown, scale)
+            self._draw_traces(results, scale)
 
-    def _draw_traces(self, shown: RunResults, scale: float) -> None:
-        dt, n = shown.result.record.dt, shown.result.record.n_steps
-        begin = min(round(shown.scenario.run.warm_up / dt), n - 2)
+    def _draw_traces(self, results: RunResults, scale: float) -> None:
+        dt, n = results.result.record.dt, results.result.record.n_steps
+        begin = min(round(results.scenario.run.warm_up / dt), n - 2)
         middle, half = (begin + n) // 2, min(round(ZOOM_S / dt), n - begin) // 2
         zoomed = (middle - half, middle + half)
         first, last = zoomed if self.plot.what == ZOOMED else (begin, n)
         times = envelope_times(first, last, BINS, dt)
         for name, source in self.sources.items():
-            values = shown.values(name, self.of.target)
+            values = results.values(name, self.of.target)
             lines = np.full(last - first, np.nan) if values is None else values[first:last, self.plot.column]
             source.data = {"x": times, "y": (scale * envelope(lines, BINS)).astype(np.float32)}
         self.figure.x_range.update(start=first * dt, end=last * dt, reset_start=first * dt, reset_end=last * dt)
         self.window.update(left=zoomed[0] * dt, right=zoomed[1] * dt)
 
-    def _draw_spectra(self, shown: RunResults, scale: float) -> None:
+    def _draw_spectra(self, results: RunResults, scale: float) -> None:
         tops: list[float] = []
         for name, source in self.sources.items():
-            spectrum = shown.spectra.get((name, self.of.target))
+            spectrum = results.spectra.get((name, self.of.target))
             if spectrum is None:
                 source.data = {"x": [], "y": []}
                 continue

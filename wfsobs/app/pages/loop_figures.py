@@ -35,9 +35,9 @@ class LoopLines:
         self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in names}
         self.lines = {name: add_line(fig, name, source) for name, source in self.sources.items()}
 
-    def restyle(self, dark: bool, hidden: list[str]) -> None:
+    def restyle(self, dark: bool, hidden_names: list[str]) -> None:
         """Set the colours of light or dark mode, and hide lines."""
-        restyle(self.lines, dark, hidden)
+        restyle(self.lines, dark, hidden_names)
 
     def highest(self) -> float:
         """Find the largest number in any line."""
@@ -55,13 +55,13 @@ class Trace(LoopLines):
         self.what = what
         self.figure.xaxis.axis_label = "time [s]"
 
-    def draw(self, shown: LoopResults, display: Display, first: int, last: int) -> None:
+    def draw(self, results: LoopResults, display: Display, first: int, last: int) -> None:
         """Send the samples first ... last - 1 of every line."""
-        dt = shown.result.record.dt
-        scale = per_micrometre(display.unit, shown.result.scenario.telescope.diameter)
+        dt = results.result.record.dt
+        scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter)
         times = envelope_times(first, last, BINS, dt)
         for name, source in self.sources.items():
-            residual = shown.residual(name)
+            residual = results.residual(name)
             source.data = (
                 {"x": [], "y": []}
                 if residual is None
@@ -70,9 +70,9 @@ class Trace(LoopLines):
         self.figure.x_range.update(start=first * dt, end=last * dt, reset_start=first * dt, reset_end=last * dt)
         self.figure.yaxis.axis_label = f"residual {display.mode_label} [{display.unit_label}]"
 
-    def fit(self, hidden: list[str]) -> None:
+    def fit(self, hidden_names: list[str]) -> None:
         """Have the axis hold every visible line."""
-        lines = [np.abs(s.data["y"]) for name, s in self.sources.items() if name not in hidden and len(s.data["y"])]
+        lines = [np.abs(s.data["y"]) for name, s in self.sources.items() if name not in hidden_names and len(s.data["y"])]
         top = 1.1 * max((float(y.max()) for y in lines), default=1.0)
         self.figure.y_range.update(start=-top, end=top, reset_start=-top, reset_end=top)
 
@@ -89,11 +89,11 @@ class LoopSpectrum(LoopLines):
         )
         self.figure.xaxis.axis_label = "frequency [Hz]"
 
-    def draw(self, shown: LoopResults, display: Display) -> None:
+    def draw(self, results: LoopResults, display: Display) -> None:
         """Send every line."""
-        scale = per_micrometre(display.unit, shown.result.scenario.telescope.diameter) ** 2
+        scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter) ** 2
         for name, source in self.sources.items():
-            frequency, density = shown.spectra.get(name, (np.empty(0), np.empty((0, display.column + 1))))
+            frequency, density = results.spectra.get(name, (np.empty(0), np.empty((0, display.column + 1))))
             source.data = {"x": frequency[1:], "y": scale * density[1:, display.column]}
             if frequency.size:
                 self.figure.x_range.update(start=float(frequency[1]), end=float(frequency[-1]))
@@ -116,21 +116,21 @@ class Response(LoopLines):
             line.glyph.update(line_alpha=0.45, line_width=1.2)
         fig.xaxis.axis_label, fig.yaxis.axis_label = "frequency [Hz]", "amplitude [dB]"
 
-    def draw(self, shown: LoopResults, display: Display) -> None:
+    def draw(self, results: LoopResults, display: Display) -> None:
         """Send every line."""
-        nyquist = 0.5 / shown.result.record.dt
+        nyquist = 0.5 / results.result.record.dt
         self.figure.x_range.update(start=1e-3 * nyquist, end=nyquist)
         for name in CURVES:
-            of = shown.curves.get(name)
+            of = results.curves.get(name)
             curves = of[display.column] if of else None
             x, rejection, noise = (curves.frequency, curves.rejection, curves.noise) if curves else NOWHERE
             self.sources[name].data = {"x": x, "y": _decibel(rejection)}
             self.noise[name].data = {"x": x, "y": _decibel(noise)}
 
-    def restyle(self, dark: bool, hidden: list[str]) -> None:
+    def restyle(self, dark: bool, hidden_names: list[str]) -> None:
         """Restyle the faint lines too."""
-        super().restyle(dark, hidden)
-        restyle(self.faint, dark, hidden)
+        super().restyle(dark, hidden_names)
+        restyle(self.faint, dark, hidden_names)
 
 
 def _decibel(x: Complex) -> Array:
@@ -152,15 +152,15 @@ class Nyquist(LoopLines):
         fig.xaxis.axis_label, fig.yaxis.axis_label = "real part", "imaginary part"
         self._at: dict[str, list[tuple[complex, str]]] = {}
 
-    def draw(self, shown: LoopResults, display: Display) -> None:
+    def draw(self, results: LoopResults, display: Display) -> None:
         """Send every line and mark."""
         self._at = {}
         for name, source in self.sources.items():
-            of = shown.curves.get(name)
+            of = results.curves.get(name)
             L = of[display.column].loop_gain if of else np.empty(0, dtype=complex)
             L = np.where(np.abs(L) < 20.0, L, np.nan)
             source.data = {"x": np.real(L), "y": np.imag(L)}
-            margins = shown.result.design.laws[name][display.column].margins if name in shown.result.design.laws else None
+            margins = results.result.design.laws[name][display.column].margins if name in results.result.design.laws else None
             if margins is None or not L.size:
                 continue
             self._at[name] = [(complex(-1.0 / margins.gain), "circle")] if margins.gain else []
@@ -168,13 +168,13 @@ class Nyquist(LoopLines):
                 both = [-np.exp(1j * sign * margins.phase) for sign in (1.0, -1.0)]
                 self._at[name].append((min(both, key=lambda p, L=L: np.nanmin(np.abs(L - p))), "square"))
 
-    def restyle(self, dark: bool, hidden: list[str]) -> None:
+    def restyle(self, dark: bool, hidden_names: list[str]) -> None:
         """Restyle the marks too."""
-        super().restyle(dark, hidden)
+        super().restyle(dark, hidden_names)
         shown = [
             (point, marker, look(name).colour(dark))
             for name, at in self._at.items()
-            if name not in hidden
+            if name not in hidden_names
             for point, marker in at
         ]
         self.marks.data = {

@@ -19,27 +19,27 @@ from wfsobs.evaluation.rows import Row as Score
 UNSTABLE = macro("tag", "above", "unstable")
 
 
-def of_mode(shown: LoopResults, display: Display) -> list[Score]:
+def of_mode(results: LoopResults, display: Display) -> list[Score]:
     """Select the rows of the mode shown, least residual first, those without one last."""
-    rows = [r for r in shown.rows if r["mode"] == display.mode]
+    rows = [r for r in results.rows if r["mode"] == display.mode]
     return sorted(rows, key=lambda r: float("inf") if r["residual_rms_nm"] is None else r["residual_rms_nm"])
 
 
-def loop_html(shown: LoopResults, display: Display) -> str:
+def loop_html(results: LoopResults, display: Display) -> str:
     """Residual and Strehl of every controller, and the bound."""
     unit = display.unit_label
     columns = {
         "Controller": "and its line in the figures",
         f"Residual [{unit}]": "rms after the warm-up",
         f"Theory [{unit}]": "from the true spectra, for an endless record",
-        f"Strehl at {shown.result.scenario.control.wavelength:g} µm": "of all simulated modes together",
+        f"Strehl at {results.result.scenario.control.wavelength:g} µm": "of all simulated modes together",
         "Gain": "of the integrator",
         "At a limit [%]": "steps in which a limit of the mirror changed the command",
         "Needs": "inputs beside measurements",
     }
-    rows = of_mode(shown, display)
+    rows = of_mode(results, display)
     best = next((r["controller"] for r in rows if r["controller"] != BOUND and r["residual_rms_nm"] is not None), None)
-    scale = 1e-3 * per_micrometre(display.unit, shown.result.scenario.telescope.diameter)
+    scale = 1e-3 * per_micrometre(display.unit, results.result.scenario.telescope.diameter)
     body = [_row(r, display, scale, r["controller"] == best) for r in rows]
     notes = {r["note"]: label(r["controller"]) for r in reversed(rows) if r["note"] and not r["limited"]}
     failures = macro("texts", "failure", [f"{name}: {note}" for note, name in notes.items()])
@@ -72,7 +72,7 @@ def _row(row: Score, display: Display, scale: float, best: bool) -> Row:
     return _line(row, display, cells)
 
 
-def margins_html(shown: LoopResults, display: Display) -> str:
+def margins_html(results: LoopResults, display: Display) -> str:
     """Margins of the loops that have a transfer function."""
     columns = {
         "Controller": "",
@@ -80,7 +80,7 @@ def margins_html(shown: LoopResults, display: Display) -> str:
         "Phase margin [°]": "phase lag that can be added before the loop is unstable",
         "Delay margin [ms]": "delay that can be added before the loop is unstable",
     }
-    rows = [r for r in of_mode(shown, display) if r["phase_margin_deg"] is not None]
+    rows = [r for r in of_mode(results, display) if r["phase_margin_deg"] is not None]
     keys = ("gain_margin_db", "phase_margin_deg", "delay_margin_ms")
     return str(table("Margins", columns, [("", [_line(r, display, [number(r[key]) for key in keys]) for r in rows])]))
 

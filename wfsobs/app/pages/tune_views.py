@@ -62,23 +62,23 @@ class HistoryFigure:
         self._best.glyph.update(line_color=look("fitted").colour(dark))
 
 
-def unit_for(tuned: TuningResult | None, display: Display) -> str:
+def unit_for(result: TuningResult | None, display: Display) -> str:
     """Choose the unit: the one shown, or nm where it is an angle and the modes have none."""
-    modes = (tuned.before.validation or tuned.after.validation) if tuned else None
+    modes = (result.before.validation or result.after.validation) if result else None
     angles = modes is None or set(modes.modes) <= {mode.name for mode in TIP_TILT}
     return "nm" if display.unit in NO_ANGLE and not angles else display.unit
 
 
-def tuning_html(tuned: TuningResult, display: Display, diameter: float) -> str:
+def tuning_html(result: TuningResult, display: Display, diameter: float) -> str:
     """Write settings, errors and likelihoods before and after."""
-    unit = unit_for(tuned, display)
+    unit = unit_for(result, display)
     scale = per_micrometre(unit, diameter)
     groups = [
-        (TITLES[section].format(measure=tuned.measure, unit=UNITS[unit]), [_row(*row, scale) for row in found])
-        for section, found in groupby(tuning_rows(tuned), key=lambda row: row[0])
+        (TITLES[section].format(measure=result.measure, unit=UNITS[unit]), [_row(*row, scale) for row in found])
+        for section, found in groupby(tuning_rows(result), key=lambda row: row[0])
     ]
     columns = {"What": "", "Before": "", "After": "", "Change [%]": ""}
-    notes = [f"{line}." for line in tuning_remarks(tuned) if "likelihood" not in line]
+    notes = [f"{line}." for line in tuning_remarks(result) if "likelihood" not in line]
     return f"{table('Before and after', columns, groups)}{macro('texts', 'text', notes)}"
 
 

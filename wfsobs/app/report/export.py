@@ -22,7 +22,7 @@ def export(
     vary: Sequence[Variation] = (),
     preset: str = "paper",
     watch: Watch = QUIET,
-    done: Callable[[Result], None] = lambda result: None,
+    on_result: Callable[[Result], None] = lambda result: None,
 ) -> None:
     """Run a scenario and write a report: one HTML file with figures and numbers that opens without a network.
 
@@ -38,7 +38,7 @@ def export(
         Preset that the report compares the settings with.
     watch : Watch, optional
         Receives the progress, and is asked at every block of work whether to stop.
-    done : callable, optional
+    on_result : callable, optional
         Receives every result.
 
     Raises
@@ -55,7 +55,7 @@ def export(
     kept = []
     for i, one in enumerate(chosen):
         result = run(one, watch=Watch(lambda f, i=i: watch.progress((i + f) / len(chosen)), watch.is_cancelled))
-        done(result)
+        on_result(result)
         kept.append(state_of(result, len(chosen)))
     content = page(Report(preset, scenario, tuple(vary), tuple(kept)), datetime.now().astimezone()).encode()
     write_whole(path, lambda file: file.write(content))

@@ -35,8 +35,8 @@ START = 'document.documentElement.classList.add("js")'
 """Run before anything is drawn: what is for scripts alone may show."""
 
 
-def page(report: Report, made: datetime) -> str:
-    """Write the whole file; made: now, in the zone to write it in."""
+def page(report: Report, date: datetime) -> str:
+    """Write the whole file; date: now, in the zone to write it in."""
     bokeh = "\n".join(Resources(mode="inline", components=["bokeh"], minified=True, log_level="warn").js_raw)
     scripts = {"start": START, "bokeh": bokeh, "page": f"{asset('strip.js')}\n{asset('report.js')}"}
     names = [state_name(report, state, i) or "All modes" for i, state in enumerate(report.states)]
@@ -45,7 +45,7 @@ def page(report: Report, made: datetime) -> str:
         "report/page.html",
         version=__version__,
         report=report,
-        summary=summary(report, made),
+        summary=summary(report, date),
         policy=_policy(*scripts.values()),
         scripts={name: Markup(script) for name, script in scripts.items()},
         sheets={"shared": Markup(asset("style.css") + asset("strip.css")), "own": Markup(asset("report.css"))},
@@ -65,7 +65,7 @@ def page(report: Report, made: datetime) -> str:
         embedded={"rows": _rows(report), "data": _data(report), "figures": _figures(report)},
         **scenario_values(report),
         **meaning_values(report),
-        **origin_values(report, made),
+        **origin_values(report, date),
     )
 
 

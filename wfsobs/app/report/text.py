@@ -22,7 +22,7 @@ LONGEST = 8000
 FILE = "wfsobs.toml"
 
 
-def summary(report: Report, made: datetime) -> str:
+def summary(report: Report, date: datetime) -> str:
     """Say in one line what this is."""
     base, count = report.base, len(changed_settings(report.base, reference_preset(report.preset)))
     length = report.states[0].grid.n * report.states[0].grid.dt
@@ -31,7 +31,7 @@ def summary(report: Report, made: datetime) -> str:
         f"{length:g} s at {base.sensors.lgs_rate:g} Hz",
         "of a loaded record" if report.is_recorded else f"seed {base.run.seed}",
         *([f"{len(report.states)} variations"] if len(report.states) > 1 else []),
-        f"made {made:%Y-%m-%d %H:%M %Z}".rstrip() + f" with wfsobs {__version__}",
+        f"made {date:%Y-%m-%d %H:%M %Z}".rstrip() + f" with wfsobs {__version__}",
     ]
     return " · ".join(parts)
 
@@ -122,10 +122,10 @@ def meaning_values(report: Report) -> dict[str, Any]:
     }
 
 
-def origin_values(report: Report, made: datetime) -> dict[str, Any]:
+def origin_values(report: Report, date: datetime) -> dict[str, Any]:
     """Collect versions, date, seed, and the command that makes the report again."""
     command, by_file = (f"wfsobs observe RECORD --config {FILE}", True) if report.is_recorded else command_of(report)
-    facts = {"Program": f"wfsobs {__version__}, {machine(('bokeh',))}", "Made": f"{made:%Y-%m-%d %H:%M:%S %Z}".rstrip()}
+    facts = {"Program": f"wfsobs {__version__}, {machine(('bokeh',))}", "Made": f"{date:%Y-%m-%d %H:%M:%S %Z}".rstrip()}
     if not report.is_recorded:
         facts["Seed"] = str(report.base.run.seed)
     return {"facts": facts, "command": command, "by_file": by_file}

@@ -40,21 +40,21 @@ def word(event: Event, scenario: Scenario) -> str:
     return f"{100 * event.share:g} % {event.sensor.upper()} lost"
 
 
-def events_of(shown: RunResults) -> list[Event]:
+def events_of(results: RunResults) -> list[Event]:
     """By their start, of the simulation; a record that was loaded has none."""
-    return [] if shown.simulation is None else sorted(shown.simulation.events, key=lambda e: e.start)
+    return [] if results.simulation is None else sorted(results.simulation.events, key=lambda e: e.start)
 
 
-def room(shown: RunResults) -> float:
+def room(results: RunResults) -> float:
     """Compute the height of the words above the lines, as a share of the axis."""
-    return 0.1 * (1 + max(levels(shown), default=-1))
+    return 0.1 * (1 + max(levels(results), default=-1))
 
 
-def levels(shown: RunResults) -> list[int]:
+def levels(results: RunResults) -> list[int]:
     """How many lines below the top the word of each event stands, so that none stands in the one before."""
     out, before = [], -math.inf
-    for event in events_of(shown):
-        near = event.start - before < WORD * shown.scenario.run.duration
+    for event in events_of(results):
+        near = event.start - before < WORD * results.scenario.run.duration
         out.append((out[-1] + 1) % LEVELS if near else 0)
         before = event.start
     return out
@@ -75,9 +75,9 @@ class EventMarks:
         fig.add_glyph(self.jumps, self._line)
         fig.add_glyph(self.words, self._text, level="overlay")
 
-    def draw(self, shown: RunResults, dark: bool) -> None:
+    def draw(self, results: RunResults, dark: bool) -> None:
         """Show those of the results."""
-        events = events_of(shown)
+        events = events_of(results)
         lasting = [e for e in events if e.duration > 0]
         send(self.jumps, {"x": [e.start for e in events if not e.duration > 0]})
         send(self.spans, {"start": [e.start for e in lasting], "end": [e.start + e.duration for e in lasting]})
@@ -87,8 +87,8 @@ class EventMarks:
             {
                 "x": [e.start for e in events],
                 "y": [top] * len(events),
-                "text": [word(e, shown.scenario) for e in events],
-                "below": [2 + LINE_PX * level for level in levels(shown)],
+                "text": [word(e, results.scenario) for e in events],
+                "below": [2 + LINE_PX * level for level in levels(results)],
             },
         )
         self.restyle(dark)

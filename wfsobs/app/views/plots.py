@@ -78,11 +78,11 @@ def _same(a: Any, b: Any) -> bool:
     return np.array_equal(a, b, equal_nan=True) if isinstance(b, np.ndarray) else list(a) == list(b)
 
 
-def restyle(lines: dict[str, GlyphRenderer], dark: bool, hidden: list[str]) -> None:
+def restyle(lines: dict[str, GlyphRenderer], dark: bool, hidden_names: list[str]) -> None:
     """Give every line the colour of the mode, and hide those that are to be hidden."""
     for name, line in lines.items():
         line.glyph.line_color = look(name).colour(dark)  # type: ignore[union-attr]
-        line.visible = name not in hidden
+        line.visible = name not in hidden_names
 
 
 class PinnedLines:

@@ -27,10 +27,10 @@ class SpectraFigures(TargetFigures):
         self.spectra = {target: _Spectrum(target, self.x_range) for target in TARGETS}
         super().__init__(run, display, self.spectra, ["mode", "show", "unit", "spectrum", "pinned"])
 
-    def _draw(self, shown: RunResults) -> None:
+    def _draw(self, results: RunResults) -> None:
         for spectrum in self.spectra.values():
-            spectrum.draw(shown, self.display)
-        frequencies = next((s.frequency for s in shown.spectra.values()), None)
+            spectrum.draw(results, self.display)
+        frequencies = next((s.frequency for s in results.spectra.values()), None)
         if frequencies is not None:
             limits = {"start": float(frequencies[1]), "end": float(frequencies[-1])}
             if self.x_range.reset_start != limits["start"] or self.x_range.reset_end != limits["end"]:
@@ -69,12 +69,12 @@ class _Spectrum:
         model = self.figure.add_glyph(self.model, VSpan(x="x", line_color=MODEL, line_dash=[4, 3], line_width=1.5))
         self.figure.add_tools(HoverTool(renderers=[peaks, model], tooltips="@text"))
 
-    def draw(self, shown: RunResults, display: Display) -> None:
+    def draw(self, results: RunResults, display: Display) -> None:
         """Send every line, its axis and the marks."""
-        diameter = shown.scenario.telescope.diameter
+        diameter = results.scenario.telescope.diameter
         drawn: list[Array] = []
         for name, source in self.sources.items():
-            spectrum = shown.spectra.get((name, self.target))
+            spectrum = results.spectra.get((name, self.target))
             if spectrum is None:
                 send(source, {"x": [], "y": []})
                 continue
@@ -88,7 +88,7 @@ class _Spectrum:
         )
         self.figure.yaxis.axis_label = f"{what}, {display.mode_label} [{unit}]"
         if self.target == VIBRATION:
-            self._draw_marks(shown)
+            self._draw_marks(results)
 
     def draw_pinned(self, display: Display) -> list[Array]:
         """Send the pinned run's visible lines; what was sent."""
@@ -110,9 +110,9 @@ class _Spectrum:
             room, decades = (1.5, DECADES / 2) if cumulative else (3.0, DECADES)
             self.figure.y_range.update(start=max(low / room, high * 10.0**-decades), end=high * room)
 
-    def _draw_marks(self, shown: RunResults) -> None:
-        simulated = shown.result.record.vibration is not None  # peaks of the settings are not those of a record
-        drawn, kalman = marked_peaks(shown.scenario) if simulated else [], shown.scenario.kalman
+    def _draw_marks(self, results: RunResults) -> None:
+        simulated = results.result.record.vibration is not None  # peaks of the settings are not those of a record
+        drawn, kalman = marked_peaks(results.scenario) if simulated else [], results.scenario.kalman
         send(
             self.peaks,
             {

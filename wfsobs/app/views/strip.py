@@ -46,38 +46,38 @@ class Strip:
         observers = [self._observer(name, shown) for name in observers_of(self.target)]
         return [self._truth(shown), *observers]
 
-    def _observer(self, name: str, shown: RunResults | None) -> dict[str, Any]:
-        score = find(shown, name, self.target, self.display.mode) if shown else None
-        if shown is None or score is None:
-            if shown is not None and shown.result.estimate(name, self.target) is not None:
-                return self._without_truth(name, shown)
+    def _observer(self, name: str, results: RunResults | None) -> dict[str, Any]:
+        score = find(results, name, self.target, self.display.mode) if results else None
+        if results is None or score is None:
+            if results is not None and results.result.estimate(name, self.target) is not None:
+                return self._without_truth(name, results)
             waiting = self.run.state == RUNNING
             return self._card(name, None, "computing …" if waiting else "no result")
-        return self._score_fields(name, score, shown, "truth")
+        return self._score_fields(name, score, results, "truth")
 
-    def _score_fields(self, name: str, score: Score, shown: RunResults, base: str) -> dict[str, Any]:
+    def _score_fields(self, name: str, score: Score, results: RunResults, base: str) -> dict[str, Any]:
         relative = f"{score.normalised_rms:.2f} × {base}" if score.normalised_rms is not None else ""
-        return self._card(name, self._in_unit(score.rms, shown), own_interval(score_rows([score], None)[0]) or relative)
+        return self._card(name, self._in_unit(score.rms, results), own_interval(score_rows([score], None)[0]) or relative)
 
-    def _without_truth(self, name: str, shown: RunResults) -> dict[str, Any]:
+    def _without_truth(self, name: str, results: RunResults) -> dict[str, Any]:
         """How well the next measurement is predicted, by whoever says what it will be."""
-        score = find(shown, name, PREDICTION, self.display.mode)
-        return self._score_fields(name, score, shown, "z, next z") if score else self._card(name, None, "no truth")
+        score = find(results, name, PREDICTION, self.display.mode)
+        return self._score_fields(name, score, results, "z, next z") if score else self._card(name, None, "no truth")
 
-    def _truth(self, shown: RunResults | None) -> dict[str, Any]:
+    def _truth(self, results: RunResults | None) -> dict[str, Any]:
         of = (self.target, self.display.mode)
-        scores = [s for s in shown.result.scores if (s.target, s.mode) == of and not s.apart] if shown else []
-        if shown is None or not scores:
-            left = find(shown, LOOP, RESIDUAL, self.display.mode) if shown else None
-            return self._loop(left, shown) if shown and left else self._card(TRUTH, None, "")
-        return self._card(TRUTH, self._in_unit(scores[0].truth_rms, shown), "rms")
+        scores = [s for s in results.result.scores if (s.target, s.mode) == of and not s.apart] if results else []
+        if results is None or not scores:
+            left = find(results, LOOP, RESIDUAL, self.display.mode) if results else None
+            return self._loop(left, results) if results and left else self._card(TRUTH, None, "")
+        return self._card(TRUTH, self._in_unit(scores[0].truth_rms, results), "rms")
 
-    def _loop(self, left: Score, shown: RunResults) -> dict[str, Any]:
+    def _loop(self, left: Score, results: RunResults) -> dict[str, Any]:
         """Describe the recorded loop's residual, in the place of the truth, which has no line either."""
-        return self._score_fields(TRUTH, left, shown, "z, residual") | {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
+        return self._score_fields(TRUTH, left, results, "z, residual") | {"label": NOT_OBSERVERS[LOOP], "colour": "transparent"}
 
-    def _in_unit(self, value: float, shown: RunResults) -> float:
-        return value * per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
+    def _in_unit(self, value: float, results: RunResults) -> float:
+        return value * per_micrometre(self.display.unit, results.scenario.telescope.diameter)
 
     def _card(self, name: str, value: float | None, note: str) -> dict[str, Any]:
         it = look(name)

@@ -30,9 +30,9 @@ from wfsobs.observers.base import TARGETS
 BEST, ABOVE = macro("tag", "best", "best"), macro("tag", "above", "above truth")
 
 
-def find(shown: RunResults, observer: str, target: str, mode: str) -> Score | None:
+def find(results: RunResults, observer: str, target: str, mode: str) -> Score | None:
     """Find the score of one observer, target and mode; None if there is none."""
-    return next((s for s in shown.result.scores if (s.observer, s.target, s.mode) == (observer, target, mode)), None)
+    return next((s for s in results.result.scores if (s.observer, s.target, s.mode) == (observer, target, mode)), None)
 
 
 class Table:
@@ -96,7 +96,7 @@ class Table:
         shown = self.run.result
         scores = {
             name: find(shown, name, target, self.display.mode) if shown else None
-            for name in (*observers_of(target, hidden=True), BOUND)
+            for name in (*observers_of(target, with_hidden=True), BOUND)
         }
         best = min((s.rms for n, s in scores.items() if s and can_be_best(n, s.apart)), default=None)
         order = list(scores.items())

@@ -50,7 +50,7 @@ class TargetFigures:
             with pn.io.hold():
                 self._draw(shown)
 
-    def _draw(self, shown: RunResults) -> None:
+    def _draw(self, results: RunResults) -> None:
         """Send the data of every figure."""
         raise NotImplementedError
 

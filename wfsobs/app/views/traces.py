@@ -48,15 +48,15 @@ class Traces(TargetFigures):
         for end in ("start", "end"):
             self.x_range.on_change(end, self._on_move)
 
-    def _draw(self, shown: RunResults) -> None:
-        record = shown.result.record
+    def _draw(self, results: RunResults) -> None:
+        record = results.result.record
         length = record.n_steps * record.dt
         if length != self.length:
             self.length = length
             self.x_range.update(start=0.0, end=length, reset_start=0.0, reset_end=length)
         first, last = self._window(record.n_steps, record.dt)
         for trace in self.traces.values():
-            trace.draw(shown, self.display, first, last)
+            trace.draw(results, self.display, first, last)
 
     def _window(self, n_steps: int, dt: float) -> tuple[int, int]:
         """Find the samples to send: those in view and a margin."""
@@ -102,19 +102,19 @@ class _Trace:
         self.faint = PinnedLines(self.figure)
         self.events = EventMarks(self.figure)
 
-    def draw(self, shown: RunResults, display: Display, first: int, last: int) -> None:
+    def draw(self, results: RunResults, display: Display, first: int, last: int) -> None:
         """Send the samples first ... last - 1 of every line."""
-        scale = per_micrometre(display.unit, shown.scenario.telescope.diameter)
-        data: dict[str, Any] = {"x": envelope_times(first, last, BINS, shown.result.record.dt)}
+        scale = per_micrometre(display.unit, results.scenario.telescope.diameter)
+        data: dict[str, Any] = {"x": envelope_times(first, last, BINS, results.result.record.dt)}
         for name in self.names:
-            values = _line(shown, name, self.target, display, first, last)
+            values = _line(results, name, self.target, display, first, last)
             data[name] = (scale * envelope(values, BINS)).astype(np.float32)
         send(self.source, data)
-        warm_up = shown.scenario.run.warm_up
+        warm_up = results.scenario.run.warm_up
         self.warm_up.right = warm_up
         settled = warm_up + WINDOW_S * display.running
-        self._fit(data, settled, self._draw_pinned(display, data["x"]), room(shown))
-        self.events.draw(shown, display.dark)
+        self._fit(data, settled, self._draw_pinned(display, data["x"]), room(results))
+        self.events.draw(results, display.dark)
         what = f"{'running rms of ' if display.running else ''}{'error of ' if display.error else ''}{display.mode_label}"
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
 
@@ -133,13 +133,13 @@ class _Trace:
         self.faint.draw(lines, display.dark)
         return lines
 
-    def _fit(self, data: dict[str, Any], warm_up: float, pinned: dict[str, tuple[Array, Array]], above: float) -> None:
+    def _fit(self, data: dict[str, Any], warm_up: float, pin_lines: dict[str, tuple[Array, Array]], above: float) -> None:
         """Have the axis hold every visible line; what a filter does while it settles does not count."""
         counted = data["x"] >= warm_up
         if not counted.any():
             counted[:] = True
         lines = [data[name][counted] for name, line in self.lines.items() if line.visible]
-        lines += [y[x >= warm_up] for x, y in pinned.values()]
+        lines += [y[x >= warm_up] for x, y in pin_lines.values()]
         values = np.concatenate(lines) if lines else np.empty(0)
         values = values[np.isfinite(values)]
         if values.size:
@@ -155,13 +155,13 @@ def _times_of_envelope(times: Array) -> Array:
     return np.interp(envelope_times(0, times.size, BINS, 1.0), np.arange(times.size), times)
 
 
-def _line(shown: RunResults, name: str, target: str, display: Display, first: int, last: int) -> Array:
+def _line(results: RunResults, name: str, target: str, display: Display, first: int, last: int) -> Array:
     """Compute the samples of one line [um], NaN where there is nothing to draw."""
-    values, truth = shown.values(name, target), shown.values(TRUTH, target)
+    values, truth = results.values(name, target), results.values(TRUTH, target)
     nothing = np.full(last - first, np.nan)
     if values is None:
         return nothing
-    n = max(round(WINDOW_S / shown.result.record.dt), 1)
+    n = max(round(WINDOW_S / results.result.record.dt), 1)
     before = min(n - 1, first) if display.running else 0
     cut = slice(first - before, last), slice(display.column, display.column + 1)
     if not display.error:
