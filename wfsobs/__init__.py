@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from wfsobs.scenario.presets import PRESETS
     from wfsobs.settings.group import SettingError
     from wfsobs.simulation.loop import simulate
+    from wfsobs.stepping import design
     from wfsobs.telemetry.records import load
     from wfsobs.tuning.tuning import tune
 
@@ -32,6 +33,7 @@ __version__ = "0.2.0"
 _HOMES = {
     "export": "app.report.export",
     "close_loop": "closed_loop.run",
+    "design": "stepping",
     "score": "evaluation.scores",
     "identify": "identification.identification",
     "Result": "pipeline",
@@ -57,6 +59,7 @@ __all__ = [
     "Scenario",
     "SettingError",
     "close_loop",
+    "design",
     "export",
     "identify",
     "load",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,20 @@ DELAY = 2
 
 class RecordError(ValueError):
     """Error: a record that cannot be used; one line naming what, where and what is expected."""
+
+
+class Sampling(NamedTuple):
+    """What of a loop an observer is designed for.
+
+    n_modes : number of modes;  dt : fast step [s]
+    ratio   : fast steps per NGS frame, None without NGS
+    delay   : steps from a command to the first measurement that sees it
+    """
+
+    n_modes: int
+    dt: float
+    ratio: int | None = None
+    delay: int = DELAY
 
 
 @dataclass(frozen=True)
@@ -79,6 +94,11 @@ class Signals:
     def n_modes(self) -> int:
         """Number of Zernike modes."""
         return self.y_lgs.shape[1]
+
+    @property
+    def sampling(self) -> Sampling:
+        """Modes, step, NGS ratio and delay."""
+        return Sampling(self.n_modes, self.dt, self.ratio, self.delay)
 
     @property
     def missing(self) -> int:

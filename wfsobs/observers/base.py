@@ -10,10 +10,11 @@ from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, NamedTuple
 
-from wfsobs.observers.missing import LINE_WIDTH, fill_missing
+from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
+from wfsobs.observers.step import MakeEstimator, StepError, StepObserver
 from wfsobs.prior import PARTS, Part, Prior
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Measurements, Record
+from wfsobs.record import Measurements, Record, Sampling
 from wfsobs.settings import Group, Section
 from wfsobs.typing import Array
 
@@ -108,6 +109,8 @@ class Observer:
         (settings, n_steps, n_modes, dt [s]) -> estimated time [s]; None for one as fast as a Kalman filter.
     look : Look
         Line in figures.
+    step : callable or None
+        (prior, settings, sampling, horizon) -> its estimator, one frame at a time (`wfsobs.observers.step`); None without one.
     """
 
     id: str
@@ -125,6 +128,7 @@ class Observer:
     weight: float = 1.0
     seconds: Callable[[Any, int, int, float], float] | None = None
     look: Look = PLAIN
+    step: MakeEstimator | None = None
 
     def missing(self, record: Record) -> tuple[str, ...]:
         """Return the needed fields that a record does not have."""
@@ -160,6 +164,41 @@ class Observer:
         """
         whole = fill_missing(measurements, prior, getattr(settings, "line_width", LINE_WIDTH))
         return self.run(whole, prior, settings, watch)
+
+    def design(self, prior: Prior, settings: Group | None, sampling: Sampling, horizon: float = 0.0) -> StepObserver:
+        """Return the observer one frame at a time; missing samples are filled as in `estimate`.
+
+        Parameters
+        ----------
+        prior : Prior
+            What it needs beside measurements.
+        settings : Group or None
+            Its own settings.
+        sampling : Sampling
+            Modes, step, NGS ratio and delay of the loop.
+        horizon : float
+            Frames ahead that predictions are wanted for.
+
+        Returns
+        -------
+        StepObserver
+            Before its first frame.
+
+        Raises
+        ------
+        ValueError
+            There is none; one line with the reason.
+        """
+        if self.step is None:
+            why = "has no step interface" if self.causal else "looks ahead: it cannot run frame by frame"
+            raise StepError(f"{self.id}: {why}")
+        needs_ngs = "y_ngs" in self.needs
+        if needs_ngs and sampling.ratio is None:
+            raise StepError(f"{self.id}: needs NGS frames: a sampling with their ratio")
+        width = getattr(settings, "line_width", LINE_WIDTH)
+        lgs, ngs = bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio, width)
+        estimator = self.step(prior, settings, sampling, horizon)
+        return StepObserver(self.id, self.targets, estimator, sampling, lgs, ngs if needs_ngs else None)
 
     @property
     def group(self) -> str | None:

@@ -8,8 +8,9 @@ Only samples before a gap fill it, so estimates stay causal, and what has been f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from math import inf
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -18,6 +19,7 @@ from wfsobs.prior import Prior
 from wfsobs.record import Signals, delay_signal, frame_mean, hold_last
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import DisturbanceModel
+from wfsobs.signal.stepping import FilterBank, Gain, GainCycle, Saved
 from wfsobs.typing import Array
 
 S = TypeVar("S", bound=Signals)
@@ -39,15 +41,16 @@ def fill_missing(signals: S, prior: Prior, line_width: float = LINE_WIDTH) -> S:
     y_lgs, open_loop_y, y_ngs = signals.y_lgs, signals.open_loop_y, signals.y_ngs
     if np.isnan(y_lgs).any():
         mirror = delay_signal(u, signals.delay)
-        y_lgs = predict_missing(y_lgs - mirror, _of_lgs(prior, line_width)) + mirror
+        y_lgs = np.where(np.isnan(y_lgs), predict_missing(y_lgs - mirror, _of_lgs(prior, line_width)) + mirror, y_lgs)
     if open_loop_y is not None and np.isnan(open_loop_y).any():
         open_loop_y = predict_missing(open_loop_y, _of_lgs(prior, line_width))
     if y_ngs is not None and signals.ratio is not None and np.isnan(y_ngs[signals.ratio :: signals.ratio]).any():
         n = signals.ratio
         mirror = frame_mean(delay_signal(u, signals.delay - 1), n)[n::n]
         y_ngs = y_ngs.copy()
-        frames = [Predictor(m.at(n * signals.dt).disturbance(), m.ngs_noise) for m in prior.model]
-        y_ngs[n::n] = predict_missing(y_ngs[n::n] - mirror, frames) + mirror
+        frames = y_ngs[n::n]
+        whole = predict_missing(frames - mirror, _of_ngs(prior, n * signals.dt)) + mirror
+        y_ngs[n::n] = np.where(np.isnan(frames), whole, frames)
     return replace(signals, y_lgs=y_lgs, u=u, y_ngs=y_ngs, open_loop_y=open_loop_y)
 
 
@@ -58,21 +61,87 @@ def _of_lgs(prior: Prior, line_width: float) -> list[Predictor]:
     return [Predictor(m.disturbance(line_width), m.noise) for m in prior.lines]
 
 
+def _of_ngs(prior: Prior, dt: float) -> list[Predictor]:
+    """Return the model of every mode at the rate of NGS frames, `dt` [s] each; empty where the prior has no model."""
+    return [Predictor(m.at(dt).disturbance(), m.ngs_noise) for m in prior.model]
+
+
 def predict_missing(z: Array, predictors: Sequence[Predictor]) -> Array:
     """Replace every NaN of z (n, n_modes) by the prediction of the steady-state Kalman filter of that mode's model.
 
     Without models, or where a model has no such filter, the last measurement is held.
     """
-    out = hold_last(z).copy()
-    for mode, (model, noise) in enumerate(predictors):
-        try:
-            K = model.A @ steady_state(model.A, model.C, model.Q, np.array(noise**2)).L[:, 0]
-        except ValueError:
-            continue
-        x = np.zeros(len(model.A))
-        for k, gone in enumerate(np.isnan(z[:, mode])):
-            expected = model.C @ x
-            if gone:
-                out[k, mode] = expected
-            x = model.A @ x + K * (out[k, mode] - expected)
+    if not predictors:
+        return hold_last(z)
+    bridge = Bridge(z.shape[1], predictors)
+    return np.array([bridge.complete(row) for row in z])
+
+
+class Bridge:
+    """`predict_missing`, one frame at a time."""
+
+    def __init__(self, n_modes: int, predictors: Sequence[Predictor] = ()):
+        found = [(mode, gains) for mode, one in enumerate(predictors) if (gains := _gains(one)) is not None]
+        self._modes = np.array([mode for mode, _ in found], dtype=int)
+        self._bank = FilterBank([gains.estimator() for _, gains in found]) if found else None
+        self._rows = expected_rows([gains for _, gains in found])
+        self._last = np.zeros(n_modes)
+
+    def complete(self, z: Array) -> Array:
+        """Return z (n_modes,) [um] with its NaN replaced; z itself where it has none."""
+        if not z.dot(z) < inf:
+            z = np.where(np.isnan(z), self._expectation(), z)
+        self._last[...] = z
+        if self._bank is not None:
+            self._bank.step(z[self._modes, None])
+        return z
+
+    def _expectation(self) -> Array:
+        out = self._last.copy()
+        if self._bank is not None:
+            out[self._modes] = np.sum(self._rows * self._bank.x, axis=1)
+        return out
+
+    def take_over(self, old: Bridge) -> None:
+        """Go on from the state of another one, as far as it is of the same kind."""
+        self._last[...] = old._last
+        if self._bank is not None and old._bank is not None and self._bank.x.shape == old._bank.x.shape:
+            self._bank.load(old._bank.save())
+
+    def reset(self) -> None:
+        """Set the state back to the start."""
+        self._last[...] = 0.0
+        if self._bank is not None:
+            self._bank.reset()
+
+    def save(self) -> Saved:
+        """Return a copy of the state."""
+        return {"last": self._last.copy()} | ({} if self._bank is None else self._bank.save())
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        self._last[...] = state["last"]
+        if self._bank is not None:
+            self._bank.load(state)
+
+
+def bridges(prior: Prior, n_modes: int, dt: float, ratio: int | None, line_width: float = LINE_WIDTH) -> tuple[Bridge, Bridge]:
+    """Return the bridges of LGS measurements and of NGS frames that `fill_missing` uses for a prior."""
+    return Bridge(n_modes, _of_lgs(prior, line_width)), Bridge(n_modes, _of_ngs(prior, ratio * dt) if ratio else ())
+
+
+def expected_rows(gains: Sequence[GainCycle]) -> Array:
+    """Rows (n_modes, n) that give from x_hat[k-1] what the LGS measurement of step k is expected to be [um]."""
+    rows = [(one.steps[0].C[0] @ one.steps[-1].A) for one in gains]
+    out = np.zeros((len(rows), max(map(len, rows), default=0)))
+    for row, values in zip(out, rows, strict=True):
+        row[: len(values)] = values
     return out
+
+
+def _gains(predictor: Predictor) -> GainCycle | None:
+    model, noise = predictor
+    try:
+        return GainCycle([Gain(model.A, np.atleast_2d(model.C), steady_state(model.A, model.C, model.Q, np.array(noise**2)).L)])
+    except ValueError:
+        return None

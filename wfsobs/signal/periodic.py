@@ -16,6 +16,9 @@ import numpy as np
 
 from wfsobs.typing import Array
 
+FilterStep = tuple[Array, Array, Array, Array]
+"""(F, G, H, J) of one step: F (n, n), G (n, m), H (p, n), J (p, m)."""
+
 BLOCK = 48
 """Approximate steps per block; the work per step grows with it, the number of blocks falls."""
 
@@ -27,10 +30,10 @@ class PeriodicFilter:
     Attributes
     ----------
     steps : sequence of tuple
-        One tuple (F, G, H, J) per step of the cycle: F (n, n), G (n, m), H (p, n), J (p, m).
+        One tuple (F, G, H, J) per step of the cycle.
     """
 
-    steps: Sequence[tuple[Array, Array, Array, Array]]
+    steps: Sequence[FilterStep]
 
     def cycle_matrix(self) -> Array:
         """Return the product of the F over one cycle, (n, n); the filter is stable if its spectral radius is below 1."""

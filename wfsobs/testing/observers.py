@@ -20,9 +20,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.testing.common import QUICK, SAME, CheckError, change_from, in_a_fresh_process
-from wfsobs.typing import Array
-
-Estimates = dict[str, Array]
+from wfsobs.testing.steps import Estimates, check_steps
 
 
 def check_observer(observer: Observer, scenario: Scenario | None = None, alone: bool = True) -> None:
@@ -30,7 +28,8 @@ def check_observer(observer: Observer, scenario: Scenario | None = None, alone: 
 
     It returns every target that it names, as numbers of the shape of the measurements; the same twice; unless it is marked as not
     causal, no later sample changes an estimate; it does not change its arguments; it works with
-    missing samples; and in a fresh process, which has never had the truth, its estimates are the same.
+    missing samples; where it can run frame by frame, its estimates are then the same; and in a fresh process, which has never had
+    the truth, its estimates are the same.
 
     Parameters
     ----------
@@ -61,6 +60,7 @@ def check_observer(observer: Observer, scenario: Scenario | None = None, alone: 
     if observer.causal:
         _check_causal(observer, given, base)
     _check_gaps(observer, given)
+    check_steps(observer, *given)
     if alone:
         _compare(
             observer,

@@ -6,10 +6,11 @@ The filter is that of `kalman.single`, its model one AR(2) per line of the vibra
 from __future__ import annotations
 
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
-from wfsobs.observers.kalman.single import by_target, steady_filter
+from wfsobs.observers.kalman.single import by_target, steady_filter, steady_mode
+from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.prior import Lines, Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements
+from wfsobs.record import Measurements, Sampling
 from wfsobs.settings import Group, Real, Section, Whole
 from wfsobs.typing import Array
 
@@ -43,6 +44,12 @@ def kf_multi(measured: Measurements, prior: Prior, settings: MultiPeak, watch: W
     return by_target(columns)
 
 
+def step_kf_multi(prior: Prior, settings: MultiPeak, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
+    """Return the filters of all modes, one frame at a time."""
+    modes = [steady_mode(one.disturbance(settings.line_width), one.noise) for one in prior.lines]
+    return KalmanEstimator(modes, bridges=True)
+
+
 KF_MULTI = Observer(
     "kf-multi",
     "Multi-peak KF",
@@ -53,4 +60,5 @@ KF_MULTI = Observer(
     settings=Section("multipeak", "Multi-peak Kalman filter", MultiPeak),
     tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
     look=Look("Multi-peak", "#00707F", "#4DD0E1", (14, 3)),
+    step=step_kf_multi,
 )

@@ -17,14 +17,16 @@ import numpy as np
 import param
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
-from wfsobs.observers.kalman.single import MODEL, NGS, by_target, filter_step
+from wfsobs.observers.kalman.single import MODEL, NGS, by_target
+from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
 from wfsobs.prior import Model, Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements
+from wfsobs.record import Measurements, Sampling
 from wfsobs.settings import Group, Real, Section
-from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.periodic import FilterStep, PeriodicFilter
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import DisturbanceModel
+from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 
 
@@ -78,7 +80,7 @@ def multirate_noise(settings: MultiRate, model: Model) -> tuple[float, float]:
 class MultiRateFilter:
     """first: (F, G, H, J) of step 0, which has no NGS frame; cycle: the steps from k = 1 on, the frame last."""
 
-    first: tuple[Array, Array, Array, Array]
+    first: FilterStep
     cycle: PeriodicFilter
 
     def run(self, z: Array) -> Array:
@@ -89,26 +91,40 @@ class MultiRateFilter:
         return np.vstack([J @ start, rest])
 
 
-def multirate_filter(
-    model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, outputs: Array | None = None
-) -> MultiRateFilter:
-    """Return the filter for an NGS frame every `ratio` steps; lgs_noise, ngs_noise: square roots of r [um].
+def filter_of_gains(gains: GainCycle, outputs: Array) -> MultiRateFilter:
+    """Return the filter with these outputs (p, n) of the state."""
+    assert gains.first is not None
+    return MultiRateFilter(gains.first.filter_step(outputs), gains.filter(outputs))
 
-    outputs : rows of the state x_hat[k] to return, (p, n); every target by default. Raises UnstableCycle.
+
+def multirate_gains(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float) -> GainCycle:
+    """Return the gains for an NGS frame every `ratio` steps; lgs_noise, ngs_noise: square roots of r [um].
+
+    Raises UnstableCycle.
     """
     C_lgs, C_both = np.atleast_2d(model.C), np.vstack([model.C, model.C])
     L_lgs = steady_state(model.A, C_lgs, model.Q, np.array(lgs_noise**2)).L
     L_both = steady_state(model.A, C_both, model.Q, np.diag([lgs_noise**2, ngs_noise**2])).L
-    rows = model.output_rows(TARGETS) if outputs is None else outputs
-    alone = filter_step(model.A, C_both, np.hstack([L_lgs, np.zeros_like(L_lgs)]), rows)
-    cycle = PeriodicFilter([*([alone] * (ratio - 1)), filter_step(model.A, C_both, L_both, rows)])
-    radius = np.abs(np.linalg.eigvals(cycle.cycle_matrix())).max()
+    alone = Gain(model.A, C_both, np.hstack([L_lgs, np.zeros_like(L_lgs)]))
+    gains = GainCycle([*([alone] * (ratio - 1)), Gain(model.A, C_both, L_both)], alone)
+    radius = np.abs(np.linalg.eigvals(gains.filter(np.zeros((0, len(model.A)))).cycle_matrix())).max()
     if radius >= 1.0:
         raise UnstableCycle(
             f"multi-rate filter: the cycle of {ratio} steps is unstable (spectral radius {radius:.3g}) with LGS noise "
             f"{lgs_noise * 1e3:.4g} nm and NGS noise {ngs_noise * 1e3:.4g} nm; bring the two closer together"
         )
-    return MultiRateFilter(alone, cycle)
+    return gains
+
+
+def multirate_filter(
+    model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, outputs: Array | None = None
+) -> MultiRateFilter:
+    """Return the filter of `multirate_gains`.
+
+    outputs : rows of the state x_hat[k] to return, (p, n); every target by default. Raises UnstableCycle.
+    """
+    gains = multirate_gains(model, ratio, lgs_noise, ngs_noise)
+    return filter_of_gains(gains, model.output_rows(TARGETS) if outputs is None else outputs)
 
 
 def run_modes(measured: Measurements, watch: Watch, make: Callable[[int], MultiRateFilter]) -> list[Array]:
@@ -134,6 +150,16 @@ def multirate(measured: Measurements, prior: Prior, settings: MultiRate, watch: 
     return {TURBULENCE: by_target(columns)[TURBULENCE]}
 
 
+def step_multirate(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:
+    """Return the filters of all modes, one frame at a time."""
+    assert sampling.ratio is not None
+    modes = []
+    for known in prior.model:
+        model = known.disturbance()
+        modes.append(ModeFilter(model, multirate_gains(model, sampling.ratio, *multirate_noise(settings, known))))
+    return KalmanEstimator(modes)
+
+
 MULTIRATE = Observer(
     "multirate",
     "Multi-rate KF",
@@ -145,4 +171,5 @@ MULTIRATE = Observer(
     needs=NGS,
     tunable=TUNABLE,
     look=Look("Multi-rate KF", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
+    step=step_multirate,
 )

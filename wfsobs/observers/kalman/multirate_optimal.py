@@ -14,15 +14,24 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, Look, Observer
-from wfsobs.observers.kalman.multirate import RATES, TUNABLE, MultiRate, MultiRateFilter, multirate_noise, run_modes
-from wfsobs.observers.kalman.single import NGS, by_target, filter_step
+from wfsobs.observers.kalman.multirate import (
+    RATES,
+    TUNABLE,
+    MultiRate,
+    MultiRateFilter,
+    filter_of_gains,
+    multirate_noise,
+    run_modes,
+)
+from wfsobs.observers.kalman.single import NGS, by_target
+from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
 from wfsobs.prior import LgsError, Model, Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements
+from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import SteadyState, Step, periodic_steady_state
 from wfsobs.signal.statespace import DisturbanceModel, process_model
+from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 
 
@@ -54,17 +63,23 @@ def optimal_cycle(
     return steps
 
 
-def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[MultiRateFilter, list[SteadyState]]:
-    """Return the filter of a cycle, and its covariances at steps 1 ... n; outputs (p, n_states) rows of the state.
+def optimal_gains(cycle: list[Step]) -> tuple[GainCycle, list[SteadyState]]:
+    """Return the gains of a cycle, and its covariances at steps 1 ... n.
 
     Step 0, before the first frame, measures the LGS alone and starts the frame anew.
     """
     states = periodic_steady_state(cycle)
-    steps = [filter_step(A, C, s.L, outputs) for (A, C, _, _), s in zip(cycle, states, strict=True)]
     A, C, _, R = cycle[-1]
     alone = C * [[1.0], [0.0]]
     L = np.linalg.solve(alone @ states[-1].P @ alone.T + R, alone @ states[-1].P).T
-    return MultiRateFilter(filter_step(A, alone, L, outputs), PeriodicFilter(steps)), states
+    steps = [Gain(A, C, s.L) for (A, C, _, _), s in zip(cycle, states, strict=True)]
+    return GainCycle(steps, Gain(A, alone, L)), states
+
+
+def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[MultiRateFilter, list[SteadyState]]:
+    """Return the filter of `optimal_gains` and the covariances; outputs (p, n_states) rows of the state."""
+    gains, states = optimal_gains(cycle)
+    return filter_of_gains(gains, outputs), states
 
 
 def optimal_model(
@@ -86,6 +101,16 @@ def multirate_optimal(measured: Measurements, prior: Prior, settings: MultiRate,
     return by_target(columns)
 
 
+def step_multirate_optimal(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:
+    """Return the filters of all modes, one frame at a time."""
+    assert sampling.ratio is not None
+    modes = []
+    for mode, known in enumerate(prior.model):
+        gains, states = optimal_gains(optimal_model(settings, prior, mode, sampling.ratio)[0])
+        modes.append(ModeFilter(known.disturbance(), gains, tuple(s.filtered for s in states)))
+    return KalmanEstimator(modes)
+
+
 MULTIRATE_OPTIMAL = Observer(
     "multirate-optimal",
     "Optimal multi-rate KF",
@@ -97,4 +122,5 @@ MULTIRATE_OPTIMAL = Observer(
     needs=NGS,
     tunable=TUNABLE,
     look=Look("Opt. multi-rate", "#7A1FA2", "#C9A0FF", (3, 2)),
+    step=step_multirate_optimal,
 )

@@ -13,13 +13,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
+from wfsobs.observers.kalman.step import FrameEstimator, KalmanEstimator, ModeFilter
 from wfsobs.prior import Model, Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements
+from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.riccati import SteadyState, steady_state
 from wfsobs.signal.statespace import DisturbanceModel
+from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
@@ -35,13 +37,10 @@ MIN_NOISE = 1e-6
 """Floor of a modelled measurement noise [um]: a filter for perfect measurements has no Riccati solution."""
 
 
-def filter_step(A: Array, C: Array, L: Array, outputs: Array) -> tuple[Array, Array, Array, Array]:
-    """Return (F, G, H, J) of one step with transition A (n, n), measurement rows C (m, n) and filter gain L (n, m).
-
-    The state is x_pred[k], the result outputs (p, n) times x_hat[k].
-    """
-    reduced = np.eye(len(A)) - L @ C
-    return A @ reduced, A @ L, outputs @ reduced, outputs @ L
+def steady_gains(model: DisturbanceModel, noise: float) -> tuple[GainCycle, SteadyState]:
+    """Return the gains of the steady-state filter of z (1 input), and its covariances; noise [um]."""
+    steady = steady_state(model.A, model.C, model.Q, np.array(noise**2))
+    return GainCycle([Gain(model.A, np.atleast_2d(model.C), steady.L)]), steady
 
 
 def steady_filter(model: DisturbanceModel, noise: float, outputs: Array | None = None) -> tuple[PeriodicFilter, SteadyState]:
@@ -49,9 +48,8 @@ def steady_filter(model: DisturbanceModel, noise: float, outputs: Array | None =
 
     outputs : rows of the state x_hat[k] to return, (p, n); every target by default
     """
-    steady = steady_state(model.A, model.C, model.Q, np.array(noise**2))
-    rows = model.output_rows(TARGETS) if outputs is None else outputs
-    return PeriodicFilter([filter_step(model.A, np.atleast_2d(model.C), steady.L, rows)]), steady
+    gains, steady = steady_gains(model, noise)
+    return gains.filter(model.output_rows(TARGETS) if outputs is None else outputs), steady
 
 
 def kf_lgs(measured: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
@@ -63,6 +61,17 @@ def kf_lgs(measured: Measurements, prior: Prior, _settings: None, watch: Watch) 
         kalman, _ = steady_filter(model.disturbance(), model.lgs_noise)
         columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
     return by_target(columns)
+
+
+def step_kf_lgs(prior: Prior, _settings: None, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
+    """Return the filters of all modes, one frame at a time."""
+    return KalmanEstimator([steady_mode(one.disturbance(), one.lgs_noise) for one in prior.model], bridges=True)
+
+
+def steady_mode(model: DisturbanceModel, noise: float) -> ModeFilter:
+    """Return the steady-state filter of a mode; noise [um]."""
+    gains, steady = steady_gains(model, noise)
+    return ModeFilter(model, gains, (steady.filtered,))
 
 
 def kf_ngs(measured: Measurements, prior: Prior, settings: Kalman, watch: Watch) -> dict[str, Array]:
@@ -89,19 +98,37 @@ def kf_ngs(measured: Measurements, prior: Prior, settings: Kalman, watch: Watch)
     return by_target(columns)
 
 
-def between_frames(process: Ar2, n: int, how: str) -> Array:
-    """Weights (n, 2) of the slow estimates i and i - 1, both given frame i, in those of the fast steps of slow step i.
+def step_kf_ngs(prior: Prior, settings: Kalman, sampling: Sampling, _horizon: float) -> FrameEstimator:
+    """Return the filters of all modes, one frame at a time."""
+    assert sampling.ratio is not None
+    n, how = sampling.ratio, settings.ngs_between_frames
+    modes = [
+        ModeFilter(m, steady_gains(m, noise)[0])
+        for m, noise in ((m.at(n * sampling.dt).disturbance(), m.ngs_noise) for m in prior.model)
+    ]
+
+    def spread(mode: int, target: str, since: int) -> Array:
+        model, at = prior.model[mode], TARGETS.index(target)
+        weights = between_frames((model.turbulence, model.vibration)[at], n, how, max(since + 1, n))[since]
+        return weights @ modes[mode].model.pairs[2 * at : 2 * at + 2]
+
+    return FrameEstimator(modes, spread, held=how == "hold")
+
+
+def between_frames(process: Ar2, n: int, how: str, steps: int | None = None) -> Array:
+    """Weights (steps, 2) of the slow estimates i and i - 1, both given frame i, in those of the fast steps from n i on.
 
     hold: (1, 0). propagate: the conditional mean of phi[n i + j] given the two slow means under the fast
-    model, Cov(phi, s) Cov(s)^-1.
+    model, Cov(phi, s) Cov(s)^-1. steps : the n of slow step i unless given.
     """
+    steps = n if steps is None else steps
     if how == "hold" or process.rms == 0:
-        return np.column_stack([np.ones(n), np.zeros(n)])
-    r = process.autocovariance(2 * n)
-    lag = np.abs(np.subtract.outer(np.arange(2 * n), np.arange(2 * n)))
-    covariance = r[lag]  # of fast steps n (i - 1) ... n (i + 1) - 1
+        return np.column_stack([np.ones(steps), np.zeros(steps)])
+    r = process.autocovariance(n + steps)
+    lag = np.abs(np.subtract.outer(np.arange(n + steps), np.arange(2 * n)))
+    covariance = r[lag]  # of fast steps n (i - 1) ... n i + steps - 1 with n (i - 1) ... n (i + 1) - 1
     means = np.kron(np.eye(2), np.full((1, n), 1.0 / n))[::-1]  # rows: slow step i, slow step i - 1
-    cross, between = covariance[n:] @ means.T, means @ covariance @ means.T
+    cross, between = covariance[n:] @ means.T, means @ covariance[: 2 * n] @ means.T
     return np.linalg.lstsq(between, cross.T, rcond=1e-14)[0].T
 
 
@@ -121,6 +148,7 @@ KF_LGS = Observer(
     # The gain depends on the ratios of turbulence, vibration and noise. Turbulence tuned for vibration would be no turbulence.
     tunable=Tunable((*MODEL[:2], "kalman.vibration_rms"), ("kalman.turbulence_rms", "kalman.lgs_noise")),
     look=Look("LGS KF", "#FF6600", "#FF8533"),
+    step=step_kf_lgs,
 )
 
 KF_NGS = Observer(
@@ -134,4 +162,5 @@ KF_NGS = Observer(
     needs=NGS,
     tunable=Tunable(("kalman.turbulence_rms", "kalman.vibration_rms"), (*MODEL[:2], "kalman.ngs_noise")),
     look=Look("NGS KF", "#003DE6", "#7AA2FF", (8, 2)),
+    step=step_kf_ngs,
 )

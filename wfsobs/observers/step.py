@@ -1,0 +1,254 @@
+"""An observer one frame at a time, as a real loop calls it.
+
+`StepObserver` is what a loop holds. It checks what comes in, completes missing measurements as `wfsobs.observers.missing` does
+over a record, and knows when an NGS frame is due; the rest is its `Estimator`, which every observer makes in its own module.
+After frame k `predict(0)` is row k of the observer's run over the record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from math import inf, isnan
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from wfsobs.observers.missing import Bridge
+from wfsobs.signal.stepping import Saved, Stateful, load_parts, save_parts
+from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.prior import Prior
+    from wfsobs.record import Sampling
+
+
+class StepError(ValueError):
+    """Error: a step that cannot be taken, or an observer that has none; one line with the reason."""
+
+
+class Estimator(Stateful, Protocol):
+    """The part of a step observer that differs from observer to observer; measurements reach it complete.
+
+    Attributes
+    ----------
+    horizon : float or None
+        Frames ahead that it was trained for; None where it predicts any.
+    needs_command : bool
+        Whether `advance` needs u.
+    bridges : bool
+        Whether a missing measurement takes what it expects itself (`expectation`), not what a filter beside it does.
+    """
+
+    horizon: float | None
+    needs_command: bool
+    bridges: bool
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame: z (n_modes,) [um]; ngs (n_modes,) [um] where an NGS frame is due; u (n_modes,) [um]."""
+        ...
+
+    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
+        """Return (mean, sd) of the target that many frames ahead, each (n_modes,) [um]. Raises StepError."""
+        ...
+
+    def expectation(self) -> Array:
+        """Return what the next measurement is expected to be, (n_modes,) [um]."""
+        ...
+
+    def take_over(self, old: Any) -> None:
+        """Go on from the state of another design of the same observer. Raises StepError."""
+        ...
+
+
+MakeEstimator = Callable[["Prior", Any, "Sampling", float], Estimator]
+"""(prior, settings, sampling, horizon) -> estimator. Raises ValueError with the reason where there is none."""
+
+
+class _Own:
+    """Completes a measurement by what the estimator itself expects: its correction vanishes."""
+
+    def __init__(self, estimator: Estimator):
+        self._expectation = estimator.expectation
+
+    def complete(self, z: Array) -> Array:
+        return z if z.dot(z) < inf else np.where(np.isnan(z), self._expectation(), z)
+
+    def reset(self) -> None:
+        return None
+
+    def save(self) -> Saved:
+        return {}
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        return None
+
+
+class StepObserver:
+    """An observer of several modes, one frame at a time; made by `wfsobs.design`.
+
+    Attributes
+    ----------
+    id : str
+        Of the observer.
+    targets : tuple of str
+        What it estimates.
+    sampling : Sampling
+        Modes, step, NGS ratio and delay that it was designed for.
+    frame : int
+        Frames that it has taken.
+    """
+
+    def __init__(
+        self, id: str, targets: tuple[str, ...], estimator: Estimator, sampling: Sampling, lgs: Bridge, ngs: Bridge | None
+    ):
+        self.id, self.targets, self.sampling, self.estimator = id, targets, sampling, estimator
+        self.frame, self._ratio = 0, sampling.ratio or 0
+        self._lgs, self._ngs = _Own(estimator) if estimator.bridges else lgs, ngs
+        self._parts: dict[str, Stateful] = {"estimator": estimator, "lgs": self._lgs}
+        if ngs is not None:
+            self._parts["ngs"] = ngs
+        self._allowed: set[tuple[float, str]] = set()
+        self._nothing = np.full(sampling.n_modes, np.nan)
+
+    def update(self, z: ArrayLike, ngs: ArrayLike | None = None, u: ArrayLike | None = None) -> None:
+        """Take the measurements of a frame.
+
+        Parameters
+        ----------
+        z : array_like
+            Pseudo-open-loop LGS measurement z[k] = y_lgs[k] - u[k-delay] of every mode, (n_modes,) [um]; NaN is missing.
+        ngs : array_like, optional
+            Pseudo-open-loop NGS measurement, (n_modes,) [um], in the frames that have one: k = n, 2n, ... for the ratio n. One
+            that is due and missing or NaN is predicted.
+        u : array_like, optional
+            Command u[k], (n_modes,) [um]; for observers alone whose windows hold commands.
+
+        Raises
+        ------
+        StepError
+            A wrong shape, an infinite number, an NGS frame that is not due, no command where one is needed. The frame is then
+            not taken.
+        """
+        z = self._check(z, "z")
+        due = self._ngs is not None and self.frame > 0 and self.frame % self._ratio == 0
+        slow = self._check_ngs(ngs, due) if self._ngs is not None else None
+        if self.estimator.needs_command:
+            if u is None:
+                raise StepError(f"{self.id}: its windows hold commands: update(z, u=...) takes that of the frame, too")
+            u = self._check(u, "u")
+        else:
+            u = None
+        complete = self._lgs.complete(z)
+        if slow is not None and self._ngs is not None:
+            slow = self._ngs.complete(slow)
+        self.estimator.advance(complete, slow, u)
+        self.frame += 1
+
+    def predict(self, frames: float = 0, target: str | None = None) -> tuple[Array, Array]:
+        """Predict a target.
+
+        Parameters
+        ----------
+        frames : float
+            Frames ahead of the last one, 0 or more; with a fraction where the observer has a model in continuous time.
+        target : str, optional
+            "turbulence" or "vibration"; can be left out where the observer estimates one.
+
+        Returns
+        -------
+        mean, sd : Array
+            Prediction, and its standard deviation by the observer's own model once that is in its steady state, each
+            (n_modes,) [um]. NaN where there is none. They are overwritten by the next call for the same frames and target.
+
+        Raises
+        ------
+        StepError
+            Another target, or frames that the observer does not predict.
+        """
+        if target is None:
+            target = self._only_target()
+        if (frames, target) not in self._allowed:
+            self._check_request(frames, target)
+        return self.estimator.predict(frames, target) if self.frame else (self._nothing, self._nothing)
+
+    def reset(self) -> None:
+        """Go back to before the first frame."""
+        self.frame = 0
+        for part in self._parts.values():
+            part.reset()
+
+    def state_dict(self) -> dict[str, Array]:
+        """Return a copy of the state: name -> array, plain numbers that `numpy.savez` can keep."""
+        return {"frame": np.array(self.frame), **save_parts(self._parts)}
+
+    def load_state_dict(self, state: Mapping[str, ArrayLike]) -> None:
+        """Go on from a state of `state_dict`. Raises StepError where it is that of another design."""
+        given, own = {name: np.asarray(x) for name, x in state.items()}, self.state_dict()
+        for name in sorted(own.keys() | given.keys()):
+            if name not in given or name not in own or given[name].shape != own[name].shape:
+                shape = "no such state" if name not in own else f"takes the shape {own[name].shape}"
+                raise StepError(f"{self.id}: load_state_dict: the state is that of another design: {name}: {shape}")
+        self.frame = int(given["frame"])
+        load_parts(self._parts, given)
+
+    def take_over(self, old: StepObserver) -> None:
+        """Go on where another design of the same observer is: the estimates continue without a start of their own.
+
+        Parameters
+        ----------
+        old : StepObserver
+            Of the same observer and sampling, with another prior or other settings.
+
+        Raises
+        ------
+        StepError
+            Another observer or sampling, or a state that cannot be carried over.
+        """
+        if old.id != self.id or old.sampling != self.sampling:
+            raise StepError(f"{self.id}: takes over from a design of the same observer and sampling, not from {old.id}")
+        self.estimator.take_over(old.estimator)
+        for new, was in ((self._lgs, old._lgs), (self._ngs, old._ngs)):
+            if isinstance(new, Bridge) and isinstance(was, Bridge):
+                new.take_over(was)
+        self.frame = old.frame
+
+    def _check(self, x: ArrayLike, name: str) -> Array:
+        x = np.asarray(x, dtype=float)
+        if x.shape != self._nothing.shape:
+            raise StepError(f"{self.id}: {name} takes the shape {self._nothing.shape}, one number per mode, not {x.shape}")
+        if not x.dot(x) < inf and np.isinf(x).any():
+            raise StepError(f"{self.id}: {name} is infinite in frame {self.frame}; NaN stands for a missing number")
+        return x
+
+    def _check_ngs(self, ngs: ArrayLike | None, due: bool) -> Array | None:
+        if due:
+            return self._nothing if ngs is None else self._check(ngs, "ngs")
+        if ngs is not None and not np.isnan(self._check(ngs, "ngs")).all():
+            n = self._ratio
+            raise StepError(f"{self.id}: an NGS frame in frame {self.frame}: one is due in every {n}th, {n}, {2 * n}, ...")
+        return None
+
+    def _check_request(self, frames: float, target: str) -> None:
+        if target not in self.targets:
+            raise StepError(f"{self.id}: target {target!r}: it estimates {' and '.join(self.targets)}")
+        if not 0 <= frames < inf:
+            raise StepError(f"{self.id}: frames = {frames!r}: takes 0 or more")
+        own = self.estimator.horizon
+        if own is not None and frames != own:
+            raise StepError(
+                f"{self.id}: designed for {own:g} frames ahead; design it with horizon = {frames:g} for predict({frames:g})"
+            )
+        self._allowed.add((frames, target))
+
+    def _only_target(self) -> str:
+        if len(self.targets) != 1:
+            raise StepError(f"{self.id}: predict takes a target: {' or '.join(self.targets)}")
+        return next(iter(self.targets))
+
+
+def whole_frames(frames: float, what: str) -> int:
+    """Return frames as a whole number. Raises StepError."""
+    if isnan(frames) or frames < 0 or frames != int(frames):
+        raise StepError(f"{what}: takes a whole number of frames ahead, 0 or more, not {frames:g}")
+    return int(frames)

@@ -1,0 +1,85 @@
+"""An observer frame by frame against its run over a record."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from wfsobs.observers.base import Observer
+from wfsobs.observers.step import StepObserver
+from wfsobs.prior import Prior
+from wfsobs.record import Measurements, hold_last
+from wfsobs.testing.common import SAME, CheckError
+from wfsobs.typing import Array
+
+Estimates = dict[str, Array]
+
+
+def run_steps(observer: StepObserver, measured: Measurements, steps: Iterable[int] | None = None) -> Estimates:
+    """Return `predict(0)` after every frame of measurements, target -> (n_steps, n_modes) [um]; steps : those to take.
+
+    A lost command is held, as the mirror holds its position; NGS frames are given where they are due, NaN where they are lost.
+    """
+    measured = replace(measured, u=hold_last(measured.u))
+    z, u, n = measured.z, measured.u, measured.ratio
+    z_ngs = None if n is None or measured.y_ngs is None else measured.z_ngs
+    out = {target: np.full_like(z, np.nan) for target in observer.targets}
+    for k in range(measured.n_steps) if steps is None else steps:
+        due = z_ngs is not None and n is not None and k > 0 and k % n == 0
+        observer.update(z[k], z_ngs[k] if z_ngs is not None and due else None, u=u[k])
+        for target, values in out.items():
+            values[k] = observer.predict(0, target)[0]
+    return out
+
+
+def step_difference(observer: Observer, measured: Measurements, prior: Prior, settings: Any) -> float:
+    """Return the largest difference between steps and batch over the standard deviation of the estimate; inf where NaN differ."""
+    batch = observer.estimate(measured, prior, settings)
+    got = run_steps(observer.design(prior, settings, measured.sampling), measured)
+    worst = 0.0
+    for target in observer.targets:
+        a, b = got[target], batch[target]
+        if not np.array_equal(np.isnan(a), np.isnan(b)):
+            return float("inf")
+        if not np.isnan(b).all():
+            worst = max(worst, float(np.nanmax(np.abs(a - b))) / (float(np.nanstd(b)) or 1.0))
+    return worst
+
+
+def check_steps(observer: Observer, measured: Measurements, prior: Prior, settings: Any) -> None:
+    """Check an observer that can run frame by frame.
+
+    After every frame its estimate is that of its run over the record, gaps included. It goes on from a saved state as if there
+    had been no break, and a reset takes it back to the start.
+
+    Raises
+    ------
+    CheckError
+        With the rule that it does not keep.
+    """
+    if observer.step is None:
+        return
+    y, half = measured.y_lgs.copy(), measured.n_steps // 2
+    y[half : half + 7] = np.nan
+    measured = replace(measured, y_lgs=y)
+    if not step_difference(observer, measured, prior, settings) <= SAME:
+        raise CheckError(f"{observer.id}: frame by frame its estimate is not that of its run over the record")
+    ours, other = (observer.design(prior, settings, measured.sampling) for _ in range(2))
+    base = run_steps(ours, measured)
+    run_steps(other, measured, range(half))
+    ours.reset()
+    ours.load_state_dict(other.state_dict())
+    _compare(
+        observer, run_steps(ours, measured, range(half, measured.n_steps)), base, half, "from a saved state it goes on elsewhere"
+    )
+    ours.reset()
+    _compare(observer, run_steps(ours, measured), base, 0, "after a reset it is not what it was at the start")
+
+
+def _compare(observer: Observer, got: Estimates, base: Estimates, start: int, what: str) -> None:
+    for target in observer.targets:
+        if not np.array_equal(got[target][start:], base[target][start:], equal_nan=True):
+            raise CheckError(f"{observer.id}: {what} ({target})")
