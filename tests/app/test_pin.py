@@ -53,6 +53,7 @@ class TestPin:
         assert "the same settings" in pinned.explore.pinning.note.object
 
     def test_faint_lines(self, pinned: Dashboard) -> None:
+        pinned.display.param.update(show="signal", hidden={})
         trace, kept = pinned.explore.traces.traces["turbulence"], pinned.display.pinned
         data = trace.faint.source.data
         assert len(data["xs"]) == len(data["colour"]) == 1 + len(observers_of("turbulence"))
@@ -140,7 +141,7 @@ class TestTable:
 
 def test_cumulative_rms(dashboard: Dashboard) -> None:
     """At the lowest frequency it is the rms of what is shown, the mean aside."""
-    dashboard.display.spectrum = "cumulative"
+    dashboard.display.param.update(spectrum="cumulative", show="signal")
     shown, view = dashboard.store.run.result, dashboard.explore.spectra.spectra["vibration"]
     y = np.asarray(view.sources["kf-lgs"].data["y"])
     assert np.all(np.diff(y) <= 0)

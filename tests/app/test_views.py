@@ -54,6 +54,7 @@ class TestEnvelope:
 
 class TestTraces:
     def test_signal(self, dashboard: Dashboard) -> None:
+        dashboard.display.show = "signal"
         shown = dashboard.store.run.result
         data = trace(dashboard, "turbulence")
         assert set(data) == {"x", TRUTH, "kf-lgs", "kf-multi", "kf-adaptive", "kf-ngs", "multirate", "multirate-optimal"}
@@ -62,7 +63,7 @@ class TestTraces:
         assert data["x"][0] >= 0 and data["x"][-1] <= 2.0 and data["x"].size == data[TRUTH].size
 
     def test_error(self, dashboard: Dashboard) -> None:
-        dashboard.display.show = "error"
+        assert dashboard.display.show == "error", "at first"
         shown = dashboard.store.run.result
         error = shown.values("kf-lgs", "vibration") - shown.values(TRUTH, "vibration")
         data = trace(dashboard, "vibration")
@@ -71,7 +72,7 @@ class TestTraces:
         assert "error of tip [nm]" in dashboard.explore.traces.traces["vibration"].figure.yaxis.axis_label
 
     def test_mode_and_unit(self, dashboard: Dashboard) -> None:
-        dashboard.display.param.update(mode="tilt", unit="mas")
+        dashboard.display.param.update(mode="tilt", unit="mas", show="signal")
         truth = dashboard.store.run.result.values(TRUTH, "vibration")[:, 1]
         assert np.allclose(trace(dashboard, "vibration")[TRUTH], 103.132403 * envelope(truth, BINS), rtol=1e-6)
         assert dashboard.explore.traces.traces["vibration"].figure.yaxis.axis_label == "tilt [mas]"
@@ -89,6 +90,7 @@ class TestTraces:
         assert len(spans) == 2 and spans[0] == spans[1] and len(spans[0]) == 1
 
     def test_a_zoom_sends_the_samples_of_its_window(self, dashboard: Dashboard) -> None:
+        dashboard.display.show = "signal"
         dashboard.explore.traces.x_range.update(start=1.0, end=1.1)
         data = trace(dashboard, "vibration")
         step = np.diff(data["x"])
@@ -107,8 +109,10 @@ class TestTraces:
         assert (dashboard.explore.traces.x_range.start, dashboard.explore.traces.x_range.end) == window
         dashboard.store.change("run.duration", 3)
         loop.finish(dashboard.store)
-        assert (dashboard.explore.traces.x_range.start, dashboard.explore.traces.x_range.end) == (0.0, 3.0)
+        window = (dashboard.explore.traces.x_range.start, dashboard.explore.traces.x_range.end)
+        assert window == (0.5, 2.5), "two seconds from the warm-up on"
         dashboard.explore.traces.zoom(None)
+        assert (dashboard.explore.traces.x_range.start, dashboard.explore.traces.x_range.end) == (0.0, 3.0)
         assert dashboard.explore.traces.x_range.reset_end == 3.0
 
     def test_hidden_lines(self, dashboard: Dashboard) -> None:
@@ -130,6 +134,7 @@ class TestSpectra:
     def test_signal_and_error(self, dashboard: Dashboard) -> None:
         shown, view = dashboard.store.run.result, dashboard.explore.spectra.spectra["vibration"]
         spectrum = shown.spectra["gpr-offline", "vibration"]
+        dashboard.display.show = "signal"
         assert np.allclose(view.sources["gpr-offline"].data["y"], 1e6 * spectrum.signal[1:, 0])
         truth = np.asarray(view.sources[TRUTH].data["y"])
         dashboard.display.show = "error"
@@ -257,7 +262,7 @@ class TestHigherModes:
         units = dashboard.units
         assert list(units.buttons.options.values()) == ["nm", "um"] and units.note.visible and units.buttons.value == "nm"
         display.mode = "oblique astigmatism"
-        assert truth.yaxis[0].axis_label == "Z5 [nm]" and "Oblique astigmatism (Z5)" in switch.list.options
+        assert truth.yaxis[0].axis_label == "error of Z5 [nm]" and "Oblique astigmatism (Z5)" in switch.list.options
         display.mode = "tilt"
         assert "mas" in units.buttons.options.values() and not units.note.visible
         units.buttons.value = "mas"

@@ -133,7 +133,9 @@ def test_signal_and_error(open_page: Any) -> None:
     page = open_page()
     label = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
         .filter(m => m.type === "LinearAxis").map(m => m.axis_label).join()"""
-    assert "error" not in page.evaluate(label)
+    assert "error of tip [nm]" in page.evaluate(label)
+    page.get_by_role("button", name="Signal", exact=True).click()
+    page.wait_for_function(f"!({label})().includes('error')")
     page.get_by_role("button", name="Error", exact=True).click()
     page.wait_for_function(f"({label})().includes('error of tip [nm]')")
     page.get_by_role("button", name="mas", exact=True).click()
@@ -146,7 +148,8 @@ def test_a_zoom_fetches_more_samples(open_page: Any) -> None:
     page = open_page()
     step = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
         .filter(m => m.type === "ColumnDataSource" && m.data["kf-ngs"]).map(m => m.data.x[1] - m.data.x[0])[0]"""
-    assert page.evaluate(step) > 5e-3
+    page.get_by_role("button", name="Time window: whole record").click()
+    page.wait_for_function(f"({step})() > 5e-3")
     page.get_by_role("button", name="Time window: 0.2 s").click()
     page.wait_for_function(f"Math.abs(({step})() - 1e-3) < 1e-9")
 
@@ -160,6 +163,41 @@ def test_cards_hide_lines(open_page: Any) -> None:
     visible = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
         .filter(m => m.type === "GlyphRenderer" && m.name === "kf-ngs").map(m => m.visible)"""
     page.wait_for_function(f"({visible})().every(v => !v)")
+
+
+VISIBLE = """() => [...new Set([...Bokeh.index.roots[0].model.document._all_models.values()]
+    .filter(m => m.type === "GlyphRenderer" && m.visible && m.glyph.type === "Line").map(m => m.name))].sort()"""
+"""Names of the lines that a figure shows."""
+
+
+def vibration_card(page: Page, label: str) -> Any:
+    return page.locator(".strip", has_text="Online GPR").get_by_role("button", name=label)
+
+
+def test_a_double_click_shows_a_line_alone(open_page: Any) -> None:
+    page = open_page()
+    few = page.evaluate(VISIBLE)
+    assert "gpr-online" in few and "multirate" not in few and "butterworth-ol" not in few, "the few that matter at first"
+    expect(vibration_card(page, "Offline GPR")).to_have_attribute("aria-pressed", "false")
+    for card in page.locator(".card[data-name=kf-lgs]").all():
+        card.dblclick()
+    page.wait_for_function(f"() => ({VISIBLE})().join() === 'kf-lgs'")
+    expect(vibration_card(page, "Online GPR")).to_have_attribute("aria-pressed", "false")
+    page.keyboard.press("s")  # the card has the focus
+    page.wait_for_function(f"() => ({VISIBLE})().includes('gpr-offline')")
+    for button in page.get_by_role("button", name="Show the main ones").all():
+        button.click()
+    page.wait_for_function(f"few => ({VISIBLE})().join() === few.join()", arg=few)
+
+
+def test_figures_take_the_height_of_the_window(open_page: Any) -> None:
+    page = open_page(1400, 1000)
+    figure = page.get_by_role("figure", name="Turbulence time trace")
+    height = "box => box.getBoundingClientRect().height"
+    # 42 % of the window, of which a line of text is the caption's
+    page.wait_for_function(f"([it]) => Math.abs(({height})(it) - 400) < 30", arg=[figure.element_handle()])
+    page.set_viewport_size({"width": 1400, "height": 700})
+    page.wait_for_function(f"([it]) => Math.abs(({height})(it) - 274) < 30", arg=[figure.element_handle()])
 
 
 def test_cancel(open_page: Any, server: Any) -> None:

@@ -282,6 +282,7 @@ def test_no_window_scrolls_sideways(open_page: Any, width: int) -> None:
 
 def test_a_long_run_grows_and_stops_at_once(open_page: Any) -> None:
     page = open_page()
+    page.get_by_role("button", name="Time window: whole record").click()
     page.get_by_role("button", name="Run", exact=True).last.click()  # the topic
     duration = page.get_by_role("textbox", name="Duration [s]", exact=True)
     duration.fill("40")

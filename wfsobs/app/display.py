@@ -88,7 +88,7 @@ class Display(param.Parameterized):
     """The switches above the figures."""
 
     mode = param.Selector(default=MODES[0], objects=MODES, label="Mode")
-    show = param.Selector(default=SIGNAL, objects=[SIGNAL, ERROR, RUNNING_RMS], label="Show")
+    show = param.Selector(default=ERROR, objects=[SIGNAL, ERROR, RUNNING_RMS], label="Show")
     unit = param.Selector(default="nm", objects=list(UNITS), label="Unit")
     hidden = param.Dict({}, doc="Target -> names of its hidden lines.")
     dark = param.Boolean(False, doc="Dark mode.")

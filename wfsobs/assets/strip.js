@@ -1,9 +1,12 @@
 // A strip of cards, one per line of the figures below it: what it is, its number, and a switch for the line.
+// A click hides or shows a line, a double click or the key S shows it alone, and once more all of them.
 
 export function render({model, el}) {
   const strip = document.createElement("div")
   strip.className = "strip"
-  el.append(strip)
+  const hint = document.createElement("div")
+  hint.className = "hint"
+  el.append(strip, hint)
 
   const line = (item) =>
     `<svg width="26" height="8" aria-hidden="true"><line x1="0" y1="4" x2="26" y2="4" stroke="${item.colour}"` +
@@ -17,38 +20,75 @@ export function render({model, el}) {
     return div
   }
 
+  const toggle = (name) => {
+    const others = model.hidden.filter((it) => it !== name)
+    model.hidden = others.length < model.hidden.length ? others : [...others, name]
+  }
+
+  const solo = (name) => {
+    const others = model.items.map((item) => item.name).filter((it) => it !== name)
+    const alone = !model.hidden.includes(name) && others.every((it) => model.hidden.includes(it))
+    model.hidden = alone ? [] : others
+  }
+
+  const cardOf = (item) => {
+    const card = document.createElement("button")
+    card.type = "button"
+    card.className = "card"
+    card.dataset.name = item.name
+    card.style.setProperty("--colour", item.colour)
+    part(card, "line", "").innerHTML = line(item)
+    part(card, "name", item.label)
+    const value = part(card, "value", item.value)
+    if (item.unit) {
+      const unit = document.createElement("small")
+      unit.textContent = ` ${item.unit}`
+      value.append(unit)
+    }
+    part(card, "note", item.note)
+    card.onclick = (event) => { if (event.detail < 2) toggle(item.name) }  // the second one of a double click does not count
+    card.ondblclick = () => solo(item.name)
+    card.onkeydown = (event) => {
+      if (event.key.toLowerCase() === "s" && !event.ctrlKey && !event.metaKey && !event.altKey) solo(item.name)
+    }
+    return card
+  }
+
+  const mark = () => {
+    for (const card of strip.children) {
+      const shown = !model.hidden.includes(card.dataset.name)
+      const label = card.querySelector(".name").textContent
+      card.setAttribute("aria-pressed", shown)
+      card.title = `${shown ? "Hide" : "Show"} ${label}; double click or S: ${label} alone`
+    }
+    const n = strip.children.length - [...strip.children].filter((it) => model.hidden.includes(it.dataset.name)).length
+    count.textContent = n < strip.children.length ? `${n} of ${strip.children.length} lines shown` : ""
+    all.disabled = n === strip.children.length
+  }
+
   const draw = () => {
     const focused = el.getRootNode().activeElement?.dataset?.name
-    strip.replaceChildren(...model.items.map((item) => {
-      const shown = !model.hidden.includes(item.name)
-      const card = document.createElement("button")
-      card.type = "button"
-      card.className = "card"
-      card.dataset.name = item.name
-      card.style.setProperty("--colour", item.colour)
-      card.setAttribute("aria-pressed", shown)
-      card.title = shown ? `Hide ${item.label}` : `Show ${item.label}`
-      part(card, "line", "").innerHTML = line(item)
-      part(card, "name", item.label)
-      const value = part(card, "value", item.value)
-      if (item.unit) {
-        const unit = document.createElement("small")
-        unit.textContent = ` ${item.unit}`
-        value.append(unit)
-      }
-      part(card, "note", item.note)
-      card.onclick = () => {
-        const hidden = model.hidden.filter((name) => name !== item.name)
-        model.hidden = shown ? [...hidden, item.name] : hidden
-      }
-      return card
-    }))
+    strip.replaceChildren(...model.items.map(cardOf))
+    mark()
     if (focused) {
       strip.querySelector(`[data-name="${focused}"]`)?.focus()
     }
   }
 
+  const button = (text, act) => {
+    const it = document.createElement("button")
+    it.type = "button"
+    it.textContent = text
+    it.onclick = act
+    hint.append(it)
+    return it
+  }
+  const count = document.createElement("span")
+  hint.append(count)
+  const all = button("Show all", () => { model.hidden = [] })
+  if (model.main) button(model.main, () => model.send_msg("main"))
+
   model.on("items", draw)
-  model.on("hidden", draw)
+  model.on("hidden", mark)
   draw()
 }

@@ -16,6 +16,7 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.parts import WIDE, box
 from wfsobs.app.render import macro
 from wfsobs.app.style import HEARD, asset
+from wfsobs.app.views.main_lines import MainLines
 from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.plots import call
 from wfsobs.app.views.spectra import MODEL, PEAKS, SpectraFigures
@@ -29,6 +30,11 @@ GRID = """
 :host { display: grid !important; grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); gap: 10px; }
 @media (max-width: 1000px) { :host { grid-template-columns: minmax(0, 1fr); } }
 """
+TALL: Mapping[str, Any] = MappingProxyType(
+    {**WIDE, "height": 230, "stylesheets": [":host { height: clamp(230px, 42vh, 560px) !important; }"]}
+)
+"""A figure as high as the window has room for, so that a target has its verdict, its cards and its figures in one view."""
+
 GAP = ":host { gap: 10px; }"
 ZOOMS: Mapping[str, float | None] = MappingProxyType({"Whole record": None, "2 s": 2.0, "0.2 s": 0.2})
 MARKS = macro("marks", PEAKS, MODEL)
@@ -39,6 +45,7 @@ class Explore:
 
     def __init__(self, run: BackgroundTask, display: Display):
         self.display = display
+        self.lines = MainLines(run, display)
         self.traces, self.spectra = Traces(run, display), SpectraFigures(run, display)
         self.strips = {target: Strip(target, run, display) for target in TARGETS}
         self.verdicts = {target: VerdictLine(target, run, display) for target in TARGETS}
@@ -88,17 +95,19 @@ class Explore:
         call(self.spectra.spectra[target].figure, f"{target.capitalize()} spectrum")
         cards = self.strips[target].cards
         cards.param.watch(lambda event: self._hide(target, event.new), "hidden")
+        cards.on_main = lambda: self.lines.reset(target)
         marks = MARKS if target == VIBRATION else ""
         figures = pn.Column(
-            pn.Column(_caption("Time trace"), self.traces.pane(target), **WIDE),
-            pn.Column(_caption("Spectrum", marks), self.spectra.pane(target), **WIDE),
+            pn.Column(_caption("Time trace"), self.traces.pane(target), **TALL),
+            pn.Column(_caption("Spectrum", marks), self.spectra.pane(target), **TALL),
             **WIDE,
             stylesheets=[GRID],
         )
         return box(target.capitalize(), self.verdicts[target].pane, cards, figures)
 
     def _hide(self, target: str, names: list[str]) -> None:
-        self.display.hidden = {**self.display.hidden, target: list(names)}
+        if names != self.display.hidden.get(target, []):
+            self.lines.choose(target, names)
 
 
 def group(display: Display, name: str, options: Any) -> pmui.RadioButtonGroup:

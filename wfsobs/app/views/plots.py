@@ -32,6 +32,7 @@ def new_figure(**options: Any) -> figure:
         tools="xbox_zoom,xpan,xwheel_zoom,reset,save",
         active_drag="xbox_zoom",
         toolbar_location="above",
+        toolbar_inner=True,
         min_border_right=10,
         min_border_left=70,
         **options,

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import panel as pn
 from bokeh.models import ColumnDataSource, HoverTool, Range1d, VSpan
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, PinnedLines, add_line, marked_peaks, new_figure, send
-from wfsobs.app.views.target_figures import TargetFigures
+from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, Array, RunResults, SignalAndError
 from wfsobs.evaluation.scores import cumulative_rms
 from wfsobs.observers.base import TARGETS, VIBRATION
@@ -35,12 +34,6 @@ class SpectraFigures(TargetFigures):
             limits = {"start": float(frequencies[1]), "end": float(frequencies[-1])}
             if self.x_range.reset_start != limits["start"] or self.x_range.reset_end != limits["end"]:
                 self.x_range.update(**limits, reset_start=limits["start"], reset_end=limits["end"])
-
-    def _restyle(self, *_: object) -> None:
-        super()._restyle()
-        with pn.io.hold():
-            for spectrum in self.spectra.values():
-                spectrum.draw_pinned(self.display)
 
 
 class _Spectrum:
@@ -71,18 +64,19 @@ class _Spectrum:
 
     def draw(self, results: RunResults, display: Display) -> None:
         """Send every line, its axis and the marks."""
-        diameter = results.scenario.telescope.diameter
+        diameter, error = results.scenario.telescope.diameter, shows_error(results, self.target, display)
         drawn: list[Array] = []
         for name, source in self.sources.items():
             spectrum = results.spectra.get((name, self.target))
             if spectrum is None:
                 send(source, {"x": [], "y": []})
                 continue
-            y = _curve(spectrum, name, display, diameter)
+            y = _curve(spectrum, error and name != TRUTH, display, diameter)
             send(source, {"x": spectrum.frequency[1:], "y": y})
-            drawn.append(y)
+            if self.lines[name].visible:
+                drawn.append(y)
         self._fit(drawn + self.draw_pinned(display), display.cumulative)
-        of = " of error" if display.error else ""
+        of = " of error" if error else ""
         what, unit = (
             (f"cumulative rms{of}", display.unit_label) if display.cumulative else (f"PSD{of}", f"{display.unit_label}²/Hz")
         )
@@ -98,7 +92,8 @@ class _Spectrum:
             for name, line in self.lines.items():
                 spectrum = kept.spectra.get((name, self.target))
                 if line.visible and spectrum is not None:
-                    lines[name] = (spectrum.frequency[1:], _curve(spectrum, name, display, diameter))
+                    error = display.error and name != TRUTH and np.isfinite(spectrum.error).all()
+                    lines[name] = (spectrum.frequency[1:], _curve(spectrum, bool(error), display, diameter))
         self.faint.draw(lines, display.dark)
         return [y for _, y in lines.values()]
 
@@ -129,8 +124,8 @@ class _Spectrum:
         )
 
 
-def _curve(spectrum: SignalAndError, name: str, display: Display, diameter: float) -> Array:
+def _curve(spectrum: SignalAndError, error: bool, display: Display, diameter: float) -> Array:
     """Compute what is drawn of a spectrum above zero frequency. In error plots the truth stays: the error of answering zero."""
     scale = per_micrometre(display.unit, diameter)
-    density = (spectrum.error if display.error and name != TRUTH else spectrum.signal)[1:, display.column]
+    density = (spectrum.error if error else spectrum.signal)[1:, display.column]
     return scale * cumulative_rms(spectrum.frequency[1:], density) if display.cumulative else scale**2 * density

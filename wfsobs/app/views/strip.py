@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import param
@@ -17,15 +18,26 @@ from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.rows import NOT_OBSERVERS, own_interval, score_rows
 from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL, Score
 
+MAIN = "Show the main ones"
+
 
 class Cards(JSComponent):
-    """The cards in the browser; a click on one hides or shows its line."""
+    """The cards in the browser; a click on one hides or shows its line, a double click shows it alone."""
 
     items = param.List([], doc="{name, label, colour, dash, value, unit, note} of every card.")
     hidden = param.List([], doc="Names of the cards whose lines are hidden.")
+    main = param.String("", doc="What the button is called that shows the lines that matter; none if empty.")
 
     _esm = asset("strip.js")
     _stylesheets = [asset("strip.css")]  # noqa: RUF012
+
+    def __init__(self, **params: Any):
+        self.on_main: Callable[[], None] = lambda: None
+        super().__init__(**params)
+
+    def _handle_msg(self, data: object) -> None:
+        if data == "main":
+            self.on_main()
 
 
 class Strip:
@@ -33,12 +45,16 @@ class Strip:
 
     def __init__(self, target: str, run: BackgroundTask, display: Display):
         self.target, self.run, self.display = target, run, display
-        self.cards = Cards(items=self.items(), sizing_mode="stretch_width", margin=0)
+        self.cards = Cards(items=self.items(), main=MAIN, sizing_mode="stretch_width", margin=0)
         run.param.watch(self._refresh, ["result", "state"])
         display.param.watch(self._refresh, ["mode", "unit", "dark"])
+        display.param.watch(self._hide, "hidden")
 
     def _refresh(self, *_: object) -> None:
         self.cards.items = self.items()
+
+    def _hide(self, *_: object) -> None:
+        self.cards.hidden = self.display.hidden.get(self.target, [])
 
     def items(self) -> list[dict[str, Any]]:
         """Describe the cards."""

@@ -12,7 +12,7 @@ from bokeh.plotting import figure
 from wfsobs.app.display import Display
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.views.plots import restyle
-from wfsobs.app.work import RunResults
+from wfsobs.app.work import TRUTH, RunResults
 
 
 class Drawing(Protocol):
@@ -35,7 +35,8 @@ class TargetFigures:
 
     def pane(self, target: str) -> pn.pane.Bokeh:
         """Return the figure of one target."""
-        return pn.pane.Bokeh(self._drawings[target].figure, sizing_mode="stretch_width", margin=0)
+        self._drawings[target].figure.sizing_mode = "stretch_both"
+        return pn.pane.Bokeh(self._drawings[target].figure, sizing_mode="stretch_both", margin=0)
 
     def show(self, visible: bool) -> None:
         """Draw what has come meanwhile, and go on while visible."""
@@ -44,18 +45,24 @@ class TargetFigures:
             self._redraw()
 
     def _redraw(self, *_: object) -> None:
-        shown = self.run.result
+        results = self.run.result
         self._behind = not self.visible
-        if shown is not None and self.visible:
+        if results is not None and self.visible:
             with pn.io.hold():
-                self._draw(shown)
+                self._draw(results)
 
     def _draw(self, results: RunResults) -> None:
         """Send the data of every figure."""
         raise NotImplementedError
 
     def _restyle(self, *_: object) -> None:
-        """Set the colours of light or dark mode, and hide lines."""
+        """Set the colours of light or dark mode, hide lines, and fit the axes to the others."""
         with pn.io.hold():
             for target, drawing in self._drawings.items():
                 restyle(drawing.lines, self.display.dark, self.display.hidden.get(target, []))
+            self._redraw()
+
+
+def shows_error(results: RunResults, target: str, display: Display) -> bool:
+    """Whether errors are drawn: as chosen, where there is a truth to compare with."""
+    return display.error and results.values(TRUTH, target) is not None

@@ -13,9 +13,9 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
-from wfsobs.app.views.event_marks import EventMarks, room
+from wfsobs.app.views.event_marks import EventMarks, events_of, room
 from wfsobs.app.views.plots import PinnedLines, add_line, new_figure, send
-from wfsobs.app.views.target_figures import TargetFigures
+from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.recovery import trailing_rms
 from wfsobs.observers.base import TARGETS
@@ -30,6 +30,9 @@ MARGIN = 0.25
 
 WINDOW_S = 1.0
 """Over which the running rms of an error is taken [s]."""
+
+FIRST_S = 2.0
+"""How much of a record is shown at first [s]: of ten seconds a vibration is a block."""
 
 SETTLE_MS = 60
 """A zoom is answered when the window has not moved for this long."""
@@ -53,7 +56,8 @@ class Traces(TargetFigures):
         length = record.n_steps * record.dt
         if length != self.length:
             self.length = length
-            self.x_range.update(start=0.0, end=length, reset_start=0.0, reset_end=length)
+            start, end = first_window(results)
+            self.x_range.update(start=start, end=end, reset_start=0.0, reset_end=length)
         first, last = self._window(record.n_steps, record.dt)
         for trace in self.traces.values():
             trace.draw(results, self.display, first, last)
@@ -80,10 +84,6 @@ class Traces(TargetFigures):
         middle = 0.5 * (float(self.x_range.start) + float(self.x_range.end))  # type: ignore[arg-type]
         start = min(max(middle - 0.5 * length, 0.0), self.length - length)
         self.x_range.update(start=start, end=start + length)
-
-    def _restyle(self, *_: object) -> None:
-        super()._restyle()
-        self._redraw()
 
 
 class _Trace:
@@ -115,7 +115,8 @@ class _Trace:
         settled = warm_up + WINDOW_S * display.running
         self._fit(data, settled, self._draw_pinned(display, data["x"]), room(results))
         self.events.draw(results, display.dark)
-        what = f"{'running rms of ' if display.running else ''}{'error of ' if display.error else ''}{display.mode_label}"
+        error = shows_error(results, self.target, display)
+        what = f"{'running rms of ' if error and display.running else ''}{'error of ' if error else ''}{display.mode_label}"
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
 
     def _draw_pinned(self, display: Display, times: Array) -> dict[str, tuple[Array, Array]]:
@@ -148,6 +149,16 @@ class _Trace:
             self.figure.y_range.update(start=low - pad, end=high + pad + above * (high - low))
 
 
+def first_window(results: RunResults) -> tuple[float, float]:
+    """Choose what is shown of a record at first [s]: around its first event, or from the end of the warm-up."""
+    record = results.result.record
+    length = record.n_steps * record.dt
+    events = events_of(results)
+    start = events[0].start - 0.5 * FIRST_S if events else results.scenario.run.warm_up
+    start = max(min(start, length - FIRST_S), 0.0)
+    return start, min(start + FIRST_S, length)
+
+
 def _times_of_envelope(times: Array) -> Array:
     """Compute the times of an envelope of samples that are a run of times themselves."""
     if times.size <= 2 * BINS:
@@ -162,14 +173,14 @@ def _line(results: RunResults, name: str, target: str, display: Display, first: 
     if values is None:
         return nothing
     n = max(round(WINDOW_S / results.result.record.dt), 1)
-    before = min(n - 1, first) if display.running else 0
+    before = min(n - 1, first) if display.running and truth is not None else 0
     cut = slice(first - before, last), slice(display.column, display.column + 1)
-    if not display.error:
+    if truth is None or not display.error:
         return values[cut][:, 0]
-    if truth is None or name == TRUTH:
+    if name == TRUTH:
         return nothing
     error = values[cut] - truth[cut]
-    if display.running:  # where there is no estimate yet, that of a while ago is not shown in its place
+    if display.running:  # where there is no estimate yet, that of a while ago is not results in its place
         error = np.where(np.isnan(error), np.nan, trailing_rms(error, n))
     return error[before:, 0]
 

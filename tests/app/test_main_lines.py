@@ -1,0 +1,98 @@
+"""Which lines are shown before anything has been chosen, and how the choice is made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.style import observers_of
+from wfsobs.app.views.main_lines import REFERENCES, main_observers
+from wfsobs.app.views.traces import first_window
+from wfsobs.evaluation.rows import is_non_causal
+from wfsobs.evaluation.scores import PREDICTION, Score
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS
+from wfsobs.scenario import Scenario
+
+
+@pytest.fixture
+def scores(dashboard: Dashboard) -> tuple[Score, ...]:
+    return dashboard.store.run.result.result.scores
+
+
+def hidden(dashboard: Dashboard, target: str) -> list[str]:
+    lines = dashboard.explore.traces.traces[target].lines
+    assert dashboard.explore.strips[target].cards.hidden == [name for name in observers_of(target) if not lines[name].visible]
+    return dashboard.explore.strips[target].cards.hidden
+
+
+class TestRule:
+    @pytest.mark.parametrize("target", TARGETS)
+    def test_the_references_and_the_two_best_that_are_causal(self, scores: tuple[Score, ...], target: str) -> None:
+        errors = {
+            s.observer: s.rms
+            for s in scores
+            if (s.target, s.mode) == (target, "tip") and s.observer in observers_of(target) and not is_non_causal(s.observer)
+        }
+        one, two, *_ = sorted(errors, key=errors.__getitem__)
+        expected = {one, two} | {name for name in REFERENCES if target in OBSERVERS[name].targets}
+        assert set(main_observers(scores, target, "tip")) == expected
+
+    def test_who_looks_ahead_is_not_among_the_best(self, scores: tuple[Score, ...]) -> None:
+        first = [replace(s, rms=0.0) if s.observer == "butterworth-ol" else s for s in scores]
+        assert "butterworth-ol" not in main_observers(first, "vibration", "tip")
+
+    def test_without_truth_those_that_predict_best(self, scores: tuple[Score, ...]) -> None:
+        told = [replace(s, target=PREDICTION) for s in scores if s.target == "turbulence"]
+        assert main_observers(told, "turbulence", "tip") == main_observers(scores, "turbulence", "tip")
+
+    def test_all_where_nothing_can_be_compared(self) -> None:
+        assert main_observers([], "vibration", "tip") == observers_of("vibration")
+
+
+class TestChoice:
+    def test_the_others_are_hidden(self, dashboard: Dashboard, scores: tuple[Score, ...]) -> None:
+        for target in TARGETS:
+            assert set(hidden(dashboard, target)) == {*observers_of(target)} - {*main_observers(scores, target, "tip")}
+
+    def test_a_choice_stays_until_the_main_ones_are_asked_for(self, dashboard: Dashboard, loop: Any) -> None:
+        at_first = hidden(dashboard, "vibration")
+        dashboard.explore.strips["vibration"].cards.hidden = ["truth", "kf-lgs"]
+        dashboard.store.change("turbulence.wind_speed", 30)
+        loop.finish(dashboard.store)
+        dashboard.display.mode = "tilt"
+        assert dashboard.display.hidden["vibration"] == ["truth", "kf-lgs"]
+        dashboard.display.mode = "tip"
+        dashboard.explore.strips["vibration"].cards._handle_msg("main")
+        scores = dashboard.store.run.result.result.scores
+        assert set(hidden(dashboard, "vibration")) == {*observers_of("vibration")} - {*main_observers(scores, "vibration", "tip")}
+        assert at_first
+
+    def test_the_axis_fits_the_lines_that_are_shown(self, dashboard: Dashboard) -> None:
+        view = dashboard.explore.traces.traces["vibration"]
+        dashboard.explore.strips["vibration"].cards.hidden = [n for n in ("truth", *observers_of("vibration")) if n != "kf-multi"]
+        counted = np.asarray(view.source.data["kf-multi"])[np.asarray(view.source.data["x"]) >= 0.5]
+        low, high = counted.min(), counted.max()
+        # 5 % of its height are left on either side of a line
+        assert view.figure.y_range.end == pytest.approx(high + 0.05 * (high - low), rel=1e-4)
+        spectrum = dashboard.explore.spectra.spectra["vibration"]
+        density = spectrum.sources["kf-multi"].data["y"]
+        assert spectrum.figure.y_range.end == pytest.approx(3.0 * density.max()), "half a decade above it"
+
+
+class TestFirstWindow:
+    def test_two_seconds_from_the_warm_up_on(self, dashboard: Dashboard, loop: Any) -> None:
+        assert first_window(dashboard.store.run.result) == (0.0, 2.0), "a record of two seconds"
+        dashboard.store.change("run.duration", 4.0)
+        loop.finish(dashboard.store)
+        assert first_window(dashboard.store.run.result) == (0.5, 2.5)
+
+    def test_around_the_first_event(self, dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+        events = [{"kind": "wind", "start": 2.5, "wind_factor": 2.0}]
+        dashboard.store.load(short.replace({"run.duration": 4.0, "events": events}))
+        loop.finish(dashboard.store)
+        assert first_window(dashboard.store.run.result) == (1.5, 3.5)

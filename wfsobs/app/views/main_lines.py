@@ -1,0 +1,72 @@
+"""Which observers a figure shows before the visitor has chosen: the few that matter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from wfsobs.app.display import Display
+from wfsobs.app.jobs.job import RUNNING
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.style import observers_of
+from wfsobs.evaluation.rows import can_be_best
+from wfsobs.evaluation.scores import PREDICTION, Score
+from wfsobs.observers.base import TARGETS
+
+REFERENCES = ("kf-lgs", "gpr-online")
+"""The two that the paper compares: always shown."""
+
+BEST = 2
+"""How many of the best are shown beside them."""
+
+
+def main_observers(scores: Iterable[Score], target: str, mode: str) -> list[str]:
+    """List the observers of a target that matter: the references, and the best of those that can be compared.
+
+    Without truth the best are those that predict the next measurement best. All, where there is no score at all.
+    """
+    drawn = observers_of(target)
+    of_mode = [s for s in scores if s.mode == mode and s.observer in drawn and can_be_best(s.observer, s.apart)]
+    ranked = sorted(
+        [s for s in of_mode if s.target == target] or [s for s in of_mode if s.target == PREDICTION], key=lambda s: s.rms
+    )
+    best = [s.observer for s in ranked[:BEST]]
+    return [name for name in drawn if name in best or name in REFERENCES] if best else drawn
+
+
+class MainLines:
+    """Keeps the lines that are shown to those that matter, per target, until the visitor chooses others.
+
+    Made before the figures, so that they draw once. While a run goes on its first choice stays.
+    """
+
+    def __init__(self, run: BackgroundTask, display: Display):
+        self.run, self.display = run, display
+        self._chosen: set[str] = set()
+        run.param.watch(self._on_results, "result")
+        display.param.watch(self._follow, "mode")
+
+    def choose(self, target: str, hidden: list[str]) -> None:
+        """Hide these lines and no others from now on."""
+        self._chosen.add(target)
+        self.display.hidden = {**self.display.hidden, target: list(hidden)}
+
+    def reset(self, target: str) -> None:
+        """Show those that matter again."""
+        self._chosen.discard(target)
+        self._follow()
+
+    def _on_results(self, *_: object) -> None:
+        if self.run.state != RUNNING or not self.display.hidden:
+            self._follow()
+
+    def _follow(self, *_: object) -> None:
+        results = self.run.result
+        if results is None:
+            return
+        hidden = dict(self.display.hidden)
+        for target in TARGETS:
+            if target not in self._chosen:
+                main = main_observers(results.result.scores, target, self.display.mode)
+                hidden[target] = [name for name in observers_of(target) if name not in main]
+        if hidden != self.display.hidden:
+            self.display.hidden = hidden
