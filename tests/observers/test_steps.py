@@ -87,7 +87,7 @@ def test_predictions_and_their_sd(frames: float) -> None:
         row = model.outputs[target] @ power
         np.testing.assert_allclose(mean[0], row @ x, rtol=1e-9)
         if frames == int(frames):
-            P = steady.filtered
+            P = steady.posterior
             for _ in range(int(frames)):
                 P = model.A @ P @ model.A.T + model.Q
             np.testing.assert_allclose(sd[0], np.sqrt(model.outputs[target] @ P @ model.outputs[target]), rtol=1e-9)

@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from wfsobs.control.late_regression import LateRegression
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers.gpr.inputs import Scale, StreamingInputs, scale_of, window_signals
+from wfsobs.observers.gpr.late_regression import LateRegression
 from wfsobs.observers.gpr.offline import OfflineGpr, train, training_targets
 from wfsobs.observers.gpr.online import OnlineGpr, kernel_of
 from wfsobs.observers.per_mode import over_modes

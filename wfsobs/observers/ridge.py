@@ -12,13 +12,15 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import solve
 
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
-from wfsobs.observers.gpr.inputs import scale_of, tunable, window_signals
+from wfsobs.observers.gpr.inputs import scale_of, scales_of, training_signals, tunable, window_signals
 from wfsobs.observers.gpr.kernels import sliding_products, square_from_band
 from wfsobs.observers.gpr.offline import OFFLINE, OfflineGpr, training_targets
 from wfsobs.observers.per_mode import over_modes
+from wfsobs.observers.step import whole_frames
+from wfsobs.observers.windows import LinearPredictor, Windows
 from wfsobs.prior import Bands, Prior, Training
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Measurements, RecordError, pseudo_open_loop
+from wfsobs.record import Measurements, RecordError, Sampling, pseudo_open_loop
 from wfsobs.signal.linalg import eliminate, solve_rows
 from wfsobs.typing import Array
 
@@ -77,38 +79,59 @@ def predict(signals: Array, weights: Array, constant: float) -> Array:
     return out
 
 
+def fit_ridge(prior: Prior, g: OfflineGpr, mode: int, dt: float, delay: int, horizon: int = 0) -> tuple[Array, float]:
+    """Fit the linear limit of the offline GPR of one mode to the vibration `horizon` frames ahead, as `fit`."""
+    training, bands = prior.training, prior.bands
+    assert training is not None and bands is not None
+    targets = training_targets(training, bands, dt, delay, horizon)[:, mode]
+    signals = training_signals(g, training, mode, dt, delay)
+    return fit(signals, targets, g.depth, g.training_size, (g.noise_std * g.length_scale / g.signal_std) ** 2)
+
+
 def ridge(measured: Measurements, prior: Prior, settings: OfflineGpr, watch: Watch) -> dict[str, Array]:
     """Run the linear limit of the offline GPR: its windows, its training size, its penalty."""
-    g, training, bands = settings, prior.training, prior.bands
-    assert training is not None and bands is not None
-    targets = training_targets(training, bands, measured.dt, measured.delay)
-    training_z = pseudo_open_loop(training.y_lgs, training.u, measured.delay)
-    penalty = (g.noise_std * g.length_scale / g.signal_std) ** 2
+    g, dt, delay = settings, measured.dt, measured.delay
 
     def one(mode: int, watch: Watch) -> Array:
         watch.check()
-        scale = scale_of(g, training, measured.delay, mode)
-        known = window_signals(g, training.y_lgs, training.u, training_z, mode, measured.dt, scale)
-        fitted = fit(known, targets[:, mode], g.depth, g.training_size, penalty)
-        return predict(window_signals(g, measured.y_lgs, measured.u, measured.z, mode, measured.dt, scale), *fitted)
+        scale = scale_of(g, prior.training, delay, mode)
+        fitted = fit_ridge(prior, g, mode, dt, delay)
+        return predict(window_signals(g, measured.y_lgs, measured.u, measured.z, mode, dt, scale), *fitted)
 
     return {VIBRATION: over_modes(measured.n_modes, one, watch)}
 
 
-def ridge_30(measured: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
-    """Plain least squares on the last 30 measurements z, over all of the training record."""
+def step_ridge(prior: Prior, settings: OfflineGpr, sampling: Sampling, horizon: float) -> LinearPredictor:
+    """Return `ridge`, one frame at a time."""
+    g, ahead, modes = settings, whole_frames(horizon, "ridge"), range(sampling.n_modes)
+    fits = [fit_ridge(prior, g, mode, sampling.dt, sampling.delay, ahead) for mode in modes]
+    return LinearPredictor(Windows(g, sampling, g.depth, scales_of(g, prior.training, sampling)), fits, ahead)
+
+
+def fit_30(prior: Prior, mode: int, dt: float, delay: int, horizon: int = 0) -> tuple[Array, float]:
+    """Fit the last 30 measurements z of one mode to the vibration `horizon` frames ahead, as `fit`."""
     training, bands = prior.training, prior.bands
     assert training is not None and bands is not None
-    targets = training_targets(training, bands, measured.dt, measured.delay)
-    training_z = pseudo_open_loop(training.y_lgs, training.u, measured.delay)
-    m = training_z.shape[0] - TAPS  # the last target has no reference
+    targets = training_targets(training, bands, dt, delay, horizon)[:, mode]
+    z = pseudo_open_loop(training.y_lgs, training.u, delay)[:, [mode]]
+    m = len(z) - TAPS - horizon  # the last targets have no reference
+    return fit(z, targets, TAPS, m, PLAIN * m * float(np.mean(z**2)))
+
+
+def ridge_30(measured: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
+    """Plain least squares on the last 30 measurements z, over all of the training record."""
     columns = []
     for mode in range(measured.n_modes):
         watch.step(mode / measured.n_modes)
-        z = training_z[:, [mode]]
-        penalty = PLAIN * m * float(np.mean(z**2))
-        columns.append(predict(measured.z[:, [mode]], *fit(z, targets[:, mode], TAPS, m, penalty)))
+        columns.append(predict(measured.z[:, [mode]], *fit_30(prior, mode, measured.dt, measured.delay)))
     return {VIBRATION: np.column_stack(columns)}
+
+
+def step_ridge_30(prior: Prior, _settings: None, sampling: Sampling, horizon: float) -> LinearPredictor:
+    """Return `ridge_30`, one frame at a time."""
+    ahead = whole_frames(horizon, "ridge-30")
+    fits = [fit_30(prior, mode, sampling.dt, sampling.delay, ahead) for mode in range(sampling.n_modes)]
+    return LinearPredictor(Windows(None, sampling, TAPS), fits, ahead)
 
 
 RIDGE = Observer(

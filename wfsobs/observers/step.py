@@ -40,9 +40,14 @@ class Estimator(Stateful, Protocol):
         Whether a missing measurement takes what it expects itself (`expectation`), not what a filter beside it does.
     """
 
-    horizon: float | None
-    needs_command: bool
-    bridges: bool
+    @property
+    def horizon(self) -> float | None: ...  # noqa: D102
+
+    @property
+    def needs_command(self) -> bool: ...  # noqa: D102
+
+    @property
+    def bridges(self) -> bool: ...  # noqa: D102
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame: z (n_modes,) [um]; ngs (n_modes,) [um] where an NGS frame is due; u (n_modes,) [um]."""
@@ -50,6 +55,10 @@ class Estimator(Stateful, Protocol):
 
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
         """Return (mean, sd) of the target that many frames ahead, each (n_modes,) [um]. Raises StepError."""
+        ...
+
+    def settle(self) -> None:
+        """Do now what `advance` left for later."""
         ...
 
     def expectation(self) -> Array:
@@ -171,6 +180,13 @@ class StepObserver:
         if (frames, target) not in self._allowed:
             self._check_request(frames, target)
         return self.estimator.predict(frames, target) if self.frame else (self._nothing, self._nothing)
+
+    def settle(self) -> None:
+        """Do what does not need to be done before the estimate is out; the next `update` does it otherwise.
+
+        An observer that learns from every frame learns here: call it once the command has been sent.
+        """
+        self.estimator.settle()
 
     def reset(self) -> None:
         """Go back to before the first frame."""

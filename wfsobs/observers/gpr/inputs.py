@@ -7,13 +7,14 @@ from rest at the first sample, and the means and deviations are those of the tra
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 import param
 from scipy.signal import butter, sosfilt, sosfilt_zi
 
-from wfsobs.record import RecordError, Training, pseudo_open_loop
+from wfsobs.record import RecordError, Sampling, Training, pseudo_open_loop
 from wfsobs.settings import Group, Real, Whole
 from wfsobs.typing import Array
 
@@ -105,6 +106,18 @@ def scale_of(settings: Gpr, training: Training | None, delay: int, mode: int) ->
     return Scale(x.mean(axis=0), np.where(std > 0, std, 1.0))
 
 
+def scales_of(settings: Gpr, training: Training | None, sampling: Sampling) -> list[Scale]:
+    """Return the scales of standardised inputs of every mode; none for others. Raises RecordError."""
+    found = (scale_of(settings, training, sampling.delay, mode) for mode in range(sampling.n_modes))
+    return [scale for scale in found if scale is not None]
+
+
+def training_signals(settings: Gpr, training: Training, mode: int, dt: float, delay: int) -> Array:
+    """Return the channels of a window in the training record, (n_steps, channels)."""
+    z = pseudo_open_loop(training.y_lgs, training.u, delay)
+    return window_signals(settings, training.y_lgs, training.u, z, mode, dt, scale_of(settings, training, delay, mode))
+
+
 def high_pass(corner: float, dt: float) -> Array:
     """Second-order sections of the Butterworth high-pass with that corner [Hz]. Raises RecordError beyond half the rate."""
     if corner >= 0.5 / dt:
@@ -130,6 +143,21 @@ class StreamingInputs:
         self._scale = scale
         self._sos = high_pass(settings.highpass, dt) if settings.inputs_filter == "high-pass" else None
         self._state: Array | None = None
+
+    def reset(self) -> None:
+        """Set the state back to before the first sample."""
+        self._state = None
+
+    def save(self, channels: int) -> dict[str, Array]:
+        """Return a copy of the state, NaN before the first sample."""
+        if self._sos is None:
+            return {}
+        return {"inputs": np.full((len(self._sos), 2, channels), np.nan) if self._state is None else self._state.copy()}
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        if self._sos is not None:
+            self._state = None if np.isnan(state["inputs"]).any() else state["inputs"].copy()
 
     def step(self, sample: Array) -> Array:
         """Return the inputs (channels,) of this step's sample (channels,)."""

@@ -9,14 +9,16 @@ a, b, delta), a prediction is
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.baselines import open_loop_reference
-from wfsobs.observers.gpr.inputs import Gpr, scale_of, tunable, window_signals
+from wfsobs.observers.gpr.inputs import Gpr, scale_of, scales_of, training_signals, tunable, window_signals
 from wfsobs.observers.gpr.kernels import (
     Points,
     SquaredExponential,
@@ -28,11 +30,14 @@ from wfsobs.observers.gpr.kernels import (
 )
 from wfsobs.observers.gpr.online import kernel_of
 from wfsobs.observers.per_mode import over_modes, turns
+from wfsobs.observers.step import whole_frames
+from wfsobs.observers.windows import Windows
 from wfsobs.prior import Bands, Prior
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import DELAY, Measurements, RecordError, Training, pseudo_open_loop
+from wfsobs.record import DELAY, Measurements, RecordError, Sampling, Training, pseudo_open_loop
 from wfsobs.settings import Section
 from wfsobs.signal.linalg import eliminate, solve_rows
+from wfsobs.signal.stepping import Saved
 from wfsobs.typing import Array
 
 ROWS = 256
@@ -75,6 +80,14 @@ class TrainedGpr:
             out[start : start + rows] = known + here.delta * self.constant
         return out
 
+    def predict_one(self, window: Array) -> float:
+        """Mean for one window, (channels, depth), the oldest sample first."""
+        window = window / self.kernel.length_scale
+        G = sum(np.correlate(known, x, "valid") for known, x in zip(self.signals.T, window, strict=True))
+        here = self.kernel.points(np.array([np.sum(np.square(window))]))
+        known = self.kernel.split_times(np.asarray(G)[None], here, self.points, self.weights)
+        return float(known[0] + here.delta[0] * self.constant)
+
 
 def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExponential, watch: Watch = QUIET) -> TrainedGpr:
     """Fit the first m windows of signals (n, channels) to targets (n,), one per step.
@@ -96,28 +109,94 @@ def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExp
     return TrainedGpr(signals[: first + m] / kernel.length_scale, depth, points, a - b * constant, float(constant), kernel)
 
 
-def training_targets(training: Training, bands: Bands, dt: float, delay: int = DELAY) -> Array:
-    """Return the vibration reference of the training record, (n, n_modes) [um]; NaN at the last step."""
+def training_targets(training: Training, bands: Bands, dt: float, delay: int = DELAY, horizon: int = 0) -> Array:
+    """Return the vibration reference `horizon` steps ahead of every step of the training record, (n, n_modes) [um].
+
+    NaN at the last step, and where it lies beyond the record.
+    """
     twin = training.open_loop_y
-    return open_loop_reference(bands, pseudo_open_loop(training.y_lgs, training.u, delay) if twin is None else twin, dt)
+    at = open_loop_reference(bands, pseudo_open_loop(training.y_lgs, training.u, delay) if twin is None else twin, dt)
+    return np.vstack([at[horizon:], np.full((horizon, at.shape[1]), np.nan)])
+
+
+def train_mode(
+    prior: Prior, g: OfflineGpr, mode: int, dt: float, delay: int, horizon: int = 0, watch: Watch = QUIET
+) -> TrainedGpr:
+    """Train on one mode of the training record, for the vibration `horizon` steps ahead. Raises RecordError, ConditionError."""
+    training, bands = prior.training, prior.bands
+    assert training is not None and bands is not None
+    if len(training.y_lgs) < (needed := g.depth + g.training_size + horizon):
+        raise RecordError(f"the training record has {len(training.y_lgs)} steps, depth + training size need {needed}")
+    targets = training_targets(training, bands, dt, delay, horizon)[:, mode]
+    return train(training_signals(g, training, mode, dt, delay), targets, g.depth, g.training_size, kernel_of(g), watch)
 
 
 def gpr_offline(measured: Measurements, prior: Prior, settings: OfflineGpr, watch: Watch) -> dict[str, Array]:
     """Train on the training record and predict over the measurements, all modes at the same time."""
-    g, training, bands = settings, prior.training, prior.bands
-    assert training is not None and bands is not None
+    g, dt, delay = settings, measured.dt, measured.delay
     if measured.n_steps < g.depth:
         raise RecordError(f"the record has {measured.n_steps} steps; depth needs {g.depth}")
-    targets = training_targets(training, bands, measured.dt, measured.delay)
-    training_z = pseudo_open_loop(training.y_lgs, training.u, measured.delay)
 
     def one(mode: int, watch: Watch) -> Array:
-        scale = scale_of(g, training, measured.delay, mode)
-        signals = window_signals(g, training.y_lgs, training.u, training_z, mode, measured.dt, scale)
-        model = train(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), watch)
-        return model.predict(window_signals(g, measured.y_lgs, measured.u, measured.z, mode, measured.dt, scale), watch)
+        model = train_mode(prior, g, mode, dt, delay, watch=watch)
+        scale = scale_of(g, prior.training, delay, mode)
+        return model.predict(window_signals(g, measured.y_lgs, measured.u, measured.z, mode, dt, scale), watch)
 
     return {VIBRATION: over_modes(measured.n_modes, one, watch)}
+
+
+def step_gpr_offline(prior: Prior, settings: OfflineGpr, sampling: Sampling, horizon: float) -> OfflineEstimator:
+    """Return `gpr_offline`, one frame at a time, trained for `horizon` frames ahead."""
+    g, ahead = settings, whole_frames(horizon, "gpr-offline")
+    models = [train_mode(prior, g, mode, sampling.dt, sampling.delay, ahead) for mode in range(sampling.n_modes)]
+    return OfflineEstimator(Windows(g, sampling, g.depth, scales_of(g, prior.training, sampling)), models, ahead)
+
+
+class OfflineEstimator:
+    """Trained GPR of all modes, one frame at a time; `train_mode` made them for `horizon` frames ahead."""
+
+    bridges = False
+
+    def __init__(self, windows: Windows, models: Sequence[TrainedGpr], horizon: float):
+        self.windows, self.models, self.horizon, self.needs_command = windows, tuple(models), horizon, windows.needs_command
+        self._mean, self._sd = np.full(len(models), np.nan), np.full(len(models), np.nan)
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame."""
+        self.windows.push(z, u)
+        if self.windows.is_full:
+            parts = np.split(self.windows.window, len(self.models))
+            self._mean[...] = [model.predict_one(x) for model, x in zip(self.models, parts, strict=True)]
+
+    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
+        """Return the mean of the vibration; NaN before the first full window."""
+        return self._mean, self._sd
+
+    def settle(self) -> None:
+        """Have nothing left to do."""
+
+    def expectation(self) -> Array:
+        """Return no number: it predicts no measurement."""
+        return np.full_like(self._mean, np.nan)
+
+    def reset(self) -> None:
+        """Set the state back to the start."""
+        self.windows.reset()
+        self._mean[...] = np.nan
+
+    def save(self) -> Saved:
+        """Return a copy of the state."""
+        return {**self.windows.save(), "mean": self._mean.copy()}
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        self.windows.load(state)
+        self._mean[...] = state["mean"]
+
+    def take_over(self, old: Any) -> None:
+        """Go on with the samples of another design."""
+        self.windows.take_over(old.windows)
+        self._mean[...] = old._mean
 
 
 def seconds(settings: OfflineGpr, n_steps: int, n_modes: int, _dt: float) -> float:
@@ -143,4 +222,5 @@ GPR_OFFLINE = Observer(
     weight=20.0,
     seconds=seconds,
     look=Look("Offline GPR", "#0A960A", "#4FD64F", (12, 2, 2, 2, 2, 2)),
+    step=step_gpr_offline,
 )

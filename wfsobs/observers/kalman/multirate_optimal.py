@@ -107,7 +107,7 @@ def step_multirate_optimal(prior: Prior, settings: MultiRate, sampling: Sampling
     modes = []
     for mode, known in enumerate(prior.model):
         gains, states = optimal_gains(optimal_model(settings, prior, mode, sampling.ratio)[0])
-        modes.append(ModeFilter(known.disturbance(), gains, tuple(s.filtered for s in states)))
+        modes.append(ModeFilter(known.disturbance(), gains, tuple(s.posterior for s in states)))
     return KalmanEstimator(modes)
 
 

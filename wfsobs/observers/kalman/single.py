@@ -71,7 +71,7 @@ def step_kf_lgs(prior: Prior, _settings: None, _sampling: Sampling, _horizon: fl
 def steady_mode(model: DisturbanceModel, noise: float) -> ModeFilter:
     """Return the steady-state filter of a mode; noise [um]."""
     gains, steady = steady_gains(model, noise)
-    return ModeFilter(model, gains, (steady.filtered,))
+    return ModeFilter(model, gains, (steady.posterior,))
 
 
 def kf_ngs(measured: Measurements, prior: Prior, settings: Kalman, watch: Watch) -> dict[str, Array]:

@@ -29,12 +29,12 @@ class ModeFilter(NamedTuple):
 
     model    : of the disturbance, the first states of the filter
     gains    : of the filter
-    filtered : covariance after the measurement, of every step that repeats; empty where it is not known
+    posterior : covariance after the measurement, of every step that repeats; empty where it is not known
     """
 
     model: DisturbanceModel
     gains: GainCycle
-    filtered: tuple[Array, ...] = ()
+    posterior: tuple[Array, ...] = ()
 
 
 class Plan(NamedTuple):
@@ -68,6 +68,9 @@ class LinearEstimator:
         self._state = self.bank.x[:, :, None]
         self._plans: dict[tuple[float, str], Plan] = {}
         self._expected = expected_rows([mode.gains for mode in modes])
+
+    def settle(self) -> None:
+        """Have nothing left to do."""
 
     def expectation(self) -> Array:
         """Return the expected next measurement of the LGS, (n_modes,) [um]."""
@@ -127,8 +130,8 @@ class KalmanEstimator(LinearEstimator):
         powers = [matrix_power(mode.model.A, frames) for mode in self.modes]
         rows = [mode.model.outputs[target] @ power for mode, power in zip(self.modes, powers, strict=True)]
         sd = np.full((len(self.bank.maps), len(rows)), np.nan)
-        if self.modes[0].filtered:
-            repeat = len(self.modes[0].filtered)
+        if self.modes[0].posterior:
+            repeat = len(self.modes[0].posterior)
             sd[-repeat:] = np.array([_prediction_sd(m, row, target) for m, row in zip(self.modes, rows, strict=True)]).T
         self._plans[frames, target] = out = plan(rows, self.bank.x.shape[1], sd)
         return out
@@ -164,7 +167,7 @@ def _prediction_sd(mode: ModeFilter, row: Array, target: str) -> list[float]:
     """Return the standard deviation [um] of the prediction `row` of the model's state, for every step that repeats."""
     n, now = len(mode.model.A), mode.model.outputs[target]
     S = lyapunov(mode.model.A, mode.model.Q)
-    return [float(np.sqrt(max(now @ S @ now - row @ (S - P[:n, :n]) @ row, 0.0))) for P in mode.filtered]
+    return [float(np.sqrt(max(now @ S @ now - row @ (S - P[:n, :n]) @ row, 0.0))) for P in mode.posterior]
 
 
 def matrix_power(A: Array, frames: float) -> Array:
