@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from wfsobs.app.report.export import export
     from wfsobs.closed_loop.run import close_loop
+    from wfsobs.evaluation.budget import error_budget
     from wfsobs.evaluation.scores import score
     from wfsobs.identification.identification import identify
     from wfsobs.pipeline import Result, observe, run
@@ -34,6 +35,7 @@ _HOMES = {
     "export": "app.report.export",
     "close_loop": "closed_loop.run",
     "design": "stepping",
+    "error_budget": "evaluation.budget",
     "score": "evaluation.scores",
     "identify": "identification.identification",
     "Result": "pipeline",
@@ -60,6 +62,7 @@ __all__ = [
     "SettingError",
     "close_loop",
     "design",
+    "error_budget",
     "export",
     "identify",
     "load",

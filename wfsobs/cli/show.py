@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import click
@@ -11,11 +11,14 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from wfsobs.cli.budget_table import budget_table
 from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.tables import score_table
+from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.rows import TIME, Row
 from wfsobs.evaluation.verdict import verdict
 from wfsobs.pipeline import Result
+from wfsobs.progress import Watch
 
 
 def show(all_rows: list[Row], as_json: bool) -> None:
@@ -49,6 +52,25 @@ def show_verdicts(result: Result) -> None:
     for it in found:
         if it is not None:
             click.echo("\n" + "\n".join(f"{'  ' * bool(i)}{line}" for i, line in enumerate(it.sentences())))
+
+
+def find_budgets(result: Result, observers: Sequence[str] | None) -> list[Budget]:
+    """Return the error budgets of a run, under a progress bar."""
+    with progress_bar("error budget") as update:
+        return error_budget(result, observers=observers, watch=Watch(progress=update))
+
+
+def add_budgets(all_rows: list[Row], budgets: Sequence[Budget]) -> list[Row]:
+    """Return the rows of one run with their error budgets, where there are any."""
+    found = {(b.observer, b.target, b.mode): budget_row(b) for b in budgets}
+    return [row | {"budget": found.get((row["observer"], row["target"], row["mode"]))} for row in all_rows] if found else all_rows
+
+
+def show_budgets(budgets: Sequence[Budget]) -> None:
+    """Print error budgets as a table."""
+    if budgets:
+        click.echo()
+        show_table(budget_table(budgets))
 
 
 def warn(result: Result) -> None:

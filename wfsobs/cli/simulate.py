@@ -9,11 +9,22 @@ import click
 from wfsobs.cli.loop_table import loop_table
 from wfsobs.cli.options import load_declared, record_options, scenario_options, training, training_options
 from wfsobs.cli.recovery_tables import OverTime
-from wfsobs.cli.show import progress_bar, show, show_over_time, show_table, show_verdicts, warn
+from wfsobs.cli.show import (
+    add_budgets,
+    find_budgets,
+    progress_bar,
+    show,
+    show_budgets,
+    show_over_time,
+    show_table,
+    show_verdicts,
+    warn,
+)
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.rows import Row, score_rows
+from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
 from wfsobs.priors_from.training import trained_until, with_training
@@ -42,6 +53,10 @@ from wfsobs.units import UNITS
     help="Print the running error over this time against time (docs/events.md).",
 )
 @click.option("--psd-unit", type=click.Choice(UNITS), help="Unit of the spectrum, squared per Hz, where the file gives none.")
+@click.option("--budget", is_flag=True, help="Also print the error budget of every linear observer (docs/error-budget.md).")
+@click.option(
+    "--budget-of", multiple=True, metavar="NAME", help="Print the error budget of this observer alone; can be given many times."
+)
 def run(
     preset: str | None,
     config: str | None,
@@ -52,10 +67,16 @@ def run(
     vibration_psd: str | None,
     over_time: float | None,
     psd_unit: str | None,
+    budget: bool,
+    budget_of: tuple[str, ...],
 ) -> None:
     """Simulate the loop, run every observer and print the RMS table."""
     if save and seeds > 1:
         raise SettingError("--save: saves one record; leave --seeds at 1")
+    if (budget or budget_of) and (seeds > 1 or over_time):
+        raise SettingError("--budget: is of one record, without --over-time; leave --seeds at 1")
+    if unknown := set(budget_of) - set(OBSERVERS):
+        raise SettingError(f"--budget-of {min(unknown)}: no such observer; there are {', '.join(OBSERVERS)}")
     scenario = configfile.scenario_from(preset, config, assignments)
     if vibration_psd is not None:
         table = load_psd(vibration_psd, psd_unit, scenario.telescope.diameter)
@@ -75,10 +96,12 @@ def run(
                 history.add(result, one.run.seed)
     if history:
         show_over_time(history, as_json)
-    else:
-        show(all_rows, as_json)
-        if seeds == 1 and not as_json:
-            show_verdicts(result)
+        return
+    budgets = find_budgets(result, budget_of or None) if budget or budget_of else []
+    show(add_budgets(all_rows, budgets), as_json)
+    if seeds == 1 and not as_json:
+        show_verdicts(result)
+        show_budgets(budgets)
 
 
 @click.command()

@@ -18,6 +18,10 @@ NOT_OBSERVERS = {LOOP: "Recorded loop", BOUND: "Bound, mean of the LGS"}
 """Labels of rows in a table of observers that are not observers."""
 
 
+NO_ESTIMATE = "zero"
+"""The observer that stands for having none; it is never the best, nor worse than itself."""
+
+
 def score_rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
     """Return one plain dictionary per score: the keys of `wfsobs run --json`, and TIME."""
     return [

@@ -9,12 +9,12 @@ from math import sqrt
 import numpy as np
 from scipy.stats import t as student
 
-from wfsobs.evaluation.rows import can_be_best, row_label
+from wfsobs.evaluation.known_lines import given_lines, is_near
+from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best, row_label
 from wfsobs.evaluation.scores import BOUND, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate
 from wfsobs.prior import Bands, Lines, Model, Part, Training
-from wfsobs.priors_from.scenario import modelled_peak
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import welch_psd
@@ -26,12 +26,6 @@ BATCHES = 20
 
 LEVEL = 0.05
 """Of two equally good observers, the share of records in which a difference is called significant."""
-
-HALF_WIDTH = 1.5
-"""What counts as at a line [Hz] to either side, three bins of a spectrum with 0.5 Hz."""
-
-NO_ESTIMATE = "zero"
-"""The observer that stands for having none; it is never the best, nor worse than itself."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +101,7 @@ def verdict(
             Harm(
                 s.observer,
                 differs(_keep_scored(record, truth[:, column], s), errors[s.observer]),
-                *_shares(errors[s.observer], record.dt, lines, _given_lines(scenario, s.observer, column, lines)),
+                *_shares(errors[s.observer], record.dt, lines, given_lines(scenario, s.observer, column, lines)),
             )
             for s in reversed(ranked)
             if s.rms >= s.truth_rms
@@ -153,26 +147,10 @@ def _shares(error: Array, dt: float, lines: Sequence[float], given: Sequence[flo
     total = density.sum()
     if not total > 0:
         return 0.0, 0.0
-    at_lines = _near(frequency, lines)
-    at_given = at_lines & _near(frequency, given)
+    at_lines = is_near(frequency, lines)
+    at_given = at_lines & is_near(frequency, given)
     at_others = at_lines & ~at_given
     return float(density[at_given].sum() / total), float(density[at_others].sum() / total)
-
-
-def _near(frequency: Array, lines: Sequence[float]) -> Array:
-    """Which bins are at one of the lines."""
-    apart = np.abs(frequency[:, None] - np.asarray(lines, dtype=float))
-    return np.any(apart <= HALF_WIDTH, axis=1)
-
-
-def _given_lines(scenario: Scenario, observer: str, column: int, lines: Sequence[float]) -> Sequence[float]:
-    """Return the lines [Hz] that an observer is given."""
-    prior = OBSERVERS[observer].prior
-    if Lines in prior or not lines:
-        return lines
-    if Model in prior:
-        return [modelled_peak(scenario, column)[0]]
-    return scenario.butterworth.frequencies if Bands in prior else ()
 
 
 # ---------------------------------------------------------------------- in words

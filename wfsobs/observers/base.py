@@ -101,6 +101,10 @@ class Observer:
         Settings -> further needs for these.
     causal : bool
         False only for a reference that uses later samples.
+    linear : bool
+        Whether estimates are a linear function of the measurements, with prior and settings fixed; a constant may be added.
+    sensors : tuple of str
+        Whose measurements it uses, of "lgs" and "ngs".
     tunable : Tunable
         Settings that can be tuned.
     weight : float
@@ -124,6 +128,8 @@ class Observer:
     needs: tuple[str, ...] = ()
     asks: Callable[[Any], tuple[Part, ...]] = _nothing
     causal: bool = True
+    linear: bool = False
+    sensors: tuple[str, ...] = ("lgs",)
     tunable: Tunable = NOT_TUNED
     weight: float = 1.0
     seconds: Callable[[Any, int, int, float], float] | None = None

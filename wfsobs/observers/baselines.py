@@ -64,6 +64,7 @@ BUTTERWORTH_OL = Observer(
     prior=(Bands,),
     needs=("open_loop_y",),
     causal=False,
+    linear=True,
     tunable=Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
     look=Look("Butterworth OL", "#B40000", "#FF7A70", (2, 2)),
 )
@@ -75,6 +76,7 @@ BUTTERWORTH_CL = Observer(
     butterworth_cl,
     help="the same bands, causal",
     prior=(Bands,),
+    linear=True,
     tunable=Tunable(("butterworth.bandwidth_online",), ("butterworth.order",)),
     look=Look("Butterworth CL", "#B40000", "#FF7A70", (8, 3)),
 )
@@ -85,6 +87,7 @@ PERSISTENCE = Observer(
     (TURBULENCE,),
     persistence,
     help="the newest measurement taken for the turbulence",
+    linear=True,
     weight=0.1,
     look=Look("Persistence", "#707070", "#A8A8A8", (1, 3), in_figures=False),
 )
@@ -95,6 +98,7 @@ ZERO = Observer(
     TARGETS,
     zero,
     help="the trivial baseline",
+    linear=True,
     weight=0.1,
     look=Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4), in_figures=False),
 )

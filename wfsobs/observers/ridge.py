@@ -143,6 +143,7 @@ RIDGE = Observer(
     prior=(Training, Bands),
     settings=OFFLINE,
     needs=("training",),
+    linear=True,
     # The penalty (sigma_n l / sigma_SE)^2 is one number.
     tunable=Tunable(
         ("gpr_offline.noise_std", "gpr_offline.depth"),
@@ -159,6 +160,7 @@ RIDGE_30 = Observer(
     help="plain least squares on 30 measurements z: the honest baseline",
     prior=(Training, Bands),
     needs=("training",),
+    linear=True,
     tunable=Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
     look=Look("30-tap predictor", "#8A5A00", "#D8A44D", (2, 3), in_figures=False),
 )

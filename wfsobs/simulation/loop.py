@@ -10,10 +10,10 @@ import numpy as np
 from scipy.signal import lfilter
 
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Record, Training, delay_signal, frame_mean
+from wfsobs.record import DELAY, Measurements, Record, Training, delay_signal, frame_mean
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.disturbance import make_disturbance
-from wfsobs.simulation.sensing import measure_open_loop
+from wfsobs.simulation.sensing import OpenLoop, measure_noise, measure_open_loop
 from wfsobs.typing import Array
 
 TRAINING_MARGIN = 0.5
@@ -88,20 +88,33 @@ def _run(scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watc
     disturbance = make_disturbance(scenario, n_steps, disturbance_rng, watch)
     seen = measure_open_loop(scenario, disturbance, sensor_rng, watch)
     watch.check()
-    u = np.zeros_like(seen.lgs)
+    measured = measure_closed_loop(scenario, seen)
+    return Record(**vars(measured), turbulence=disturbance.turbulence, vibration=disturbance.vibration)
+
+
+def measure_closed_loop(scenario: Scenario, seen: OpenLoop) -> Measurements:
+    """Return the measurements and commands of the scenario's loop on open-loop measurements.
+
+    The loop is linear: those of a sum are the sums of those of its parts, where the same samples are missing.
+    """
+    u, n = np.zeros_like(seen.lgs), scenario.sensors.exposure_ratio
     if scenario.loop.closed:
         u = integrate_commands(seen.lgs, scenario.loop.gain, scenario.loop.leak)
-    n = scenario.sensors.exposure_ratio
-    return Record(
-        y_lgs=seen.lgs + delay_signal(u, 2),
+    return Measurements(
+        y_lgs=seen.lgs + delay_signal(u, DELAY),
         u=u,
         dt=scenario.dt,
-        y_ngs=seen.ngs + frame_mean(delay_signal(u, 1), n),
+        y_ngs=seen.ngs + frame_mean(delay_signal(u, DELAY - 1), n),
         ratio=n,
-        turbulence=disturbance.turbulence,
-        vibration=disturbance.vibration,
         open_loop_y=seen.lgs,
     )
+
+
+def simulate_noise(scenario: Scenario) -> OpenLoop:
+    """Return the white sensor noise [um] in the record that `simulate` makes from the scenario's seed."""
+    record_rng, _ = np.random.default_rng(scenario.run.seed).spawn(2)
+    _, sensor_rng = record_rng.spawn(2)
+    return measure_noise(scenario, scenario.n_steps, sensor_rng)
 
 
 def _training(scenario: Scenario, rng: np.random.Generator, watch: Watch) -> Training:

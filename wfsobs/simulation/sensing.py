@@ -84,6 +84,32 @@ def measure_open_loop(scenario: Scenario, disturbance: Disturbance, rng: np.rand
     return OpenLoop(lgs, ngs)
 
 
+def measure_noise(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> OpenLoop:
+    """Return the white noise in the open-loop measurements that `measure_open_loop` simulates from the same generator.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    n_steps : int
+        Number of steps.
+    rng : numpy.random.Generator
+        Source of the noise.
+
+    Returns
+    -------
+    OpenLoop
+        Noise of the combined LGS and of the NGS at every step, whether it has a frame or not.
+    """
+    lgs_rng, ngs_rng, _ = rng.spawn(3)
+    stars = [white_noise(scenario, "lgs", n_steps, star.spawn(2)[0]) for star in lgs_rng.spawn(scenario.sensors.lgs_count)]
+    nothing, working = np.zeros_like(stars[0]), events.laser_count(scenario, n_steps)
+    lgs = nothing.copy()
+    for count in np.unique(working[working > 0]):
+        lgs[working == count] = _combine(scenario, [nothing], nothing, stars[:count])[working == count]
+    return OpenLoop(lgs, white_noise(scenario, "ngs", n_steps, ngs_rng))
+
+
 def _combine(scenario: Scenario, seen: Sequence[Array], vibration: Array, errors: Sequence[Array]) -> Array:
     """Combine the LGS, as many as there are errors, (n_steps, n_modes)."""
     stars = len(errors)

@@ -58,6 +58,7 @@ KF_MULTI = Observer(
     help="every line of the scenario in its model, turbulence of order 2 or 3; not in the paper",
     prior=(Lines,),
     settings=Section("multipeak", "Multi-peak Kalman filter", MultiPeak),
+    linear=True,
     tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
     look=Look("Multi-peak", "#00707F", "#4DD0E1", (14, 3)),
     step=step_kf_multi,

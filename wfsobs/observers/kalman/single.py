@@ -145,6 +145,7 @@ KF_LGS = Observer(
     kf_lgs,
     help="steady-state Kalman filter, one vibration peak in its model",
     prior=(Model,),
+    linear=True,
     # The gain depends on the ratios of turbulence, vibration and noise. Turbulence tuned for vibration would be no turbulence.
     tunable=Tunable((*MODEL[:2], "kalman.vibration_rms"), ("kalman.turbulence_rms", "kalman.lgs_noise")),
     look=Look("LGS KF", "#FF6600", "#FF8533"),
@@ -160,6 +161,8 @@ KF_NGS = Observer(
     prior=(Model,),
     settings="kalman",
     needs=NGS,
+    linear=True,
+    sensors=("ngs",),
     tunable=Tunable(("kalman.turbulence_rms", "kalman.vibration_rms"), (*MODEL[:2], "kalman.ngs_noise")),
     look=Look("NGS KF", "#003DE6", "#7AA2FF", (8, 2)),
     step=step_kf_ngs,

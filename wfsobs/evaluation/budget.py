@@ -1,0 +1,290 @@
+"""Error budget: the mean square error of an observer, cause by cause.
+
+The measurements are a sum of sources (`sources`), and so are the estimates of a linear observer and its errors,
+
+    e = e_noise + e_cone + e_lines + e_lag + e_mismatch.
+
+The term of a cause is the mean of e_cause e. The terms add up to the mean of e^2, whatever the record and without an order of the
+causes; between independent sources it is the mean of e_cause^2 but for chance. The response to the signal is compared with
+that of the filter of the right model (`reference_filter`): what this lacks is lag, the difference of the two mismatch.
+
+An observer that is not linear runs on every combination of sources, and e_cause is the mean over all orders of switching
+them on (Shapley, Contributions to the Theory of Games II, 1953): those that learn from measurements learn anew each time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from math import factorial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from wfsobs.evaluation.known_lines import given_lines
+from wfsobs.evaluation.reference_filter import follow_signal
+from wfsobs.evaluation.rows import NO_ESTIMATE
+from wfsobs.evaluation.scores import BOUND, Score
+from wfsobs.evaluation.sources import CONE, LINES, NOISE, SIGNAL, Source, split_record, sum_sources
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Observer
+from wfsobs.priors_from.scenario import arguments
+from wfsobs.progress import QUIET, Watch, detach_watch
+from wfsobs.record import Measurements, Record
+from wfsobs.scenario import Scenario
+from wfsobs.simulation.disturbance import vibration_lines
+from wfsobs.simulation.loop import measure_closed_loop
+from wfsobs.simulation.sensing import OpenLoop
+from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.pipeline import Result
+
+LAG, MISMATCH = "lag", "mismatch"
+
+TERMS = {
+    NOISE: "Noise",
+    LAG: "Lag",
+    LINES: "Lines not modelled",
+    MISMATCH: "Model mismatch",
+    CONE: "Cone effect and aliasing",
+}
+"""Terms of a budget, and their labels."""
+
+LINEAR, AVERAGED = "linear", "averaged over orders"
+"""How the terms were found."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Error budget of one observer, target and mode.
+
+    Attributes
+    ----------
+    observer, target, mode : str
+        Of what.
+    total : float
+        Mean square error, as scored [um^2].
+    terms : dict of str to float
+        Term -> its part of the total, in the order of TERMS [um^2]; empty where there is no budget.
+    bound : float or None
+        Minimum mean square error of any causal observer of the LGS [um^2], a mark beside the terms; None where it is not known.
+    method : str
+        LINEAR or AVERAGED.
+    reason : str
+        Why there is no budget.
+    """
+
+    observer: str
+    target: str
+    mode: str
+    total: float
+    terms: dict[str, float] = field(default_factory=dict)
+    bound: float | None = None
+    method: str = LINEAR
+    reason: str = ""
+
+
+def error_budget(
+    result: Result, *, observers: Sequence[str] | None = None, mode: str | None = None, watch: Watch = QUIET
+) -> list[Budget]:
+    """Split the mean square error of every observer of a run into its causes.
+
+    Parameters
+    ----------
+    result : Result
+        What `run` returned.
+    observers : sequence of str, optional
+        Ids of the observers; by default all that gave an estimate. Those that are not linear have a budget only if they are
+        named: it takes 16 runs of the observer.
+    mode : str, optional
+        Name of a mode; by default all.
+    watch : Watch, optional
+        Receives the progress, and is asked between observers whether to stop.
+
+    Returns
+    -------
+    list of Budget
+        One per score, without the bounds and the observer that gives zero.
+
+    Raises
+    ------
+    ValueError
+        The record was not simulated from the scenario, or its vibration names no lines.
+    Cancelled
+        `watch` asks to stop.
+
+    See Also
+    --------
+    run : Simulates a record and runs the observers.
+
+    Examples
+    --------
+    >>> import wfsobs
+    >>> result = wfsobs.run(wfsobs.PRESETS["paper"]().replace({"run.duration": 2.0}), observers=["kf-lgs"])
+    >>> budget = wfsobs.error_budget(result)[0]
+    >>> abs(sum(budget.terms.values()) / budget.total - 1.0) < 1e-9
+    True
+    """
+    scenario, record = result.scenario, result.record
+    _check_simulated(scenario, record)
+    chosen = [name for name in dict.fromkeys(e.observer for e in result.estimates) if observers is None or name in observers]
+    out: list[Budget] = []
+    for i, name in enumerate(chosen):
+        watch.step(i / len(chosen))
+        own = [s for s in result.scores if s.observer == name and mode in (None, s.mode)]
+        if name != NO_ESTIMATE and own:
+            values = {e.target: e.values for e in result.estimates if e.observer == name}
+            bounds = {(s.target, s.mode): s.rms**2 for s in result.scores if s.observer == BOUND}
+            if reason := _without_budget(OBSERVERS[name], observers is not None):
+                found = [Budget(s.observer, s.target, s.mode, s.rms**2, reason=reason) for s in own]
+            else:
+                found = _of_observer(OBSERVERS[name], scenario, record, values, own, watch)
+            out += [replace(it, bound=bounds.get((it.target, it.mode))) for it in found]
+    return out
+
+
+def _check_simulated(scenario: Scenario, record: Record) -> None:
+    """Raise ValueError where the sources of a record are not known."""
+    if record.turbulence is None or record.vibration is None or record.n_steps != scenario.n_steps:
+        raise ValueError("error budget: takes a record that was simulated from its scenario")
+    if scenario.vibration.source == "psd":
+        raise ValueError("error budget: vibration.source = psd is a table, not lines that a model could have")
+
+
+def _without_budget(observer: Observer, named: bool) -> str:
+    """Return why an observer has no budget, empty if it has."""
+    if not observer.causal:
+        return "looks ahead"
+    return "" if observer.linear or named else "not linear, takes 16 runs: only if named"
+
+
+def _of_observer(
+    observer: Observer, scenario: Scenario, record: Record, values: dict[str, Array], scores: Iterable[Score], watch: Watch
+) -> list[Budget]:
+    before = scenario.before_events
+    lines = [[line[0] for line in vibration_lines(scenario, i)] for i in range(record.n_modes)]
+    given = [_lines_of(observer, before, i, of) for i, of in enumerate(lines)]
+    sources = split_record(scenario, record, lines, given)
+    responses, rest = observer_responses(observer, scenario, record, sources, watch)
+    columns = {mode.name: i for i, mode in enumerate(scenario.modes)}
+    complete = {name: Source(_fill(part.seen), part.truth) for name, part in sources.items()}
+    reference: dict[int, dict[str, Array]] = {}
+    out = []
+    for s in scores:
+        i = columns[s.mode]
+        if i not in reference:
+            watch.check()
+            sensors = observer.sensors
+            reference[i] = follow_signal(before, i, given[i], sensors, complete[SIGNAL].seen, scenario.sensors.exposure_ratio)
+        truth = {name: part.truth[s.target][:, i] for name, part in sources.items()}
+        parts = {name: responses[name][s.target][:, i] - truth[name] for name in sources}
+        lag = reference[i][s.target] - truth[SIGNAL]
+        parts |= {LAG: lag, MISMATCH: parts.pop(SIGNAL) - lag + rest[s.target][:, i]}
+        error = values[s.target][:, i] - sum(truth.values())
+        out.append(Budget(s.observer, s.target, s.mode, s.rms**2, _terms(parts, error, s, record.dt), method=_method(observer)))
+    return out
+
+
+def _terms(parts: dict[str, Array], error: Array, score: Score, dt: float) -> dict[str, float]:
+    """Return the mean of part times error over the scored samples, term by term."""
+    assert score.start is not None and score.stop is not None
+    scored = slice(round(score.start / dt), round(score.stop / dt))
+    known = ~np.isnan(error[scored])
+    return {name: float(np.mean(parts[name][scored][known] * error[scored][known])) for name in TERMS}
+
+
+def _lines_of(observer: Observer, scenario: Scenario, column: int, lines: Sequence[float]) -> Sequence[float]:
+    """Return the lines that an observer models; one that is given none and learns from the measurements can find them all."""
+    return lines if not observer.prior and not observer.linear else given_lines(scenario, observer.id, column, lines)
+
+
+def _method(observer: Observer) -> str:
+    return LINEAR if observer.linear else AVERAGED
+
+
+def _fill(seen: OpenLoop) -> OpenLoop:
+    return OpenLoop(np.nan_to_num(seen.lgs), np.nan_to_num(seen.ngs))
+
+
+# ---------------------------------------------------------------------- responses
+
+Estimates = dict[str, Array]
+
+
+def observer_responses(
+    observer: Observer, scenario: Scenario, record: Record, sources: dict[str, Source], watch: Watch = QUIET
+) -> tuple[dict[str, Estimates], Estimates]:
+    """Split an observer's estimate into its responses to each source.
+
+    Parameters
+    ----------
+    observer : Observer
+        The observer.
+    scenario : Scenario
+        Settings.
+    record : Record
+        The record, for what the observer is given of it.
+    sources : dict of str to Source
+        The sources, by name.
+    watch : Watch
+        Asked between runs whether to stop.
+
+    Returns
+    -------
+    tuple of dict
+        Source -> target -> response; and the estimate from nothing. Their sum is the estimate.
+    """
+    _, prior, settings = arguments(observer, record, scenario.before_events)
+
+    def estimate(names: Iterable[str]) -> Estimates:
+        watch.check()
+        chosen = [sources[name] for name in names]
+        measured = measure_closed_loop(scenario, sum_sources(chosen) if chosen else _nothing(sources))
+        return _estimate(observer, measured, prior, settings, watch)
+
+    rest = estimate(())
+    share = _linear_share if observer.linear else _shapley_share
+    return share(tuple(sources), estimate, rest), rest
+
+
+def _estimate(observer: Observer, measured: Measurements, prior: Any, settings: Any, watch: Watch) -> Estimates:
+    """Return an observer's estimate, zero where there is none."""
+    own = measured if "open_loop_y" in observer.needs else replace(measured, open_loop_y=None)
+    with detach_watch(replace(watch, progress=lambda _: None, partial=lambda *_: None)) as alone:
+        return {target: np.nan_to_num(values) for target, values in observer.estimate(own, prior, settings, alone).items()}
+
+
+def _nothing(sources: dict[str, Source]) -> OpenLoop:
+    seen = sources[SIGNAL].seen
+    return OpenLoop(0.0 * seen.lgs, 0.0 * seen.ngs)
+
+
+def _linear_share(names: Sequence[str], estimate: Callable[[Iterable[str]], Estimates], rest: Estimates) -> dict[str, Estimates]:
+    return {name: {target: values - rest[target] for target, values in estimate((name,)).items()} for name in names}
+
+
+def _shapley_share(names: Sequence[str], estimate: Callable[[Iterable[str]], Estimates], rest: Estimates) -> dict[str, Estimates]:
+    """Return the mean over all orders of what a source adds to the estimate from those before it."""
+    n = len(names)
+    found = {frozenset(of): estimate(of) if of else rest for size in range(n + 1) for of in combinations(names, size)}
+    out = {}
+    for name in names:
+        others = [of for of in found if name not in of]
+        weight = {of: factorial(len(of)) * factorial(n - len(of) - 1) / factorial(n) for of in others}
+        out[name] = {
+            target: sum(weight[of] * (found[of | {name}][target] - found[of][target]) for of in others) for target in rest
+        }
+    return out
+
+
+def budget_row(budget: Budget) -> dict[str, Any]:
+    """Return a budget as a plain dictionary: what `wfsobs run --budget --json` adds to a row."""
+    return {
+        "total_um2": budget.total,
+        "terms_um2": budget.terms or None,
+        "bound_um2": budget.bound,
+        "method": budget.method if budget.terms else None,
+        "reason": budget.reason or None,
+    }
