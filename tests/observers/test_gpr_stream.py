@@ -7,7 +7,8 @@ from scipy.signal import lfilter
 from wfsobs.observers.gpr.inputs import scale_of
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
 from wfsobs.observers.gpr.online import predict_sliding
-from wfsobs.observers.gpr.stream import OnlineGprStream, SlidingRegression
+from wfsobs.observers.gpr.sliding_regression import SlidingRegression
+from wfsobs.observers.gpr.stream import OnlineGprStream
 from wfsobs.pipeline import run_observer
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario.presets import paper

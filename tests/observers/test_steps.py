@@ -60,6 +60,10 @@ def test_steps_are_the_run_over_the_record(name: str, preset: str) -> None:
     assert step_difference(OBSERVERS[name], *given) <= (GPR if name.startswith("gpr") else ROUNDING)
 
 
+def test_every_causal_observer_has_steps() -> None:
+    assert [name for name, observer in OBSERVERS.items() if observer.step is None] == ["butterworth-ol"]
+
+
 def test_the_public_door_gives_the_same() -> None:
     record, scenario = with_gaps("paper")
     for prior in (scenario, prior_of(scenario, record, (Model, Lines))):

@@ -7,13 +7,18 @@ causal, so its estimate of step k is what the filter gives at step k.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer, Tunable
+from wfsobs.observers.step import StepError
 from wfsobs.prior import Bands, Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements
-from wfsobs.signal.bandpass import bandpass_bank, filter_causal, filter_zero_phase
+from wfsobs.record import Measurements, Sampling
+from wfsobs.signal.bandpass import bandpass_bank, bank_recursion, filter_causal, filter_zero_phase
+from wfsobs.signal.stepping import FilterBank, Saved
 from wfsobs.typing import Array
 
 
@@ -55,6 +60,110 @@ def zero(measured: Measurements, _prior: Prior, _settings: None, watch: Watch) -
     return {target: np.zeros_like(measured.y_lgs) for target in TARGETS}
 
 
+class BankEstimator:
+    """The causal band-passes of all modes, one frame at a time. They predict nothing."""
+
+    horizon, needs_command, bridges = 0.0, False, False
+
+    def __init__(self, bands: Bands, sampling: Sampling):
+        bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
+        self.filters = FilterBank([bank_recursion(bank)] * sampling.n_modes)
+        self._mean, self._sd = np.zeros(sampling.n_modes), np.full(sampling.n_modes, np.nan)
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame."""
+        self._mean[...] = self.filters.step(z[:, None])[:, 0]
+
+    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
+        """Return the vibration of this frame."""
+        return self._mean, self._sd
+
+    def settle(self) -> None:
+        """Have nothing left to do."""
+
+    def expectation(self) -> Array:
+        """Return no number: it predicts no measurement."""
+        return np.full_like(self._mean, np.nan)
+
+    def reset(self) -> None:
+        """Set the state back to the start."""
+        self.filters.reset()
+        self._mean[...] = 0.0
+
+    def save(self) -> Saved:
+        """Return a copy of the state."""
+        return {**self.filters.save(), "mean": self._mean.copy()}
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        self.filters.load(state)
+        self._mean[...] = state["mean"]
+
+    def take_over(self, old: Any) -> None:
+        """Go on from band-passes of the same number and order. Raises StepError."""
+        if old.filters.x.shape != self.filters.x.shape:
+            raise StepError("the designs have another number of band-passes, or of another order")
+        self.load(old.save())
+
+
+class LastValue:
+    """The last measurement times a factor, held for any number of frames."""
+
+    horizon, needs_command, bridges = None, False, False
+
+    def __init__(self, sampling: Sampling, factor: float):
+        self._factor, self._mean, self._sd = factor, np.zeros(sampling.n_modes), np.full(sampling.n_modes, np.nan)
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame."""
+        np.multiply(z, self._factor, out=self._mean)
+
+    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
+        """Return the value."""
+        return self._mean, self._sd
+
+    def settle(self) -> None:
+        """Have nothing left to do."""
+
+    def expectation(self) -> Array:
+        """Return the value."""
+        return self._mean
+
+    def reset(self) -> None:
+        """Set the state back to the start."""
+        self._mean[...] = 0.0
+
+    def save(self) -> Saved:
+        """Return a copy of the state."""
+        return {"mean": self._mean.copy()}
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        self._mean[...] = state["mean"]
+
+    def take_over(self, old: Any) -> None:
+        """Go on from the last value."""
+        self.load(old.save())
+
+
+def step_butterworth_cl(prior: Prior, _settings: None, sampling: Sampling, horizon: float) -> BankEstimator:
+    """Return `butterworth_cl`, one frame at a time. Raises StepError for a horizon."""
+    assert prior.bands is not None
+    if horizon != 0:
+        raise StepError(f"butterworth-cl: band-passes predict nothing: takes horizon = 0, not {horizon:g}")
+    return BankEstimator(prior.bands, sampling)
+
+
+def step_persistence(_prior: Prior, _settings: None, sampling: Sampling, _horizon: float) -> LastValue:
+    """Return `persistence`, one frame at a time."""
+    return LastValue(sampling, 1.0)
+
+
+def step_zero(_prior: Prior, _settings: None, sampling: Sampling, _horizon: float) -> LastValue:
+    """Return `zero`, one frame at a time."""
+    return LastValue(sampling, 0.0)
+
+
 BUTTERWORTH_OL = Observer(
     "butterworth-ol",
     "Butterworth, open loop",
@@ -79,6 +188,7 @@ BUTTERWORTH_CL = Observer(
     linear=True,
     tunable=Tunable(("butterworth.bandwidth_online",), ("butterworth.order",)),
     look=Look("Butterworth CL", "#B40000", "#FF7A70", (8, 3)),
+    step=step_butterworth_cl,
 )
 
 PERSISTENCE = Observer(
@@ -90,6 +200,7 @@ PERSISTENCE = Observer(
     linear=True,
     weight=0.1,
     look=Look("Persistence", "#707070", "#A8A8A8", (1, 3), in_figures=False),
+    step=step_persistence,
 )
 
 ZERO = Observer(
@@ -101,4 +212,5 @@ ZERO = Observer(
     linear=True,
     weight=0.1,
     look=Look("Zero", "#8A8A8A", "#9A9A9A", (2, 4), in_figures=False),
+    step=step_zero,
 )

@@ -150,6 +150,7 @@ RIDGE = Observer(
         ("gpr_offline.length_scale", *tunable("gpr_offline"), "butterworth.bandwidth_offline", "butterworth.order"),
     ),
     look=Look("Ridge", "#6B6B00", "#C8C84D", (4, 2), in_figures=False),
+    step=step_ridge,
 )
 
 RIDGE_30 = Observer(
@@ -163,4 +164,5 @@ RIDGE_30 = Observer(
     linear=True,
     tunable=Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),
     look=Look("30-tap predictor", "#8A5A00", "#D8A44D", (2, 3), in_figures=False),
+    step=step_ridge_30,
 )

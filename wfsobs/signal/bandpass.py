@@ -8,6 +8,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.signal import butter, sosfilt
 
+from wfsobs.signal.stepping import Recursion
 from wfsobs.typing import Array
 
 
@@ -77,6 +78,14 @@ class StreamingBank:
         """Update the state with the last sample."""
         self._x = self._A @ self._x + self._b * self._z
         self._ahead = float(self._c @ self._x)
+
+
+def bank_recursion(bank: Sequence[Array]) -> Recursion:
+    """Return `filter_causal` of one signal as a recursion."""
+    systems = [sos2ss(sos) for sos in bank]
+    A = block_diag(*(A for A, *_ in systems))
+    b, c = (np.concatenate([system[i] for system in systems]) for i in (1, 2))
+    return Recursion([(A, b[:, None], c[None], np.array([[sum(d for *_, d in systems)]]))])
 
 
 def sos2ss(sos: Array) -> tuple[Array, Array, Array, float]:

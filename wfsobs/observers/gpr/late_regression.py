@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from wfsobs.observers.gpr.kernels import SquaredExponential
-from wfsobs.observers.gpr.stream import SlidingRegression
+from wfsobs.observers.gpr.sliding_regression import SlidingRegression
 from wfsobs.typing import Array
 
 

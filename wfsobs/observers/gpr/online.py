@@ -12,13 +12,16 @@ import numpy as np
 
 from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.baselines import online_reference
-from wfsobs.observers.gpr.inputs import Gpr, scale_of, tunable, window_signals
+from wfsobs.observers.gpr.inputs import Gpr, scale_of, scales_of, tunable, window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
+from wfsobs.observers.gpr.online_step import OnlineEstimator
 from wfsobs.observers.gpr.sliding import finish, run_lengths, slide
 from wfsobs.observers.per_mode import over_modes, turns
+from wfsobs.observers.step import whole_frames
+from wfsobs.observers.windows import Windows
 from wfsobs.prior import Bands, Part, Prior, Training
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Measurements, RecordError, Signals
+from wfsobs.record import Measurements, RecordError, Sampling, Signals
 from wfsobs.settings import Real, Section, Whole
 from wfsobs.typing import Array
 
@@ -142,6 +145,15 @@ def _whole_run(
     return S, f
 
 
+def step_gpr_online(prior: Prior, settings: OnlineGpr, sampling: Sampling, horizon: float) -> OnlineEstimator:
+    """Return the online GPR, one frame at a time, learning the vibration `horizon` frames ahead."""
+    g = settings
+    assert prior.bands is not None
+    windows = Windows(g, sampling, 1, scales_of(g, prior.training, sampling))
+    ahead = whole_frames(horizon, "gpr-online")
+    return OnlineEstimator(windows, prior.bands, sampling, g.depth, g.training_size, kernel_of(g), ahead)
+
+
 def standardised_parts(settings: Gpr) -> tuple[Part, ...]:
     """Standardised inputs are divided by the deviations of a training record."""
     return (Training,) if settings.inputs_filter == "standardised" else ()
@@ -170,4 +182,5 @@ GPR_ONLINE = Observer(
     weight=200.0,
     seconds=seconds,
     look=Look("Online GPR", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
+    step=step_gpr_online,
 )

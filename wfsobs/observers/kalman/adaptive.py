@@ -12,15 +12,15 @@ from collections.abc import Callable
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
-from wfsobs.observers.kalman.single import MIN_NOISE, by_target, steady_filter
+from wfsobs.observers.kalman.adaptive_step import AdaptiveEstimator
+from wfsobs.observers.kalman.single import by_target
+from wfsobs.observers.kalman.window_model import NOT_YET, Found, identify_window, lengths, mode_of
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements, RecordError
+from wfsobs.record import Measurements, RecordError, Sampling
 from wfsobs.settings import Group, Real, Section, Whole
 from wfsobs.signal.periodic import PeriodicFilter
-from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.quick import SHORTEST, quick_spectrum
 from wfsobs.typing import Array
 
 
@@ -57,19 +57,12 @@ class Adaptive(Group):
     )
 
 
-STILL = PeriodicFilter([(np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((2, 1)), np.zeros((2, 1)))])
-"""The filter of white noise: nothing moves."""
-
-
 def kf_adaptive(measured: Measurements, _prior: Prior, settings: Adaptive, watch: Watch) -> dict[str, Array]:
     """Run the filter on the LGS measurement, at every fast step; NaN until the first window is full.
 
     Raises RecordError for a record shorter than a window, or a window of too few samples.
     """
-    window = round(settings.window / measured.dt)
-    if window < SHORTEST:
-        least = SHORTEST * measured.dt
-        raise RecordError(f"adaptive.window = {settings.window:g}: takes {least:g} s or more, {SHORTEST} samples")
+    window, _ = lengths(settings, measured.dt)
     needed = window + measured.delay
     if measured.n_steps < needed:
         raise RecordError(f"the record has {measured.n_steps} steps; adaptive.window = {settings.window:g} s needs {needed}")
@@ -90,31 +83,28 @@ def adapt(z: Array, dt: float, settings: Adaptive, tell: Callable[[float], None]
 
     A window whose model or filter cannot be found leaves the filter before it in charge.
     """
-    n, window, interval = len(z), round(settings.window / dt), max(round(settings.interval / dt), 1)
+    n, window, interval = len(z), *lengths(settings, dt)
     out = np.full((n, len(TARGETS)), np.nan)
-    spectrum: Spectrum | None = None
-    kalman: PeriodicFilter | None = None
+    found = NOT_YET
     for start in range(0, n - window + 1, interval):
         tell(start / n)
         now, stop = start + window - 1, min(start + window - 1 + interval, n)
-        try:
-            with np.errstate(divide="raise", over="raise", invalid="raise"):
-                spectrum = quick_spectrum(z[start : now + 1], dt, settings.peak_count, settings.lowest, spectrum)
-                kalman = filter_of(spectrum)
-        except (ValueError, ArithmeticError):
-            pass
-        if kalman is not None:
+        found = identify_window(z[start : now + 1], dt, settings, found)
+        if found.spectrum is not None:
             mean = z[start : now + 1].mean()  # what does not move in a window is turbulence, whatever its model says
-            out[now:stop] = kalman.run((z[start:stop] - mean)[:, None, None])[window - 1 :, :, 0] + [mean, 0.0]
+            estimate = found.filter.run((z[start:stop] - mean)[:, None, None])
+            out[now:stop] = estimate[window - 1 :, :, 0] + [mean, 0.0]
     return out
 
 
 def filter_of(spectrum: Spectrum) -> PeriodicFilter:
     """Return the steady-state filter of a spectrum: z -> turbulence, vibration. Raises ValueError where there is none."""
-    if not spectrum.processes:
-        return STILL
-    model = disturbance_model([] if spectrum.turbulence is None else [spectrum.turbulence], spectrum.resonances)
-    return steady_filter(model, max(spectrum.noise, MIN_NOISE))[0]
+    return Found(spectrum, spectrum, mode_of(spectrum)).filter
+
+
+def step_kf_adaptive(_prior: Prior, settings: Adaptive, sampling: Sampling, _horizon: float) -> AdaptiveEstimator:
+    """Return `kf_adaptive`, one frame at a time."""
+    return AdaptiveEstimator(settings, sampling)
 
 
 def seconds(settings: Adaptive, n_steps: int, n_modes: int, dt: float) -> float:
@@ -134,4 +124,5 @@ KF_ADAPTIVE = Observer(
     weight=50.0,
     seconds=seconds,
     look=Look("Adaptive KF", "#E0006E", "#FF7AB8", (20, 2), width=1.8),
+    step=step_kf_adaptive,
 )

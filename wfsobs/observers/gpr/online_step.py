@@ -1,0 +1,113 @@
+"""The online GPR of several modes one frame at a time, for the vibration now or a number of frames ahead.
+
+The target of a window is the vibration h frames later as the causal bank on z gives it, one frame late: at step k that of window
+k - 1 - h is known. What it learns from a frame it learns in `settle`, after the estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from wfsobs.observers.gpr.kernels import SquaredExponential
+from wfsobs.observers.gpr.late_regression import LateRegression
+from wfsobs.observers.gpr.sliding_regression import SlidingRegression
+from wfsobs.observers.step import StepError
+from wfsobs.observers.windows import Windows
+from wfsobs.prior import Bands
+from wfsobs.record import Sampling
+from wfsobs.signal.bandpass import bandpass_bank, bank_recursion
+from wfsobs.signal.stepping import FilterBank, Saved, load_parts, save_parts
+from wfsobs.typing import Array
+
+
+class OnlineEstimator:
+    """Online GPR of all modes.
+
+    Parameters
+    ----------
+    windows : Windows
+        The channels of a sample; of depth 1.
+    bands : Bands
+        Of the bank that gives the targets.
+    sampling : Sampling
+        Of the loop.
+    depth, m : int
+        Samples in a window, windows in the training set.
+    kernel : SquaredExponential
+        The covariance.
+    horizon : int
+        Frames ahead that it learns. Raises ValueError where that is as long as the training set.
+    """
+
+    bridges = False
+
+    def __init__(
+        self, windows: Windows, bands: Bands, sampling: Sampling, depth: int, m: int, kernel: SquaredExponential, horizon: int
+    ):
+        self.windows, self.horizon, self.needs_command = windows, horizon, windows.needs_command
+        self._size = depth, m, 2 if windows.needs_command else 1, kernel
+        bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
+        self.bank = FilterBank([bank_recursion(bank)] * sampling.n_modes)
+        self._mean, self._sd = np.full(sampling.n_modes, np.nan), np.full(sampling.n_modes, np.nan)
+        self._pending = False
+        self.regressions = self._start()
+
+    def _start(self) -> list[SlidingRegression]:
+        late = self.horizon
+        return [LateRegression(*self._size, late) if late else SlidingRegression(*self._size) for _ in self._mean]
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame."""
+        self.settle()
+        targets = self.bank.step(z[:, None])[:, 0]
+        samples = self.windows.push(z, u).reshape(len(z), -1)
+        for mode, regression in enumerate(self.regressions):
+            self._mean[mode] = regression.predict(samples[mode], float(targets[mode]))
+        self._pending = True
+
+    def settle(self) -> None:
+        """Learn from the last frame. Raises ConditionError where the precision is not enough."""
+        if self._pending:
+            self._pending = False
+            for regression in self.regressions:
+                regression.update()
+
+    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
+        """Return the mean of the vibration; NaN until the training set is full."""
+        return self._mean, self._sd
+
+    def expectation(self) -> Array:
+        """Return no number: it predicts no measurement."""
+        return np.full_like(self._mean, np.nan)
+
+    def reset(self) -> None:
+        """Set the state back to the start."""
+        self.windows.reset()
+        self.bank.reset()
+        self.regressions, self._pending = self._start(), False
+        self._mean[...] = np.nan
+
+    def save(self) -> Saved:
+        """Return a copy of the state."""
+        self.settle()
+        parts = {"windows": self.windows, "bank": self.bank}
+        found = [regression.save() for regression in self.regressions]
+        return (
+            save_parts(parts) | {"mean": self._mean.copy()} | {name: np.array([one[name] for one in found]) for name in found[0]}
+        )
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        load_parts({"windows": self.windows, "bank": self.bank}, state)
+        self._mean[...], self._pending = state["mean"], False
+        for mode, regression in enumerate(self.regressions):
+            regression.load({name: x[mode] for name, x in state.items() if "." not in name and name != "mean"})
+
+    def take_over(self, old: Any) -> None:
+        """Go on from a design with the same windows, training set, kernel and horizon. Raises StepError."""
+        if old._size != self._size or old.horizon != self.horizon or old.bank.x.shape != self.bank.x.shape:
+            raise StepError("the designs have other windows, training sets, kernels or horizons: one of them has to learn anew")
+        self.load(old.save())

@@ -1,0 +1,129 @@
+"""The adaptive Kalman filter one frame at a time: a window of samples, and a filter per mode that it is identified anew from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from wfsobs.observers.base import TURBULENCE
+from wfsobs.observers.kalman.step import KalmanEstimator
+from wfsobs.observers.kalman.window_model import NOT_YET, Found, identify_window, lengths, mode_of, pack_spectrum, unpack_spectrum
+from wfsobs.observers.step import StepError
+from wfsobs.record import Sampling
+from wfsobs.signal.stepping import Saved
+from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.observers.kalman.adaptive import Adaptive
+
+
+class AdaptiveEstimator:
+    """`kf_adaptive`, one frame at a time. It identifies in `advance`, in one frame of every interval."""
+
+    horizon, needs_command, bridges = None, False, False
+
+    def __init__(self, settings: Adaptive, sampling: Sampling):
+        self.settings, self.sampling = settings, sampling
+        self.window, self.interval = lengths(settings, sampling.dt)
+        self._samples = np.zeros((sampling.n_modes, 2 * self.window))  # newest last; moved to the front at the end
+        self._sd = np.full(sampling.n_modes, np.nan)
+        self._outputs: dict[tuple[float, str], Array] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Set the state back to the start."""
+        n = self.sampling.n_modes
+        self._end = self.count = 0
+        self.found = [NOT_YET] * n
+        self.means = np.full(n, np.nan)
+        self.filters: list[KalmanEstimator | None] = [None] * n
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame; those of the mirror's first delay are left out: what it did before is not known."""
+        self.count += 1
+        if self.count <= self.sampling.delay:
+            return
+        if self._end == self._samples.shape[1]:
+            self._samples[:, : self.window - 1] = self._samples[:, 1 - self.window :]
+            self._end = self.window - 1
+        self._samples[:, self._end] = z
+        self._end += 1
+        full = self.count - self.sampling.delay - self.window
+        if full >= 0 and full % self.interval == 0:
+            for mode in range(len(z)):
+                self._identify(mode)
+            return
+        for kalman, value, mean in zip(self.filters, z, self.means, strict=True):
+            if kalman is not None:
+                kalman.advance(np.array([value - mean]), None, None)
+
+    def _identify(self, mode: int) -> None:
+        z = self._samples[mode, self._end - self.window : self._end]
+        self.found[mode] = identify_window(z, self.sampling.dt, self.settings, self.found[mode])
+        if self.found[mode].spectrum is None:
+            return
+        self.means[mode] = z.mean()
+        self._start(mode)
+        kalman = self.filters[mode]
+        if kalman is not None:
+            gains = kalman.modes[0].gains
+            states = gains.filter(np.eye(len(kalman.modes[0].model.A))).run((z - self.means[mode])[:, None, None])
+            kalman.bank.x[0] = states[-1, :, 0]
+
+    def _start(self, mode: int) -> None:
+        """Put the filter that has been found in charge, at rest."""
+        one = self.found[mode].mode
+        self.filters[mode] = None if one is None else KalmanEstimator([one])
+
+    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
+        """Return the mean; NaN before the first full window."""
+        out = self._outputs.setdefault((frames, target), np.empty(len(self.means)))
+        for mode, (kalman, mean) in enumerate(zip(self.filters, self.means, strict=True)):
+            moving = 0.0 if kalman is None else kalman.predict(frames, target)[0][0]
+            out[mode] = moving + (mean if target == TURBULENCE else 0.0 * mean)
+        return out, self._sd
+
+    def settle(self) -> None:
+        """Have nothing left to do."""
+
+    def expectation(self) -> Array:
+        """Return no number: a missing measurement is the last one."""
+        return np.full_like(self.means, np.nan)
+
+    def save(self) -> Saved:
+        """Return a copy of the state: the window, what was found in it, and the states of the filters."""
+        rows = self.settings.peak_count + 2
+        spectra = [[pack_spectrum(one, rows) for one in (found.fit, found.spectrum)] for found in self.found]
+        window, states = np.zeros((len(self.means), self.window)), np.zeros((len(self.means), 3 * rows))
+        size = min(self._end, self.window)
+        window[:, self.window - size :] = self._samples[:, self._end - size : self._end]
+        for row, kalman in zip(states, self.filters, strict=True):
+            if kalman is not None:
+                row[: kalman.bank.x.shape[1]] = kalman.bank.x[0]
+        counts = np.array([self.count, size])
+        return {"window": window, "spectra": np.array(spectra), "means": self.means.copy(), "states": states, "counts": counts}
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        self.count, size = (int(i) for i in state["counts"])
+        self._end = self.window
+        self._samples[:, : self.window] = state["window"]
+        if size < self.window:
+            self._samples[:, :size] = state["window"][:, self.window - size :]
+            self._end = size
+        self.means[...] = state["means"]
+        for mode, (packed, x) in enumerate(zip(state["spectra"], state["states"], strict=True)):
+            fit, spectrum = (unpack_spectrum(one, self.sampling.dt) for one in packed)
+            self.found[mode] = Found(fit, spectrum, None if spectrum is None else mode_of(spectrum))
+            self._start(mode)
+            kalman = self.filters[mode]
+            if kalman is not None:
+                kalman.bank.x[0] = x[: kalman.bank.x.shape[1]]
+
+    def take_over(self, old: Any) -> None:
+        """Go on from another design with the same window and as many peaks. Raises StepError."""
+        if old.window != self.window or old.settings.peak_count != self.settings.peak_count:
+            raise StepError("the designs have another window or maximum number of peaks")
+        self.load(old.save())

@@ -1,0 +1,97 @@
+"""The model of a window of measurements, for the adaptive Kalman filter: what has been identified, and as numbers to save."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.kalman.single import MIN_NOISE, steady_mode
+from wfsobs.observers.kalman.step import ModeFilter
+from wfsobs.record import RecordError
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.statespace import disturbance_model
+from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.quick import SHORTEST, quick_spectrum
+from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.observers.kalman.adaptive import Adaptive
+
+STILL = PeriodicFilter([(np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((2, 1)), np.zeros((2, 1)))])
+"""The filter of white noise: nothing moves."""
+
+
+def lengths(settings: Adaptive, dt: float) -> tuple[int, int]:
+    """Return window and interval [steps]. Raises RecordError for a window of too few samples."""
+    window = round(settings.window / dt)
+    if window < SHORTEST:
+        raise RecordError(f"adaptive.window = {settings.window:g}: takes {SHORTEST * dt:g} s or more, {SHORTEST} samples")
+    return window, max(round(settings.interval / dt), 1)
+
+
+class Found(NamedTuple):
+    """What has been identified last: the newest fit, and the spectrum that the filter in charge is of; None before the first.
+
+    mode : that filter; None where nothing moves
+    """
+
+    fit: Spectrum | None
+    spectrum: Spectrum | None
+    mode: ModeFilter | None
+
+    @property
+    def filter(self) -> PeriodicFilter:
+        """The filter, z -> turbulence, vibration."""
+        return STILL if self.mode is None else self.mode.gains.filter(self.mode.model.output_rows(TARGETS))
+
+
+NOT_YET = Found(None, None, None)
+
+
+def identify_window(z: Array, dt: float, settings: Adaptive, last: Found) -> Found:
+    """Identify the model of a window z (n,); where it or its filter cannot be found, the last filter stays."""
+    fit = last.fit
+    try:
+        with np.errstate(divide="raise", over="raise", invalid="raise"):
+            fit = quick_spectrum(z, dt, settings.peak_count, settings.lowest, fit)
+            return Found(fit, fit, mode_of(fit))
+    except (ValueError, ArithmeticError):
+        return Found(fit, last.spectrum, last.mode)
+
+
+def mode_of(spectrum: Spectrum) -> ModeFilter | None:
+    """Return the steady-state filter of a spectrum, None where nothing moves. Raises ValueError where there is none."""
+    if not spectrum.processes:
+        return None
+    model = disturbance_model([] if spectrum.turbulence is None else [spectrum.turbulence], spectrum.resonances)
+    return steady_mode(model, max(spectrum.noise, MIN_NOISE))
+
+
+def pack_spectrum(spectrum: Spectrum | None, rows: int) -> Array:
+    """Return a spectrum as numbers, (rows, 4): noise; then omega, damping, rms of turbulence and resonances; NaN where none."""
+    out = np.full((rows, 4), np.nan)
+    if spectrum is not None:
+        out[0, 0] = spectrum.noise
+        for row, process in zip(out[1:], (spectrum.turbulence, *spectrum.resonances), strict=False):
+            if process is not None:
+                row[:3] = process.omega, process.damping, process.rms
+                row[3] = getattr(process, "corner", np.nan)
+    return out
+
+
+def unpack_spectrum(packed: Array, dt: float) -> Spectrum | None:
+    """Return the spectrum of these numbers."""
+    if np.isnan(packed[0, 0]):
+        return None
+    processes = [None if np.isnan(row[0]) else _process(row, dt) for row in packed[1:]]
+    resonances = tuple(p for p in processes[1:] if isinstance(p, Ar2))
+    return Spectrum(float(packed[0, 0]), dt, processes[0], resonances)
+
+
+def _process(row: Array, dt: float) -> Ar2 | Ar3:
+    omega, damping, rms, corner = row.tolist()
+    return Ar2(omega, damping, rms, dt) if np.isnan(corner) else Ar3(omega, damping, corner, rms, dt)
