@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from wfsobs.observers.kalman import adaptive as kalman_adaptive
+from wfsobs.observers.kalman import window_model
 from wfsobs.observers.kalman.adaptive import filter_of
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import run_observer
@@ -134,7 +134,7 @@ def test_filters_of_given_models_by_hand(monkeypatch: pytest.MonkeyPatch) -> Non
     record = made(1700, 1, 4, PEAK)
     models = [MODEL, Spectrum(0.02, DT, TURBULENCE, (Ar2(2 * pi * 33.0, 0.02, 0.01, DT),)), Spectrum(0.02, DT, None, (PEAK,))]
     given_models = iter(models)
-    monkeypatch.setattr(kalman_adaptive, "quick_spectrum", lambda *_: next(given_models))
+    monkeypatch.setattr(window_model, "quick_spectrum", lambda *_: next(given_models))
     got = run_observer("kf-adaptive", record, with_window(1.0, 0.25))
     z, expected = record.z[2:, 0], np.full((1700, 2), np.nan)
     for i, spectrum in enumerate(models):
@@ -202,9 +202,9 @@ def test_what_fails_leaves_the_filter_before_in_charge(monkeypatch: pytest.Monke
             raise it
         return it
 
-    monkeypatch.setattr(kalman_adaptive, "quick_spectrum", some)
+    monkeypatch.setattr(window_model, "quick_spectrum", some)
     got = run_observer("kf-adaptive", record, s)
-    monkeypatch.setattr(kalman_adaptive, "quick_spectrum", lambda *_: MODEL)
+    monkeypatch.setattr(window_model, "quick_spectrum", lambda *_: MODEL)
     expected = run_observer("kf-adaptive", record, s)
     for target, values in expected.items():
         assert np.isfinite(values[1001:]).all()

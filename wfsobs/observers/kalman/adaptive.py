@@ -14,7 +14,7 @@ import numpy as np
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.kalman.adaptive_step import AdaptiveEstimator
 from wfsobs.observers.kalman.single import by_target
-from wfsobs.observers.kalman.window_model import NOT_YET, Found, identify_window, lengths, mode_of
+from wfsobs.observers.kalman.window_model import NOT_YET, WindowModel, identify_window, lengths, mode_of
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling
@@ -99,7 +99,7 @@ def adapt(z: Array, dt: float, settings: Adaptive, tell: Callable[[float], None]
 
 def filter_of(spectrum: Spectrum) -> PeriodicFilter:
     """Return the steady-state filter of a spectrum: z -> turbulence, vibration. Raises ValueError where there is none."""
-    return Found(spectrum, spectrum, mode_of(spectrum)).filter
+    return WindowModel(spectrum, spectrum, mode_of(spectrum)).filter
 
 
 def step_kf_adaptive(_prior: Prior, settings: Adaptive, sampling: Sampling, _horizon: float) -> AdaptiveEstimator:

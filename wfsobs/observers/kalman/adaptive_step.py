@@ -9,7 +9,15 @@ import numpy as np
 
 from wfsobs.observers.base import TURBULENCE
 from wfsobs.observers.kalman.step import KalmanEstimator
-from wfsobs.observers.kalman.window_model import NOT_YET, Found, identify_window, lengths, mode_of, pack_spectrum, unpack_spectrum
+from wfsobs.observers.kalman.window_model import (
+    NOT_YET,
+    WindowModel,
+    identify_window,
+    lengths,
+    mode_of,
+    pack_spectrum,
+    unpack_spectrum,
+)
 from wfsobs.observers.step import StepError
 from wfsobs.record import Sampling
 from wfsobs.signal.stepping import Saved
@@ -116,7 +124,7 @@ class AdaptiveEstimator:
         self.means[...] = state["means"]
         for mode, (packed, x) in enumerate(zip(state["spectra"], state["states"], strict=True)):
             fit, spectrum = (unpack_spectrum(one, self.sampling.dt) for one in packed)
-            self.found[mode] = Found(fit, spectrum, None if spectrum is None else mode_of(spectrum))
+            self.found[mode] = WindowModel(fit, spectrum, None if spectrum is None else mode_of(spectrum))
             self._start(mode)
             kalman = self.filters[mode]
             if kalman is not None:

@@ -33,7 +33,7 @@ def lengths(settings: Adaptive, dt: float) -> tuple[int, int]:
     return window, max(round(settings.interval / dt), 1)
 
 
-class Found(NamedTuple):
+class WindowModel(NamedTuple):
     """What has been identified last: the newest fit, and the spectrum that the filter in charge is of; None before the first.
 
     mode : that filter; None where nothing moves
@@ -49,18 +49,18 @@ class Found(NamedTuple):
         return STILL if self.mode is None else self.mode.gains.filter(self.mode.model.output_rows(TARGETS))
 
 
-NOT_YET = Found(None, None, None)
+NOT_YET = WindowModel(None, None, None)
 
 
-def identify_window(z: Array, dt: float, settings: Adaptive, last: Found) -> Found:
+def identify_window(z: Array, dt: float, settings: Adaptive, last: WindowModel) -> WindowModel:
     """Identify the model of a window z (n,); where it or its filter cannot be found, the last filter stays."""
     fit = last.fit
     try:
         with np.errstate(divide="raise", over="raise", invalid="raise"):
             fit = quick_spectrum(z, dt, settings.peak_count, settings.lowest, fit)
-            return Found(fit, fit, mode_of(fit))
+            return WindowModel(fit, fit, mode_of(fit))
     except (ValueError, ArithmeticError):
-        return Found(fit, last.spectrum, last.mode)
+        return WindowModel(fit, last.spectrum, last.mode)
 
 
 def mode_of(spectrum: Spectrum) -> ModeFilter | None:
