@@ -143,7 +143,7 @@ def run(scenario: Scenario, *, observers: Sequence[str] | None = None, watch: Wa
     >>> wfsobs.run(scenario, observers=["kf-lgs"])
     Result(1 observers, ...)
     """
-    return observe(simulate(scenario, watch=watch), scenario, observers=observers, watch=watch, simulated=True)
+    return observe(simulate(scenario, watch=watch), scenario, observers=observers, watch=watch, is_simulated=True)
 
 
 def observe(
@@ -154,7 +154,7 @@ def observe(
     prior: Identification | Scenario | None = None,
     train: Record | float | None = None,
     watch: Watch = QUIET,
-    simulated: bool = False,
+    is_simulated: bool = False,
 ) -> Result:
     """Run observers on a record.
 
@@ -176,7 +176,7 @@ def observe(
         [s] of the first part of this one. There are then estimates and scores only after it.
     watch : Watch, optional
         Receives the progress, and is asked at every block of work whether to stop.
-    simulated : bool
+    is_simulated : bool
         Whether the record was simulated from the scenario, so that its Wiener bound is known.
 
     Returns
@@ -207,7 +207,7 @@ def observe(
             failures.append(item)
         else:
             estimates.append(_from(item, round(start / record.dt)))
-    least = record_bounds(scenario, record) if simulated else []
+    least = record_bounds(scenario, record) if is_simulated else []
     return collect(scenario, record, estimates, failures, watch, least, start)
 
 

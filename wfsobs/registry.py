@@ -71,8 +71,8 @@ class Registry(MutableMapping[str, E]):
         Ids that are used for something else.
     """
 
-    def __init__(self, kind: type[E], group: str, built_in: Iterable[E], reserved: Iterable[str] = ()):
-        self.kind, self.group, self.reserved = kind, group, frozenset(reserved)
+    def __init__(self, kind: type[E], group: str, built_in: Iterable[E], reserved_ids: Iterable[str] = ()):
+        self.kind, self.group, self.reserved = kind, group, frozenset(reserved_ids)
         self._entries: dict[str, E] = {}
         self._complete, self._reading = False, False
         for entry in built_in:

@@ -231,7 +231,7 @@ def test_wrong_tables(text: str, message: str) -> None:
 
 def test_empty_cells_are_missing_samples_and_ends() -> None:
     text = "\ufeffu/tip,y_lgs/tip_nm,training_y/tip,training_u/tip\n1,1000,5,6\n2,,7,8\n\n3,3000,,\n4,nan,,\n"
-    record = read_record(io.BytesIO(text.encode()), "r.csv", stated=DeclaredFormat(rate=100.0, unit=None))
+    record = read_record(io.BytesIO(text.encode()), "r.csv", declaration=DeclaredFormat(rate=100.0, unit=None))
     np.testing.assert_array_equal(record.y_lgs[:, 0], [1.0, np.nan, 3.0, np.nan])
     np.testing.assert_array_equal(record.u[:, 0], [1, 2, 3, 4])
     np.testing.assert_array_equal(record.training.u[:, 0], [6, 8])

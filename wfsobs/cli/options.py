@@ -70,13 +70,13 @@ def training_options(command: Callable) -> Callable:
 
 
 def training(
-    train: str | None, train_until: float | None, record: Record, scenario: Scenario, stated: DeclaredFormat
+    train: str | None, train_until: float | None, record: Record, scenario: Scenario, declaration: DeclaredFormat
 ) -> Record | float | None:
     """Read what --train and --train-until name, and say it on standard error. Raises SettingError, RecordError."""
     if train is not None and train_until is not None:
         raise SettingError("--train and --train-until: give one of them")
     if train is not None:
-        other = load_declared(train, scenario, stated)
+        other = load_declared(train, scenario, declaration)
         click.echo(f"wfsobs: training data: {train}, {other.n_steps * other.dt:g} s; no score is of it", err=True)
         return other
     if train_until is not None:
@@ -85,9 +85,9 @@ def training(
     return train_until
 
 
-def load_declared(record_file: str, scenario: Scenario, stated: DeclaredFormat, sha256: str | None = None) -> Record:
+def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFormat, sha256: str | None = None) -> Record:
     """Read the record of a file; print its interpretation on standard error."""
-    record = load_record(record_file, scenario, stated, sha256)
+    record = load_record(record_file, scenario, declaration, sha256)
     if record.origin:
         click.echo(f"wfsobs: {record_file}: read as {record.origin}", err=True)
     if record.missing:

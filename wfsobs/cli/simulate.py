@@ -89,7 +89,7 @@ def run(
             record = simulate(one)
             if save:
                 save_record(save, record, configfile.to_toml(one))
-            result = observe_record(record, one, watch=Watch(progress=lambda f, i=i: update((i + f) / seeds)), simulated=True)
+            result = observe_record(record, one, watch=Watch(progress=lambda f, i=i: update((i + f) / seeds)), is_simulated=True)
             warn(result)
             all_rows += score_rows(result.scores, one.run.seed)
             if history:

@@ -10,24 +10,24 @@ from wfsobs.tuning.report import nm, settings
 from wfsobs.tuning.tuning import TuningResult
 
 
-def settings_table(tuned: TuningResult) -> Table:
+def settings_table(result: TuningResult) -> Table:
     """Return the table of searched settings, and of those set by hand for the search, before and after."""
-    out = Table(title=f"{row_label(tuned.observer)}: settings after {len(tuned.history)} evaluations")
+    out = Table(title=f"{row_label(result.observer)}: settings after {len(result.history)} evaluations")
     out.add_column("Setting", no_wrap=True)
     for name in ("before", "after"):
         out.add_column(name, justify="right", no_wrap=True)
-    for path, before, after in settings(tuned):
+    for path, before, after in settings(result):
         out.add_row(path, before, after)
     return out
 
 
-def errors_table(tuned: TuningResult) -> Table:
+def errors_table(result: TuningResult) -> Table:
     """Errors, or what takes their place, on validation and test record, mode by mode and together."""
-    out = Table(title=f"{tuned.measure}{'' if tuned.target == PREDICTION else f' in {tuned.target}'}, nm")
+    out = Table(title=f"{result.measure}{'' if result.target == PREDICTION else f' in {result.target}'}, nm")
     out.add_column("", no_wrap=True)
     for name in ("validation, before", "after", "test, before", "after"):
         out.add_column(name, justify="right", no_wrap=True)
-    stages = (tuned.before, tuned.after)
+    stages = (result.before, result.after)
     cells = [s.validation for s in stages] + [s.test for s in stages]
     for mode in next(e for e in cells if e).modes:
         out.add_row(mode, *(nm(e.modes[mode]) if e else "fails" for e in cells))

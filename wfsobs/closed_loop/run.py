@@ -130,14 +130,14 @@ def truth(record: Record) -> Array:
 
 
 def _outcome(
-    controller: Controller, designed: Sequence[LawDesign], record: Record, disturbance: Array, plan: Design, watch: Watch
+    controller: Controller, designs: Sequence[LawDesign], record: Record, disturbance: Array, plan: Design, watch: Watch
 ) -> Outcome:
-    stable = tuple(d.stable for d in designed)
-    notes = [d.note for d in designed if d.note]
+    stable = tuple(d.stable for d in designs)
+    notes = [d.note for d in designs if d.note]
     if notes or not all(stable):
         note = notes[0] if notes else "a pole of the closed loop is not within the unit circle"
         return Outcome(controller.id, stable, note=note)
-    laws, settings = [d.law for d in designed if d.law is not None], own_settings(controller, plan.scenario)
+    laws, settings = [d.law for d in designs if d.law is not None], own_settings(controller, plan.scenario)
     try:
         measured, prior = controller_arguments(controller, record, settings, plan.priors[controller.id])
         with detach_watch(watch) as alone:

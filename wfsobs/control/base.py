@@ -117,30 +117,36 @@ class Controller:
         return () if self.law is None else tuple(self.law(prior, mode, plant, settings) for mode in range(n_modes))
 
     def commands(
-        self, laws: Sequence[Law], measured: Measurements, prior: Prior, plant: Plant, settings: Settings, watch: Watch = QUIET
+        self,
+        laws: Sequence[Law],
+        measurements: Measurements,
+        prior: Prior,
+        plant: Plant,
+        settings: Settings,
+        watch: Watch = QUIET,
     ) -> tuple[Array, Array]:
         """(commands that the mirror takes [um], whether a limit changed them), both (n_steps, n_modes).
 
         laws : of `laws`, from the same prior, plant and settings. Missing samples are bridged by what the controller is told.
         Raises ValueError, Cancelled.
         """
-        if self.ngs and measured.y_ngs is None:
+        if self.ngs and measurements.y_ngs is None:
             raise RecordError("the record has no NGS measurement")
         width = getattr(getattr(settings, "multipeak", None), "line_width", LINE_WIDTH)
-        measured = fill_missing(measured, prior, width)
-        z = measured.z
+        measurements = fill_missing(measurements, prior, width)
+        z = measurements.z
         forward = np.zeros_like(z)
         if self.law is None:
             return forward, forward > 0.0
         if self.predict is not None:
             assert prior.bands is not None
-            ahead = self.predict(measured, prior, plant, settings, watch)
+            ahead = self.predict(measurements, prior, plant, settings, watch)
             if np.shape(ahead) != z.shape:
                 raise ValueError(f"its prediction takes the shape {z.shape}, (n_steps, n_modes), not {np.shape(ahead)}")
             known = ~np.isnan(ahead)
             forward = -np.where(known, ahead, 0.0)
-            z = z - np.where(known, online_reference(prior.bands, z, measured.dt), 0.0)
-        inputs = np.stack([z, np.nan_to_num(measured.z_ngs)], axis=1) if self.ngs else z[:, None]
+            z = z - np.where(known, online_reference(prior.bands, z, measurements.dt), 0.0)
+        inputs = np.stack([z, np.nan_to_num(measurements.z_ngs)], axis=1) if self.ngs else z[:, None]
         modes = [_limit_commands(law, plant, inputs[:, :, mode], forward[:, mode]) for mode, law in enumerate(laws)]
         return np.column_stack([u for u, _ in modes]), np.column_stack([u != wanted for u, wanted in modes])
 

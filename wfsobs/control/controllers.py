@@ -128,6 +128,6 @@ CONTROLLERS = Registry(
             look=Look("Int. + online", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
         ),
     ),
-    reserved=("truth", "loop", "bound"),
+    reserved_ids=("truth", "loop", "bound"),
 )
 """Every controller, in the order of tables and legends."""

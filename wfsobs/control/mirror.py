@@ -56,9 +56,9 @@ class Mirror:
         """P, from a command to the measurement, at omega [rad per step]; same shape."""
         return np.exp(-1j * np.multiply.outer(omega, np.arange(self.taps.size))) @ self.taps
 
-    def clip_command(self, wanted: float, last: float) -> float:
-        """Return the command nearest to `wanted` within the limits after `last` [um]."""
-        near = min(max(wanted, last - self.slew), last + self.slew)
+    def clip_command(self, command: float, last: float) -> float:
+        """Return the command nearest to `command` within the limits after `last` [um]."""
+        near = min(max(command, last - self.slew), last + self.slew)
         return min(max(near, -self.stroke), self.stroke)
 
     def within(self, u: Array) -> bool:

@@ -26,7 +26,7 @@ from wfsobs.typing import Array
 G = TypeVar("G", OfflineGpr, OnlineGpr)
 
 
-def gpr_offline_ahead(measured: Measurements, prior: Prior, plant: Plant, settings: Any, watch: Watch) -> Array:
+def gpr_offline_ahead(measurements: Measurements, prior: Prior, plant: Plant, settings: Any, watch: Watch) -> Array:
     """Predict the vibration while u[k] acts, (n_steps, n_modes) [um], NaN before the first full window.
 
     The GPR is trained once on the training record, with targets as many steps later.
@@ -35,21 +35,23 @@ def gpr_offline_ahead(measured: Measurements, prior: Prior, plant: Plant, settin
     if training is None:
         raise RecordError("the record has no training record")
     assert prior.bands is not None
-    if measured.n_steps < g.depth:
-        raise RecordError(f"the record has {measured.n_steps} steps; depth needs {g.depth}")
+    if measurements.n_steps < g.depth:
+        raise RecordError(f"the record has {measurements.n_steps} steps; depth needs {g.depth}")
     steps, ahead = training.y_lgs.shape[0], plant.mirror.taps.size - 2  # by which the targets end earlier
     if steps < (needed := g.depth + g.training_size + ahead):
         raise RecordError(f"the training record has {steps} steps, depth + training size + {ahead} need {needed}")
-    targets = _ahead(training_targets(training, prior.bands, measured.dt, measured.delay), plant.mirror)
-    training_z = pseudo_open_loop(training.y_lgs, training.u, measured.delay)
+    targets = _ahead(training_targets(training, prior.bands, measurements.dt, measurements.delay), plant.mirror)
+    training_z = pseudo_open_loop(training.y_lgs, training.u, measurements.delay)
 
     def one(mode: int, watch: Watch) -> Array:
-        scale = scale_of(g, training, measured.delay, mode)
-        signals = window_signals(g, training.y_lgs, training.u, training_z, mode, measured.dt, scale)
+        scale = scale_of(g, training, measurements.delay, mode)
+        signals = window_signals(g, training.y_lgs, training.u, training_z, mode, measurements.dt, scale)
         model = train(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), watch)
-        return model.predict(window_signals(g, measured.y_lgs, measured.u, measured.z, mode, measured.dt, scale), watch)
+        return model.predict(
+            window_signals(g, measurements.y_lgs, measurements.u, measurements.z, mode, measurements.dt, scale), watch
+        )
 
-    return over_modes(measured.n_modes, one, watch)
+    return over_modes(measurements.n_modes, one, watch)
 
 
 def of_z(settings: G) -> G:
@@ -95,21 +97,21 @@ class VibrationPredictor:
         return value
 
 
-def gpr_online_ahead(measured: Measurements, prior: Prior, plant: Plant, settings: Any, watch: Watch) -> Array:
+def gpr_online_ahead(measurements: Measurements, prior: Prior, plant: Plant, settings: Any, watch: Watch) -> Array:
     """As `gpr_offline_ahead`, by `VibrationPredictor`."""
     g, bands = settings.gpr_online, prior.bands
     assert bands is not None
-    done = np.zeros(measured.n_modes)
+    done = np.zeros(measurements.n_modes)
 
     def one(mode: int, watch: Watch) -> Array:
-        scale = scale_of(of_z(g), prior.training, measured.delay, mode)
-        predictor, z = VibrationPredictor(g, bands, plant, scale), measured.z[:, mode].tolist()
-        out = np.empty(measured.n_steps)
+        scale = scale_of(of_z(g), prior.training, measurements.delay, mode)
+        predictor, z = VibrationPredictor(g, bands, plant, scale), measurements.z[:, mode].tolist()
+        out = np.empty(measurements.n_steps)
         for k, sample in enumerate(z):
             if k % 256 == 0:
-                done[mode] = k / measured.n_steps
+                done[mode] = k / measurements.n_steps
                 watch.step(float(done.mean()))
             out[k] = predictor.step(sample)
         return out
 
-    return over_modes(measured.n_modes, one, watch)
+    return over_modes(measurements.n_modes, one, watch)

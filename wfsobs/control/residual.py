@@ -17,12 +17,12 @@ AT_A_TIME = 2**17
 """Frequencies; slow winds have millions of them."""
 
 
-def residual_density(T: Any, target: Array, cross: Any, measured: Array) -> Array:
+def residual_density(T: Any, target: Array, cross: Any, measurement: Array) -> Array:
     """Spectrum of the residual phi_dist + phi_corr where T = P F: what is not rejected, and the noise let in.
 
-    target : of phi_dist; cross : between phi_dist[k] and z[k + 1]; measured : of z
+    target : of phi_dist; cross : between phi_dist[k] and z[k + 1]; measurement : of z
     """
-    return target + np.abs(T) ** 2 * measured - 2.0 * np.real(np.conj(cross) * T)
+    return target + np.abs(T) ** 2 * measurement - 2.0 * np.real(np.conj(cross) * T)
 
 
 def residual_variance(law: Law, spectra: Spectra, mirror: Mirror) -> float:

@@ -66,7 +66,7 @@ class Score:
     interval: tuple[float, float] | None = None
 
 
-def common_samples(known: Sequence[Array]) -> list[tuple[Array, bool]]:
+def common_samples(samples: Sequence[Array]) -> list[tuple[Array, bool]]:
     """Select the samples on which estimates are scored.
 
     Starting with the estimate with most samples, every estimate takes part that leaves SHARE of the samples in common. These are
@@ -74,7 +74,7 @@ def common_samples(known: Sequence[Array]) -> list[tuple[Array, bool]]:
 
     Parameters
     ----------
-    known : sequence of Array
+    samples : sequence of Array
         Samples that each estimate has, bool (n,).
 
     Returns
@@ -82,17 +82,17 @@ def common_samples(known: Sequence[Array]) -> list[tuple[Array, bool]]:
     list of (Array, bool)
         Samples of each estimate, and whether it stands apart.
     """
-    if not known:
+    if not samples:
         return []
-    order = sorted(range(len(known)), key=lambda i: -known[i].sum())
-    shared, apart = known[order[0]], set()
+    order = sorted(range(len(samples)), key=lambda i: -samples[i].sum())
+    shared, apart = samples[order[0]], set()
     for i in order[1:]:
-        both = shared & known[i]
-        if both.sum() >= SHARE * known[order[0]].sum():
+        both = shared & samples[i]
+        if both.sum() >= SHARE * samples[order[0]].sum():
             shared = both
         else:
             apart.add(i)
-    return [(known[i] if i in apart else shared, i in apart) for i in range(len(known))]
+    return [(samples[i] if i in apart else shared, i in apart) for i in range(len(samples))]
 
 
 def score(

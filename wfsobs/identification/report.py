@@ -21,9 +21,9 @@ def identification_dict(result: Identification) -> dict[str, Any]:
     Every number has its standard deviation as `_std`, null where there is none; rms in um, frequencies in Hz.
     """
 
-    def numbers(**named: Number) -> dict[str, float | None]:
-        std = {f"{name}_std": None if isnan(n.std) else n.std for name, n in named.items()}
-        return {key: (n.value if key == name else std[key]) for name, n in named.items() for key in (name, f"{name}_std")}
+    def numbers(**values: Number) -> dict[str, float | None]:
+        std = {f"{name}_std": None if isnan(n.std) else n.std for name, n in values.items()}
+        return {key: (n.value if key == name else std[key]) for name, n in values.items() for key in (name, f"{name}_std")}
 
     def of(p: IdentifiedProcess) -> dict[str, float | None]:
         return numbers(**{name: n for name, n in vars(p).items() if n is not None})

@@ -34,30 +34,30 @@ def online_reference(bands: Bands, z: Array, dt: float) -> Array:
     return filter_causal(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, dt), z)
 
 
-def butterworth_ol(measured: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
+def butterworth_ol(measurements: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
     """Zero-phase, on the open-loop twin of the record. Not causal."""
     watch.step(0.0)
-    assert measured.open_loop_y is not None and prior.bands is not None
-    return {VIBRATION: open_loop_reference(prior.bands, measured.open_loop_y, measured.dt)}
+    assert measurements.open_loop_y is not None and prior.bands is not None
+    return {VIBRATION: open_loop_reference(prior.bands, measurements.open_loop_y, measurements.dt)}
 
 
-def butterworth_cl(measured: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
+def butterworth_cl(measurements: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
     """Causal, on the record's own pseudo-open-loop measurement."""
     watch.step(0.0)
     assert prior.bands is not None
-    return {VIBRATION: online_reference(prior.bands, measured.z, measured.dt)}
+    return {VIBRATION: online_reference(prior.bands, measurements.z, measurements.dt)}
 
 
-def persistence(measured: Measurements, _prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
+def persistence(measurements: Measurements, _prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
     """Return the newest measurement as the turbulence: no model, all of the noise and the vibration, one step late."""
     watch.step(0.0)
-    return {TURBULENCE: measured.z}
+    return {TURBULENCE: measurements.z}
 
 
-def zero(measured: Measurements, _prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
+def zero(measurements: Measurements, _prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
     """Return zero, the trivial baseline."""
     watch.step(0.0)
-    return {target: np.zeros_like(measured.y_lgs) for target in TARGETS}
+    return {target: np.zeros_like(measurements.y_lgs) for target in TARGETS}
 
 
 class BankEstimator:

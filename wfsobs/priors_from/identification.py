@@ -17,16 +17,16 @@ FOUND = ("telescope", "turbulence", "vibration", "sensors", "kalman", "butterwor
 """Groups of settings of which priors are made."""
 
 
-def told_by(found: Scenario | Identification, scenario: Scenario) -> Scenario:
+def told_by(model: Scenario | Identification, scenario: Scenario) -> Scenario:
     """Return a scenario with the models of an identification, and all other settings of `scenario`.
 
-    found : an identification, or the file of one (`wfsobs identify --out`)
+    model : an identification, or the file of one (`wfsobs identify --out`)
     """
-    if not isinstance(found, Scenario):
-        found = found.scenario(scenario)
+    if not isinstance(model, Scenario):
+        model = model.scenario(scenario)
     out = scenario.before_events.copy()
     for group in FOUND:
-        setattr(out, group, getattr(found, group).copy())
+        setattr(out, group, getattr(model, group).copy())
     out.kalman.ngs_between_frames = scenario.kalman.ngs_between_frames  # what a filter does, not what it is told
     return out
 
@@ -35,12 +35,12 @@ KNOWN: tuple[Part, ...] = (Model, LgsError, Lines, Bands)
 """What an identification tells."""
 
 
-def prior_of(found: Identification, parts: Iterable[Part] = KNOWN, scenario: Scenario | None = None) -> Prior:
+def prior_of(identification: Identification, parts: Iterable[Part] = KNOWN, scenario: Scenario | None = None) -> Prior:
     """Return what an identification tells of each of its modes: a prior without a file.
 
     scenario : where sensors and bands come from, which telemetry does not tell; the defaults unless given
     Raises ValueError for a part that cannot be made from an identification.
     """
-    prior, n = priors.prior_of(told_by(found, scenario or Scenario()), None, parts), len(found.modes)
-    lines = tuple(mode.prior for mode in found.modes) if prior.lines else ()
+    prior, n = priors.prior_of(told_by(identification, scenario or Scenario()), None, parts), len(identification.modes)
+    lines = tuple(mode.prior for mode in identification.modes) if prior.lines else ()
     return replace(prior, model=prior.model[:n], lgs_error=prior.lgs_error[:n], lines=lines, spectra=prior.spectra[:n])

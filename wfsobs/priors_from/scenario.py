@@ -73,10 +73,10 @@ def spectra_of(scenario: Scenario, mode: int) -> Spectra:
     return told_spectra(true_spectra(scenario, mode))
 
 
-def told_spectra(known: TrueSpectra) -> Spectra:
+def told_spectra(spectra: TrueSpectra) -> Spectra:
     """Return the part of true spectra in a prior: those of the disturbance as a whole."""
-    disturbance, cross = known.total
-    return Spectra(disturbance, known.measurement, cross)
+    disturbance, cross = spectra.total
+    return Spectra(disturbance, spectra.measurement, cross)
 
 
 # ---------------------------------------------------------------------- one vibration peak

@@ -121,10 +121,10 @@ def preset(name: Any) -> Scenario:
     return PRESETS[name]()
 
 
-def preset_name(chosen: str | None, config: str | Path | None, default: str = "paper") -> str:
+def preset_name(name: str | None, config: str | Path | None, default: str = "paper") -> str:
     """Return the preset that `scenario_from` starts from. Raises SettingError where the file cannot be read."""
-    if chosen is not None or config is None:
-        return chosen or default
+    if name is not None or config is None:
+        return name or default
     try:
         return parse_toml(_text(config)).get("preset", default)
     except SettingError as error:

@@ -12,7 +12,7 @@ from wfsobs.settings.group import SettingError
 Kind = Literal["lgs", "ngs"]
 
 
-def fit_lenslets(settings: LensletArrays, kind: Kind, diameter: float, wanted: int) -> tuple[Lenslets, int]:
+def fit_lenslets(settings: LensletArrays, kind: Kind, diameter: float, min_order: int) -> tuple[Lenslets, int]:
     """Return the lenslets on an LGS or on the NGS, and the radial order fitted to their slopes.
 
     Parameters
@@ -23,7 +23,7 @@ def fit_lenslets(settings: LensletArrays, kind: Kind, diameter: float, wanted: i
         Which sensor.
     diameter : float
         Aperture diameter [m].
-    wanted : int
+    min_order : int
         Minimum radial order.
 
     Returns
@@ -36,7 +36,7 @@ def fit_lenslets(settings: LensletArrays, kind: Kind, diameter: float, wanted: i
     Raises
     ------
     SettingError
-        The slopes determine fewer orders than wanted.
+        The slopes determine fewer orders than `min_order`.
     """
     across = settings.lgs_subapertures if kind == "lgs" else settings.ngs_subapertures
     lenslets = Lenslets(diameter, across, settings.illumination, settings.obscuration)
@@ -45,9 +45,9 @@ def fit_lenslets(settings: LensletArrays, kind: Kind, diameter: float, wanted: i
         order = highest_order(lenslets, settings.fitted_order)
     except ValueError as error:
         raise SettingError(f"{name}: {error}") from None
-    if order < wanted:
+    if order < min_order:
         raise SettingError(
             f"{name}: with sensors.lenslets.fitted_order = {settings.fitted_order} these fit modes up to radial "
-            f"order {order}, fewer than telescope.radial_order = {wanted}"
+            f"order {order}, fewer than telescope.radial_order = {min_order}"
         )
     return lenslets, order

@@ -90,16 +90,16 @@ class PeriodicFilter:
         return state, from_inputs, H, J
 
 
-def _block_states(F: Array, driven: Array, start: Array) -> Array:
+def _block_states(F: Array, drive: Array, start: Array) -> Array:
     """Return the state at the start of each block: x_0 = start, x_b+1 = F x_b + driven_b.
 
-    `driven` is (n, blocks, columns). The same method again: blocks of blocks, then one short loop.
+    `drive` is (n, blocks, columns). The same method again: blocks of blocks, then one short loop.
     """
-    n, blocks, columns = driven.shape
+    n, blocks, columns = drive.shape
     length = max(1, int(np.sqrt(blocks)))
     groups = -(-blocks // length)
     padded = np.zeros((n, groups * length, columns))
-    padded[:, :blocks] = driven
+    padded[:, :blocks] = drive
     padded = padded.reshape(n, groups, length, columns)
     local = np.zeros((n, groups, length + 1, columns))  # states of every group started from zero
     for i in range(length):

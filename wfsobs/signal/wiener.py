@@ -107,14 +107,14 @@ def causal_error(target: Array, cross: Complex, whitener: Whitener) -> float:
     return circle_mean(error_spectrum(target, cross, whitener))
 
 
-def explained_variance(measured: Array, cross: Array) -> Array:
+def explained_variance(autocovariance: Array, cross: Array) -> Array:
     """Return the variance of targets s[k] that n = 1, 2, ... measurements z[k], ..., z[k-n+1] explain.
 
     Levinson's recursion: the errors of predicting each earlier measurement from the later ones are orthogonal.
 
     Parameters
     ----------
-    measured : Array
+    autocovariance : Array
         Autocovariance of z at the lags 0 ... n - 1, (n,).
     cross : Array
         E s[k] z[k-j], j = 0 ... n - 1, (n_targets, n).
@@ -124,14 +124,14 @@ def explained_variance(measured: Array, cross: Array) -> Array:
     Array
         Explained variance, (n_targets, n).
     """
-    n = measured.size
+    n = autocovariance.size
     backwards = np.ascontiguousarray(cross[:, ::-1])
-    predictor, error = np.zeros(n), float(measured[0])
+    predictor, error = np.zeros(n), float(autocovariance[0])
     predictor[0] = 1.0
     out = np.empty_like(backwards)
     for k in range(n):
         if k:
-            reflection = float(predictor[:k] @ measured[k:0:-1]) / error
+            reflection = float(predictor[:k] @ autocovariance[k:0:-1]) / error
             predictor[1 : k + 1] -= reflection * predictor[k - 1 :: -1] if k > 1 else reflection
             error *= 1.0 - reflection**2
         out[:, k] = (backwards[:, n - 1 - k :] @ predictor[: k + 1]) ** 2 / error

@@ -42,19 +42,19 @@ class MissingSamples:
         For the records drawn.
     """
 
-    def __init__(self, gone: Array, dt: float, rng: np.random.Generator):
-        self.gone, self.dt, self.n = gone, dt, len(gone)
-        self.any = bool(gone.any())
+    def __init__(self, is_missing: Array, dt: float, rng: np.random.Generator):
+        self.is_missing, self.dt, self.n = is_missing, dt, len(is_missing)
+        self.any = bool(is_missing.any())
         self.noise = rng.standard_normal((DRAWS, self.n)) if self.any else np.zeros((0, self.n))
 
     def rounds(self, left: float) -> int:
         """Return the number of rounds of filling and fitting that leave `left` of the first error; 1 where nothing is missing."""
-        return max(1, ceil(log(left) / log(self.gone.mean()))) if self.any else 1
+        return max(1, ceil(log(left) / log(self.is_missing.mean()))) if self.any else 1
 
     def interpolate(self, z: Array) -> Array:
         """Return z (n,) with straight lines through the gaps, for a first guess."""
         k = np.arange(self.n)
-        return np.interp(k, k[~self.gone], z[~self.gone]) if self.any else z
+        return np.interp(k, k[~self.is_missing], z[~self.is_missing]) if self.any else z
 
     def fill(self, z: Array, S: Array) -> Array:
         """Return z (n,) with the missing samples replaced by their expectation for the density S (bins,), given all others."""
@@ -66,15 +66,15 @@ class MissingSamples:
 
         def within(x: Array) -> Array:
             whole = np.zeros(self.n)
-            whole[self.gone] = x
-            return weighted(whole)[self.gone]
+            whole[self.is_missing] = x
+            return weighted(whole)[self.is_missing]
 
         start = self.interpolate(z)
-        out, count = start.copy(), int(self.gone.sum())
-        rest = -weighted(start)[self.gone]
+        out, count = start.copy(), int(self.is_missing.sum())
+        rest = -weighted(start)[self.is_missing]
         size = CLOSE * np.sqrt(count * S.min() / (2.0 * self.dt))
         move, _ = cg(LinearOperator((count, count), matvec=within, dtype=float), rest, rtol=0.0, atol=size, maxiter=MOST)
-        out[self.gone] += move
+        out[self.is_missing] += move
         return out
 
     def draw_errors(self, S: Array) -> Array:
@@ -90,7 +90,7 @@ class MissingSamples:
         edges = np.unique(np.concatenate([[0], np.geomspace(1, len(V), BANDS).astype(int)]))
         centre, level = (np.array([x[a:b].mean() for a, b in pairwise(edges)]) for x in (np.log(j), V))
         V = np.exp(np.interp(np.log(j), centre, np.log(np.maximum(level, np.finfo(float).tiny))))
-        return np.maximum(1.0 - V / S * self.gone.mean() / np.mean(V / S), LEAST)
+        return np.maximum(1.0 - V / S * self.is_missing.mean() / np.mean(V / S), LEAST)
 
     def _at_all_frequencies(self, S: Array) -> Array:
         """Return a density at all frequencies of rfft, zero included."""

@@ -84,14 +84,14 @@ class Spectrum:
             self, noise=float(np.exp(vector[0])), turbulence=turbulence, background=background, resonances=tuple(processes)
         )
 
-    def slopes(self, f: Array, wanted: Sequence[int]) -> Array:
-        """Return the derivatives of the density by the wanted parameters, in their order, (len(wanted), len(f)) [um^2/Hz]."""
+    def slopes(self, f: Array, indices: Sequence[int]) -> Array:
+        """Return the derivatives of the density by parameters, in the order of `indices`, (len(indices), len(f)) [um^2/Hz]."""
         on = _Frequencies(f, self.dt)
         rows = {0: np.full_like(f, 4.0 * self.dt * self.noise**2)}
         for start, p in zip(self.starts, self.processes, strict=False):
             at = _vector(p)
             for i in range(len(at)):
-                if start + i not in wanted:
+                if start + i not in indices:
                     continue
                 if i == RMS:
                     rows[start + i] = 2.0 * on.density(p)
@@ -100,7 +100,7 @@ class Spectrum:
                 move[i] = STEP * p.damping if i == 0 else STEP  # a resonance is as narrow as its damping
                 up, down = (on.density(_process(at + sign * move, self.dt)) for sign in (1.0, -1.0))
                 rows[start + i] = (up - down) / (2.0 * move[i])
-        return np.array([rows[i] for i in wanted])
+        return np.array([rows[i] for i in indices])
 
 
 class _Frequencies:

@@ -31,14 +31,14 @@ def spectrum_negative_log_likelihood(spectrum: Spectrum, cells: Cells) -> float:
     return whittle.negative_log_likelihood(spectrum.psd(cells.frequency), cells.mean, cells.count)
 
 
-def spectrum_information(spectrum: Spectrum, cells: Cells, wanted: Sequence[int] | None = None) -> Array:
-    """Return the Fisher information of the wanted parameters of `Spectrum.vector`, by default all, (p, p).
+def spectrum_information(spectrum: Spectrum, cells: Cells, indices: Sequence[int] | None = None) -> Array:
+    """Return the Fisher information of some parameters of `Spectrum.vector`, (p, p); by default of all.
 
     Where samples are missing, with g the measured share of a bin, it is sum g^2 d d' + v v' / sum g (1 - g) with
     v = sum g (1 - g) d: random gaps spread what a bin loses over all others, where it adds to noise but not to a peak.
     """
-    wanted = range(spectrum.starts[-1]) if wanted is None else wanted
-    d = spectrum.slopes(cells.frequency, wanted) / spectrum.psd(cells.frequency)
+    indices = range(spectrum.starts[-1]) if indices is None else indices
+    d = spectrum.slopes(cells.frequency, indices) / spectrum.psd(cells.frequency)
     carried = cells.count * cells.share * (1.0 - cells.share)
     v = d @ carried
     return (d * (cells.count * cells.share**2)) @ d.T + np.outer(v, v) / max(carried.sum(), 1e-300)

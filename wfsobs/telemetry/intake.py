@@ -42,7 +42,7 @@ class DeclaredFormat:
     rate: float | None = None
 
 
-def to_record(contents: Contents, scenario: Scenario, stated: DeclaredFormat) -> Record:
+def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredFormat) -> Record:
     """Return the record of a file's contents. Raises RecordError with one line naming what, where and what is expected."""
     arrays = contents.arrays
     for name in ("y_lgs", "u"):
@@ -58,14 +58,14 @@ def to_record(contents: Contents, scenario: Scenario, stated: DeclaredFormat) ->
         rows = signals[name].shape[0] if name == NGS else rows  # may have one row per frame
         if signals[name].shape != (rows, n_modes):
             raise RecordError(f"{name} has shape {signals[name].shape}; expected ({rows}, {n_modes})")
-    origin, sign = _into_micrometres(signals, contents, stated, scenario.telescope.diameter)
+    origin, sign = _into_micrometres(signals, contents, declaration, scenario.telescope.diameter)
     signals["u"] *= sign
     if "training_u" in signals:
         signals["training_u"] *= sign
-    dt, ratio = _apply_timestamps(signals, arrays, stated)
+    dt, ratio = _apply_timestamps(signals, arrays, declaration)
     if np.isnan(signals["y_lgs"]).all(axis=0).any():
         raise RecordError("y_lgs holds no measurement of one of its modes")
-    delay = _whole("delay", arrays, stated.command_delay, DELAY)
+    delay = _whole("delay", arrays, declaration.command_delay, DELAY)
     if delay < 1:
         raise RecordError(f"delay takes a whole number from 1, not {delay}")
     fields = {name: signals[name] for name in (*FAST, NGS) if name in signals}
@@ -86,7 +86,9 @@ def _signal(name: str, raw: Array) -> Array:
     return out
 
 
-def _into_micrometres(signals: dict[str, Array], contents: Contents, stated: DeclaredFormat, diameter: float) -> tuple[str, int]:
+def _into_micrometres(
+    signals: dict[str, Array], contents: Contents, declaration: DeclaredFormat, diameter: float
+) -> tuple[str, int]:
     """Scale every signal to um; return (unit, sign and aperture as one line, sign of the commands)."""
     arrays, own = contents.arrays, contents.units
     if "unit" in arrays:
@@ -95,15 +97,15 @@ def _into_micrometres(signals: dict[str, Array], contents: Contents, stated: Dec
             raise RecordError(f"unit is {str(arrays['unit'])[:40]!r}, which is no unit of a wavefront")
         own = dict.fromkeys(signals, unit) | own
     for name, unit in own.items():
-        if stated.unit is not None and unit != stated.unit:
-            raise RecordError(f"{name} is in {unit}, but {stated.unit} is stated")
-    units = {name: own.get(name, stated.unit or "um") for name in signals}
+        if declaration.unit is not None and unit != declaration.unit:
+            raise RecordError(f"{name} is in {unit}, but {declaration.unit} is stated")
+    units = {name: own.get(name, declaration.unit or "um") for name in signals}
     if set(units.values()) & set(ANGLES) and signals["y_lgs"].shape[1] > 2:
         raise RecordError("angles are for tip and tilt alone, of which there are two")
     for name, unit in units.items():
         if unit != "um":
             signals[name] *= micrometres_per(unit, diameter)
-    sign = _whole("command_sign", arrays, stated.command_sign, 1)
+    sign = _whole("command_sign", arrays, declaration.command_sign, 1)
     if sign not in (1, -1):
         raise RecordError(f"command_sign takes 1 or -1, not {sign}")
     said = [f"unit {unit}" for unit in dict.fromkeys(units.values()) if unit != "um"]
@@ -113,14 +115,16 @@ def _into_micrometres(signals: dict[str, Array], contents: Contents, stated: Dec
     return ", ".join(before + said), sign
 
 
-def _apply_timestamps(signals: dict[str, Array], arrays: Mapping[str, Array], stated: DeclaredFormat) -> tuple[float, int | None]:
+def _apply_timestamps(
+    signals: dict[str, Array], arrays: Mapping[str, Array], declaration: DeclaredFormat
+) -> tuple[float, int | None]:
     """Place the rows by their time stamps, and NGS frames beside them; return the fast step [s] and the ratio."""
     n = signals["y_lgs"].shape[0]
     dt = None if "dt" not in arrays else _number("dt", arrays["dt"])
-    if stated.rate is not None:
-        if dt is not None and abs(dt * stated.rate - 1.0) > clock.AGREE:
-            raise RecordError(f"its rate is {1.0 / dt:.6g} Hz, but {stated.rate:.6g} Hz are stated")
-        dt = 1.0 / stated.rate if dt is None else dt
+    if declaration.rate is not None:
+        if dt is not None and abs(dt * declaration.rate - 1.0) > clock.AGREE:
+            raise RecordError(f"its rate is {1.0 / dt:.6g} Hz, but {declaration.rate:.6g} Hz are stated")
+        dt = 1.0 / declaration.rate if dt is None else dt
     start = 0.0
     if "time" in arrays:
         time = _clock("time", arrays["time"], n)
@@ -191,17 +195,17 @@ def _number(name: str, raw: Array) -> float:
     return float(raw)
 
 
-def _whole(name: str, arrays: Mapping[str, Array], stated: int | None = None, default: int | None = None) -> int:
+def _whole(name: str, arrays: Mapping[str, Array], declaration: int | None = None, default: int | None = None) -> int:
     """Return an integer of the file, else the declared one, else the default."""
     if name not in arrays:
-        if stated is None and default is None:
+        if declaration is None and default is None:
             raise RecordError("y_ngs needs ratio, the number of fast steps per NGS frame")
-        return int(stated if stated is not None else default)  # type: ignore[arg-type]
+        return int(declaration if declaration is not None else default)  # type: ignore[arg-type]
     value = float(raw) if (raw := arrays[name]).ndim == 0 and raw.dtype.kind in "fiu" else np.nan
     if value != round(value, 0) or (name == "ratio" and value <= 0):
         raise RecordError(f"{name} takes a whole number, not {value:g}")
-    if stated is not None and value != stated:
-        raise RecordError(f"{name} is {value:g}, but {stated} is stated")
+    if declaration is not None and value != declaration:
+        raise RecordError(f"{name} is {value:g}, but {declaration} is stated")
     return int(value)
 
 

@@ -100,29 +100,29 @@ class SpectrumPreview:
 
 
 def preview_any(
-    data: bytes, name: str, scenario: Scenario | None = None, stated: DeclaredFormat | None = None
+    data: bytes, name: str, scenario: Scenario | None = None, declaration: DeclaredFormat | None = None
 ) -> Preview | SpectrumPreview:
     """Preview the bytes of a record, or of a vibration spectrum. Raises RecordError with one clear line."""
     try:
-        return preview(data, name, scenario, stated)
+        return preview(data, name, scenario, declaration)
     except RecordError as error:
         if "has no y_lgs" not in str(error):
             raise
         no_record = error
     shown, diameter = safe_name(name), (scenario or Scenario()).telescope.diameter
     try:
-        table = read_psd(io.BytesIO(data), shown, stated.unit if stated else None, diameter)
+        table = read_psd(io.BytesIO(data), shown, declaration.unit if declaration else None, diameter)
     except NoSpectrumError:
         raise no_record from None
     return SpectrumPreview(table, shown, np.array(table["frequency"]), np.column_stack([table["tip"], table["tilt"]]))
 
 
-def preview(data: bytes, name: str, scenario: Scenario | None = None, stated: DeclaredFormat | None = None) -> Preview:
+def preview(data: bytes, name: str, scenario: Scenario | None = None, declaration: DeclaredFormat | None = None) -> Preview:
     """Preview the bytes of a record; its name gives the format. Raises RecordError with one clear line."""
     shown = safe_name(name)
     if len(data) > MOST_FILE:
         raise RecordError(f"{shown}: has {len(data) / 1e6:.0f} MB, at most {MOST_FILE / 1e6:.0f} MB are taken")
-    record = read_record(io.BytesIO(data), shown, scenario, stated, MOST_NUMBERS)
+    record = read_record(io.BytesIO(data), shown, scenario, declaration, MOST_NUMBERS)
     z = record.z
     signals = {"y_lgs": record.y_lgs, "u": record.u, "z": z}
     values = {key: tuple(rms(column[~np.isnan(column)]) for column in signal.T) for key, signal in signals.items()}

@@ -52,7 +52,7 @@ def save_arrays(path: str | Path, arrays: Mapping[str, Array]) -> None:
 
 
 def load_record(
-    path: str | Path, scenario: Scenario | None = None, stated: DeclaredFormat | None = None, sha256: str | None = None
+    path: str | Path, scenario: Scenario | None = None, declaration: DeclaredFormat | None = None, sha256: str | None = None
 ) -> Record:
     """Read and check the record of a file. Raises RecordError with one line naming what, where and what is expected.
 
@@ -65,7 +65,7 @@ def load_record(
                 if found != sha256.lower():
                     raise RecordError(f"{path}: is another file: its SHA-256 is {found}, not {sha256[:64]}")
                 file.seek(0)
-            return read_record(file, str(path), scenario, stated)
+            return read_record(file, str(path), scenario, declaration)
     except OSError as error:
         raise RecordError(f"{path}: cannot be read: {error.strerror or error}") from None
 
@@ -110,10 +110,14 @@ def load(
 
 
 def read_record(
-    file: IO[bytes], name: str, scenario: Scenario | None = None, stated: DeclaredFormat | None = None, most: int = MOST_BYTES
+    file: IO[bytes],
+    name: str,
+    scenario: Scenario | None = None,
+    declaration: DeclaredFormat | None = None,
+    most: int = MOST_BYTES,
 ) -> Record:
     """Read the record of an open file; its name gives the format and is never opened. most : maximum bytes of numbers."""
     try:
-        return to_record(format_of(name).read(file, most), scenario or Scenario(), stated or DeclaredFormat())
+        return to_record(format_of(name).read(file, most), scenario or Scenario(), declaration or DeclaredFormat())
     except RecordError as error:
         raise RecordError(f"{name}: {error}") from None

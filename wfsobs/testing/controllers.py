@@ -87,20 +87,20 @@ def _inputs(controller: Controller, record: Record, scenario: Scenario) -> Contr
     return ControllerInputs(measured, prior, plant_of(scenario), settings)
 
 
-def _laws(controller: Controller, given: ControllerInputs) -> tuple[Law, ...]:
-    return controller.laws(given.prior, given.plant, given.settings, given.measurements.n_modes)
+def _laws(controller: Controller, inputs: ControllerInputs) -> tuple[Law, ...]:
+    return controller.laws(inputs.prior, inputs.plant, inputs.settings, inputs.measurements.n_modes)
 
 
-def _commands(controller: Controller, given: ControllerInputs) -> Array:
-    laws = _laws(controller, given)
+def _commands(controller: Controller, inputs: ControllerInputs) -> Array:
+    laws = _laws(controller, inputs)
     try:
-        return controller.commands(laws, *given)[0]
+        return controller.commands(laws, *inputs)[0]
     except ValueError as error:
         raise CheckError(f"{controller.id}: cannot run: {error}") from error
 
 
-def _check_laws(controller: Controller, given: ControllerInputs) -> tuple[Law, ...]:
-    laws = _laws(controller, given)
+def _check_laws(controller: Controller, inputs: ControllerInputs) -> tuple[Law, ...]:
+    laws = _laws(controller, inputs)
     for law in laws:
         if not isinstance(law, Law):
             raise CheckError(f"{controller.id}: law takes a wfsobs.control.law.Law, not a {type(law).__name__}")
@@ -109,15 +109,15 @@ def _check_laws(controller: Controller, given: ControllerInputs) -> tuple[Law, .
     return laws
 
 
-def _check_shape(controller: Controller, u: Any, measured: Measurements) -> None:
-    if not isinstance(u, np.ndarray) or u.dtype != float or u.shape != measured.y_lgs.shape:
-        raise CheckError(f"{controller.id}: its commands take numbers of shape {measured.y_lgs.shape}, (n_steps, n_modes)")
+def _check_shape(controller: Controller, u: Any, measurements: Measurements) -> None:
+    if not isinstance(u, np.ndarray) or u.dtype != float or u.shape != measurements.y_lgs.shape:
+        raise CheckError(f"{controller.id}: its commands take numbers of shape {measurements.y_lgs.shape}, (n_steps, n_modes)")
     if not np.isfinite(u).all():
         raise CheckError(f"{controller.id}: a command is NaN or infinite")
 
 
-def _check_untouched(controller: Controller, given: ControllerInputs, fresh: ControllerInputs) -> None:
-    for name, now, was in zip(ControllerInputs._fields, given, fresh, strict=True):
+def _check_untouched(controller: Controller, inputs: ControllerInputs, fresh: ControllerInputs) -> None:
+    for name, now, was in zip(ControllerInputs._fields, inputs, fresh, strict=True):
         same = not isinstance(was, Settings) or _settings(now) == _settings(was)
         if not same or not all(np.array_equal(a, b, equal_nan=True) for a, b in zip(_arrays(now), _arrays(was), strict=True)):
             raise CheckError(f"{controller.id}: changes its arguments ({name})")
@@ -131,9 +131,9 @@ def _settings(own: Any) -> dict[str, Any]:
     return {name: group.to_dict() for name, group in vars(own).items()}
 
 
-def _check_causal(controller: Controller, given: ControllerInputs, base: Array) -> None:
+def _check_causal(controller: Controller, inputs: ControllerInputs, base: Array) -> None:
     """Check that u[k] uses y[0..k] and u[0..k-1] alone."""
-    measured, n = given.measurements, given.measurements.n_steps
+    measured, n = inputs.measurements, inputs.measurements.n_steps
     for k in (n // 2, n // 2 + 3, n - 5):
         rng = np.random.default_rng(k)
         later = replace(
@@ -143,13 +143,13 @@ def _check_causal(controller: Controller, given: ControllerInputs, base: Array) 
             y_ngs=None if measured.y_ngs is None else change_from(measured.y_ngs, k + 1, rng),
         )
         what = f"looks ahead: measurements after step {k} change its command of that step or an earlier one"
-        _compare(controller, _commands(controller, given._replace(measurements=later)), base, what, stop=k + 1)
+        _compare(controller, _commands(controller, inputs._replace(measurements=later)), base, what, stop=k + 1)
 
 
-def _check_gaps(controller: Controller, given: ControllerInputs) -> None:
-    y, start = given.measurements.y_lgs.copy(), given.measurements.n_steps // 2
+def _check_gaps(controller: Controller, inputs: ControllerInputs) -> None:
+    y, start = inputs.measurements.y_lgs.copy(), inputs.measurements.n_steps // 2
     y[start : start + LOST] = np.nan
-    u = _commands(controller, given._replace(measurements=replace(given.measurements, y_lgs=y)))
+    u = _commands(controller, inputs._replace(measurements=replace(inputs.measurements, y_lgs=y)))
     if not np.isfinite(u).all():
         raise CheckError(f"{controller.id}: a command is NaN or infinite after missing samples")
     if controller.law is not None and not np.ptp(u[start + LOST :], axis=0).any():

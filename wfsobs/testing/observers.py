@@ -70,29 +70,29 @@ def check_observer(observer: Observer, scenario: Scenario | None = None, alone: 
         )
 
 
-def _check_shapes(observer: Observer, base: Estimates, measured: Measurements) -> None:
+def _check_shapes(observer: Observer, base: Estimates, measurements: Measurements) -> None:
     for target in observer.targets:
         if target not in TARGETS:
             raise CheckError(f"{observer.id}: target {target!r} is none of {', '.join(TARGETS)}")
         values = base.get(target)
         if values is None:
             raise CheckError(f"{observer.id}: gives no {target}")
-        if not isinstance(values, np.ndarray) or values.dtype != float or values.shape != measured.y_lgs.shape:
-            raise CheckError(f"{observer.id}: {target} takes numbers of shape {measured.y_lgs.shape}, (n_steps, n_modes)")
+        if not isinstance(values, np.ndarray) or values.dtype != float or values.shape != measurements.y_lgs.shape:
+            raise CheckError(f"{observer.id}: {target} takes numbers of shape {measurements.y_lgs.shape}, (n_steps, n_modes)")
         if np.isnan(values).all() or np.isinf(values).any():
             raise CheckError(f"{observer.id}: {target} has no estimate or is infinite; NaN stands for steps without one")
 
 
-def _check_untouched(observer: Observer, measured: Measurements, fresh: Measurements) -> None:
+def _check_untouched(observer: Observer, measurements: Measurements, fresh: Measurements) -> None:
     for name in ("y_lgs", "u", "y_ngs", "open_loop_y"):
         was = getattr(fresh, name)
-        if was is not None and not np.array_equal(getattr(measured, name), was, equal_nan=True):
+        if was is not None and not np.array_equal(getattr(measurements, name), was, equal_nan=True):
             raise CheckError(f"{observer.id}: changes its measurements ({name})")
 
 
-def _check_causal(observer: Observer, given: tuple[Measurements, Prior, Any], base: Estimates) -> None:
+def _check_causal(observer: Observer, arguments: tuple[Measurements, Prior, Any], base: Estimates) -> None:
     """phi_hat[k] may use y[0..k] and u[0..k], see `wfsobs.observers.base`."""
-    measured, n = given[0], given[0].n_steps
+    measured, n = arguments[0], arguments[0].n_steps
     for k in (n // 2, n // 2 + 3, n - 5):
         rng = np.random.default_rng(k)
         later = replace(
@@ -103,18 +103,18 @@ def _check_causal(observer: Observer, given: tuple[Measurements, Prior, Any], ba
         )
         _compare(
             observer,
-            observer.estimate(later, *given[1:]),
+            observer.estimate(later, *arguments[1:]),
             base,
             f"looks ahead: measurements after step {k} change its estimate of earlier steps",
             stop=k + 1,
         )
 
 
-def _check_gaps(observer: Observer, given: tuple[Measurements, Prior, Any]) -> None:
-    measured = given[0]
+def _check_gaps(observer: Observer, arguments: tuple[Measurements, Prior, Any]) -> None:
+    measured = arguments[0]
     y, start = measured.y_lgs.copy(), measured.n_steps // 2
     y[start : start + 7] = np.nan
-    for target, values in observer.estimate(replace(measured, y_lgs=y), *given[1:]).items():
+    for target, values in observer.estimate(replace(measured, y_lgs=y), *arguments[1:]).items():
         if target in observer.targets and np.isnan(values[start + 1 :]).all():
             raise CheckError(f"{observer.id}: {target} does not come back after missing samples")
 
@@ -129,5 +129,5 @@ def _compare(
             raise CheckError(f"{observer.id}: {what} ({target})")
 
 
-def _run(observer: Observer, *given: Any) -> Estimates:
-    return observer.estimate(*given)
+def _run(observer: Observer, *arguments: Any) -> Estimates:
+    return observer.estimate(*arguments)

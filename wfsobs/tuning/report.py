@@ -13,7 +13,7 @@ from wfsobs.tuning.records import TRUTH
 from wfsobs.tuning.tuning import Stage, TuningResult
 
 
-def tuning_dict(tuned: TuningResult) -> dict[str, Any]:
+def tuning_dict(result: TuningResult) -> dict[str, Any]:
     """Return the output of `wfsobs tune --json`.
 
     Errors in um, null where the observer failed; likelihoods in nats, null where there is no GPR.
@@ -30,16 +30,16 @@ def tuning_dict(tuned: TuningResult) -> dict[str, Any]:
         }
 
     return {
-        "observer": tuned.observer,
-        "target": tuned.target,
-        "against": tuned.against,
-        "settings": changed_settings(tuned.scenario, tuned.before.scenario),
-        "start": tuned.start,
-        "before": stage(tuned.before),
-        "after": stage(tuned.after),
+        "observer": result.observer,
+        "target": result.target,
+        "against": result.against,
+        "settings": changed_settings(result.scenario, result.before.scenario),
+        "start": result.start,
+        "before": stage(result.before),
+        "after": stage(result.after),
         "evaluations": [
             {"settings": e.changes, "rms_um": e.errors.rms if e.errors else None, "reason": e.reason or None}
-            for e in tuned.history
+            for e in result.history
         ],
     }
 
@@ -48,17 +48,17 @@ def _modes(errors: Errors | None) -> dict[str, float] | None:
     return dict(errors.modes) if errors else None
 
 
-def settings(tuned: TuningResult) -> list[tuple[str, str, str]]:
+def settings(result: TuningResult) -> list[tuple[str, str, str]]:
     """(dotted path, before, after) of every setting that was searched or set by hand."""
-    changed = [path for path in changed_settings(tuned.scenario, tuned.before.scenario) if path not in tuned.start]
-    before = {path: _before(tuned, path) for path in (*changed, *tuned.start)}
-    if tuned.scenario == tuned.before.scenario:
+    changed = [path for path in changed_settings(result.scenario, result.before.scenario) if path not in result.start]
+    before = {path: _before(result, path) for path in (*changed, *result.start)}
+    if result.scenario == result.before.scenario:
         return [(path, text, text) for path, text in before.items()]
-    return [(path, text, _format(_value(tuned.scenario, path))) for path, text in before.items()]
+    return [(path, text, _format(_value(result.scenario, path))) for path, text in before.items()]
 
 
-def _before(tuned: TuningResult, path: str) -> str:
-    return _format(tuned.start.get(path, _value(tuned.before.scenario, path)))
+def _before(result: TuningResult, path: str) -> str:
+    return _format(result.start.get(path, _value(result.before.scenario, path)))
 
 
 def _value(scenario: Scenario, path: str) -> Any:
@@ -74,39 +74,40 @@ def nm(rms: float) -> str:
     return f"{rms * 1e3:.2f}"
 
 
-def tuning_remarks(tuned: TuningResult) -> list[str]:
+def tuning_remarks(result: TuningResult) -> list[str]:
     """Return one line on each fact that is not in the tables."""
-    out = [] if tuned.against == TRUTH else [f"compared with {tuned.against}, no truth being known"]
-    known = [s.likelihood for s in (tuned.before, tuned.after)]
+    out = [] if result.against == TRUTH else [f"compared with {result.against}, no truth being known"]
+    known = [s.likelihood for s in (result.before, result.after)]
     if all(known):
         text = " -> ".join(", ".join(f"{x:.1f}" for x in values) for values in known if values)
         out.append(f"log marginal likelihood of the training targets (information only), per mode: {text}")
-    if tuned.scenario == tuned.before.scenario:
+    if result.scenario == result.before.scenario:
         out.append("nothing that was tried is better than the settings as they were")
-    failed = [e for e in tuned.history if not e.errors]
+    failed = [e for e in result.history if not e.errors]
     if failed:
-        out.append(f"{len(failed)} of {len(tuned.history)} evaluations failed, the last of them: {failed[-1].reason}")
+        out.append(f"{len(failed)} of {len(result.history)} evaluations failed, the last of them: {failed[-1].reason}")
     return out
 
 
-def tuning_toml(tuned: TuningResult) -> str:
+def tuning_toml(result: TuningResult) -> str:
     """Return the tuned scenario as TOML, with the former values beside changed settings."""
-    base = tuned.before.scenario
+    base = result.before.scenario
     notes = {
-        path: f"{'tuned' if path in tuned.paths else 'with it'}, {_before(tuned, path)} before"
-        for path in changed_settings(tuned.scenario, base)
+        path: f"{'tuned' if path in result.paths else 'with it'}, {_before(result, path)} before"
+        for path in changed_settings(result.scenario, base)
     }
+    evaluations = len(result.history)
     head = [
-        f"{row_label(tuned.observer)} tuned for {tuned.target}, against {tuned.against}, in {len(tuned.history)} evaluations.",
+        f"{row_label(result.observer)} tuned for {result.target}, against {result.against}, in {evaluations} evaluations.",
         *(
-            f"{tuned.measure}, {name}: {_of(before)} before, {_of(after)} after"
+            f"{result.measure}, {name}: {_of(before)} before, {_of(after)} after"
             for name, before, after in (
-                ("validation", tuned.before.validation, tuned.after.validation),
-                ("test", tuned.before.test, tuned.after.test),
+                ("validation", result.before.validation, result.after.validation),
+                ("test", result.before.test, result.after.test),
             )
         ),
     ]
-    return "\n".join(f"# {line}" for line in head) + "\n\n" + add_comments(to_toml(tuned.scenario), notes)
+    return "\n".join(f"# {line}" for line in head) + "\n\n" + add_comments(to_toml(result.scenario), notes)
 
 
 def _of(errors: Errors | None) -> str:

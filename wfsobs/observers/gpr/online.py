@@ -62,30 +62,30 @@ def online_targets(record: Signals, bands: Bands) -> Array:
     return np.vstack([f[1:], np.zeros((1, record.n_modes))])
 
 
-def gpr_online(measured: Measurements, prior: Prior, settings: OnlineGpr, watch: Watch) -> dict[str, Array]:
+def gpr_online(measurements: Measurements, prior: Prior, settings: OnlineGpr, watch: Watch) -> dict[str, Array]:
     """Run the online GPR over a record, all modes at the same time, in blocks."""
-    if measured.n_steps < settings.depth + settings.training_size:
+    if measurements.n_steps < settings.depth + settings.training_size:
         needed = settings.depth + settings.training_size
-        raise RecordError(f"the record has {measured.n_steps} steps; depth + training size need {needed}")
+        raise RecordError(f"the record has {measurements.n_steps} steps; depth + training size need {needed}")
     assert prior.bands is not None
-    targets = online_targets(measured, prior.bands)
-    values = np.full((measured.n_steps, measured.n_modes), np.nan)
-    done = np.zeros(measured.n_modes)
+    targets = online_targets(measurements, prior.bands)
+    values = np.full((measurements.n_steps, measurements.n_modes), np.nan)
+    done = np.zeros(measurements.n_modes)
 
     def one(mode: int, watch: Watch) -> Array:
         def deliver(start: int, stop: int, mean: Array) -> None:
             values[start:stop, mode] = mean
-            done[mode] = stop / measured.n_steps
+            done[mode] = stop / measurements.n_steps
             watch.step(float(done.mean()))
             watch.partial(VIBRATION, values)
 
-        scale = scale_of(settings, prior.training, measured.delay, mode)
-        signals = window_signals(settings, measured.y_lgs, measured.u, measured.z, mode, measured.dt, scale)
+        scale = scale_of(settings, prior.training, measurements.delay, mode)
+        signals = window_signals(settings, measurements.y_lgs, measurements.u, measurements.z, mode, measurements.dt, scale)
         return predict_sliding(
             signals, targets[:, mode], settings.depth, settings.training_size, kernel_of(settings), deliver, watch.check
         )[0]
 
-    return {VIBRATION: over_modes(measured.n_modes, one, watch)}
+    return {VIBRATION: over_modes(measurements.n_modes, one, watch)}
 
 
 def predict_sliding(

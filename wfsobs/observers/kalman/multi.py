@@ -33,12 +33,12 @@ class MultiPeak(Group):
     )
 
 
-def kf_multi(measured: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> dict[str, Array]:
+def kf_multi(measurements: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> dict[str, Array]:
     """Run the filter on the LGS measurement, at every fast step."""
-    z = measured.z
+    z = measurements.z
     columns = []
     for mode, model in enumerate(prior.lines):
-        watch.step(mode / measured.n_modes)
+        watch.step(mode / measurements.n_modes)
         kalman, _ = steady_filter(model.disturbance(settings.line_width), model.noise)
         columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
     return by_target(columns)

@@ -127,26 +127,26 @@ def multirate_filter(
     return filter_of_gains(gains, model.output_rows(TARGETS) if outputs is None else outputs)
 
 
-def run_modes(measured: Measurements, watch: Watch, make: Callable[[int], MultiRateFilter]) -> list[Array]:
+def run_modes(measurements: Measurements, watch: Watch, make: Callable[[int], MultiRateFilter]) -> list[Array]:
     """Run the filter that `make` gives for each mode; per mode (n_steps, n_targets)."""
-    z = np.stack([measured.z, np.nan_to_num(measured.z_ngs)], axis=1)
+    z = np.stack([measurements.z, np.nan_to_num(measurements.z_ngs)], axis=1)
     columns = []
-    for mode in range(measured.n_modes):
-        watch.step(mode / measured.n_modes)
+    for mode in range(measurements.n_modes):
+        watch.step(mode / measurements.n_modes)
         columns.append(make(mode).run(z[:, :, mode]))
     return columns
 
 
-def multirate(measured: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> dict[str, Array]:
+def multirate(measurements: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> dict[str, Array]:
     """Run the multi-rate filter over a record, for turbulence."""
-    assert measured.ratio is not None
-    ratio = measured.ratio
+    assert measurements.ratio is not None
+    ratio = measurements.ratio
 
     def of_mode(mode: int) -> MultiRateFilter:
         model = prior.model[mode]
         return multirate_filter(model.disturbance(), ratio, *multirate_noise(settings, model))
 
-    columns = run_modes(measured, watch, of_mode)
+    columns = run_modes(measurements, watch, of_mode)
     return {TURBULENCE: by_target(columns)[TURBULENCE]}
 
 

@@ -93,11 +93,11 @@ def optimal_model(
     return cycle, np.hstack([rows, np.zeros((len(rows), len(cycle[0][0]) - rows.shape[1]))])
 
 
-def multirate_optimal(measured: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> dict[str, Array]:
+def multirate_optimal(measurements: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> dict[str, Array]:
     """Run the optimal multi-rate filter over a record."""
-    assert measured.ratio is not None
-    ratio = measured.ratio
-    columns = run_modes(measured, watch, lambda mode: optimal_filter(*optimal_model(settings, prior, mode, ratio))[0])
+    assert measurements.ratio is not None
+    ratio = measurements.ratio
+    columns = run_modes(measurements, watch, lambda mode: optimal_filter(*optimal_model(settings, prior, mode, ratio))[0])
     return by_target(columns)
 
 

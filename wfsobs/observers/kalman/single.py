@@ -52,12 +52,12 @@ def steady_filter(model: DisturbanceModel, noise: float, outputs: Array | None =
     return gains.filter(model.output_rows(TARGETS) if outputs is None else outputs), steady
 
 
-def kf_lgs(measured: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
+def kf_lgs(measurements: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
     """Run the Kalman filter on the LGS measurement, at every fast step."""
-    z = measured.z
+    z = measurements.z
     columns = []
     for mode, model in enumerate(prior.model):
-        watch.step(mode / measured.n_modes)
+        watch.step(mode / measurements.n_modes)
         kalman, _ = steady_filter(model.disturbance(), model.lgs_noise)
         columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
     return by_target(columns)
@@ -74,26 +74,26 @@ def steady_mode(model: DisturbanceModel, noise: float) -> ModeFilter:
     return ModeFilter(model, gains, (steady.posterior,))
 
 
-def kf_ngs(measured: Measurements, prior: Prior, settings: Kalman, watch: Watch) -> dict[str, Array]:
+def kf_ngs(measurements: Measurements, prior: Prior, settings: Kalman, watch: Watch) -> dict[str, Array]:
     """Run the Kalman filter on NGS frames, with the coefficients for T_NGS.
 
     A frame at k = n i measures slow step i - 1 (fast steps k - n ... k - 1); the estimate is that of slow
     step i, the fast steps k ... k + n - 1. It is held over them, or propagated by the fast model.
     """
-    assert measured.ratio is not None
-    n = measured.ratio
-    frames = measured.z_ngs[n::n]
+    assert measurements.ratio is not None
+    n = measurements.ratio
+    frames = measurements.z_ngs[n::n]
     columns = []
     for mode, model in enumerate(prior.model):
-        watch.step(mode / measured.n_modes)
-        of_frames = model.at(n * measured.dt).disturbance()
+        watch.step(mode / measurements.n_modes)
+        of_frames = model.at(n * measurements.dt).disturbance()
         kalman, _ = steady_filter(of_frames, model.ngs_noise, of_frames.pairs)
         slow = kalman.run(frames[:, None, mode, None])[:, :, 0]  # of each process, slow steps i and i - 1
-        fast = np.full((measured.n_steps, len(TARGETS)), np.nan)
+        fast = np.full((measurements.n_steps, len(TARGETS)), np.nan)
         for target, process in enumerate((model.turbulence, model.vibration)):
             spread = between_frames(process, n, settings.ngs_between_frames)
             values = slow[:, 2 * target : 2 * target + 2] @ spread.T
-            fast[n:, target] = values.ravel()[: measured.n_steps - n]
+            fast[n:, target] = values.ravel()[: measurements.n_steps - n]
         columns.append(fast)
     return by_target(columns)
 
