@@ -88,17 +88,17 @@ def fit_ridge(prior: Prior, g: OfflineGpr, mode: int, dt: float, delay: int, hor
     return fit(signals, targets, g.depth, g.training_size, (g.noise_std * g.length_scale / g.signal_std) ** 2)
 
 
-def ridge(measured: Measurements, prior: Prior, settings: OfflineGpr, watch: Watch) -> dict[str, Array]:
+def ridge(measurements: Measurements, prior: Prior, settings: OfflineGpr, watch: Watch) -> dict[str, Array]:
     """Run the linear limit of the offline GPR: its windows, its training size, its penalty."""
-    g, dt, delay = settings, measured.dt, measured.delay
+    g, dt, delay = settings, measurements.dt, measurements.delay
 
     def one(mode: int, watch: Watch) -> Array:
         watch.check()
         scale = scale_of(g, prior.training, delay, mode)
         fitted = fit_ridge(prior, g, mode, dt, delay)
-        return predict(window_signals(g, measured.y_lgs, measured.u, measured.z, mode, dt, scale), *fitted)
+        return predict(window_signals(g, measurements.y_lgs, measurements.u, measurements.z, mode, dt, scale), *fitted)
 
-    return {VIBRATION: over_modes(measured.n_modes, one, watch)}
+    return {VIBRATION: over_modes(measurements.n_modes, one, watch)}
 
 
 def step_ridge(prior: Prior, settings: OfflineGpr, sampling: Sampling, horizon: float) -> LinearPredictor:
@@ -118,12 +118,12 @@ def fit_30(prior: Prior, mode: int, dt: float, delay: int, horizon: int = 0) -> 
     return fit(z, targets, TAPS, m, PLAIN * m * float(np.mean(z**2)))
 
 
-def ridge_30(measured: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
+def ridge_30(measurements: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
     """Plain least squares on the last 30 measurements z, over all of the training record."""
     columns = []
-    for mode in range(measured.n_modes):
-        watch.step(mode / measured.n_modes)
-        columns.append(predict(measured.z[:, [mode]], *fit_30(prior, mode, measured.dt, measured.delay)))
+    for mode in range(measurements.n_modes):
+        watch.step(mode / measurements.n_modes)
+        columns.append(predict(measurements.z[:, [mode]], *fit_30(prior, mode, measurements.dt, measurements.delay)))
     return {VIBRATION: np.column_stack(columns)}
 
 

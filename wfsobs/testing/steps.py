@@ -18,16 +18,16 @@ from wfsobs.typing import Array
 Estimates = dict[str, Array]
 
 
-def run_steps(observer: StepObserver, measured: Measurements, steps: Iterable[int] | None = None) -> Estimates:
+def run_steps(observer: StepObserver, measurements: Measurements, steps: Iterable[int] | None = None) -> Estimates:
     """Return `predict(0)` after every frame of measurements, target -> (n_steps, n_modes) [um]; steps : those to take.
 
     A lost command is held, as the mirror holds its position; NGS frames are given where they are due, NaN where they are lost.
     """
-    measured = replace(measured, u=hold_last(measured.u))
-    z, u, n = measured.z, measured.u, measured.ratio
-    z_ngs = None if n is None or measured.y_ngs is None else measured.z_ngs
+    measurements = replace(measurements, u=hold_last(measurements.u))
+    z, u, n = measurements.z, measurements.u, measurements.ratio
+    z_ngs = None if n is None or measurements.y_ngs is None else measurements.z_ngs
     out = {target: np.full_like(z, np.nan) for target in observer.targets}
-    for k in range(measured.n_steps) if steps is None else steps:
+    for k in range(measurements.n_steps) if steps is None else steps:
         due = z_ngs is not None and n is not None and k > 0 and k % n == 0
         observer.update(z[k], z_ngs[k] if z_ngs is not None and due else None, u=u[k])
         for target, values in out.items():
@@ -35,10 +35,10 @@ def run_steps(observer: StepObserver, measured: Measurements, steps: Iterable[in
     return out
 
 
-def step_difference(observer: Observer, measured: Measurements, prior: Prior, settings: Any) -> float:
+def step_difference(observer: Observer, measurements: Measurements, prior: Prior, settings: Any) -> float:
     """Return the largest difference between steps and batch over the standard deviation of the estimate; inf where NaN differ."""
-    batch = observer.estimate(measured, prior, settings)
-    got = run_steps(observer.design(prior, settings, measured.sampling), measured)
+    batch = observer.estimate(measurements, prior, settings)
+    got = run_steps(observer.design(prior, settings, measurements.sampling), measurements)
     worst = 0.0
     for target in observer.targets:
         a, b = got[target], batch[target]
@@ -49,7 +49,7 @@ def step_difference(observer: Observer, measured: Measurements, prior: Prior, se
     return worst
 
 
-def check_steps(observer: Observer, measured: Measurements, prior: Prior, settings: Any) -> None:
+def check_steps(observer: Observer, measurements: Measurements, prior: Prior, settings: Any) -> None:
     """Check an observer that can run frame by frame.
 
     After every frame its estimate is that of its run over the record, gaps included. It goes on from a saved state as if there
@@ -62,21 +62,25 @@ def check_steps(observer: Observer, measured: Measurements, prior: Prior, settin
     """
     if observer.step is None:
         return
-    y, half = measured.y_lgs.copy(), measured.n_steps // 2
+    y, half = measurements.y_lgs.copy(), measurements.n_steps // 2
     y[half : half + 7] = np.nan
-    measured = replace(measured, y_lgs=y)
-    if not step_difference(observer, measured, prior, settings) <= SAME:
+    measurements = replace(measurements, y_lgs=y)
+    if not step_difference(observer, measurements, prior, settings) <= SAME:
         raise CheckError(f"{observer.id}: frame by frame its estimate is not that of its run over the record")
-    ours, other = (observer.design(prior, settings, measured.sampling) for _ in range(2))
-    base = run_steps(ours, measured)
-    run_steps(other, measured, range(half))
+    ours, other = (observer.design(prior, settings, measurements.sampling) for _ in range(2))
+    base = run_steps(ours, measurements)
+    run_steps(other, measurements, range(half))
     ours.reset()
     ours.load_state_dict(other.state_dict())
     _compare(
-        observer, run_steps(ours, measured, range(half, measured.n_steps)), base, half, "from a saved state it goes on elsewhere"
+        observer,
+        run_steps(ours, measurements, range(half, measurements.n_steps)),
+        base,
+        half,
+        "from a saved state it goes on elsewhere",
     )
     ours.reset()
-    _compare(observer, run_steps(ours, measured), base, 0, "after a reset it is not what it was at the start")
+    _compare(observer, run_steps(ours, measurements), base, 0, "after a reset it is not what it was at the start")
 
 
 def _compare(observer: Observer, got: Estimates, base: Estimates, start: int, what: str) -> None:

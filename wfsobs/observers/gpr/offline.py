@@ -131,18 +131,18 @@ def train_mode(
     return train(training_signals(g, training, mode, dt, delay), targets, g.depth, g.training_size, kernel_of(g), watch)
 
 
-def gpr_offline(measured: Measurements, prior: Prior, settings: OfflineGpr, watch: Watch) -> dict[str, Array]:
+def gpr_offline(measurements: Measurements, prior: Prior, settings: OfflineGpr, watch: Watch) -> dict[str, Array]:
     """Train on the training record and predict over the measurements, all modes at the same time."""
-    g, dt, delay = settings, measured.dt, measured.delay
-    if measured.n_steps < g.depth:
-        raise RecordError(f"the record has {measured.n_steps} steps; depth needs {g.depth}")
+    g, dt, delay = settings, measurements.dt, measurements.delay
+    if measurements.n_steps < g.depth:
+        raise RecordError(f"the record has {measurements.n_steps} steps; depth needs {g.depth}")
 
     def one(mode: int, watch: Watch) -> Array:
         model = train_mode(prior, g, mode, dt, delay, watch=watch)
         scale = scale_of(g, prior.training, delay, mode)
-        return model.predict(window_signals(g, measured.y_lgs, measured.u, measured.z, mode, dt, scale), watch)
+        return model.predict(window_signals(g, measurements.y_lgs, measurements.u, measurements.z, mode, dt, scale), watch)
 
-    return {VIBRATION: over_modes(measured.n_modes, one, watch)}
+    return {VIBRATION: over_modes(measurements.n_modes, one, watch)}
 
 
 def step_gpr_offline(prior: Prior, settings: OfflineGpr, sampling: Sampling, horizon: float) -> OfflineEstimator:

@@ -112,7 +112,7 @@ def step_kf_ngs(prior: Prior, settings: Kalman, sampling: Sampling, _horizon: fl
         weights = between_frames((model.turbulence, model.vibration)[at], n, how, max(since + 1, n))[since]
         return weights @ modes[mode].model.pairs[2 * at : 2 * at + 2]
 
-    return FrameEstimator(modes, spread, held=how == "hold")
+    return FrameEstimator(modes, spread, holds=how == "hold")
 
 
 def between_frames(process: Ar2, n: int, how: str, steps: int | None = None) -> Array:

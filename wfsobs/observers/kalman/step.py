@@ -195,7 +195,7 @@ class FrameEstimator(LinearEstimator):
 
     def __init__(self, modes: Sequence[ModeFilter], spread: Spread, held: bool):
         super().__init__(modes)
-        self._spread, self._held = spread, held
+        self._spread, self._holds = spread, held
         self._since = -1
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
@@ -208,7 +208,7 @@ class FrameEstimator(LinearEstimator):
 
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
         """Return the mean of the target; NaN before the first NGS frame."""
-        ahead = 0 if self._held else whole_frames(frames, "an estimate between NGS frames")
+        ahead = 0 if self._holds else whole_frames(frames, "an estimate between NGS frames")
         key = (max(self._since, 0) + ahead, target)
         one = self._plans.get(key) or self._plan(*key)
         np.matmul(one.rows, self._state, out=one.product)
