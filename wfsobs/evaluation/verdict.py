@@ -141,14 +141,14 @@ def _keep_scored(record: Record, error: Array, score: Score) -> Array:
     return out
 
 
-def _shares(error: Array, dt: float, lines: Sequence[float], given: Sequence[float]) -> tuple[float, float]:
+def _shares(error: Array, dt: float, lines: Sequence[float], given_lines: Sequence[float]) -> tuple[float, float]:
     """Shares of an error's variance at the lines [Hz] that an observer is given, and at the others."""
     frequency, density = welch_psd(error[~np.isnan(error)][:, None], dt)
     total = density.sum()
     if not total > 0:
         return 0.0, 0.0
     at_lines = is_near(frequency, lines)
-    at_given = at_lines & is_near(frequency, given)
+    at_given = at_lines & is_near(frequency, given_lines)
     at_others = at_lines & ~at_given
     return float(density[at_given].sum() / total), float(density[at_others].sum() / total)
 
@@ -191,7 +191,7 @@ def _to_bound(it: Verdict, scale: float, unit: str) -> str:
     return f", {'at' if percent == 0 else f'{abs(percent)} % ' + ('above' if percent > 0 else 'below')} the bound of the LGS"
 
 
-def _harm_sentence(it: Verdict, harms: Sequence[Harm], told: str) -> str:
+def _harm_sentence(it: Verdict, harms: Sequence[Harm], prior: str) -> str:
     """Observers that are told the same, together; shares are the mean of theirs."""
     names = _join_labels([harm.observer for harm in harms])
     be, they, their = ("is", "it", "its") if len(harms) == 1 else ("are", "they", "their")
@@ -204,7 +204,7 @@ def _harm_sentence(it: Verdict, harms: Sequence[Harm], told: str) -> str:
     }
     where, share = max(shares.items(), key=lambda item: item[1])
     reason = f"; {100.0 * share:.0f} % of {their} error lies {where}" if it.lines else ""
-    return f"{names} {be} {'worse' if harms[0].worse else 'no better'} than no estimate: {they} {tell} given {told}{reason}."
+    return f"{names} {be} {'worse' if harms[0].worse else 'no better'} than no estimate: {they} {tell} given {prior}{reason}."
 
 
 def _join_labels(observers: Sequence[str]) -> str:

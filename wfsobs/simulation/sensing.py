@@ -110,13 +110,13 @@ def measure_noise(scenario: Scenario, n_steps: int, rng: np.random.Generator) ->
     return OpenLoop(lgs, white_noise(scenario, "ngs", n_steps, ngs_rng))
 
 
-def _combine(scenario: Scenario, seen: Sequence[Array], vibration: Array, errors: Sequence[Array]) -> Array:
+def _combine(scenario: Scenario, turbulence_per_star: Sequence[Array], vibration: Array, errors: Sequence[Array]) -> Array:
     """Combine the LGS, as many as there are errors, (n_steps, n_modes)."""
     stars = len(errors)
     if scenario.sensors.lgs_combination == MEAN:
-        turbulence = seen[0] if len(seen) == 1 else np.mean(seen[:stars], axis=0)
+        turbulence = turbulence_per_star[0] if len(turbulence_per_star) == 1 else np.mean(turbulence_per_star[:stars], axis=0)
         return delay_signal(turbulence + vibration, 1) + np.mean(errors, axis=0)
-    every = list(seen) * stars if len(seen) == 1 else seen[:stars]
+    every = list(turbulence_per_star) * stars if len(turbulence_per_star) == 1 else turbulence_per_star[:stars]
     each = [delay_signal(x + vibration, 1) + error for x, error in zip(every, errors, strict=True)]
     return np.tensordot(np.stack(each, axis=1), lgs_weights(scenario, stars), ([1, 2], [1, 2]))
 

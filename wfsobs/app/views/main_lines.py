@@ -45,10 +45,10 @@ class MainLines:
         run.param.watch(self._on_results, "result")
         display.param.watch(self._follow, "mode")
 
-    def choose(self, target: str, hidden: list[str]) -> None:
+    def choose(self, target: str, hidden_names: list[str]) -> None:
         """Hide these lines and no others from now on."""
         self._chosen.add(target)
-        self.display.hidden = {**self.display.hidden, target: list(hidden)}
+        self.display.hidden = {**self.display.hidden, target: list(hidden_names)}
 
     def reset(self, target: str) -> None:
         """Show those that matter again."""

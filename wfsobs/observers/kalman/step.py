@@ -193,9 +193,9 @@ class FrameEstimator(LinearEstimator):
         Whether an estimate is held until the next frame, so that any fraction of a frame is defined.
     """
 
-    def __init__(self, modes: Sequence[ModeFilter], spread: Spread, held: bool):
+    def __init__(self, modes: Sequence[ModeFilter], spread: Spread, holds: bool):
         super().__init__(modes)
-        self._spread, self._holds = spread, held
+        self._spread, self._holds = spread, holds
         self._since = -1
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
