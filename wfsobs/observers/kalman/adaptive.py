@@ -57,24 +57,24 @@ class Adaptive(Group):
     )
 
 
-def kf_adaptive(measured: Measurements, _prior: Prior, settings: Adaptive, watch: Watch) -> dict[str, Array]:
+def kf_adaptive(measurements: Measurements, _prior: Prior, settings: Adaptive, watch: Watch) -> dict[str, Array]:
     """Run the filter on the LGS measurement, at every fast step; NaN until the first window is full.
 
     Raises RecordError for a record shorter than a window, or a window of too few samples.
     """
-    window, _ = lengths(settings, measured.dt)
-    needed = window + measured.delay
-    if measured.n_steps < needed:
-        raise RecordError(f"the record has {measured.n_steps} steps; adaptive.window = {settings.window:g} s needs {needed}")
-    z = measured.z[measured.delay :]  # what the mirror did before the record is not known
+    window, _ = lengths(settings, measurements.dt)
+    needed = window + measurements.delay
+    if measurements.n_steps < needed:
+        raise RecordError(f"the record has {measurements.n_steps} steps; adaptive.window = {settings.window:g} s needs {needed}")
+    z = measurements.z[measurements.delay :]  # what the mirror did before the record is not known
     columns = []
-    for mode in range(measured.n_modes):  # one after the other: steps as short as these leave a second thread no room
+    for mode in range(measurements.n_modes):  # one after the other: steps as short as these leave a second thread no room
 
         def tell(fraction: float, mode: int = mode) -> None:
-            watch.step((mode + fraction) / measured.n_modes)
+            watch.step((mode + fraction) / measurements.n_modes)
 
-        before = np.full((measured.delay, len(TARGETS)), np.nan)
-        columns.append(np.vstack([before, adapt(z[:, mode], measured.dt, settings, tell)]))
+        before = np.full((measurements.delay, len(TARGETS)), np.nan)
+        columns.append(np.vstack([before, adapt(z[:, mode], measurements.dt, settings, tell)]))
     return by_target(columns)
 
 
