@@ -20,6 +20,7 @@ class Place(NamedTuple):
 
 COMMANDS = {
     "bench": Place("bench", "Time the observers beside textbook versions, and other libraries if installed."),
+    "campaign": Place("campaign", "Run many scenarios and seeds, on many processes or machines."),
     "export": Place("export", "Write a report: one HTML file with figures and numbers that opens without a network."),
     "identify": Place("telemetry", "Find noise, turbulence and vibration peaks in a record."),
     "loop": Place("simulate", "Close the loop with every controller on the same disturbance and print what is left of it."),

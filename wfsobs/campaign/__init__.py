@@ -1,0 +1,1 @@
+"""Campaigns: many scenarios, seeds, observers and controllers, on many processes or machines."""

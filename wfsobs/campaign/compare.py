@@ -1,0 +1,165 @@
+"""Compare what ran on the same records: rms over seeds, paired differences and their intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.special import stdtrit
+
+from wfsobs.evaluation.rows import can_be_best
+from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    import pyarrow
+
+LEVEL = 0.95
+"""Level of intervals."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One observer or controller in one scenario, target and mode.
+
+    Attributes
+    ----------
+    cell : int
+        Number of the scenario.
+    scenario, target, mode, name : str
+        What was compared.
+    seeds : int
+        Number of records with a result.
+    failures : int
+        Number of records without.
+    rms : float
+        Root mean square over the records [nm].
+    difference : float or None
+        Mean of its rms less that of the best over the records that both have [nm]; None for the best and for rows that cannot be
+        the best.
+    half_width : float or None
+        Of the interval of the difference at the level [nm]; None with fewer than two records.
+    """
+
+    cell: int
+    scenario: str
+    target: str
+    mode: str
+    name: str
+    seeds: int
+    failures: int
+    rms: float
+    difference: float | None = None
+    half_width: float | None = None
+
+    @property
+    def tied(self) -> bool:
+        """Whether the difference from the best is not significant."""
+        return self.difference is not None and (self.half_width is None or abs(self.difference) <= self.half_width)
+
+
+def paired_difference(a: Array, b: Array, level: float = LEVEL) -> tuple[float, float | None]:
+    """Return the mean of a - b, and the half-width of its interval by Student's t.
+
+    Parameters
+    ----------
+    a, b : Array
+        Results on the same records, (n,); pairs with NaN are left out.
+    level : float
+        Level of the interval.
+
+    Returns
+    -------
+    float
+        Mean.
+    float or None
+        Half-width; None for fewer than two pairs.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> mean, half = paired_difference(np.array([2.0, 4.0]), np.array([1.0, 1.0]))
+    >>> round(mean, 3), round(half, 3)  # t(0.975, 1 degree of freedom) = 12.706
+    (2.0, 12.706)
+    """
+    d = (a - b)[~np.isnan(a - b)]
+    if len(d) < 2:
+        return (float(d.mean()) if len(d) else float("nan")), None
+    return float(d.mean()), float(stdtrit(len(d) - 1, (1 + level) / 2) * d.std(ddof=1) / np.sqrt(len(d)))
+
+
+def compare(table: pyarrow.Table, level: float = LEVEL) -> list[Comparison]:
+    """Compare all that ran in each scenario.
+
+    Parameters
+    ----------
+    table : pyarrow.Table
+        Rows of `wfsobs.campaign.store.read_results`.
+    level : float
+        Level of the intervals of the differences.
+
+    Returns
+    -------
+    list of Comparison
+        By scenario, target and mode, the smallest error first.
+    """
+    return [one for group in _groups(table) for one in _compare_one(*group, level)]
+
+
+Group = tuple[int, str, str, str, Array, list[str], Array, Array]
+"""Cell, scenario, target, mode, seeds (n,), names, rms (n, n_names) with NaN, whether a name can be best (n_names,)."""
+
+
+def _groups(table: pyarrow.Table) -> Iterator[Group]:
+    rows = table.sort_by([(c, "ascending") for c in ("cell", "target", "mode", "name", "seed")]).to_pylist()
+    start = 0
+    failed: dict[int, list[tuple[str, int]]] = {}
+    for row in rows:
+        if not row["target"]:
+            failed.setdefault(row["cell"], []).append((row["name"], row["seed"]))
+    while start < len(rows):
+        key = tuple(rows[start][c] for c in ("cell", "target", "mode"))
+        stop = start
+        while stop < len(rows) and tuple(rows[stop][c] for c in ("cell", "target", "mode")) == key:
+            stop += 1
+        part, start = rows[start:stop], stop
+        if not key[1]:
+            continue
+        names = list(dict.fromkeys(r["name"] for r in part))
+        missing = failed.get(key[0], [])
+        seeds = np.array(sorted({r["seed"] for r in part} | {seed for _, seed in missing}))
+        values = np.full((len(seeds), len(names)), np.nan)
+        eligible = np.ones(len(names), dtype=bool)
+        for r in part:
+            column = names.index(r["name"])
+            values[np.searchsorted(seeds, r["seed"]), column] = np.nan if r["rms_nm"] is None else r["rms_nm"]
+            eligible[column] &= (key[1] == "residual" and r["name"] != "bound") or can_be_best(r["name"], r["apart"])
+        yield (*key[:1], part[0]["scenario"], *key[1:], seeds, names, values, eligible)
+
+
+def _compare_one(
+    cell: int,
+    scenario: str,
+    target: str,
+    mode: str,
+    seeds: Array,
+    names: Sequence[str],
+    values: Array,
+    eligible: Array,
+    level: float,
+) -> list[Comparison]:
+    """Return the rows of one scenario, target and mode, the smallest error first."""
+    known = ~np.isnan(values)
+    count = known.sum(axis=0)
+    with np.errstate(invalid="ignore"):
+        rms = np.sqrt(np.where(known, values, 0.0).__pow__(2).sum(axis=0) / count)
+    ranked = [i for i in np.argsort(rms) if eligible[i] and count[i] == count[eligible].max(initial=0)]
+    out = []
+    for i in np.argsort(rms):
+        difference, half = None, None
+        if ranked and eligible[i] and i != ranked[0]:
+            difference, half = paired_difference(values[:, i], values[:, ranked[0]], level)
+        failures = len(seeds) - int(count[i]) if count[i] else len(seeds)
+        out.append(Comparison(cell, scenario, target, mode, names[i], int(count[i]), failures, float(rms[i]), difference, half))
+    return out

@@ -1,0 +1,239 @@
+"""What a campaign runs: its scenarios, seeds, observers and controllers, from a TOML file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from wfsobs.campaign.points import Changes, conditions, grid, product, sample
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.observers import OBSERVERS
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import load_scenario, parse_toml, preset
+from wfsobs.settings.group import SettingError, leaves
+
+KEYS = (
+    "name",
+    "seeds",
+    "first_seed",
+    "observers",
+    "controllers",
+    "preset",
+    "scenario",
+    "settings",
+    "grid",
+    "sample",
+    "conditions",
+)
+"""What a plan may contain."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One scenario of a campaign, to be run with several seeds.
+
+    Attributes
+    ----------
+    index : int
+        Number in the plan.
+    name : str
+        Name of the scenario that it is made from.
+    base : mapping
+        Settings of that scenario that differ from the defaults, nested.
+    changes : mapping
+        Dotted path -> value of what the axes of the plan set.
+    """
+
+    index: int
+    name: str
+    base: Mapping[str, Any]
+    changes: Changes
+
+    def scenario(self) -> Scenario:
+        """Return the scenario. Raises SettingError."""
+        made = Scenario.from_dict(self.base)
+        made = made.replace(self.changes) if self.changes else made
+        made.validate()
+        return made
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A campaign.
+
+    Attributes
+    ----------
+    name : str
+        Title.
+    cells : tuple of Cell
+        Scenarios.
+    seeds : range
+        Seeds of each.
+    observers, controllers : tuple of str
+        Ids.
+    """
+
+    name: str
+    cells: tuple[Cell, ...]
+    seeds: range
+    observers: tuple[str, ...]
+    controllers: tuple[str, ...]
+
+    @property
+    def n_runs(self) -> int:
+        """Number of runs: scenarios times seeds."""
+        return len(self.cells) * len(self.seeds)
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Dotted paths of the settings that the cells differ in."""
+        return tuple(dict.fromkeys(path for cell in self.cells for path in cell.changes))
+
+    def identity(self) -> str:
+        """Return a digest of all but the number of seeds and the title: results of plans with the same one belong together."""
+        content = {k: v for k, v in self.to_dict().items() if k not in ("name", "seeds")}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the plan as plain values, with the contents of the files that it names."""
+        return {
+            "name": self.name,
+            "first_seed": self.seeds.start,
+            "seeds": len(self.seeds),
+            "observers": list(self.observers),
+            "controllers": list(self.controllers),
+            "scenarios": {cell.name: cell.base for cell in self.cells},
+            "cells": [[cell.name, cell.changes] for cell in self.cells],
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Plan:
+        """Return the plan of `to_dict`."""
+        bases, first = values["scenarios"], values["first_seed"]
+        return cls(
+            values["name"],
+            tuple(Cell(i, name, bases[name], changes) for i, (name, changes) in enumerate(values["cells"])),
+            range(first, first + values["seeds"]),
+            tuple(values["observers"]),
+            tuple(values["controllers"]),
+        )
+
+
+def load_plan(path: str | Path) -> Plan:
+    """Read a plan.
+
+    Parameters
+    ----------
+    path : str or Path
+        TOML file; files that it names are looked for beside it.
+
+    Returns
+    -------
+    Plan
+        The plan.
+
+    Raises
+    ------
+    SettingError
+        The file cannot be read, or a value cannot be used; the line starts with the path.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from None
+    try:
+        return parse_plan(text, Path(path).parent)
+    except SettingError as error:
+        raise SettingError(f"{path}: {error}") from None
+
+
+def parse_plan(text: str, folder: Path) -> Plan:
+    """Return the plan of a TOML text. Raises SettingError.
+
+    folder : where the files that it names are looked for
+    """
+    values = parse_toml(text)
+    for key in values:
+        if key not in KEYS:
+            raise SettingError(f"{key}: not part of a plan; takes {', '.join(KEYS)}")
+    count, first = _whole(values, "seeds", 1, 1, 10_000_000), _whole(values, "first_seed", 1, 0, 2**31 - 1)
+    observers = _ids(values, "observers", list(OBSERVERS), list(OBSERVERS))
+    controllers = _ids(values, "controllers", [], list(CONTROLLERS))
+    if not observers and not controllers:
+        raise SettingError("observers = []: without controllers there is nothing to run")
+    axes = [
+        conditions(_table(values, "conditions"), folder),
+        sample(_table(values, "sample")),
+        grid(dict(leaves(_table(values, "grid")))),
+    ]
+    cells: list[Cell] = []
+    for name, base in _scenarios(values, folder):
+        cells += [Cell(len(cells) + i, name, base, changes) for i, changes in enumerate(product(axes))]
+    for cell in _corners(cells, axes):
+        try:
+            cell.scenario()
+        except SettingError as error:
+            raise SettingError(f"scenario {cell.index} ({cell.name}): {error}") from None
+    return Plan(str(values.get("name", "Campaign")), tuple(cells), range(first, first + count), observers, controllers)
+
+
+def _corners(cells: Sequence[Cell], axes: Sequence[Sequence[Changes]]) -> Iterator[Cell]:
+    """Yield cells in which every value of every setting occurs: all cells are checked when they run."""
+    known: set[tuple[str, str, str]] = set()
+    for cell in cells:
+        fresh = {(cell.name, path, repr(value)) for path, value in cell.changes.items()} or {(cell.name, "", "")}
+        if not fresh <= known:
+            known |= fresh
+            yield cell
+
+
+def _scenarios(values: Mapping[str, Any], folder: Path) -> list[tuple[str, Mapping[str, Any]]]:
+    """Return (name, settings that differ from the defaults) of the scenarios."""
+    entries = values.get("scenario", [{"preset": values.get("preset", "paper")}])
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+        raise SettingError("scenario: takes tables, [[scenario]]")
+    if "scenario" in values and "preset" in values:
+        raise SettingError("preset: belongs into each [[scenario]]")
+    out: dict[str, Mapping[str, Any]] = {}
+    for i, entry in enumerate(entries):
+        where = f"scenario.{i}"
+        for key in entry:
+            if key not in ("name", "preset", "config", "settings"):
+                raise SettingError(f"{where}.{key}: takes name, preset, config, settings")
+        name = str(entry.get("name", entry.get("preset", entry.get("config", f"scenario {i}"))))
+        if name in out:
+            raise SettingError(f"{where}.name = {name!r}: there are two")
+        base = preset(entry["preset"]) if "preset" in entry else None
+        made = load_scenario(folder / str(entry["config"]), base) if "config" in entry else base or preset("paper")
+        made.update(_table(values, "settings"))
+        made.update(_table(entry, "settings"))
+        out[name] = made.difference(Scenario())
+    return list(out.items())
+
+
+def _table(values: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    table = values.get(key, {})
+    if not isinstance(table, dict):
+        raise SettingError(f"{key}: takes a table, [{key}]")
+    return table
+
+
+def _whole(values: Mapping[str, Any], key: str, default: int, low: int, high: int) -> int:
+    value = values.get(key, default)
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        raise SettingError(f"{key} = {value!r}: takes a whole number from {low} to {high}")
+    return value
+
+
+def _ids(values: Mapping[str, Any], key: str, default: list[str], allowed: list[str]) -> tuple[str, ...]:
+    chosen = values.get(key, default)
+    if not isinstance(chosen, list):
+        raise SettingError(f"{key} = {chosen!r}: takes a list of ids")
+    for name in chosen:
+        if name not in allowed:
+            raise SettingError(f"{key}: {name!r} is not one of {', '.join(allowed)}")
+    return tuple(name for name in allowed if name in chosen)

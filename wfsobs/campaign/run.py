@@ -1,0 +1,209 @@
+"""Run a campaign: batches on an executor until no run is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wfsobs.campaign.plan import Cell, Plan
+from wfsobs.campaign.pools import Pool
+from wfsobs.campaign.state import finished_runs, open_folder
+from wfsobs.campaign.work import Batch, Done, wfsobs_batch
+from wfsobs.cost import part_seconds
+from wfsobs.settings.group import SettingError
+from wfsobs.typing import Array
+
+BATCH = 3.0
+"""Wanted time of a batch [s]: long against the overhead of a scheduler, short against the wait for the last ones."""
+MOST_RUNS = 2000
+"""Maximum number of runs of a batch."""
+AHEAD = 2
+"""Batches in the executor per worker."""
+BREAKS = 20
+"""How often in a row an executor may break with no batch finished in between."""
+
+
+@dataclass
+class Progress:
+    """State of a campaign.
+
+    Attributes
+    ----------
+    total, before : int
+        Runs in this call's share, and how many of them were done before.
+    done : int
+        Runs done by now, those before included.
+    breaks : int
+        How often workers died and their batches started again.
+    """
+
+    total: int
+    before: int
+    done: int = 0
+    breaks: int = 0
+
+
+def run_campaign(
+    plan: Plan,
+    folder: Path,
+    pool: Pool,
+    shard: tuple[int, int] = (1, 1),
+    *,
+    report: Callable[[Progress], None] = lambda _: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Progress:
+    """Run what is missing of a campaign; call it again to resume.
+
+    Parameters
+    ----------
+    plan : Plan
+        What to run.
+    folder : Path
+        Where the results are; they are written by the workers, one file per batch.
+    pool : Pool
+        Where batches run.
+    shard : tuple of int
+        (k, n): the k-th of n shares of the runs, from 1.
+    report : callable
+        Receives the progress after every batch.
+    stopped : callable
+        Asked before every batch; true ends the campaign when the batches that run are finished.
+
+    Returns
+    -------
+    Progress
+        What is done.
+
+    Raises
+    ------
+    SettingError
+        The folder is that of another plan, or the workers die one after the other.
+    OSError
+        Results cannot be written.
+    """
+    open_folder(plan, folder)
+    todo = missing_runs(plan, folder, shard)
+    share = _share(plan, shard)
+    progress = Progress(int(share.sum()), int(share.sum() - len(todo)))
+    progress.done = progress.before
+    report(progress)
+    batches = _Batches(plan, todo, str(folder))
+    try:
+        _drive(batches, pool, progress, report, stopped)
+    finally:
+        pool.close()
+    return progress
+
+
+def missing_runs(plan: Plan, folder: Path, shard: tuple[int, int] = (1, 1)) -> Array:
+    """Return the numbers of the runs of a share that are missing: cell number times seeds plus seed number, (n,)."""
+    return np.flatnonzero(_share(plan, shard) & ~finished_runs(plan, folder).ravel())
+
+
+def _share(plan: Plan, shard: tuple[int, int]) -> Array:
+    """Return the runs of a share, bool (n_runs,): of every scenario some seeds, so that shares take equally long."""
+    k, n = shard
+    return np.arange(plan.n_runs) % n == k - 1
+
+
+class _Batches:
+    """The batches that are still to be done, as long as the wanted time by what runs took so far."""
+
+    def __init__(self, plan: Plan, todo: Array, folder: str):
+        self.plan, self.todo, self.folder = plan, todo, folder
+        self.position = 0
+        self.again: list[Batch] = []
+        self.spent, self.expected = 0.0, 0.0
+        self._cost: dict[int, float] = {}
+
+    def __iter__(self) -> Iterator[Batch]:
+        return self
+
+    def __next__(self) -> Batch:
+        """Return the next batch."""
+        if self.again:
+            return self.again.pop()
+        if self.position >= len(self.todo):
+            raise StopIteration
+        runs: list[tuple[Cell, int]] = []
+        seconds, speed = 0.0, self.spent / self.expected if self.expected else 1.0
+        while self.position < len(self.todo) and len(runs) < MOST_RUNS and (not runs or seconds < BATCH):
+            cell, seed = divmod(int(self.todo[self.position]), len(self.plan.seeds))
+            seconds += speed * self.cost(cell)
+            runs.append((self.plan.cells[cell], self.plan.seeds[seed]))
+            self.position += 1
+        return Batch(tuple(runs), self.plan.observers, self.plan.controllers, self.folder)
+
+    def learn(self, batch: Batch, done: Done) -> None:
+        """Correct the expected times by that of a batch."""
+        self.spent += done.seconds
+        self.expected += sum(self.cost(cell.index) for cell, _ in batch.runs)
+
+    def cost(self, cell: int) -> float:
+        """Return the expected time of a run [s]."""
+        if cell not in self._cost:
+            self._cost = {cell: run_cost(self.plan, cell)} if len(self._cost) > MOST_RUNS else self._cost
+            self._cost[cell] = run_cost(self.plan, cell)
+        return self._cost[cell]
+
+
+def run_cost(plan: Plan, cell: int) -> float:
+    """Estimate the time of one run of a scenario [s]."""
+    try:
+        scenario = plan.cells[cell].scenario()
+    except SettingError:
+        return 1e-3
+    parts = part_seconds(scenario)
+    return 2e-3 + sum(seconds for name, seconds in parts.items() if name == "rest" or name in plan.observers)
+
+
+def _drive(
+    batches: _Batches, pool: Pool, progress: Progress, report: Callable[[Progress], None], stopped: Callable[[], bool]
+) -> None:
+    """Keep the executor busy until all batches are done."""
+    executor, running, in_a_row = pool.executor(), dict[Future[Done], Batch](), 0
+    while True:
+        while not stopped() and len(running) < AHEAD * pool.workers and (batch := next(batches, None)) is not None:
+            try:
+                running[executor.submit(wfsobs_batch, batch)] = batch
+            except (BrokenExecutor, RuntimeError):  # noticed by a batch that runs, too
+                batches.again.append(batch)
+                break
+        if not running and (stopped() or not batches.again):
+            return
+        broken = not running
+        for future in wait(running, timeout=0.5, return_when=FIRST_COMPLETED).done:
+            batch = running.pop(future)
+            try:
+                done = future.result()
+            except Exception as error:
+                if not _is_loss(error):
+                    raise
+                broken = True
+                batches.again.append(batch)
+                continue
+            batches.learn(batch, done)
+            progress.done += done.runs
+            in_a_row = 0
+            report(progress)
+        if broken:
+            in_a_row += 1
+            progress.breaks += 1
+            if in_a_row > BREAKS:
+                raise SettingError(
+                    f"workers died {in_a_row} times in a row with no batch finished: see their memory and time limits"
+                )
+            batches.again += running.values()
+            running.clear()
+            executor = pool.executor()
+
+
+def _is_loss(error: Exception) -> bool:
+    """Return whether an error says that a worker or a scheduler was lost, and not that a batch cannot be done."""
+    if isinstance(error, OSError):
+        return error.errno is None or isinstance(error, ConnectionError)
+    return isinstance(error, (BrokenExecutor, CancelledError)) or type(error).__module__.startswith("distributed")

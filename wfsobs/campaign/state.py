@@ -1,0 +1,75 @@
+"""What of a campaign is done: one bit for each run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from wfsobs.campaign.keys import row_key, scenario_digest
+from wfsobs.campaign.plan import Plan
+from wfsobs.campaign.store import PLAN, ROWS, read_batches
+from wfsobs.files import write_whole
+from wfsobs.settings.group import SettingError
+from wfsobs.typing import Array
+
+
+def open_folder(plan: Plan, folder: Path) -> None:
+    """Make the folder of a campaign, or check that it is that of this plan.
+
+    Parameters
+    ----------
+    plan : Plan
+        What is to run.
+    folder : Path
+        Folder; the same plan with more seeds continues what is there.
+
+    Raises
+    ------
+    SettingError
+        The folder holds the results of another plan.
+    OSError
+        It cannot be written.
+    """
+    (folder / ROWS).mkdir(parents=True, exist_ok=True)
+    known = folder / PLAN
+    if known.exists() and folder_plan(folder).identity() != plan.identity():
+        raise SettingError(f"{folder}: holds another campaign; the plan may differ in its number of seeds alone")
+    write_whole(known, lambda file: file.write(json.dumps(plan.to_dict()).encode()))
+
+
+def folder_plan(folder: Path) -> Plan:
+    """Return the plan of a folder. Raises SettingError."""
+    if not (folder / PLAN).is_file():
+        raise SettingError(f"{folder}: holds no campaign ({PLAN} is missing)")
+    try:
+        return Plan.from_dict(json.loads((folder / PLAN).read_text(encoding="utf-8")))
+    except (ValueError, KeyError, TypeError):
+        raise SettingError(f"{folder / PLAN}: is not the plan of a campaign") from None
+
+
+def finished_runs(plan: Plan, folder: Path) -> Array:
+    """Return which runs have all their rows, bool (n_cells, n_seeds).
+
+    A row counts if its key is that of the present settings and versions.
+    """
+    names = (*plan.observers, *plan.controllers)
+    seen = np.zeros((len(plan.cells), len(plan.seeds), len(names)), dtype=bool)
+    digests: dict[int, str] = {}
+    for table in read_batches(folder, ("key", "cell", "seed", "name")):
+        for key, cell, seed, name in zip(*(table[c].to_pylist() for c in ("key", "cell", "seed", "name")), strict=True):
+            if cell >= len(plan.cells) or seed not in plan.seeds or name not in names:
+                continue
+            if key == row_key(_digest(plan, cell, digests), seed, name):
+                seen[cell, plan.seeds.index(seed), names.index(name)] = True
+    return seen.all(axis=2)
+
+
+def _digest(plan: Plan, cell: int, digests: dict[int, str]) -> str:
+    if cell not in digests:
+        try:
+            digests[cell] = scenario_digest(plan.cells[cell].scenario())
+        except SettingError:  # its failures have keys of their own
+            digests[cell] = repr(plan.cells[cell].changes)
+    return digests[cell]

@@ -1,0 +1,120 @@
+"""Results of a campaign: a folder with the plan and one Parquet file per batch."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from wfsobs.files import write_whole
+from wfsobs.settings.group import SettingError
+
+if TYPE_CHECKING:
+    import pyarrow
+
+PLAN = "plan.json"
+ROWS = "rows"
+"""Folder of the batches."""
+
+RESULTS = {
+    "key": "string",
+    "cell": "int32",
+    "scenario": "string",
+    "seed": "int64",
+    "name": "string",
+    "target": "string",
+    "mode": "string",
+    "rms_nm": "float64",
+    "truth_rms_nm": "float64",
+    "start_s": "float64",
+    "apart": "bool",
+    "note": "string",
+}
+"""Columns that settings and seed determine."""
+
+PROVENANCE = {"step_us": "float64", "kernel": "string", "host": "string", "process": "int64", "written": "float64"}
+"""Columns that say where and how a row was made."""
+
+ORDER = ("key", "target", "mode")
+
+
+def need_pyarrow() -> None:
+    """Raise SettingError where pyarrow is not installed."""
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError:
+        raise SettingError('campaigns need pyarrow: pip install "wfsobs[campaign]"') from None
+
+
+def schema() -> pyarrow.Schema:
+    """Return the columns of a file."""
+    import pyarrow as pa
+
+    types = {"string": pa.string(), "int32": pa.int32(), "int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_()}
+    return pa.schema([(name, types[kind]) for name, kind in {**RESULTS, **PROVENANCE}.items()])
+
+
+def write_batch(folder: Path, rows: Sequence[Mapping[str, Any]], provenance: Mapping[str, Any]) -> None:
+    """Write the rows of a batch to a file of their own: all or none of them. Raises OSError."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pa.Table.from_pylist([{**row, **provenance} for row in rows], schema=schema())
+    path = folder / ROWS / f"{uuid.uuid4().hex}.parquet"
+
+    def write(file: Any) -> None:
+        pq.write_table(table, file, compression="zstd")
+        file.flush()
+        os.fsync(file.fileno())
+
+    write_whole(path, write)
+
+
+def batch_files(folder: Path) -> list[Path]:
+    """Return the files of all batches."""
+    return sorted((folder / ROWS).glob("[!.]*.parquet"))
+
+
+def read_batches(folder: Path, columns: Iterable[str], unreadable: list[Path] | None = None) -> Iterator[pyarrow.Table]:
+    """Yield the rows of one file after the other; one that cannot be read is left out, and appended to `unreadable`."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    for path in batch_files(folder):
+        try:
+            yield pq.ParquetFile(path).read(columns=list(columns))
+        except (OSError, pa.ArrowException):
+            if unreadable is not None:
+                unreadable.append(path)
+
+
+def read_results(folder: Path, provenance: bool = False) -> pyarrow.Table:
+    """Return all rows, each once, sorted by key, target and mode.
+
+    Rows that were computed twice (by a worker that was taken for dead) have one key, and the first counts.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the campaign.
+    provenance : bool
+        Whether to return the columns of PROVENANCE, too.
+
+    Returns
+    -------
+    pyarrow.Table
+        The rows.
+    """
+    import numpy as np
+    import pyarrow as pa
+
+    columns = [*RESULTS, *(PROVENANCE if provenance else ())]
+    tables = list(read_batches(folder, columns))
+    if not tables:
+        return pa.schema([f for f in schema() if f.name in columns]).empty_table()
+    table = pa.concat_tables(tables).sort_by([(name, "ascending") for name in ORDER])
+    keys = [table[name].to_numpy() for name in ORDER]
+    again = np.logical_and.reduce([k[1:] == k[:-1] for k in keys])
+    return table.filter(pa.array(np.concatenate([[True], ~again])))

@@ -1,0 +1,217 @@
+"""`wfsobs campaign`: many scenarios and seeds, on many processes or machines."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from wfsobs.campaign.compare import compare
+from wfsobs.campaign.plan import Plan, load_plan
+from wfsobs.campaign.pools import DaskCluster, Processes, usable_processors
+from wfsobs.campaign.run import BATCH, run_campaign, run_cost
+from wfsobs.campaign.run import Progress as State
+from wfsobs.campaign.state import finished_runs, folder_plan
+from wfsobs.campaign.store import RESULTS, need_pyarrow, read_results
+from wfsobs.cli.show import show_table
+from wfsobs.evaluation.rows import NOT_OBSERVERS
+from wfsobs.settings.group import SettingError
+
+ROW_BYTES, FILE_BYTES = 60, 12_000
+"""Measured size of a row in a file, and of a file without rows."""
+
+STOPPED = 143
+"""Exit status after SIGTERM, as the shell has it."""
+
+
+@click.group()
+def campaign() -> None:
+    """Run many scenarios and seeds, on many processes or machines (docs/campaigns.md)."""
+    need_pyarrow()
+
+
+@campaign.command()
+@click.argument("plan_file", metavar="PLAN")
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 100_000),
+    default=None,
+    metavar="N",
+    help="Batches side by side; by default the processors.",
+)
+def plan(plan_file: str, workers: int | None) -> None:
+    """Say how many runs, hours and bytes a campaign takes."""
+    made, side_by_side = load_plan(plan_file), workers or usable_processors()
+    step = max(1, len(made.cells) // 200)  # of many scenarios some
+    costs = [run_cost(made, cell) for cell in range(0, len(made.cells), step)]
+    hours = sum(costs) / len(costs) * made.n_runs / 3600
+    rows = _rows_of_a_run(made) * made.n_runs
+    batches = max(1.0, hours * 3600 / BATCH)
+    click.echo(f"{made.name}: {len(made.cells)} scenarios x {len(made.seeds)} seeds = {made.n_runs} runs")
+    click.echo(f"observers: {', '.join(made.observers) or 'none'}; controllers: {', '.join(made.controllers) or 'none'}")
+    for path in made.axes:
+        values = list(dict.fromkeys(repr(c.changes[path]) for c in made.cells if path in c.changes))
+        click.echo(f"  {path}: {', '.join(values[:6])}{f' ... ({len(values)} values)' if len(values) > 6 else ''}")
+    click.echo(f"{hours:.3g} core hours, {hours / side_by_side:.3g} h on {side_by_side} workers, in about {batches:.0f} batches")
+    click.echo(f"{rows} rows, about {(rows * ROW_BYTES + batches * FILE_BYTES) / 1e6:.3g} MB")
+
+
+def _rows_of_a_run(made: Plan) -> int:
+    modes = len(made.cells[0].scenario().modes)
+    return modes * (2 * (len(made.observers) + 1) * bool(made.observers) + (len(made.controllers) + 1) * bool(made.controllers))
+
+
+@campaign.command()
+@click.argument("plan_file", metavar="PLAN")
+@click.option("--out", required=True, metavar="DIR", help="Folder of the results; the same command again resumes.")
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 1024),
+    default=None,
+    metavar="N",
+    help="Processes on this machine; by default one per processor.",
+)
+@click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Run on a Dask cluster, such as tcp://head:8786; its workers see DIR under the same path.",
+)
+@click.option("--shard", metavar="K/N", help="Run the K-th of N shares, for job arrays.")
+@click.option("--json", "as_json", is_flag=True, help="Print what was done as JSON.")
+def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, shard: str | None, as_json: bool) -> None:
+    """Run what is missing of a campaign."""
+    if workers and scheduler:
+        raise SettingError("--workers: is for this machine, leave it out with --scheduler")
+    made, share = load_plan(plan_file), _shard(shard)
+    stop = _Stop()
+    pool = DaskCluster(scheduler) if scheduler else Processes(workers or usable_processors())
+    with _bar(made.name) as bar:
+        task = bar.add_task("runs", total=None)
+
+        def report(state: State) -> None:
+            bar.update(task, completed=state.done, total=state.total)
+
+        state = run_campaign(made, Path(out), pool, share, report=report, stopped=stop)
+    if as_json:
+        click.echo(json.dumps({"total": state.total, "done": state.done, "before": state.before, "breaks": state.breaks}))
+    else:
+        lost = f"; workers were lost {state.breaks} times, and their batches run again" if state.breaks else ""
+        click.echo(
+            f"wfsobs: {out}: {state.done} of {state.total} runs are done, {state.done - state.before} of them now{lost}", err=True
+        )
+    if stop():
+        click.echo("wfsobs: stopped; the same command resumes", err=True)
+        sys.exit(STOPPED)
+
+
+class _Stop:
+    """Set by SIGTERM or the first Ctrl-C: batches that run are finished."""
+
+    def __init__(self) -> None:
+        self.set = False
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number: int, _frame: FrameType | None) -> None:
+        self.set = True
+        if number == signal.SIGINT:
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # a second one ends at once
+
+    def __call__(self) -> bool:
+        return self.set
+
+
+def _bar(title: str) -> Progress:
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left:"),
+        TimeRemainingColumn(),
+    )
+    return Progress(*columns, console=console, disable=not console.is_terminal)
+
+
+def _shard(text: str | None) -> tuple[int, int]:
+    if text is None:
+        return 1, 1
+    match = re.fullmatch(r"(\d+)/(\d+)", text)
+    if not match or not 1 <= int(match[1]) <= int(match[2]):
+        raise SettingError(f"--shard {text}: takes K/N, such as 3/10, with K from 1 to N")
+    return int(match[1]), int(match[2])
+
+
+@campaign.command()
+@click.argument("folder", metavar="DIR")
+@click.option("--csv", "as_csv", is_flag=True, help="Print all rows, sorted by key, without times and hosts.")
+@click.option("--parquet", metavar="FILE", help="Write all rows with their settings to one Parquet file.")
+def table(folder: str, as_csv: bool, parquet: str | None) -> None:
+    """Print the results of a campaign: errors over the seeds and paired differences from the best."""
+    made = folder_plan(Path(folder))
+    rows = read_results(Path(folder))
+    if parquet:
+        import pyarrow.parquet as pq
+
+        from wfsobs.files import write_whole
+
+        write_whole(parquet, lambda file: pq.write_table(rows, file))
+        return
+    if as_csv:
+        _print_csv(made, rows.to_pylist())
+        return
+    done = int(finished_runs(made, Path(folder)).sum())
+    show_table(_summary(made, rows, f"{made.name}: {done} of {made.n_runs} runs"))
+
+
+def _print_csv(made: Plan, rows: list[dict]) -> None:
+    """Print rows, with the settings of their scenarios; numbers with all their digits."""
+    out = csv.writer(sys.stdout, lineterminator="\n")
+    columns = list(RESULTS)
+    out.writerow([*columns, *made.axes])
+    for row in rows:
+        changes = made.cells[row["cell"]].changes if row["cell"] < len(made.cells) else {}
+        out.writerow([_text(row[c]) for c in columns] + [_text(changes.get(path)) for path in made.axes])
+
+
+def _text(value: object) -> object:
+    return "" if value is None else repr(value) if isinstance(value, float) else value
+
+
+def _summary(made: Plan, rows: object, title: str) -> Table:
+    """Return a table with one row per scenario, target, mode and observer."""
+    out = Table(title=title, caption="+-: interval of 95 % of the paired difference from the best; ~: not significant")
+    for name in ("Scenario", "Settings", "Target", "Mode", "Name", "rms, nm", "above the best, nm", "seeds"):
+        out.add_column(name, justify="right" if name in ("rms, nm", "above the best, nm", "seeds") else "left")
+    before = None
+    for one in compare(rows):  # type: ignore[arg-type]
+        key = (one.cell, one.target, one.mode)
+        settings = ", ".join(f"{path.split('.')[-1]} = {value}" for path, value in made.cells[one.cell].changes.items())
+        new = key != before
+        above = (
+            ""
+            if one.difference is None
+            else f"{'~' if one.tied else ''}{one.difference:.2f}"
+            + (f" +- {one.half_width:.2f}" if one.half_width is not None else "")
+        )
+        label = NOT_OBSERVERS.get(one.name, one.name)
+        failed = f" ({one.failures} failed)" if one.failures else ""
+        out.add_row(
+            *((one.scenario, settings, one.target, one.mode) if new else ("",) * 4),
+            label,
+            f"{one.rms:.2f}",
+            above,
+            f"{one.seeds}{failed}",
+        )
+        before = key
+    return out
