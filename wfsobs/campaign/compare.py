@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -40,6 +40,8 @@ class Comparison:
         the best.
     half_width : float or None
         Of the interval of the difference at the level [nm]; None with fewer than two records.
+    is_best : bool
+        Whether it has the smallest error of those that can be the best and did not fail more often than others.
     """
 
     cell: int
@@ -52,9 +54,10 @@ class Comparison:
     rms: float
     difference: float | None = None
     half_width: float | None = None
+    is_best: bool = False
 
     @property
-    def tied(self) -> bool:
+    def is_tie(self) -> bool:
         """Whether the difference from the best is not significant."""
         return self.difference is not None and (self.half_width is None or abs(self.difference) <= self.half_width)
 
@@ -104,14 +107,27 @@ def compare(table: pyarrow.Table, level: float = LEVEL) -> list[Comparison]:
     list of Comparison
         By scenario, target and mode, the smallest error first.
     """
-    return [one for group in _groups(table) for one in _compare_one(*group, level)]
+    return [one for group in _groups(table) for one in _compare_one(group, level)]
 
 
-Group = tuple[int, str, str, str, Array, list[str], Array, Array]
-"""Cell, scenario, target, mode, seeds (n,), names, rms (n, n_names) with NaN, whether a name can be best (n_names,)."""
+@dataclass(frozen=True)
+class _Group:
+    """What ran in one scenario, for one target and mode.
+
+    values   : rms [nm], (n_seeds, n_names), NaN without a result
+    eligible : whether a name can be the best, bool (n_names,)
+    """
+
+    cell: int
+    scenario: str
+    target: str
+    mode: str
+    names: list[str]
+    values: Array
+    eligible: Array
 
 
-def _groups(table: pyarrow.Table) -> Iterator[Group]:
+def _groups(table: pyarrow.Table) -> Iterator[_Group]:
     rows = table.sort_by([(c, "ascending") for c in ("cell", "target", "mode", "name", "seed")]).to_pylist()
     start = 0
     failed: dict[int, list[tuple[str, int]]] = {}
@@ -135,31 +151,23 @@ def _groups(table: pyarrow.Table) -> Iterator[Group]:
             column = names.index(r["name"])
             values[np.searchsorted(seeds, r["seed"]), column] = np.nan if r["rms_nm"] is None else r["rms_nm"]
             eligible[column] &= (key[1] == "residual" and r["name"] != "bound") or can_be_best(r["name"], r["apart"])
-        yield (*key[:1], part[0]["scenario"], *key[1:], seeds, names, values, eligible)
+        yield _Group(key[0], part[0]["scenario"], key[1], key[2], names, values, eligible)
 
 
-def _compare_one(
-    cell: int,
-    scenario: str,
-    target: str,
-    mode: str,
-    seeds: Array,
-    names: Sequence[str],
-    values: Array,
-    eligible: Array,
-    level: float,
-) -> list[Comparison]:
-    """Return the rows of one scenario, target and mode, the smallest error first."""
+def _compare_one(group: _Group, level: float) -> list[Comparison]:
+    """Return the rows of a group, the smallest error first."""
+    names, values, eligible = group.names, group.values, group.eligible
     known = ~np.isnan(values)
     count = known.sum(axis=0)
     with np.errstate(invalid="ignore"):
-        rms = np.sqrt(np.where(known, values, 0.0).__pow__(2).sum(axis=0) / count)
+        rms = np.sqrt((np.where(known, values, 0.0) ** 2).sum(axis=0) / count)
     ranked = [i for i in np.argsort(rms) if eligible[i] and count[i] == count[eligible].max(initial=0)]
     out = []
     for i in np.argsort(rms):
         difference, half = None, None
         if ranked and eligible[i] and i != ranked[0]:
             difference, half = paired_difference(values[:, i], values[:, ranked[0]], level)
-        failures = len(seeds) - int(count[i]) if count[i] else len(seeds)
-        out.append(Comparison(cell, scenario, target, mode, names[i], int(count[i]), failures, float(rms[i]), difference, half))
+        failures, is_best = len(values) - int(count[i]), bool(ranked) and bool(i == ranked[0])
+        where = group.cell, group.scenario, group.target, group.mode
+        out.append(Comparison(*where, names[i], int(count[i]), failures, float(rms[i]), difference, half, is_best))
     return out

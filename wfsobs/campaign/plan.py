@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from wfsobs.campaign.points import Changes, conditions, grid, product, sample
+from wfsobs.campaign.stopping import Stop, parse_stop
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
@@ -28,6 +29,7 @@ KEYS = (
     "grid",
     "sample",
     "conditions",
+    "stop",
 )
 """What a plan may contain."""
 
@@ -75,6 +77,8 @@ class Plan:
         Seeds of each.
     observers, controllers : tuple of str
         Ids.
+    stop : Stop or None
+        When a scenario has enough seeds; None for all of them.
     """
 
     name: str
@@ -82,6 +86,7 @@ class Plan:
     seeds: range
     observers: tuple[str, ...]
     controllers: tuple[str, ...]
+    stop: Stop | None = None
 
     @property
     def n_runs(self) -> int:
@@ -95,7 +100,7 @@ class Plan:
 
     def identity(self) -> str:
         """Return a digest of all but the number of seeds and the title: results of plans with the same one belong together."""
-        content = {k: v for k, v in self.to_dict().items() if k not in ("name", "seeds")}
+        content = {k: v for k, v in self.to_dict().items() if k not in ("name", "seeds", "stop")}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def to_dict(self) -> dict[str, Any]:
@@ -108,6 +113,7 @@ class Plan:
             "controllers": list(self.controllers),
             "scenarios": {cell.name: cell.base for cell in self.cells},
             "cells": [[cell.name, cell.changes] for cell in self.cells],
+            "stop": self.stop and asdict(self.stop),
         }
 
     @classmethod
@@ -120,6 +126,7 @@ class Plan:
             range(first, first + values["seeds"]),
             tuple(values["observers"]),
             tuple(values["controllers"]),
+            values["stop"] and Stop(values["stop"]["half_width"], tuple(values["stop"]["looks"])),
         )
 
 
@@ -178,7 +185,8 @@ def parse_plan(text: str, folder: Path) -> Plan:
             cell.scenario()
         except SettingError as error:
             raise SettingError(f"scenario {cell.index} ({cell.name}): {error}") from None
-    return Plan(str(values.get("name", "Campaign")), tuple(cells), range(first, first + count), observers, controllers)
+    stop = parse_stop(_table(values, "stop"), count)
+    return Plan(str(values.get("name", "Campaign")), tuple(cells), range(first, first + count), observers, controllers, stop)
 
 
 def _corners(cells: Sequence[Cell], axes: Sequence[Sequence[Changes]]) -> Iterator[Cell]:

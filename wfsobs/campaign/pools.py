@@ -20,11 +20,11 @@ DASK_RETRIES = 10
 """How often a scheduler starts a batch again whose worker died."""
 
 
-class Pool(Protocol):
+class Workers(Protocol):
     """Makes executors: a fresh one after the last one broke."""
 
     @property
-    def workers(self) -> int:
+    def count(self) -> int:
         """Number of batches that run side by side."""
         ...
 
@@ -47,19 +47,19 @@ class Processes:
 
     Parameters
     ----------
-    workers : int
+    count : int
         Number of processes.
     """
 
-    def __init__(self, workers: int):
-        self.workers = workers
+    def __init__(self, count: int):
+        self.count = count
         self._executor: ProcessPoolExecutor | None = None
 
     def executor(self) -> Executor:
         """Return a fresh executor."""
         self.close()
         os.environ["OPENBLAS_NUM_THREADS"] = "1"  # inherited by the processes, and read when they import numpy
-        self._executor = ProcessPoolExecutor(self.workers, mp_context=get_context("spawn"), initializer=_start_worker)
+        self._executor = ProcessPoolExecutor(self.count, mp_context=get_context("spawn"), initializer=_start_worker)
         return self._executor
 
     def close(self) -> None:
@@ -104,11 +104,12 @@ class DaskCluster:
         self._connect: Callable[[], Any] = lambda: distributed.Client(
             address, timeout=DASK_TIMEOUT, set_as_default=False, name="wfsobs"
         )
-        self.address, self._client = address, None
+        self.address = address
+        self._client: Any = None
         self.executor()
 
     @property
-    def workers(self) -> int:
+    def count(self) -> int:
         """Number of threads of all workers."""
         return max(1, sum(self._client.ncores().values()))
 

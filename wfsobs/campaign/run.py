@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from wfsobs.campaign.plan import Cell, Plan
-from wfsobs.campaign.pools import Pool
+from wfsobs.campaign.pools import Workers
 from wfsobs.campaign.state import finished_runs, open_folder
-from wfsobs.campaign.work import Batch, Done, wfsobs_batch
+from wfsobs.campaign.stopping import wanted_seeds
+from wfsobs.campaign.store import read_results
+from wfsobs.campaign.work import Batch, Summary, wfsobs_batch
 from wfsobs.cost import part_seconds
 from wfsobs.settings.group import SettingError
 from wfsobs.typing import Array
@@ -37,6 +39,8 @@ class Progress:
         Runs in this call's share, and how many of them were done before.
     done : int
         Runs done by now, those before included.
+    runs : int
+        Runs of this call.
     breaks : int
         How often workers died and their batches started again.
     """
@@ -44,13 +48,14 @@ class Progress:
     total: int
     before: int
     done: int = 0
+    runs: int = 0
     breaks: int = 0
 
 
 def run_campaign(
     plan: Plan,
     folder: Path,
-    pool: Pool,
+    workers: Workers,
     shard: tuple[int, int] = (1, 1),
     *,
     report: Callable[[Progress], None] = lambda _: None,
@@ -64,7 +69,7 @@ def run_campaign(
         What to run.
     folder : Path
         Where the results are; they are written by the workers, one file per batch.
-    pool : Pool
+    workers : Workers
         Where batches run.
     shard : tuple of int
         (k, n): the k-th of n shares of the runs, from 1.
@@ -86,22 +91,30 @@ def run_campaign(
         Results cannot be written.
     """
     open_folder(plan, folder)
-    todo = missing_runs(plan, folder, shard)
-    share = _share(plan, shard)
-    progress = Progress(int(share.sum()), int(share.sum() - len(todo)))
-    progress.done = progress.before
-    report(progress)
-    batches = _Batches(plan, todo, str(folder))
+    progress = Progress(0, 0)
     try:
-        _drive(batches, pool, progress, report, stopped)
+        while True:
+            wanted, finished = _wanted_runs(plan, folder, shard)
+            progress.total, progress.done = int(wanted.sum()), int((wanted & finished).sum())
+            todo = np.flatnonzero(wanted & ~finished)
+            if progress.runs == 0:
+                progress.before = progress.done
+            report(progress)
+            if not len(todo) or stopped():
+                return progress
+            _drive(_Batches(plan, todo, str(folder)), workers, progress, report, stopped)
+            if plan.stop is None or shard != (1, 1):  # shares decide when all of them have ended
+                return progress
     finally:
-        pool.close()
-    return progress
+        workers.close()
 
 
-def missing_runs(plan: Plan, folder: Path, shard: tuple[int, int] = (1, 1)) -> Array:
-    """Return the numbers of the runs of a share that are missing: cell number times seeds plus seed number, (n,)."""
-    return np.flatnonzero(_share(plan, shard) & ~finished_runs(plan, folder).ravel())
+def _wanted_runs(plan: Plan, folder: Path, shard: tuple[int, int]) -> tuple[Array, Array]:
+    """Return the runs of a share that are wanted by now, and those that are finished, bool (n_runs,)."""
+    finished = finished_runs(plan, folder)
+    seeds = wanted_seeds(plan, finished, read_results(folder)) if plan.stop else np.full(len(plan.cells), len(plan.seeds))
+    wanted = np.arange(len(plan.seeds)) < seeds[:, None]
+    return wanted.ravel() & _share(plan, shard), finished.ravel()
 
 
 def _share(plan: Plan, shard: tuple[int, int]) -> Array:
@@ -138,7 +151,7 @@ class _Batches:
             self.position += 1
         return Batch(tuple(runs), self.plan.observers, self.plan.controllers, self.folder)
 
-    def learn(self, batch: Batch, done: Done) -> None:
+    def learn(self, batch: Batch, done: Summary) -> None:
         """Correct the expected times by that of a batch."""
         self.spent += done.seconds
         self.expected += sum(self.cost(cell.index) for cell, _ in batch.runs)
@@ -162,12 +175,12 @@ def run_cost(plan: Plan, cell: int) -> float:
 
 
 def _drive(
-    batches: _Batches, pool: Pool, progress: Progress, report: Callable[[Progress], None], stopped: Callable[[], bool]
+    batches: _Batches, workers: Workers, progress: Progress, report: Callable[[Progress], None], stopped: Callable[[], bool]
 ) -> None:
     """Keep the executor busy until all batches are done."""
-    executor, running, in_a_row = pool.executor(), dict[Future[Done], Batch](), 0
+    executor, running, in_a_row = workers.executor(), dict[Future[Summary], Batch](), 0
     while True:
-        while not stopped() and len(running) < AHEAD * pool.workers and (batch := next(batches, None)) is not None:
+        while not stopped() and len(running) < AHEAD * workers.count and (batch := next(batches, None)) is not None:
             try:
                 running[executor.submit(wfsobs_batch, batch)] = batch
             except (BrokenExecutor, RuntimeError):  # noticed by a batch that runs, too
@@ -188,6 +201,7 @@ def _drive(
                 continue
             batches.learn(batch, done)
             progress.done += done.runs
+            progress.runs += done.runs
             in_a_row = 0
             report(progress)
         if broken:
@@ -199,7 +213,7 @@ def _drive(
                 )
             batches.again += running.values()
             running.clear()
-            executor = pool.executor()
+            executor = workers.executor()
 
 
 def _is_loss(error: Exception) -> bool:

@@ -63,7 +63,7 @@ def finished_runs(plan: Plan, folder: Path) -> Array:
                 continue
             if key == row_key(_digest(plan, cell, digests), seed, name):
                 seen[cell, plan.seeds.index(seed), names.index(name)] = True
-    return seen.all(axis=2)
+    return np.all(seen, axis=2)
 
 
 def _digest(plan: Plan, cell: int, digests: dict[int, str]) -> str:

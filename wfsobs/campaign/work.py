@@ -56,7 +56,7 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Done:
+class Summary:
     """Summary of a batch.
 
     Attributes
@@ -71,7 +71,7 @@ class Done:
     seconds: float
 
 
-def wfsobs_batch(batch: Batch) -> Done:
+def wfsobs_batch(batch: Batch) -> Summary:
     """Do the runs of a batch and write their rows to a file. Raises OSError where it cannot be written.
 
     The name is what dashboards of schedulers show.
@@ -81,7 +81,7 @@ def wfsobs_batch(batch: Batch) -> Done:
         rows = [row for cell, seed in batch.runs for row in run_rows(cell, seed, batch.observers, batch.controllers)]
     seconds = perf_counter() - start
     write_batch(Path(batch.folder), rows, {"host": socket.gethostname(), "process": os.getpid(), "written": time()})
-    return Done(len(batch.runs), seconds)
+    return Summary(len(batch.runs), seconds)
 
 
 @dataclass

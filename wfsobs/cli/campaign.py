@@ -93,21 +93,23 @@ def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, sh
         raise SettingError("--workers: is for this machine, leave it out with --scheduler")
     made, share = load_plan(plan_file), _shard(shard)
     stop = _Stop()
-    pool = DaskCluster(scheduler) if scheduler else Processes(workers or usable_processors())
+    place = DaskCluster(scheduler) if scheduler else Processes(workers or usable_processors())
     with _bar(made.name) as bar:
         task = bar.add_task("runs", total=None)
 
         def report(state: State) -> None:
             bar.update(task, completed=state.done, total=state.total)
 
-        state = run_campaign(made, Path(out), pool, share, report=report, stopped=stop)
+        state = run_campaign(made, Path(out), place, share, report=report, stopped=stop)
     if as_json:
-        click.echo(json.dumps({"total": state.total, "done": state.done, "before": state.before, "breaks": state.breaks}))
+        click.echo(
+            json.dumps(
+                {"total": state.total, "done": state.done, "before": state.before, "runs": state.runs, "breaks": state.breaks}
+            )
+        )
     else:
         lost = f"; workers were lost {state.breaks} times, and their batches run again" if state.breaks else ""
-        click.echo(
-            f"wfsobs: {out}: {state.done} of {state.total} runs are done, {state.done - state.before} of them now{lost}", err=True
-        )
+        click.echo(f"wfsobs: {out}: {state.done} of {state.total} runs are done, {state.runs} of them now{lost}", err=True)
     if stop():
         click.echo("wfsobs: stopped; the same command resumes", err=True)
         sys.exit(STOPPED)
@@ -152,11 +154,11 @@ def _shard(text: str | None) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-@campaign.command()
+@campaign.command("table")
 @click.argument("folder", metavar="DIR")
 @click.option("--csv", "as_csv", is_flag=True, help="Print all rows, sorted by key, without times and hosts.")
 @click.option("--parquet", metavar="FILE", help="Write all rows with their settings to one Parquet file.")
-def table(folder: str, as_csv: bool, parquet: str | None) -> None:
+def print_table(folder: str, as_csv: bool, parquet: str | None) -> None:
     """Print the results of a campaign: errors over the seeds and paired differences from the best."""
     made = folder_plan(Path(folder))
     rows = read_results(Path(folder))
@@ -201,7 +203,7 @@ def _summary(made: Plan, rows: object, title: str) -> Table:
         above = (
             ""
             if one.difference is None
-            else f"{'~' if one.tied else ''}{one.difference:.2f}"
+            else f"{'~' if one.is_tie else ''}{one.difference:.2f}"
             + (f" +- {one.half_width:.2f}" if one.half_width is not None else "")
         )
         label = NOT_OBSERVERS.get(one.name, one.name)
