@@ -11,6 +11,7 @@ import inspect
 import io
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,7 @@ from click.testing import CliRunner
 
 import wfsobs
 from wfsobs import RecordError
+from wfsobs.campaign.plan import parse_plan
 from wfsobs.cli import main
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
@@ -152,6 +154,7 @@ def test_the_page_of_observers_lists_them() -> None:
 def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every line of a ```sh block that starts with wfsobs, in order, in one folder, on short records."""
     monkeypatch.chdir(tmp_path)
+    shutil.copy(ROOT / "examples" / "wind.toml", tmp_path)
     for line in "".join(blocks(page, "sh")).splitlines():
         words = shlex.split(line)
         if words[0] != "wfsobs":
@@ -164,6 +167,12 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert result.exit_code == 0, (line, result.output)
         if out:
             Path(out).write_text(result.stdout, encoding="utf-8")
+
+
+def test_the_plan_on_the_page_of_campaigns_is_one(tmp_path: Path) -> None:
+    (tmp_path / "nights.csv").write_text("r0,noise_nm\n0.1,20\n0.2,10\n", encoding="utf-8")
+    plan = parse_plan(blocks(DOCS / "campaigns.md", "toml")[0], tmp_path)
+    assert len(plan.cells) == 2 * 2 * 32 * 3 and len(plan.axes) == 4
 
 
 def test_output_on_the_page_of_the_command_line_is_real() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import click
@@ -38,16 +38,25 @@ def commands() -> str:
     """Every command with its arguments and options, as `--help` has them."""
     out = ["# Command line\n\n[The command line](../command-line.md) is an introduction with examples.\n"]
     whole = click.Context(main, info_name="wfsobs")
-    for name in main.list_commands(whole):
-        command = main.get_command(whole, name)
-        assert command is not None
-        context = click.Context(command, info_name=name, parent=whole)
+    for name, command, parent in every_command(main, whole):
+        context = click.Context(command, info_name=name.split()[-1], parent=parent)
         records = (p.get_help_record(context) for p in command.get_params(context))
         rows = ((f"`{option}`", linked(text)) for option, text in filter(None, records) if text)
         usage = command.get_usage(context).removeprefix("Usage: ")
         text = linked(inspect.cleandoc(command.help or ""))
         out.append(f"## wfsobs {name}\n\n{text}\n\n    {usage}\n\n{table(('Option', 'Meaning'), rows)}\n")
     return "\n".join(out)
+
+
+def every_command(group: click.Group, context: click.Context) -> Iterator[tuple[str, click.Command, click.Context]]:
+    """Name, command and context of the group above it, of the commands of a group and of the groups in it."""
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        assert command is not None
+        yield name, command, context
+        if isinstance(command, click.Group):
+            below = every_command(command, click.Context(command, info_name=name, parent=context))
+            yield from ((f"{name} {inner}", one, parent) for inner, one, parent in below)
 
 
 def linked(text: str) -> str:

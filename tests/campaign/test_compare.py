@@ -1,0 +1,83 @@
+"""Comparisons over seeds: against scipy, and how often their intervals hold."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from scipy.stats import binom, ttest_rel
+
+from wfsobs.campaign.compare import LEVEL, Comparison, compare, paired_difference
+from wfsobs.campaign.stopping import Stop, looks
+from wfsobs.campaign.store import schema
+
+
+def rows(values, name, cell=0):
+    return [
+        {
+            "cell": cell,
+            "scenario": "s",
+            "seed": i,
+            "name": name,
+            "target": "vibration",
+            "mode": "tip",
+            "rms_nm": v,
+            "apart": False,
+        }
+        for i, v in enumerate(values)
+    ]
+
+
+def test_differences_are_those_of_the_paired_t_test():
+    rng = np.random.default_rng(5)
+    a, b = rng.normal(10, 1, (2, 12))
+    mean, half = paired_difference(a, b)
+    expected = ttest_rel(a, b).confidence_interval(LEVEL)
+    assert mean == pytest.approx((expected.low + expected.high) / 2, rel=1e-12)
+    assert half == pytest.approx((expected.high - expected.low) / 2, rel=1e-12)
+
+
+def test_the_best_is_causal_and_has_every_seed():
+    table = pa.Table.from_pylist(
+        [
+            *rows([4.0, 4.0, 4.0], "kf-lgs"),
+            *rows([5.0, 3.0, 7.0], "kf-multi"),
+            *rows([1.0, 1.0, None], "ridge"),  # failed once: smaller over the others is not better
+            *rows([0.5, 0.5, 0.5], "bound"),
+        ],
+        schema=schema(),
+    )
+    found = {c.name: c for c in compare(table)}
+    assert [name for name, c in found.items() if c.is_best] == ["kf-lgs"]
+    assert found["kf-multi"].rms == pytest.approx(np.sqrt((25 + 9 + 49) / 3), rel=1e-12)
+    assert found["kf-multi"].difference == pytest.approx(1.0) and found["kf-multi"].is_tie
+    assert found["ridge"].failures == 1 and found["bound"].difference is None
+
+
+def covers(differences, truth, level):
+    mean, half = paired_difference(differences, np.zeros(len(differences)), level)
+    return abs(mean - truth) <= half
+
+
+def test_intervals_at_a_fixed_number_of_seeds_cover_what_they_say():
+    rng = np.random.default_rng(11)
+    hits = sum(covers(rng.normal(1.0, 2.0, 12), 1.0, LEVEL) for _ in range(4000))
+    assert binom.ppf(1e-4, 4000, LEVEL) <= hits <= binom.ppf(1 - 1e-4, 4000, LEVEL)
+    assert 0.94 <= hits / 4000 <= 0.96
+
+
+def test_intervals_where_it_is_stopped_cover_at_least_94_per_cent():
+    """The worst for a rule that stops: the true difference is zero, and stopping asks for significance."""
+    rng = np.random.default_rng(12)
+    stop = Stop(0.02, looks(5, 80))
+    hits, used = 0, []
+    for _ in range(4000):
+        d = rng.normal(0.0, 1.0, 80)
+        for count in stop.looks:
+            mean, half = paired_difference(d[:count], np.zeros(count), stop.level)
+            rival = Comparison(0, "s", "t", "m", "rival", count, 0, 10.0 + mean, mean, half)
+            best = Comparison(0, "s", "t", "m", "best", count, 0, 10.0, is_best=True)
+            if stop.is_decided([best, rival]):
+                break
+        hits += abs(mean) <= half
+        used.append(count)
+    assert hits / 4000 >= 0.94
+    assert np.mean(used) < 80  # some are stopped before the last look

@@ -1,0 +1,164 @@
+"""Campaigns as they are run: resumed, shared, disturbed; the table is that of an undisturbed run, byte by byte."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+import wfsobs
+from wfsobs.campaign.keys import row_key, scenario_digest
+from wfsobs.campaign.store import read_results
+
+TINY = """
+name = "Tiny"
+seeds = {seeds}
+observers = ["kf-lgs", "persistence"]
+[settings]
+run.duration = 0.3
+run.warm_up = 0.1
+[grid]
+turbulence.wind_speed = [5, 10]
+"""
+COMMAND = [sys.executable, "-m", "wfsobs"]
+ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    path = tmp_path_factory.mktemp("plan") / "tiny.toml"
+    path.write_text(TINY.format(seeds=40), encoding="utf-8")
+    return path
+
+
+def campaign(*arguments, check=True):
+    done = subprocess.run(
+        [*COMMAND, "campaign", *map(str, arguments)], capture_output=True, text=True, env=ENVIRONMENT, timeout=250
+    )
+    assert not check or done.returncode == 0, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def undisturbed(plan, tmp_path_factory):
+    out = tmp_path_factory.mktemp("undisturbed")
+    assert "80 of 80 runs are done, 80 of them now" in campaign("run", plan, "--out", out, "--workers", 2).stderr
+    return out
+
+
+def test_rows_are_those_of_a_run_of_the_library(undisturbed):
+    table = {(r["cell"], r["seed"], r["name"], r["target"], r["mode"]): r for r in read_results(undisturbed).to_pylist()}
+    base = wfsobs.PRESETS["paper"]().replace({"run.duration": 0.3, "run.warm_up": 0.1})
+    for cell, wind in enumerate((5, 10)):
+        scenario = base.replace({"turbulence.wind_speed": wind, "run.seed": 3})
+        for score in wfsobs.run(scenario, observers=["kf-lgs", "persistence"]).scores:
+            row = table.pop((cell, 3, score.observer, score.target, score.mode))
+            assert row["rms_nm"] == score.rms * 1e3
+            assert row["key"] == row_key(scenario_digest(scenario), 3, score.observer)
+    assert all(seed != 3 for _, seed, *_ in table)
+
+
+def test_what_is_done_is_not_done_again(plan, undisturbed):
+    assert "80 of 80 runs are done, 0 of them now" in campaign("run", plan, "--out", undisturbed).stderr
+
+
+def test_shares_make_up_the_whole(plan, undisturbed, tmp_path):
+    for k in (1, 2, 3):
+        campaign("run", plan, "--out", tmp_path, "--shard", f"{k}/3", "--workers", 1)
+    assert campaign("table", tmp_path, "--csv").stdout == campaign("table", undisturbed, "--csv").stdout
+
+
+def test_killed_workers_and_a_killed_campaign_change_nothing(plan, undisturbed, tmp_path):
+    chance = random.Random(1)
+    client_killed = False
+    for _ in range(20):
+        process = subprocess.Popen(
+            [*COMMAND, "campaign", "run", str(plan), "--out", str(tmp_path), "--workers", "2"],
+            env=ENVIRONMENT,
+            stderr=subprocess.PIPE,
+        )
+        family = psutil.Process(process.pid)
+        deadline = time.monotonic() + 200
+        while process.poll() is None and time.monotonic() < deadline:
+            try:
+                process.wait(chance.uniform(2.0, 4.0))
+                break
+            except subprocess.TimeoutExpired:
+                pass
+            workers = [p for p in family.children() if "spawn_main" in " ".join(p.cmdline())]
+            if not client_killed and list((tmp_path / "rows").glob("*")):
+                client_killed = True
+                process.kill()
+                psutil.wait_procs(workers, timeout=20)
+                assert not [p for p in workers if p.is_running()], "workers do not outlive the campaign"
+            elif workers and client_killed:
+                chance.choice(workers).kill()
+                break
+        process.wait(200)
+        process.stderr.close()
+        if process.returncode == 0:
+            break
+    assert process.returncode == 0 and client_killed
+    assert campaign("table", tmp_path, "--csv").stdout == campaign("table", undisturbed, "--csv").stdout
+
+
+def test_a_stopped_campaign_finishes_its_batches_and_resumes(plan, undisturbed, tmp_path):
+    process = subprocess.Popen(
+        [*COMMAND, "campaign", "run", str(plan), "--out", str(tmp_path), "--workers", "1"],
+        env=ENVIRONMENT,
+        stderr=subprocess.PIPE,
+    )
+    while not (tmp_path / "rows").exists():
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=200)
+    assert process.returncode == 143 and b"the same command resumes" in said
+    campaign("run", plan, "--out", tmp_path, "--workers", 1)
+    assert campaign("table", tmp_path, "--csv").stdout == campaign("table", undisturbed, "--csv").stdout
+
+
+def test_more_seeds_continue_and_another_plan_is_refused(tmp_path):
+    small, large, other = (tmp_path / f"{name}.toml" for name in ("small", "large", "other"))
+    small.write_text(TINY.format(seeds=2), encoding="utf-8")
+    large.write_text(TINY.format(seeds=3), encoding="utf-8")
+    other.write_text(TINY.format(seeds=2).replace("10]", "11]"), encoding="utf-8")
+    out = tmp_path / "out"
+    campaign("run", small, "--out", out, "--workers", 1)
+    assert "6 of 6 runs are done, 2 of them now" in campaign("run", large, "--out", out, "--workers", 1).stderr
+    refused = campaign("run", other, "--out", out, check=False)
+    assert refused.returncode == 2 and "holds another campaign" in refused.stderr and refused.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["--shard", "4/3"], "--shard 4/3: takes K/N"),
+        (["--scheduler", "tcp://localhost:1", "--workers", "2"], "--workers: is for this machine"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line(plan, tmp_path, arguments, line):
+    refused = campaign("run", plan, "--out", tmp_path / "out", *arguments, check=False)
+    assert refused.returncode == 2 and line in refused.stderr and refused.stderr.count("\n") == 1
+
+
+def test_an_observer_that_ends_in_an_error_is_a_failure_of_its_own(monkeypatch):
+    from dataclasses import replace
+
+    from wfsobs.campaign.plan import parse_plan
+    from wfsobs.campaign.work import run_rows
+    from wfsobs.observers import OBSERVERS
+
+    def broken(*_):
+        raise ZeroDivisionError("of a package")
+
+    monkeypatch.setitem(OBSERVERS._entries, "persistence", replace(OBSERVERS["persistence"], run=broken))
+    plan = parse_plan(TINY.format(seeds=1), Path())
+    rows = run_rows(plan.cells[0], 1, plan.observers, ())
+    failed = [r for r in rows if r["name"] == "persistence"]
+    assert [(r["rms_nm"], r["note"]) for r in failed] == [(None, "ZeroDivisionError: of a package")]
+    assert len([r for r in rows if r["name"] == "kf-lgs" and r["rms_nm"]]) == 4
