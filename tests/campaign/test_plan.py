@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from wfsobs.campaign.plan import Plan, parse_plan
+from wfsobs.campaign.plan import Campaign, parse_plan
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.group import SettingError
@@ -41,7 +41,7 @@ def test_cells_are_the_scenarios_of_the_presets_with_their_settings():
 
 def test_a_plan_survives_its_file():
     plan = parse_plan(TEXT + "[stop]\nfirst = 2\nhalf_width = 0.1\n", Path())
-    again = Plan.from_dict(json.loads(json.dumps(plan.to_dict())))
+    again = Campaign.from_dict(json.loads(json.dumps(plan.to_dict())))
     assert again == plan
     assert again.identity() == plan.identity() == parse_plan(TEXT.replace("seeds = 3", "seeds = 9"), Path()).identity()
     assert parse_plan(TEXT.replace("15]", "16]"), Path()).identity() != plan.identity()

@@ -162,3 +162,19 @@ def test_an_observer_that_ends_in_an_error_is_a_failure_of_its_own(monkeypatch):
     failed = [r for r in rows if r["name"] == "persistence"]
     assert [(r["rms_nm"], r["note"]) for r in failed] == [(None, "ZeroDivisionError: of a package")]
     assert len([r for r in rows if r["name"] == "kf-lgs" and r["rms_nm"]]) == 4
+
+
+def test_the_file_for_data_frames_has_the_settings(undisturbed, tmp_path):
+    import pyarrow.parquet as pq
+
+    campaign("table", undisturbed, "--parquet", tmp_path / "all.parquet")
+    table = pq.read_table(tmp_path / "all.parquet")
+    wind = dict(zip(table["cell"].to_pylist(), table["turbulence.wind_speed"].to_pylist(), strict=True))
+    assert wind == {0: 5, 1: 10} and table.num_rows == len(read_results(undisturbed))
+
+
+def test_the_plan_says_how_much_it_is(plan):
+    said = campaign("plan", plan).stdout
+    assert "Tiny: 2 scenarios x 40 seeds = 80 runs" in said and "turbulence.wind_speed: 5, 10" in said
+    # 2 modes x 2 targets x 2 observers and the bound, in each of 80 runs
+    assert f"{80 * 2 * 2 * 3} rows" in said

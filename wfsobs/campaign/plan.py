@@ -64,7 +64,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Plan:
+class Campaign:
     """A campaign.
 
     Attributes
@@ -117,7 +117,7 @@ class Plan:
         }
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Plan:
+    def from_dict(cls, values: Mapping[str, Any]) -> Campaign:
         """Return the plan of `to_dict`."""
         bases, first = values["scenarios"], values["first_seed"]
         return cls(
@@ -130,7 +130,7 @@ class Plan:
         )
 
 
-def load_plan(path: str | Path) -> Plan:
+def load_plan(path: str | Path) -> Campaign:
     """Read a plan.
 
     Parameters
@@ -140,7 +140,7 @@ def load_plan(path: str | Path) -> Plan:
 
     Returns
     -------
-    Plan
+    Campaign
         The plan.
 
     Raises
@@ -158,7 +158,7 @@ def load_plan(path: str | Path) -> Plan:
         raise SettingError(f"{path}: {error}") from None
 
 
-def parse_plan(text: str, folder: Path) -> Plan:
+def parse_plan(text: str, folder: Path) -> Campaign:
     """Return the plan of a TOML text. Raises SettingError.
 
     folder : where the files that it names are looked for
@@ -186,7 +186,7 @@ def parse_plan(text: str, folder: Path) -> Plan:
         except SettingError as error:
             raise SettingError(f"scenario {cell.index} ({cell.name}): {error}") from None
     stop = parse_stop(_table(values, "stop"), count)
-    return Plan(str(values.get("name", "Campaign")), tuple(cells), range(first, first + count), observers, controllers, stop)
+    return Campaign(str(values.get("name", "Campaign")), tuple(cells), range(first, first + count), observers, controllers, stop)
 
 
 def _corners(cells: Sequence[Cell], axes: Sequence[Sequence[Changes]]) -> Iterator[Cell]:

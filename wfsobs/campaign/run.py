@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wfsobs.campaign.plan import Cell, Plan
+from wfsobs.campaign.plan import Campaign, Cell
 from wfsobs.campaign.pools import Workers
 from wfsobs.campaign.state import finished_runs, open_folder
 from wfsobs.campaign.stopping import wanted_seeds
@@ -53,7 +53,7 @@ class Progress:
 
 
 def run_campaign(
-    plan: Plan,
+    plan: Campaign,
     folder: Path,
     workers: Workers,
     shard: tuple[int, int] = (1, 1),
@@ -65,7 +65,7 @@ def run_campaign(
 
     Parameters
     ----------
-    plan : Plan
+    plan : Campaign
         What to run.
     folder : Path
         Where the results are; they are written by the workers, one file per batch.
@@ -109,7 +109,7 @@ def run_campaign(
         workers.close()
 
 
-def _wanted_runs(plan: Plan, folder: Path, shard: tuple[int, int]) -> tuple[Array, Array]:
+def _wanted_runs(plan: Campaign, folder: Path, shard: tuple[int, int]) -> tuple[Array, Array]:
     """Return the runs of a share that are wanted by now, and those that are finished, bool (n_runs,)."""
     finished = finished_runs(plan, folder)
     seeds = wanted_seeds(plan, finished, read_results(folder)) if plan.stop else np.full(len(plan.cells), len(plan.seeds))
@@ -117,7 +117,7 @@ def _wanted_runs(plan: Plan, folder: Path, shard: tuple[int, int]) -> tuple[Arra
     return wanted.ravel() & _share(plan, shard), finished.ravel()
 
 
-def _share(plan: Plan, shard: tuple[int, int]) -> Array:
+def _share(plan: Campaign, shard: tuple[int, int]) -> Array:
     """Return the runs of a share, bool (n_runs,): of every scenario some seeds, so that shares take equally long."""
     k, n = shard
     return np.arange(plan.n_runs) % n == k - 1
@@ -126,7 +126,7 @@ def _share(plan: Plan, shard: tuple[int, int]) -> Array:
 class _Batches:
     """The batches that are still to be done, as long as the wanted time by what runs took so far."""
 
-    def __init__(self, plan: Plan, todo: Array, folder: str):
+    def __init__(self, plan: Campaign, todo: Array, folder: str):
         self.plan, self.todo, self.folder = plan, todo, folder
         self.position = 0
         self.again: list[Batch] = []
@@ -164,7 +164,7 @@ class _Batches:
         return self._cost[cell]
 
 
-def run_cost(plan: Plan, cell: int) -> float:
+def run_cost(plan: Campaign, cell: int) -> float:
     """Estimate the time of one run of a scenario [s]."""
     try:
         scenario = plan.cells[cell].scenario()

@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from wfsobs.campaign.keys import row_key, scenario_digest
-from wfsobs.campaign.plan import Plan
+from wfsobs.campaign.plan import Campaign
 from wfsobs.campaign.store import PLAN, ROWS, read_batches
 from wfsobs.files import write_whole
 from wfsobs.settings.group import SettingError
 from wfsobs.typing import Array
 
 
-def open_folder(plan: Plan, folder: Path) -> None:
+def open_folder(plan: Campaign, folder: Path) -> None:
     """Make the folder of a campaign, or check that it is that of this plan.
 
     Parameters
     ----------
-    plan : Plan
+    plan : Campaign
         What is to run.
     folder : Path
         Folder; the same plan with more seeds continues what is there.
@@ -39,17 +39,17 @@ def open_folder(plan: Plan, folder: Path) -> None:
     write_whole(known, lambda file: file.write(json.dumps(plan.to_dict()).encode()))
 
 
-def folder_plan(folder: Path) -> Plan:
+def folder_plan(folder: Path) -> Campaign:
     """Return the plan of a folder. Raises SettingError."""
     if not (folder / PLAN).is_file():
         raise SettingError(f"{folder}: holds no campaign ({PLAN} is missing)")
     try:
-        return Plan.from_dict(json.loads((folder / PLAN).read_text(encoding="utf-8")))
+        return Campaign.from_dict(json.loads((folder / PLAN).read_text(encoding="utf-8")))
     except (ValueError, KeyError, TypeError):
         raise SettingError(f"{folder / PLAN}: is not the plan of a campaign") from None
 
 
-def finished_runs(plan: Plan, folder: Path) -> Array:
+def finished_runs(plan: Campaign, folder: Path) -> Array:
     """Return which runs have all their rows, bool (n_cells, n_seeds).
 
     A row counts if its key is that of the present settings and versions.
@@ -66,7 +66,7 @@ def finished_runs(plan: Plan, folder: Path) -> Array:
     return np.all(seen, axis=2)
 
 
-def _digest(plan: Plan, cell: int, digests: dict[int, str]) -> str:
+def _digest(plan: Campaign, cell: int, digests: dict[int, str]) -> str:
     if cell not in digests:
         try:
             digests[cell] = scenario_digest(plan.cells[cell].scenario())

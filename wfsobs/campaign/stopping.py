@@ -12,7 +12,7 @@ from wfsobs.settings.group import SettingError
 if TYPE_CHECKING:
     import pyarrow
 
-    from wfsobs.campaign.plan import Plan
+    from wfsobs.campaign.plan import Campaign
     from wfsobs.typing import Array
 
 
@@ -81,14 +81,14 @@ def looks(first: int, last: int) -> tuple[int, ...]:
     return tuple(out)
 
 
-def wanted_seeds(plan: Plan, finished: Array, table: pyarrow.Table) -> Array:
+def wanted_seeds(plan: Campaign, finished: Array, table: pyarrow.Table) -> Array:
     """Return how many seeds each scenario is to have by what is known, (n_cells,).
 
     At each look the first seeds alone count, so that the order of arrival does not matter.
 
     Parameters
     ----------
-    plan : Plan
+    plan : Campaign
         The campaign.
     finished : Array
         Runs that are finished, bool (n_cells, n_seeds).

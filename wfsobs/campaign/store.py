@@ -14,6 +14,8 @@ from wfsobs.settings.group import SettingError
 if TYPE_CHECKING:
     import pyarrow
 
+    from wfsobs.campaign.plan import Campaign
+
 PLAN = "plan.json"
 ROWS = "rows"
 """Folder of the batches."""
@@ -118,3 +120,11 @@ def read_results(folder: Path, provenance: bool = False) -> pyarrow.Table:
     keys = [table[name].to_numpy() for name in ORDER]
     again = np.logical_and.reduce([k[1:] == k[:-1] for k in keys])
     return table.filter(pa.array(np.concatenate([[True], ~again])))
+
+
+def add_settings(plan: Campaign, table: pyarrow.Table) -> pyarrow.Table:
+    """Return the rows with a column for each setting that the scenarios differ in."""
+    cells = table["cell"].to_pylist()
+    for path in plan.axes:
+        table = table.append_column(path, [[plan.cells[cell].changes.get(path) for cell in cells]])
+    return table

@@ -8,6 +8,7 @@ import re
 import signal
 import sys
 from pathlib import Path
+from time import perf_counter
 from types import FrameType
 
 import click
@@ -16,18 +17,22 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from wfsobs.campaign.compare import compare
-from wfsobs.campaign.plan import Plan, load_plan
+from wfsobs.campaign.plan import Campaign, load_plan
 from wfsobs.campaign.pools import DaskCluster, Processes, usable_processors
 from wfsobs.campaign.run import BATCH, run_campaign, run_cost
 from wfsobs.campaign.run import Progress as State
 from wfsobs.campaign.state import finished_runs, folder_plan
-from wfsobs.campaign.store import RESULTS, need_pyarrow, read_results
+from wfsobs.campaign.store import RESULTS, add_settings, need_pyarrow, read_results
+from wfsobs.campaign.work import run_rows
 from wfsobs.cli.show import show_table
 from wfsobs.evaluation.rows import NOT_OBSERVERS
 from wfsobs.settings.group import SettingError
 
 ROW_BYTES, FILE_BYTES = 60, 12_000
 """Measured size of a row in a file, and of a file without rows."""
+
+LONG = 60.0
+"""Expected time of a run that is not tried for a plan [s]."""
 
 STOPPED = 143
 """Exit status after SIGTERM, as the shell has it."""
@@ -39,7 +44,7 @@ def campaign() -> None:
     need_pyarrow()
 
 
-@campaign.command()
+@campaign.command("plan")
 @click.argument("plan_file", metavar="PLAN")
 @click.option(
     "--workers",
@@ -48,12 +53,10 @@ def campaign() -> None:
     metavar="N",
     help="Batches side by side; by default the processors.",
 )
-def plan(plan_file: str, workers: int | None) -> None:
+def print_plan(plan_file: str, workers: int | None) -> None:
     """Say how many runs, hours and bytes a campaign takes."""
     made, side_by_side = load_plan(plan_file), workers or usable_processors()
-    step = max(1, len(made.cells) // 200)  # of many scenarios some
-    costs = [run_cost(made, cell) for cell in range(0, len(made.cells), step)]
-    hours = sum(costs) / len(costs) * made.n_runs / 3600
+    hours, measured = _core_hours(made)
     rows = _rows_of_a_run(made) * made.n_runs
     batches = max(1.0, hours * 3600 / BATCH)
     click.echo(f"{made.name}: {len(made.cells)} scenarios x {len(made.seeds)} seeds = {made.n_runs} runs")
@@ -61,11 +64,33 @@ def plan(plan_file: str, workers: int | None) -> None:
     for path in made.axes:
         values = list(dict.fromkeys(repr(c.changes[path]) for c in made.cells if path in c.changes))
         click.echo(f"  {path}: {', '.join(values[:6])}{f' ... ({len(values)} values)' if len(values) > 6 else ''}")
-    click.echo(f"{hours:.3g} core hours, {hours / side_by_side:.3g} h on {side_by_side} workers, in about {batches:.0f} batches")
+    click.echo(f"{_span(hours)} of one processor{measured}")
+    click.echo(f"{_span(hours / side_by_side)} on {side_by_side} workers, in about {batches:.0f} batches")
     click.echo(f"{rows} rows, about {(rows * ROW_BYTES + batches * FILE_BYTES) / 1e6:.3g} MB")
 
 
-def _rows_of_a_run(made: Plan) -> int:
+def _span(hours: float) -> str:
+    """Return a time for people."""
+    return f"{hours:.3g} h" if hours >= 1 else f"{hours * 60:.2g} min" if hours >= 0.05 else f"{hours * 3600:.2g} s"
+
+
+def _core_hours(made: Campaign) -> tuple[float, str]:
+    """Return the time of all runs [h], by that of the first one on this machine, and how it was found."""
+    step = max(1, len(made.cells) // 200)  # of many scenarios some
+    costs = [run_cost(made, cell) for cell in range(0, len(made.cells), step)]
+    mean, how = sum(costs) / len(costs), ""
+    if costs[0] < LONG:
+        times = [perf_counter()]
+        for _ in range(2):
+            run_rows(made.cells[0], made.seeds[0], made.observers, made.controllers)
+            times.append(perf_counter())
+        first, again = times[1] - times[0], times[2] - times[1]
+        mean = mean * again / costs[0] + max(first - again, 0.0) / len(made.seeds)  # designs and bounds, once for all seeds
+        how = f" (the first run took {again:.2g} s here)"
+    return mean * made.n_runs / 3600, how
+
+
+def _rows_of_a_run(made: Campaign) -> int:
     modes = len(made.cells[0].scenario().modes)
     return modes * (2 * (len(made.observers) + 1) * bool(made.observers) + (len(made.controllers) + 1) * bool(made.controllers))
 
@@ -167,7 +192,7 @@ def print_table(folder: str, as_csv: bool, parquet: str | None) -> None:
 
         from wfsobs.files import write_whole
 
-        write_whole(parquet, lambda file: pq.write_table(rows, file))
+        write_whole(parquet, lambda file: pq.write_table(add_settings(made, rows), file))
         return
     if as_csv:
         _print_csv(made, rows.to_pylist())
@@ -176,7 +201,7 @@ def print_table(folder: str, as_csv: bool, parquet: str | None) -> None:
     show_table(_summary(made, rows, f"{made.name}: {done} of {made.n_runs} runs"))
 
 
-def _print_csv(made: Plan, rows: list[dict]) -> None:
+def _print_csv(made: Campaign, rows: list[dict]) -> None:
     """Print rows, with the settings of their scenarios; numbers with all their digits."""
     out = csv.writer(sys.stdout, lineterminator="\n")
     columns = list(RESULTS)
@@ -190,7 +215,7 @@ def _text(value: object) -> object:
     return "" if value is None else repr(value) if isinstance(value, float) else value
 
 
-def _summary(made: Plan, rows: object, title: str) -> Table:
+def _summary(made: Campaign, rows: object, title: str) -> Table:
     """Return a table with one row per scenario, target, mode and observer."""
     out = Table(title=title, caption="+-: interval of 95 % of the paired difference from the best; ~: not significant")
     for name in ("Scenario", "Settings", "Target", "Mode", "Name", "rms, nm", "above the best, nm", "seeds"):
