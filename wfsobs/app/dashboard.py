@@ -15,6 +15,7 @@ from wfsobs.app.connection import Connection
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.panel import Controls, waiting_text
 from wfsobs.app.display import Display
+from wfsobs.app.help import Help
 from wfsobs.app.jobs.job import FAILED
 from wfsobs.app.jobs.task import IDLE
 from wfsobs.app.pages.explore import Explore
@@ -33,6 +34,9 @@ ACTIONS = """
 :host > * { flex: 0 1 auto; width: auto !important; }
 """
 STALE = "These results are not those of the settings."
+
+NARROW = {"@media (max-width: 600px)": {"& .header a:has(.title)": {"display": "none !important"}}}
+"""On a phone the bar at the top has room for the run, not for the name."""
 
 PHONE_PX = 600
 """Below this width the drawer lies over the page, and starts closed."""
@@ -87,9 +91,11 @@ class Dashboard:
         self.actions.attach(self.pages)
         page = pmui.Page(
             title="wfsobs",
+            header=[self.controls.bar(), Help(styles={"margin-left": "auto"})],
             sidebar=[self.controls.view()],
             sidebar_width=340,
             theme_config=theme(),
+            sx=NARROW,
             favicon=None,
             main=[
                 _title(),

@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 import param
 
+from wfsobs.app.glossary import LAG, NEEDS, REAL_TIME, RELATIVE, RMS_ERROR, TERMS
 from wfsobs.app.pin import Pin
 from wfsobs.sensors.modes import HIGHEST_ORDER, TIP_TILT, Mode, modes_up_to
 from wfsobs.settings.parameters import unit_of
@@ -61,17 +62,17 @@ def score_columns(unit: str, base: str = "truth", pin_columns: Mapping[str, str]
     base        : what an error is divided by: "truth", or "z" for a record without truth
     pin_columns : columns that go beside the error
     """
-    error = "of the estimate" if base == "truth" else "of the prediction of z one step ahead, or residual of the recorded loop"
+    of_z = "Of the prediction of z one step ahead, or residual of the recorded loop"
     return {
-        "Observer": "and its line in the figures",
-        f"RMS error [{unit}]": f"{error}, after the warm-up, over the samples that all have",
+        "Observer": "",
+        f"RMS error [{unit}]": TERMS[RMS_ERROR] if base == "truth" else of_z,
         **pin_columns,
-        f"RMS {base} [{unit}]": "error of an estimate of zero",
-        f"error / {base}": "above 1: worse than an estimate of zero",
-        "Needs": "inputs beside measurements",
-        "Lag [ms]": "delay of the estimate",
-        "Time per step [µs]": "computing time per step and mode",
-        "Real-time factor": "time per step over the period of the loop; below 1: fast enough for it",
+        f"RMS {base} [{unit}]": "Error of an estimate of zero",
+        f"error / {base}": TERMS[RELATIVE] if base == "truth" else "Above 1: worse than an estimate of zero",
+        "Needs": TERMS[NEEDS],
+        "Lag [ms]": TERMS[LAG],
+        "Time per step [µs]": "Computing time per step and mode",
+        "Real-time factor": TERMS[REAL_TIME],
     }
 
 

@@ -88,6 +88,16 @@ export function render({model, el}) {
   const all = button("Show all", () => { model.hidden = [] })
   if (model.main) button(model.main, () => model.send_msg("main"))
 
+  for (const [word, meaning] of Object.entries(model.terms)) {
+    const it = button(word)
+    it.className = "term"
+    const definition = document.createElement("span")
+    Object.assign(definition, {className: "definition", popover: "auto", textContent: meaning})
+    definition.setAttribute("role", "note")
+    it.popoverTargetElement = definition
+    hint.append(definition)
+  }
+
   model.on("items", draw)
   model.on("hidden", mark)
   draw()

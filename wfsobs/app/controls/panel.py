@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from html import escape
 from typing import Any
 
@@ -14,9 +15,10 @@ from panel.custom import JSComponent
 from wfsobs.app.controls.fields import ROOM, TAG, Field, make_field
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.controls.rows import RowEditor
+from wfsobs.app.controls.search import Search
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.store import Store
-from wfsobs.app.style import asset
+from wfsobs.app.style import PRIMARY, asset
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.group import Group
@@ -40,6 +42,31 @@ TWO_LINES = """
 }
 """
 """What is below must not move under the pointer with every change."""
+
+
+ON_BAR = {
+    "color": "#fff",
+    "borderColor": "#fff",
+    "&.Mui-disabled": {"color": "#ffffff80", "borderColor": "#ffffff60"},
+    "&:hover": {"backgroundColor": "#ffffff30", "borderColor": "#fff", "color": "#fff"},
+    "@media (max-width: 600px)": {
+        "fontSize": 0,
+        "minWidth": "40px",
+        "height": "34px",
+        "padding": 0,
+        "& .MuiButton-startIcon": {"margin": 0, "fontSize": "22px"},
+    },
+}
+"""Buttons on the bar at the top, which is dark in either mode; on a phone their icons alone are seen."""
+
+BAR = ":host { align-items: center; }"
+STATUS_ON_BAR = """
+:host { color: #fff; }
+progress::-webkit-progress-value { background: #8fd3f0; }
+progress::-moz-progress-bar { background: #8fd3f0; }
+.line { white-space: nowrap; }
+.note { color: #ffc9c2; height: auto; }
+"""
 
 
 class Status(JSComponent):
@@ -77,9 +104,12 @@ class Controls:
             pmui.Button(label=name, icon=name.lower(), variant="text", size="small", margin=(4, 4, 4, 0), disabled=True)
             for name in ("Undo", "Redo")
         )
-        self.run = pmui.Button(label="Run", icon="play_arrow", color="primary", **ROOM)
-        self.cancel = pmui.Button(label="Cancel", icon="stop", variant="outlined", margin=(4, 0, 4, 8))
-        self.status = Status(sizing_mode="stretch_width", margin=(4, 0))
+        self.run = pmui.Button(
+            label="Run", icon="play_arrow", size="small", margin=0, sx=ON_BAR | {"backgroundColor": "#fff", "color": PRIMARY}
+        )
+        self.cancel = pmui.Button(label="Cancel", icon="stop", variant="outlined", size="small", margin=(0, 10, 0, 8), sx=ON_BAR)
+        self.status = Status(sizing_mode="stretch_width", max_width=220, margin=0, stylesheets=[STATUS_ON_BAR])
+        self.search = Search(self.open_setting, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
         self.topics = _names()
         self.rooms = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
         self.accordion = pmui.Accordion(
@@ -102,13 +132,22 @@ class Controls:
         return pn.Column(
             self.preset,
             pn.Row(self.undo, self.redo, self.reset, sizing_mode="stretch_width", margin=0),
-            pn.Row(self.run, self.cancel, sizing_mode="stretch_width", margin=0),
-            self.status,
             *(f.view for f in first),
+            self.search,
             self.accordion,
             sizing_mode="stretch_width",
             margin=(8, 14),
         )
+
+    def bar(self) -> pn.Row:
+        """Return what stays in sight: the buttons of the run, and how it is going."""
+        return pn.Row(self.run, self.cancel, self.status, sizing_mode="stretch_width", margin=(0, 8, 0, 12), stylesheets=[BAR])
+
+    def open_setting(self, path: str) -> None:
+        """Open the topic of a setting."""
+        index = list(self.topics).index(path.split(".")[0])
+        if path not in FIRST and index not in self.accordion.active:
+            self.accordion.active = [*self.accordion.active, index]
 
     def open_topic(self, name: str) -> None:
         """Fill a topic with its fields, the first time it is opened."""
@@ -197,6 +236,10 @@ class Controls:
         self.preset.value = self.store.preset
         self.preset.helper_text = f"{len(changed)} changed: {', '.join(changed)}" if changed else NO_CHANGES
         self.reset.disabled = not changed
+        count = Counter(path.split(".")[0] for path in changed)
+        names = [title + (f" · {count[name]} changed" if count[name] else "") for name, title in self.topics.items()]
+        if names != self.accordion._names:
+            self.accordion._names = names
         self.undo.disabled, self.redo.disabled = not self.store.can_undo, not self.store.can_redo
 
     def _refresh_run(self, *_: object) -> None:

@@ -12,6 +12,7 @@ import panel as pn
 from wfsobs.app.copies import LOOP, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save, residuals_csv, residuals_npz, table_csv
+from wfsobs.app.glossary import STREHL, TERMS
 from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
@@ -49,7 +50,7 @@ class ClosedLoopPage(PageActions):
         self.work = BackgroundTask(run.session)
         self.visible, self._of = False, object()
         self.note, self.table, self.margins = html(), html(), html()
-        self.cards = Cards(items=[], hidden=[], sizing_mode="stretch_width", margin=0)
+        self.cards = Cards(items=[], hidden=[], terms={STREHL: TERMS[STREHL]}, sizing_mode="stretch_width", margin=0)
         self.whole, self.zoomed = Trace("whole record"), Trace("zoomed")
         self.spectrum, self.response, self.nyquist = LoopSpectrum(), Response(), Nyquist()
         self._drawn = (self.whole, self.zoomed, self.spectrum, self.response, self.nyquist)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from markupsafe import Markup
 
 from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.glossary import NEEDS, STREHL, TERMS
 from wfsobs.app.loop_work import LoopResults
 from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.render import Row, macro, table
@@ -29,13 +30,13 @@ def loop_html(results: LoopResults, display: Display) -> str:
     """Residual and Strehl of every controller, and the bound."""
     unit = display.unit_label
     columns = {
-        "Controller": "and its line in the figures",
+        "Controller": "",
         f"Residual [{unit}]": "rms after the warm-up",
         f"Theory [{unit}]": "from the true spectra, for an endless record",
-        f"Strehl at {results.result.scenario.control.wavelength:g} µm": "of all simulated modes together",
+        f"Strehl at {results.result.scenario.control.wavelength:g} µm": TERMS[STREHL],
         "Gain": "of the integrator",
         "At a limit [%]": "steps in which a limit of the mirror changed the command",
-        "Needs": "inputs beside measurements",
+        "Needs": TERMS[NEEDS],
     }
     rows = of_mode(results, display)
     best = next((r["controller"] for r in rows if r["controller"] != BOUND and r["residual_rms_nm"] is not None), None)

@@ -9,6 +9,7 @@ import param
 from panel.custom import JSComponent
 
 from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.glossary import RELATIVE, TERMS
 from wfsobs.app.jobs.job import RUNNING
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.numbers import NOTHING, number
@@ -26,10 +27,11 @@ class Cards(JSComponent):
 
     items = param.List([], doc="{name, label, colour, dash, value, unit, note} of every card.")
     hidden = param.List([], doc="Names of the cards whose lines are hidden.")
+    terms = param.Dict({}, doc="Word that stands on the cards -> what it means.")
     main = param.String("", doc="What the button is called that shows the lines that matter; none if empty.")
 
     _esm = asset("strip.js")
-    _stylesheets = [asset("strip.css")]  # noqa: RUF012
+    _stylesheets = [asset("style.css"), asset("strip.css")]  # noqa: RUF012
 
     def __init__(self, **params: Any):
         self.on_main: Callable[[], None] = lambda: None
@@ -45,7 +47,9 @@ class Strip:
 
     def __init__(self, target: str, run: BackgroundTask, display: Display):
         self.target, self.run, self.display = target, run, display
-        self.cards = Cards(items=self.items(), main=MAIN, sizing_mode="stretch_width", margin=0)
+        self.cards = Cards(
+            items=self.items(), main=MAIN, terms={RELATIVE: TERMS[RELATIVE]}, sizing_mode="stretch_width", margin=0
+        )
         run.param.watch(self._refresh, ["result", "state"])
         display.param.watch(self._refresh, ["mode", "unit", "dark"])
         display.param.watch(self._hide, "hidden")

@@ -9,6 +9,8 @@ import panel as pn
 from markupsafe import Markup
 
 from wfsobs.app.display import IN_MOST, Display, per_micrometre, score_columns
+from wfsobs.app.glossary import BOUND as TERM_OF_BOUND
+from wfsobs.app.glossary import term
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.numbers import NOTHING, change, number
 from wfsobs.app.render import Row, macro, table
@@ -124,7 +126,8 @@ class Table:
         return Row(head, cells, {"observer": name, "target": target})
 
     def _head(self, name: str) -> Markup:
-        return swatch(name, self.display.dark) + row_label(name)
+        label = row_label(name)
+        return swatch(name, self.display.dark) + (term(TERM_OF_BOUND, label) if name == BOUND else label)
 
     def _pinned_cells(self, name: str, target: str, score: Score | None) -> list[str]:
         """Write the pinned run's error and the change since; nothing while nothing is pinned."""

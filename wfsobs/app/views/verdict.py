@@ -7,6 +7,7 @@ from html import escape
 import panel as pn
 
 from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.glossary import BOUND, explain_first
 from wfsobs.app.jobs.job import DONE
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import asset
@@ -39,4 +40,4 @@ class VerdictLine:
         scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
         first, *others = found.sentences(scale, self.display.unit_label)
         more = "".join(f"<br>{escape(sentence)}" for sentence in others)
-        return f'<p class="verdict"><strong>{escape(first)}</strong>{more}</p>'
+        return f'<p class="verdict"><strong>{explain_first(first, "bound", BOUND)}</strong>{more}</p>'

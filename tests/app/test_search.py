@@ -1,0 +1,55 @@
+"""Settings that are found, and the headings of the drawer that say what differs from the preset."""
+
+from __future__ import annotations
+
+from wfsobs.app.controls.search import settings_found
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.scenario import Scenario
+
+
+def titles(dashboard: Dashboard) -> dict[str, str]:
+    return dict(zip(dashboard.controls.topics, dashboard.controls.accordion._names, strict=True))
+
+
+class TestSearch:
+    def test_every_setting_has_a_name_and_a_topic(self) -> None:
+        found = {item["path"]: item for item in settings_found()}
+        scenario = Scenario()
+        lists = dict(scenario.lists())
+        single = {path for path, _, _ in scenario.walk() if not any(path.startswith(f"{it}.") for it in lists)}
+        assert set(found) == single | set(lists)
+        assert all(item["label"] and item["topic"] for item in found.values())
+        assert found["turbulence.wind_speed"]["label"] == "Wind speed V₀ [m/s]"
+        assert found["vibration.peaks"]["topic"] == "Vibration"
+
+    def test_the_browser_gets_them_when_it_asks(self, dashboard: Dashboard) -> None:
+        search = dashboard.controls.search
+        assert search.items == [], "not with the page"
+        search._handle_msg({"open": True})
+        assert len(search.items) == len(settings_found())
+
+    def test_the_topic_of_the_one_chosen_opens(self, dashboard: Dashboard) -> None:
+        search, controls = dashboard.controls.search, dashboard.controls
+        search._handle_msg({"open": True})
+        assert "kalman.vibration_rms" not in controls.fields
+        search._handle_msg({"path": "kalman.vibration_rms"})
+        assert "kalman.vibration_rms" in controls.fields
+        assert list(controls.topics).index("kalman") in controls.accordion.active
+        before = list(controls.accordion.active)
+        search._handle_msg({"path": "no.such"})
+        search._handle_msg({"path": "turbulence.wind_speed"})
+        assert controls.accordion.active == before, "nothing to open: unknown, or above the topics"
+
+
+class TestHeadings:
+    def test_they_count_what_differs_from_the_preset(self, dashboard: Dashboard) -> None:
+        dashboard.store.choose("paper")
+        plain = titles(dashboard)
+        assert plain == dashboard.controls.topics
+        dashboard.store.replace({"kalman.vibration_rms": 0.1, "kalman.turbulence_rms": 0.4, "run.seed": 5})
+        assert titles(dashboard) == plain | {
+            "kalman": f"{plain['kalman']} · 2 changed",
+            "run": f"{plain['run']} · 1 changed",
+        }
+        dashboard.store.undo()
+        assert titles(dashboard) == plain

@@ -1,0 +1,79 @@
+"""The first minute: what a visitor finds, by search, by the bar at the top and by asking what a word means."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from playwright.sync_api import expect
+
+
+def test_a_setting_is_found_and_gets_the_focus(open_page: Any) -> None:
+    page = open_page()
+    box = page.get_by_role("combobox", name="Find a setting")
+    box.focus()
+    page.keyboard.type("process noise")
+    found = page.get_by_role("listbox", name="Settings found").get_by_role("option")
+    expect(found.first).to_contain_text("Process noise Q")
+    expect(page.get_by_role("combobox", name="Process noise Q")).to_have_count(0)
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("combobox", name="Process noise Q")).to_be_focused()
+    box.focus()
+    page.keyboard.type("no such thing")
+    expect(page.get_by_text("No setting of that name")).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(page.get_by_text("No setting of that name")).to_be_hidden()
+
+
+def test_run_and_status_stay_in_sight(open_page: Any) -> None:
+    page = open_page(1200, 700)
+    page.get_by_role("button", name="Close drawer").click()
+    page.get_by_role("heading", name="RMS errors").scroll_into_view_if_needed()
+    expect(page.get_by_role("button", name="Run", exact=True).first).to_be_in_viewport()
+    expect(page.get_by_role("status").filter(has_text="Done in").first).to_be_in_viewport()
+
+
+def test_a_word_says_what_it_means(open_page: Any) -> None:
+    page = open_page()
+    for word, meaning in (
+        ("bound", "Smallest RMS error"),
+        ("Lag [ms]", "cross-correlation"),
+        ("× truth", "1 is as good as no estimate"),
+    ):
+        button = page.get_by_role("button", name=word, exact=True).first
+        definition = page.get_by_role("note").filter(has_text=meaning).first
+        expect(definition).to_be_hidden()
+        button.focus()
+        page.keyboard.press("Enter")
+        expect(definition).to_be_visible()
+        page.keyboard.press("Escape")
+        expect(definition).to_be_hidden()
+
+
+def test_help_and_tour_by_keyboard(open_page: Any) -> None:
+    page = open_page()
+    page.keyboard.press("?")
+    sheet = page.get_by_role("dialog", name="Help")
+    expect(sheet.get_by_text("Undo and redo a change of the settings")).to_be_visible()
+    tour = sheet.get_by_role("button", name="Take the tour")
+    expect(tour).to_be_focused()
+    page.keyboard.press("Enter")
+    note = page.get_by_role("dialog", name="Tour")
+    for i in range(1, 6):
+        expect(note).to_contain_text(f"{i} of 5")
+        expect(note).to_be_in_viewport(ratio=1)
+        expect(note.get_by_role("button", name="Done" if i == 5 else "Next")).to_be_focused()
+        page.keyboard.press("Enter")
+    expect(note).to_have_count(0)
+    page.keyboard.press("/")
+    expect(page.get_by_role("combobox", name="Find a setting")).to_be_focused()
+    page.keyboard.press("?")
+    expect(sheet).to_be_hidden()
+
+
+def test_a_heading_says_what_differs(open_page: Any) -> None:
+    page = open_page(390, 844)
+    page.get_by_role("button", name="Open drawer").click()
+    page.get_by_role("textbox", name="m/s").fill("20")
+    page.get_by_role("textbox", name="m/s").press("Enter")
+    expect(page.get_by_role("button", name=re.compile("Turbulence · 1 changed"))).to_be_visible()

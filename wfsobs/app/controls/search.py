@@ -1,0 +1,50 @@
+"""A box that finds settings: what it knows of them, and what it asks of the drawer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.display import label_of, unit_text
+from wfsobs.app.style import asset
+from wfsobs.scenario import Scenario
+
+
+class Search(JSComponent):
+    """The box in the browser; it gets the settings when it is first used, and says which one has been chosen."""
+
+    items = param.List([], doc="{path, label, topic, doc} of every setting.")
+
+    _esm = asset("search.js")
+    _stylesheets = [asset("search.css")]  # noqa: RUF012
+
+    def __init__(self, reveal: Callable[[str], None], **params: Any):
+        """Make the box. reveal : opens the topic of the setting of a path."""
+        self._reveal = reveal
+        super().__init__(**params)
+
+    def _handle_msg(self, data: dict[str, Any]) -> None:
+        if data.get("open") and not self.items:
+            self.items = settings_found()
+        elif (path := str(data.get("path", ""))) in {item["path"] for item in self.items}:
+            self._reveal(path)
+
+
+def settings_found() -> list[dict[str, str]]:
+    """List every setting and every list of settings, with its topic in words."""
+    scenario, topics = Scenario(), Scenario.settings()
+    lists = dict(scenario.lists())
+    inner = tuple(f"{path}." for path in lists)
+    known = [*lists.items(), *((path, p) for path, _, p in scenario.walk() if not path.startswith(inner))]
+    return [
+        {
+            "path": path,
+            "label": label_of(p),
+            "topic": str(topics[path.split(".")[0]].label),
+            "doc": unit_text(p.doc or ""),
+        }
+        for path, p in known
+    ]

@@ -1,0 +1,55 @@
+"""What the words of the page mean, in one place; tables, cards, verdicts and the help take them from here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from markupsafe import Markup, escape
+
+from wfsobs.app.render import macro
+
+BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME = (
+    "Bound",
+    "Needs",
+    "Lag",
+    "Strehl",
+    "× truth",
+    "RMS error",
+    "Real-time factor",
+)
+
+TERMS: Mapping[str, str] = MappingProxyType(
+    {
+        RMS_ERROR: (
+            "Root mean square of estimate minus truth after the warm-up, over the samples that all observers have. "
+            "Smaller is better."
+        ),
+        RELATIVE: (
+            "RMS error over the RMS of the truth. 0 is perfect, 1 is as good as no estimate; above 1 the estimate does harm."
+        ),
+        BOUND: (
+            "Smallest RMS error that a causal observer of the mean LGS measurement can have, from the true spectra (Wiener). "
+            "It is a mean over records: on one record an observer may come out a little below."
+        ),
+        NEEDS: ("What an observer must be given beside measurements: a model, the true lines, frequency bands or training data."),
+        LAG: "Delay of the estimate: where its cross-correlation with the truth has its maximum. Negative if the estimate leads.",
+        REAL_TIME: "Computing time per step over the period of the loop. Below 1 the observer is fast enough for it.",
+        STREHL: "Peak intensity over that of an image without error, from the residual of the simulated modes; at most 1.",
+    }
+)
+
+
+def term(name: str, words: str = "") -> Markup:
+    """Write a word that says what it means when it is pressed. words : how it is written, if not as in TERMS."""
+    return macro("term", words or name, TERMS[name], f"term-{name}")
+
+
+def explain_first(text: str, word: str, name: str) -> Markup:
+    """Escape a text, and have the first time that a word stands in it say what it means.
+
+    >>> str(explain_first("5 % above x", "bound", BOUND))
+    '5 % above x'
+    """
+    before, found, after = text.partition(word)
+    return escape(before) + term(name, word) + escape(after) if found else escape(text)

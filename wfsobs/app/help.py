@@ -1,0 +1,39 @@
+"""The help: shortcuts, words and a tour of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.glossary import TERMS
+from wfsobs.app.style import asset
+
+SHORTCUTS: Mapping[str, str] = MappingProxyType(
+    {
+        "?": "This help",
+        "/": "Find a setting",
+        "Ctrl+Z, Ctrl+Shift+Z": "Undo and redo a change of the settings",
+        "Enter or Space on a card": "Hide or show its line",
+        "S on a card": "Its line alone, and all lines again",
+        "Arrow keys": "Choose in a switch, go from line to line in a table",
+        "Tab": "The first stop of the page leads to the figures",
+    }
+)
+"""Key -> what it does."""
+
+
+class Help(JSComponent):
+    """The button at the top, and what it opens."""
+
+    shortcuts = param.Dict(dict(SHORTCUTS), doc="Key -> what it does.")
+    terms = param.Dict(dict(TERMS), doc="Word -> what it means.")
+
+    _esm = asset("help.js")
+    _stylesheets = [asset("help.css")]  # noqa: RUF012
+
+    def __init__(self, **params: Any):
+        super().__init__(width=36, margin=0, **params)

@@ -1,0 +1,97 @@
+// A box that finds settings by their name, their meaning or their path; choosing one opens its topic and goes to it.
+
+const TAG = "setting:"
+const MOST = 8 // of what is found
+
+export function render({model, el}) {
+  const box = document.createElement("input")
+  Object.assign(box, {type: "search", placeholder: "Find a setting", autocomplete: "off", spellcheck: false})
+  for (const [name, value] of Object.entries({role: "combobox", "aria-label": "Find a setting", "aria-expanded": "false",
+    "aria-controls": "found", "aria-autocomplete": "list"})) box.setAttribute(name, value)
+  const list = document.createElement("div")
+  Object.assign(list, {id: "found", hidden: true})
+  list.setAttribute("role", "listbox")
+  list.setAttribute("aria-label", "Settings found")
+  const said = document.createElement("div")
+  said.className = "said"
+  said.setAttribute("role", "status")
+  el.append(box, list, said)
+  let at = 0, found = []
+
+  const mark = () => {
+    for (const [i, item] of [...list.children].entries()) item.setAttribute("aria-selected", i === at)
+    if (found.length) box.setAttribute("aria-activedescendant", `found-${at}`)
+    else box.removeAttribute("aria-activedescendant")
+  }
+
+  const show = () => {
+    const words = box.value.toLowerCase().split(/\s+/).filter(Boolean)
+    found = words.length ? ranked(model.items, words).slice(0, MOST) : []
+    at = 0
+    list.replaceChildren(...found.map((item, i) => {
+      const row = document.createElement("div")
+      row.id = `found-${i}`
+      row.setAttribute("role", "option")
+      row.textContent = item.label
+      const topic = document.createElement("small")
+      topic.textContent = item.topic + (item.unused ? `: ${item.unused}` : "")
+      row.append(topic)
+      row.onpointerdown = (event) => { event.preventDefault(); choose(item) }
+      return row
+    }))
+    list.hidden = !found.length
+    box.setAttribute("aria-expanded", found.length > 0)
+    said.textContent = words.length && model.items.length && !found.length ? "No setting of that name" : ""
+    mark()
+  }
+
+  const choose = (item) => {
+    box.value = ""
+    show()
+    model.send_msg({path: item.path})
+    go(item.path)
+  }
+
+  box.onfocus = () => model.send_msg({open: true})
+  box.oninput = show
+  box.onblur = () => { list.hidden = true; box.setAttribute("aria-expanded", "false") }
+  box.onkeydown = (event) => {
+    const step = {ArrowDown: 1, ArrowUp: -1}[event.key]
+    if (step && found.length) {
+      event.preventDefault()
+      at = (at + step + found.length) % found.length
+      mark()
+    } else if (event.key === "Enter" && found.length) {
+      event.preventDefault()
+      choose(found[at])
+    } else if (event.key === "Escape") {
+      box.value = ""
+      show()
+    }
+  }
+  model.on("items", show)
+}
+
+// Those in which every word stands, first in whose name they do.
+function ranked(items, words) {
+  const rank = (item) => {
+    const name = item.label.toLowerCase()
+    const text = `${name} ${item.topic.toLowerCase()} ${item.path} ${item.doc.toLowerCase()}`
+    if (!words.every((word) => text.includes(word))) return 0
+    return name.startsWith(words[0]) ? 4 : words.every((word) => name.includes(word)) ? 3 : words.every((word) => item.path.includes(word)) ? 2 : 1
+  }
+  return items.map((item) => [rank(item), item]).filter(([r]) => r > 0).sort((a, b) => b[0] - a[0]).map(([, item]) => item)
+}
+
+// Give a setting the focus, as soon as its topic has opened.
+function go(path, tries = 600) {
+  const view = [...Bokeh.index.query((it) => it.model.tags?.includes(TAG + path))].find((it) => it.el.getBoundingClientRect().height > 0)
+  const root = view?.el.shadowRoot
+  const target = root?.querySelector("input, [role=combobox], select, button")
+  if (target) {
+    view.el.scrollIntoView({block: "center"})
+    target.focus()
+    if (root.activeElement === target) return
+  }
+  if (tries) requestAnimationFrame(() => go(path, tries - 1))
+}
