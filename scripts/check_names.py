@@ -1,9 +1,9 @@
-"""Check the names of functions and classes: none is a bare participle, none stands for two things.
+"""Check the names of functions, classes, fields and parameters: none is a bare participle, none stands for two things.
 
     python scripts/check_names.py
 
 A function is a verb with a noun (`fit_ar3`), or the noun of what it returns (`rms`); `fitted` says neither what is fitted nor
-that anything is done.
+that anything is done. A field or a parameter is the noun of what it holds (`measurements`); `measured` leaves open what.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ IRREGULAR = frozenset(
 PARTICIPLES = {
     "Cancelled": "an exception; the word of concurrent code",
 }
-"""Allowed, and why."""
+"""Allowed, and why. The signature of a method that a library calls would belong here, too; today there is none."""
 
 DOUBLES = {
     "prior_of": "the same of a scenario and of an identification: the module says of which",
@@ -66,12 +66,33 @@ def names(path: Path) -> Iterator[tuple[str, bool]]:
             yield from ((n.name, False) for n in node.body if isinstance(n, ast.FunctionDef))
 
 
-def faults() -> list[str]:
-    """Return one line for every name that breaks a rule."""
+def fields_and_parameters(source: str) -> Iterator[str]:
+    r"""Yield the fields of classes and the parameters of functions in a source, each after its owner.
+
+    >>> list(fields_and_parameters("class A:\n  seen: int\n  def f(self, told, *made, kept=1): pass"))
+    ['A.seen', 'f.self', 'f.told', 'f.kept', 'f.made']
+    """
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ClassDef):
+            fields = [n.target for n in node.body if isinstance(n, ast.AnnAssign)]
+            yield from (f"{node.name}.{field.id}" for field in fields if isinstance(field, ast.Name))
+        elif isinstance(node, ast.FunctionDef):
+            a = node.args
+            every = [*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg))]
+            yield from (f"{node.name}.{parameter.arg}" for parameter in every)
+
+
+def faults(package: Path = PACKAGE) -> list[str]:
+    """Return one line for every name in a package that breaks a rule."""
     homes: dict[str, list[str]] = defaultdict(list)
     out = []
-    for path in sorted(PACKAGE.rglob("*.py")):
-        where = path.relative_to(PACKAGE.parent).as_posix()
+    for path in sorted(package.rglob("*.py")):
+        where = path.relative_to(package.parent).as_posix()
+        out += [
+            f"{where}: {name}: a bare participle; take the noun of what it holds"
+            for name in fields_and_parameters(path.read_text(encoding="utf-8"))
+            if is_participle(name.rpartition(".")[2])
+        ]
         for name, is_top in names(path):
             if is_participle(name) and name not in PARTICIPLES:
                 out.append(f"{where}: {name}: a bare participle; say what is done to what")

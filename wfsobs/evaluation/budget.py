@@ -153,11 +153,11 @@ def _check_simulated(scenario: Scenario, record: Record) -> None:
         raise ValueError("error budget: vibration.source = psd is a table, not lines that a model could have")
 
 
-def _without_budget(observer: Observer, named: bool) -> str:
+def _without_budget(observer: Observer, by_name: bool) -> str:
     """Return why an observer has no budget, empty if it has."""
     if not observer.causal:
         return "looks ahead"
-    return "" if observer.linear or named else "not linear, takes 16 runs: only if named"
+    return "" if observer.linear or by_name else "not linear, takes 16 runs: only if named"
 
 
 def _of_observer(
@@ -169,7 +169,7 @@ def _of_observer(
     sources = split_record(scenario, record, lines, given)
     responses, rest = observer_responses(observer, scenario, record, sources, watch)
     columns = {mode.name: i for i, mode in enumerate(scenario.modes)}
-    complete = {name: Source(_fill(part.seen), part.truth) for name, part in sources.items()}
+    complete = {name: Source(_fill(part.measurement), part.truth) for name, part in sources.items()}
     reference: dict[int, dict[str, Array]] = {}
     out = []
     for s in scores:
@@ -177,7 +177,9 @@ def _of_observer(
         if i not in reference:
             watch.check()
             sensors = observer.sensors
-            reference[i] = follow_signal(before, i, given[i], sensors, complete[SIGNAL].seen, scenario.sensors.exposure_ratio)
+            reference[i] = follow_signal(
+                before, i, given[i], sensors, complete[SIGNAL].measurement, scenario.sensors.exposure_ratio
+            )
         truth = {name: part.truth[s.target][:, i] for name, part in sources.items()}
         parts = {name: responses[name][s.target][:, i] - truth[name] for name in sources}
         lag = reference[i][s.target] - truth[SIGNAL]
@@ -204,8 +206,8 @@ def _method(observer: Observer) -> str:
     return LINEAR if observer.linear else AVERAGED
 
 
-def _fill(seen: OpenLoop) -> OpenLoop:
-    return OpenLoop(np.nan_to_num(seen.lgs), np.nan_to_num(seen.ngs))
+def _fill(open_loop: OpenLoop) -> OpenLoop:
+    return OpenLoop(np.nan_to_num(open_loop.lgs), np.nan_to_num(open_loop.ngs))
 
 
 # ---------------------------------------------------------------------- responses
@@ -249,15 +251,15 @@ def observer_responses(
     return share(tuple(sources), estimate, rest), rest
 
 
-def _estimate(observer: Observer, measured: Measurements, prior: Any, settings: Any, watch: Watch) -> Estimates:
+def _estimate(observer: Observer, measurements: Measurements, prior: Any, settings: Any, watch: Watch) -> Estimates:
     """Return an observer's estimate, zero where there is none."""
-    own = measured if "open_loop_y" in observer.needs else replace(measured, open_loop_y=None)
+    own = measurements if "open_loop_y" in observer.needs else replace(measurements, open_loop_y=None)
     with detach_watch(replace(watch, progress=lambda _: None, partial=lambda *_: None)) as alone:
         return {target: np.nan_to_num(values) for target, values in observer.estimate(own, prior, settings, alone).items()}
 
 
 def _nothing(sources: dict[str, Source]) -> OpenLoop:
-    seen = sources[SIGNAL].seen
+    seen = sources[SIGNAL].measurement
     return OpenLoop(0.0 * seen.lgs, 0.0 * seen.ngs)
 
 

@@ -29,7 +29,7 @@ from wfsobs.typing import Array
 
 
 def follow_signal(
-    scenario: Scenario, mode: int, given: Sequence[float], sensors: Sequence[str], seen: OpenLoop, ratio: int
+    scenario: Scenario, mode: int, given_lines: Sequence[float], sensors: Sequence[str], open_loop: OpenLoop, ratio: int
 ) -> dict[str, Array]:
     """Run the filter on the noiseless measurements of one mode.
 
@@ -39,11 +39,11 @@ def follow_signal(
         Settings of the simulation, without events.
     mode : int
         Index of the mode.
-    given : sequence of float
+    given_lines : sequence of float
         Lines [Hz] in the model.
     sensors : sequence of str
         Sensors in use, of "lgs" and "ngs".
-    seen : OpenLoop
+    open_loop : OpenLoop
         What the sensors measure of turbulence and lines; steps without a frame count as zero.
     ratio : int
         Steps per NGS frame.
@@ -53,25 +53,25 @@ def follow_signal(
     dict of str to Array
         Target -> estimate, (n_steps,) [um].
     """
-    model, noise = right_model(scenario, mode, given), max(lgs_noise_rms(scenario, mode), MIN_NOISE)
+    model, noise = right_model(scenario, mode, given_lines), max(lgs_noise_rms(scenario, mode), MIN_NOISE)
     if model is None:
-        return {target: np.zeros(len(seen.lgs)) for target in TARGETS}
+        return {target: np.zeros(len(open_loop.lgs)) for target in TARGETS}
     if "ngs" not in sensors:
-        out = steady_filter(model, noise)[0].run(seen.lgs[:, None, mode, None])[:, :, 0]
+        out = steady_filter(model, noise)[0].run(open_loop.lgs[:, None, mode, None])[:, :, 0]
     else:
         cycle = optimal_cycle(model, ratio, noise, max(noise_rms(scenario, "ngs")[mode], MIN_NOISE))
         used = np.array([[float("lgs" in sensors)], [1.0]])
         rows = model.output_rows(TARGETS)
         rows = np.hstack([rows, np.zeros((len(rows), 1))])
         kalman, _ = optimal_filter([(A, used * C, Q, R) for A, C, Q, R in cycle], rows)
-        out = kalman.run(np.column_stack([seen.lgs[:, mode], seen.ngs[:, mode]]))
+        out = kalman.run(np.column_stack([open_loop.lgs[:, mode], open_loop.ngs[:, mode]]))
     return {target: out[:, i] for i, target in enumerate(TARGETS)}
 
 
-def right_model(scenario: Scenario, mode: int, given: Sequence[float]) -> DisturbanceModel | None:
+def right_model(scenario: Scenario, mode: int, given_lines: Sequence[float]) -> DisturbanceModel | None:
     """Return the state-space model of the true turbulence and of the lines [Hz] that are given, None where there is neither."""
     lines = [Line(*line) for line in vibration_lines(scenario, mode)]
-    near = is_near(np.array([line.frequency for line in lines]), given)
+    near = is_near(np.array([line.frequency for line in lines]), given_lines)
     known = tuple(line for line, is_given in zip(lines, near, strict=True) if is_given)
     turbulence = true_turbulence(scenario, mode)
     if not (known or turbulence):

@@ -31,18 +31,18 @@ class Source:
 
     Attributes
     ----------
-    seen : OpenLoop
+    measurement : OpenLoop
         What the sensors measure of it, NaN where the record has no measurement.
     truth : dict of str to Array
         Target -> part of the truth, (n_steps, n_modes) [um].
     """
 
-    seen: OpenLoop
+    measurement: OpenLoop
     truth: dict[str, Array]
 
 
 def split_record(
-    scenario: Scenario, record: Record, lines: Sequence[Sequence[float]], given: Sequence[Sequence[float]]
+    scenario: Scenario, record: Record, lines: Sequence[Sequence[float]], given_lines: Sequence[Sequence[float]]
 ) -> dict[str, Source]:
     """Split a record into its sources.
 
@@ -52,7 +52,7 @@ def split_record(
         Settings that the record was simulated from.
     record : Record
         The record.
-    lines, given : sequence
+    lines, given_lines : sequence
         All the lines [Hz] of the vibration, and those that an observer is given, mode by mode.
 
     Returns
@@ -63,7 +63,7 @@ def split_record(
     assert record.turbulence is not None and record.vibration is not None and record.ratio is not None
     assert record.open_loop_y is not None
     total, noise, nothing = OpenLoop(record.open_loop_y, record.z_ngs), simulate_noise(scenario), np.zeros_like(record.vibration)
-    split = [split_lines(x, record.dt, *of) for x, *of in zip(record.vibration.T, lines, given, strict=True)]
+    split = [split_lines(x, record.dt, *of) for x, *of in zip(record.vibration.T, lines, given_lines, strict=True)]
     known = np.column_stack(split)
     others = record.vibration - known
     on_axis = _see(record.turbulence + record.vibration, record.ratio)
@@ -74,10 +74,10 @@ def split_record(
         LINES: Source(_see(others, record.ratio), {TURBULENCE: nothing, VIBRATION: others}),
         SIGNAL: Source(_see(record.turbulence + known, record.ratio), {TURBULENCE: record.turbulence, VIBRATION: known}),
     }
-    return {name: Source(_where_measured(part.seen, total), part.truth) for name, part in parts.items()}
+    return {name: Source(_where_measured(part.measurement, total), part.truth) for name, part in parts.items()}
 
 
-def split_lines(vibration: Array, dt: float, lines: Sequence[float], given: Sequence[float]) -> Array:
+def split_lines(vibration: Array, dt: float, lines: Sequence[float], given_lines: Sequence[float]) -> Array:
     """Return the part (n,) of a vibration (n,) whose frequencies belong to a line [Hz] that is given.
 
     A frequency belongs to the nearest of the lines; where there are none it is a line itself.
@@ -85,7 +85,7 @@ def split_lines(vibration: Array, dt: float, lines: Sequence[float], given: Sequ
     bins = np.fft.rfftfreq(vibration.size, dt)
     at = np.asarray(lines, dtype=float) if len(lines) else bins
     nearest = np.argmin(np.abs(bins[:, None] - at), axis=1) if len(lines) else np.arange(bins.size)
-    known = is_near(at, given)
+    known = is_near(at, given_lines)
     if known.all():
         return vibration
     return np.fft.irfft(np.fft.rfft(vibration) * known[nearest], vibration.size)
@@ -93,7 +93,7 @@ def split_lines(vibration: Array, dt: float, lines: Sequence[float], given: Sequ
 
 def sum_sources(parts: Sequence[Source]) -> OpenLoop:
     """Return the measurements of several sources together."""
-    return OpenLoop(sum(part.seen.lgs for part in parts), sum(part.seen.ngs for part in parts))  # type: ignore[arg-type]
+    return OpenLoop(sum(part.measurement.lgs for part in parts), sum(part.measurement.ngs for part in parts))  # type: ignore[arg-type]
 
 
 def _see(signal: Array, ratio: int) -> OpenLoop:
@@ -101,5 +101,5 @@ def _see(signal: Array, ratio: int) -> OpenLoop:
     return OpenLoop(delay_signal(signal, 1), frame_mean(signal, ratio))
 
 
-def _where_measured(seen: OpenLoop, total: OpenLoop) -> OpenLoop:
-    return OpenLoop(np.where(np.isnan(total.lgs), np.nan, seen.lgs), np.where(np.isnan(total.ngs), np.nan, seen.ngs))
+def _where_measured(open_loop: OpenLoop, total: OpenLoop) -> OpenLoop:
+    return OpenLoop(np.where(np.isnan(total.lgs), np.nan, open_loop.lgs), np.where(np.isnan(total.ngs), np.nan, open_loop.ngs))

@@ -92,21 +92,21 @@ def _run(scenario: Scenario, n_steps: int, rng: np.random.Generator, watch: Watc
     return Record(**vars(measured), turbulence=disturbance.turbulence, vibration=disturbance.vibration)
 
 
-def measure_closed_loop(scenario: Scenario, seen: OpenLoop) -> Measurements:
+def measure_closed_loop(scenario: Scenario, open_loop: OpenLoop) -> Measurements:
     """Return the measurements and commands of the scenario's loop on open-loop measurements.
 
     The loop is linear: those of a sum are the sums of those of its parts, where the same samples are missing.
     """
-    u, n = np.zeros_like(seen.lgs), scenario.sensors.exposure_ratio
+    u, n = np.zeros_like(open_loop.lgs), scenario.sensors.exposure_ratio
     if scenario.loop.closed:
-        u = integrate_commands(seen.lgs, scenario.loop.gain, scenario.loop.leak)
+        u = integrate_commands(open_loop.lgs, scenario.loop.gain, scenario.loop.leak)
     return Measurements(
-        y_lgs=seen.lgs + delay_signal(u, DELAY),
+        y_lgs=open_loop.lgs + delay_signal(u, DELAY),
         u=u,
         dt=scenario.dt,
-        y_ngs=seen.ngs + frame_mean(delay_signal(u, DELAY - 1), n),
+        y_ngs=open_loop.ngs + frame_mean(delay_signal(u, DELAY - 1), n),
         ratio=n,
-        open_loop_y=seen.lgs,
+        open_loop_y=open_loop.lgs,
     )
 
 

@@ -152,11 +152,11 @@ class SlidingRegression:
         self._points = self._points._replace(largest=max(self._points.largest, self._newest.largest))
         self._renew_products()
 
-    def _solve_without(self, v: Array, gone: Array, s: int) -> Array:
+    def _solve_without(self, v: Array, old_column: Array, s: int) -> Array:
         """N_ v, the inverse without slot s; sets v[s] to zero."""
         v[s] = 0.0
         out = dsymv(1.0, self._N, v, lower=1)
-        out -= gone * (gone @ v)
+        out -= old_column * (old_column @ v)
         out[s] = 0.0
         return out
 

@@ -83,13 +83,13 @@ def pack_spectrum(spectrum: Spectrum | None, rows: int) -> Array:
     return out
 
 
-def unpack_spectrum(packed: Array, dt: float) -> Spectrum | None:
+def unpack_spectrum(table: Array, dt: float) -> Spectrum | None:
     """Return the spectrum of these numbers."""
-    if np.isnan(packed[0, 0]):
+    if np.isnan(table[0, 0]):
         return None
-    processes = [None if np.isnan(row[0]) else _process(row, dt) for row in packed[1:]]
+    processes = [None if np.isnan(row[0]) else _process(row, dt) for row in table[1:]]
     resonances = tuple(p for p in processes[1:] if isinstance(p, Ar2))
-    return Spectrum(float(packed[0, 0]), dt, processes[0], resonances)
+    return Spectrum(float(table[0, 0]), dt, processes[0], resonances)
 
 
 def _process(row: Array, dt: float) -> Ar2 | Ar3:

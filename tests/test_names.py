@@ -1,0 +1,46 @@
+"""The check of names, `scripts/check_names.py`: what it finds in a small package that breaks its rules."""
+
+from __future__ import annotations
+
+import doctest
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def check() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("check_names", Path(__file__).parents[1] / "scripts" / "check_names.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+SOURCE = """
+class Spectra:
+    measured: float
+    noise: float
+
+def estimate(record, told, /, *made, seen=None, speed=1.0, **hidden): ...
+def fitted(): ...
+"""
+
+
+def test_participles_are_found_wherever_a_name_is_given(check: ModuleType, tmp_path: Path) -> None:
+    (tmp_path / "bad.py").write_text(SOURCE, encoding="utf-8")
+    found = [line.split(": ")[1] for line in check.faults(tmp_path)]
+    assert found == ["Spectra.measured", "estimate.told", "estimate.seen", "estimate.made", "estimate.hidden", "fitted"]
+
+
+def test_one_name_in_two_modules_is_found(check: ModuleType, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.py").write_text("def rms(x): ...\ndef _inner(x): ...\n", encoding="utf-8")
+    assert [line.split(": ")[1:] for line in check.faults(tmp_path)] == [["rms", "one name in 2 modules"]]
+
+
+def test_examples_of_the_check(check: ModuleType) -> None:
+    results = doctest.testmod(check)
+    assert results.attempted >= 2 and results.failed == 0
