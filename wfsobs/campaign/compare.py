@@ -107,15 +107,25 @@ def compare(table: pyarrow.Table, level: float = LEVEL) -> list[Comparison]:
     list of Comparison
         By scenario, target and mode, the smallest error first.
     """
-    return [one for group in _groups(table) for one in _compare_one(group, level)]
+    return [one for group in each_group(table) for one in _compare_one(group, level)]
 
 
 @dataclass(frozen=True)
-class _Group:
+class Samples:
     """What ran in one scenario, for one target and mode.
 
-    values   : rms [nm], (n_seeds, n_names), NaN without a result
-    eligible : whether a name can be the best, bool (n_names,)
+    Attributes
+    ----------
+    cell : int
+        Number of the scenario.
+    scenario, target, mode : str
+        What was compared.
+    names : list of str
+        Ids.
+    values : Array
+        rms [nm], (n_seeds, n_names), NaN without a result.
+    eligible : Array
+        Whether a name can be the best, bool (n_names,).
     """
 
     cell: int
@@ -127,7 +137,8 @@ class _Group:
     eligible: Array
 
 
-def _groups(table: pyarrow.Table) -> Iterator[_Group]:
+def each_group(table: pyarrow.Table) -> Iterator[Samples]:
+    """Yield what ran in each scenario, for each target and mode."""
     rows = table.sort_by([(c, "ascending") for c in ("cell", "target", "mode", "name", "seed")]).to_pylist()
     start = 0
     failed: dict[int, list[tuple[str, int]]] = {}
@@ -151,10 +162,10 @@ def _groups(table: pyarrow.Table) -> Iterator[_Group]:
             column = names.index(r["name"])
             values[np.searchsorted(seeds, r["seed"]), column] = np.nan if r["rms_nm"] is None else r["rms_nm"]
             eligible[column] &= (key[1] == "residual" and r["name"] != "bound") or can_be_best(r["name"], r["apart"])
-        yield _Group(key[0], part[0]["scenario"], key[1], key[2], names, values, eligible)
+        yield Samples(key[0], part[0]["scenario"], key[1], key[2], names, values, eligible)
 
 
-def _compare_one(group: _Group, level: float) -> list[Comparison]:
+def _compare_one(group: Samples, level: float) -> list[Comparison]:
     """Return the rows of a group, the smallest error first."""
     names, values, eligible = group.names, group.values, group.eligible
     known = ~np.isnan(values)

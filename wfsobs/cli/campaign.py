@@ -122,10 +122,10 @@ def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, sh
     with _bar(made.name) as bar:
         task = bar.add_task("runs", total=None)
 
-        def report(state: State) -> None:
+        def tell(state: State) -> None:
             bar.update(task, completed=state.done, total=state.total)
 
-        state = run_campaign(made, Path(out), place, share, report=report, stopped=stop)
+        state = run_campaign(made, Path(out), place, share, report=tell, stopped=stop)
     if as_json:
         click.echo(
             json.dumps(
@@ -199,6 +199,18 @@ def print_table(folder: str, as_csv: bool, parquet: str | None) -> None:
         return
     done = int(finished_runs(made, Path(folder)).sum())
     show_table(_summary(made, rows, f"{made.name}: {done} of {made.n_runs} runs"))
+
+
+@campaign.command()
+@click.argument("folder", metavar="DIR")
+@click.option("--out", default=None, metavar="FILE", help="HTML file; report.html in DIR unless told.")
+def report(folder: str, out: str | None) -> None:
+    """Write the results of a campaign as one HTML file: maps of winners, ranks, all comparisons."""
+    from wfsobs.campaign.report import write_report
+
+    path = Path(out) if out else Path(folder) / "report.html"
+    write_report(Path(folder), path)
+    click.echo(f"wfsobs: {path}: written", err=True)
 
 
 def _print_csv(made: Campaign, rows: list[dict]) -> None:

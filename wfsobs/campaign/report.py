@@ -1,0 +1,191 @@
+"""The report of a campaign: one HTML file with maps of winners, ranks and all comparisons, that opens without a network."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from wfsobs.campaign.compare import Comparison, compare
+from wfsobs.campaign.plan import Campaign
+from wfsobs.campaign.ranking import Ranking, first_places, rank
+from wfsobs.campaign.state import finished_runs, folder_plan
+from wfsobs.campaign.store import read_results
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.evaluation.rows import NOT_OBSERVERS
+from wfsobs.files import write_whole
+from wfsobs.observers import OBSERVERS
+
+MOST_ROWS = 4000
+"""Maximum number of scenarios, targets and modes in the table of comparisons; the maps have all."""
+FULL_MARGIN = 0.3
+"""Margin of the winner from which its colour is full: the second is 30 % worse."""
+
+
+class Square(NamedTuple):
+    """One scenario on a map."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    colour: str
+    opacity: float
+    text: str
+
+
+class Map(NamedTuple):
+    """Winners over one or two settings."""
+
+    title: str
+    x_name: str
+    y_name: str
+    x_labels: Sequence[tuple[float, str]]
+    y_labels: Sequence[tuple[float, str]]
+    squares: Sequence[Square]
+    winners: Sequence[tuple[str, str]]
+
+
+WIDTH, HEIGHT, LEFT, TOP = 520.0, 260.0, 90.0, 10.0
+"""Size of a map, and the room for its labels [px]."""
+
+
+def write_report(folder: Path, path: Path) -> None:
+    """Write the report of a campaign.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the campaign.
+    path : Path
+        HTML file.
+
+    Raises
+    ------
+    SettingError
+        The folder holds no campaign.
+    OSError
+        The file cannot be written.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    plan, table = folder_plan(folder), read_results(folder)
+    comparisons = compare(table)
+    stable = first_places(table, np.random.default_rng(0))
+    environment = Environment(
+        loader=PackageLoader("wfsobs.campaign"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    text = environment.get_template("report.html").render(
+        plan=plan,
+        done=int(finished_runs(plan, folder).sum()),
+        maps=[m for key in _keys(comparisons) for m in _maps(plan, [c for c in comparisons if (c.target, c.mode) == key])],
+        rankings=[(r, _lines(r)) for r in rank(comparisons)],
+        groups=list(_by_group(comparisons).items())[:MOST_ROWS],
+        left_out=max(0, len(_by_group(comparisons)) - MOST_ROWS),
+        stable=stable,
+        label=name_label,
+        colour=colour,
+        settings=lambda cell: ", ".join(f"{path} = {_short(v)}" for path, v in plan.cells[cell].changes.items()),
+        size=(WIDTH, HEIGHT, LEFT, TOP),
+    )
+    write_whole(path, lambda file: file.write(text.encode()))
+
+
+def name_label(name: str) -> str:
+    """Return the label of an observer, a controller or a bound."""
+    return NOT_OBSERVERS.get(name) or getattr(OBSERVERS.get(name) or CONTROLLERS.get(name), "label", name)
+
+
+def colour(name: str) -> str:
+    """Return the colour of an observer or a controller."""
+    entry = OBSERVERS.get(name) or CONTROLLERS.get(name)
+    return entry.look.light if entry is not None else "#555577"
+
+
+def _keys(comparisons: Sequence[Comparison]) -> list[tuple[str, str]]:
+    return list(dict.fromkeys((c.target, c.mode) for c in comparisons))
+
+
+def _by_group(comparisons: Sequence[Comparison]) -> dict[tuple[int, str, str], list[Comparison]]:
+    out: dict[tuple[int, str, str], list[Comparison]] = {}
+    for c in comparisons:
+        out.setdefault((c.cell, c.target, c.mode), []).append(c)
+    return out
+
+
+def _maps(plan: Campaign, comparisons: Sequence[Comparison]) -> list[Map]:
+    """Return a map of winners for each scenario of a plan that is varied: over its first two settings that are numbers."""
+    out = []
+    for name in dict.fromkeys(c.scenario for c in comparisons):
+        cells = _by_group([c for c in comparisons if c.scenario == name])
+        changes = {key[0]: plan.cells[key[0]].changes for key in cells}
+        paths = [p for p in plan.axes if all(isinstance(c.get(p), (int, float)) for c in changes.values())][:2]
+        paths = [p for p in paths if len({c[p] for c in changes.values()}) > 1]
+        if paths:
+            out.append(_map(name, cells, changes, paths))
+    return out
+
+
+def _map(
+    name: str,
+    cells: Mapping[tuple[int, str, str], Sequence[Comparison]],
+    changes: Mapping[int, Mapping[str, Any]],
+    paths: Sequence[str],
+) -> Map:
+    """Return the map of one scenario; where a third setting varies, points share a square and the last one is seen."""
+    xs, ys = (sorted({c[path] for c in changes.values()}) for path in (paths[0], paths[-1]))
+    ys = ys if len(paths) > 1 else [0.0]
+    wide, high = (WIDTH - LEFT - 10) / len(xs), (HEIGHT - TOP - 40) / len(ys)
+    squares, winners = [], dict[str, str]()
+    for (cell, target, mode), rows in cells.items():
+        best = next((r for r in rows if r.is_best), None)
+        if best is None:
+            continue
+        second = min((r.rms for r in rows if r.difference is not None), default=math.inf)
+        margin = second / best.rms - 1.0 if best.rms > 0 and math.isfinite(second) else FULL_MARGIN
+        tie = any(r.is_tie for r in rows)
+        i, j = xs.index(changes[cell][paths[0]]), ys.index(changes[cell][paths[1]]) if len(paths) > 1 else 0
+        text = f"{name_label(best.name)}, {best.rms:.1f} nm, {margin:.0%} before the next" + (
+            ", another is not significantly worse" if tie else ""
+        )
+        text += f"; {', '.join(f'{p} = {_short(changes[cell][p])}' for p in paths)}; {target}, {mode}"
+        winners[best.name] = name_label(best.name)
+        opacity = 0.25 + 0.75 * min(1.0, margin / FULL_MARGIN)
+        top = TOP + (len(ys) - 1 - j) * high
+        squares.append(Square(LEFT + i * wide, top, wide - 1, high - 1, colour(best.name), 0.15 if tie else opacity, text))
+    target, mode = next(iter(cells))[1:]
+    return Map(
+        f"{target}, {mode}: {name}",
+        paths[0],
+        paths[1] if len(paths) > 1 else "",
+        [(LEFT + (i + 0.5) * wide, _short(x)) for i, x in enumerate(xs) if i % max(1, len(xs) // 8) == 0],
+        [
+            (TOP + (len(ys) - 0.5 - j) * high, _short(y))
+            for j, y in enumerate(ys)
+            if len(paths) > 1 and j % max(1, len(ys) // 8) == 0
+        ],
+        squares,
+        [(colour(n), text) for n, text in winners.items()],
+    )
+
+
+def _lines(ranking: Ranking) -> dict[str, Any]:
+    """Return positions of the critical-difference diagram [px]."""
+    last = max(2, len(ranking.names))
+
+    def x(value: float) -> float:
+        return 30.0 + (value - 1.0) / (last - 1.0) * 440.0
+
+    return {
+        "ticks": [(x(i), str(i)) for i in range(1, last + 1)],
+        "names": [(x(r), name) for r, name in zip(ranking.mean_ranks, ranking.names, strict=True)],
+        "ties": [(x(ranking.mean_ranks[a]), x(ranking.mean_ranks[b])) for a, b in ranking.ties],
+        "critical": None if ranking.critical is None else (x(1.0), x(1.0 + ranking.critical)),
+    }
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, (int, float)) and not isinstance(value, bool) else str(value)
