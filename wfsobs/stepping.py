@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.missing import fill_missing
-from wfsobs.observers.step import StepError, StepObserver
-from wfsobs.prior import Prior, Training
+from wfsobs.observers.step import StepError
+from wfsobs.prior import Part, Prior, Training
+from wfsobs.priors_from.controllers import own_settings, plant_of
 from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.scenario import observer_settings, prior_of
 from wfsobs.record import Record, Sampling
@@ -28,17 +30,18 @@ def design(
     sampling: Sampling | None = None,
     horizon: float = 0.0,
     train: Record | Training | None = None,
-) -> StepObserver:
-    """Design an observer for a loop that calls it frame by frame.
+) -> Any:
+    """Design an observer or a controller for a loop that calls it frame by frame.
 
     Parameters
     ----------
     name : str
-        Id of the observer.
+        Id of the observer or controller.
     prior : Prior, Identification or Scenario
         What it is told: numbers of its own, what `identify` found, or settings.
     scenario : Scenario, optional
-        Its settings; by default those of `prior` where that is a scenario, else those of `Scenario()`.
+        Its settings, and the mirror of a controller; by default those of `prior` where that is a scenario, else those of
+        `Scenario()`.
     sampling : Sampling, optional
         Number of modes, time step, NGS ratio and delay of the loop; by default those of `scenario`. `record.sampling` has them.
     horizon : float
@@ -48,13 +51,13 @@ def design(
 
     Returns
     -------
-    StepObserver
-        To be told the measurements by `update`, and asked by `predict`.
+    StepObserver or StepController
+        An observer receives measurements by `update` and is asked by `predict`; the `update` of a controller returns a command.
 
     Raises
     ------
     SettingError
-        The observer is unknown.
+        The name is unknown.
     StepError
         It cannot run frame by frame, or not for this horizon.
     ValueError
@@ -68,22 +71,46 @@ def design(
     >>> mean, sd = observer.predict(1, "turbulence")
     >>> mean.shape, sd.shape
     ((2,), (2,))
+    >>> controller = wfsobs.design("lqg-kf-multi", wfsobs.PRESETS["paper"]())
+    >>> controller.update(np.array([0.1, np.nan])).shape
+    (2,)
     """
-    if name not in OBSERVERS:
-        raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
-    observer = OBSERVERS[name]
+    if name not in OBSERVERS and name not in CONTROLLERS:
+        known = ", ".join([*OBSERVERS, *CONTROLLERS])
+        raise SettingError(f"design {name!r}: no such observer or controller; there are {known}")
     settings = scenario or (prior if isinstance(prior, Scenario) else Scenario())
     sampling = sampling or _sampling(prior, settings)
     settings = as_sampled(settings, sampling)
-    own = observer_settings(observer, settings)
-    parts = (*observer.prior, *observer.asks(own))
-    if not isinstance(prior, Prior):
-        told = settings if scenario is None and isinstance(prior, Scenario) else as_sampled(told_by(prior, settings), sampling)
-        prior = prior_of(told.before_events, None, parts)
+    told = prior if isinstance(prior, Prior) else settings
+    if not isinstance(prior, Prior) and (scenario is not None or not isinstance(prior, Scenario)):
+        told = as_sampled(told_by(prior, settings), sampling)
+    if name in OBSERVERS:
+        observer = OBSERVERS[name]
+        own = observer_settings(observer, settings)
+        given = _prior(name, told, (*observer.prior, *observer.asks(own)), settings, sampling, train)
+        return observer.design(given, own, sampling, horizon)
+    if horizon:
+        raise StepError(f"{name}: a controller has the horizon of its mirror, control.delay; leave horizon out")
+    controller = CONTROLLERS[name]
+    groups = own_settings(controller, settings)
+    given = _prior(name, told, controller.parts(groups), settings, sampling, train)
+    return controller.design(given, plant_of(settings), groups, sampling)
+
+
+def _prior(
+    name: str,
+    told: Prior | Scenario,
+    parts: tuple[Part, ...],
+    scenario: Scenario,
+    sampling: Sampling,
+    train: Record | Training | None,
+) -> Prior:
+    """Return these parts of what is told, for the modes of the loop."""
+    prior = told if isinstance(told, Prior) else prior_of(told.before_events, None, parts)
     prior = _of_modes(prior, name, sampling.n_modes)
     if Training in parts and prior.training is None:
-        prior = replace(prior, training=_training(settings, train))
-    return observer.design(prior, own, sampling, horizon)
+        prior = replace(prior, training=_training(scenario, train))
+    return prior
 
 
 def _sampling(prior: Prior | Identification | Scenario, scenario: Scenario) -> Sampling:

@@ -22,12 +22,15 @@ import numpy as np
 from wfsobs.control.integrator import limited_integrator
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Plant
+from wfsobs.control.step import StepController
+from wfsobs.control.step_laws import Integrators, LinearLaws, StepLaw, StepPredict, VibrationAhead
 from wfsobs.observers.base import NOTHING, PLAIN, Look
 from wfsobs.observers.baselines import online_reference
-from wfsobs.observers.missing import LINE_WIDTH, fill_missing
+from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
+from wfsobs.observers.step import StepError
 from wfsobs.prior import PARTS, Bands, Part, Prior
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Measurements, RecordError
+from wfsobs.record import Measurements, RecordError, Sampling
 from wfsobs.settings import Section
 from wfsobs.typing import Array
 
@@ -74,6 +77,8 @@ class Controller:
         (settings, n_steps, n_modes) -> maximum time [s]; None for one as fast as a linear law.
     look : Look
         Line in figures.
+    step_predict : callable or None
+        (prior, plant, settings, sampling) -> its prediction, one frame at a time; None without one.
 
     Raises
     ------
@@ -94,6 +99,7 @@ class Controller:
     weight: float = 1.0
     seconds: Callable[[Any, int, int], float] | None = None
     look: Look = PLAIN
+    step_predict: StepPredict | None = None
 
     def __post_init__(self) -> None:
         if self.predict is not None and Bands not in self.prior:
@@ -116,6 +122,47 @@ class Controller:
         """One law per mode, none for control by nothing. Raises ValueError saying why there is none."""
         return () if self.law is None else tuple(self.law(prior, mode, plant, settings) for mode in range(n_modes))
 
+    def design(self, prior: Prior, plant: Plant, settings: Settings, sampling: Sampling) -> StepController:
+        """Return the controller one frame at a time; missing samples are filled as in `commands`.
+
+        Parameters
+        ----------
+        prior : Prior
+            What it needs beside measurements.
+        plant : Plant
+            Mirror, step and NGS ratio.
+        settings : Settings
+            Its own groups of settings.
+        sampling : Sampling
+            Number of modes; its delay is that of the training record.
+
+        Returns
+        -------
+        StepController
+            Before its first frame, the mirror at rest.
+
+        Raises
+        ------
+        ValueError
+            There is none; one line with the reason.
+        """
+        if self.predict is not None and self.step_predict is None:
+            raise StepError(f"{self.id}: has no step interface")
+        if self.ngs and sampling.ratio is None:
+            raise StepError(f"{self.id}: needs NGS frames: a sampling with their ratio")
+        found = self.laws(prior, plant, settings, sampling.n_modes)
+        if not all(law.stable for law in found):
+            raise StepError(f"{self.id}: a pole of the closed loop is not within the unit circle")
+        law: StepLaw | None = None
+        if found:
+            law = LinearLaws(found) if any(one.gain is None for one in found) else Integrators(found, plant.mirror)
+        ahead = None
+        if self.step_predict is not None:
+            assert prior.bands is not None
+            ahead = VibrationAhead(self.step_predict(prior, plant, settings, sampling), prior.bands, sampling)
+        lgs, ngs = bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio, _line_width(settings))
+        return StepController(self.id, plant, sampling, law, ahead, lgs, ngs if self.ngs else None)
+
     def commands(
         self,
         laws: Sequence[Law],
@@ -132,8 +179,7 @@ class Controller:
         """
         if self.ngs and measurements.y_ngs is None:
             raise RecordError("the record has no NGS measurement")
-        width = getattr(getattr(settings, "multipeak", None), "line_width", LINE_WIDTH)
-        measurements = fill_missing(measurements, prior, width)
+        measurements = fill_missing(measurements, prior, _line_width(settings))
         z = measurements.z
         forward = np.zeros_like(z)
         if self.law is None:
@@ -149,6 +195,10 @@ class Controller:
         inputs = np.stack([z, np.nan_to_num(measurements.z_ngs)], axis=1) if self.ngs else z[:, None]
         modes = [_limit_commands(law, plant, inputs[:, :, mode], forward[:, mode]) for mode, law in enumerate(laws)]
         return np.column_stack([u for u, _ in modes]), np.column_stack([u != wanted for u, wanted in modes])
+
+
+def _line_width(settings: Settings) -> float:
+    return getattr(getattr(settings, "multipeak", None), "line_width", LINE_WIDTH)
 
 
 def _limit_commands(law: Law, plant: Plant, inputs: Array, forward: Array) -> tuple[Array, Array]:

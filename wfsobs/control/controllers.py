@@ -10,7 +10,7 @@ from wfsobs.control.integrator import best_gain, integrator_law
 from wfsobs.control.law import Law
 from wfsobs.control.lqg import lqg_kf_lgs, lqg_kf_multi, lqg_multirate, lqg_multirate_multi, lqg_multirate_optimal
 from wfsobs.control.mirror import Plant
-from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
+from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead, step_gpr_offline_ahead, step_gpr_online_ahead
 from wfsobs.observers.base import Look
 from wfsobs.prior import Bands, LgsError, Lines, Model, Part, Prior, Spectra, Training
 from wfsobs.registry import Registry
@@ -107,6 +107,7 @@ CONTROLLERS = Registry(
             "Integrator and offline GPR",
             integrator,
             predict=gpr_offline_ahead,
+            step_predict=step_gpr_offline_ahead,
             help="integrator and minus the vibration that the offline GPR predicts",
             prior=(Training, Bands),
             settings=("control", "gpr_offline"),
@@ -119,6 +120,7 @@ CONTROLLERS = Registry(
             "Integrator and online GPR",
             integrator,
             predict=gpr_online_ahead,
+            step_predict=step_gpr_online_ahead,
             help="the same with the online GPR, one sample at a time",
             prior=(Bands,),
             settings=("control", "gpr_online"),

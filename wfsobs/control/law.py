@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import schur
 
-from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.periodic import FilterStep, PeriodicFilter
+from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
 
@@ -27,12 +28,16 @@ class Law:
     cycle : the filter from z (LGS, or LGS and NGS) to u
     run   : z (n_steps, n_inputs) [um] -> u (n_steps,) [um]
     gain, leak : of an integrator
+    first : step 0, where it is not one of the cycle
+    model : of the disturbance, the first states of the filter, where there is one
     """
 
     cycle: PeriodicFilter
     run: Callable[[Array], Array]
     gain: float | None = None
     leak: float = 1.0
+    first: FilterStep | None = None
+    model: DisturbanceModel | None = None
 
     @property
     def poles(self) -> Complex:

@@ -9,6 +9,7 @@ frames, and for n + f frames the mean over the time that the command is held,
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ def _rows_of(model: DisturbanceModel, mirror: Mirror) -> Array:
 
 def lqg_of(model: DisturbanceModel, noise: float, mirror: Mirror) -> Law:
     """LQG on the LGS with any model; noise [um] of a measurement. Raises RiccatiError."""
-    return steady_law(steady_filter(model, noise, _rows_of(model, mirror))[0])
+    return replace(steady_law(steady_filter(model, noise, _rows_of(model, mirror))[0]), model=model)
 
 
 def lqg_kf_lgs(prior: Prior, mode: int, plant: Plant, _settings: Any) -> Law:
@@ -62,7 +63,7 @@ def lqg_multirate(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the paper's multi-rate filter. Raises UnstableCycle."""
     known = prior.model[mode]
     model, noise = known.disturbance(), multirate_noise(settings.multirate, known)
-    return _two_sensors(multirate_filter(model, plant.ratio, *noise, _rows_of(model, plant.mirror)))
+    return _two_sensors(multirate_filter(model, plant.ratio, *noise, _rows_of(model, plant.mirror)), model)
 
 
 def lqg_multirate_optimal(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
@@ -76,9 +77,10 @@ def lqg_multirate_multi(prior: Prior, mode: int, plant: Plant, settings: Any) ->
 
 
 def _optimal(prior: Prior, mode: int, plant: Plant, settings: Any, model: DisturbanceModel | None) -> Law:
+    model = model or prior.model[mode].disturbance()
     cycle, rows = optimal_model(settings.multirate, prior, mode, plant.ratio, model)
-    return _two_sensors(optimal_filter(cycle, command_rows(cycle[0][0], rows.sum(axis=0), plant.mirror))[0])
+    return _two_sensors(optimal_filter(cycle, command_rows(cycle[0][0], rows.sum(axis=0), plant.mirror))[0], model)
 
 
-def _two_sensors(filter_: MultiRateFilter) -> Law:
-    return Law(filter_.cycle, lambda z: filter_.run(z)[:, 0])
+def _two_sensors(filter_: MultiRateFilter, model: DisturbanceModel) -> Law:
+    return Law(filter_.cycle, lambda z: filter_.run(z)[:, 0], first=filter_.first, model=model)

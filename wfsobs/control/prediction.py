@@ -12,14 +12,16 @@ from typing import Any, TypeVar
 import numpy as np
 
 from wfsobs.control.mirror import Mirror, Plant
-from wfsobs.observers.gpr.inputs import Scale, StreamingInputs, scale_of, window_signals
+from wfsobs.observers.gpr.inputs import Scale, StreamingInputs, scale_of, scales_of, training_signals, window_signals
 from wfsobs.observers.gpr.late_regression import LateRegression
-from wfsobs.observers.gpr.offline import OfflineGpr, train, training_targets
+from wfsobs.observers.gpr.offline import OfflineEstimator, OfflineGpr, TrainedGpr, train, training_targets
 from wfsobs.observers.gpr.online import OnlineGpr, kernel_of
+from wfsobs.observers.gpr.online_step import OnlineEstimator
 from wfsobs.observers.per_mode import over_modes
+from wfsobs.observers.windows import Windows
 from wfsobs.prior import Bands, Prior
-from wfsobs.progress import Watch
-from wfsobs.record import Measurements, RecordError, pseudo_open_loop
+from wfsobs.progress import QUIET, Watch
+from wfsobs.record import Measurements, RecordError, Sampling
 from wfsobs.signal.bandpass import StreamingBank, bandpass_bank
 from wfsobs.typing import Array
 
@@ -37,21 +39,42 @@ def gpr_offline_ahead(measurements: Measurements, prior: Prior, plant: Plant, se
     assert prior.bands is not None
     if measurements.n_steps < g.depth:
         raise RecordError(f"the record has {measurements.n_steps} steps; depth needs {g.depth}")
+    dt, delay = measurements.dt, measurements.delay
+
+    def one(mode: int, watch: Watch) -> Array:
+        model = _train_ahead(prior, g, mode, plant, dt, delay, watch)
+        scale = scale_of(g, training, delay, mode)
+        return model.predict(window_signals(g, measurements.y_lgs, measurements.u, measurements.z, mode, dt, scale), watch)
+
+    return over_modes(measurements.n_modes, one, watch)
+
+
+def _train_ahead(prior: Prior, g: OfflineGpr, mode: int, plant: Plant, dt: float, delay: int, watch: Watch = QUIET) -> TrainedGpr:
+    """Train on the vibration while u[k] acts, in one mode of the training record. Raises RecordError."""
+    training = prior.training
+    if training is None:
+        raise RecordError("the record has no training record")
+    assert prior.bands is not None
     steps, ahead = training.y_lgs.shape[0], plant.mirror.taps.size - 2  # by which the targets end earlier
     if steps < (needed := g.depth + g.training_size + ahead):
         raise RecordError(f"the training record has {steps} steps, depth + training size + {ahead} need {needed}")
-    targets = _ahead(training_targets(training, prior.bands, measurements.dt, measurements.delay), plant.mirror)
-    training_z = pseudo_open_loop(training.y_lgs, training.u, measurements.delay)
+    targets = _ahead(training_targets(training, prior.bands, dt, delay)[:, mode], plant.mirror)
+    return train(training_signals(g, training, mode, dt, delay), targets, g.depth, g.training_size, kernel_of(g), watch)
 
-    def one(mode: int, watch: Watch) -> Array:
-        scale = scale_of(g, training, measurements.delay, mode)
-        signals = window_signals(g, training.y_lgs, training.u, training_z, mode, measurements.dt, scale)
-        model = train(signals, targets[:, mode], g.depth, g.training_size, kernel_of(g), watch)
-        return model.predict(
-            window_signals(g, measurements.y_lgs, measurements.u, measurements.z, mode, measurements.dt, scale), watch
-        )
 
-    return over_modes(measurements.n_modes, one, watch)
+def step_gpr_offline_ahead(prior: Prior, plant: Plant, settings: Any, sampling: Sampling) -> OfflineEstimator:
+    """Return `gpr_offline_ahead`, one frame at a time."""
+    g = of_z(settings.gpr_offline)
+    models = [_train_ahead(prior, g, mode, plant, sampling.dt, sampling.delay) for mode in range(sampling.n_modes)]
+    return OfflineEstimator(Windows(g, sampling, g.depth, scales_of(g, prior.training, sampling)), models, None)
+
+
+def step_gpr_online_ahead(prior: Prior, plant: Plant, settings: Any, sampling: Sampling) -> OnlineEstimator:
+    """Return `gpr_online_ahead`, one frame at a time."""
+    g = of_z(settings.gpr_online)
+    assert prior.bands is not None
+    windows = Windows(g, sampling, 1, scales_of(g, prior.training, sampling))
+    return OnlineEstimator(windows, prior.bands, sampling, g.depth, g.training_size, kernel_of(g), plant.mirror.taps[1:])
 
 
 def of_z(settings: G) -> G:

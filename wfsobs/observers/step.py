@@ -200,11 +200,7 @@ class StepObserver:
 
     def load_state_dict(self, state: Mapping[str, ArrayLike]) -> None:
         """Go on from a state of `state_dict`. Raises StepError where it is that of another design."""
-        given, own = {name: np.asarray(x) for name, x in state.items()}, self.state_dict()
-        for name in sorted(own.keys() | given.keys()):
-            if name not in given or name not in own or given[name].shape != own[name].shape:
-                shape = "no such state" if name not in own else f"takes the shape {own[name].shape}"
-                raise StepError(f"{self.id}: load_state_dict: the state is that of another design: {name}: {shape}")
+        given = check_state(self.id, state, self.state_dict())
         self.frame = int(given["frame"])
         load_parts(self._parts, given)
 
@@ -230,19 +226,12 @@ class StepObserver:
         self.frame = old.frame
 
     def _check(self, x: ArrayLike, name: str) -> Array:
-        x = np.asarray(x, dtype=float)
-        if x.shape != self._nothing.shape:
-            raise StepError(f"{self.id}: {name} takes the shape {self._nothing.shape}, one number per mode, not {x.shape}")
-        if not x.dot(x) < inf and np.isinf(x).any():
-            raise StepError(f"{self.id}: {name} is infinite in frame {self.frame}; NaN stands for a missing number")
-        return x
+        return check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
 
     def _check_ngs(self, ngs: ArrayLike | None, due: bool) -> Array | None:
         if due:
             return self._nothing if ngs is None else self._check(ngs, "ngs")
-        if ngs is not None and not np.isnan(self._check(ngs, "ngs")).all():
-            n = self._ratio
-            raise StepError(f"{self.id}: an NGS frame in frame {self.frame}: one is due in every {n}th, {n}, {2 * n}, ...")
+        check_not_due(self.id, ngs, self._ratio, self.frame)
         return None
 
     def _check_request(self, frames: float, target: str) -> None:
@@ -261,6 +250,32 @@ class StepObserver:
         if len(self.targets) != 1:
             raise StepError(f"{self.id}: predict takes a target: {' or '.join(self.targets)}")
         return next(iter(self.targets))
+
+
+def check_frame(id: str, x: ArrayLike, name: str, n_modes: int, frame: int) -> Array:
+    """Return one number per mode as an array; NaN is missing. Raises StepError."""
+    x = np.asarray(x, dtype=float)
+    if x.shape != (n_modes,):
+        raise StepError(f"{id}: {name} takes the shape {(n_modes,)}, one number per mode, not {x.shape}")
+    if not x.dot(x) < inf and np.isinf(x).any():
+        raise StepError(f"{id}: {name} is infinite in frame {frame}; NaN stands for a missing number")
+    return x
+
+
+def check_not_due(id: str, ngs: ArrayLike | None, ratio: int, frame: int) -> None:
+    """Raise StepError for an NGS frame where none is due."""
+    if ngs is not None and not np.isnan(ngs).all():
+        raise StepError(f"{id}: an NGS frame in frame {frame}: one is due in every {ratio}th, {ratio}, {2 * ratio}, ...")
+
+
+def check_state(id: str, state: Mapping[str, ArrayLike], own: Mapping[str, Array]) -> dict[str, Array]:
+    """Return a state as arrays. Raises StepError where names or shapes are not those of one's own."""
+    given = {name: np.asarray(x) for name, x in state.items()}
+    for name in sorted(own.keys() | given.keys()):
+        if name not in given or name not in own or given[name].shape != own[name].shape:
+            shape = "no such state" if name not in own else f"takes the shape {own[name].shape}"
+            raise StepError(f"{id}: load_state_dict: the state is that of another design: {name}: {shape}")
+    return given
 
 
 def whole_frames(frames: float, what: str) -> int:

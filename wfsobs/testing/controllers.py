@@ -23,6 +23,7 @@ from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 from wfsobs.testing.common import QUICK, SAME, CheckError, change_from, in_a_fresh_process
 from wfsobs.testing.reach import SEED, given_away, walk_references
+from wfsobs.testing.steps import run_loop
 from wfsobs.typing import Array
 
 LOST = 7
@@ -43,7 +44,8 @@ def check_controller(controller: Controller, scenario: Scenario | None = None, a
 
     It reaches neither truth nor scenario nor seed. Its laws are stable. Its commands are numbers of the shape of the measurements
     and the same twice. Nothing that comes after a step changes its command of the step. It leaves its arguments as they are and
-    gets over missing samples. In a fresh process, which has never seen the truth, it commands the same.
+    gets over missing samples. Where it can run frame by frame, it then commands the same. In a fresh process,
+    which has never seen the truth, it commands the same.
 
     Parameters
     ----------
@@ -75,6 +77,7 @@ def check_controller(controller: Controller, scenario: Scenario | None = None, a
     _check_untouched(controller, given, _inputs(controller, record, s))
     _check_causal(controller, given, base)
     _check_gaps(controller, given)
+    _check_steps(controller, given)
     if alone:
         there = in_a_fresh_process(controller.id, _commands, controller, again)
         what = "in a fresh process, with measurements and prior alone, it commands something else: it knows more than it is told"
@@ -154,6 +157,19 @@ def _check_gaps(controller: Controller, inputs: ControllerInputs) -> None:
         raise CheckError(f"{controller.id}: a command is NaN or infinite after missing samples")
     if controller.law is not None and not np.ptp(u[start + LOST :], axis=0).any():
         raise CheckError(f"{controller.id}: does not come back after missing samples")
+
+
+def _check_steps(controller: Controller, given: ControllerInputs) -> None:
+    """Check that frame by frame it commands what it commands over a record, unless it cannot run frame by frame."""
+    if controller.predict is not None and controller.step_predict is None:
+        return
+    y, start = given.measurements.y_lgs.copy(), given.measurements.n_steps // 2
+    y[start : start + LOST] = np.nan
+    measured = replace(given.measurements, y_lgs=y)
+    got = run_loop(controller.design(given.prior, given.plant, given.settings, measured.sampling), measured)
+    _compare(
+        controller, got, _commands(controller, given._replace(measurements=measured)), "frame by frame it commands something else"
+    )
 
 
 def _compare(controller: Controller, got: Array, base: Array, what: str, stop: int | None = None, exact: bool = False) -> None:

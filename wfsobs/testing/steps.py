@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from wfsobs.control.step import StepController
 from wfsobs.observers.base import Observer
 from wfsobs.observers.step import StepObserver
 from wfsobs.prior import Prior
@@ -33,6 +34,23 @@ def run_steps(observer: StepObserver, measurements: Measurements, steps: Iterabl
         for target, values in out.items():
             values[k] = observer.predict(0, target)[0]
     return out
+
+
+def run_loop(controller: StepController, measurements: Measurements) -> Array:
+    """Return the commands (n_steps, n_modes) [um] in a loop with the mirror and these pseudo-open-loop measurements."""
+    measurements = replace(measurements, u=hold_last(measurements.u))
+    z, n, mirror = measurements.z, measurements.ratio, controller.plant.mirror
+    z_ngs = None if n is None or measurements.y_ngs is None else measurements.z_ngs
+    u, seen = np.zeros_like(z), np.zeros_like(z)
+    back = np.arange(1, mirror.taps.size)
+    for k in range(len(z)):
+        past = back[back <= k]
+        seen[k] = mirror.taps[past] @ u[k - past]
+        ngs = None
+        if z_ngs is not None and n is not None and k > 0 and k % n == 0:
+            ngs = z_ngs[k] + seen[k + 1 - n : k + 1].mean(axis=0)
+        u[k] = controller.update(z[k] + seen[k], ngs)
+    return u
 
 
 def step_difference(observer: Observer, measurements: Measurements, prior: Prior, settings: Any) -> float:

@@ -157,7 +157,7 @@ class OfflineEstimator:
 
     bridges = False
 
-    def __init__(self, windows: Windows, models: Sequence[TrainedGpr], horizon: float):
+    def __init__(self, windows: Windows, models: Sequence[TrainedGpr], horizon: float | None):
         self.windows, self.models, self.horizon, self.needs_command = windows, tuple(models), horizon, windows.needs_command
         self._mean, self._sd = np.full(len(models), np.nan), np.full(len(models), np.nan)
 

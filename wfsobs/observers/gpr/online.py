@@ -151,7 +151,7 @@ def step_gpr_online(prior: Prior, settings: OnlineGpr, sampling: Sampling, horiz
     assert prior.bands is not None
     windows = Windows(g, sampling, 1, scales_of(g, prior.training, sampling))
     ahead = whole_frames(horizon, "gpr-online")
-    return OnlineEstimator(windows, prior.bands, sampling, g.depth, g.training_size, kernel_of(g), ahead)
+    return OnlineEstimator(windows, prior.bands, sampling, g.depth, g.training_size, kernel_of(g), np.eye(ahead + 1)[-1])
 
 
 def standardised_parts(settings: Gpr) -> tuple[Part, ...]:

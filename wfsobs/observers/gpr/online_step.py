@@ -38,16 +38,18 @@ class OnlineEstimator:
         Samples in a window, windows in the training set.
     kernel : SquaredExponential
         The covariance.
-    horizon : int
-        Frames ahead that it learns. Raises ValueError where that is as long as the training set.
+    weights : Array
+        Of the vibration now, one frame ahead and so on in what it learns; fewer than m.
     """
 
     bridges = False
 
     def __init__(
-        self, windows: Windows, bands: Bands, sampling: Sampling, depth: int, m: int, kernel: SquaredExponential, horizon: int
+        self, windows: Windows, bands: Bands, sampling: Sampling, depth: int, m: int, kernel: SquaredExponential, weights: Array
     ):
-        self.windows, self.horizon, self.needs_command = windows, horizon, windows.needs_command
+        self.windows, self.weights, self.needs_command = windows, weights, windows.needs_command
+        self.horizon = float(len(weights) - 1)
+        self._filtered = np.zeros((len(weights), sampling.n_modes))  # oldest first
         self._size = depth, m, 2 if windows.needs_command else 1, kernel
         bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
         self.bank = FilterBank([bank_recursion(bank)] * sampling.n_modes)
@@ -56,13 +58,15 @@ class OnlineEstimator:
         self.regressions = self._start()
 
     def _start(self) -> list[SlidingRegression]:
-        late = self.horizon
+        late = len(self.weights) - 1
         return [LateRegression(*self._size, late) if late else SlidingRegression(*self._size) for _ in self._mean]
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
         self.settle()
-        targets = self.bank.step(z[:, None])[:, 0]
+        self._filtered[:-1] = self._filtered[1:].copy()
+        self._filtered[-1] = self.bank.step(z[:, None])[:, 0]
+        targets = self.weights @ self._filtered
         samples = self.windows.push(z, u).reshape(len(z), -1)
         for mode, regression in enumerate(self.regressions):
             self._mean[mode] = regression.predict(samples[mode], float(targets[mode]))
@@ -88,26 +92,25 @@ class OnlineEstimator:
         self.windows.reset()
         self.bank.reset()
         self.regressions, self._pending = self._start(), False
-        self._mean[...] = np.nan
+        self._mean[...], self._filtered[...] = np.nan, 0.0
 
     def save(self) -> Saved:
         """Return a copy of the state."""
         self.settle()
         parts = {"windows": self.windows, "bank": self.bank}
+        own = {"mean": self._mean.copy(), "filtered": self._filtered.copy()}
         found = [regression.save() for regression in self.regressions]
-        return (
-            save_parts(parts) | {"mean": self._mean.copy()} | {name: np.array([one[name] for one in found]) for name in found[0]}
-        )
+        return save_parts(parts) | own | {name: np.array([one[name] for one in found]) for name in found[0]}
 
     def load(self, state: Mapping[str, Array]) -> None:
         """Take over a state."""
         load_parts({"windows": self.windows, "bank": self.bank}, state)
-        self._mean[...], self._pending = state["mean"], False
+        self._mean[...], self._filtered[...], self._pending = state["mean"], state["filtered"], False
         for mode, regression in enumerate(self.regressions):
-            regression.load({name: x[mode] for name, x in state.items() if "." not in name and name != "mean"})
+            regression.load({name: x[mode] for name, x in state.items() if "." not in name and name not in ("mean", "filtered")})
 
     def take_over(self, old: Any) -> None:
         """Go on from a design with the same windows, training set, kernel and horizon. Raises StepError."""
-        if old._size != self._size or old.horizon != self.horizon or old.bank.x.shape != self.bank.x.shape:
+        if old._size != self._size or not np.array_equal(old.weights, self.weights) or old.bank.x.shape != self.bank.x.shape:
             raise StepError("the designs have other windows, training sets, kernels or horizons: one of them has to learn anew")
         self.load(old.save())

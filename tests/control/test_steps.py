@@ -1,0 +1,114 @@
+"""Controllers frame by frame: the commands over the record again, in every preset, with gaps, events, delays and limits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import wfsobs
+from wfsobs import PRESETS, simulate
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.observers.step import StepError
+from wfsobs.prior import Lines
+from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.testing import QUICK
+from wfsobs.testing.steps import run_loop
+
+ROUNDING, GPR = 1e-12, 1e-9
+"""Differences over the std of the commands: sums in another order; the kernel's condition number makes more of them in a GPR."""
+
+
+@cache
+def with_gaps(preset: str) -> tuple[Record, Scenario]:
+    """A record of 0.8 s with missing measurements and NGS frames; events come at the same share of it."""
+    s = PRESETS[preset]()
+    events = [e.to_dict() | {k: getattr(e, k) * 0.8 / s.run.duration for k in ("start", "duration")} for e in s.events]
+    scenario = s.replace({**QUICK, "run.duration": 0.8, "events": events})
+    record = simulate(scenario)
+    y, ngs, n = record.y_lgs.copy(), record.y_ngs.copy(), record.ratio
+    y[np.r_[0, 1, 400:412, 500, 510]], y[600, 0] = np.nan, np.nan
+    ngs[[n, 90 * n, 91 * n]] = ngs[100 * n, 0] = np.nan
+    return replace(record, y_lgs=y, y_ngs=ngs), scenario.before_events
+
+
+def difference(name: str, record: Record, scenario: Scenario) -> float:
+    controller, settings, plant = CONTROLLERS[name], own_settings(CONTROLLERS[name], scenario), plant_of(scenario)
+    measured, prior = controller_arguments(controller, record, settings, prior_for(controller, scenario))
+    laws = controller.laws(prior_for(controller, scenario), plant, settings, record.n_modes)
+    want, limited = controller.commands(laws, measured, prior, plant, settings)
+    got = run_loop(wfsobs.design(name, scenario, sampling=record.sampling, train=record.training), measured)
+    if plant.mirror.has_limits and name != "none":
+        assert limited.any()
+    return float(np.abs(got - want).max() / (want.std() or 1.0))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_steps_are_the_run_over_the_record(name: str, preset: str) -> None:
+    record, scenario = with_gaps(preset)
+    if Lines in CONTROLLERS[name].prior and scenario.vibration.source == "psd":
+        with pytest.raises(ValueError, match="table, not lines"):
+            wfsobs.design(name, scenario, sampling=record.sampling)
+        return
+    assert difference(name, record, scenario) <= (GPR if "gpr" in name else ROUNDING)
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize(
+    "changes", [{"control.delay": 2.4}, {"control.stroke": 0.1, "control.rate": 0.01}], ids=["delay", "limits"]
+)
+def test_with_a_fraction_of_a_frame_of_delay_and_with_limits(name: str, changes: dict[str, float]) -> None:
+    record, scenario = with_gaps("paper")
+    assert difference(name, record, scenario.replace(changes)) <= (GPR if "gpr" in name else ROUNDING)
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_saved_state_and_a_reset(name: str) -> None:
+    record, scenario = with_gaps("paper")
+    one, other = (wfsobs.design(name, scenario, sampling=record.sampling, train=record.training) for _ in range(2))
+    rows = np.nan_to_num(record.y_lgs[:300])
+    ngs = [record.y_ngs[k] if k and k % record.ratio == 0 else None for k in range(300)]
+    base = [one.update(y, n) for y, n in zip(rows, ngs, strict=True)]
+    for y, n in zip(rows[:150], ngs[:150], strict=True):
+        other.update(y, n)
+    one.reset()
+    one.load_state_dict(other.state_dict())
+    np.testing.assert_array_equal([one.update(y, n) for y, n in zip(rows[150:], ngs[150:], strict=True)], base[150:])
+    one.reset()
+    np.testing.assert_array_equal([one.update(y, n) for y, n in zip(rows, ngs, strict=True)], base)
+
+
+@pytest.mark.parametrize("name", ["lqg-kf-multi", "lqg-multirate-multi"])
+def test_a_design_takes_over_without_a_bump(name: str) -> None:
+    """The first commands of a design with other noise: near those that the old one would have given, where a start at rest is
+    far off. Its own noise makes them differ by some percent."""
+    record, scenario = with_gaps("paper")
+    old = wfsobs.design(name, scenario, sampling=record.sampling)
+    run_loop(old, record.measurements())
+    changed = scenario.replace({"kalman.measurement_noise": "manual", "kalman.lgs_noise": 0.02, "kalman.ngs_noise": 0.012})
+    new, rest = (wfsobs.design(name, changed, sampling=record.sampling) for _ in range(2))
+    new.take_over(old)
+    y = record.y_lgs[-1]
+    want, got, cold = old.update(y), new.update(y), rest.update(y)
+    assert np.abs(got - want).max() < 0.05 * np.abs(cold - want).max()
+
+
+def test_wrong_input_is_one_line_and_takes_no_frame() -> None:
+    controller = wfsobs.design("lqg-multirate", PRESETS["paper"]())
+    for given, match in (
+        (([0.0],), r"y takes the shape \(2,\)"),
+        (([0.0, np.inf],), "infinite in frame 0"),
+        (([0.0, 0.0], [0.0, 0.0]), "one is due in every 5th"),
+    ):
+        with pytest.raises(StepError, match=match):
+            controller.update(*given)
+    assert controller.frame == 0
+    with pytest.raises(StepError, match="not from integrator"):
+        controller.take_over(wfsobs.design("integrator", PRESETS["paper"]()))
+    with pytest.raises(StepError, match="state is that of another design"):
+        controller.load_state_dict(wfsobs.design("integrator", PRESETS["paper"]()).state_dict())

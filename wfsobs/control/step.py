@@ -1,0 +1,167 @@
+"""A controller one frame at a time, as a real loop calls it: a measurement in, the command out.
+
+It knows its own commands, so it makes the pseudo-open-loop z of a measurement itself; the rest is its law, and perhaps a
+prediction of the vibration beside it. Over a frame it does what `Controller.commands` does over a record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from wfsobs.control.mirror import Plant
+from wfsobs.control.step_laws import StepLaw, VibrationAhead, push_row
+from wfsobs.observers.missing import Bridge
+from wfsobs.observers.step import StepError, check_frame, check_not_due, check_state
+from wfsobs.record import Sampling
+from wfsobs.signal.stepping import Stateful, load_parts, save_parts
+from wfsobs.typing import Array
+
+
+class StepController:
+    """A controller of several modes, one frame at a time; made by `wfsobs.design`.
+
+    Attributes
+    ----------
+    id : str
+        Of the controller.
+    plant : Plant
+        Mirror, step and NGS ratio that it was designed for.
+    sampling : Sampling
+        Number of modes, step and NGS ratio.
+    frame : int
+        Frames that it has taken.
+    """
+
+    def __init__(
+        self,
+        id: str,
+        plant: Plant,
+        sampling: Sampling,
+        law: StepLaw | None,
+        ahead: VibrationAhead | None,
+        lgs: Bridge,
+        ngs: Bridge | None,
+    ):
+        self.id, self.plant, self.sampling, self.law, self.ahead = id, plant, sampling, law, ahead
+        self.frame = 0
+        n = sampling.n_modes
+        self._lgs, self._ngs, self._ratio = lgs, ngs, sampling.ratio or 0
+        self._taps = plant.mirror.taps[1:]
+        self._sent = np.zeros((len(self._taps), n))  # commands, newest first
+        self._mirror = np.zeros((max(self._ratio, 1), n))  # the mirror in the last measurements, newest first
+        self._nothing, self._none = np.full(n, np.nan), np.zeros(n)
+        self._parts: dict[str, Stateful] = {"lgs": lgs}
+        self._parts |= {} if law is None else {"law": law}
+        self._parts |= {} if ngs is None else {"ngs": ngs}
+        self._parts |= {} if ahead is None else ahead.parts
+
+    def update(self, y: ArrayLike, ngs: ArrayLike | None = None) -> Array:
+        """Take the measurements of a frame and return its command.
+
+        Parameters
+        ----------
+        y : array_like
+            LGS measurement of every mode, residual of the loop, (n_modes,) [um]; NaN is missing.
+        ngs : array_like, optional
+            NGS measurement, (n_modes,) [um], in the frames that have one: k = n, 2n, ... for the ratio n. One that is due and
+            missing or NaN is predicted.
+
+        Returns
+        -------
+        Array
+            Command u[k] that the mirror is to take, its limits kept, (n_modes,) [um].
+
+        Raises
+        ------
+        StepError
+            A wrong shape, an infinite number, an NGS frame that is not due. The frame is then not taken, and no command is given.
+        """
+        y = self._check(y, "y")
+        due = self._ngs is not None and self.frame > 0 and self.frame % self._ratio == 0
+        slow = None if self._ngs is None else self._check_ngs(ngs, due)
+        seen = self._taps @ self._sent
+        z = self._lgs.complete(y - seen)
+        if self._ngs is not None:
+            push_row(self._mirror, seen)
+            if slow is not None:
+                slow = self._ngs.complete(slow - self._mirror.mean(axis=0))
+        forward = self._none
+        if self.ahead is not None:
+            z, forward = self.ahead.split(z)
+        u = self._none.copy()
+        if self.law is not None:
+            u = self._clip(self.law.command(z, slow, forward))
+            self.law.tell(u, forward)
+        push_row(self._sent, u)
+        self.frame += 1
+        return u
+
+    def settle(self) -> None:
+        """Do what does not need to be done before the command is out; the next `update` does it otherwise."""
+        if self.ahead is not None:
+            self.ahead.estimator.settle()
+
+    def reset(self) -> None:
+        """Go back to before the first frame, the mirror at rest."""
+        self.frame = 0
+        self._sent[...] = self._mirror[...] = 0.0
+        for part in self._parts.values():
+            part.reset()
+
+    def state_dict(self) -> dict[str, Array]:
+        """Return a copy of the state: name -> array, plain numbers that `numpy.savez` can keep."""
+        own = {"frame": np.array(self.frame), "sent": self._sent.copy(), "mirror": self._mirror.copy()}
+        return own | save_parts(self._parts)
+
+    def load_state_dict(self, state: Mapping[str, ArrayLike]) -> None:
+        """Go on from a state of `state_dict`. Raises StepError where it is that of another design."""
+        given = check_state(self.id, state, self.state_dict())
+        self.frame = int(given["frame"])
+        self._sent[...], self._mirror[...] = given["sent"], given["mirror"]
+        load_parts(self._parts, given)
+
+    def take_over(self, old: StepController) -> None:
+        """Go on where another design of the same controller is, without a bump.
+
+        Parameters
+        ----------
+        old : StepController
+            Of the same controller, sampling and delay, with another prior or other settings.
+
+        Raises
+        ------
+        StepError
+            Another controller, sampling or delay, or a state that cannot be carried over.
+        """
+        if old.id != self.id or old.sampling != self.sampling or old._sent.shape != self._sent.shape:
+            raise StepError(f"{self.id}: takes over from a design of the same controller, sampling and delay, not from {old.id}")
+        if self.law is not None:
+            self.law.take_over(old.law)
+        if self.ahead is not None and old.ahead is not None:
+            self.ahead.estimator.take_over(old.ahead.estimator)
+            if self.ahead.bank.x.shape == old.ahead.bank.x.shape:
+                self.ahead.bank.load(old.ahead.bank.save())
+        self._lgs.take_over(old._lgs)
+        if self._ngs is not None and old._ngs is not None:
+            self._ngs.take_over(old._ngs)
+        self._sent[...], self._mirror[...], self.frame = old._sent, old._mirror, old.frame
+
+    def _clip(self, wanted: Array) -> Array:
+        """Return the commands nearest to the wanted ones within the limits of the mirror."""
+        mirror = self.plant.mirror
+        if not mirror.has_limits:
+            return wanted
+        last = self._sent[0]
+        return np.clip(np.clip(wanted, last - mirror.slew, last + mirror.slew), -mirror.stroke, mirror.stroke)
+
+    def _check(self, x: ArrayLike, name: str) -> Array:
+        return check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
+
+    def _check_ngs(self, ngs: ArrayLike | None, due: bool) -> Array | None:
+        if due:
+            return self._nothing if ngs is None else self._check(ngs, "ngs")
+        check_not_due(self.id, ngs, self._ratio, self.frame)
+        return None
