@@ -131,7 +131,7 @@ def test_a_law_that_breaks_a_rule_is_refused_with_the_reason(law: Any, reason: s
         (next_measurement, "looks ahead: measurements after step 750"),
         (own_command, "looks ahead: measurements after step 750"),
         (one_column, r"shape \(1500, 2\)"),
-        (in_place, r"changes its arguments \(measured\)"),
+        (in_place, r"changes its arguments \(measurements\)"),
         (of_settings, r"changes its arguments \(settings\)"),
         (infinite, "a command is NaN or infinite$"),
         (none_where_still, "NaN or infinite after missing samples"),
