@@ -8,7 +8,7 @@ from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.grid import parse_variation
 from wfsobs.scenario.groups.vibration import Peak
 from wfsobs.scenario.presets import PRESETS, paper
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 
 @pytest.mark.parametrize("name", PRESETS)

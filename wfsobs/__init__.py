@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from wfsobs.registry import register
     from wfsobs.scenario import Scenario
     from wfsobs.scenario.presets import PRESETS
-    from wfsobs.settings.group import SettingError
+    from wfsobs.settings.errors import SettingError
     from wfsobs.simulation.loop import simulate
     from wfsobs.stepping import design
     from wfsobs.telemetry.records import load
@@ -46,7 +46,7 @@ _HOMES = {
     "register": "registry",
     "Scenario": "scenario",
     "PRESETS": "scenario.presets",
-    "SettingError": "settings.group",
+    "SettingError": "settings.errors",
     "simulate": "simulation.loop",
     "load": "telemetry.records",
     "tune": "tuning.tuning",

@@ -21,7 +21,7 @@ from wfsobs.priors_from.training import trained_until, with_training
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 

@@ -17,7 +17,8 @@ from typing import Any, Protocol, TypeVar
 
 import param
 
-from wfsobs.settings.group import Group, Section
+from wfsobs.settings.group import Group
+from wfsobs.settings.sections import Section
 
 log = logging.getLogger(__name__)
 

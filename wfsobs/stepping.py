@@ -15,7 +15,7 @@ from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.scenario import observer_settings, prior_of
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
 
 if TYPE_CHECKING:

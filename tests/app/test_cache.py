@@ -22,7 +22,7 @@ from wfsobs.pipeline import Result
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 WAIT = 60.0
 

@@ -20,7 +20,7 @@ from wfsobs.app.work import RunResults
 from wfsobs.cost import run_bytes, run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS, paper
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 
 def refused(limits: Limits, changes: dict[str, Any]) -> str:

@@ -22,7 +22,8 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.atmosphere import Layer, Process
 from wfsobs.scenario.groups.vibration import Peak
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.group import Group, SettingError
+from wfsobs.settings.errors import SettingError
+from wfsobs.settings.group import Group
 from wfsobs.simulation.loop import simulate
 
 QUICK = {

@@ -68,7 +68,7 @@ def test_a_worker_that_dies_changes_nothing(cluster, tmp_path):
 
 def test_without_a_scheduler_there_is_one_line(tmp_path, monkeypatch):
     from wfsobs.campaign import pools
-    from wfsobs.settings.group import SettingError
+    from wfsobs.settings.errors import SettingError
 
     monkeypatch.setattr(pools, "DASK_TIMEOUT", 1.0)
     with pytest.raises(SettingError, match=r"--scheduler tcp://127.0.0.1:1: no scheduler answers"):

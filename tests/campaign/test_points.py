@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import kstest
 
 from wfsobs.campaign.points import conditions, grid, product, sample
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 
 def test_a_grid_has_every_combination_once():

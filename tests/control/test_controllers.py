@@ -23,7 +23,7 @@ from wfsobs.progress import QUIET
 from wfsobs.record import Record, RecordError, Training
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import paper_matrices
 from wfsobs.signal.welch import welch_psd

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import MOST, Variation, parse_variation, scenarios
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False) | st.integers(-(2**53), 2**53)
 VALUES = st.one_of(

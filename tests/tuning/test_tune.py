@@ -21,7 +21,7 @@ from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.sensor_noise import noise_covariance
 from wfsobs.tuning import Evaluation, tune

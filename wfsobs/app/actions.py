@@ -22,7 +22,7 @@ from wfsobs.app.sources import SimulatedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, labels
 from wfsobs.app.work import RunResults
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 LARGEST = 2_000_000
 """Of a scenario file that is opened [bytes]."""

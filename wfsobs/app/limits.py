@@ -8,7 +8,7 @@ from functools import reduce
 
 from wfsobs.cost import run_bytes, run_seconds
 from wfsobs.scenario import Scenario
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import Reals
 
 

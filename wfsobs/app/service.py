@@ -20,7 +20,7 @@ from wfsobs.app.work import RunResults, compute
 from wfsobs.cost import run_seconds
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 Compute = Callable[[Scenario, Watch, Tell, Source | None], RunResults]
 Post = Callable[[Callable[[], None]], None]

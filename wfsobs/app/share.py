@@ -20,7 +20,8 @@ from wfsobs.app.controls.fields import parse_number
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.configfile import from_toml, parse_toml, reference_preset, to_toml
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.group import SettingError, holds_groups, settings_of
+from wfsobs.settings.errors import SettingError
+from wfsobs.settings.group import holds_groups, settings_of
 
 Check = Callable[[Scenario], None]
 

@@ -17,7 +17,7 @@ from wfsobs.cost import run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import reference_preset
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 Step = tuple[Scenario, str, Source | None]
 """Settings, the preset that they are compared with, and what they run on where that is not their simulation."""

@@ -26,7 +26,7 @@ from wfsobs.progress import Watch
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import Preview, SpectrumPreview, preview_any, safe_name

@@ -15,7 +15,8 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import load_scenario, parse_toml, preset
-from wfsobs.settings.group import SettingError, leaves
+from wfsobs.settings.errors import SettingError
+from wfsobs.settings.tree import leaves
 
 KEYS = (
     "name",

@@ -9,7 +9,8 @@ from itertools import product as cartesian
 from pathlib import Path
 from typing import Any
 
-from wfsobs.settings.group import SettingError, leaves
+from wfsobs.settings.errors import SettingError
+from wfsobs.settings.tree import leaves
 
 Changes = Mapping[str, Any]
 """Dotted path -> value."""

@@ -11,7 +11,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
 from typing import Any, Protocol
 
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 DASK_TIMEOUT = 60.0
 """How long a scheduler may be away before a campaign gives up [s]."""

@@ -16,7 +16,7 @@ from wfsobs.campaign.stopping import wanted_seeds
 from wfsobs.campaign.store import read_results
 from wfsobs.campaign.work import Batch, Summary, wfsobs_batch
 from wfsobs.cost import part_seconds
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.typing import Array
 
 BATCH = 3.0

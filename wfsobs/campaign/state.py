@@ -11,7 +11,7 @@ from wfsobs.campaign.keys import row_key, scenario_digest
 from wfsobs.campaign.plan import Campaign
 from wfsobs.campaign.store import PLAN, ROWS, read_batches
 from wfsobs.files import write_whole
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.typing import Array
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from wfsobs.campaign.compare import LEVEL, Comparison, compare
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 if TYPE_CHECKING:
     import pyarrow

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wfsobs.files import write_whole
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 if TYPE_CHECKING:
     import pyarrow

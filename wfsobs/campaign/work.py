@@ -26,7 +26,7 @@ from wfsobs.observers.base import Estimate
 from wfsobs.pipeline import Failure, collect, each_estimate
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
 
 Row = dict[str, Any]

@@ -26,7 +26,7 @@ from wfsobs.campaign.store import RESULTS, add_settings, need_pyarrow, read_resu
 from wfsobs.campaign.work import run_rows
 from wfsobs.cli.show import show_table
 from wfsobs.evaluation.rows import NOT_OBSERVERS
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 ROW_BYTES, FILE_BYTES = 60, 12_000
 """Measured size of a row in a file, and of a file without rows."""

@@ -9,7 +9,7 @@ from wfsobs.cli.show import progress_bar, warn
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
 from wfsobs.scenario.grid import MOST, parse_variation
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 
 @click.command()

@@ -56,7 +56,7 @@ class Commands(click.Group):
             return super().invoke(ctx)
         except ValueError as error:
             from wfsobs.record import RecordError
-            from wfsobs.settings.group import SettingError
+            from wfsobs.settings.errors import SettingError
 
             if not isinstance(error, (SettingError, RecordError)):
                 raise

@@ -9,7 +9,7 @@ import click
 from wfsobs.record import DELAY, Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import load_record
 from wfsobs.units import UNITS

@@ -13,7 +13,7 @@ from wfsobs.evaluation.recovery import PooledRms, Recovery, recovery, running_rm
 from wfsobs.evaluation.rows import Row, row_label
 from wfsobs.pipeline import Result
 from wfsobs.scenario import Scenario
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 MOST_TIMES = 8
 """Columns of times in a table."""

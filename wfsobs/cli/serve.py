@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 
 @click.command()

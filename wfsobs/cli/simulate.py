@@ -30,7 +30,7 @@ from wfsobs.pipeline import observe as observe_record
 from wfsobs.priors_from.training import trained_until, with_training
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats.psd import load_psd
 from wfsobs.telemetry.intake import DeclaredFormat

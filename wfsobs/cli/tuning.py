@@ -14,7 +14,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.tuning import report
 from wfsobs.tuning import tune as search

@@ -19,7 +19,7 @@ from wfsobs.prior import Prior, Spectra
 from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for
 from wfsobs.priors_from.scenario import told_spectra
 from wfsobs.scenario import Scenario
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
 
 

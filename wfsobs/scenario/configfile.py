@@ -15,7 +15,8 @@ import tomli_w
 from wfsobs.files import write_whole
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.settings.group import SettingError, leaves
+from wfsobs.settings.errors import SettingError
+from wfsobs.settings.tree import leaves
 
 DEEPEST = 8
 """Maximum depth of nested tables and lists; settings have four levels."""

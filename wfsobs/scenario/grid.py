@@ -10,7 +10,8 @@ from typing import Any
 
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import NotToml, format_value, parse_toml
-from wfsobs.settings.group import Plain, SettingError
+from wfsobs.settings.errors import SettingError
+from wfsobs.settings.tree import Plain
 
 MOST = 60
 """Maximum number of combinations of one run."""

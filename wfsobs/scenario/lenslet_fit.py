@@ -7,7 +7,7 @@ from typing import Literal
 from wfsobs.scenario.groups.shack_hartmann import LensletArrays
 from wfsobs.sensors.lenslets import Lenslets
 from wfsobs.sensors.reconstructor import highest_order
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 Kind = Literal["lgs", "ngs"]
 

@@ -25,7 +25,9 @@ from wfsobs.scenario.groups.vibration import Vibration
 from wfsobs.scenario.lenslet_fit import fit_lenslets
 from wfsobs.scenario.timeline import shift, turbulence_time
 from wfsobs.sensors.modes import Mode, modes_up_to
-from wfsobs.settings.group import Group, Section, SettingError, section
+from wfsobs.settings.errors import SettingError
+from wfsobs.settings.group import Group
+from wfsobs.settings.sections import Section, section
 
 if TYPE_CHECKING:
     from wfsobs.observers.gpr.offline import OfflineGpr

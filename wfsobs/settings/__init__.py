@@ -1,6 +1,8 @@
 """Building blocks of settings: kinds of values, groups of them, and their error."""
 
-from wfsobs.settings.group import Group, Section, SettingError
+from wfsobs.settings.errors import SettingError
+from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import Real, Reals, Whole
+from wfsobs.settings.sections import Section
 
 __all__ = ["Group", "Real", "Reals", "Section", "SettingError", "Whole"]

@@ -6,29 +6,18 @@ TOML files and shareable links all go through the functions here.
 
 from __future__ import annotations
 
-import reprlib
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, Self, TypeVar, cast
+from typing import Any, Self, cast
 
-import numpy as np
 import param
 
 from wfsobs.notebook import html_table
+from wfsobs.settings.errors import SettingError, shorten
 from wfsobs.settings.parameters import allowed_values, hint
-
-Plain = dict[str, Any]
-"""A tree as plain values: nested dictionaries, lists, numbers, strings and booleans."""
-
+from wfsobs.settings.tree import Plain, leaves, put_value, to_native
 
 SHOWN = 3
 """Maximum number of settings in the representation of a group."""
-
-
-class SettingError(ValueError):
-    """Error: a setting that cannot be used; one line naming the setting, its value and what is allowed."""
-
-
-G = TypeVar("G", bound="Group")
 
 
 class Group(param.Parameterized):
@@ -59,7 +48,7 @@ class Group(param.Parameterized):
     def __setattr__(self, name: str, value: Any) -> None:
         if not name.startswith("_") and name != "name" and name not in type(self).param:
             raise AttributeError(f"{type(self).__name__} has no setting {name!r}")
-        super().__setattr__(name, _native(value))
+        super().__setattr__(name, to_native(value))
 
     def idle(self) -> tuple[str, ...]:
         """Return the settings without effect for the present values of the others."""
@@ -70,8 +59,7 @@ class Group(param.Parameterized):
         shown = ", ".join(f"{path}={value}" for path, value in changed[:SHOWN])
         return f"{type(self).__name__}({shown}{f', and {len(changed) - SHOWN} more' if len(changed) > SHOWN else ''})"
 
-    def __str__(self) -> str:
-        return repr(self)
+    __str__ = __repr__
 
     def _repr_html_(self) -> str:
         return html_table((type(self).__name__, "" if (changed := self._changed_settings()) else "default settings"), changed)
@@ -80,7 +68,7 @@ class Group(param.Parameterized):
         """Return (dotted path, value, shortened) of the settings that are not at their defaults."""
 
         def text(value: Any) -> str:
-            return f"[{len(value)} entries]" if isinstance(value, list) and len(value) > 3 else _short(value, 40)
+            return f"[{len(value)} entries]" if isinstance(value, list) and len(value) > 3 else shorten(value, 40)
 
         return [(path, text(value)) for path, value in leaves(self.difference(type(self)()))]
 
@@ -125,7 +113,7 @@ class Group(param.Parameterized):
         current = getattr(self, name)
         if isinstance(current, Group) and not isinstance(value, Group):
             if not isinstance(value, Mapping):
-                raise SettingError(f"{path} = {_short(value)}: this is a group of settings, not a value")
+                raise SettingError(f"{path} = {shorten(value)}: this is a group of settings, not a value")
             current.update(value, f"{path}.")
             return
         if isinstance(p, param.List) and holds_groups(p):
@@ -135,7 +123,7 @@ class Group(param.Parameterized):
         try:
             setattr(self, name, value)
         except (ValueError, TypeError, RecursionError) as error:  # the last of param's words for a value nested very deep
-            raise SettingError(f"{path} = {_short(value)}: {allowed_values(p)}{hint(value)}") from error
+            raise SettingError(f"{path} = {shorten(value)}: {allowed_values(p)}{hint(value)}") from error
 
     def difference(self, base: Group) -> Plain:
         """Return the settings in which this tree differs from `base`, as a partial dictionary."""
@@ -199,7 +187,7 @@ class Group(param.Parameterized):
         """
         trial = self.to_dict()
         for path, value in changes.items():
-            if _put(trial, path.split("."), value, path):
+            if put_value(trial, path.split("."), value, path):
                 trial = type(self).from_dict(trial).to_dict()  # a new item has its other settings, too
         return type(self).from_dict(trial)
 
@@ -225,62 +213,12 @@ class Group(param.Parameterized):
                 yield f"{prefix}{name}", p
 
 
-class Section(NamedTuple):
-    """A group of settings of an observer or a controller.
-
-    Attributes
-    ----------
-    name : str
-        Name in a scenario, before the first dot of the paths and in TOML.
-    label : str
-        Label on the page.
-    group : type of Group
-        The settings.
-    """
-
-    name: str
-    label: str
-    group: type[Group]
-
-
-class _Section(param.ClassSelector):
-    """A setting that is a group; a tree made before the setting was declared gets a fresh one when it is read."""
-
-    def __get__(self, obj: Any, objtype: Any) -> Any:
-        value = super().__get__(obj, objtype)
-        if value is None and obj is not None:
-            value = cast(type[Group], self.class_)()
-            self.__set__(obj, value)
-        return value
-
-
-def section(kind: type[G], label: str, doc: str = "") -> G:
-    """Declare a setting that is a group of its own; each tree gets a fresh one."""
-    return cast(G, _Section(class_=kind, label=label, doc=doc, per_instance=False))
-
-
-def _native(value: Any) -> Any:
-    """Convert NumPy scalars, alone or in a list, to Python's own: a setting is read again without NumPy."""
-    if isinstance(value, np.generic):
-        return value.item()
-    return [_native(v) for v in value] if isinstance(value, (list, tuple)) else value
-
-
 def _plain(value: Any) -> Any:
     if isinstance(value, Group):
         return value.to_dict()
     if isinstance(value, (list, tuple)):
         return [_plain(v) for v in value]
     return value
-
-
-def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield (dotted path, value) of a (partial) dictionary of settings; lists as a whole."""
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            yield from leaves(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def holds_groups(p: param.List) -> bool:
@@ -295,7 +233,7 @@ def settings_of(p: param.List) -> dict[str, param.Parameter]:
 
 def _groups(p: param.List, value: Any, path: str) -> list[Group]:
     if not isinstance(value, (list, tuple)):
-        raise SettingError(f"{path} = {_short(value)}: takes a list of tables")
+        raise SettingError(f"{path} = {shorten(value)}: takes a list of tables")
     _, high = p.bounds or (0, None)
     if high is not None and len(value) > high:
         raise SettingError(f"{path}: {len(value)} entries, at most {high} are allowed")
@@ -308,44 +246,5 @@ def _groups(p: param.List, value: Any, path: str) -> list[Group]:
             made.update(item, f"{path}.{i}.")
             out.append(made)
         else:
-            raise SettingError(f"{path}.{i} = {_short(item)}: takes a table of settings")
+            raise SettingError(f"{path}.{i} = {shorten(item)}: takes a table of settings")
     return out
-
-
-def _put(node: Any, keys: list[str], value: Any, path: str) -> bool:
-    """Put `value` into nested plain values, and return whether a list grew; unknown names are left for `update` to refuse."""
-    key = keys[0]
-    grown = False
-    if isinstance(node, list):
-        if not key.isdecimal() or int(key) > len(node):
-            raise SettingError(f"{path}: the list has {len(node)} entries, numbered from 0; {len(node)} adds one")
-        index = int(key)
-        if index == len(node):
-            node.append({} if len(keys) > 1 else None)
-            grown = True
-        if len(keys) == 1:
-            node[index] = value
-        else:
-            grown |= _put(node[index], keys[1:], value, path)
-    elif isinstance(node, dict):
-        if len(keys) == 1:
-            node[key] = value
-        elif key in node:
-            grown = _put(node[key], keys[1:], value, path)
-        elif node:
-            raise SettingError(f"{path}: no such setting; {key!r} is not one of {', '.join(node)}")
-        else:
-            raise SettingError(f"{path}: the entry is new; give it a whole {key} first")
-    else:
-        raise SettingError(f"{path}: no such setting")
-    return grown
-
-
-_WORDS = reprlib.Repr()  # stops at a depth, where `repr` would end in a RecursionError
-_WORDS.maxlist = _WORDS.maxtuple = _WORDS.maxdict = 40
-_WORDS.maxstring = _WORDS.maxother = _WORDS.maxlong = 400
-
-
-def _short(value: Any, most: int = 80) -> str:
-    text = _WORDS.repr(value)
-    return text if len(text) <= most else text[: most - 3] + "..."

@@ -14,7 +14,7 @@ from wfsobs.pipeline import Failure, each_estimate
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 
 
 @dataclass(frozen=True)

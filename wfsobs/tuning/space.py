@@ -16,7 +16,7 @@ import param
 from wfsobs.observers import OBSERVERS
 from wfsobs.priors_from.scenario import measurement_noise
 from wfsobs.scenario import Scenario
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
 from wfsobs.simulation.layers import relative_rms
 from wfsobs.simulation.turbulence import turbulence_process

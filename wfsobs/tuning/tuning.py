@@ -13,7 +13,7 @@ from wfsobs.pipeline import as_stated
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.tuning.judge import Errors, Judge, target_of
 from wfsobs.tuning.likelihood import likelihood
 from wfsobs.tuning.records import DESIGN, MEASURES, Records, cut_record, simulate_records, stream

@@ -34,7 +34,7 @@ from wfsobs.identification.report import identification_toml
 from wfsobs.pipeline import as_stated
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
 from wfsobs.spectral.search import LOWEST
 

@@ -24,7 +24,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION
 from wfsobs.record import RecordError
 from wfsobs.scenario.configfile import changed_settings
-from wfsobs.settings.group import SettingError
+from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
 from wfsobs.tuning import Evaluation, TuningResult
 from wfsobs.tuning.records import MEASURES, TRUTH

@@ -5,8 +5,9 @@ from __future__ import annotations
 import param
 
 from wfsobs.scenario.groups.shack_hartmann import LensletArrays, Spots
-from wfsobs.settings.group import Group, section
+from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import Real, Reals, Whole
+from wfsobs.settings.sections import section
 
 
 class Sensors(Group):
