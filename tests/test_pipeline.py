@@ -13,8 +13,9 @@ from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Estimate
-from wfsobs.pipeline import Failure, as_stated, each_estimate
+from wfsobs.pipeline import as_stated, each_estimate
 from wfsobs.progress import Cancelled, Watch
+from wfsobs.result import Failure
 from wfsobs.signal.welch import rms
 
 

@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wfsobs.evaluation.scores import cumulative_rms, lag, scored_samples, supervised_scores, unsupervised_scores
+from wfsobs.evaluation.error_spectra import cumulative_rms, scored_samples
+from wfsobs.evaluation.lag import lag
+from wfsobs.evaluation.scores import supervised_scores, unsupervised_scores
 from wfsobs.observers.base import Estimate
 from wfsobs.record import Record
 from wfsobs.signal.ar2 import Ar2

@@ -11,7 +11,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import j1, jv
 
-from wfsobs.atmosphere.frozen_flow import FrequencyGrid, View, frozen_flow, waves
+from wfsobs.atmosphere.frequency_grid import FrequencyGrid
+from wfsobs.atmosphere.frozen_flow import View, frozen_flow, waves
 from wfsobs.atmosphere.plane_waves import Footprint, Wave
 from wfsobs.atmosphere.von_karman import TurbulenceLayer, von_karman_density
 from wfsobs.sensors import zernike

@@ -17,11 +17,12 @@ from wfsobs.closed_loop.run import closed_loop
 from wfsobs.identification import Identification, identify
 from wfsobs.identification.report import identification_toml
 from wfsobs.observers import OBSERVERS
-from wfsobs.pipeline import Result, observe
+from wfsobs.pipeline import observe
 from wfsobs.prior import Lines
 from wfsobs.priors_from.identification import prior_of, told_by
 from wfsobs.priors_from.training import with_training
 from wfsobs.record import Record, Training
+from wfsobs.result import Result
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate

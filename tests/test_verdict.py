@@ -12,7 +12,8 @@ from scipy.signal import lfilter
 from wfsobs.evaluation.rows import can_be_best, row_label
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.evaluation.verdict import BATCHES, LEVEL, differs, verdict
-from wfsobs.pipeline import Result, run
+from wfsobs.pipeline import run
+from wfsobs.result import Result
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.disturbance import vibration_lines
 from wfsobs.typing import Array

@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from wfsobs.evaluation.budget import error_budget
     from wfsobs.evaluation.scores import score
     from wfsobs.identification.identification import identify
-    from wfsobs.pipeline import Result, observe, run
+    from wfsobs.pipeline import observe, run
     from wfsobs.record import Record, RecordError
     from wfsobs.registry import register
+    from wfsobs.result import Result
     from wfsobs.scenario import Scenario
     from wfsobs.scenario.presets import PRESETS
     from wfsobs.settings.errors import SettingError
@@ -38,7 +39,7 @@ _HOMES = {
     "error_budget": "evaluation.budget",
     "score": "evaluation.scores",
     "identify": "identification.identification",
-    "Result": "pipeline",
+    "Result": "result",
     "observe": "pipeline",
     "run": "pipeline",
     "Record": "record",

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wfsobs.evaluation.bound import Bound, bound_scores, record_bounds
-from wfsobs.evaluation.rows import score_rows
-from wfsobs.evaluation.scores import Score, score
-from wfsobs.notebook import html_table
+from wfsobs.evaluation.scores import score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Observer
 from wfsobs.priors_from.identification import told_by
@@ -20,91 +18,14 @@ from wfsobs.priors_from.scenario import arguments
 from wfsobs.priors_from.training import trained_until, with_training
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record
+from wfsobs.result import Failure, Result
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
-    import pandas
-
     from wfsobs.identification.result import Identification
-
-
-@dataclass(frozen=True)
-class Failure:
-    """An observer without an estimate, and the reason in one line."""
-
-    observer: str
-    reason: str
-
-
-@dataclass(frozen=True, repr=False)
-class Result:
-    """Result of a run: scenario, record, estimates and scores.
-
-    Attributes
-    ----------
-    scenario : Scenario
-        Settings of the run.
-    record : Record
-        Measurements, commands and truth.
-    estimates : tuple of Estimate
-        One per observer and target, in the order of the registry.
-    scores : tuple of Score
-        One per observer, target and mode; the bounds last.
-    failures : tuple of Failure
-        Observers without an estimate.
-    """
-
-    scenario: Scenario
-    record: Record
-    estimates: tuple[Estimate, ...]
-    scores: tuple[Score, ...]
-    failures: tuple[Failure, ...] = ()
-
-    def __repr__(self) -> str:
-        left_out = f", {len(self.failures)} left out" if self.failures else ""
-        observers = len({e.observer for e in self.estimates})
-        return f"Result({observers} observers, {len(self.scores)} scores{left_out}, {self.record!r})"
-
-    def _repr_html_(self) -> str:
-        cells = [(s.target, s.mode, s.observer, f"{s.rms * 1e3:.2f}") for s in self.scores]
-        return html_table(("Target", "Mode", "Observer", "error, nm"), cells)
-
-    def to_dataframe(self) -> pandas.DataFrame:
-        """Return the scores as a pandas table, one row per score.
-
-        Returns
-        -------
-        pandas.DataFrame
-            The keys of `wfsobs run --json` as columns.
-
-        Raises
-        ------
-        ImportError
-            pandas is not installed.
-        """
-        import pandas
-
-        return pandas.DataFrame(score_rows(self.scores, self.scenario.run.seed))
-
-    def estimate(self, observer: str, target: str) -> Estimate | None:
-        """Return the estimate of one observer and target.
-
-        Parameters
-        ----------
-        observer : str
-            Id of the observer.
-        target : str
-            "turbulence" or "vibration".
-
-        Returns
-        -------
-        Estimate or None
-            None where there is no such estimate.
-        """
-        return next((e for e in self.estimates if (e.observer, e.target) == (observer, target)), None)
 
 
 def run(scenario: Scenario, *, observers: Sequence[str] | None = None, watch: Watch = QUIET) -> Result:

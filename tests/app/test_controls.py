@@ -12,8 +12,8 @@ from wfsobs.app.controls.fields import SliderField, label_of, parse_number, unit
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.controls.panel import FIRST, Controls, status_of
 from wfsobs.app.work import RunResults
-from wfsobs.pipeline import Result
 from wfsobs.record import Record
+from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 

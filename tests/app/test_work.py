@@ -10,7 +10,7 @@ import pytest
 
 from wfsobs.app import work
 from wfsobs.app.work import TRUTH, RunResults, compute
-from wfsobs.evaluation.scores import scored_samples
+from wfsobs.evaluation.error_spectra import scored_samples
 from wfsobs.observers import OBSERVERS
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.scenario import Scenario

@@ -22,8 +22,8 @@ from wfsobs.app.display import UNITS, per_micrometre
 from wfsobs.app.numbers import number
 from wfsobs.app.work import TRUTH
 from wfsobs.cli import main
+from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
 from wfsobs.evaluation.rows import row_label
-from wfsobs.evaluation.scores import cumulative_rms, spectra
 from wfsobs.observers.base import TARGETS
 
 SETTINGS = {

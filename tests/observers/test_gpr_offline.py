@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, lfilter, sosfilt
 
-from wfsobs.evaluation.scores import lag
+from wfsobs.evaluation.lag import lag
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
 from wfsobs.observers.gpr.offline import train, training_targets
 from wfsobs.pipeline import run_observer

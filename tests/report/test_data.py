@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from wfsobs.app.report.data import LEVELS, Grid, Pool, Report, bins_for, encode, state_of, window_of
 from wfsobs.app.report.packing import pack, unpack
 from wfsobs.app.work import TRUTH
+from wfsobs.evaluation.error_spectra import cumulative_rms
 from wfsobs.evaluation.rows import score_rows
-from wfsobs.evaluation.scores import cumulative_rms
-from wfsobs.pipeline import Result
+from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation
 from wfsobs.signal.welch import welch_psd

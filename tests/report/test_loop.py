@@ -14,7 +14,7 @@ from wfsobs.app.report.page import page
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.bound import BOUND
-from wfsobs.pipeline import Result
+from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 
 MADE = datetime(2024, 1, 2, tzinfo=UTC)

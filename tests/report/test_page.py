@@ -22,7 +22,8 @@ from wfsobs.app.report.data import Grid, Report, state_of
 from wfsobs.app.report.page import page
 from wfsobs.app.report.text import FILE, LONGEST, command_of
 from wfsobs.evaluation.rows import TIME, is_non_causal, row_label, scored_interval
-from wfsobs.pipeline import Result, observe, run
+from wfsobs.pipeline import observe, run
+from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import from_toml, scenario_from
 from wfsobs.scenario.grid import Variation, parse_variation, scenarios

@@ -19,12 +19,13 @@ from threadpoolctl import threadpool_limits
 from wfsobs.app.jobs.job import INTERVAL, Tell
 from wfsobs.app.sources import Source
 from wfsobs.evaluation.bound import Bound, record_bounds
-from wfsobs.evaluation.scores import spectra
+from wfsobs.evaluation.error_spectra import spectra
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Estimate
-from wfsobs.pipeline import Failure, Result, as_stated, collect, each_estimate
+from wfsobs.pipeline import as_stated, collect, each_estimate
 from wfsobs.progress import Watch
 from wfsobs.record import Record
+from wfsobs.result import Failure, Result
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
 

@@ -23,8 +23,9 @@ from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.bound import Bound, record_bounds
 from wfsobs.evaluation.rows import TIME, score_rows
 from wfsobs.observers.base import Estimate
-from wfsobs.pipeline import Failure, collect, each_estimate
+from wfsobs.pipeline import collect, each_estimate
 from wfsobs.record import Record
+from wfsobs.result import Failure
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from wfsobs.evaluation.recovery import PooledRms, Recovery, recovery, running_rms
 from wfsobs.evaluation.rows import Row, row_label
-from wfsobs.pipeline import Result
+from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 

@@ -17,8 +17,8 @@ from wfsobs.cli.tables import score_table
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.rows import TIME, Row
 from wfsobs.evaluation.verdict import verdict
-from wfsobs.pipeline import Result
 from wfsobs.progress import Watch
+from wfsobs.result import Result
 
 
 def show(all_rows: list[Row], as_json: bool) -> None:

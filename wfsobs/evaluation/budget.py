@@ -39,7 +39,7 @@ from wfsobs.simulation.sensing import OpenLoop
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
-    from wfsobs.pipeline import Result
+    from wfsobs.result import Result
 
 LAG, MISMATCH = "lag", "mismatch"
 

@@ -1,4 +1,4 @@
-"""Scores of estimates: error, lag and spectra after the warm-up; compared errors are on common samples."""
+"""Scores of estimates: error and lag after the warm-up; compared errors are on common samples."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wfsobs.evaluation.lag import lag
 from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.record import Record
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
-from wfsobs.signal.welch import rms, welch_psd
+from wfsobs.signal.welch import rms
 from wfsobs.typing import Array
 
 PREDICTION, RESIDUAL = "next z", "residual y"
@@ -19,8 +20,6 @@ PREDICTION, RESIDUAL = "next z", "residual y"
 LOOP, BOUND = "loop", "bound"
 """Rows that are not observers: the loop that made the record, and the Wiener bound."""
 
-MAX_LAG = 0.025
-"""Maximum lag [s]."""
 
 SHARE = 0.5
 """Minimum share of the samples after the warm-up that observers in a table have in common; those that leave fewer stand apart."""
@@ -230,81 +229,3 @@ def _ratio(error: Array, signal: Array) -> float | None:
     """Return the rms of an error over that of the signal, None where that is zero."""
     scale = rms(signal)
     return rms(error) / scale if scale > 0 else None
-
-
-def scored_samples(record: Record, truth: Array, value: Array, warm_up: float) -> tuple[Array, Array]:
-    """Return (truth, estimate) without the warm-up [s] and without the steps where the estimate is NaN."""
-    start = round(warm_up / record.dt)
-    known = ~np.isnan(value[start:]) & ~np.isnan(truth[start:])
-    return truth[start:][known], value[start:][known]
-
-
-def lag(truth: Array, value: Array, dt: float) -> float | None:
-    """Estimate the delay of `value` behind `truth` [s]: where their correlation coefficient is highest.
-
-    The maximum is interpolated by a parabola through three points. Positive is late; None where either is constant.
-
-    The middle of the truth is compared with equally long pieces of the estimate, each with its own mean and variance:
-    a plain cross-correlation has fewer terms at larger lags, which biases the broad maximum of a slow signal towards
-    zero. Of maxima within 2 % of the highest, the periods of a pure tone, it is the one nearest to zero.
-    """
-    reach = min(round(MAX_LAG / dt), (truth.size - 1) // 4)
-    middle = truth[reach : truth.size - reach]
-    if np.ptp(value) == 0 or np.ptp(middle) == 0:
-        return None
-    n, moving = middle.size, value - value.mean()
-    sums, squares = (np.concatenate([[0.0], np.cumsum(x)]) for x in (moving, moving**2))
-    power = squares[n:] - squares[:-n] - (sums[n:] - sums[:-n]) ** 2 / n
-    if not power.max() > 0:  # so small that its square is nothing
-        return None
-    power = np.maximum(power, 1e-12 * power.max())
-    alike = np.correlate(moving, middle - middle.mean(), "valid") / np.sqrt(power)
-    inner = alike[1:-1]
-    tops = 1 + np.flatnonzero((inner >= alike[:-2]) & (inner >= alike[2:]) & (inner >= 0.98 * alike.max()))
-    if tops.size == 0:
-        return float((np.argmax(alike) - reach) * dt)
-    peak = tops[np.argmin(np.abs(tops - reach))]
-    before, at, after = alike[peak - 1 : peak + 2]
-    curvature = before - 2.0 * at + after
-    shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
-    return float((peak - reach + shift) * dt)
-
-
-def spectra(record: Record, target: str, values: Array, warm_up: float) -> tuple[Array, Array, Array] | None:
-    """Compute the spectra of an estimate and of its error.
-
-    Over all samples after the warm-up [s] that have an estimate; without a truth the error is zero.
-
-    Parameters
-    ----------
-    record : Record
-        Record, with the truth where there is one.
-    target : str
-        "turbulence" or "vibration".
-    values : Array
-        Estimate, (n_steps, n_modes) [um].
-    warm_up : float
-        Start of the record that does not count [s].
-
-    Returns
-    -------
-    tuple of Array or None
-        Frequency [Hz], density of the estimate and of its error [um^2/Hz], a column per mode; None with too few samples.
-    """
-    truth = record.truth(target)
-    truth = values if truth is None else truth
-    columns = [scored_samples(record, truth[:, mode], values[:, mode], warm_up) for mode in range(record.n_modes)]
-    shortest = min(true.size for true, _ in columns)
-    if shortest < 16:
-        return None
-    true = np.column_stack([t[-shortest:] for t, _ in columns])
-    value = np.column_stack([v[-shortest:] for _, v in columns])
-    frequency, density = welch_psd(np.hstack([value, value - true]), record.dt)
-    signal, error = np.hsplit(density, 2)
-    return frequency, signal, error
-
-
-def cumulative_rms(frequency: Array, density: Array) -> Array:
-    """Return the root of the variance above each frequency, from high to low (the AO habit); same shape as `density`."""
-    df = frequency[1] - frequency[0]
-    return np.sqrt(np.cumsum(density[::-1], axis=0)[::-1] * df)

@@ -10,9 +10,10 @@ import numpy as np
 from wfsobs.evaluation.scores import PREDICTION, supervised_scores, unsupervised_scores
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, VIBRATION, Estimate
-from wfsobs.pipeline import Failure, each_estimate
+from wfsobs.pipeline import each_estimate
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
+from wfsobs.result import Failure
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 

@@ -10,7 +10,8 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import add_comments, changed_settings, to_toml
 from wfsobs.tuning.judge import Errors
 from wfsobs.tuning.records import TRUTH
-from wfsobs.tuning.tuning import Stage, TuningResult
+from wfsobs.tuning.trials import Stage
+from wfsobs.tuning.tuning import TuningResult
 
 
 def tuning_dict(result: TuningResult) -> dict[str, Any]:

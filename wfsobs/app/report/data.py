@@ -19,12 +19,12 @@ from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows as controller_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
 from wfsobs.evaluation.rows import Row, score_rows
-from wfsobs.evaluation.scores import cumulative_rms, spectra
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.pipeline import Result
 from wfsobs.record import RecordError
+from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation
 

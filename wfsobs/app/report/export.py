@@ -9,8 +9,9 @@ from pathlib import Path
 from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.page import page
 from wfsobs.files import check_writable, write_whole
-from wfsobs.pipeline import Result, run
+from wfsobs.pipeline import run
 from wfsobs.progress import QUIET, Watch
+from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation, scenarios
 

@@ -11,7 +11,7 @@ from wfsobs.app.style import observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, PinnedLines, add_line, marked_peaks, new_figure, send
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, Array, RunResults, SignalAndError
-from wfsobs.evaluation.scores import cumulative_rms
+from wfsobs.evaluation.error_spectra import cumulative_rms
 from wfsobs.observers.base import TARGETS, VIBRATION
 
 DECADES = 8
