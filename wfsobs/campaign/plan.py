@@ -238,11 +238,11 @@ def _whole(values: Mapping[str, Any], key: str, default: int, low: int, high: in
     return value
 
 
-def _ids(values: Mapping[str, Any], key: str, default: list[str], allowed: list[str]) -> tuple[str, ...]:
+def _ids(values: Mapping[str, Any], key: str, default: list[str], choices: list[str]) -> tuple[str, ...]:
     chosen = values.get(key, default)
     if not isinstance(chosen, list):
         raise SettingError(f"{key} = {chosen!r}: takes a list of ids")
     for name in chosen:
-        if name not in allowed:
-            raise SettingError(f"{key}: {name!r} is not one of {', '.join(allowed)}")
-    return tuple(name for name in allowed if name in chosen)
+        if name not in choices:
+            raise SettingError(f"{key}: {name!r} is not one of {', '.join(choices)}")
+    return tuple(name for name in choices if name in chosen)

@@ -37,7 +37,7 @@ class Progress:
     ----------
     total, before : int
         Runs in this call's share, and how many of them were done before.
-    done : int
+    n_done : int
         Runs done by now, those before included.
     runs : int
         Runs of this call.
@@ -47,7 +47,7 @@ class Progress:
 
     total: int
     before: int
-    done: int = 0
+    n_done: int = 0
     runs: int = 0
     breaks: int = 0
 
@@ -59,7 +59,7 @@ def run_campaign(
     shard: tuple[int, int] = (1, 1),
     *,
     report: Callable[[Progress], None] = lambda _: None,
-    stopped: Callable[[], bool] = lambda: False,
+    must_stop: Callable[[], bool] = lambda: False,
 ) -> Progress:
     """Run what is missing of a campaign; call it again to resume.
 
@@ -75,7 +75,7 @@ def run_campaign(
         (k, n): the k-th of n shares of the runs, from 1.
     report : callable
         Receives the progress after every batch.
-    stopped : callable
+    must_stop : callable
         Asked before every batch; true ends the campaign when the batches that run are finished.
 
     Returns
@@ -95,14 +95,14 @@ def run_campaign(
     try:
         while True:
             wanted, finished = _wanted_runs(plan, folder, shard)
-            progress.total, progress.done = int(wanted.sum()), int((wanted & finished).sum())
+            progress.total, progress.n_done = int(wanted.sum()), int((wanted & finished).sum())
             todo = np.flatnonzero(wanted & ~finished)
             if progress.runs == 0:
-                progress.before = progress.done
+                progress.before = progress.n_done
             report(progress)
-            if not len(todo) or stopped():
+            if not len(todo) or must_stop():
                 return progress
-            _drive(_Batches(plan, todo, str(folder)), workers, progress, report, stopped)
+            _drive(_Batches(plan, todo, str(folder)), workers, progress, report, must_stop)
             if plan.stop is None or shard != (1, 1):  # shares decide when all of them have ended
                 return progress
     finally:
@@ -151,9 +151,9 @@ class _Batches:
             self.position += 1
         return Batch(tuple(runs), self.plan.observers, self.plan.controllers, self.folder)
 
-    def learn(self, batch: Batch, done: Summary) -> None:
+    def learn(self, batch: Batch, summary: Summary) -> None:
         """Correct the expected times by that of a batch."""
-        self.spent += done.seconds
+        self.spent += summary.seconds
         self.expected += sum(self.cost(cell.index) for cell, _ in batch.runs)
 
     def cost(self, cell: int) -> float:
@@ -175,33 +175,33 @@ def run_cost(plan: Campaign, cell: int) -> float:
 
 
 def _drive(
-    batches: _Batches, workers: Workers, progress: Progress, report: Callable[[Progress], None], stopped: Callable[[], bool]
+    batches: _Batches, workers: Workers, progress: Progress, report: Callable[[Progress], None], must_stop: Callable[[], bool]
 ) -> None:
     """Keep the executor busy until all batches are done."""
     executor, running, in_a_row = workers.executor(), dict[Future[Summary], Batch](), 0
     while True:
-        while not stopped() and len(running) < AHEAD * workers.count and (batch := next(batches, None)) is not None:
+        while not must_stop() and len(running) < AHEAD * workers.count and (batch := next(batches, None)) is not None:
             try:
                 running[executor.submit(wfsobs_batch, batch)] = batch
             except (BrokenExecutor, RuntimeError):  # noticed by a batch that runs, too
                 batches.again.append(batch)
                 break
-        if not running and (stopped() or not batches.again):
+        if not running and (must_stop() or not batches.again):
             return
         broken = not running
         for future in wait(running, timeout=0.5, return_when=FIRST_COMPLETED).done:
             batch = running.pop(future)
             try:
-                done = future.result()
+                summary = future.result()
             except Exception as error:
                 if not _is_loss(error):
                     raise
                 broken = True
                 batches.again.append(batch)
                 continue
-            batches.learn(batch, done)
-            progress.done += done.runs
-            progress.runs += done.runs
+            batches.learn(batch, summary)
+            progress.n_done += summary.runs
+            progress.runs += summary.runs
             in_a_row = 0
             report(progress)
         if broken:

@@ -36,18 +36,18 @@ class Stop:
         """Level of the interval at one look: the looks share the error of all (Bonferroni), which no order of them exceeds."""
         return 1.0 - (1.0 - LEVEL) / len(self.looks)
 
-    def is_decided(self, compared: Sequence[Comparison]) -> bool:
+    def is_decided(self, comparisons: Sequence[Comparison]) -> bool:
         """Return whether a scenario needs no further seed.
 
         Each difference from the best is significant, or known to the wanted half-width.
 
         Parameters
         ----------
-        compared : sequence of Comparison
+        comparisons : sequence of Comparison
             All rows of one scenario, target and mode, with intervals at `level`.
         """
-        rivals = [c for c in compared if c.difference is not None]
-        best = next((c.rms for c in compared if c.is_best), None)
+        rivals = [c for c in comparisons if c.difference is not None]
+        best = next((c.rms for c in comparisons if c.is_best), None)
         if best is None:
             return True
         wanted = self.half_width * best
@@ -81,7 +81,7 @@ def looks(first: int, last: int) -> tuple[int, ...]:
     return tuple(out)
 
 
-def wanted_seeds(plan: Campaign, finished: Array, table: pyarrow.Table) -> Array:
+def wanted_seeds(plan: Campaign, complete: Array, table: pyarrow.Table) -> Array:
     """Return how many seeds each scenario is to have by what is known, (n_cells,).
 
     At each look the first seeds alone count, so that the order of arrival does not matter.
@@ -90,7 +90,7 @@ def wanted_seeds(plan: Campaign, finished: Array, table: pyarrow.Table) -> Array
     ----------
     plan : Campaign
         The campaign.
-    finished : Array
+    complete : Array
         Runs that are finished, bool (n_cells, n_seeds).
     table : pyarrow.Table
         Their rows.
@@ -103,7 +103,7 @@ def wanted_seeds(plan: Campaign, finished: Array, table: pyarrow.Table) -> Array
     undecided = np.ones(len(plan.cells), dtype=bool)
     for count in plan.stop.looks:
         wanted[undecided] = count
-        undecided &= finished[:, :count].all(axis=1)  # the others wait for their seeds
+        undecided &= complete[:, :count].all(axis=1)  # the others wait for their seeds
         if not undecided.any():
             break
         first = table["seed"].to_numpy() < plan.seeds.start + count

@@ -55,14 +55,14 @@ def campaign() -> None:
 )
 def print_plan(plan_file: str, workers: int | None) -> None:
     """Say how many runs, hours and bytes a campaign takes."""
-    made, side_by_side = load_plan(plan_file), workers or usable_processors()
-    hours, measured = _core_hours(made)
-    rows = _rows_of_a_run(made) * made.n_runs
+    plan, side_by_side = load_plan(plan_file), workers or usable_processors()
+    hours, measured = _core_hours(plan)
+    rows = _rows_of_a_run(plan) * plan.n_runs
     batches = max(1.0, hours * 3600 / BATCH)
-    click.echo(f"{made.name}: {len(made.cells)} scenarios x {len(made.seeds)} seeds = {made.n_runs} runs")
-    click.echo(f"observers: {', '.join(made.observers) or 'none'}; controllers: {', '.join(made.controllers) or 'none'}")
-    for path in made.axes:
-        values = list(dict.fromkeys(repr(c.changes[path]) for c in made.cells if path in c.changes))
+    click.echo(f"{plan.name}: {len(plan.cells)} scenarios x {len(plan.seeds)} seeds = {plan.n_runs} runs")
+    click.echo(f"observers: {', '.join(plan.observers) or 'none'}; controllers: {', '.join(plan.controllers) or 'none'}")
+    for path in plan.axes:
+        values = list(dict.fromkeys(repr(c.changes[path]) for c in plan.cells if path in c.changes))
         click.echo(f"  {path}: {', '.join(values[:6])}{f' ... ({len(values)} values)' if len(values) > 6 else ''}")
     click.echo(f"{_span(hours)} of one processor{measured}")
     click.echo(f"{_span(hours / side_by_side)} on {side_by_side} workers, in about {batches:.0f} batches")
@@ -74,25 +74,25 @@ def _span(hours: float) -> str:
     return f"{hours:.3g} h" if hours >= 1 else f"{hours * 60:.2g} min" if hours >= 0.05 else f"{hours * 3600:.2g} s"
 
 
-def _core_hours(made: Campaign) -> tuple[float, str]:
+def _core_hours(plan: Campaign) -> tuple[float, str]:
     """Return the time of all runs [h], by that of the first one on this machine, and how it was found."""
-    step = max(1, len(made.cells) // 200)  # of many scenarios some
-    costs = [run_cost(made, cell) for cell in range(0, len(made.cells), step)]
+    step = max(1, len(plan.cells) // 200)  # of many scenarios some
+    costs = [run_cost(plan, cell) for cell in range(0, len(plan.cells), step)]
     mean, how = sum(costs) / len(costs), ""
     if costs[0] < LONG:
         times = [perf_counter()]
         for _ in range(2):
-            run_rows(made.cells[0], made.seeds[0], made.observers, made.controllers)
+            run_rows(plan.cells[0], plan.seeds[0], plan.observers, plan.controllers)
             times.append(perf_counter())
         first, again = times[1] - times[0], times[2] - times[1]
-        mean = mean * again / costs[0] + max(first - again, 0.0) / len(made.seeds)  # designs and bounds, once for all seeds
+        mean = mean * again / costs[0] + max(first - again, 0.0) / len(plan.seeds)  # designs and bounds, once for all seeds
         how = f" (the first run took {again:.2g} s here)"
-    return mean * made.n_runs / 3600, how
+    return mean * plan.n_runs / 3600, how
 
 
-def _rows_of_a_run(made: Campaign) -> int:
-    modes = len(made.cells[0].scenario().modes)
-    return modes * (2 * (len(made.observers) + 1) * bool(made.observers) + (len(made.controllers) + 1) * bool(made.controllers))
+def _rows_of_a_run(plan: Campaign) -> int:
+    modes = len(plan.cells[0].scenario().modes)
+    return modes * (2 * (len(plan.observers) + 1) * bool(plan.observers) + (len(plan.controllers) + 1) * bool(plan.controllers))
 
 
 @campaign.command()
@@ -116,25 +116,25 @@ def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, sh
     """Run what is missing of a campaign."""
     if workers and scheduler:
         raise SettingError("--workers: is for this machine, leave it out with --scheduler")
-    made, share = load_plan(plan_file), _shard(shard)
+    plan, share = load_plan(plan_file), _shard(shard)
     stop = _Stop()
     place = DaskCluster(scheduler) if scheduler else Processes(workers or usable_processors())
-    with _bar(made.name) as bar:
+    with _bar(plan.name) as bar:
         task = bar.add_task("runs", total=None)
 
         def tell(state: State) -> None:
-            bar.update(task, completed=state.done, total=state.total)
+            bar.update(task, completed=state.n_done, total=state.total)
 
-        state = run_campaign(made, Path(out), place, share, report=tell, stopped=stop)
+        state = run_campaign(plan, Path(out), place, share, report=tell, must_stop=stop)
     if as_json:
         click.echo(
             json.dumps(
-                {"total": state.total, "done": state.done, "before": state.before, "runs": state.runs, "breaks": state.breaks}
+                {"total": state.total, "done": state.n_done, "before": state.before, "runs": state.runs, "breaks": state.breaks}
             )
         )
     else:
         lost = f"; workers were lost {state.breaks} times, and their batches run again" if state.breaks else ""
-        click.echo(f"wfsobs: {out}: {state.done} of {state.total} runs are done, {state.runs} of them now{lost}", err=True)
+        click.echo(f"wfsobs: {out}: {state.n_done} of {state.total} runs are done, {state.runs} of them now{lost}", err=True)
     if stop():
         click.echo("wfsobs: stopped; the same command resumes", err=True)
         sys.exit(STOPPED)
@@ -185,20 +185,20 @@ def _shard(text: str | None) -> tuple[int, int]:
 @click.option("--parquet", metavar="FILE", help="Write all rows with their settings to one Parquet file.")
 def print_table(folder: str, as_csv: bool, parquet: str | None) -> None:
     """Print the results of a campaign: errors over the seeds and paired differences from the best."""
-    made = folder_plan(Path(folder))
+    plan = folder_plan(Path(folder))
     rows = read_results(Path(folder))
     if parquet:
         import pyarrow.parquet as pq
 
         from wfsobs.files import write_whole
 
-        write_whole(parquet, lambda file: pq.write_table(add_settings(made, rows), file))
+        write_whole(parquet, lambda file: pq.write_table(add_settings(plan, rows), file))
         return
     if as_csv:
-        _print_csv(made, rows.to_pylist())
+        _print_csv(plan, rows.to_pylist())
         return
-    done = int(finished_runs(made, Path(folder)).sum())
-    show_table(_summary(made, rows, f"{made.name}: {done} of {made.n_runs} runs"))
+    done = int(finished_runs(plan, Path(folder)).sum())
+    show_table(_summary(plan, rows, f"{plan.name}: {done} of {plan.n_runs} runs"))
 
 
 @campaign.command()
@@ -213,21 +213,21 @@ def report(folder: str, out: str | None) -> None:
     click.echo(f"wfsobs: {path}: written", err=True)
 
 
-def _print_csv(made: Campaign, rows: list[dict]) -> None:
+def _print_csv(plan: Campaign, rows: list[dict]) -> None:
     """Print rows, with the settings of their scenarios; numbers with all their digits."""
     out = csv.writer(sys.stdout, lineterminator="\n")
     columns = list(RESULTS)
-    out.writerow([*columns, *made.axes])
+    out.writerow([*columns, *plan.axes])
     for row in rows:
-        changes = made.cells[row["cell"]].changes if row["cell"] < len(made.cells) else {}
-        out.writerow([_text(row[c]) for c in columns] + [_text(changes.get(path)) for path in made.axes])
+        changes = plan.cells[row["cell"]].changes if row["cell"] < len(plan.cells) else {}
+        out.writerow([_text(row[c]) for c in columns] + [_text(changes.get(path)) for path in plan.axes])
 
 
 def _text(value: object) -> object:
     return "" if value is None else repr(value) if isinstance(value, float) else value
 
 
-def _summary(made: Campaign, rows: object, title: str) -> Table:
+def _summary(plan: Campaign, rows: object, title: str) -> Table:
     """Return a table with one row per scenario, target, mode and observer."""
     out = Table(title=title, caption="+-: interval of 95 % of the paired difference from the best; ~: not significant")
     for name in ("Scenario", "Settings", "Target", "Mode", "Name", "rms, nm", "above the best, nm", "seeds"):
@@ -235,7 +235,7 @@ def _summary(made: Campaign, rows: object, title: str) -> Table:
     before = None
     for one in compare(rows):  # type: ignore[arg-type]
         key = (one.cell, one.target, one.mode)
-        settings = ", ".join(f"{path.split('.')[-1]} = {value}" for path, value in made.cells[one.cell].changes.items())
+        settings = ", ".join(f"{path.split('.')[-1]} = {value}" for path, value in plan.cells[one.cell].changes.items())
         new = key != before
         above = (
             ""

@@ -1,0 +1,154 @@
+"""The live loop: blocks without a seam, a ring, and numbers that are those of the recording."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import wfsobs
+from wfsobs.live.blocks import endless_blocks
+from wfsobs.live.follow import BINS, Follower
+from wfsobs.live.ring import CAPACITY, Ring
+from wfsobs.live.source import _Loop
+from wfsobs.observers import OBSERVERS
+from wfsobs.scenario.presets import paper
+from wfsobs.stepping import design
+
+
+def frames(n, length, seed=1, **changes):
+    scenario = paper().replace(changes)
+    out = []
+    for block in endless_blocks(scenario, np.random.default_rng(seed), length):
+        out.append(block)
+        if sum(len(b.z) for b in out) >= n:
+            return {name: np.vstack([getattr(b, name) for b in out])[:n] for name in vars(block)}
+
+
+def test_covariances_across_joints_are_those_of_a_record():
+    """Covariance at lags of 1 to 40 ms around joints, over many joints, against that in the middle of blocks."""
+    half, lags, n = 500, np.array([0, 1, 5, 20, 40]), 500 * 1200
+    z = frames(n, 2 * half / 1000, **{"vibration.peaks": [{"frequency": 45.0, "damping": 0.05, "rms": [0.02, 0.02]}]})[
+        "vibration"
+    ][:, 0]
+    start = np.arange(half, n - half, half)  # the joints, where all weight changes from one record to another
+
+    def covariance(at):
+        return np.array([np.mean([z[at + o] * z[at + o + lag] for o in range(-20, 20, 4)], axis=0) for lag in lags])
+
+    joints, middles = covariance(start), covariance(start + half // 2)
+    mean, scale = middles.mean(axis=1), joints.std(axis=1) + middles.std(axis=1)
+    # independent joints: the difference of two means of 1199 within 5 of its standard deviation
+    assert np.all(np.abs(joints.mean(axis=1) - mean) < 5 * scale / np.sqrt(len(start)))
+    assert mean[0] == pytest.approx(0.02**2, rel=0.05)
+
+
+def test_weights_are_those_of_the_formula():
+    """Of white noise the variance is that of the noise at every step of a block."""
+    z = np.array([frames(100, 0.1, seed)["z"][:, 0] for seed in range(400)])
+    true = wfsobs.simulate(paper().replace({"run.duration": 40.0})).z[:, 0].var()
+    ratio = z.var(axis=0) / true
+    # turbulence is nearly constant over a tenth of a second: 400 records, the variance is within 7 % (1 sigma)
+    assert np.all(np.abs(ratio - 1) < 0.35) and abs(ratio.mean() - 1) < 0.3
+
+
+def test_frames_of_the_natural_guide_star_come_when_they_are_due():
+    made = frames(3000, 0.73, **{"sensors.exposure_ratio": 5})
+    there = ~np.isnan(made["ngs"][:, 0])
+    assert np.array_equal(there, np.arange(3000) % 5 == 0)
+    assert not np.isnan(made["z"]).any()
+
+
+def test_the_integrator_goes_on_from_block_to_block():
+    z = np.random.default_rng(1).normal(size=(300, 2))
+    scenario = paper()
+    loop = _Loop(scenario)
+    parts = np.vstack([loop.commands(part) for part in np.split(z, [1, 100, 101])])
+    g, leak = scenario.loop.gain, scenario.loop.leak
+    assert parts == pytest.approx(lfilter([-g], [1, -leak, g], z, axis=0), rel=0, abs=1e-13)
+
+
+def test_a_slow_reader_is_told_what_it_lost():
+    ring = Ring(2)
+    other = Ring(2, ring.name)
+    for i in range(CAPACITY + 3):
+        ring.write(np.arange(11.0) + i)
+    assert other.read(1) is None and other.count == CAPACITY + 3
+    frame = other.read(CAPACITY)
+    assert frame is not None and frame.due == CAPACITY
+    assert frame.vibration == pytest.approx([CAPACITY + 9, CAPACITY + 10])
+    other.release()
+    ring.release()
+
+
+def test_quantiles_are_within_a_bin():
+    follower = Follower(design("zero", paper()), 0, 1e-3)
+    times = np.random.default_rng(2).lognormal(-9, 1, 5000)
+    np.add.at(follower._counts, np.searchsorted(BINS, times), 1)
+    for share in (0.5, 0.999):
+        exact = np.sort(times)[int(np.ceil(share * 5000)) - 1]
+        assert exact <= follower.quantile(share) <= exact * BINS[1] / BINS[0] * (1 + 1e-12)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """Run half a second of the loop, recorded, at a tenth of real time: a busy machine is no fault."""
+    path = tmp_path_factory.mktemp("live") / "night.npz"
+    command = [
+        sys.executable,
+        "-m",
+        "wfsobs",
+        "live",
+        "--headless",
+        "--json",
+        "--seconds",
+        "5",
+        "--speed",
+        "0.3",
+        "--record",
+        str(path),
+    ]
+    done = subprocess.run([*command, "--set", "run.warm_up=0.2"], capture_output=True, text=True, timeout=250)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout, parse_constant=pytest.fail), path
+
+
+def test_every_frame_reaches_every_observer(session):
+    result, path = session
+    assert (result["frames"], result["lost"]) == (1500, 0)
+    assert 0 <= result["late_share"] <= 1
+    assert {"kf-lgs", "kf-multi", "multirate-optimal", "gpr-online"} <= result["observers"].keys()
+    for row in result["observers"].values():
+        assert 0 < row["p50_us"] <= row["p99_9_us"] and 0 <= row["late"] <= 1500
+    assert wfsobs.load(path).n_steps == 1500
+
+
+def test_live_numbers_are_those_of_the_recording(session):
+    result, path = session
+    record = wfsobs.load(path)
+    scenario = paper().replace({"run.warm_up": 0.2})
+    names = [n for n in result["observers"] if record.training is not None or "training data" not in OBSERVERS[n].needed_parts]
+    assert {"kf-lgs", "multirate-optimal", "gpr-online"} <= set(names)
+    for name in names:
+        for s in wfsobs.observe(record, scenario, observers=[name]).scores:
+            live = result["observers"][name]["errors_nm"][s.target][s.mode]
+            # frame by frame and at once are one algorithm; commands of the recording are summed in another order
+            assert live == pytest.approx(s.rms * 1e3, rel=1e-6), s
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ([], "live: there is no page yet, take --headless"),
+        (["--headless", "--observer", "butterworth-ol"], "looks ahead: it cannot run frame by frame"),
+        (["--headless", "--observer", "kf"], "observer 'kf': no such observer; there are"),
+        (["--headless", "--preset", "peak-jump"], "events: a live loop takes none"),
+    ],
+)
+def test_what_cannot_run_is_one_line(arguments, line):
+    done = subprocess.run(
+        [sys.executable, "-m", "wfsobs", "live", "--seconds", "1", *arguments], capture_output=True, text=True, timeout=200
+    )
+    assert done.returncode == 2 and line in done.stderr and done.stderr.count("\n") == 1

@@ -1,0 +1,197 @@
+"""Observers that follow a source frame by frame: their latency and their errors."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Sequence
+from time import monotonic, sleep
+from typing import Any
+
+import numpy as np
+
+from wfsobs.live.blocks import check_live
+from wfsobs.live.ring import LiveFrame
+from wfsobs.live.source import SimulatedSource
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.step import StepError, StepObserver
+from wfsobs.scenario import Scenario
+from wfsobs.settings.group import SettingError
+from wfsobs.stepping import design
+
+POLL = 1e-4
+"""Pause between two looks at the ring [s]."""
+LATE = 1e-3
+"""From which delay a frame counts as late [s]."""
+LONG_STEPS = ("kf-adaptive", "gpr-offline")
+"""Observers that are run if named alone."""
+BINS = np.geomspace(1e-7, 10.0, 1601)
+"""Edges of the histogram of latencies [s]: each 1.2 % above the one before, which is how exact a quantile is."""
+
+
+class Follower:
+    """One observer on a source.
+
+    Parameters
+    ----------
+    observer : StepObserver
+        Before its first frame.
+    scored_from : int
+        First frame that counts in the error.
+    budget : float
+        Time in which the estimate should be there [s].
+    """
+
+    def __init__(self, observer: StepObserver, scored_from: int, budget: float):
+        self.observer, self.scored_from, self.budget = observer, scored_from, budget
+        n_modes = observer.sampling.n_modes
+        self.late, self._counts = 0, np.zeros(len(BINS) + 1, dtype=np.int64)
+        self._squares = {target: np.zeros(n_modes) for target in observer.targets}
+        self._samples = {target: np.zeros(n_modes, dtype=np.int64) for target in observer.targets}
+
+    def take(self, frame: LiveFrame, number: int) -> None:
+        """Update, estimate and score on one frame."""
+        start = monotonic()
+        needs_command = self.observer.estimator.needs_command
+        ngs = None if np.isnan(frame.ngs[0]) or number == 0 else frame.ngs
+        self.observer.update(frame.z, ngs, frame.u if needs_command else None)
+        means = {target: self.observer.predict(0, target)[0] for target in self.observer.targets}
+        spent = monotonic() - start
+        self._counts[np.searchsorted(BINS, spent)] += 1
+        self.late += spent > self.budget
+        if number >= self.scored_from:
+            for target, mean in means.items():
+                error = mean - getattr(frame, target)
+                known = ~np.isnan(error)
+                self._squares[target] += np.where(known, error, 0.0) ** 2
+                self._samples[target] += known
+        self.observer.settle()
+
+    def quantile(self, share: float) -> float:
+        """Return a quantile of the latencies [s]; NaN without a frame."""
+        if not (total := self._counts.sum()):
+            return float("nan")
+        bin_ = int(np.searchsorted(np.cumsum(self._counts), share * total))
+        return float(BINS[min(bin_, len(BINS) - 1)])
+
+    def errors(self, modes: Sequence[str]) -> dict[str, dict[str, float | None]]:
+        """Return target -> mode -> rms error after the warm-up [nm], None without a sample."""
+        return {
+            target: {name: _rms(float(s), int(n)) for name, s, n in zip(modes, squares, self._samples[target], strict=True)}
+            for target, squares in self._squares.items()
+        }
+
+    def error(self) -> float | None:
+        """Return the rms error over all targets and modes [nm]."""
+        return _rms(sum(float(s.sum()) for s in self._squares.values()), sum(int(n.sum()) for n in self._samples.values()))
+
+
+def _rms(squares: float, samples: int) -> float | None:
+    return float(np.sqrt(squares / samples)) * 1e3 if samples else None
+
+
+def default_observers() -> list[str]:
+    """Return the ids of the observers that run frame by frame, but for those whose step may be longer than a frame."""
+    return [o.id for o in OBSERVERS.values() if o.step is not None and o.id not in LONG_STEPS]
+
+
+def follow(
+    scenario: Scenario,
+    n_frames: int,
+    observers: Sequence[str] | None = None,
+    *,
+    speed: float = 1.0,
+    keep: Callable[[LiveFrame], None] | None = None,
+    report: Callable[[float], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Let observers follow the simulated loop in real time.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    n_frames : int
+        Frames to follow.
+    observers : sequence of str, optional
+        Ids; by default those of `default_observers`.
+    speed : float
+        1 is real time.
+    keep : callable, optional
+        Receives every frame.
+    report : callable
+        Receives the share that is done, about once a second.
+
+    Returns
+    -------
+    dict
+        "frames" delivered to every observer, "lost", "late_share" (reached the observers more than 1 ms after they were due) and
+        "observers": id -> latency "p50_us", "p99_9_us", frames "late" (longer than a frame), "rms_nm" over all targets and modes,
+        "errors_nm" by target and mode.
+
+    Raises
+    ------
+    SettingError
+        An observer is unknown or does not run frame by frame, or the scenario has events.
+    """
+    check_live(scenario)
+    chosen = list(observers) if observers else default_observers()
+    pace = scenario.dt / speed
+    first = round(scenario.run.warm_up / scenario.dt)
+    try:
+        followers = {name: Follower(design(name, scenario), first, pace) for name in dict.fromkeys(chosen)}
+    except StepError as error:
+        raise SettingError(str(error)) from None
+    source = SimulatedSource(scenario, speed, n_frames)
+    try:
+        source.start()
+        frames, lost, late = _drain(source, followers, n_frames, keep, report)
+    finally:
+        source.stop()
+    modes = [mode.name for mode in scenario.modes]
+    return {
+        "frames": frames,
+        "lost": lost,
+        "late_share": late / max(frames, 1),
+        "observers": {
+            name: {
+                "p50_us": f.quantile(0.5) * 1e6,
+                "p99_9_us": f.quantile(0.999) * 1e6,
+                "late": int(f.late),
+                "rms_nm": f.error(),
+                "errors_nm": f.errors(modes),
+            }
+            for name, f in followers.items()
+        },
+    }
+
+
+def _drain(
+    source: SimulatedSource,
+    followers: dict[str, Follower],
+    n_frames: int,
+    keep: Callable[[LiveFrame], None] | None,
+    report: Callable[[float], None],
+) -> tuple[int, int, int]:
+    """Take every frame of a source; return how many were taken, lost and late."""
+    ring, number, lost, late = source.ring, 0, 0, 0
+    gc.collect()
+    gc.freeze()
+    while number < n_frames:
+        if ring.count <= number:
+            if not source.is_alive and ring.count <= number:
+                break
+            sleep(POLL)
+            continue
+        frame = ring.read(number)
+        if frame is None:
+            lost += 1
+        else:
+            late += monotonic() - frame.due > LATE
+            for follower in followers.values():
+                follower.take(frame, number)
+            if keep is not None:
+                keep(frame)
+        number += 1
+        if number % 1000 == 0:
+            report(number / n_frames)
+    gc.unfreeze()
+    return number - lost, lost + n_frames - number, late
