@@ -21,6 +21,7 @@ from wfsobs.app.jobs.task import IDLE
 from wfsobs.app.pages.explore import Explore
 from wfsobs.app.pages.pages import Pages
 from wfsobs.app.pages.parts import WIDE
+from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import Post, Session
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, theme
@@ -76,7 +77,8 @@ class Dashboard:
         self.controls = Controls(self.store)
         self.actions = Actions(self.store)
         self.modes, self.units = ModeSwitch(self.store.run, self.display), UnitSwitch(self.display)
-        self.explore = Explore(self.store.run, self.display)
+        self.seeds = SeedRuns(self.store)
+        self.explore = Explore(self.store.run, self.display, self.seeds)
         self.connection = Connection(self.controls.take, width=0, height=0, margin=0)
         self.frame = Frame(width=0, height=0, margin=0)
         self.keyboard = Keyboard(width=0, height=0, margin=0, styles={"position": "absolute"})

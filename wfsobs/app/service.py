@@ -84,6 +84,10 @@ class Service:
         work: Work = lambda watch, tell: self._work(scenario, watch, tell, source)  # noqa: E731
         return Job("run", work, key=_key(scenario, source), cost=run_seconds(scenario), refusal=SettingError)
 
+    def seed_key(self, scenario: Scenario, source: Source | None, seed: int) -> str:
+        """Name the scores of a scenario's observers on the record of another seed."""
+        return f"seed {seed} of {_key(scenario, source)}"
+
     def close(self, timeout: float = 1.5) -> bool:
         """Stop every job; whether all have ended in time [s]. To set `queue.closing` alone does the same later."""
         return self.queue.close(timeout)

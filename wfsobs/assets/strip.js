@@ -46,6 +46,7 @@ export function render({model, el}) {
       value.append(unit)
     }
     part(card, "note", item.note)
+    if (item.range) part(card, "note", item.range).title = "where the mean error over seeds lies, at 95 % confidence"
     card.onclick = (event) => { if (event.detail < 2) toggle(item.name) }  // the second one of a double click does not count
     card.ondblclick = () => solo(item.name)
     card.onkeydown = (event) => {

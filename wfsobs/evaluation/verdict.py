@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 
 import numpy as np
 from scipy.stats import t as student
 
+from wfsobs.evaluation.evidence import LEVEL, Evidence, differ_in_pairs
 from wfsobs.evaluation.known_lines import given_lines, is_near
 from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best, row_label
 from wfsobs.evaluation.scores import BOUND, Score
@@ -23,9 +24,6 @@ from wfsobs.typing import Array
 
 BATCHES = 20
 """Pieces of the record whose mean squared errors are compared."""
-
-LEVEL = 0.05
-"""Of two equally good observers, the share of records in which a difference is called significant."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +49,7 @@ class Verdict:
     bound : the least error possible [um], None where it is not known
     lines : how many lines the vibration has
     harms : observers that are worse than no estimate, the worst first
+    seeds : over how many records of the scenario, whose mean error is that of `best`
     """
 
     best: Score
@@ -58,6 +57,7 @@ class Verdict:
     bound: float | None
     lines: int
     harms: tuple[Harm, ...]
+    seeds: int = 1
 
     def sentences(self, scale: float = 1e3, unit: str = "nm") -> list[str]:
         """Return the verdict in words; scale: from micrometres to the unit."""
@@ -76,11 +76,13 @@ def verdict(
     mode: str,
     *,
     simulation: Scenario | None = None,
+    evidence: Evidence | None = None,
 ) -> Verdict | None:
     """Return the verdict on one target and mode, None where nothing can be compared or there is no truth.
 
     scenario   : what the observers' priors were made from
     simulation : what the record was made from, so that the lines of the vibration are known
+    evidence   : errors over several seeds, on which the verdict then rests; where the errors lie is that of the record
     """
     of = [s for s in scores if (s.target, s.mode) == (target, mode)]
     ranked = sorted((s for s in of if can_be_best(s.observer, s.apart) and s.observer != NO_ESTIMATE), key=lambda s: s.rms)
@@ -92,7 +94,7 @@ def verdict(
     errors = {s.observer: _keep_scored(record, values[s.observer] - truth[:, column], s) for s in ranked}
     lines = () if simulation is None else tuple(line[0] for line in vibration_lines(simulation, column))
     first = ranked[0]
-    return Verdict(
+    found = Verdict(
         first,
         tuple(s.observer for s in ranked[1:] if not differs(errors[first.observer], errors[s.observer])),
         next((s.rms for s in of if s.observer == BOUND), None),
@@ -106,6 +108,30 @@ def verdict(
             for s in reversed(ranked)
             if s.rms >= s.truth_rms
         ),
+    )
+    return found if evidence is None else _over_seeds(found, evidence, {s.observer: s for s in ranked})
+
+
+def _over_seeds(found: Verdict, evidence: Evidence, scores: dict[str, Score]) -> Verdict:
+    """Return a verdict that rests on the errors of several seeds; as it was where they say nothing."""
+    target, mode = found.best.target, found.best.mode
+    leaders = evidence.leaders(target, mode)
+    if not leaders or leaders[0] not in scores:
+        return found
+    keys = {harm: (harm.observer, target, mode) for harm in found.harms if (harm.observer, target, mode) in evidence.errors}
+    errors, truths = evidence.errors, evidence.truths
+    mean = evidence.mean((leaders[0], target, mode))
+    assert mean is not None
+    return replace(
+        found,
+        best=replace(scores[leaders[0]], rms=mean),
+        ties=leaders[1:],
+        harms=tuple(
+            replace(harm, worse=differ_in_pairs(truths[key], errors[key]))
+            for harm, key in keys.items()
+            if errors[key].mean() >= truths[key].mean()
+        ),
+        seeds=evidence.n_seeds,
     )
 
 
@@ -174,10 +200,11 @@ def told_of(observer: str, lines: int) -> str:
 def _best_sentence(it: Verdict, scale: float, unit: str) -> str:
     target, mode, name = it.best.target.capitalize(), it.best.mode, row_label(it.best.observer)
     size = f"{_format_number(it.best.rms * scale)} {unit}"
+    seeds = f" over {it.seeds} seeds" if it.seeds > 1 else ""
     if it.ties:
-        start = f"{name} has the smallest error, {size}, tied with {_join_labels(it.ties)} on this record"
+        start = f"{name} has the smallest error, {size}, tied with {_join_labels(it.ties)}{seeds or ' on this record'}"
     else:
-        start = f"{name} is best, {size}"
+        start = f"{name} is best{seeds}, {size}"
     return f"{target}, {mode}: {start}{_to_bound(it, scale, unit)}; it is given {told_of(it.best.observer, it.lines)}."
 
 

@@ -17,8 +17,9 @@ log = logging.getLogger(__name__)
 
 RUNNING, DONE, CANCELLED, FAILED = "running", "done", "cancelled", "failed"
 
-CLICK, SWEEP = 0, 1
-"""Priorities: somebody waits for the answer to a click; a search or a long run takes its time anyway."""
+CLICK, SWEEP, IDLE_TIME = 0, 1, 2
+"""Priorities: somebody waits for the answer to a click; a search or a long run takes its time anyway; what nobody has asked for
+is done while there is nothing else, and begins again after all else."""
 
 LONG = 5.0
 """A job that takes longer is no click [s]."""
@@ -107,8 +108,11 @@ class Job:
         if self._known.get("place", 0) != place:
             self.tell(place=place)
 
-    def run(self, closing: Callable[[], bool], keep: Callable[[str, Any], Any]) -> None:
-        """Do the work, in a thread of the queue. Keep is given the key, if there is one, and the result."""
+    def run(self, closing: Callable[[], bool], keep: Callable[[str, Any], Any], busy: Callable[[], bool] = lambda: False) -> bool:
+        """Do the work, in a thread of the queue; return whether it gave way and is to be done again.
+
+        Keep is given the key, if there is one, and the result; busy tells a job for idle time that there is other work.
+        """
         start, told = monotonic(), 0.0
         event(f"{self.kind}-start", **{self.kind: self.number}, session=self.owner, wait=start - self.since, estimate=self.cost)
 
@@ -121,13 +125,25 @@ class Job:
         def stopped() -> bool:
             return self._unwanted or closing()
 
+        gave_way = False
+
+        def gives_way() -> bool:
+            nonlocal gave_way
+            gave_way = gave_way or (self.priority == IDLE_TIME and busy())
+            return gave_way
+
         said, news = "failed", {"state": FAILED}
         try:
-            result = self._work(Watch(progress, lambda: stopped() or monotonic() - start > self.time_limit), self.tell)
+            result = self._work(
+                Watch(progress, lambda: stopped() or gives_way() or monotonic() - start > self.time_limit), self.tell
+            )
             if self.key:
                 keep(self.key, result)
             said, news = "done", {"state": DONE, "progress": 1.0, "result": result}
         except Cancelled:
+            if gave_way and not stopped():
+                said = "gave way"
+                return True
             if stopped() or monotonic() - start <= self.time_limit:
                 said, news = "cancelled", {"state": CANCELLED}
             else:
@@ -140,4 +156,6 @@ class Job:
         finally:
             level = logging.ERROR if said == "failed" else logging.INFO
             event(f"{self.kind}-end", level, **{self.kind: self.number}, state=said, seconds=monotonic() - start)
-            self.tell(**news)
+            if said != "gave way":
+                self.tell(**news)
+        return False

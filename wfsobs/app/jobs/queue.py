@@ -15,7 +15,7 @@ from time import monotonic
 from typing import Any
 
 from wfsobs.app.cache import Cache
-from wfsobs.app.jobs.job import CANCELLED, CLICK, DONE, FAILED, Job, Listener
+from wfsobs.app.jobs.job import CANCELLED, CLICK, DONE, FAILED, IDLE_TIME, Job, Listener
 from wfsobs.app.logs import event
 
 log = logging.getLogger(__name__)
@@ -27,9 +27,9 @@ PATIENCE = 60.0
 class JobQueue:
     """Threads of their own, as many as jobs may be done at once, and the results kept of jobs that have a key.
 
-    Clicks go before sweeps, then turns are taken: the first job of every owner before the second of anybody, whoever comes
-    later beginning with the turn that is being done, and within a turn first come first served. What is wanted twice is done
-    once.
+    Clicks go before sweeps, and both before what is done in idle time, which gives way to them. Then turns are taken: the first
+    job of every owner before the second of anybody, whoever comes later beginning with the turn that is being done, and within a
+    turn first come first served. What is wanted twice is done once.
     """
 
     def __init__(self, workers: int, cache: Cache[Any]):
@@ -81,7 +81,7 @@ class JobQueue:
             self._timers[job].daemon = True
             self._timers[job].start()
         owner = job.owner
-        job.turn = max([self._turn, *(other.turn + 1 for other in (*self._running, *self._waiting) if other.owner == owner)])
+        job.turn = max([self._turn, *(other.turn + 1 for other in self._asked if other.owner == owner)])
         self._waiting.append(job)
         self._changed.notify_all()
         self._tell_places()
@@ -141,14 +141,19 @@ class JobQueue:
     def _work(self) -> None:
         lower_priority()
         while (job := self._next()) is not None:
+            again = False
             try:
-                job.run(lambda: self.closing, self.cache.put)
+                again = job.run(lambda: self.closing, self.cache.put, self._is_busy)
             except Exception:  # a bug, but the thread is for all
                 log.exception("a job failed")
             finally:
                 with self._changed:
                     self._running.remove(job)
-                    self._take_out(job)
+                    if again:
+                        self._waiting.append(job)
+                    else:
+                        self._take_out(job)
+                    self._changed.notify_all()
                 del job
                 release_memory()
 
@@ -156,8 +161,8 @@ class JobQueue:
         """Take the first job of the line; None when there will be no more."""
         with self._changed:
             while not self.closing:
-                if self._waiting:
-                    job = self._line()[0]
+                job = self._line()[0] if self._waiting else None
+                if job is not None and not (job.priority == IDLE_TIME and self._is_busy()):
                     self._waiting.remove(job)
                     if job in self._timers:
                         self._timers.pop(job).cancel()
@@ -172,7 +177,20 @@ class JobQueue:
     def _line(self) -> list[Job]:
         """Who waits, in the order of their turns."""
         late = monotonic() - PATIENCE
-        return sorted(self._waiting, key=lambda job: (CLICK if job.since < late else job.priority, job.turn))
+
+        def place(job: Job) -> tuple[int, int]:
+            return CLICK if job.since < late and job.priority != IDLE_TIME else job.priority, job.turn
+
+        return sorted(self._waiting, key=place)
+
+    @property
+    def _asked(self) -> list[Job]:
+        """Jobs that somebody has asked for, waiting or being done."""
+        return [job for job in (*self._running, *self._waiting) if job.priority != IDLE_TIME]
+
+    def _is_busy(self) -> bool:
+        """Whether somebody waits for a job."""
+        return bool(self._asked)
 
     def _tell_places(self) -> None:
         """Tell the waiting jobs their places; a free thread takes the next job at once."""

@@ -15,10 +15,12 @@ from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Disp
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.parts import WIDE, box
 from wfsobs.app.render import macro
+from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import HEARD, asset
 from wfsobs.app.views.main_lines import MainLines
 from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.plots import call
+from wfsobs.app.views.seed_switch import SeedSwitch
 from wfsobs.app.views.spectra import MODEL, PEAKS, SpectraFigures
 from wfsobs.app.views.strip import Strip
 from wfsobs.app.views.table import Table
@@ -43,20 +45,20 @@ MARKS = macro("marks", PEAKS, MODEL)
 class Explore:
     """The page; its figures rest while it is hidden."""
 
-    def __init__(self, run: BackgroundTask, display: Display):
-        self.display = display
+    def __init__(self, run: BackgroundTask, display: Display, seeds: SeedRuns | None = None):
+        self.display, self.seeds = display, seeds
         self.lines = MainLines(run, display)
         self.traces, self.spectra = Traces(run, display), SpectraFigures(run, display)
-        self.strips = {target: Strip(target, run, display) for target in TARGETS}
-        self.verdicts = {target: VerdictLine(target, run, display) for target in TARGETS}
-        self.table = Table(run, display)
+        self.strips = {target: Strip(target, run, display, seeds) for target in TARGETS}
+        self.verdicts = {target: VerdictLine(target, run, display, seeds) for target in TARGETS}
+        self.table = Table(run, display, seeds)
         self.pinning = Pinning(run, display)
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
         body = pn.Column(
             *(self._section(target) for target in TARGETS),
-            box("RMS errors", self._best_first(), self.table.pane),
+            box("RMS errors", self._above_table(), self.table.pane),
             **WIDE,
             stylesheets=[GAP],
         )
@@ -77,6 +79,10 @@ class Explore:
             align_items="center",
             **WIDE,
         )
+
+    def _above_table(self) -> pn.FlexBox:
+        seeds = SeedSwitch(self.seeds).view() if self.seeds else []
+        return pn.FlexBox(self._best_first(), *seeds, gap="4px 16px", align_items="center", **WIDE)
 
     def _best_first(self) -> pmui.Checkbox:
         return pmui.Checkbox.from_param(self.display.param.best_first, size="small", margin=(0, 0, 4, 0))

@@ -13,6 +13,7 @@ from wfsobs.app.glossary import RELATIVE, TERMS
 from wfsobs.app.jobs.job import RUNNING
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.numbers import NOTHING, number
+from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.table import find
 from wfsobs.app.work import TRUTH, RunResults
@@ -25,7 +26,7 @@ MAIN = "Show the main ones"
 class Cards(JSComponent):
     """The cards in the browser; a click on one hides or shows its line, a double click shows it alone."""
 
-    items = param.List([], doc="{name, label, colour, dash, value, unit, note} of every card.")
+    items = param.List([], doc="{name, label, colour, dash, value, unit, note, range} of every card.")
     hidden = param.List([], doc="Names of the cards whose lines are hidden.")
     terms = param.Dict({}, doc="Word that stands on the cards -> what it means.")
     main = param.String("", doc="What the button is called that shows the lines that matter; none if empty.")
@@ -45,12 +46,14 @@ class Cards(JSComponent):
 class Strip:
     """The cards of one target, in step with the results and the switches."""
 
-    def __init__(self, target: str, run: BackgroundTask, display: Display):
-        self.target, self.run, self.display = target, run, display
+    def __init__(self, target: str, run: BackgroundTask, display: Display, seeds: SeedRuns | None = None):
+        self.target, self.run, self.display, self.seeds = target, run, display, seeds
         self.cards = Cards(
             items=self.items(), main=MAIN, terms={RELATIVE: TERMS[RELATIVE]}, sizing_mode="stretch_width", margin=0
         )
         run.param.watch(self._refresh, ["result", "state"])
+        if seeds is not None:
+            seeds.param.watch(self._refresh, "evidence")
         display.param.watch(self._refresh, ["mode", "unit", "dark"])
         display.param.watch(self._hide, "hidden")
 
@@ -73,7 +76,13 @@ class Strip:
                 return self._without_truth(name, results)
             waiting = self.run.state == RUNNING
             return self._card(name, None, "computing …" if waiting else "no result")
-        return self._score_fields(name, score, results, "truth")
+        return self._score_fields(name, score, results, "truth") | {"range": self._range(name, results)}
+
+    def _range(self, name: str, results: RunResults) -> str:
+        """Write the interval of the mean error over several seeds; empty where there is none."""
+        evidence = self.seeds.evidence if self.seeds else None
+        interval = evidence.interval((name, self.target, self.display.mode)) if evidence else None
+        return " – ".join(number(self._in_unit(x, results)) for x in interval) if interval else ""
 
     def _score_fields(self, name: str, score: Score, results: RunResults, base: str) -> dict[str, Any]:
         relative = f"{score.normalised_rms:.2f} × {base}" if score.normalised_rms is not None else ""
@@ -107,6 +116,7 @@ class Strip:
             "colour": it.colour(self.display.dark),
             "dash": list(it.dash),
             "note": note,
+            "range": "",
             "value": NOTHING if value is None else number(value),
             "unit": "" if value is None else self.display.unit_label,
         }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import panel as pn
 from markupsafe import Markup
@@ -14,6 +14,7 @@ from wfsobs.app.glossary import term
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.numbers import NOTHING, change, number
 from wfsobs.app.render import Row, macro, table
+from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import RunResults
 from wfsobs.evaluation.rows import (
@@ -29,7 +30,9 @@ from wfsobs.evaluation.rows import (
 from wfsobs.evaluation.scores import BOUND, LOOP, RESIDUAL, Score
 from wfsobs.observers.base import TARGETS
 
-BEST, ABOVE = macro("tag", "best", "best"), macro("tag", "above", "above truth")
+BEST, TIED, ABOVE = macro("tag", "best", "best"), macro("tag", "tied", "tied"), macro("tag", "above", "above truth")
+
+OVER_SEEDS = "where the mean error over records lies, at 95 % confidence"
 
 
 def find(results: RunResults, observer: str, target: str, mode: str) -> Score | None:
@@ -40,10 +43,12 @@ def find(results: RunResults, observer: str, target: str, mode: str) -> Score | 
 class Table:
     """Every score of the mode shown, one row per observer and target."""
 
-    def __init__(self, run: BackgroundTask, display: Display):
-        self.run, self.display = run, display
+    def __init__(self, run: BackgroundTask, display: Display, seeds: SeedRuns | None = None):
+        self.run, self.display, self.seeds = run, display, seeds
         self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
         run.param.watch(self._refresh, "result")
+        if seeds is not None:
+            seeds.param.watch(self._refresh, "evidence")
         display.param.watch(self._refresh, ["mode", "unit", "dark", "best_first", "pinned"])
 
     def _refresh(self, *_: object) -> None:
@@ -100,21 +105,36 @@ class Table:
             name: find(shown, name, target, self.display.mode) if shown else None
             for name in (*observers_of(target, with_hidden=True), BOUND)
         }
-        best = min((s.rms for n, s in scores.items() if s and can_be_best(n, s.apart)), default=None)
+        marks = self._marks(target, scores)
         order = list(scores.items())
         if self.display.best_first:
             order.sort(key=lambda item: (item[1].apart, item[1].rms) if item[1] else (True, math.inf))
         title = f"{target.capitalize()}, {self.display.mode}{_stretch([s for s in scores.values() if s])}"
-        return title, [self._row(name, target, score, best) for name, score in order]
+        return title, [self._row(name, target, score, marks.get(name, Markup())) for name, score in order]
 
-    def _row(self, name: str, target: str, score: Score | None, best: float | None) -> Row:
+    def _marks(self, target: str, scores: Mapping[str, Score | None]) -> dict[str, Markup]:
+        """Mark the best: over several seeds only if it differs significantly from all others, which are tied with it if not."""
+        evidence = self.seeds.evidence if self.seeds else None
+        if evidence and (leaders := evidence.leaders(target, self.display.mode)):
+            return dict.fromkeys(leaders, TIED if len(leaders) > 1 else BEST)
+        best = min((s.rms for n, s in scores.items() if s and can_be_best(n, s.apart)), default=None)
+        return {n: BEST for n, s in scores.items() if s and s.rms == best and can_be_best(n, s.apart)}
+
+    def _over_seeds(self, name: str, target: str, scale: float) -> Markup:
+        """Write the interval of the mean error over several seeds, to stand behind that of the record."""
+        evidence = self.seeds.evidence if self.seeds else None
+        interval = evidence.interval((name, target, self.display.mode)) if evidence else None
+        if evidence is None or interval is None:
+            return Markup()
+        return macro("interval", *(number(x * scale) for x in interval), f"{OVER_SEEDS}, {evidence.n_seeds} seeds")
+
+    def _row(self, name: str, target: str, score: Score | None, mark: Markup) -> Row:
         shown, pinned = self.run.result, self._pinned_cells(name, target, score)
         cells = [NOTHING, *pinned, *[NOTHING] * 2, row_needs(name), *[NOTHING] * 3]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
-            is_best = score.rms == best and can_be_best(name, score.apart)
             cells = [
-                (BEST if is_best else "") + number(score.rms * scale) + _interval(score.interval, scale),
+                mark + number(score.rms * scale) + (_interval(score.interval, scale) or self._over_seeds(name, target, scale)),
                 *pinned,
                 number(score.truth_rms * scale),
                 (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),

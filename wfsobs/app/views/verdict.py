@@ -10,6 +10,7 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.glossary import BOUND, explain_first
 from wfsobs.app.jobs.job import DONE
 from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
 from wfsobs.evaluation.verdict import verdict
 
@@ -17,10 +18,12 @@ from wfsobs.evaluation.verdict import verdict
 class VerdictLine:
     """The verdict on one target in the mode and unit shown, once all observers are done."""
 
-    def __init__(self, target: str, run: BackgroundTask, display: Display):
-        self.target, self.run, self.display = target, run, display
+    def __init__(self, target: str, run: BackgroundTask, display: Display, seeds: SeedRuns | None = None):
+        self.target, self.run, self.display, self.seeds = target, run, display, seeds
         self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
         run.param.watch(self._refresh, ["result", "state"])
+        if seeds is not None:
+            seeds.param.watch(self._refresh, "evidence")
         display.param.watch(self._refresh, ["mode", "unit"])
 
     def _refresh(self, *_: object) -> None:
@@ -33,7 +36,14 @@ class VerdictLine:
             return ""
         it = shown.result
         found = verdict(
-            it.scenario, it.record, it.estimates, it.scores, self.target, self.display.mode, simulation=shown.simulation
+            it.scenario,
+            it.record,
+            it.estimates,
+            it.scores,
+            self.target,
+            self.display.mode,
+            simulation=shown.simulation,
+            evidence=self.seeds.evidence if self.seeds else None,
         )
         if found is None:
             return ""

@@ -1,0 +1,135 @@
+"""Further seeds in idle time: they give way, go with the settings, and say what is significant."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from time import monotonic, sleep
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app import seeds as module
+from wfsobs.app.cache import Cache
+from wfsobs.app.display import Display
+from wfsobs.app.jobs.job import CLICK, DONE, IDLE_TIME, SWEEP, Job
+from wfsobs.app.jobs.queue import JobQueue
+from wfsobs.app.seeds import SeedRuns
+from wfsobs.app.store import Store
+from wfsobs.app.views.seed_switch import SeedSwitch
+from wfsobs.app.views.strip import Strip
+from wfsobs.app.views.table import Table
+from wfsobs.app.views.verdict import VerdictLine
+from wfsobs.pipeline import run
+from wfsobs.progress import Watch
+
+
+@pytest.fixture
+def queue() -> Iterator[JobQueue]:
+    queue = JobQueue(1, Cache(1_000_000))
+    yield queue
+    queue.close(5.0)
+
+
+def wait(condition: Any) -> None:
+    end = monotonic() + 30.0
+    while not condition():
+        assert monotonic() < end
+        sleep(0.005)
+
+
+def test_a_job_for_idle_time_gives_way_to_a_click_and_begins_again(queue: JobQueue) -> None:
+    begun, log, go = threading.Event(), [], threading.Event()
+
+    def idle(watch: Watch, _tell: Any) -> str:
+        log.append("idle begins")
+        begun.set()
+        while not go.is_set():
+            watch.check()
+            sleep(0.005)
+        return "idle"
+
+    heard: list[Any] = []
+    queue.submit(Job("seed", idle, priority=IDLE_TIME), "a", heard.append)
+    begun.wait(30)
+    for priority in (CLICK, SWEEP):
+        before = len(log)
+        queue.submit(Job("run", lambda *_: log.append("click"), priority=priority), "b", lambda _news: None)
+        wait(lambda before=before: len(log) >= before + 2)
+        assert log[before:] == ["click", "idle begins"]
+    go.set()
+    wait(lambda: any("result" in news for news in heard))
+    # It was told nothing of giving way: no state but the last.
+    assert [news["state"] for news in heard if "state" in news] == [DONE]
+
+
+def test_idle_time_does_not_take_the_turn_of_who_asks(queue: JobQueue) -> None:
+    log, go, begun = [], threading.Event(), threading.Event()
+
+    def first(*_: Any) -> None:
+        begun.set()
+        go.wait(30)
+
+    queue.submit(Job("run", first), "c", lambda _news: None)
+    begun.wait(30)
+    for _ in range(3):
+        queue.submit(Job("seed", lambda *_: log.append("idle"), priority=IDLE_TIME), "a", lambda _news: None)
+    queue.submit(Job("run", lambda *_: log.append("a")), "a", lambda _news: None)
+    queue.submit(Job("run", lambda *_: log.append("b")), "b", lambda _news: None)
+    go.set()
+    wait(lambda: len(log) == 5)
+    assert log == ["a", "b", "idle", "idle", "idle"]
+
+
+@pytest.fixture
+def store(make_store: Any, monkeypatch: pytest.MonkeyPatch) -> Store:
+    monkeypatch.setattr(module, "REST", 0.0)
+    return make_store()
+
+
+def test_every_seed_is_that_of_the_library_and_the_views_say_so(store: Store, loop: Any, short: Any) -> None:
+    seeds, display = SeedRuns(store), Display()
+    seeds.count = 3
+    table, strip = Table(store.run, display, seeds), Strip("vibration", store.run, display, seeds)
+    verdict, switch = VerdictLine("vibration", store.run, display, seeds), SeedSwitch(seeds)
+    store.start()
+    loop.until(lambda: seeds.done == 3)
+    assert seeds.evidence is not None and seeds.evidence.n_seeds == 3
+    key = ("kf-lgs", "turbulence", "tip")
+    scores = [run(short.replace({"run.seed": short.run.seed + i})).scores for i in range(3)]
+    expected = [next(s.rms for s in of if (s.observer, s.target, s.mode) == key) for of in scores]
+    # The same computation; rounding may depend on the threads of BLAS.
+    np.testing.assert_allclose(seeds.evidence.errors[key], expected, rtol=1e-9)
+    low, high = seeds.evidence.interval(("kf-lgs", "vibration", "tip")) or (0.0, 0.0)
+    assert f"{1e3 * low:.1f}"[:3] in table.html() and "3 seeds" in table.html()
+    card = next(item for item in strip.items() if item["name"] == "kf-lgs")
+    assert card["range"].count("–") == 1 and float(card["range"].split()[0]) == pytest.approx(1e3 * low, rel=6e-3)
+    assert "over 3 seeds" in verdict.html() and "over 3 seeds" in switch.text()
+    assert high > low
+
+
+def test_a_change_of_settings_cancels_them_and_one_seed_is_none(store: Store, loop: Any) -> None:
+    seeds = SeedRuns(store)
+    store.start()
+    loop.until(lambda: seeds.done >= 2)
+    store.change("turbulence.wind_speed", 12.0)
+    assert seeds.evidence is None and seeds.done == 0 and seeds.task.state != DONE
+    seeds.count = 1
+    loop.finish(store)
+    assert seeds.done == 1 and seeds.evidence is None and store.session.service.queue.length == 0
+    seeds.count = 2
+    loop.until(lambda: seeds.done == 2)
+    assert seeds.evidence is not None
+
+
+def test_a_loaded_record_has_no_other_seeds(store: Store, loop: Any) -> None:
+    from wfsobs.app.sources import LoadedRecord
+    from wfsobs.simulation.loop import simulate
+
+    seeds = SeedRuns(store)
+    store.source = LoadedRecord(simulate(store.scenario), "mine", "key")
+    store.start()
+    loop.finish(store)
+    assert store.run.state == DONE and seeds.done == 1 and seeds.evidence is None and not seeds.possible
+    assert "only for simulations" in SeedSwitch(seeds).text()

@@ -1,0 +1,28 @@
+"""Further seeds in idle time, as a visitor sees them: intervals come, a change of settings takes them away."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from playwright.sync_api import Page, expect
+
+QUICK = "?run.duration=2.0&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5"
+
+
+def test_seeds_give_intervals_and_go_with_the_settings(open_page: Any, server: Any) -> None:
+    page: Page = open_page(url=server.url + QUICK)
+    field = page.get_by_label("Seeds", exact=True)
+    field.fill("3")
+    field.press("Enter")
+    expect(page.locator(".seeds")).to_have_text("over 3 seeds", timeout=120_000)
+    row = page.locator('tr[data-target="vibration"][data-observer="kf-lgs"]')
+    expect(row.locator("td").first).to_contain_text(re.compile(r"\d – \d"))
+    expect(row.locator(".range")).to_have_attribute("title", re.compile("3 seeds$"))
+    expect(page.locator('.card[data-name="kf-lgs"]').first).to_contain_text(re.compile(r"\d – \d"))
+    expect(page.locator("p.verdict").first).to_contain_text("over 3 seeds")
+    field.fill("1")
+    field.press("Enter")
+    expect(page.locator(".seeds")).to_have_text("one record")
+    expect(row.locator(".range")).to_have_count(0)
+    expect(page.locator("p.verdict").first).not_to_contain_text("over 3 seeds")

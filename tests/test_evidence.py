@@ -1,0 +1,78 @@
+"""What seeds say: intervals with the coverage that they claim, and differences pair by pair."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import ttest_1samp, ttest_rel
+
+from wfsobs.evaluation.evidence import differ_in_pairs, gather_evidence
+from wfsobs.evaluation.scores import Score
+from wfsobs.evaluation.verdict import verdict
+from wfsobs.pipeline import run
+from wfsobs.scenario.presets import PRESETS
+
+
+def score(observer: str, rms: float, apart: bool = False) -> Score:
+    return Score(observer, "vibration", "tip", rms, 1.0, rms, None, 0.0, 0.0, 1.0, apart)
+
+
+def test_a_difference_is_that_of_a_paired_t_test() -> None:
+    rng = np.random.default_rng(1)
+    for shift in np.linspace(0.0, 2.0, 9):
+        one = rng.normal(10.0, 3.0, 8)
+        other = one + rng.normal(shift, 1.0, 8)
+        assert differ_in_pairs(one, other) == (ttest_rel(one, other).pvalue < 0.05)
+
+
+def test_the_interval_is_that_of_the_mean() -> None:
+    values = [10.0, 11.5, 9.0, 10.2, 10.9]
+    found = gather_evidence([[score("kf-lgs", x)] for x in values])
+    expected = ttest_1samp(values, 0.0).confidence_interval(0.95)
+    assert found.interval(("kf-lgs", "vibration", "tip")) == pytest.approx((expected.low, expected.high))
+    assert found.mean(("kf-lgs", "vibration", "tip")) == pytest.approx(np.mean(values))
+
+
+def test_leaders_are_the_best_and_those_that_do_not_differ() -> None:
+    noise = np.array([0.0, 1.0, -1.0, 2.0, -2.0])
+    base = np.array([10.0, 14.0, 9.0, 12.0, 11.0])
+    names = {
+        "kf-multi": base,
+        "ridge": base + 0.1 * noise + 0.02,
+        "kf-lgs": base + 1.0 + 0.1 * noise,
+        "butterworth-ol": base - 5.0,
+    }
+    found = gather_evidence([[score(name, float(x[i])) for name, x in names.items()] for i in range(5)])
+    # The one that looks ahead cannot be best, however small its error.
+    assert found.leaders("vibration", "tip") == ("kf-multi", "ridge")
+    assert gather_evidence([[score("kf-lgs", 1.0)]] * 2).leaders("vibration", "tip") == ()
+
+
+def test_rows_that_are_missing_or_apart_in_a_seed_say_nothing() -> None:
+    found = gather_evidence(
+        [[score("kf-lgs", 1.0), score("ridge", 2.0)], [score("kf-lgs", 1.0), score("ridge", 2.0, apart=True)]]
+    )
+    assert set(found.errors) == {("kf-lgs", "vibration", "tip")}
+
+
+def test_the_verdict_over_seeds_has_their_mean_and_says_how_many() -> None:
+    scenario = PRESETS["paper"]().replace({"run.duration": 3.0, "run.warm_up": 1.0})
+    observers = ["kf-lgs", "kf-multi", "ridge-30", "zero"]
+    results = [run(scenario.replace({"run.seed": 1 + i}), observers=observers) for i in range(4)]
+    evidence, first = gather_evidence([r.scores for r in results]), results[0]
+    found = verdict(
+        first.scenario, first.record, first.estimates, first.scores, "vibration", "tip", simulation=scenario, evidence=evidence
+    )
+    assert found is not None and found.best.observer == "kf-multi" and found.seeds == 4
+    of = [s.rms for r in results for s in r.scores if (s.observer, s.target, s.mode) == ("kf-multi", "vibration", "tip")]
+    assert found.best.rms == pytest.approx(np.mean(of))
+    assert "is best over 4 seeds, " in found.sentences()[0] or "over 4 seeds, at" in found.sentences()[0]
+    single = verdict(first.scenario, first.record, first.estimates, first.scores, "vibration", "tip", simulation=scenario)
+    assert single is not None and "seeds" not in " ".join(single.sentences())
+    worse = replace(evidence, errors={k: v * (100.0 if k[0] == "kf-lgs" else 1.0) for k, v in evidence.errors.items()})
+    harm = verdict(
+        first.scenario, first.record, first.estimates, first.scores, "vibration", "tip", simulation=scenario, evidence=worse
+    )
+    assert harm is not None and all(h.worse for h in harm.harms if h.observer == "kf-lgs")

@@ -1,0 +1,120 @@
+"""Further seeds of the scenario shown, run in idle time: what they say of the errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import perf_counter, sleep
+
+import numpy as np
+import param
+
+from wfsobs.app.jobs.job import DONE, IDLE_TIME, Job, Tell
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
+from wfsobs.app.store import Store
+from wfsobs.app.work import RunResults
+from wfsobs.cost import run_seconds
+from wfsobs.evaluation.evidence import Evidence, gather_evidence
+from wfsobs.evaluation.scores import Score
+from wfsobs.pipeline import observe
+from wfsobs.progress import Watch
+from wfsobs.scenario import Scenario
+from wfsobs.settings.group import SettingError
+from wfsobs.simulation.loop import simulate
+
+SEEDS = 8
+"""How many seeds there are unless chosen, the one shown among them."""
+
+MOST = 50
+
+REST = 1.0
+"""Time left to the page and the browser before a seed [s]."""
+
+PATIENCE = 20.0
+"""A scenario whose run takes longer has no further seeds [s]."""
+
+
+@dataclass(frozen=True)
+class SeedScores:
+    """The scores of one seed, and their errors as an array, whose size the cache counts."""
+
+    scores: tuple[Score, ...]
+    errors: np.ndarray
+
+
+def run_seed(scenario: Scenario, source: Source | None, seed: int, watch: Watch, _tell: Tell) -> SeedScores:
+    """Run every observer on the record of another seed, after a rest. Raises SettingError, Cancelled."""
+    until = perf_counter() + REST
+    while perf_counter() < until:
+        watch.check()
+        sleep(0.02)
+    simulation = (scenario if source is None or source.simulation is None else source.simulation).replace({"run.seed": seed})
+    result = observe(simulate(simulation, watch=watch), scenario, watch=watch)
+    return SeedScores(result.scores, np.array([s.rms for s in result.scores]))
+
+
+class SeedRuns(param.Parameterized):
+    """One seed after the other, once a run is done; what has been found of a scenario goes with it."""
+
+    count = param.Integer(SEEDS, bounds=(1, MOST), label="Seeds", doc="Seeds whose records are compared; 1 is the one shown.")
+    evidence: Evidence | None = param.Parameter(None, doc="What the seeds done so far say; None for one alone.")  # type: ignore
+
+    def __init__(self, store: Store):
+        super().__init__()
+        self.store, self.run, self.task = store, store.run, BackgroundTask(store.session)
+        self._of: RunResults | None = None
+        self._scores: list[Sequence[Score]] = []
+        self.run.param.watch(self._follow, ["state", "result"])
+        store.param.watch(self._follow, "stale")
+        self.task.param.watch(self._take, "result")
+        self.param.watch(self._go_on, "count")
+
+    @property
+    def done(self) -> int:
+        """How many seeds are known."""
+        return min(len(self._scores), self.count)
+
+    @property
+    def possible(self) -> bool:
+        """Whether the record shown can be simulated with other seeds, in a time that is not too long."""
+        of = self._of
+        return of is not None and not isinstance(of.source, LoadedRecord) and run_seconds(of.scenario) <= PATIENCE
+
+    def _follow(self, *_: object) -> None:
+        """Begin anew with what is shown, once it is complete."""
+        shown = self.run.result if self.run.state == DONE and not self.store.stale else None
+        if shown is self._of:
+            return
+        self.task.close()
+        self._of, self._scores = shown, [shown.result.scores] if shown is not None else []
+        self._go_on()
+
+    def _take(self, *_: object) -> None:
+        found = self.task.result
+        if found is not None and self._of is not None:
+            self._scores.append(found.scores)
+            self.task.result = None  # the next may be the same
+            self._go_on()
+
+    def _go_on(self, *_: object) -> None:
+        """Say what is known, and have the next seed run."""
+        self.evidence = gather_evidence(self._scores[: self.count]) if self.done > 1 else None
+        if not self.possible or len(self._scores) >= self.count:
+            self.task.close()
+        else:
+            assert self._of is not None
+            self.task.start(self._job(self._of, len(self._scores)))
+
+    def _job(self, of: RunResults, number: int) -> Job:
+        source = of.source
+        simulated = source.simulation if isinstance(source, SimulatedRecord) else of.scenario
+        seed = simulated.run.seed + number
+        return Job(
+            "seed",
+            lambda watch, tell: run_seed(of.scenario, source, seed, watch, tell),
+            key=self.task.session.service.seed_key(of.scenario, source, seed),
+            cost=run_seconds(of.scenario),
+            priority=IDLE_TIME,
+            refusal=SettingError,
+        )
