@@ -10,19 +10,24 @@ from playwright.sync_api import Page, expect
 QUICK = "?run.duration=2.0&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5"
 
 
+def set_seeds(page: Page, count: int) -> None:
+    """Type a number, see it, and leave the field."""
+    field = page.get_by_label("Seeds", exact=True)
+    field.fill(str(count))
+    expect(field).to_have_value(str(count))
+    field.press("Tab")
+
+
 def test_seeds_give_intervals_and_go_with_the_settings(open_page: Any, server: Any) -> None:
     page: Page = open_page(url=server.url + QUICK)
-    field = page.get_by_label("Seeds", exact=True)
-    field.fill("3")
-    field.press("Enter")
+    set_seeds(page, 3)
     expect(page.locator(".seeds")).to_have_text("over 3 seeds", timeout=120_000)
     row = page.locator('tr[data-target="vibration"][data-observer="kf-lgs"]')
     expect(row.locator("td").first).to_contain_text(re.compile(r"\d – \d"))
     expect(row.locator(".range")).to_have_attribute("title", re.compile("3 seeds$"))
     expect(page.locator('.card[data-name="kf-lgs"]').first).to_contain_text(re.compile(r"\d – \d"))
     expect(page.locator("p.verdict").first).to_contain_text("over 3 seeds")
-    field.fill("1")
-    field.press("Enter")
+    set_seeds(page, 1)
     expect(page.locator(".seeds")).to_have_text("one record")
     expect(row.locator(".range")).to_have_count(0)
     expect(page.locator("p.verdict").first).not_to_contain_text("over 3 seeds")
