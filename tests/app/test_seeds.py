@@ -94,7 +94,7 @@ def test_every_seed_is_that_of_the_library_and_the_views_say_so(store: Store, lo
     table, strip = Table(store.run, display, seeds), Strip("vibration", store.run, display, seeds)
     verdict, switch = VerdictLine("vibration", store.run, display, seeds), SeedSwitch(seeds)
     store.start()
-    loop.until(lambda: seeds.done == 3)
+    loop.until(lambda: seeds.n_known == 3)
     assert seeds.evidence is not None and seeds.evidence.n_seeds == 3
     key = ("kf-lgs", "turbulence", "tip")
     scores = [run(short.replace({"run.seed": short.run.seed + i})).scores for i in range(3)]
@@ -112,14 +112,14 @@ def test_every_seed_is_that_of_the_library_and_the_views_say_so(store: Store, lo
 def test_a_change_of_settings_cancels_them_and_one_seed_is_none(store: Store, loop: Any) -> None:
     seeds = SeedRuns(store)
     store.start()
-    loop.until(lambda: seeds.done >= 2)
+    loop.until(lambda: seeds.n_known >= 2)
     store.change("turbulence.wind_speed", 12.0)
-    assert seeds.evidence is None and seeds.done == 0 and seeds.task.state != DONE
+    assert seeds.evidence is None and seeds.n_known == 0 and seeds.task.state != DONE
     seeds.count = 1
     loop.finish(store)
-    assert seeds.done == 1 and seeds.evidence is None and store.session.service.queue.length == 0
+    assert seeds.n_known == 1 and seeds.evidence is None and store.session.service.queue.length == 0
     seeds.count = 2
-    loop.until(lambda: seeds.done == 2)
+    loop.until(lambda: seeds.n_known == 2)
     assert seeds.evidence is not None
 
 
@@ -131,5 +131,5 @@ def test_a_loaded_record_has_no_other_seeds(store: Store, loop: Any) -> None:
     store.source = LoadedRecord(simulate(store.scenario), "mine", "key")
     store.start()
     loop.finish(store)
-    assert store.run.state == DONE and seeds.done == 1 and seeds.evidence is None and not seeds.possible
+    assert store.run.state == DONE and seeds.n_known == 1 and seeds.evidence is None and not seeds.possible
     assert "only for simulations" in SeedSwitch(seeds).text()

@@ -71,7 +71,7 @@ class SeedRuns(param.Parameterized):
         self.param.watch(self._go_on, "count")
 
     @property
-    def done(self) -> int:
+    def n_known(self) -> int:
         """How many seeds are known."""
         return min(len(self._scores), self.count)
 
@@ -99,7 +99,7 @@ class SeedRuns(param.Parameterized):
 
     def _go_on(self, *_: object) -> None:
         """Say what is known, and have the next seed run."""
-        self.evidence = gather_evidence(self._scores[: self.count]) if self.done > 1 else None
+        self.evidence = gather_evidence(self._scores[: self.count]) if self.n_known > 1 else None
         if not self.possible or len(self._scores) >= self.count:
             self.task.close()
         else:

@@ -112,18 +112,18 @@ def verdict(
     return found if evidence is None else _over_seeds(found, evidence, {s.observer: s for s in ranked})
 
 
-def _over_seeds(found: Verdict, evidence: Evidence, scores: dict[str, Score]) -> Verdict:
+def _over_seeds(one: Verdict, evidence: Evidence, scores: dict[str, Score]) -> Verdict:
     """Return a verdict that rests on the errors of several seeds; as it was where they say nothing."""
-    target, mode = found.best.target, found.best.mode
+    target, mode = one.best.target, one.best.mode
     leaders = evidence.leaders(target, mode)
     if not leaders or leaders[0] not in scores:
-        return found
-    keys = {harm: (harm.observer, target, mode) for harm in found.harms if (harm.observer, target, mode) in evidence.errors}
+        return one
+    keys = {harm: (harm.observer, target, mode) for harm in one.harms if (harm.observer, target, mode) in evidence.errors}
     errors, truths = evidence.errors, evidence.truths
     mean = evidence.mean((leaders[0], target, mode))
     assert mean is not None
     return replace(
-        found,
+        one,
         best=replace(scores[leaders[0]], rms=mean),
         ties=leaders[1:],
         harms=tuple(

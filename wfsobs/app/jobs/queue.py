@@ -81,7 +81,7 @@ class JobQueue:
             self._timers[job].daemon = True
             self._timers[job].start()
         owner = job.owner
-        job.turn = max([self._turn, *(other.turn + 1 for other in self._asked if other.owner == owner)])
+        job.turn = max([self._turn, *(other.turn + 1 for other in self._requests if other.owner == owner)])
         self._waiting.append(job)
         self._changed.notify_all()
         self._tell_places()
@@ -184,13 +184,13 @@ class JobQueue:
         return sorted(self._waiting, key=place)
 
     @property
-    def _asked(self) -> list[Job]:
+    def _requests(self) -> list[Job]:
         """Jobs that somebody has asked for, waiting or being done."""
         return [job for job in (*self._running, *self._waiting) if job.priority != IDLE_TIME]
 
     def _is_busy(self) -> bool:
         """Whether somebody waits for a job."""
-        return bool(self._asked)
+        return bool(self._requests)
 
     def _tell_places(self) -> None:
         """Tell the waiting jobs their places; a free thread takes the next job at once."""

@@ -30,18 +30,18 @@ class SeedSwitch:
     def text(self) -> str:
         """Say how many seeds are done."""
         seeds = self.seeds
-        if not seeds.done:
+        if not seeds.n_known:
             said = ""
         elif seeds.count == 1:
             said = "one record"
         elif not seeds.possible:
             said = "only for simulations that do not take long"
         elif seeds.task.state == FAILED:
-            said = f"{seeds.done} of {seeds.count} seeds: {seeds.task.message}"
-        elif seeds.done < seeds.count:
-            said = f"{seeds.done} of {seeds.count} seeds, the next ones in idle time"
+            said = f"{seeds.n_known} of {seeds.count} seeds: {seeds.task.message}"
+        elif seeds.n_known < seeds.count:
+            said = f"{seeds.n_known} of {seeds.count} seeds, the next ones in idle time"
         else:
-            said = f"over {seeds.done} seeds"
+            said = f"over {seeds.n_known} seeds"
         return f'<span class="caption seeds">{said}</span>'
 
     def _refresh(self, *_: object) -> None:
