@@ -37,6 +37,8 @@ TINY = Sizes(
     more_steps=50,
     order=1,
     layers=2,
+    step_count=20,
+    paced_duration=0.02,
     longest_duration=0.3,
 )
 
@@ -47,13 +49,16 @@ KEYS = {
     "steps",
     "median_s",
     "per_step_us",
+    "p99_us",
     "p999_us",
+    "max_us",
     "ready_us",
     "ratio_to_ours",
     "max_error_over_std",
     "peak_memory_mb",
 }
 REQUIRED = {
+    "step": {OURS, "reference"},
     "online-gpr-record": {OURS, "ours-two-modes", "gemm-cholesky"},
     "online-gpr-stream": {OURS, "gemm-cholesky"},
     "offline-gpr-train": {OURS, "gemm-cholesky"},
@@ -84,7 +89,9 @@ def test_rows_are_complete(rows):
         assert r["median_s"] > 0 and r["ratio_to_ours"] > 0
         assert (r["per_step_us"] is None) == (r["steps"] is None) == (r["task"] == "offline-gpr-train")
         assert (r["ready_us"] is None) == (r["task"] != "online-gpr-stream")
-        assert (r["max_error_over_std"] is None) == (r["task"] in ("adaptive-record", "observer", "frozen-flow", "whole-run"))
+        assert (r["max_error_over_std"] is None) == (
+            r["task"] in ("adaptive-record", "observer", "step", "frozen-flow", "whole-run")
+        )
         assert r["variant"] != OURS or r["ratio_to_ours"] == 1.0
     assert {r["size"] for r in rows if r["peak_memory_mb"] is not None} == {
         "0.3 s, 2 modes",

@@ -99,14 +99,14 @@ def design(
 
 def _prior(
     name: str,
-    told: Prior | Scenario,
+    source: Prior | Scenario,
     parts: tuple[Part, ...],
     scenario: Scenario,
     sampling: Sampling,
     train: Record | Training | None,
 ) -> Prior:
     """Return these parts of what is told, for the modes of the loop."""
-    prior = told if isinstance(told, Prior) else prior_of(told.before_events, None, parts)
+    prior = source if isinstance(source, Prior) else prior_of(source.before_events, None, parts)
     prior = _of_modes(prior, name, sampling.n_modes)
     if Training in parts and prior.training is None:
         prior = replace(prior, training=_training(scenario, train))

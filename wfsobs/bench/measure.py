@@ -23,6 +23,7 @@ steps               : steps of the work that was timed, None where it has none
 median_s            : time of that work [s], median of repeats
 per_step_us         : the same per step [us]; of a stream the median over single steps, estimate and update together
 p999_us, ready_us   : of a stream: 99.9th percentile of a step, from 1000 steps on; sample to estimate, median [us]
+p99_us, max_us      : of steps that are timed one by one: 99th percentile and maximum [us]
 ratio_to_ours       : time, per step where there are steps, over that of `ours`
 max_error_over_std  : largest error of a result over the standard deviation of the results
 peak_memory_mb      : most memory the process has held until then [MB]
@@ -56,7 +57,9 @@ def row(
     steps: int | None = None,
     *,
     per_step_us: float | None = None,
+    p99_us: float | None = None,
     p999_us: float | None = None,
+    max_us: float | None = None,
     ready_us: float | None = None,
     error: float | None = None,
     peak_memory_mb: float | None = None,
@@ -71,7 +74,9 @@ def row(
         "steps": steps,
         "median_s": seconds,
         "per_step_us": per_step_us,
+        "p99_us": p99_us,
         "p999_us": p999_us,
+        "max_us": max_us,
         "ready_us": ready_us,
         "ratio_to_ours": None,
         "max_error_over_std": error,

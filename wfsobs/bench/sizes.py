@@ -24,6 +24,8 @@ class Sizes:
     more_online       : further (m, d) of the online GPR
     more_steps        : predicted steps of each of these
     order, layers     : radial order and number of layers of the larger frozen-flow task
+    step_count        : steps timed back to back, of every observer and controller
+    paced_duration    : of such steps at a paced rate [s]
     longest_duration  : of a whole run of which the memory is measured too [s], or None
     """
 
@@ -38,6 +40,8 @@ class Sizes:
     more_steps: int = 2048
     order: int = 5
     layers: int = 10
+    step_count: int = 2000
+    paced_duration: float = 1.0
     longest_duration: float | None = None
 
     def scenario(self, duration: float, changes: Mapping[str, Any] | None = None) -> Scenario:
@@ -46,4 +50,9 @@ class Sizes:
 
 
 QUICK = Sizes()
-FULL = Sizes(more_online=((511, 1000), (1024, 170), (1024, 1000), (2048, 170), (2048, 1000)), longest_duration=60.0)
+FULL = Sizes(
+    step_count=20_000,
+    paced_duration=60.0,
+    more_online=((511, 1000), (1024, 170), (1024, 1000), (2048, 170), (2048, 1000)),
+    longest_duration=60.0,
+)

@@ -12,6 +12,7 @@ from wfsobs.bench.filters import adaptive_record, kalman_record, multirate_recor
 from wfsobs.bench.gpr import offline, online_record, online_stream
 from wfsobs.bench.measure import OURS, Row, measure_time, peak_memory_mb, row, with_ratios
 from wfsobs.bench.sizes import Sizes
+from wfsobs.bench.steps import steps
 from wfsobs.bench.turbulence import frozen
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import run, run_observer
@@ -71,6 +72,7 @@ TASKS = (
     Task(multirate_record, 2.0),
     Task(adaptive_record, 2.0),
     Task(each_observer, 2.0),
+    Task(steps, 20.0),
     Task(frozen, 20.0),
     Task(whole_run, 3.0),
 )

@@ -27,5 +27,5 @@ def bench(full: bool, as_json: bool) -> None:
         return
     console = Console()
     table = bench_table(measured, markdown=not console.is_terminal)
-    (console if console.is_terminal else Console(width=200)).print(table)
+    (console if console.is_terminal else Console(width=240)).print(table)
     click.echo(benches.machine(benches.LIBRARIES))

@@ -16,7 +16,17 @@ def bench_table(rows: Sequence[Row], markdown: bool = False) -> Table:
     memory = any(r["peak_memory_mb"] is not None for r in rows)
     for name in ("Task", "Size", "Variant"):
         table.add_column(name, no_wrap=True)
-    numbers = ("steps", "median, ms", "us / step", "99.9 %, us", "ready, us", "ratio to ours", "error / std")
+    numbers = (
+        "steps",
+        "median, ms",
+        "us / step",
+        "99 %, us",
+        "99.9 %, us",
+        "max, us",
+        "ready, us",
+        "ratio to ours",
+        "error / std",
+    )
     for name in (*numbers, *(("peak, MB",) if memory else ())):
         table.add_column(name, justify="right", no_wrap=True)
     last = None
@@ -31,7 +41,9 @@ def bench_table(rows: Sequence[Row], markdown: bool = False) -> Table:
             "-" if r["steps"] is None else str(r["steps"]),
             _number(r["median_s"] * 1e3),
             _number(r["per_step_us"]),
+            _number(r["p99_us"]),
             _number(r["p999_us"]),
+            _number(r["max_us"]),
             _number(r["ready_us"]),
             _number(r["ratio_to_ours"]),
             "-" if r["max_error_over_std"] is None else f"{r['max_error_over_std']:.0e}",

@@ -27,6 +27,7 @@ COMMANDS = {
     "loop": Place("simulate", "Close the loop with every controller on the same disturbance and print what is left of it."),
     "observe": Place("telemetry", "Run the observers on a record: .npz, .csv, .fits or AOT."),
     "presets": Place("presets", "List the presets, or print one as TOML."),
+    "rt-check": Place("realtime", "Tell what this machine can hold as a real-time loop."),
     "run": Place("simulate", "Simulate the loop, run every observer and print the RMS table."),
     "serve": Place("serve", "Serve the dashboard."),
     "tune": Place("tuning", "Search for the settings of an observer that are best on a validation record."),
@@ -44,7 +45,7 @@ class Commands(click.Group):
         """Return the command of this name."""
         if cmd_name not in COMMANDS:
             return None
-        return getattr(import_module(f"wfsobs.cli.{COMMANDS[cmd_name].module}"), cmd_name)
+        return getattr(import_module(f"wfsobs.cli.{COMMANDS[cmd_name].module}"), cmd_name.replace("-", "_"))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of commands, without importing them."""

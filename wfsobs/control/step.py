@@ -79,11 +79,11 @@ class StepController:
         StepError
             A wrong shape, an infinite number, an NGS frame that is not due. The frame is then not taken, and no command is given.
         """
-        y = self._check(y, "y")
+        y, is_whole = check_frame(self.id, y, "y", self.sampling.n_modes, self.frame)
         due = self._ngs is not None and self.frame > 0 and self.frame % self._ratio == 0
         slow = None if self._ngs is None else self._check_ngs(ngs, due)
         seen = self._taps @ self._sent
-        z = self._lgs.complete(y - seen)
+        z = self._lgs.complete(y - seen, is_whole)
         if self._ngs is not None:
             push_row(self._mirror, seen)
             if slow is not None:
@@ -149,19 +149,16 @@ class StepController:
             self._ngs.take_over(old._ngs)
         self._sent[...], self._mirror[...], self.frame = old._sent, old._mirror, old.frame
 
-    def _clip(self, wanted: Array) -> Array:
-        """Return the commands nearest to the wanted ones within the limits of the mirror."""
+    def _clip(self, command: Array) -> Array:
+        """Return the commands nearest to these within the limits of the mirror."""
         mirror = self.plant.mirror
         if not mirror.has_limits:
-            return wanted
+            return command
         last = self._sent[0]
-        return np.clip(np.clip(wanted, last - mirror.slew, last + mirror.slew), -mirror.stroke, mirror.stroke)
-
-    def _check(self, x: ArrayLike, name: str) -> Array:
-        return check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
+        return np.clip(np.clip(command, last - mirror.slew, last + mirror.slew), -mirror.stroke, mirror.stroke)
 
     def _check_ngs(self, ngs: ArrayLike | None, due: bool) -> Array | None:
         if due:
-            return self._nothing if ngs is None else self._check(ngs, "ngs")
+            return self._nothing if ngs is None else check_frame(self.id, ngs, "ngs", self.sampling.n_modes, self.frame)[0]
         check_not_due(self.id, ngs, self._ratio, self.frame)
         return None

@@ -28,7 +28,7 @@ class StepLaw(Stateful, Protocol):
         """Return the commands (n_modes,) [um] that the laws want, `forward` included."""
         ...
 
-    def tell(self, taken: Array, forward: Array) -> None:
+    def tell(self, command: Array, forward: Array) -> None:
         """Tell what the mirror took of them."""
         ...
 
@@ -53,7 +53,7 @@ class LinearLaws:
             v[:, 1] = 0.0 if ngs is None else ngs
         return self.bank.step(v)[:, 0] + forward
 
-    def tell(self, taken: Array, forward: Array) -> None:
+    def tell(self, command: Array, forward: Array) -> None:
         """Take no notice: z holds none of the commands."""
 
     def take_over(self, old: Any) -> None:
@@ -98,9 +98,9 @@ class Integrators:
         """Return leak u - g y, y the measurement with the integrator's own commands alone."""
         return self._leak * self._own[0] - self._gain * (z + self._taps @ self._own) + forward
 
-    def tell(self, taken: Array, forward: Array) -> None:
+    def tell(self, command: Array, forward: Array) -> None:
         """Go on from what the mirror took."""
-        push_row(self._own, taken - forward)
+        push_row(self._own, command - forward)
 
     def take_over(self, old: Any) -> None:
         """Go on from the last commands."""

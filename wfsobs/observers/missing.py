@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import inf
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -86,13 +85,19 @@ class Bridge:
         self._bank = FilterBank([gains.estimator() for _, gains in found]) if found else None
         self._rows = expected_rows([gains for _, gains in found])
         self._last = np.zeros(n_modes)
+        self._all_modes = len(found) == n_modes
 
-    def complete(self, z: Array) -> Array:
-        """Return z (n_modes,) [um] with its NaN replaced; z itself where it has none."""
-        if not z.dot(z) < inf:
+    def complete(self, z: Array, is_whole: bool = False) -> Array:
+        """Return z (n_modes,) [um] with its NaN replaced; z itself where it is known to have none."""
+        if not is_whole:
             z = np.where(np.isnan(z), self._expectation(), z)
-        self._last[...] = z
-        if self._bank is not None:
+        if self._bank is None:
+            self._last[...] = z
+        elif self._all_modes:
+            self._bank.v[:, 0] = z
+            self._bank.advance()
+        else:
+            self._last[...] = z
             self._bank.step(z[self._modes, None])
         return z
 

@@ -80,8 +80,8 @@ class _Own:
     def __init__(self, estimator: Estimator):
         self._expectation = estimator.expectation
 
-    def complete(self, z: Array) -> Array:
-        return z if z.dot(z) < inf else np.where(np.isnan(z), self._expectation(), z)
+    def complete(self, z: Array, is_whole: bool = False) -> Array:
+        return z if is_whole else np.where(np.isnan(z), self._expectation(), z)
 
     def reset(self) -> None:
         return None
@@ -139,16 +139,16 @@ class StepObserver:
             A wrong shape, an infinite number, an NGS frame that is not due, no command where one is needed. The frame is then
             not taken.
         """
-        z = self._check(z, "z")
+        z, is_whole = self._check(z, "z")
         due = self._ngs is not None and self.frame > 0 and self.frame % self._ratio == 0
         slow = self._check_ngs(ngs, due) if self._ngs is not None else None
         if self.estimator.needs_command:
             if u is None:
                 raise StepError(f"{self.id}: its windows hold commands: update(z, u=...) takes that of the frame, too")
-            u = self._check(u, "u")
+            u, _ = self._check(u, "u")
         else:
             u = None
-        complete = self._lgs.complete(z)
+        complete = self._lgs.complete(z, is_whole)
         if slow is not None and self._ngs is not None:
             slow = self._ngs.complete(slow)
         self.estimator.advance(complete, slow, u)
@@ -225,12 +225,12 @@ class StepObserver:
                 new.take_over(was)
         self.frame = old.frame
 
-    def _check(self, x: ArrayLike, name: str) -> Array:
+    def _check(self, x: ArrayLike, name: str) -> tuple[Array, bool]:
         return check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
 
     def _check_ngs(self, ngs: ArrayLike | None, due: bool) -> Array | None:
         if due:
-            return self._nothing if ngs is None else self._check(ngs, "ngs")
+            return self._nothing if ngs is None else self._check(ngs, "ngs")[0]
         check_not_due(self.id, ngs, self._ratio, self.frame)
         return None
 
@@ -252,14 +252,15 @@ class StepObserver:
         return next(iter(self.targets))
 
 
-def check_frame(id: str, x: ArrayLike, name: str, n_modes: int, frame: int) -> Array:
-    """Return one number per mode as an array; NaN is missing. Raises StepError."""
+def check_frame(id: str, x: ArrayLike, name: str, n_modes: int, frame: int) -> tuple[Array, bool]:
+    """Return one number per mode as an array, and whether it has no NaN, which is missing. Raises StepError."""
     x = np.asarray(x, dtype=float)
     if x.shape != (n_modes,):
         raise StepError(f"{id}: {name} takes the shape {(n_modes,)}, one number per mode, not {x.shape}")
-    if not x.dot(x) < inf and np.isinf(x).any():
+    is_whole = bool(x.dot(x) < inf)
+    if not is_whole and np.isinf(x).any():
         raise StepError(f"{id}: {name} is infinite in frame {frame}; NaN stands for a missing number")
-    return x
+    return x, is_whole
 
 
 def check_not_due(id: str, ngs: ArrayLike | None, ratio: int, frame: int) -> None:

@@ -103,6 +103,8 @@ class FilterBank:
     ----------
     x : Array
         State after the last step, (n_modes, n) [as in the filters, zeros behind the shorter ones].
+    v : Array
+        Inputs of the next step, (n_modes, m).
     phase : int
         Which of the maps comes next.
     last : int
@@ -121,14 +123,18 @@ class FilterBank:
                 one[:size, :size], one[:size, n:], one[n:, :size], one[n:, n:] = F, G, H, J
         self._after = [*range(1, len(self.maps)), int(first)]
         self._in, self._out = np.zeros((len(modes), n + m)), np.zeros((len(modes), n + p))
-        self.x, self._v = self._in[:, :n], self._in[:, n:]
+        self.x, self.v = self._in[:, :n], self._in[:, n:]
         self._next, self._e = self._out[:, :n], self._out[:, n:]
         self._in3, self._out3 = self._in[:, :, None], self._out[:, :, None]
         self.phase = self.last = 0
 
     def step(self, v: Array) -> Array:
         """Take the inputs v (n_modes, m) of a step; return its outputs (n_modes, p), valid until the next."""
-        self._v[...] = v
+        self.v[...] = v
+        return self.advance()
+
+    def advance(self) -> Array:
+        """Do as `step` with the inputs that have been written to `v`."""
         np.matmul(self.maps[self.phase], self._in3, out=self._out3)
         self.x[...] = self._next
         self.last, self.phase = self.phase, self._after[self.phase]

@@ -159,16 +159,19 @@ def _check_gaps(controller: Controller, inputs: ControllerInputs) -> None:
         raise CheckError(f"{controller.id}: does not come back after missing samples")
 
 
-def _check_steps(controller: Controller, given: ControllerInputs) -> None:
+def _check_steps(controller: Controller, inputs: ControllerInputs) -> None:
     """Check that frame by frame it commands what it commands over a record, unless it cannot run frame by frame."""
     if controller.predict is not None and controller.step_predict is None:
         return
-    y, start = given.measurements.y_lgs.copy(), given.measurements.n_steps // 2
+    y, start = inputs.measurements.y_lgs.copy(), inputs.measurements.n_steps // 2
     y[start : start + LOST] = np.nan
-    measured = replace(given.measurements, y_lgs=y)
-    got = run_loop(controller.design(given.prior, given.plant, given.settings, measured.sampling), measured)
+    measured = replace(inputs.measurements, y_lgs=y)
+    got = run_loop(controller.design(inputs.prior, inputs.plant, inputs.settings, measured.sampling), measured)
     _compare(
-        controller, got, _commands(controller, given._replace(measurements=measured)), "frame by frame it commands something else"
+        controller,
+        got,
+        _commands(controller, inputs._replace(measurements=measured)),
+        "frame by frame it commands something else",
     )
 
 

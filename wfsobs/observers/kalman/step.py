@@ -110,15 +110,15 @@ class KalmanEstimator(LinearEstimator):
     def __init__(self, modes: Sequence[ModeFilter], bridges: bool = False):
         super().__init__(modes)
         self.bridges = bridges
-        self._v = np.zeros((len(modes), modes[0].gains.steps[0].L.shape[1]))
+        v = self.bank.v
+        self._lgs, self._ngs = v[:, 0], v[:, 1] if v.shape[1] > 1 else None
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
-        v = self._v
-        v[:, 0] = z
-        if v.shape[1] > 1:
-            v[:, 1] = 0.0 if ngs is None else ngs
-        self.bank.step(v)
+        self._lgs[...] = z
+        if self._ngs is not None:
+            self._ngs[...] = 0.0 if ngs is None else ngs
+        self.bank.advance()
 
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
         """Return (mean, sd) of the target."""
