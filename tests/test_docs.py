@@ -276,7 +276,7 @@ def test_reference_holds_every_entry_and_module() -> None:
     for page, entries in (("presets", PRESETS), ("observers", OBSERVERS), ("controllers", CONTROLLERS)):
         text = made[f"reference/{page}.md"]
         assert all(name in text for name in entries), page
-    sections = dict(re.findall(r"^## wfsobs (\w+)\n(.*?)(?=^## |\Z)", made["reference/command-line.md"], flags=re.M | re.S))
+    sections = dict(re.findall(r"^## wfsobs ([\w-]+)\n(.*?)(?=^## |\Z)", made["reference/command-line.md"], flags=re.M | re.S))
     context = click.Context(main)
     commands = {name: main.get_command(context, name) for name in main.list_commands(context)}
     assert sections.keys() == commands.keys() >= {"run", "observe"}
@@ -426,3 +426,10 @@ def test_scripts_named_on_a_page_have_the_tables_named(page: Path) -> None:
     known = script("reproduction").TABLES
     named = re.findall(r"^`(\w+)`[;.,]", page.read_text(encoding="utf-8"), flags=re.M)
     assert set(named) == (set(known) if page.name == "reproduction.md" else set())
+
+
+def test_the_page_of_loops() -> None:
+    """Its code runs; the residual of its controller is less than a quarter of the disturbance, as in the closed loop."""
+    names = run_page(DOCS / "your-loop.md")
+    assert names["residual"][500:].std() < 0.25 * names["disturbance"][500:].std()
+    assert np.isfinite(names["mean"]).all() and (names["sd"] > 0).all()
