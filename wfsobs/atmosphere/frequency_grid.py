@@ -58,7 +58,7 @@ class FrequencyGrid:
         last = int(np.ceil(END / (np.pi * diameter) * layer.speed * period))
         f_high = np.arange(1, max(last, TAPER) + 1) / period
         w_high = np.full(f_high.size, 1.0 / period)
-        f, share = np.concatenate([f_low, f_high]), np.concatenate([taper(f_low / top), 1.0 - taper(f_high / top)])
+        f, share = np.concatenate([f_low, f_high]), np.concatenate([fade_out(f_low / top), 1.0 - fade_out(f_high / top)])
         return cls(f, np.concatenate([w_low, w_high]) * share, f_low.size, n_fft, dt)
 
     def signal(self, amplitude: Array, n_steps: int) -> Array:
@@ -87,7 +87,7 @@ def fft_length(layer: TurbulenceLayer, diameter: float, n_steps: int, dt: float)
     return next_fast_len(int(np.ceil(2.0 * (n_steps + across / dt))), real=True)
 
 
-def taper(x: Array) -> Array:
+def fade_out(x: Array) -> Array:
     """Return a smooth window from 1 at x = 0 to 0 at x = 1."""
     return np.where(x < 1.0, 0.5 * erfc(STEEPNESS * (x - 0.5)), 0.0)
 

@@ -161,14 +161,14 @@ def _has_part(fine: Array, T: float, frequency: float, width: int) -> bool:
 
 def count_unexplained(modes: Sequence[OneMode], level: float, lowest: float) -> list[int]:
     """Return per mode the number of refused candidates that the search still finds."""
-    refused = [mode.refused for mode in modes]
+    refused = [mode.rejections for mode in modes]
     for mode in modes:
-        mode.refused = []
+        mode.rejections = []
     out = []
     for mode, were, found in zip(modes, refused, search_modes(modes, level, lowest), strict=True):
         flagged = mode.f[np.logical_or.reduce([one.above_limit for one in found])]
         out.append(sum(bool(np.any(np.abs(flagged - c.frequency) <= (c.width + 1) * mode.f[0])) for c in were))
-        mode.refused = were
+        mode.rejections = were
     return out
 
 

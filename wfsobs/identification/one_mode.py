@@ -9,29 +9,31 @@ import numpy as np
 
 from wfsobs.identification.misfit import margin
 from wfsobs.identification.order import choose_order, with_background
+from wfsobs.identification.resonances import (
+    WIDEST,
+    add_resonance,
+    is_resolved,
+    misfit_of,
+    reach_of,
+    split_resonance,
+    strongest_bin,
+    window_about,
+)
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.spectral.lines import Sinusoid, nearest_line
 from wfsobs.spectral.missing import MissingSamples
 from wfsobs.spectral.model import RMS, Spectrum
 from wfsobs.spectral.periodogram import Cells, inflation, periodogram, periodogram_frequencies
 from wfsobs.spectral.search import PAD, Candidate
-from wfsobs.spectral.whittle import first_guess, fit_spectrum, spectrum_negative_log_likelihood, standard_deviations
+from wfsobs.spectral.whittle import first_guess, fit_spectrum, standard_deviations
 from wfsobs.typing import Array
 
-NEIGHBOURS = 4.0
-"""Bins, beside half its width, within which a candidate is not a new peak: two peaks that near are one."""
 WIDEST_LINE = 9
 """Maximum width of a candidate, in bins, that may be an undamped line."""
-RESOLVED = 0.2
-"""Minimum half width at half maximum of a resonance, in bins; what is narrower is a line."""
-WIDEST = 0.5
-"""Maximum damping of a resonance."""
 SURE = 2.0
 """Minimum rms of a resonance, in standard deviations."""
 WORTH = 6.0
 """Minimum gain of log-likelihood by three parameters: noise gains as much with a probability of 0.7 % (chi squared of 12)."""
-SPLIT = 8.0
-"""The same for two resonances in place of one, which is tried for every wide one."""
 
 SETTLED = 0.01
 """Remaining error of repeated filling and fitting: each round leaves about the share that is missing."""
@@ -59,21 +61,21 @@ class OneMode:
         Expected periodogram of the complete `left`.
     share : Array
         Measured share of every bin, see `missing`.
-    refused : list
+    rejections : list
         Candidates that no peak explains.
     """
 
     def __init__(self, z: Array, dt: float, rng: np.random.Generator | None = None):
-        self.measured, self.dt, self.n = z - np.nanmean(z), dt, len(z)
+        self.measurement, self.dt, self.n = z - np.nanmean(z), dt, len(z)
         self.missing = MissingSamples(np.isnan(z), dt, rng or np.random.default_rng(0))
         self.f = periodogram_frequencies(self.n, dt)
-        self.share, self.unknown, self.lost = np.ones(len(self.f)), np.zeros((0, self.n)), np.zeros(len(self.f))
-        self.z = self.missing.interpolate(self.measured)
+        self.share, self.unknown, self.missing_power = np.ones(len(self.f)), np.zeros((0, self.n)), np.zeros(len(self.f))
+        self.z = self.missing.interpolate(self.measurement)
         self.lines: list[Sinusoid] = []
         self._subtract_lines()
         self.spectrum = first_guess(self.f, self.I, dt)
         self.strong = np.zeros(len(self.f), bool)
-        self.refused: list[Candidate] = []
+        self.rejections: list[Candidate] = []
         self._fill()
 
     def _fill(self) -> None:
@@ -82,8 +84,8 @@ class OneMode:
             S, lines = self.spectrum.psd(self.f), self._signal()
             self.unknown = self.missing.draw_errors(S)
             self.share = self.missing.measured_share(S, self.unknown)
-            self.lost = (1.0 - self.share) * S
-            self.z = self.missing.fill(self.measured - lines, S) + lines
+            self.missing_power = (1.0 - self.share) * S
+            self.z = self.missing.fill(self.measurement - lines, S) + lines
             self._subtract_lines()
 
     def _signal(self) -> Array:
@@ -91,7 +93,7 @@ class OneMode:
 
     def _subtract_lines(self) -> None:
         self.left = self.z - self._signal()
-        self.I = periodogram(self.left, self.dt) + self.lost
+        self.I = periodogram(self.left, self.dt) + self.missing_power
 
     @property
     def complete(self) -> Array:
@@ -109,7 +111,7 @@ class OneMode:
         S = self.spectrum.psd(self.f)
         S = np.exp(np.interp(f, self.f, np.log(S * self.share * margin(self.I / S))))
         ratio = periodogram(self.left, self.dt, PAD) / S
-        for candidate in self.refused:
+        for candidate in self.rejections:
             ratio[np.abs(f - candidate.frequency) <= (0.5 * candidate.width + 0.5) * self.f[0]] = 1.0
         return ratio
 
@@ -132,96 +134,52 @@ class OneMode:
         self.spectrum = fit_spectrum(self.spectrum, cells)
         if reshape:
             self.spectrum = with_background(choose_order(self.spectrum, cells, third), cells)
-        for p in [p for p in self.spectrum.resonances if not self._is_resolved(p)]:
+        for p in [p for p in self.spectrum.resonances if not is_resolved(p, self.f)]:
             self.spectrum = replace(self.spectrum, resonances=tuple(q for q in self.spectrum.resonances if q is not p))
             frequency = p.omega / (2 * pi)
             if p.damping < WIDEST and 2.0 * self.f[0] < frequency < self.f[-1]:
                 self.lines = [*self.lines, nearest_line(self.left, self.dt, frequency, 0.75 * self.f[0])]
-            self.refused.append(Candidate(frequency, WIDEST_LINE, 0.0))  # or it would come back
+            self.rejections.append(Candidate(frequency, WIDEST_LINE, 0.0))  # or it would come back
             self._subtract_lines()
         self._fill()
-
-    def _is_resolved(self, p: Ar2) -> bool:
-        """Return whether a resonance is wider than a line, narrower than turbulence, and below half the rate."""
-        frequency = p.omega / (2 * pi)
-        return RESOLVED * self.f[0] < p.damping * frequency and p.damping < WIDEST and 2.0 * self.f[0] < frequency < self.f[-1]
 
     def explain(self, candidate: Candidate) -> bool:
         """Add the line or the resonance that explains the candidate best; return whether it is worth its parameters.
 
         Where there are lines beside it, they may become one resonance.
         """
-        window = self._window(candidate)
-        before = self._misfit(window, self.spectrum, self.I)
-        lines, spectrum = self.lines, self.spectrum
-        beside = [line for line in lines if abs(line.frequency - candidate.frequency) < self._reach(candidate)]
+        window = window_about(candidate, self.f)
+        before = misfit_of(self.spectrum, self.f[window], self.I[window])
+        lines, spectrum, reach = self.lines, self.spectrum, reach_of(candidate, self.f[0])
+        beside = [line for line in lines if abs(line.frequency - candidate.frequency) < reach]
         trials: list[tuple[list[Sinusoid], Spectrum]] = []
         if beside:
             self.lines = rest = [line for line in lines if line not in beside]
             self._subtract_lines()
             centre = float(np.mean([line.frequency for line in beside]))
-            trials.append((rest, self._with_resonance(Candidate(centre, max(candidate.width, 3), candidate.strength))))
-        elif not any(abs(p.omega / (2 * pi) - candidate.frequency) < self._reach(candidate) for p in spectrum.resonances):
-            trials.append((lines, self._with_resonance(candidate)))
+            wide = Candidate(centre, max(candidate.width, 3), candidate.strength)
+            trials.append((rest, add_resonance(spectrum, self.f, self.I, wide)))
+        elif not any(abs(p.omega / (2 * pi) - candidate.frequency) < reach for p in spectrum.resonances):
+            trials.append((lines, add_resonance(spectrum, self.f, self.I, candidate)))
             if candidate.width <= WIDEST_LINE:
-                at = self._strongest_bin(candidate)
+                at = strongest_bin(candidate, self.f, self.I / spectrum.psd(self.f))
                 trials.append(([*lines, nearest_line(self.left, self.dt, at, 0.75 * self.f[0])], spectrum))
         outcomes = []
         for some, shape in trials:
             self.lines = some
             self._subtract_lines()
-            if len(shape.resonances) > len(spectrum.resonances) and not self._is_resolved(shape.resonances[-1]):
+            if len(shape.resonances) > len(spectrum.resonances) and not is_resolved(shape.resonances[-1], self.f):
                 continue
             peaks_more = len(some) - len(lines) + len(shape.resonances) - len(spectrum.resonances)
-            gain = before - self._misfit(window, shape, self.I) - WORTH * peaks_more
+            gain = before - misfit_of(shape, self.f[window], self.I[window]) - WORTH * peaks_more
             outcomes.append((gain, some, shape))
         gain, some, shape = max(outcomes, key=lambda o: o[0], default=(0.0, lines, spectrum))
         if gain <= 0:
             some, shape = lines, spectrum
-            self.refused.append(candidate)
+            self.rejections.append(candidate)
         self.lines, self.spectrum = some, shape
         self._subtract_lines()
         return gain > 0
-
-    def _reach(self, candidate: Candidate) -> float:
-        return (NEIGHBOURS + candidate.width / 2.0) * self.f[0]
-
-    def _window(self, candidate: Candidate) -> Array:
-        """Return the bins over which explanations of a candidate are compared."""
-        half = max(3.0 * self._reach(candidate), 0.03 * candidate.frequency)
-        return np.abs(self.f - candidate.frequency) < half
-
-    def _misfit(self, window: Array, spectrum: Spectrum, I: Array) -> float:  # noqa: E741
-        S = spectrum.psd(self.f[window])
-        return float(np.sum(np.log(S) + I[window] / S))
-
-    def _strongest_bin(self, candidate: Candidate) -> float:
-        near = np.abs(self.f - candidate.frequency) <= candidate.width / 2.0 * self.f[0]
-        if candidate.width == 1:
-            return candidate.frequency
-        return float(self.f[near][np.argmax(self.I[near] / self.spectrum.psd(self.f[near]))])
-
-    def _with_resonance(self, candidate: Candidate) -> Spectrum:
-        """Return the spectrum with a resonance of the candidate's width, it alone fitted to the bins about it."""
-        f0, half = candidate.frequency, 0.5 * candidate.width * self.f[0]
-        near = np.abs(self.f - f0) <= max(half, self.f[0])
-        excess = np.maximum(self.I[near] - self.spectrum.psd(self.f[near]), 0.0)
-        power, f0 = float(excess.sum() * self.f[0]), float(excess @ self.f[near] / excess.sum()) if excess.any() else f0
-        best: tuple[float, Spectrum] | None = None
-        for share in (0.15, 0.5):
-            damping = min(max(share * half / f0, 1e-6), 0.5)
-            new = Ar2(2.0 * pi * f0, damping, np.sqrt(max(power, 1e-16)), self.dt)
-            wider = replace(self.spectrum, resonances=(*self.spectrum.resonances, new))
-            window = self._window(candidate)
-            keep = np.where(window, 1.0, 0.0)
-            cells = Cells(self.f, self.I, keep, [p.omega / (2 * pi) for p in wider.resonances])
-            count = len(wider.vector)
-            shape = fit_spectrum(wider, cells, range(count - 3, count))
-            value = spectrum_negative_log_likelihood(shape, cells)
-            if best is None or value < best[0]:
-                best = value, shape
-        assert best is not None
-        return best[1]
 
     def polish(self, third: bool = False) -> None:
         """Fit every line once more with the others subtracted, then all parameters on all bins.
@@ -244,19 +202,8 @@ class OneMode:
 
     def _split(self, p: Ar2) -> None:
         """Replace one resonance that is several bins wide by two, where they are worth it: neighbours look like one."""
-        f0 = p.omega / (2 * pi)
-        half = p.damping * f0
-        if half < 2.0 * NEIGHBOURS * self.f[0]:
-            return
-        rest = [q for q in self.spectrum.resonances if q is not p]
-        two = [Ar2(2 * pi * (f0 + sign * 0.7 * half), 0.4 * p.damping, p.rms / np.sqrt(2.0), self.dt) for sign in (-1, 1)]
-        start = replace(self.spectrum, resonances=(*rest, *two))
-        keep = np.where(self._window(Candidate(f0, int(4.0 * half / self.f[0]), 0.0)), 1.0, 0.0)
-        cells = Cells(self.f, self.I, keep, [q.omega / (2 * pi) for q in (*start.resonances, p)])
-        count = len(start.vector)
-        shape = fit_spectrum(start, cells, range(count - 6, count))
-        gain = spectrum_negative_log_likelihood(self.spectrum, cells) - spectrum_negative_log_likelihood(shape, cells)
-        if gain > SPLIT and all(map(self._is_resolved, shape.resonances[-2:])):
+        shape = split_resonance(self.spectrum, self.f, self.I, p)
+        if shape is not None:
             self.spectrum = shape
             self.refit()
 
@@ -271,7 +218,7 @@ class OneMode:
             return False
         p = self.spectrum.resonances[worst]
         self.spectrum = replace(self.spectrum, resonances=tuple(q for q in self.spectrum.resonances if q is not p))
-        self.refused.append(Candidate(p.omega / (2 * pi), max(round(p.damping * p.omega / pi / self.f[0]), WIDEST_LINE), 0.0))
+        self.rejections.append(Candidate(p.omega / (2 * pi), max(round(p.damping * p.omega / pi / self.f[0]), WIDEST_LINE), 0.0))
         self.refit()
         return True
 
