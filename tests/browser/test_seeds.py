@@ -31,3 +31,14 @@ def test_seeds_give_intervals_and_go_with_the_settings(open_page: Any, server: A
     expect(page.locator(".seeds")).to_have_text("one record")
     expect(row.locator(".range")).to_have_count(0)
     expect(page.locator("p.verdict").first).not_to_contain_text("over 3 seeds")
+
+
+def test_the_error_budget_is_drawn_when_it_is_asked_for(open_page: Any, server: Any) -> None:
+    page: Page = open_page(url=server.url + QUICK)
+    figure = page.locator("[aria-label='Error budget, vibration']")
+    expect(figure).to_have_count(0)
+    page.get_by_label("Show why every error is as large as it is").check()
+    expect(figure).to_be_visible(timeout=120_000)
+    expect(page.get_by_text("Lines not modelled")).to_be_visible()
+    page.get_by_label("Show why every error is as large as it is").uncheck()
+    expect(figure).to_be_hidden()

@@ -17,6 +17,7 @@ from wfsobs.app.pages.parts import WIDE, box
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import HEARD, asset
+from wfsobs.app.views.budget import BudgetView
 from wfsobs.app.views.main_lines import MainLines
 from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.plots import call
@@ -53,12 +54,14 @@ class Explore:
         self.verdicts = {target: VerdictLine(target, run, display, seeds) for target in TARGETS}
         self.table = Table(run, display, seeds)
         self.pinning = Pinning(run, display)
+        self.budget = BudgetView(seeds.store, display) if seeds else None
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
         body = pn.Column(
             *(self._section(target) for target in TARGETS),
             box("RMS errors", self._above_table(), self.table.pane),
+            *([box("Error budget", *self.budget.view())] if self.budget else []),
             **WIDE,
             stylesheets=[GAP],
         )

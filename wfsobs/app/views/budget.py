@@ -1,0 +1,170 @@
+"""The error budget of the mode shown: a stacked bar per observer, computed and drawn once it is opened."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from math import sqrt
+from types import MappingProxyType
+from typing import Any
+
+import panel as pn
+import panel_material_ui as pmui
+from bokeh.models import ColumnDataSource, FactorRange, HoverTool, Span
+from bokeh.plotting import figure
+
+from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.pages.parts import WIDE, html
+from wfsobs.app.store import Store
+from wfsobs.app.views.plots import call
+from wfsobs.app.work import RunResults
+from wfsobs.cost import run_seconds
+from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE, TERMS, Budget, error_budget
+from wfsobs.evaluation.rows import row_label
+from wfsobs.observers.base import TARGETS
+
+COLOURS: Mapping[str, str] = MappingProxyType(
+    {NOISE: "#8A8F98", LAG: "#3C7FC0", LINES: "#E8912D", MISMATCH: "#B5539C", CONE: "#3F9E6B"}
+)
+BOUND = "#D64533"
+
+COLUMNS = ("observer", "left", "right", "colour", "term", "part", "share", "rms")
+
+ROW, FRAME = 26, 70
+"""Height of a bar with its gap, and of the axis and margins [px]."""
+
+
+class BudgetView:
+    """A button that opens the figures, and the figures."""
+
+    def __init__(self, store: Store, display: Display):
+        self.store, self.run, self.display = store, store.run, display
+        self.task = BackgroundTask(store.session)
+        self.open = pmui.Checkbox(
+            label="Show why every error is as large as it is", value=False, size="small", margin=(0, 0, 4, 0)
+        )
+        self.line, self.room = html(), pn.Column(**WIDE)
+        self.bars: dict[str, Bars] = {}
+        self._of: tuple[RunResults, str] | None = None
+        self.open.param.watch(self._follow, "value")
+        self.run.param.watch(self._follow, ["state", "result"])
+        display.param.watch(self._follow, "mode")
+        display.param.watch(self._draw, "unit")
+        self.task.param.watch(self._draw, "result")
+        self.task.param.watch(self._say, ["state", "message"])
+
+    def view(self) -> list[Any]:
+        """Return the contents of the box."""
+        return [self.open, self.line, self.room]
+
+    def _follow(self, *_: object) -> None:
+        """Compute the budget of what is shown, while it is to be seen and complete."""
+        results = self.run.result
+        self.room.visible = self.open.value
+        if not self.open.value or results is None or self.run.state != DONE:
+            self.task.close()
+            self._of = None
+        elif results.is_recorded:
+            self._of = None
+            self.task.refuse("Only for simulations of the settings: of other records neither noise nor truth is known.")
+        elif self._of is None or self._of[0] is not results or self._of[1] != self.display.mode:
+            self._of = results, self.display.mode
+            self.task.start(budget_job(results, self.display.mode))
+        self._say()
+
+    def _say(self, *_: object) -> None:
+        task = self.task
+        busy = task.state == RUNNING and self._of is not None
+        said = "Computing …" if busy else task.message if task.state == FAILED else ""
+        if self.open.value and not busy and self.run.state == RUNNING:
+            said = "After the run …"
+        self.line.object = f'<p class="text">{escape(said)}</p>' if said and self.open.value else ""
+
+    def _draw(self, *_: object) -> None:
+        if self.task.result is None or self._of is None:
+            return
+        results, mode = self._of
+        found: Sequence[Budget] = self.task.result
+        with pn.io.hold():
+            if not self.bars:
+                self.bars = {target: Bars(target) for target in TARGETS}
+                self.room[:] = [term_legend(), *(pn.pane.Bokeh(bars.figure, **WIDE) for bars in self.bars.values())]
+            for target, bars in self.bars.items():
+                scale = per_micrometre(self.display.unit, results.scenario.telescope.diameter)
+                bars.draw([b for b in found if b.target == target and b.terms], mode, scale, self.display.unit_label)
+
+
+def budget_job(results: RunResults, mode: str) -> Job:
+    """Make the job that computes the budgets of one mode."""
+    return Job(
+        "budget",
+        lambda watch, _tell: error_budget(results.result, mode=mode, watch=watch),
+        cost=4.0 * run_seconds(results.scenario),
+    )
+
+
+def term_legend() -> pn.pane.HTML:
+    """Say which colour is which term."""
+    marks = "".join(
+        f'<span class="mark" style="padding-left:6px; border-left:10px solid {COLOURS[name]}">{escape(label)}</span>'
+        for name, label in TERMS.items()
+    )
+    bound = f'<span class="mark" style="border-left:2px dashed {BOUND}">bound of the LGS</span>'
+    return html(f'<div class="caption legend">{marks}{bound}</div>')
+
+
+class Bars:
+    """The bars of one target: positive terms to the right of zero, one after the other, negative ones to the left."""
+
+    def __init__(self, target: str):
+        self.target = target
+        self.observers = FactorRange()
+        self.source = ColumnDataSource(
+            {name: [] for name in ("observer", "left", "right", "colour", "term", "part", "share", "rms")}
+        )
+        self.figure: figure = figure(
+            y_range=self.observers, height=200, sizing_mode="stretch_width", min_width=240, tools="", toolbar_location=None
+        )
+        self.figure.hbar(y="observer", left="left", right="right", height=0.7, color="colour", source=self.source)
+        tips = [("", "@observer"), ("", "@term"), ("", "@part"), ("", "@share of the mean square error"), ("", "@rms")]
+        self.figure.add_tools(HoverTool(tooltips=tips))
+        self.bound = Span(dimension="height", line_color=BOUND, line_dash="dashed", line_width=2, visible=False)
+        self.figure.add_layout(self.bound)
+        self.figure.ygrid.visible = False
+        self.figure.outline_line_color = None
+
+    def draw(self, budgets: Sequence[Budget], mode: str, scale: float, unit: str) -> None:
+        """Draw the budgets, the smallest error on top; scale: from um to the unit."""
+        ranked = sorted(budgets, key=lambda b: b.total)
+        name = f"{self.target.capitalize()}, {mode}: mean square error [{unit}²]"
+        call(self.figure, f"Error budget, {self.target}")
+        self.figure.xaxis.axis_label = name
+        self.observers.factors = [bar_label(b, scale, unit) for b in reversed(ranked)]
+        self.figure.height = FRAME + ROW * max(len(ranked), 1)
+        self.source.data = bar_data(ranked, scale, unit)  # type: ignore[assignment]
+        bound = next((b.bound for b in ranked if b.bound is not None), None)
+        self.bound.update(location=0.0 if bound is None else bound * scale**2, visible=bound is not None)
+
+
+def bar_label(budget: Budget, scale: float, unit: str) -> str:
+    """Write an observer with its error."""
+    return f"{row_label(budget.observer)}, {sqrt(budget.total) * scale:.3g} {unit}"
+
+
+def bar_data(budgets: Sequence[Budget], scale: float, unit: str) -> dict[str, list[Any]]:
+    """Return the pieces of the bars as columns."""
+    rows: list[tuple[Any, ...]] = []
+    for it in budgets:
+        ends = {True: 0.0, False: 0.0}
+        for name in TERMS:
+            part = it.terms[name] * scale**2
+            start = ends[part >= 0]
+            ends[part >= 0] = start + part
+            rms = f"rms {sqrt(part):.3g} {unit}" if part >= 0 else "less than none: the others are correlated with it"
+            share = f"{100.0 * it.terms[name] / it.total:.0f} %"
+            rows.append(
+                (bar_label(it, scale, unit), start, start + part, COLOURS[name], TERMS[name], f"{part:.3g} {unit}²", share, rms)
+            )
+    return {name: [row[i] for row in rows] for i, name in enumerate(COLUMNS)}
