@@ -178,7 +178,7 @@ def test_the_core_needs_numpy_scipy_and_param_alone():
 
 def test_loop_takes_seeds_or_a_record():
     result = call("loop", "--record", "r.npz", "--seeds", "2")
-    assert result.exit_code == 2 and result.stderr == "wfsobs: --seeds: is for simulated records, leave it out with --record\n"
+    assert result.exit_code == 2 and result.stderr == "wfsobs: --seeds: only for simulated records, not with --record\n"
 
 
 def test_the_file_of_an_identification_is_all_that_telemetry_needs(tmp_path):

@@ -317,7 +317,7 @@ def test_result_as_a_file_of_settings(record: Record, found: Identification, tmp
     out = tmp_path / "f.toml"
     done = CliRunner().invoke(main, ["identify", str(tmp_path / "r.npz"), "--out", str(out)])
     assert done.exit_code == 0, done.output
-    assert "resonance" in done.stdout and "what is left is white at 1%" in done.stdout
+    assert "resonance" in done.stdout and "residual is white at 1%" in done.stdout
     saved = configfile.load_scenario(out)
     saved.validate()
     assert saved == found.scenario(PRESETS["paper"]())
@@ -376,9 +376,9 @@ def test_records_that_are_none_of_the_model_are_survived_and_told(z: np.ndarray,
     ("change", "said"),
     [
         ({"y_lgs": np.where(np.arange(4000)[:, None] == 7, np.inf, np.ones((4000, 2))), "u": np.zeros((4000, 2))}, "infinite"),
-        ({"y_lgs": np.zeros((900, 2)), "u": np.zeros((900, 2))}, "900 samples, to identify it takes"),
+        ({"y_lgs": np.zeros((900, 2)), "u": np.zeros((900, 2))}, "900 samples, identification needs"),
         ({"y_lgs": np.zeros((4000, 2)), "u": np.zeros((4000, 2))}, "tip: z does not change"),
-        ({"y_lgs": np.ones((4000, 2)), "u": np.zeros((4000, 2)), "dt": 0.1}, "peaks from 5 Hz: .* 2.5 Hz"),
+        ({"y_lgs": np.ones((4000, 2)), "u": np.zeros((4000, 2)), "dt": 0.1}, "lowest peak frequency = 5 Hz: .* 2.5 Hz"),
     ],
 )
 def test_unusable_records_are_refused(change: dict, said: str) -> None:

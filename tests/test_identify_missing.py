@@ -123,5 +123,5 @@ def test_intervals_hold_where_a_third_is_lost() -> None:
 
 
 def test_what_lacks_too_much_is_refused() -> None:
-    with pytest.raises(RecordError, match=r"tip: \d+ of \d+ samples are measured, to identify it takes 1000, and 50%"):
+    with pytest.raises(RecordError, match=r"tip: \d+ of \d+ samples are measured, identification needs 1000, and 50%"):
         identify(record(0.6, np.random.default_rng(1), 6000))

@@ -72,7 +72,7 @@ def test_ours_are_the_same_in_a_fresh_process(name: str) -> None:
     ("run", "reason"),
     [
         (mean_of_three, "looks ahead: measurements after step 750"),
-        (of_the_truth, "knows more than it is told"),
+        (of_the_truth, "uses more than it is given"),
         (different_every_time, "two results"),
         (one_column, r"shape \(1500, 2\)"),
         (in_place, r"changes its measurements \(y_lgs\)"),

@@ -115,7 +115,7 @@ def test_one_of_a_few_lines_passes() -> None:
         (louder_every_time, "gives two results: it keeps something between runs"),
         (unstable, "not within the unit circle"),
         (backwards, "looks ahead: measurements after step 750"),
-        (partial(knows_the_scenario, Scenario()), "knows more than it is told: it reaches Run, Scenario"),
+        (partial(knows_the_scenario, Scenario()), "uses more than it is given: it reaches Run, Scenario"),
         (lambda prior, mode, plant, settings: 0.5, "takes a wfsobs.control.law.Law, not a float"),
     ],
 )
@@ -145,7 +145,7 @@ def test_a_prediction_that_breaks_a_rule_is_refused_with_the_reason(predict: Any
 @pytest.mark.parametrize(
     ("predict", "reason"),
     [
-        (the_truth, "in a fresh process.* it knows more than it is told"),
+        (the_truth, "in a fresh process.* it uses more than it is given"),
         (lambda m, *_: 0.1 * m.z, "cannot run in a fresh process"),
     ],
 )
@@ -165,5 +165,5 @@ def test_the_truth_in_an_argument_would_be_found(monkeypatch: pytest.MonkeyPatch
 
 
 def test_one_that_predicts_is_told_where_the_vibration_is() -> None:
-    with pytest.raises(ValueError, match="'mine': one that predicts takes Bands"):
+    with pytest.raises(ValueError, match="'mine': with a prediction it needs Bands"):
         Controller("mine", "Mine", half, predict=next_measurement)

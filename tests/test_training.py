@@ -130,11 +130,11 @@ def _files(night: Record, other: Record, tmp_path_factory: pytest.TempPathFactor
     ("options", "reason"),
     [
         (("--train", "none.npz"), "none.npz: cannot be read"),
-        (("--train", "slow.npz"), "the training record has a rate of 500 Hz, the record 1000 Hz"),
-        (("--train", "tip.npz"), "the training record has 1 modes, the record 2"),
-        (("--train", "late.npz"), "the training record has 3 steps of delay, the record 2"),
+        (("--train", "slow.npz"), "the training data has a rate of 500 Hz, the record 1000 Hz"),
+        (("--train", "tip.npz"), "the training data has 1 modes, the record 2"),
+        (("--train", "late.npz"), "the training data has 3 steps of delay, the record 2"),
         (("--train", "short.npz"), "the training data has 100 steps; gpr_offline.depth + training_size need 225"),
-        (("--train", "night.npz"), "the training record is the record itself"),
+        (("--train", "night.npz"), "the training data is the record itself"),
         (("--train-until", "2"), "takes more than 0 and less than the record's 2 s"),
         (("--train-until", "0.1"), "the training data has 100 steps"),
         (("--train", "other.npz", "--train-until", "1"), "give one of them"),
@@ -173,7 +173,7 @@ def test_loop_counts_what_follows_the_training_data(night: Record, files: Path) 
 
 def test_a_simulated_loop_has_its_own_training_data() -> None:
     done = call("loop", "--train-until", "1")
-    assert done.exit_code == 2 and "go with --record" in done.stderr
+    assert done.exit_code == 2 and "only with --record" in done.stderr
 
 
 # ---------------------------------------------------------------------- a prior without a file

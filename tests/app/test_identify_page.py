@@ -186,7 +186,7 @@ def test_what_cannot_be_done_is_said_in_one_line(page: IdentifyPage, loop: Any) 
     for level, lowest, reason in (
         ("2", "5", "Level = '2': takes a number from 1e-09 to 0.5"),
         ("0.04", "soon", "Lowest peak [Hz] = 'soon': takes a number from 0.001 to 10000"),
-        ("0.04", "300", "peaks from 300 Hz: takes a frequency below a quarter of the rate, 250 Hz"),
+        ("0.04", "300", "lowest peak frequency = 300 Hz: must be below a quarter of the rate, 250 Hz"),
     ):
         page.level.value, page.lowest.value = level, lowest
         page.start()

@@ -172,7 +172,7 @@ def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.Monk
         {"index": 0},
     ):
         upload.handle({"action": "part", "name": "a.csv", **msg})
-        assert upload.picker.said == "The file did not arrive whole." and upload._content == b""
+        assert upload.picker.said == "The upload is incomplete: choose the file again." and upload._content == b""
     upload.handle({"action": "large", "name": "../x.csv"})
     assert upload.picker.said == f"x.csv: larger than {LARGEST // 1_000_000} MB"
     monkeypatch.setattr(module, "LARGEST", 1000)

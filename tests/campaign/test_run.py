@@ -138,7 +138,7 @@ def test_more_seeds_continue_and_another_plan_is_refused(tmp_path):
     ("arguments", "line"),
     [
         (["--shard", "4/3"], "--shard 4/3: takes K/N"),
-        (["--scheduler", "tcp://localhost:1", "--workers", "2"], "--workers: is for this machine"),
+        (["--scheduler", "tcp://localhost:1", "--workers", "2"], "--workers: only for this machine"),
     ],
 )
 def test_what_cannot_be_used_is_one_line(plan, tmp_path, arguments, line):

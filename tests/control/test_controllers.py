@@ -307,7 +307,7 @@ def test_what_cannot_run_says_why() -> None:
     bare = replace(record, y_ngs=None, ratio=None, training=None)
     assert [o.note for o in closed_loop(bare, plan).outcomes] == [
         "the record has no NGS measurement",
-        "the record has no training record",
+        "the record has no training data",
     ]
     assert record.training is not None
     exact = 20 + 60 + 1  # of the last window the target is known a step later

@@ -128,7 +128,10 @@ WRONG_CLOCKS = [
     (clock(lambda t: t.__setitem__(3, np.nan)), "time is nan in row 3"),
     (0.001 * np.arange(N) ** 1.2, "the rate is not constant"),
     (np.cumsum(np.where(np.arange(N) % 2, 0.001, 0.0015)), "the rate is not constant"),
-    (clock(lambda t: t.__iadd__(np.where(np.arange(N) > 20, 100.0, 0.0))), "frames are missing, 40 are there: cut it"),
+    (
+        clock(lambda t: t.__iadd__(np.where(np.arange(N) > 20, 100.0, 0.0))),
+        "frames are missing, more than the 40 measured: cut the record",
+    ),
     (np.zeros(3), "time takes 40 numbers"),
 ]
 
@@ -213,7 +216,7 @@ CSV = [
     ("y_lgs/tip_um;u/tip_um\n1;2\n", "line 2, y_lgs/tip_um;u/tip_um: '1;2' is not a number"),
     ("frame,seeing\n1,2\n", "has no y_lgs; a record needs y_lgs, u and dt"),
     ("y_lgs/tip_um,y_lgs/tip_um,u/tip_um\n1,2,3\n", "two columns have the same heading"),
-    ("y_lgs/tip_um,y_lgs/tip_nm,u/tip_um\n1,2,3\n", "two columns are y_lgs/tip"),
+    ("y_lgs/tip_um,y_lgs/tip_nm,u/tip_um\n1,2,3\n", "two columns are named y_lgs/tip"),
     ("y_lgs/tip_um,y_lgs/tilt_nm,u/tip_um,u/tilt_um\n1,2,3,4\n", "y_lgs is in um and in nm"),
     ("y_lgs/tip_V,u/tip_um\n1,2\n", "y_lgs is in 'V', which is no unit"),
     ("y_lgs/tip_um,y_lgs/tilt_um,u/tip_um\n1,2,3\n", "u has the modes tip; y_lgs has tip, tilt"),

@@ -60,7 +60,7 @@ def test_every_format_and_unit(name: str, unit: str, factor: float) -> None:
 
 @pytest.mark.parametrize("name", MAKE)
 def test_a_unit_is_never_guessed(name: str) -> None:
-    with pytest.raises(RecordError, match=f"{name}: does not say the unit of tip: say it, one of um, nm, mas, arcsec, rad"):
+    with pytest.raises(RecordError, match=f"{name}: has no unit of tip: state one of um, nm, mas, arcsec, rad"):
         read_psd(io.BytesIO(MAKE[name](None)), name)
     with pytest.raises(RecordError, match=r"tip is in nm\^2/Hz, but um is stated"):
         read_psd(io.BytesIO(MAKE[name]("nm^2/Hz")), name, "um")

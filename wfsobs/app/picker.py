@@ -54,7 +54,7 @@ class PartialFile:
         except (KeyError, TypeError, ValueError, binascii.Error):
             index, count, part = 0, 0, b""
         if index != len(self._parts) or not index < count:
-            raise ValueError("The file did not arrive whole.")
+            raise ValueError("The upload is incomplete: choose the file again.")
         self._parts.append(part)
         if sum(map(len, self._parts)) > LARGEST:
             raise ValueError(too_large(self.name))

@@ -92,7 +92,7 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
         return Link(
             PRESETS[SHORTEST_NAME](),
             SHORTEST_NAME,
-            (f"The link has {len(query)} characters, at most {LONGEST} are read: nothing of it was used.",),
+            (f"The link has {len(query)} characters, at most {LONGEST} are allowed: the link is ignored.",),
         )
     pairs = parse_qsl(query.removeprefix("?").replace("+", "%2B"), keep_blank_values=True)
     fields = {key: text for key, text in pairs[:MOST] if key not in PASSED_OVER}

@@ -115,7 +115,7 @@ def _rows_of_a_run(plan: Campaign) -> int:
 def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, shard: str | None, as_json: bool) -> None:
     """Run what is missing of a campaign."""
     if workers and scheduler:
-        raise SettingError("--workers: is for this machine, leave it out with --scheduler")
+        raise SettingError("--workers: only for this machine, not with --scheduler")
     plan, share = load_plan(plan_file), _shard(shard)
     stop = _Stop()
     place = DaskCluster(scheduler) if scheduler else Processes(workers or usable_processors())

@@ -92,7 +92,7 @@ def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFor
         click.echo(f"wfsobs: {record_file}: read as {record.origin}", err=True)
     if record.missing:
         click.echo(
-            f"wfsobs: {record_file}: {record.missing} of {record.n_steps} frames are missing; they are bridged by "
+            f"wfsobs: {record_file}: {record.missing} of {record.n_steps} frames are missing; they are filled by "
             "prediction and count in no score of one",
             err=True,
         )

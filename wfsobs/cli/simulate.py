@@ -135,10 +135,10 @@ def loop(
     """Close the loop with every controller on the same disturbance and print what is left of it (docs/closed_loop.md)."""
     scenario, record, start = configfile.scenario_from(preset, config, assignments), None, 0.0
     if record_file is None and (train is not None or train_until is not None):
-        raise SettingError("--train, --train-until: go with --record, a simulated record has its own training data")
+        raise SettingError("--train, --train-until: only with --record; a simulated record has its own training data")
     if record_file is not None:
         if seeds > 1:
-            raise SettingError("--seeds: is for simulated records, leave it out with --record")
+            raise SettingError("--seeds: only for simulated records, not with --record")
         stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
         record = load_declared(record_file, scenario, stated, sha256)
         scenario = as_stated(record, scenario)

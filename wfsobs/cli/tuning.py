@@ -76,7 +76,7 @@ def tune(
     scenario, record = configfile.scenario_from(preset, config, assignments), None
     if record_file is not None:
         if validation is not None:
-            raise SettingError("--validation: is for simulated records, leave it out with --record")
+            raise SettingError("--validation: only for simulated records, not with --record")
         stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
         record = load_declared(record_file, scenario, stated, sha256)
     if out:

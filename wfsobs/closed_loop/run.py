@@ -125,7 +125,7 @@ def each_outcome(
 def truth(record: Record) -> Array:
     """phi_dist (n_steps, n_modes) [um] of a record. Raises RecordError."""
     if record.turbulence is None or record.vibration is None:
-        raise RecordError("the record has no truth: what another controller would have left of it is not known")
+        raise RecordError("the record has no truth, from which the residual of another controller is computed")
     return record.turbulence + record.vibration
 
 

@@ -103,7 +103,7 @@ class Controller:
 
     def __post_init__(self) -> None:
         if self.predict is not None and Bands not in self.prior:
-            raise ValueError(f"controller {self.id!r}: one that predicts takes Bands in its prior, where the vibration is")
+            raise ValueError(f"controller {self.id!r}: with a prediction it needs Bands in its prior")
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -188,7 +188,7 @@ class Controller:
             assert prior.bands is not None
             ahead = self.predict(measurements, prior, plant, settings, watch)
             if np.shape(ahead) != z.shape:
-                raise ValueError(f"its prediction takes the shape {z.shape}, (n_steps, n_modes), not {np.shape(ahead)}")
+                raise ValueError(f"the prediction takes the shape {z.shape}, (n_steps, n_modes), not {np.shape(ahead)}")
             known = ~np.isnan(ahead)
             forward = -np.where(known, ahead, 0.0)
             z = z - np.where(known, online_reference(prior.bands, z, measurements.dt), 0.0)

@@ -35,7 +35,7 @@ def gpr_offline_ahead(measurements: Measurements, prior: Prior, plant: Plant, se
     """
     g, training = of_z(settings.gpr_offline), prior.training
     if training is None:
-        raise RecordError("the record has no training record")
+        raise RecordError("the record has no training data")
     assert prior.bands is not None
     if measurements.n_steps < g.depth:
         raise RecordError(f"the record has {measurements.n_steps} steps; depth needs {g.depth}")
@@ -53,11 +53,11 @@ def _train_ahead(prior: Prior, g: OfflineGpr, mode: int, plant: Plant, dt: float
     """Train on the vibration while u[k] acts, in one mode of the training record. Raises RecordError."""
     training = prior.training
     if training is None:
-        raise RecordError("the record has no training record")
+        raise RecordError("the record has no training data")
     assert prior.bands is not None
     steps, ahead = training.y_lgs.shape[0], plant.mirror.taps.size - 2  # by which the targets end earlier
     if steps < (needed := g.depth + g.training_size + ahead):
-        raise RecordError(f"the training record has {steps} steps, depth + training size + {ahead} need {needed}")
+        raise RecordError(f"the training data has {steps} steps, depth + training size + {ahead} need {needed}")
     targets = _ahead(training_targets(training, prior.bands, dt, delay)[:, mode], plant.mirror)
     return train(training_signals(g, training, mode, dt, delay), targets, g.depth, g.training_size, kernel_of(g), watch)
 

@@ -72,23 +72,23 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     wfsobs.observe : Run observers on a record.
     """
     if np.isinf(record.y_lgs).any() or np.isinf(record.u).any():
-        raise RecordError("the record has samples that are infinite")
+        raise RecordError("the record has infinite samples; NaN stands for a missing one")
     z = pseudo_open_loop(record.y_lgs, hold_last(record.u), record.delay)[record.delay :]
     z = z[: fast_length(len(z))]
     if len(z) < SHORTEST:
-        raise RecordError(f"the record has {record.n_steps} samples, to identify it takes {SHORTEST + record.delay} or more")
+        raise RecordError(f"the record has {record.n_steps} samples, identification needs {SHORTEST + record.delay} or more")
     if not lowest < 0.25 / record.dt:
-        raise RecordError(f"peaks from {lowest:g} Hz: takes a frequency below a quarter of the rate, {0.25 / record.dt:g} Hz")
+        raise RecordError(f"lowest peak frequency = {lowest:g} Hz: must be below a quarter of the rate, {0.25 / record.dt:g} Hz")
     names = [mode.name for mode in modes_up_to(HIGHEST_ORDER)]
     if record.n_modes > len(names):
         raise RecordError(f"the record has {record.n_modes} modes, at most {len(names)} can be identified")
     for name, column in zip(names, z.T, strict=False):
         if (count := np.count_nonzero(np.isfinite(column))) < max(SHORTEST, LEAST * len(z)):
             raise RecordError(
-                f"{name}: {count} of {len(z)} samples are measured, to identify it takes {SHORTEST}, and {LEAST:.0%}"
+                f"{name}: {count} of {len(z)} samples are measured, identification needs {SHORTEST}, and {LEAST:.0%}"
             )
         if not np.nanstd(column) > RESTING * np.nanmax(np.abs(column)):
-            raise RecordError(f"{name}: z does not change, there is nothing to identify")
+            raise RecordError(f"{name}: z is constant, there is nothing to identify")
     modes = []
     for column in z.T:
         watch.check()

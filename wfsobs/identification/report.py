@@ -71,10 +71,10 @@ def whiteness_lines(result: Identification) -> list[str]:
     out = []
     for m in result.modes:
         w = m.whiteness
-        tests = f"cumulated spectrum p = {w.periodogram:.2g}, innovations p = {w.innovations:.2g}"
+        tests = f"cumulative spectrum p = {w.periodogram:.2g}, innovations p = {w.innovations:.2g}"
         rest = f"; {w.left} candidates that no peak explains" if w.left else ""
         why = "".join(f"; {remark}" for remark in w.remarks)
-        out.append(f"{m.name}: what is left is {'white' if w.white else 'NOT white'} at {LEVEL:.0%} ({tests}{rest}){why}")
+        out.append(f"{m.name}: residual is {'white' if w.white else 'NOT white'} at {LEVEL:.0%} ({tests}{rest}){why}")
     return out
 
 

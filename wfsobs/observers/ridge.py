@@ -37,7 +37,7 @@ def fit(signals: Array, targets: Array, depth: int, m: int, penalty: float) -> t
     targets (n,), one per step. Raises RecordError where the record is too short.
     """
     if signals.shape[0] < depth + m:
-        raise RecordError(f"the training record has {signals.shape[0]} steps, depth + training size need {depth + m}")
+        raise RecordError(f"the training data has {signals.shape[0]} steps, depth + training size need {depth + m}")
     f = targets[depth - 1 : depth - 1 + m]
     windows = sliding_window_view(signals[: depth - 1 + m], depth, axis=0)  # (m, channels, depth), the oldest sample first
     middle = windows.mean(axis=0)

@@ -53,16 +53,14 @@ def trained_until(train: Record | float | None) -> float:
 
 def _other(record: Record, train: Record) -> Record:
     if abs(train.dt / record.dt - 1.0) > SAME_RATE:
-        raise RecordError(f"the training record has a rate of {1 / train.dt:g} Hz, the record {1 / record.dt:g} Hz")
+        raise RecordError(f"the training data has a rate of {1 / train.dt:g} Hz, the record {1 / record.dt:g} Hz")
     for what in ("n_modes", "delay"):
         theirs, ours = getattr(train, what), getattr(record, what)
         if theirs != ours:
             word = "modes" if what == "n_modes" else "steps of delay"
-            raise RecordError(f"the training record has {theirs} {word}, the record {ours}")
+            raise RecordError(f"the training data has {theirs} {word}, the record {ours}")
     if train.y_lgs.shape == record.y_lgs.shape and np.array_equal(train.y_lgs, record.y_lgs, equal_nan=True):
-        raise RecordError(
-            "the training record is the record itself: training and test must differ; train until S seconds instead"
-        )
+        raise RecordError("the training data is the record itself: training and test must differ; train on the first part of it")
     return train
 
 

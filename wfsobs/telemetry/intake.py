@@ -101,7 +101,7 @@ def _into_micrometres(
             raise RecordError(f"{name} is in {unit}, but {declaration.unit} is stated")
     units = {name: own.get(name, declaration.unit or "um") for name in signals}
     if set(units.values()) & set(ANGLES) and signals["y_lgs"].shape[1] > 2:
-        raise RecordError("angles are for tip and tilt alone, of which there are two")
+        raise RecordError("angles are units of tip and tilt alone, which are two modes")
     for name, unit in units.items():
         if unit != "um":
             signals[name] *= micrometres_per(unit, diameter)

@@ -63,7 +63,9 @@ def steps_of(time: Array, dt: float | None = None) -> tuple[Array, float]:
         row = int(np.argmax(uneven)) + 1
         raise RecordError(f"the rate is not constant: {difference[row - 1]:.6g} s before row {row}, {step:.6g} s on average")
     if steps[-1] + 1 > 2 * time.size:
-        raise RecordError(f"{steps[-1] + 1 - time.size:.0f} frames are missing, {time.size} are there: cut it at its gaps")
+        raise RecordError(
+            f"{steps[-1] + 1 - time.size:.0f} frames are missing, more than the {time.size} measured: cut the record at its gaps"
+        )
     if dt is not None and abs(step / dt - 1.0) > AGREE:
         raise RecordError(f"time has a step of {step:.6g} s, but {dt:.6g} s are stated")
     return steps.astype(int), step if dt is None else dt

@@ -68,7 +68,7 @@ def check_controller(controller: Controller, scenario: Scenario | None = None, a
     given = _inputs(controller, record, s)
     laws = _check_laws(controller, given)
     if found := given_away(record, controller, laws, *given):
-        raise CheckError(f"{controller.id}: knows more than it is told: it reaches {', '.join(sorted(found))}")
+        raise CheckError(f"{controller.id}: uses more than it is given: it reaches {', '.join(sorted(found))}")
     base = _commands(controller, given)
     _check_shape(controller, base, given.measurements)
     again = _inputs(controller, record, s)
@@ -80,7 +80,7 @@ def check_controller(controller: Controller, scenario: Scenario | None = None, a
     _check_steps(controller, given)
     if alone:
         there = in_a_fresh_process(controller.id, _commands, controller, again)
-        what = "in a fresh process, with measurements and prior alone, it commands something else: it knows more than it is told"
+        what = "in a fresh process, with measurements and prior alone, it commands something else: it uses more than it is given"
         _compare(controller, there, base, what)
 
 
@@ -156,7 +156,7 @@ def _check_gaps(controller: Controller, inputs: ControllerInputs) -> None:
     if not np.isfinite(u).all():
         raise CheckError(f"{controller.id}: a command is NaN or infinite after missing samples")
     if controller.law is not None and not np.ptp(u[start + LOST :], axis=0).any():
-        raise CheckError(f"{controller.id}: does not come back after missing samples")
+        raise CheckError(f"{controller.id}: does not recover after missing samples")
 
 
 def _check_steps(controller: Controller, inputs: ControllerInputs) -> None:

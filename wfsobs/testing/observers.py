@@ -66,7 +66,7 @@ def check_observer(observer: Observer, scenario: Scenario | None = None, alone: 
             observer,
             in_a_fresh_process(observer.id, _run, observer, *again),
             base,
-            "in a fresh process, with measurements and prior alone, it gives another result: it knows more than it is told",
+            "in a fresh process, with measurements and prior alone, it gives another result: it uses more than it is given",
         )
 
 
@@ -76,7 +76,7 @@ def _check_shapes(observer: Observer, base: Estimates, measurements: Measurement
             raise CheckError(f"{observer.id}: target {target!r} is none of {', '.join(TARGETS)}")
         values = base.get(target)
         if values is None:
-            raise CheckError(f"{observer.id}: gives no {target}")
+            raise CheckError(f"{observer.id}: returns no {target}")
         if not isinstance(values, np.ndarray) or values.dtype != float or values.shape != measurements.y_lgs.shape:
             raise CheckError(f"{observer.id}: {target} takes numbers of shape {measurements.y_lgs.shape}, (n_steps, n_modes)")
         if np.isnan(values).all() or np.isinf(values).any():
@@ -116,7 +116,7 @@ def _check_gaps(observer: Observer, arguments: tuple[Measurements, Prior, Any]) 
     y[start : start + 7] = np.nan
     for target, values in observer.estimate(replace(measured, y_lgs=y), *arguments[1:]).items():
         if target in observer.targets and np.isnan(values[start + 1 :]).all():
-            raise CheckError(f"{observer.id}: {target} does not come back after missing samples")
+            raise CheckError(f"{observer.id}: {target} does not recover after missing samples")
 
 
 def _compare(

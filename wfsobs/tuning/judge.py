@@ -56,7 +56,7 @@ class Judge:
             scores = supervised_scores(record, [e for e in estimates if e.target == self.target], warm_up, names)
         modes = {s.mode: s.rms for s in scores}
         if len(modes) < len(names) or not all(map(isfinite, modes.values())):
-            raise RecordError(f"{self.observer} has nothing to be scored after {warm_up:g} s")
+            raise RecordError(f"{self.observer} has no estimate after the warm-up, {warm_up:g} s")
         return Errors(modes)
 
     def begins(self, estimates: list[Estimate]) -> int:

@@ -109,7 +109,7 @@ def judged_by(record: Record, observer: str, target: str) -> tuple[str, str]:
         return target, TRUTH
     of_both = set(OBSERVERS[observer].targets) == set(TARGETS)
     if "y_ngs" in OBSERVERS[observer].needs or not (of_both or target == VIBRATION):
-        raise RecordError(f"{observer}: nothing to judge it by in a record without the truth")
+        raise RecordError(f"{observer}: cannot be tuned on a record without truth, which holds no reference for it")
     return (PREDICTION, NEXT) if of_both else (target, REFERENCE)
 
 
@@ -144,7 +144,7 @@ def _cuts(record: Record, scenario: Scenario, learns: bool) -> list[tuple[int, i
     scored = round((scenario.run.warm_up + SHORTEST) / record.dt)
     if out[0][1] < needed or min(stop - start for start, stop in out[1:]) < scored:
         least = max(needed / SHARES[learns][0] if learns else 0, (scored + gap + per) / SHARES[learns][2])
-        raise RecordError(f"the record has {n * record.dt:.1f} s; to tune on it takes {least * record.dt:.1f} s or more")
+        raise RecordError(f"the record has {n * record.dt:.1f} s; tuning needs {least * record.dt:.1f} s or more")
     return out
 
 

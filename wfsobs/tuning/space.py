@@ -97,7 +97,7 @@ def space(scenario: Scenario, observer: str, names: Sequence[str] | None = None)
         raise SettingError(f"observer {observer!r}: has no settings to tune")
     chosen = tuple(known.usual if names is None else names)
     if not chosen:
-        raise SettingError("names: needs one setting at least")
+        raise SettingError("names: takes one setting or more")
     for i, path in enumerate(chosen):
         _check(scenario, observer, path)
         if path in chosen[:i]:
@@ -119,12 +119,12 @@ def _check(scenario: Scenario, observer: str, path: str) -> None:
     if path not in settings:
         raise SettingError(f"{path}: no such setting")
     if not isinstance(settings[path], param.Number):
-        raise SettingError(f"{path}: is not one number, which is what can be tuned")
+        raise SettingError(f"{path}: cannot be tuned, it is not a single number")
     if path not in (*usual, *others):
         raise SettingError(f"{path}: not a setting of {observer} that can be tuned; there are {', '.join((*usual, *others))}")
     group, _, name = path.rpartition(".")
     if name == "highpass" and (way := _value(scenario, f"{group}.inputs_filter")) != "high-pass":
-        raise SettingError(f"{path}: is not read while {group}.inputs_filter = {way}")
+        raise SettingError(f"{path}: has no effect while {group}.inputs_filter = {way}")
 
 
 def _value(group: Any, path: str) -> Any:

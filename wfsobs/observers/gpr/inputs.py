@@ -100,7 +100,7 @@ def scale_of(settings: Gpr, training: Training | None, delay: int, mode: int) ->
     if settings.inputs_filter != "standardised":
         return None
     if training is None:
-        raise RecordError("standardised inputs need the training record, and the record has none")
+        raise RecordError("standardised inputs need training data, and the record has none")
     x = _channels(settings, training.y_lgs, training.u, pseudo_open_loop(training.y_lgs, training.u, delay), mode)
     std = x.std(axis=0)
     return Scale(x.mean(axis=0), np.where(std > 0, std, 1.0))

@@ -22,7 +22,7 @@ class LateRegression(SlidingRegression):
 
     def __init__(self, depth: int, m: int, channels: int, kernel: SquaredExponential, late: int):
         if late >= m:
-            raise ValueError(f"training size {m}: targets known {late} steps late need more")
+            raise ValueError(f"training size {m}: must be above the delay of the targets, {late} steps")
         super().__init__(depth, m, channels, kernel)
         self.late = late
 

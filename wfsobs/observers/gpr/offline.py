@@ -95,7 +95,7 @@ def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExp
     Raises RecordError where the record is too short, ConditionError where the precision is not enough.
     """
     if signals.shape[0] < depth + m:
-        raise RecordError(f"the training record has {signals.shape[0]} steps, depth + training size need {depth + m}")
+        raise RecordError(f"the training data has {signals.shape[0]} steps, depth + training size need {depth + m}")
     first = depth - 1
     V, points = band(signals, depth, kernel, first, m, m - 1)
     watch.check()
@@ -126,7 +126,7 @@ def train_mode(
     training, bands = prior.training, prior.bands
     assert training is not None and bands is not None
     if len(training.y_lgs) < (needed := g.depth + g.training_size + horizon):
-        raise RecordError(f"the training record has {len(training.y_lgs)} steps, depth + training size need {needed}")
+        raise RecordError(f"the training data has {len(training.y_lgs)} steps, depth + training size need {needed}")
     targets = training_targets(training, bands, dt, delay, horizon)[:, mode]
     return train(training_signals(g, training, mode, dt, delay), targets, g.depth, g.training_size, kernel_of(g), watch)
 

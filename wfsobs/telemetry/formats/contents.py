@@ -72,7 +72,7 @@ def from_columns(columns: Mapping[str, Array]) -> Contents:
         elif match and match["array"] in SIGNALS:
             name = match["array"]
             if match["mode"] in found.setdefault(name, {}):
-                raise RecordError(f"two columns are {name}/{match['mode']}")
+                raise RecordError(f"two columns are named {name}/{match['mode']}")
             found[name][match["mode"]] = values
             if match["unit"]:
                 contents.state_unit(name, match["unit"])

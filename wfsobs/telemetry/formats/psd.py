@@ -123,6 +123,6 @@ def _to_table(columns: dict[str, Array], units: dict[str, str], unit: str | None
             raise RecordError(f"{name} is in {own}^2/Hz, but {unit} is stated")
         amplitude = own or unit
         if amplitude is None:
-            raise RecordError(f"does not say the unit of {name}: say it, one of {', '.join(UNITS)} (squared, per Hz)")
+            raise RecordError(f"has no unit of {name}: state one of {', '.join(UNITS)} (squared, per Hz)")
         out[name] = (columns[name] * micrometres_per(amplitude, diameter) ** 2).tolist()
     return out
