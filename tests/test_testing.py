@@ -76,7 +76,7 @@ def test_ours_are_the_same_in_a_fresh_process(name: str) -> None:
         (different_every_time, "two results"),
         (one_column, r"shape \(1500, 2\)"),
         (in_place, r"changes its measurements \(y_lgs\)"),
-        (never_again, "come back after missing"),
+        (never_again, "recover after missing"),
         (lambda m, p, s, w: {VIBRATION: m.z}, "cannot run in a fresh process"),
     ],
 )

@@ -6,7 +6,6 @@ import io
 import logging
 import re
 import threading
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -53,13 +52,11 @@ def test_a_run_from_beginning_to_end(written: io.StringIO, short: Scenario) -> N
     def fails(*_: Any) -> RunResults:
         raise RuntimeError("no such luck")
 
-    service, over = Service(NONE, 1, 0, fails), threading.Event()
+    service, failure, end = Service(NONE, 1, 0, fails), threading.Event(), threading.Event()
     session = service.enter()
-    session.submit(service.run(short), lambda news: over.set() if "message" in news else None)
-    session.submit(Job("identify", lambda *_: None, cost=1.5), lambda _news: None)
-    assert over.wait(20)
-    while service.queue.running + service.queue.length:
-        time.sleep(0.001)
+    session.submit(service.run(short), lambda news: failure.set() if "message" in news else None)
+    session.submit(Job("identify", lambda *_: None, cost=1.5), lambda news: end.set() if "result" in news else None)
+    assert failure.wait(20) and end.wait(20)  # the line of its end is written before a job tells its result
     session.leave()
     assert service.close(20)
     said = [LINE.sub("", line) for line in written.getvalue().splitlines() if LINE.match(line) and " failed" not in line]

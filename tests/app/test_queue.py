@@ -171,7 +171,7 @@ def test_what_takes_too_long_is_stopped_counted_from_its_turn(make_queue: Any) -
     first = Asked(log, "a").into(queue)
     log.until(lambda: log.started == ["a"])
     limited = Asked(log, "b", time_limit=0.05).into(queue)
-    time.sleep(0.1)
+    time.sleep(0.1)  # it waits for longer than it may take, which does not count
     first.gate.set()
     assert limited.over.wait(WAIT) and log.started == ["a", "b"]
     assert limited.known == {"place": 0, "state": FAILED, "message": "It took more than 0.05 s, which is what this server allows"}

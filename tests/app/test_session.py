@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -39,12 +40,9 @@ def test_only_its_own_thread_touches_the_document(monkeypatch: pytest.MonkeyPatc
             for k in range(100):
                 post(partial(done.append, (i, k)))
 
-        threads = [threading.Thread(target=many, args=(i,)) for i in range(8)]
-        for thread in threads:
-            thread.start()
-        while any(thread.is_alive() for thread in threads):
-            await asyncio.sleep(0.001)
-        await asyncio.sleep(0.01)
+        with ThreadPoolExecutor(8) as pool:
+            loop = asyncio.get_running_loop()
+            await asyncio.gather(*(loop.run_in_executor(pool, many, i) for i in range(8)))
 
     asyncio.run(main())
     assert page.threads == {threading.get_ident()}

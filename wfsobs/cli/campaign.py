@@ -233,7 +233,7 @@ def _summary(plan: Campaign, rows: object, title: str) -> Table:
     for name in ("Scenario", "Settings", "Target", "Mode", "Name", "rms, nm", "above the best, nm", "seeds"):
         out.add_column(name, justify="right" if name in ("rms, nm", "above the best, nm", "seeds") else "left")
     before = None
-    for one in compare(rows):  # type: ignore[arg-type]
+    for one in compare(rows):
         key = (one.cell, one.target, one.mode)
         settings = ", ".join(f"{path.split('.')[-1]} = {value}" for path, value in plan.cells[one.cell].changes.items())
         new = key != before

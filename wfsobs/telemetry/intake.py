@@ -69,7 +69,7 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     if delay < 1:
         raise RecordError(f"delay takes a whole number from 1, not {delay}")
     fields = {name: signals[name] for name in (*FAST, NGS) if name in signals}
-    return Record(**fields, dt=dt, ratio=ratio, training=_training(signals), delay=delay, origin=origin)  # type: ignore[arg-type]
+    return Record(**fields, dt=dt, ratio=ratio, training=_training(signals), delay=delay, origin=origin)
 
 
 def _signal(name: str, raw: Array) -> Array:

@@ -104,7 +104,7 @@ class ChoiceField(Field):
     """One of several words."""
 
     def _widgets(self) -> list[Any]:
-        select = pmui.Select(options=list(self.parameter.objects), size="small", **self._names(), **ROOM)  # type: ignore[attr-defined]
+        select = pmui.Select(options=list(self.parameter.objects), size="small", **self._names(), **ROOM)
         select.param.watch(self._change, "value")
         return [select]
 
@@ -218,7 +218,7 @@ class SliderField(TextField):
             return
         self._value = value
         slider = self.widgets[0]
-        low, high = self.parameter.softbounds  # type: ignore[attr-defined]
+        low, high = self.parameter.softbounds
         with param.edit_constant(slider):  # value_throttled too: releasing at its old value must count as news
             slider.param.update(start=min(low, value), end=max(high, value), value=value, value_throttled=value)
 

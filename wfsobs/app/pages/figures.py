@@ -188,7 +188,7 @@ class _PlotLines:
         """Send every line in the colours of the paper."""
         scale = per_micrometre(display.unit, results.scenario.telescope.diameter)
         for name, line in self.lines.items():
-            line.glyph.line_color = look(name).colour(display.dark)  # type: ignore[union-attr]
+            line.glyph.line_color = look(name).colour(display.dark)
         mode = TIP_TILT[self.plot.column].name
         if self.plot.what == SPECTRUM:
             self.figure.yaxis.axis_label = f"PSD, {mode} [{display.unit_label}²/Hz]"

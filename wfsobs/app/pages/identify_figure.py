@@ -89,6 +89,6 @@ class SpectrumFigure:
         """Set the colours of light or dark mode."""
         for name, renderers in self._coloured.items():
             for renderer in renderers:
-                renderer.glyph.line_color = look(name).colour(dark)  # type: ignore[union-attr]
+                renderer.glyph.line_color = look(name).colour(dark)
                 if "fill_color" in renderer.glyph.properties():
-                    renderer.glyph.fill_color = look(name).colour(dark)  # type: ignore[union-attr]
+                    renderer.glyph.fill_color = look(name).colour(dark)

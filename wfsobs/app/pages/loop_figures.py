@@ -111,7 +111,7 @@ class Response(LoopLines):
         self.noise = {name: ColumnDataSource({"x": [], "y": []}) for name in CURVES}
         self.faint = {name: add_line(fig, name, source) for name, source in self.noise.items()}
         for line in self.lines.values():
-            line.glyph.line_width = 2.2  # type: ignore[union-attr]
+            line.glyph.line_width = 2.2
         for line in self.faint.values():
             line.glyph.update(line_alpha=0.45, line_width=1.2)
         fig.xaxis.axis_label, fig.yaxis.axis_label = "frequency [Hz]", "amplitude [dB]"

@@ -82,7 +82,7 @@ def _same(a: Any, b: Any) -> bool:
 def restyle(lines: dict[str, GlyphRenderer], dark: bool, hidden_names: list[str]) -> None:
     """Give every line the colour of the mode, and hide those that are to be hidden."""
     for name, line in lines.items():
-        line.glyph.line_color = look(name).colour(dark)  # type: ignore[union-attr]
+        line.glyph.line_color = look(name).colour(dark)
         line.visible = name not in hidden_names
 
 
