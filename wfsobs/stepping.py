@@ -87,17 +87,17 @@ def design(
     if name in OBSERVERS:
         observer = OBSERVERS[name]
         own = observer_settings(observer, settings)
-        given = _prior(name, told, (*observer.prior, *observer.asks(own)), settings, sampling, train)
+        given = prior_in(name, told, (*observer.prior, *observer.asks(own)), settings, sampling, train)
         return observer.design(given, own, sampling, horizon)
     if horizon:
         raise StepError(f"{name}: a controller has the horizon of its mirror, control.delay; leave horizon out")
     controller = CONTROLLERS[name]
     groups = own_settings(controller, settings)
-    given = _prior(name, told, controller.parts(groups), settings, sampling, train)
+    given = prior_in(name, told, controller.parts(groups), settings, sampling, train)
     return controller.design(given, plant_of(settings), groups, sampling)
 
 
-def _prior(
+def prior_in(
     name: str,
     source: Prior | Scenario,
     parts: tuple[Part, ...],
@@ -115,11 +115,16 @@ def _prior(
 
 def _sampling(prior: Prior | Identification | Scenario, scenario: Scenario) -> Sampling:
     """Return the sampling of what is told, where that has one, or of the scenario."""
-    own = Sampling(len(scenario.modes), scenario.dt, scenario.sensors.exposure_ratio)
+    own = sampling_of(scenario)
     if isinstance(prior, Prior):
         n = max(len(prior.model), len(prior.lines))
         return own._replace(n_modes=n) if n else own
     return own if isinstance(prior, Scenario) else own._replace(n_modes=len(prior.modes), dt=prior.dt)
+
+
+def sampling_of(scenario: Scenario) -> Sampling:
+    """Return modes, step and NGS ratio of a scenario."""
+    return Sampling(len(scenario.modes), scenario.dt, scenario.sensors.exposure_ratio)
 
 
 def as_sampled(scenario: Scenario, sampling: Sampling) -> Scenario:

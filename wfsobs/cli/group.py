@@ -21,6 +21,7 @@ class Place(NamedTuple):
 COMMANDS = {
     "bench": Place("bench", "Time the observers beside textbook versions, and other libraries if installed."),
     "campaign": Place("campaign", "Run many scenarios and seeds, on many processes or machines."),
+    "design": Place("design", "Write a controller for a program elsewhere: C99, arrays, python-control."),
     "export": Place("export", "Write a report: one HTML file with figures and numbers that opens without a network."),
     "identify": Place("telemetry", "Find noise, turbulence and vibration peaks in a record."),
     "live": Place("live", "Run the simulated loop by the clock, every observer beside it, frame by frame."),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import minimize_scalar
 
@@ -10,6 +12,7 @@ from wfsobs.control.mirror import Mirror
 from wfsobs.control.residual import residual_density
 from wfsobs.prior import Spectra
 from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 
 FINE, COARSE = 2048, 64
@@ -28,7 +31,15 @@ def integrator_law(mirror: Mirror, gain: float, leak: float) -> Law:
     A = np.vstack([row, np.eye(n)[:-1]])
     into = np.array([-gain])
     cycle = PeriodicFilter([(A, np.eye(n)[:, :1] * into, row[None, :], into[:, None])])
-    return steady_law(cycle, gain, leak)
+    return replace(steady_law(cycle, gain, leak), gains=_as_observer(taps, gain, leak), row=np.eye(n + 1)[0])
+
+
+def _as_observer(taps: Array, gain: float, leak: float) -> GainCycle:
+    """Return the integrator as an observer: its state is what the leak leaves of the last command, then the last commands."""
+    n = len(taps)
+    A = np.eye(n, k=-1)
+    A[0, 0] = leak
+    return GainCycle([Gain(A, -np.append(0.0, taps[1:])[None], -gain * np.eye(n)[:, :1])])
 
 
 def highest_stable_gain(mirror: Mirror, leak: float) -> float:

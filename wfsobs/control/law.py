@@ -17,6 +17,7 @@ from scipy.linalg import schur
 
 from wfsobs.signal.periodic import FilterStep, PeriodicFilter
 from wfsobs.signal.statespace import DisturbanceModel
+from wfsobs.signal.stepping import GainCycle
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
 
@@ -30,6 +31,7 @@ class Law:
     gain, leak : of an integrator
     first : step 0, where it is not one of the cycle
     model : of the disturbance, the first states of the filter, where there is one
+    gains, row : the same filter as an observer: u[k] = row x_hat[k]; None where it is not known as one
     """
 
     cycle: PeriodicFilter
@@ -38,6 +40,8 @@ class Law:
     leak: float = 1.0
     first: FilterStep | None = None
     model: DisturbanceModel | None = None
+    gains: GainCycle | None = None
+    row: Array | None = None
 
     @property
     def poles(self) -> Complex:

@@ -17,11 +17,12 @@ import numpy as np
 from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.multirate import MultiRateFilter, multirate_filter, multirate_noise
-from wfsobs.observers.kalman.multirate_optimal import optimal_filter, optimal_model
-from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.observers.kalman.multirate import filter_of_gains, multirate_gains, multirate_noise
+from wfsobs.observers.kalman.multirate_optimal import optimal_gains, optimal_model
+from wfsobs.observers.kalman.single import steady_gains
 from wfsobs.prior import Prior
 from wfsobs.signal.statespace import DisturbanceModel
+from wfsobs.signal.stepping import GainCycle
 from wfsobs.typing import Array
 
 
@@ -44,7 +45,8 @@ def _rows_of(model: DisturbanceModel, mirror: Mirror) -> Array:
 
 def lqg_of(model: DisturbanceModel, noise: float, mirror: Mirror) -> Law:
     """LQG on the LGS with any model; noise [um] of a measurement. Raises RiccatiError."""
-    return replace(steady_law(steady_filter(model, noise, _rows_of(model, mirror))[0]), model=model)
+    gains, row = steady_gains(model, noise)[0], _rows_of(model, mirror)
+    return replace(steady_law(gains.filter(row)), model=model, gains=gains, row=row[0])
 
 
 def lqg_kf_lgs(prior: Prior, mode: int, plant: Plant, _settings: Any) -> Law:
@@ -63,7 +65,7 @@ def lqg_multirate(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the paper's multi-rate filter. Raises UnstableCycle."""
     known = prior.model[mode]
     model, noise = known.disturbance(), multirate_noise(settings.multirate, known)
-    return _two_sensors(multirate_filter(model, plant.ratio, *noise, _rows_of(model, plant.mirror)), model)
+    return _two_sensors(multirate_gains(model, plant.ratio, *noise), _rows_of(model, plant.mirror), model)
 
 
 def lqg_multirate_optimal(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
@@ -79,8 +81,10 @@ def lqg_multirate_multi(prior: Prior, mode: int, plant: Plant, settings: Any) ->
 def _optimal(prior: Prior, mode: int, plant: Plant, settings: Any, model: DisturbanceModel | None) -> Law:
     model = model or prior.model[mode].disturbance()
     cycle, rows = optimal_model(settings.multirate, prior, mode, plant.ratio, model)
-    return _two_sensors(optimal_filter(cycle, command_rows(cycle[0][0], rows.sum(axis=0), plant.mirror))[0], model)
+    row = command_rows(cycle[0][0], rows.sum(axis=0), plant.mirror)
+    return _two_sensors(optimal_gains(cycle)[0], row, model)
 
 
-def _two_sensors(filter_: MultiRateFilter, model: DisturbanceModel) -> Law:
-    return Law(filter_.cycle, lambda z: filter_.run(z)[:, 0], first=filter_.first, model=model)
+def _two_sensors(gains: GainCycle, row: Array, model: DisturbanceModel) -> Law:
+    filter_ = filter_of_gains(gains, row)
+    return Law(filter_.cycle, lambda z: filter_.run(z)[:, 0], first=filter_.first, model=model, gains=gains, row=row[0])

@@ -31,6 +31,8 @@ class StepController:
         Mirror, step and NGS ratio that it was designed for.
     sampling : Sampling
         Number of modes, step and NGS ratio.
+    bridges : tuple of Bridge
+        What completes LGS measurements and NGS frames; None without NGS.
     frame : int
         Frames that it has taken.
     """
@@ -53,6 +55,7 @@ class StepController:
         self._sent = np.zeros((len(self._taps), n))  # commands, newest first
         self._mirror = np.zeros((max(self._ratio, 1), n))  # the mirror in the last measurements, newest first
         self._nothing, self._none = np.full(n, np.nan), np.zeros(n)
+        self.bridges = lgs, ngs
         self._parts: dict[str, Stateful] = {"lgs": lgs}
         self._parts |= {} if law is None else {"law": law}
         self._parts |= {} if ngs is None else {"ngs": ngs}

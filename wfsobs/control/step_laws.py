@@ -89,6 +89,7 @@ class Integrators:
     """Integrators whose state are their own commands, so that a limit of the mirror stops them (anti-windup)."""
 
     def __init__(self, laws: Sequence[Law], mirror: Mirror):
+        self.laws = tuple(laws)
         self._gain = np.array([law.gain for law in laws])
         self._leak = np.array([law.leak for law in laws])
         self._taps = mirror.taps[1:]

@@ -77,10 +77,14 @@ def predict_missing(z: Array, predictors: Sequence[Predictor]) -> Array:
 
 
 class Bridge:
-    """`predict_missing`, one frame at a time."""
+    """`predict_missing`, one frame at a time.
+
+    gains : of the filters that predict, by mode; other modes hold their last value
+    """
 
     def __init__(self, n_modes: int, predictors: Sequence[Predictor] = ()):
         found = [(mode, gains) for mode, one in enumerate(predictors) if (gains := _gains(one)) is not None]
+        self.gains = dict(found)
         self._modes = np.array([mode for mode, _ in found], dtype=int)
         self._bank = FilterBank([gains.estimator() for _, gains in found]) if found else None
         self._rows = expected_rows([gains for _, gains in found])

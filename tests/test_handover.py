@@ -1,0 +1,163 @@
+"""Controllers for programs elsewhere: what they give is what the run over a record gives, and a wrong number is noticed."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.io import loadmat
+
+from wfsobs.cli import main
+
+ROUNDING = 1e-12
+"""Over the std of the commands: sums in another order."""
+
+
+def write(tmp_path: Path, controller: str, form: str, *more: str) -> Path:
+    path = tmp_path / "out"
+    result = CliRunner().invoke(main, ["design", "--controller", controller, "--to", form, "--out", str(path), *more])
+    assert result.exit_code == 0, result.output
+    return path
+
+
+def vectors(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """z and ngs (n, 4), and commands (n, 2)."""
+    return np.fromfile(path / "input.f64", "<f8").reshape(-1, 4), np.fromfile(path / "output.f64", "<f8").reshape(-1, 2)
+
+
+def make(path: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["make", "-C", str(path), "test"], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    "controller", ["integrator", "lqg-kf-lgs", "lqg-kf-multi", "lqg-multirate", "lqg-multirate-optimal", "lqg-multirate-multi"]
+)
+def test_c99_is_the_run_over_a_record_and_its_test_notices_one_wrong_number(tmp_path: Path, controller: str) -> None:
+    path = write(tmp_path, controller, "c99")
+    given, commands = vectors(path)
+    assert len(commands) >= 10_000 and np.isnan(given[:, :2]).any(axis=0).all()
+    done = make(path)
+    assert done.returncode == 0 and done.stdout.count("equal") == 2, done.stdout + done.stderr
+    assert "warning" not in done.stderr
+    commands[5000, 1] += 1e-3 * commands.std()
+    commands.tofile(path / "output.f64")
+    assert make(path).returncode != 0
+    vector = np.fromfile(path / "output.f64", "<f8")
+    vector[2 * 5000 + 1] -= 1e-3 * commands.std()
+    vector.tofile(path / "output.f64")
+    source = (path / "wfsobs_controller.c").read_text()
+    tables = re.findall(r"static const real (t\d+)\[\] = \{([^}]*)\}", source)
+    name, row = next((name, text) for name, text in tables if re.search(rf"\}}, {name}, [01]\}}", source))
+    numbers = [float(x) for x in row.split(",")]
+    wrong = int(np.argmax(np.abs(numbers)))
+    numbers[wrong] *= 1.001
+    (path / "wfsobs_controller.c").write_text(
+        source.replace(f"{name}[] = {{{row}}}", f"{name}[] = {{{', '.join(map(repr, numbers))}}}")
+    )
+    assert make(path).returncode != 0
+
+
+def run(arrays: dict[str, np.ndarray], given: np.ndarray) -> np.ndarray:
+    """The equations that the file names, without gaps."""
+    out = np.empty((len(given), 2))
+    for mode in range(2):
+        A, C, L = (arrays[f"mode{mode}_{name}"] for name in "ACL")
+        row, x, repeat = np.ravel(arrays[f"mode{mode}_row"]), np.zeros(A.shape[1]), len(A)
+        v = given[:, [mode, 2 + mode]][:, : C.shape[1]]
+        for k, measured in enumerate(np.nan_to_num(v)):
+            step = (A[(k - 1) % repeat], C[(k - 1) % repeat], L[(k - 1) % repeat])
+            if k == 0 and f"mode{mode}_first_A" in arrays:
+                step = tuple(arrays[f"mode{mode}_first_{name}"] for name in "ACL")
+            a, c, gain = step
+            w = x + gain @ (measured - c @ x)
+            out[k, mode], x = row @ w, a @ w
+    return out
+
+
+@pytest.fixture(scope="module", name="whole")
+def _whole() -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Measurements without gaps, and the commands for them by controller, from the run over a record."""
+    from wfsobs.control.controllers import CONTROLLERS
+    from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for
+    from wfsobs.record import Measurements
+    from wfsobs.scenario.presets import paper
+
+    scenario, rng = paper(), np.random.default_rng(3)
+    z = np.cumsum(0.01 * rng.standard_normal((600, 2)), axis=0)
+    ngs = np.full((600, 2), np.nan)
+    ngs[5::5] = z[5::5] + 0.01 * rng.standard_normal((119, 2))
+    commands = {}
+    for name in ("integrator", "lqg-kf-multi", "lqg-multirate-multi"):
+        controller, settings, plant = CONTROLLERS[name], own_settings(CONTROLLERS[name], scenario), plant_of(scenario)
+        prior = prior_for(controller, scenario)
+        measurements = Measurements(z, np.zeros_like(z), scenario.dt, ngs, 5)
+        commands[name] = controller.commands(controller.laws(prior, plant, settings, 2), measurements, prior, plant, settings)[0]
+    return np.hstack([z, ngs]), commands
+
+
+@pytest.mark.parametrize("form", ["npz", "mat"])
+@pytest.mark.parametrize("controller", ["integrator", "lqg-kf-multi", "lqg-multirate-multi"])
+def test_arrays_are_the_run_over_a_record(tmp_path: Path, form: str, controller: str, whole: tuple) -> None:
+    path = write(tmp_path, controller, form)
+    if form == "npz":
+        with np.load(path) as file:
+            arrays = dict(file)
+    else:
+        arrays = loadmat(path)
+        for i in range(2):  # MATLAB has no vectors and drops the last of three dimensions where it is 1
+            n = np.ravel(arrays[f"mode{i}_row"]).size
+            for name, shape in (
+                ("A", (-1, n, n)),
+                ("C", (arrays[f"mode{i}_A"].shape[0], -1, n)),
+                ("L", (arrays[f"mode{i}_A"].shape[0], n, -1)),
+            ):
+                arrays[f"mode{i}_{name}"] = arrays[f"mode{i}_{name}"].reshape(shape)
+    assert "NaN" not in str(arrays["conventions"]) and "z[k] = y[k] - (1 u[k-2])" in str(arrays["conventions"])
+    given, commands = whole
+    want = commands[controller]
+    np.testing.assert_allclose(run(arrays, given), want, rtol=0, atol=ROUNDING * want.std())
+
+
+@pytest.mark.parametrize("controller", ["integrator", "lqg-kf-multi"])
+def test_the_module_for_python_control(tmp_path: Path, controller: str, whole: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path, controller, "control")
+    names: dict = {}
+    monkeypatch.setitem(__import__("sys").modules, "control", SimpleNamespace(StateSpace=lambda *system: system))
+    exec(compile(path.read_text(), "control", "exec"), names)
+    A, B, C, D, dt = names["system"]()
+    given, commands = whole
+    x, want, got = np.zeros(len(A)), commands[controller], []
+    for z in given[:, :2]:
+        got.append(C @ x + D @ z)
+        x = A @ x + B @ z
+    assert dt == 1e-3
+    np.testing.assert_allclose(got, want, rtol=0, atol=ROUNDING * want.std())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("lqg-multirate", "control"), "repeats every 5 steps"),
+        (("integrator+gpr-online", "c99"), "no linear form"),
+        (("none", "npz"), "there is no law"),
+        (("integrator", "npz", "--set", "control.stroke=1"), "limits of the mirror"),
+        (("kf-lgs", "npz"), "no such controller"),
+        (("integrator", "pdf"), "takes one of c99, control, mat, npz"),
+    ],
+)
+def test_what_a_format_cannot_hold_is_refused_in_one_line(tmp_path: Path, arguments: tuple[str, ...], reason: str) -> None:
+    name, form, *more = arguments
+    result = CliRunner().invoke(main, ["design", "--controller", name, "--to", form, "--out", str(tmp_path / "out"), *more])
+    assert result.exit_code == 2 and reason in result.output and result.output.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_c99_overwrites_nothing(tmp_path: Path) -> None:
+    (tmp_path / "mine.c").write_text("")
+    result = CliRunner().invoke(main, ["design", "--controller", "integrator", "--to", "c99", "--out", str(tmp_path)])
+    assert result.exit_code == 2 and "takes a new or empty directory" in result.output

@@ -1,0 +1,1 @@
+"""A controller's design for programs elsewhere: C99, arrays, python-control."""

@@ -1,0 +1,114 @@
+"""A linear controller as C99 without dependencies: a header, a source, and a test on vectors of the run over a record.
+
+Sparse rows of A and dense C and L are tables of constants; one function runs any of the filters. Memory is static.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from wfsobs.files import write_whole
+from wfsobs.handover.linear import LinearDesign, predicts_itself
+from wfsobs.handover.vectors import Vectors
+from wfsobs.observers.step import StepError
+from wfsobs.signal.stepping import Gain, GainCycle
+from wfsobs.typing import Array
+
+TEMPLATES = files("wfsobs.handover") / "templates"
+
+
+class _Tables:
+    """Tables of constants, each written once however often it is used."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self._names: dict[tuple[str, bytes], str] = {}
+
+    def numbers(self, kind: str, values: Array) -> str:
+        """Return the name of a table of `kind`, real or int."""
+        values = np.ascontiguousarray(values).ravel()
+        key = kind, values.tobytes()
+        if key not in self._names:
+            self._names[key] = name = f"t{len(self._names)}"
+            text = ", ".join(repr(float(v)) if kind == "real" else str(int(v)) for v in values)
+            self.lines.append(f"static const {kind} {name}[] = {{{text}}};")
+        return self._names[key]
+
+    def step(self, gain: Gain) -> str:
+        """Return the initialiser of a step: sparse A, then rows of C and columns of L."""
+        rows = [np.flatnonzero(row) for row in gain.A]
+        starts = np.concatenate([[0], np.cumsum([len(row) for row in rows])])
+        values = np.concatenate([gain.A[i, row] for i, row in enumerate(rows)])
+        second = len(gain.C) > 1
+        parts = [
+            self.numbers("real", values),
+            self.numbers("int", np.concatenate(rows)),
+            self.numbers("int", starts),
+            self.numbers("real", gain.C[0]),
+            self.numbers("real", gain.L[:, 0]),
+            self.numbers("real", gain.C[1]) if second else "0",
+            self.numbers("real", gain.L[:, 1]) if second else "0",
+        ]
+        return "{" + ", ".join(parts) + "}"
+
+    def filter(self, gains: GainCycle | None, name: str) -> str:
+        """Return the initialiser of a filter with its state."""
+        if gains is None:
+            return "{0, 0, 0, 0, 0}"
+        steps = ([] if gains.first is None else [gains.first]) + list(gains.steps)
+        n = len(steps[0].A)
+        self.lines.append(f"static const struct step {name}_steps[] = {{{', '.join(map(self.step, steps))}}};")
+        self.lines.append(f"static real {name}_x[{n}];")
+        return f"{{{n}, {len(steps)}, {int(gains.first is not None)}, {name}_steps, {name}_x}}"
+
+
+def source(design: LinearDesign) -> Mapping[str, str]:
+    """Return the text files of the design by name."""
+    tables, modes = _Tables(), []
+    for i, mode in enumerate(design.modes):
+        own = predicts_itself(mode)
+        parts = [
+            tables.filter(mode.gains, f"u{i}"),
+            tables.filter(None if own else mode.lgs, f"z{i}"),
+            tables.filter(mode.ngs if design.ratio else None, f"s{i}"),
+            tables.numbers("real", mode.row),
+            str(int(own)),
+        ]
+        modes.append("{" + ", ".join(parts) + "}")
+    most = max(len(step.A) for mode in design.modes for g in (mode.gains, mode.lgs, mode.ngs) if g for step in g.steps)
+    words = {
+        "@CONVENTIONS@": "\n".join(f"   {line}" for line in design.conventions(True)),
+        "@TEXT@": "\n".join(design.conventions(True)),
+        "@MODES@": str(len(modes)),
+        "@RATIO@": str(design.ratio),
+        "@STATES@": str(most),
+        "@TABLES@": "\n".join(tables.lines),
+        "@FILTERS@": ",\n    ".join(modes),
+    }
+    return {name: _fill((TEMPLATES / name).read_text(encoding="utf-8"), words) for name in TEXTS}
+
+
+TEXTS: Sequence[str] = ("wfsobs_controller.h", "wfsobs_controller.c", "test.c", "Makefile", "README.txt")
+
+
+def _fill(text: str, words: Mapping[str, str]) -> str:
+    for word, value in words.items():
+        text = text.replace(word, value)
+    return text
+
+
+def write_c99(path: str | Path, design: LinearDesign, vectors: Vectors) -> None:
+    """Write the design to a new directory. Raises StepError where there is something of that name."""
+    path = Path(path)
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise StepError(f"{path}: exists; c99 takes a new or empty directory")
+    path.mkdir(parents=True, exist_ok=True)
+    contents = {name: text.encode() for name, text in source(design).items()}
+    contents["input.f64"] = np.hstack([vectors.z, vectors.ngs]).astype("<f8").tobytes()
+    contents["output.f64"] = vectors.u.astype("<f8").tobytes()
+    for name, data in contents.items():
+        write_whole(path / name, lambda file, data=data: file.write(data))

@@ -1,0 +1,111 @@
+"""A linear controller as matrices: what every format holds.
+
+Per mode, with e[k] the innovation of the measurements v[k] (z alone, or z and the NGS frame):
+
+    e = v - C x,    w = x + L e,    u = row w,    x <- A w,
+
+(A, C, L) repeating every few steps. Where a measurement is missing its innovation is that of what a filter of its own predicts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from wfsobs.control.step import StepController
+from wfsobs.control.step_laws import Integrators, LinearLaws
+from wfsobs.observers.step import StepError
+from wfsobs.signal.stepping import GainCycle
+from wfsobs.typing import Array
+
+
+class ModeMatrices(NamedTuple):
+    """One mode.
+
+    gains, row : of the controller
+    lgs, ngs   : of what predicts a missing measurement or NGS frame; None where the last one is held
+    """
+
+    gains: GainCycle
+    row: Array
+    lgs: GainCycle | None
+    ngs: GainCycle | None
+
+
+@dataclass(frozen=True)
+class LinearDesign:
+    """A controller of one or several modes.
+
+    Attributes
+    ----------
+    id : str
+        Of the controller.
+    dt : float
+        Time step [s].
+    ratio : int
+        Frames per NGS frame; 0 for a controller without NGS.
+    taps : Array
+        Weights of u[k], u[k-1], ... in y[k]: delay and mirror that it was designed for.
+    modes : tuple of ModeMatrices
+        One per mode.
+    """
+
+    id: str
+    dt: float
+    ratio: int
+    taps: Array
+    modes: tuple[ModeMatrices, ...]
+
+    @property
+    def period(self) -> int:
+        """Steps after which the gains repeat."""
+        return max(len(mode.gains.steps) for mode in self.modes)
+
+    def conventions(self, bridges: bool) -> list[str]:
+        """Return units, signs and timing, as lines of text; bridges : whether missing measurements are predicted."""
+        seen = " + ".join(f"{tap:g} u[k-{i}]" for i, tap in enumerate(self.taps) if tap)
+        lines = [
+            f"Controller {self.id} of wfsobs, {len(self.modes)} modes, one call every {self.dt:g} s.",
+            "In: z, the pseudo-open-loop measurement of every mode [um rms, Noll-normalised Zernike coefficients].",
+            f"    z[k] = y[k] - ({seen}), y the measurement of the sensor, u the commands that the mirror took.",
+            "    NaN is a missing measurement: predicted, or the last one held." if bridges else "    None may be missing.",
+            "Out: u[k], the command of every mode [um], computed once y[k] is known. The residual is disturbance + u.",
+            "    Limits of the mirror are the caller's: subtract in z the commands that it took.",
+        ]
+        if self.ratio:
+            lines += [
+                f"In: ngs, the NGS frame in the calls k = {self.ratio}, {2 * self.ratio}, ..., any number in the others [um]:",
+                f"    its measurement less the mean of what z[k] ... z[k-{self.ratio - 1}] have subtracted.",
+                f"The gains repeat every {self.ratio} calls, from call 1 on; call 0 has gains of its own.",
+            ]
+        return lines
+
+
+def linear_design(controller: StepController) -> LinearDesign:
+    """Return a controller as matrices. Raises StepError with the reason where it is none."""
+    law = controller.law
+    if law is None:
+        raise StepError(f"{controller.id}: there is no law to write")
+    if controller.ahead is not None:
+        raise StepError(f"{controller.id}: a prediction by Gaussian process regression has no linear form")
+    assert isinstance(law, (LinearLaws, Integrators))
+    if isinstance(law, Integrators) and controller.plant.mirror.has_limits:
+        raise StepError(f"{controller.id}: limits of the mirror stop an integrator, which no linear form does: leave them at 0")
+    lgs, ngs = controller.bridges
+    modes = []
+    for mode, one in enumerate(law.laws):
+        if one.gains is None or one.row is None:
+            raise StepError(f"{controller.id}: its law is not known as gains of an observer")
+        modes.append(ModeMatrices(one.gains, one.row, lgs.gains.get(mode), None if ngs is None else ngs.gains.get(mode)))
+    ratio = 0 if ngs is None else controller.sampling.ratio or 0
+    return LinearDesign(controller.id, controller.sampling.dt, ratio, controller.plant.mirror.taps, tuple(modes))
+
+
+def predicts_itself(mode: ModeMatrices) -> bool:
+    """Return whether a missing measurement is what the controller's own filter predicts, so that its innovation is zero."""
+    if mode.lgs is None or len(mode.gains.steps) > 1:
+        return False
+    pairs = zip(mode.gains.steps[0], mode.lgs.steps[0], strict=True)
+    return all(a.shape == b.shape and np.array_equal(a, b) for a, b in pairs)

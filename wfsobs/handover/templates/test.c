@@ -1,0 +1,59 @@
+/* Compare with the commands of the run over a record: input.f64 holds z and ngs of every step, output.f64 the commands. */
+#include <stdio.h>
+#include <time.h>
+
+#include "wfsobs_controller.h"
+
+#define MODES WFSOBS_MODES
+
+static double in[2 * MODES], want[MODES];
+
+static long run(FILE *input, FILE *output, double *error, double *sum, double *square)
+{
+    wfsobs_real z[MODES], ngs[MODES], u[MODES];
+    long n = 0;
+    while (fread(in, sizeof in, 1, input) == 1 && fread(want, sizeof want, 1, output) == 1) {
+        for (int i = 0; i < MODES; i++) {
+            z[i] = (wfsobs_real)in[i];
+            ngs[i] = (wfsobs_real)in[MODES + i];
+        }
+        wfsobs_step(z, ngs, u);
+        for (int i = 0; i < MODES; i++) {
+            double d = (double)u[i] - want[i];
+            if (d < 0) d = -d;
+            if (!(d <= *error)) *error = d; /* NaN as well */
+            *sum += want[i];
+            *square += want[i] * want[i];
+        }
+        n++;
+    }
+    return n;
+}
+
+int main(void)
+{
+    double error = 0, sum = 0, square = 0, variance, limit = sizeof(wfsobs_real) == 8 ? 1e-12 : 1e-5;
+    FILE *input = fopen("input.f64", "rb"), *output = fopen("output.f64", "rb");
+    wfsobs_real z[MODES] = {0}, u[MODES];
+    clock_t start;
+    long n;
+    if (!input || !output) return fprintf(stderr, "input.f64 or output.f64 is missing\n"), 2;
+    wfsobs_reset();
+    n = run(input, output, &error, &sum, &square);
+    fclose(input);
+    fclose(output);
+    if (n < 1) return fprintf(stderr, "no test vectors\n"), 2;
+    variance = square / (double)(n * MODES) - (sum / (double)(n * MODES)) * (sum / (double)(n * MODES));
+    start = clock();
+    for (long k = 0; k < 1000000; k++) {
+        for (int i = 0; i < MODES; i++) z[i] = (wfsobs_real)(k % 7) * (wfsobs_real)0.01;
+        wfsobs_step(z, z, u);
+    }
+    printf("%d bytes a number, %ld steps: ", (int)sizeof(wfsobs_real), n);
+    printf("%.3f us a step, ", (double)(clock() - start) / CLOCKS_PER_SEC);
+    /* error / std <= limit without a square root */
+    printf("(largest error / std)^2 = %.2g, allowed %.0g: ", error * error / variance, limit * limit);
+    if (!(error * error <= limit * limit * variance)) return printf("differs\n"), 1;
+    printf("equal\n");
+    return 0;
+}
