@@ -26,7 +26,7 @@ LEFT_OUT = ("zero", "ridge", "persistence")
 
 
 def tables(preset: str, seeds: int) -> str:
-    """Error on tip before, at its worst after and at the end, and the time to be back, as markdown."""
+    """Error on tip before, at its worst after and at the end, and the recovery time, as Markdown."""
     scenario = PRESETS[preset]()
     history = OverTime(scenario, WINDOW)
     for seed in range(1, seeds + 1):
@@ -34,7 +34,7 @@ def tables(preset: str, seeds: int) -> str:
     out = [f"`{preset}`, tip, rms over {WINDOW:g} s, {seeds} seeds together:\n"]
     lines = [line for line in history.recoveries() if line[0] in CASES[preset] and line[1] == "tip" and line[3] not in LEFT_OUT]
     for (target, _, event), group in groupby(lines, key=lambda line: line[:3]):
-        out.append(f"| {target}, {event} | before, nm | worst after | at the end | back after, s |\n|---|---|---|---|---|")
+        out.append(f"| {target}, {event} | before, nm | worst after | at the end | recovery time, s |\n|---|---|---|---|---|")
         out += [f"| {row_label(name)} | {' | '.join(recovery_texts(r))} |" for *_, name, r in group]
         out.append("")
     return "\n".join(out)

@@ -67,7 +67,7 @@ def test_saved_settings_give_the_tuned_scenario(tuned) -> None:
         ("kf-lgs", ["gpr_online.depth"], "not a setting of kf-lgs"),
         ("kf-lgs", ["turbulence.wind_speed"], "not a setting of kf-lgs"),
         ("kf-lgs", ["kalman.damping", "kalman.damping"], "twice"),
-        ("kf-lgs", [], "one setting at least"),
+        ("kf-lgs", [], "one setting or more"),
         ("gpr-online", ["gpr_online.highpass"], "has no effect while"),
         ("zero", None, "no settings to tune"),
         ("kf", None, "no such observer"),

@@ -88,7 +88,7 @@ class OverTime:
         table = Table(title=self._title("Error before and after every event"))
         for name in ("Target", "Mode", "Event", "Observer"):
             table.add_column(name, no_wrap=True)
-        for name in ("before, nm", "worst after, nm", "at the end, nm", "back after, s"):
+        for name in ("before, nm", "worst after, nm", "at the end, nm", "recovery time, s"):
             table.add_column(name, justify="right", no_wrap=True)
         for _, lines in groupby(self.recoveries(), key=lambda line: line[:3]):
             for target, mode, event, name, r in lines:
@@ -114,7 +114,7 @@ class OverTime:
 
 
 def recovery_texts(r: Recovery | None) -> tuple[str, str, str, str]:
-    """Error before, at its worst and at the end [nm], and the time to be back [s], as texts."""
+    """Error before, at its worst and at the end [nm], and the recovery time [s], as texts."""
     if r is None:
         return "-", "-", "-", "-"
     before, worst, last = (f"{value * 1e3:.2f}" for value in (r.before, r.worst, r.last))
@@ -122,7 +122,7 @@ def recovery_texts(r: Recovery | None) -> tuple[str, str, str, str]:
 
 
 def _rank(r: Recovery | None) -> tuple[float, float]:
-    """Who is back first comes first, then the least error."""
+    """Sort by the recovery time, then by the error."""
     return (inf, inf) if r is None else (inf if r.back is None else r.back, r.worst)
 
 
