@@ -15,6 +15,7 @@ from scipy.linalg import solve_discrete_lyapunov
 import wfsobs
 from wfsobs.cli import main
 from wfsobs.evaluation.budget import AVERAGED, TERMS, Budget, _shapley_share, error_budget
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.evaluation.sources import split_lines, split_record, sum_sources
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import run
@@ -59,7 +60,7 @@ def test_the_terms_add_up_to_the_mean_square_error_of_the_table(preset: str) -> 
     scenario = PRESETS[preset]().replace({"run.duration": 18.0 if "-" in preset and preset != "galacsi-nfm" else 3.0})
     result = run(scenario, observers=LINEAR)
     found = error_budget(result)
-    scores = {(s.observer, s.target, s.mode): s.rms**2 for s in result.scores if s.observer != "bound"}
+    scores = {(s.observer, s.target, s.mode): s.rms**2 for s in result.scores if s.observer not in BOUNDS}
     assert {(b.observer, b.target, b.mode): b.total for b in found} == scores
     assert_adds_up(found)
 

@@ -10,6 +10,7 @@ from click.testing import CliRunner
 
 import wfsobs
 from wfsobs.cli import main
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import configfile
 from wfsobs.scenario.presets import paper
@@ -37,6 +38,7 @@ KEYS = {
     "apart",
     "needs",
     "interval_um",
+    "phases_um",
     "seed",
 }
 SHORT = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50, "adaptive.window": 0.5}
@@ -67,7 +69,7 @@ def test_table_names_every_observer():
 
 def observed(result):
     """The rows of the observers: a bound is known only of a scenario that is known to have made the record."""
-    return [row for row in json.loads(result.stdout) if row["observer"] != "bound"]
+    return [row for row in json.loads(result.stdout) if row["observer"] not in BOUNDS]
 
 
 def test_a_saved_record_gives_the_same_numbers(tmp_path):

@@ -10,7 +10,8 @@ import pytest
 
 from wfsobs import PRESETS, Record, Scenario, SettingError, observe, run, simulate
 from wfsobs.evaluation.bound import bound_rms
-from wfsobs.evaluation.scores import LOOP, PREDICTION, RESIDUAL
+from wfsobs.evaluation.bound_both import bound_rms_of_both
+from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, LOOP, PREDICTION, RESIDUAL
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.pipeline import as_stated, each_estimate
@@ -40,7 +41,7 @@ def test_results_come_in_the_order_of_the_registry() -> None:
     pairs = [(e.observer, e.target) for e in result.estimates]
     assert pairs == [(name, target) for name in order for target in sorted(OBSERVERS[name].targets)]
     rows = [(*pair, mode) for pair in pairs for mode in ("tip", "tilt")]
-    rows += [("bound", target, mode) for mode in ("tip", "tilt") for target in TARGETS]
+    rows += [(bound, target, mode) for mode in ("tip", "tilt") for bound in BOUNDS for target in TARGETS]
     assert [(s.observer, s.target, s.mode) for s in result.scores] == rows
     found = result.estimate("kf-lgs", "vibration")
     assert found is not None and found.values.shape == result.record.y_lgs.shape and found.seconds_per_step > 0
@@ -50,12 +51,16 @@ def test_results_come_in_the_order_of_the_registry() -> None:
 def test_scores_are_those_of_the_estimates() -> None:
     result = run(scenario(), observers=["kf-lgs", "butterworth-ol"])  # the second has no last sample, which so counts for none
     for s in result.scores:
-        if s.observer == "bound":
+        if s.observer in BOUNDS:
             truth, mode = result.record.truth(s.target), ("tip", "tilt").index(s.mode)
             scored = slice(300, 799 if s.target == "vibration" else 800)  # those of the rows beside it
             assert truth is not None and s.truth_rms == pytest.approx(np.sqrt(np.mean(truth[scored, mode] ** 2)), rel=1e-12)
-            assert (s.start, s.stop) == pytest.approx((0.3, scored.stop / 1000)) and s.interval is not None
-            assert s.rms == bound_rms(scenario(), mode)[s.target]
+            assert (s.start, s.stop) == pytest.approx((0.3, scored.stop / 1000))
+            least = bound_rms if s.observer == BOUND else bound_rms_of_both
+            assert s.rms == least(scenario(), mode)[s.target]
+            assert (s.interval is None, s.phases is None) == (s.observer == BOUND_BOTH, s.observer == BOUND)
+            # rms is over all phases of a frame
+            assert s.phases is None or s.rms == pytest.approx(np.sqrt(np.mean(np.square(s.phases))), rel=1e-12)
             continue
         e, truth = result.estimate(s.observer, s.target), result.record.truth(s.target)
         assert e is not None and truth is not None
@@ -68,7 +73,7 @@ def test_scores_are_those_of_the_estimates() -> None:
 def test_the_late_adaptive_filter_is_scored_with_the_others_or_apart(window: float, apart: bool) -> None:
     result = run(scenario({"adaptive.window": window}), observers=["kf-lgs", "kf-adaptive", "zero"])
     begins = 1e-3 * (round(1000 * window) - 1 + result.record.delay)  # the first window is full
-    for s in (s for s in result.scores if s.observer != "bound"):
+    for s in (s for s in result.scores if s.observer not in BOUNDS):
         own = s.observer == "kf-adaptive"
         assert s.apart == (apart and own) and s.stop == pytest.approx(0.8)
         assert s.start == pytest.approx(begins if own or not apart else 0.3)
@@ -87,7 +92,7 @@ def test_every_observer_on_every_turbulence_and_mode(changes: dict[str, Any]) ->
     s = scenario(changes)
     result = run(s)
     assert not result.failures
-    assert {score.mode for score in result.scores if score.observer != "bound"} == {mode.name for mode in s.modes}
+    assert {score.mode for score in result.scores if score.observer not in BOUNDS} == {mode.name for mode in s.modes}
     assert all(np.isfinite(score.rms) for score in result.scores)
     again = run(s)
     for one, other in zip(result.estimates, again.estimates, strict=True):

@@ -14,6 +14,7 @@ import wfsobs
 from wfsobs.cli.group import COMMANDS, main
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.run import closed_loop
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.telemetry.records import save_record
 
 FUNCTIONS = ("close_loop", "error_budget", "export", "identify", "load", "observe", "run", "score", "simulate", "tune")
@@ -123,7 +124,7 @@ def test_a_data_frame_has_a_row_per_score(result: wfsobs.Result) -> None:
 
 def test_scores_are_those_of_the_run(result: wfsobs.Result) -> None:
     again = wfsobs.score(result.record, result.estimates, warm_up=result.scenario.run.warm_up)
-    assert set(again) == {s for s in result.scores if s.observer != "bound"}
+    assert set(again) == {s for s in result.scores if s.observer not in BOUNDS}
 
 
 def test_a_record_is_loaded_from_its_file(result: wfsobs.Result, tmp_path: Path) -> None:

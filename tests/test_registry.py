@@ -41,6 +41,7 @@ def mine(**changes: Any) -> Observer:
     [
         (replace(ZERO, label="Another"), "observer 'zero': the id is taken, by Zero"),
         (mine(label="Zero"), "observer 'mine': the label 'Zero' is taken"),
+        (mine(id="bound-both"), "observer 'bound-both': the id is taken, by a row of the tables"),
         (mine(id="bound"), "observer 'bound': the id is taken, by a row of the tables"),
         (mine(id="My one"), "observer 'My one': an id takes lower-case letters, digits and hyphens between them"),
         (mine(id="mine-"), "observer 'mine-': an id takes"),

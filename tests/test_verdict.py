@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from wfsobs.evaluation.rows import can_be_best, row_label
-from wfsobs.evaluation.scores import BOUND
+from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
 from wfsobs.evaluation.verdict import BATCHES, LEVEL, differs, verdict
 from wfsobs.pipeline import run
 from wfsobs.result import Result
@@ -59,13 +59,10 @@ def test_the_best_is_the_least_error_of_the_table_and_the_sentence_has_its_numbe
             # Three digits, so that half of the last is at most 0.5 %.
             said = re.search(r"(?:best|error), ([\d.]+) nm", first)
             assert said and float(said[1]) == pytest.approx(found.best.rms * 1e3, rel=5e-3)
-            bound = next(s.rms for s in of if s.observer == BOUND)
-            if found.best.observer == "multirate-optimal":
-                assert f"bound of the LGS alone {bound * 1e3:.3g} nm" in first
-            else:
-                percent = re.search(r"(\d+) % (above|below) the bound", first)
-                signed = 0.0 if percent is None else float(percent[1]) * (1 if percent[2] == "above" else -1)
-                assert signed == pytest.approx(100.0 * (found.best.rms / bound - 1.0), abs=0.51)
+            bound = next(s.rms for s in of if s.observer == BOUND_BOTH)
+            percent = re.search(r"(\d+) % (above|below) the bound of LGS and NGS", first)
+            signed = 0.0 if percent is None else float(percent[1]) * (1 if percent[2] == "above" else -1)
+            assert signed == pytest.approx(100.0 * (found.best.rms / bound - 1.0), abs=0.51)
             assert ("tied" in first) == bool(found.ties) and all(row_label(name) in first for name in found.ties)
 
 
@@ -76,7 +73,7 @@ def test_who_does_harm_is_named_with_where_its_error_lies(result: Result) -> Non
         )
         assert found is not None
         harmful = {s.observer for s in result.scores if (s.target, s.mode) == (target, "tip") and s.rms >= s.truth_rms}
-        assert {harm.observer for harm in found.harms} == harmful - {BOUND, "zero"}
+        assert {harm.observer for harm in found.harms} == harmful - {*BOUNDS, "zero"}
         truth = result.record.truth(target)
         assert truth is not None
         said = " ".join(found.sentences()[1:])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wfsobs.evaluation.bound import Bound, bound_scores, record_bounds
+from wfsobs.evaluation.record_bounds import Bound, bound_scores, record_bounds
 from wfsobs.evaluation.scores import score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Observer
@@ -98,7 +98,7 @@ def observe(
     watch : Watch, optional
         Receives the progress, and is asked at every block of work whether to stop.
     is_simulated : bool
-        Whether the record was simulated from the scenario, so that its Wiener bound is known.
+        Whether the record was simulated from the scenario, so that its Wiener bounds are known.
 
     Returns
     -------

@@ -14,7 +14,7 @@ from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.integrator import highest_stable_gain
 from wfsobs.control.mirror import Mirror
-from wfsobs.evaluation.bound import BOUND
+from wfsobs.evaluation.scores import BOUND, BOUNDS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
@@ -57,7 +57,7 @@ def two_frames() -> None:
         gain = f" (g = {one.law.gain:.2f})" if one.law and one.law.gain and not changes else ""
         simulated, theory = _pooled(left), (one.predicted_rms or 0.0) * 1e3
         print(f"| {name}{gain} | {theory:.2f} | {simulated:.2f} | {simulated / theory:.3f} |")
-    print(f"| Bound | {(plan.bound or (0.0,))[0] * 1e3:.2f} | | |")
+    print(f"| Bound | {plan.bounds[BOUND][0] * 1e3:.2f} | | |")
 
 
 def presets() -> None:
@@ -78,17 +78,10 @@ def delays() -> None:
     for delay in (1.0, 1.5, 2.0, 2.5, 3.0, 4.0):
         plan = design(MATCHED.replace({"control.delay": delay}), ["integrator", "lqg-kf-lgs"])
         integrator, lqg = plan.laws["integrator"][0], plan.laws["lqg-kf-lgs"][0]
-        assert (
-            integrator.law
-            and integrator.law.gain
-            and integrator.predicted_rms
-            and lqg.predicted_rms
-            and lqg.margins
-            and plan.bound
-        )
+        assert integrator.law and integrator.law.gain and integrator.predicted_rms and lqg.predicted_rms and lqg.margins
         m = lqg.margins
         highest = highest_stable_gain(Mirror(delay), 1.0)
-        left = " | ".join(f"{x * 1e3:.2f}" for x in (integrator.predicted_rms, lqg.predicted_rms, plan.bound[0]))
+        left = " | ".join(f"{x * 1e3:.2f}" for x in (integrator.predicted_rms, lqg.predicted_rms, plan.bounds[BOUND][0]))
         db, turn, late = 20 * np.log10(m.gain or np.inf), np.degrees(m.phase or 0.0), (m.delay or 0.0) * 1e3
         print(f"| {delay:g} | {highest:.3f} | {integrator.law.gain:.3f} | {left} | {db:.1f} dB, {turn:.0f}°, {late:.2f} ms |")
 
@@ -99,7 +92,7 @@ def _left(scenario: Scenario, controllers: Sequence[str], seeds: Sequence[int]) 
     out: dict[str, list[list[float]]] = {}
     for seed in seeds:
         result = closed_loop(simulate(scenario.replace({"run.seed": seed})), plan)
-        for name in (*controllers, BOUND):
+        for name in (*controllers, *BOUNDS):
             out.setdefault(name, []).append([r["residual_rms_nm"] for r in rows(result, seed) if r["controller"] == name])
     return out
 

@@ -27,7 +27,7 @@ from wfsobs.app.share import from_query
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.work import RunResults
 from wfsobs.closed_loop.rows import rows
-from wfsobs.evaluation.scores import BOUND
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.identification import report as identified
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
@@ -109,7 +109,7 @@ def of(dashboard: Dashboard) -> RunResults:
 def test_explore(board: Dashboard) -> None:
     shown = {(s.observer, s.target, s.mode): s.rms for s in of(board).result.scores}
     if board.store.source is not None:  # who observes a record does not know what it is bound by
-        shown = {key: value for key, value in shown.items() if key[0] != BOUND}
+        shown = {key: value for key, value in shown.items() if key[0] not in BOUNDS}
     assert {(r["observer"], r["target"], r["mode"]): r["rms_um"] for r in shell(board)} == pytest.approx(shown, rel=CLOSE)
     made = script(board)
     assert {(s.observer, s.target, s.mode): s.rms for s in made["result"].scores} == pytest.approx(shown, rel=CLOSE)

@@ -19,7 +19,7 @@ from wfsobs.app.pages.identify import EARLIER, IdentifyPage
 from wfsobs.app.pages.pages import EXPLORE, IDENTIFY
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.style import LOOKS
-from wfsobs.evaluation.scores import BOUND
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.identification import Identification, identify
 from wfsobs.identification.process import Number
 from wfsobs.identification.report import format_number, whiteness_lines
@@ -122,9 +122,9 @@ def test_filters_only(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> No
     for name in ("y_lgs", "u", "turbulence", "vibration"):
         np.testing.assert_array_equal(getattr(shown.result.record, name), getattr(before.result.record, name))
     expected = {(s.observer, s.target, s.mode): s.rms for s in observe(before.result.record, told).scores}
-    bounds = {key: value for key, value in rms(dashboard).items() if key[0] == BOUND}
+    bounds = {key: value for key, value in rms(dashboard).items() if key[0] in BOUNDS}
     assert rms(dashboard) == expected | bounds
-    assert bounds and bounds == {(s.observer, s.target, s.mode): s.rms for s in before.result.scores if s.observer == BOUND}
+    assert bounds and bounds == {(s.observer, s.target, s.mode): s.rms for s in before.result.scores if s.observer in BOUNDS}
     store.change("kalman.ngs_between_frames", "propagate")  # other settings of the filters leave the record alone, too
     loop.finish(store)
     np.testing.assert_array_equal(store.run.result.result.record.y_lgs, before.result.record.y_lgs)

@@ -18,7 +18,7 @@ from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.traces import BINS
 from wfsobs.app.work import TRUTH
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.scores import BOUND
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import PLAIN
 
@@ -230,7 +230,9 @@ class TestLooks:
         assert all(o.look is not PLAIN for o in OBSERVERS.values())
         assert look("a-new-one").label == "a-new-one"
 
-    @pytest.mark.parametrize("together", [[TRUTH, *OBSERVERS, BOUND], [*CONTROLLERS, BOUND]], ids=["observers", "controllers"])
+    @pytest.mark.parametrize(
+        "together", [[TRUTH, *OBSERVERS, *BOUNDS], [*CONTROLLERS, *BOUNDS]], ids=["observers", "controllers"]
+    )
     def test_lines_of_one_colour_differ_by_dash(self, together: list[str]) -> None:
         seen = [(look(name).light, look(name).dash) for name in together]
         assert len(seen) == len(set(seen))

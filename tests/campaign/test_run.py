@@ -176,5 +176,5 @@ def test_the_file_for_data_frames_has_the_settings(undisturbed, tmp_path):
 def test_the_plan_says_how_much_it_is(plan):
     said = campaign("plan", plan).stdout
     assert "Tiny: 2 scenarios x 40 seeds = 80 runs" in said and "turbulence.wind_speed: 5, 10" in said
-    # 2 modes x 2 targets x 2 observers and the bound, in each of 80 runs
-    assert f"{80 * 2 * 2 * 3} rows" in said
+    # 2 modes x 2 targets x 2 observers and two bounds, in each of 80 runs
+    assert f"{80 * 2 * 2 * 4} rows" in said

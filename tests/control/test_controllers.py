@@ -16,6 +16,7 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.integrator import best_gain, highest_stable_gain, integrator_law, limited_integrator
 from wfsobs.control.mirror import Mirror
 from wfsobs.control.residual import residual_variance
+from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers.baselines import online_reference
 from wfsobs.priors_from.controllers import controller_arguments, own_settings
 from wfsobs.priors_from.scenario import bands_of, kalman_model, measurement_noise, modelled_processes, spectra_of
@@ -98,7 +99,7 @@ def test_lqg_leaves_what_its_covariance_predicts() -> None:
         expected = float(np.sqrt(row @ P @ row))
         plan = design(scenario, ("lqg-kf-lgs",))
         assert plan.laws["lqg-kf-lgs"][0].predicted_rms == pytest.approx(expected, rel=1e-6)
-        assert plan.bound is not None and plan.bound[0] == pytest.approx(expected, rel=1e-6)
+        assert plan.bounds[BOUND][0] == pytest.approx(expected, rel=1e-6)
         assert pooled([closed_loop(simulate(scenario), plan)], "lqg-kf-lgs") == pytest.approx(expected * 1e3, rel=0.02)
     assert covariance == pytest.approx(21.63e-3, abs=0.005e-3)
 
@@ -269,12 +270,11 @@ def test_the_gain_is_the_best_of_all() -> None:
 @given(st.floats(1.0, 4.0), st.floats(0.005, 0.1))
 def test_no_controller_of_the_lgs_beats_the_bound(delay: float, noise: float) -> None:
     plan = design(MATCHED.replace({"control.delay": delay, "sensors.lgs_noise": noise}), ("integrator", "lqg-kf-lgs"))
-    assert plan.bound is not None
     integrator, lqg = (plan.laws[name][0].predicted_rms for name in ("integrator", "lqg-kf-lgs"))
     assert integrator is not None and lqg is not None
-    assert plan.bound[0] * (1 - 1e-6) <= lqg <= integrator
+    assert plan.bounds[BOUND][0] * (1 - 1e-6) <= lqg <= integrator
     if delay == int(delay):
-        assert lqg == pytest.approx(plan.bound[0], rel=1e-5)
+        assert lqg == pytest.approx(plan.bounds[BOUND][0], rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -341,9 +341,8 @@ def test_on_ut4_lqg_on_every_peak_leaves_a_quarter_less_than_the_best_integrator
     assert pooled(several, "lqg-multirate-multi") < 0.5 * pooled(several, "integrator")
     seen = ut4.replace({"turbulence.source": "ar2", "turbulence.rms": 0.53, "sensors.lgs_low_frequency_rms": 0.0})
     theory = design(seen, ("integrator", "lqg-kf-multi"))
-    assert theory.bound is not None
     for mode in range(2):
         integrator, lqg = (theory.laws[name][mode].predicted_rms for name in ("integrator", "lqg-kf-multi"))
         assert integrator is not None and lqg is not None
-        assert theory.bound[mode] * (1 - 1e-6) < lqg < 0.75 * integrator
-        assert lqg < 1.05 * theory.bound[mode]
+        assert theory.bounds[BOUND][mode] * (1 - 1e-6) < lqg < 0.75 * integrator
+        assert lqg < 1.05 * theory.bounds[BOUND][mode]

@@ -22,6 +22,7 @@ from wfsobs.app.report.data import Grid, Report, state_of
 from wfsobs.app.report.page import page
 from wfsobs.app.report.text import FILE, LONGEST, command_of
 from wfsobs.evaluation.rows import TIME, is_non_causal, row_label, scored_interval
+from wfsobs.evaluation.scores import BOUND
 from wfsobs.pipeline import observe, run
 from wfsobs.result import Result
 from wfsobs.scenario import Scenario
@@ -87,7 +88,7 @@ def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any)
             name = row_label(row["observer"]) + (" looks ahead" if is_non_causal(row["observer"]) else "")
             lag = "–" if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−")
             spread = "" if row["interval_um"] is None else " " + " – ".join(number(1e3 * x) for x in row["interval_um"])
-            assert (spread == "") == (row["observer"] != "bound")
+            assert (spread == "") == (row["observer"] != BOUND)
             want[f"{row['target'].capitalize()}, {row['mode']}", name] = [
                 number(1e3 * row["rms_um"]) + spread,
                 number(1e3 * row["truth_rms_um"]),

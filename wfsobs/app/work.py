@@ -18,8 +18,8 @@ from threadpoolctl import threadpool_limits
 
 from wfsobs.app.jobs.job import INTERVAL, Tell
 from wfsobs.app.sources import Source
-from wfsobs.evaluation.bound import Bound, record_bounds
 from wfsobs.evaluation.error_spectra import spectra
+from wfsobs.evaluation.record_bounds import Bound, record_bounds
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.pipeline import as_stated, collect, each_estimate

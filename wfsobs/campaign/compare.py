@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from wfsobs.evaluation.rows import can_be_best
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
@@ -161,7 +162,7 @@ def each_group(table: pyarrow.Table) -> Iterator[Samples]:
         for r in part:
             column = names.index(r["name"])
             values[np.searchsorted(seeds, r["seed"]), column] = np.nan if r["rms_nm"] is None else r["rms_nm"]
-            eligible[column] &= (key[1] == "residual" and r["name"] != "bound") or can_be_best(r["name"], r["apart"])
+            eligible[column] &= (key[1] == "residual" and r["name"] not in BOUNDS) or can_be_best(r["name"], r["apart"])
         yield Samples(key[0], part[0]["scenario"], key[1], key[2], names, values, eligible)
 
 

@@ -13,7 +13,9 @@ from wfsobs.control.law import Law
 from wfsobs.control.margins import Margins, frequencies, margins
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.control.residual import residual_variance
-from wfsobs.evaluation.bound import least_errors
+from wfsobs.evaluation.bound import TOTAL, least_errors
+from wfsobs.evaluation.bound_both import least_errors_of_both
+from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.observers.kalman.multirate import UnstableCycle
 from wfsobs.prior import Prior, Spectra
 from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for
@@ -46,8 +48,8 @@ class Design:
     """All controllers of a scenario, before any random number.
 
     laws   : controller -> one per mode
-    bound  : per mode, rms [um] of the least residual of any causal controller of the mean of the LGS; None where the spectrum of
-        the turbulence is not known
+    bounds : BOUND, BOUND_BOTH -> per mode, rms [um] of the least residual of any causal controller of the mean of the LGS, or of
+        the NGS, too; none where the spectrum of the turbulence is not known
     priors : controller -> what it is told, spectra aside, of which only laws are made
     start  : from which the residuals count [s]: after the warm-up, and after what is trained on
     """
@@ -55,7 +57,7 @@ class Design:
     scenario: Scenario
     plant: Plant
     laws: dict[str, tuple[LawDesign, ...]]
-    bound: tuple[float, ...] | None
+    bounds: dict[str, tuple[float, ...]]
     priors: dict[str, Prior] = field(default_factory=dict, repr=False)
     start: float = 0.0
 
@@ -79,10 +81,12 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None, start: 
     laws, priors = {name: laws for name, (laws, _) in made.items()}, {name: prior for name, (_, prior) in made.items()}
     if scenario.events:
         laws = {name: tuple(replace(one, predicted_rms=None) for one in designed) for name, designed in laws.items()}
-        return Design(scenario, plant, laws, None, priors, max(scenario.run.warm_up, start))
+        return Design(scenario, plant, laws, {}, priors, max(scenario.run.warm_up, start))
     # A fraction of a frame comes on top of the whole ones, which alone bound what can be known.
-    least = tuple(least_errors(one, ahead=int(plant.mirror.delay) - 1)["total"].rms for one in true)
-    return Design(scenario, plant, laws, least or None, priors, max(scenario.run.warm_up, start))
+    ahead = int(plant.mirror.delay) - 1
+    ways = {BOUND: least_errors, BOUND_BOTH: least_errors_of_both} if true else {}
+    bounds = {name: tuple(least(one, ahead)[TOTAL].rms for one in true) for name, least in ways.items()}
+    return Design(scenario, plant, laws, bounds, priors, max(scenario.run.warm_up, start))
 
 
 def select_controllers(controllers: Sequence[str] | None) -> list[Controller]:

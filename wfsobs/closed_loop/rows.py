@@ -10,7 +10,7 @@ from typing import Any
 from wfsobs.closed_loop.run import ClosedLoop, residual_rms, strehl
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import NOT_OBSERVERS, Row
-from wfsobs.evaluation.scores import BOUND
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.observers.base import SPECTRA
 from wfsobs.priors_from.controllers import own_settings
 from wfsobs.scenario import Scenario
@@ -23,7 +23,7 @@ NOT_APPLICABLE = "n/a"
 
 
 def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
-    """One plain dictionary per controller and mode, the bound last: the keys of `wfsobs loop --json`.
+    """One plain dictionary per controller and mode, the bounds last: the keys of `wfsobs loop --json`.
 
     residual_rms_nm, residual_rms_mas, strehl : of the simulation after the warm-up, null where the loop is not stable or could
         not run (`note` says why); strehl is that of all modes together
@@ -79,8 +79,8 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
                     note=outcome.note or (LIMITED if limited else ""),
                 )
             )
-    if plan.bound is not None:
-        out += [row(BOUND, SPECTRA, mode, True, plan.bound) for mode in range(len(modes))]
+    for bound, left in plan.bounds.items():
+        out += [row(bound, SPECTRA, mode, True, left) for mode in range(len(modes))]
     return out
 
 
@@ -91,7 +91,7 @@ def controller_needs(controller: str, scenario: Scenario) -> str:
 
 def label(controller: str) -> str:
     """Return a controller's label."""
-    return NOT_OBSERVERS[BOUND] if controller == BOUND else CONTROLLERS[controller].label
+    return NOT_OBSERVERS[controller] if controller in BOUNDS else CONTROLLERS[controller].label
 
 
 def linear(same: Sequence[Row], value: str) -> str:

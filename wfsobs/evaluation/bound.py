@@ -3,8 +3,8 @@
 It is the error of the Wiener filter (`wiener`) for the true spectra of the scenario (`true_spectra`) and its noise, after an
 infinitely long record; undamped lines are then known. The gap between an observer and the bound is what a better model, better
 tuning or more training can gain. An observer with more than the mean of the LGS may be better: with each star by itself, where
-they see different turbulence, or with the NGS. So may one that remembers a record of random phases, which is periodic
-(`synthesis`).
+they see different turbulence, or with the NGS (`bound_both`). So may one that remembers a record of random phases, which is
+periodic (`synthesis`).
 
 A record is neither infinitely long nor the mean of all. `interval` is the range of the rms of an optimal observer
 of all samples since the start of the record, in 95 % of records.
@@ -12,21 +12,15 @@ of all samples since the start of the record, in 95 % of records.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from math import inf, log
 
 import numpy as np
 from scipy.stats import chi2
 
-from wfsobs.evaluation.scores import BOUND, Score
-from wfsobs.observers.base import TARGETS
-from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.signal.welch import rms
 from wfsobs.signal.wiener import advance_spectrum, circle_mean, degrees_of_freedom, error_spectrum, explained_variance, factorise
-from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
+from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array
 
 SHARE = 0.95
@@ -135,52 +129,3 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
 def bound_rms(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:
     """Return target -> rms [um] of the minimum error, as `least_errors`, of one mode of a scenario."""
     return {name: error.rms for name, error in least_errors(true_spectra(scenario, mode), ahead).items()}
-
-
-@dataclass(frozen=True)
-class Bound:
-    """Minimum error of a target in a mode of a record."""
-
-    target: str
-    mode: str
-    column: int
-    error: LeastError
-
-
-def record_bounds(scenario: Scenario, record: Record) -> list[Bound]:
-    """Compute the bounds of a record that was simulated from the scenario; none where its spectra are not known."""
-    if not has_known_spectra(scenario):
-        return []
-    modes = scenario.modes[: record.n_modes]
-    with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda mode: least_errors(true_spectra(scenario, mode), n_steps=record.n_steps), range(len(modes))))
-    return [Bound(target, it.name, i, found[i][target]) for i, it in enumerate(modes) for target in TARGETS]
-
-
-def bound_scores(bounds: Sequence[Bound], record: Record, scores: Sequence[Score], warm_up: float) -> list[Score]:
-    """Return the scores of bounds, on the samples of the observers' scores, or on all after the warm-up [s]."""
-    stretches = {(s.target, s.mode): (s.start, s.stop) for s in scores if not s.apart}
-    out = []
-    for it in bounds:
-        start, stop = stretches.get((it.target, it.mode), (None, None))
-        first = round((warm_up if start is None else start) / record.dt)
-        last = record.n_steps if stop is None else round(stop / record.dt)
-        truth = record.truth(it.target)
-        if truth is not None and first < last:
-            scale = rms(truth[first:last, it.column])
-            out.append(
-                Score(
-                    BOUND,
-                    it.target,
-                    it.mode,
-                    it.error.rms,
-                    scale,
-                    it.error.rms / scale if scale > 0 else None,
-                    None,
-                    0.0,
-                    first * record.dt,
-                    last * record.dt,
-                    interval=it.error.interval(first, last),
-                )
-            )
-    return out

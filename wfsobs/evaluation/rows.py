@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from wfsobs.evaluation.scores import BOUND, LOOP, Score
+from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, LOOP, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import SPECTRA
 
@@ -14,7 +14,7 @@ Row = dict[str, Any]
 TIME = "time_per_step_us"
 """Computing time per step and mode [us]: in the table, but not part of the result, which the seed determines."""
 
-NOT_OBSERVERS = {LOOP: "Recorded loop", BOUND: "Bound, mean of the LGS"}
+NOT_OBSERVERS = {LOOP: "Recorded loop", BOUND: "Bound, mean of the LGS", BOUND_BOTH: "Bound, LGS and NGS"}
 """Labels of rows in a table of observers that are not observers."""
 
 
@@ -38,6 +38,7 @@ def score_rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
             "apart": s.apart,
             "needs": row_needs(s.observer),
             "interval_um": None if s.interval is None else list(s.interval),
+            "phases_um": None if s.phases is None else list(s.phases),
             "seed": seed,
             TIME: None if s.observer in NOT_OBSERVERS else s.seconds_per_step * 1e6,
         }
@@ -56,14 +57,14 @@ def row_label(observer: str) -> str:
 
 
 def row_needs(observer: str) -> str:
-    """Return what a row needs beside measurements; the bound needs the true spectra."""
+    """Return what a row needs beside measurements; a bound needs the true spectra."""
     if observer in NOT_OBSERVERS:
-        return SPECTRA if observer == BOUND else ""
+        return SPECTRA if observer in BOUNDS else ""
     return OBSERVERS[observer].needs_text
 
 
 def can_be_best(observer: str, apart: bool) -> bool:
-    """Return whether a row can be the best: not the bound, nor a row that is not causal or was scored on samples of its own."""
+    """Return whether a row can be the best: not a bound, nor a row that is not causal or was scored on samples of its own."""
     return observer not in NOT_OBSERVERS and not is_non_causal(observer) and not apart
 
 

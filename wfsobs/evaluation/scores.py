@@ -17,8 +17,11 @@ from wfsobs.typing import Array
 PREDICTION, RESIDUAL = "next z", "residual y"
 """Targets where there is no truth: the next measurement, and the residual of the loop."""
 
-LOOP, BOUND = "loop", "bound"
-"""Rows that are not observers: the loop that made the record, and the Wiener bound."""
+LOOP, BOUND, BOUND_BOTH = "loop", "bound", "bound-both"
+"""Rows that are not observers: the loop that made the record, and the Wiener bounds of the LGS alone and of LGS and NGS."""
+
+BOUNDS = (BOUND, BOUND_BOTH)
+"""The bounds, in the order of tables."""
 
 
 SHARE = 0.5
@@ -48,7 +51,9 @@ class Score:
     apart : bool
         Whether the samples differ from those of the other rows, so that the row cannot be compared with them.
     interval : tuple of float or None
-        Of a bound: range of the rms of an optimal observer in 95 % of records [um].
+        Of the bound of the LGS: range of the rms of an optimal observer in 95 % of records [um].
+    phases : tuple of float or None
+        Of the bound of both sensors: the bound in steps with an NGS frame, one step later, ... [um]; `rms` is over all.
     """
 
     observer: str
@@ -63,6 +68,7 @@ class Score:
     stop: float | None = None
     apart: bool = False
     interval: tuple[float, float] | None = None
+    phases: tuple[float, ...] | None = None
 
 
 def common_samples(samples: Sequence[Array]) -> list[tuple[Array, bool]]:

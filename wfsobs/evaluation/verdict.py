@@ -12,7 +12,7 @@ from scipy.stats import t as student
 from wfsobs.evaluation.evidence import LEVEL, Evidence, differ_in_pairs
 from wfsobs.evaluation.known_lines import given_lines, is_near
 from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best, row_label
-from wfsobs.evaluation.scores import BOUND, Score
+from wfsobs.evaluation.scores import BOUND_BOTH, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate
 from wfsobs.prior import Bands, Lines, Model, Part, Training
@@ -46,7 +46,7 @@ class Verdict:
 
     best  : the score with the least error of those that can be compared
     ties  : observers whose error is larger, but not significantly so on this record
-    bound : the least error possible [um], None where it is not known
+    bound : the least error possible with LGS and NGS [um], None where it is not known
     lines : how many lines the vibration has
     harms : observers that are worse than no estimate, the worst first
     seeds : over how many records of the scenario, whose mean error is that of `best`
@@ -97,7 +97,7 @@ def verdict(
     found = Verdict(
         first,
         tuple(s.observer for s in ranked[1:] if not differs(errors[first.observer], errors[s.observer])),
-        next((s.rms for s in of if s.observer == BOUND), None),
+        next((s.rms for s in of if s.observer == BOUND_BOTH), None),
         len(lines),
         tuple(
             Harm(
@@ -205,17 +205,15 @@ def _best_sentence(it: Verdict, scale: float, unit: str) -> str:
         start = f"{name} has the smallest error, {size}, tied with {_join_labels(it.ties)}{seeds or ' on this record'}"
     else:
         start = f"{name} is best{seeds}, {size}"
-    return f"{target}, {mode}: {start}{_to_bound(it, scale, unit)}; it is given {told_of(it.best.observer, it.lines)}."
+    return f"{target}, {mode}: {start}{_to_bound(it)}; it is given {told_of(it.best.observer, it.lines)}."
 
 
-def _to_bound(it: Verdict, scale: float, unit: str) -> str:
+def _to_bound(it: Verdict) -> str:
     """How far the best error is from the least possible. It is a mean over records, so that one may lie below."""
     if not it.bound:
         return ""
-    if "y_ngs" in OBSERVERS[it.best.observer].needs:
-        return f", with the NGS (bound of the LGS alone {_format_number(it.bound * scale)} {unit})"
     percent = round(100.0 * (it.best.rms / it.bound - 1.0))
-    return f", {'at' if percent == 0 else f'{abs(percent)} % ' + ('above' if percent > 0 else 'below')} the bound of the LGS"
+    return f", {'at' if percent == 0 else f'{abs(percent)} % ' + ('above' if percent > 0 else 'below')} the bound of LGS and NGS"
 
 
 def _harm_sentence(it: Verdict, harms: Sequence[Harm], prior: str) -> str:

@@ -33,5 +33,5 @@ BUILT_IN = (
 )
 """Those of wfsobs, in the order of tables and legends."""
 
-OBSERVERS = Registry(Observer, registry.OBSERVERS, BUILT_IN, reserved_ids=("truth", "loop", "bound"))
+OBSERVERS = Registry(Observer, registry.OBSERVERS, BUILT_IN, reserved_ids=("truth", "loop", "bound", "bound-both"))
 """Every observer: those above, and those of installed packages (`wfsobs.registry`)."""

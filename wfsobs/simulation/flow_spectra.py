@@ -32,11 +32,22 @@ RIPPLES = 24
 
 
 class FlowSpectra(NamedTuple):
-    """One-sided spectra of one mode: own, on the axis; measurement, of the mean of the LGS [um^2/Hz]; cross, between the two."""
+    """One-sided spectra of one mode [um^2/Hz].
+
+    Attributes
+    ----------
+    own, measurement, ngs : Array
+        On the axis, of the mean of the LGS, and of the NGS.
+    cross, ngs_cross, sensors_cross : Array
+        Between the axis and the LGS, between the axis and the NGS, and between the NGS and the LGS.
+    """
 
     own: Array
     measurement: Array
     cross: NDArray[np.complex128]
+    ngs: Array
+    ngs_cross: NDArray[np.complex128]
+    sensors_cross: NDArray[np.complex128]
 
 
 def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra:
@@ -54,18 +65,24 @@ def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra
     Returns
     -------
     FlowSpectra
-        Three densities, (n,) each [um^2/Hz].
+        Six densities, (n,) each [um^2/Hz].
     """
     found = atmosphere.layers(scenario)
     f = _frequencies(scenario, min(layer.speed for layer in found), float(frequency[-1]))
     total = np.sum([_layer(scenario, mode, layer, f) for layer in found], axis=0)
     exposure = np.sinc(f * scenario.dt) ** 2
-    at = np.log(np.maximum(frequency, f[0]))
-    own, seen = (np.exp(np.interp(at, np.log(f), np.log(np.maximum((part * exposure).real, 1e-300)))) for part in total[:2])
-    # Between the two only the share of their geometric mean is interpolated: it is smooth, and never above one.
-    share = total[2] / np.sqrt(np.maximum((total[0] * total[1]).real, 1e-300))
-    shared = np.sqrt(own * seen) * (np.interp(at, np.log(f), share.real) + 1j * np.interp(at, np.log(f), share.imag))
-    return FlowSpectra(own, seen, shared)
+    at, nodes = np.log(np.maximum(frequency, f[0])), np.log(f)
+    density = [np.exp(np.interp(at, nodes, np.log(np.maximum((row[i] * exposure).real, 1e-300)))) for i, row in enumerate(total)]
+
+    def between(i: int, j: int) -> NDArray[np.complex128]:
+        """Interpolate only the share of the geometric mean: it is smooth, and never above one."""
+        share = total[i, j] / np.sqrt(np.maximum((total[i, i] * total[j, j]).real, 1e-300))
+        return np.sqrt(density[i] * density[j]) * (np.interp(at, nodes, share.real) + 1j * np.interp(at, nodes, share.imag))
+
+    shared = between(0, 1)
+    if len(total) == 2:  # the NGS is on the axis
+        return FlowSpectra(density[0], density[1], shared, density[0], density[0] + 0j, shared)
+    return FlowSpectra(density[0], density[1], shared, density[2], between(0, 2), between(2, 1))
 
 
 def _frequencies(scenario: Scenario, speed: float, highest: float) -> Array:
@@ -84,13 +101,11 @@ def _frequencies(scenario: Scenario, speed: float, highest: float) -> Array:
 
 
 def _layer(scenario: Scenario, mode: int, layer: TurbulenceLayer, f: Array) -> NDArray[np.complex128]:
-    """Return own, seen and shared of one layer, (3, n)."""
+    """Return the spectra of one layer between axis, LGS and, off the axis, NGS, (2 or 3, the same, n)."""
     kx = 2.0 * np.pi * f / layer.speed
     front = CORE / (0.5 * scenario.telescope.diameter)
-    out = np.zeros((3, f.size), complex)
-    for part in _blocks(kx, front):
-        out[:, part] = _block(scenario, mode, layer, kx[part], front)
-    return out
+    parts = [_block(scenario, mode, layer, kx[part], front) for part in _blocks(kx, front)]
+    return np.concatenate(parts, axis=-1)
 
 
 def _blocks(kx: Array, front: float) -> Iterator[slice]:
@@ -119,14 +134,21 @@ def _block(scenario: Scenario, mode: int, layer: TurbulenceLayer, kx: Array, fro
     own = _of_mode(scenario, mode, x, y, Footprint())
     seen = np.zeros_like(own)
     for star, gains in zip(atmosphere.laser_stars(scenario), lgs_weights(scenario)[mode], strict=True):
-        footprint = atmosphere.view(atmosphere.ideal_sensor(scenario), star, (layer,)).footprints[0]
+        footprint = _footprint(scenario, star, layer)
         for other, gain in enumerate(gains):
             blind = scenario.sensors.tip_tilt_indetermination and scenario.modes[other].radial_order == 1
             if gain != 0.0 and not blind:
                 seen = seen + gain * _of_mode(scenario, other, x, y, footprint)
-    return np.array([(density * z).sum(axis=0) for z in (np.abs(own) ** 2, np.abs(seen) ** 2, own.conj() * seen)])
+    signals = [own, seen]
+    if atmosphere.natural_star(scenario) != atmosphere.on_axis():
+        signals.append(_of_mode(scenario, mode, x, y, _footprint(scenario, atmosphere.natural_star(scenario), layer)))
+    return np.array([[(density * one.conj() * other).sum(axis=0) for other in signals] for one in signals])
 
 
 def _of_mode(scenario: Scenario, mode: int, x: Array, y: Array, footprint: Footprint) -> NDArray[np.complex128]:
     sensor = ZernikeProjection(scenario.telescope.diameter, (scenario.modes[mode].noll,))
     return sensor.transform(x, y, footprint, tabulated_bessel_ratio)[0]
+
+
+def _footprint(scenario: Scenario, star: atmosphere.Star, layer: TurbulenceLayer) -> Footprint:
+    return atmosphere.view(atmosphere.ideal_sensor(scenario), star, (layer,)).footprints[0]

@@ -8,8 +8,9 @@ a controller they are taken `line_width` wide at half maximum.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.disturbance import peak_rms, pure_lines, vibration_power
 from wfsobs.simulation.flow_spectra import flow_spectra
 from wfsobs.simulation.guide_stars import lgs_noise_rms, lgs_weights, low_frequency_process
+from wfsobs.simulation.sensor_noise import noise_rms
 from wfsobs.simulation.synthesis import damping_for_width, line_width, widen_lines
 from wfsobs.simulation.turbulence import processes, table_variance, third_order_process, turbulence_process
 from wfsobs.typing import Array
@@ -39,6 +41,31 @@ FLOOR = 1e-6
 
 
 @dataclass(frozen=True)
+class NgsSpectra:
+    """Spectra of what the NGS sees in one mode, as `TrueSpectra`, at every fast step and without exposure and noise.
+
+    Attributes
+    ----------
+    signal : Array
+        Of the disturbance in the beam of the NGS.
+    measurement_cross : Array
+        Cross spectrum of it at step k and z[k + 1].
+    cross : dict of str to Array
+        Target -> cross spectrum of s[k] and it.
+    noise : float
+        Variance of the noise of a frame [um^2].
+    ratio : int
+        Fast steps in the exposure of a frame, and from frame to frame.
+    """
+
+    signal: Array
+    measurement_cross: Complex | Array
+    cross: dict[str, Complex | Array]
+    noise: float
+    ratio: int
+
+
+@dataclass(frozen=True)
 class TrueSpectra:
     """Spectra of one mode of a scenario, on the frequencies of `wiener`, all (n // 2 + 1,) [um^2 per sample].
 
@@ -50,6 +77,8 @@ class TrueSpectra:
         Target -> S_s.
     cross : dict of str to Array
         Target -> cross spectrum of s[k] and z[k + 1].
+    ngs : NgsSpectra
+        Those of the NGS.
     lines : Array or None
         Spectrum of the undamped lines of the vibration, `line_width` wide.
     gain : float
@@ -61,6 +90,7 @@ class TrueSpectra:
     measurement: Array
     signal: dict[str, Array]
     cross: dict[str, Complex | Array]
+    ngs: NgsSpectra
     lines: Array | None = None
     gain: float = 1.0
     pure: tuple[tuple[float, float], ...] = ()
@@ -79,6 +109,12 @@ class TrueSpectra:
             self.measurement - self.gain**2 * self.lines,
             self.signal | {"vibration": self.signal["vibration"] - self.lines},
             self.cross | {"vibration": self.cross["vibration"] - self.gain * self.lines},
+            replace(
+                self.ngs,
+                signal=self.ngs.signal - self.lines,
+                measurement_cross=self.ngs.measurement_cross - self.gain * self.lines,
+                cross=self.ngs.cross | {"vibration": self.ngs.cross["vibration"] - self.lines},
+            ),
         )
 
     def line_covariance(self, n: int) -> Array:
@@ -103,15 +139,22 @@ def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
         Spectra.
     """
     n = n_frequencies(scenario)
-    turbulence, seen, shared = TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n)
+    air = TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n)
     vibration, gain = _vibration(scenario, mode, n), lgs_weights(scenario)[mode, :, mode].sum()
     lines = _pure_lines(scenario, mode, n)
     if lines is not None:
         vibration = vibration + lines
     return TrueSpectra(
-        measurement=seen + gain**2 * vibration + max(lgs_noise_rms(scenario, mode), FLOOR) ** 2,
-        signal={"turbulence": turbulence, "vibration": vibration},
-        cross={"turbulence": shared, "vibration": gain * vibration},
+        measurement=air.measurement + gain**2 * vibration + max(lgs_noise_rms(scenario, mode), FLOOR) ** 2,
+        signal={"turbulence": air.own, "vibration": vibration},
+        cross={"turbulence": air.cross, "vibration": gain * vibration},
+        ngs=NgsSpectra(
+            signal=air.ngs + vibration,
+            measurement_cross=air.sensors_cross + gain * vibration,
+            cross={"turbulence": air.ngs_cross, "vibration": vibration},
+            noise=max(float(noise_rms(scenario, "ngs")[mode]), FLOOR) ** 2,
+            ratio=scenario.sensors.exposure_ratio,
+        ),
         lines=lines,
         gain=float(gain),
         pure=tuple((f * scenario.dt, variance) for f, variance in pure_lines(scenario, mode)),
@@ -120,7 +163,7 @@ def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
 
 def lgs_turbulence_spectrum(scenario: Scenario, mode: int) -> Array:
     """Return the spectrum of the turbulence in the combined LGS, on the frequencies of `true_spectra`."""
-    return TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n_frequencies(scenario))[1]
+    return TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n_frequencies(scenario)).measurement
 
 
 def n_frequencies(scenario: Scenario) -> int:
@@ -166,8 +209,15 @@ def _density(process: Ar2 | Ar3, n: int) -> Array:
     return process.psd(np.fft.rfftfreq(n, process.dt)) / (2.0 * process.dt)
 
 
-TurbulenceSpectra = tuple[Array, Array, Complex | Array]
-"""S of the turbulence, of the turbulence in the combined LGS, errors included, and between the two."""
+class TurbulenceSpectra(NamedTuple):
+    """Spectra of turbulence, per sample, as `FlowSpectra`; the combined LGS with its errors."""
+
+    own: Array
+    measurement: Array
+    cross: Complex | Array
+    ngs: Array
+    ngs_cross: Complex | Array
+    sensors_cross: Complex | Array
 
 
 def _through_lgs(scenario: Scenario, mode: int, own: Array) -> TurbulenceSpectra:
@@ -176,7 +226,7 @@ def _through_lgs(scenario: Scenario, mode: int, own: Array) -> TurbulenceSpectra
     error = _density(low_frequency_process(scenario, mode), 2 * (own.size - 1)) * np.sum(weights**2)
     blind = scenario.sensors.tip_tilt_indetermination and scenario.modes[mode].radial_order == 1
     gain = 0.0 if blind else weights.sum()
-    return own, gain**2 * own + error, gain * own
+    return TurbulenceSpectra(own, gain**2 * own + error, gain * own, own, own, gain * own)
 
 
 def _ar2_turbulence(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
@@ -201,9 +251,11 @@ def _table(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
 
 
 def _frozen_flow(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
-    own, seen, shared = flow_spectra(scenario, mode, np.fft.rfftfreq(n, scenario.dt))
-    per_sample = 0.5 / scenario.dt
-    return per_sample * own, per_sample * seen, per_sample * shared
+    # Along the wind the spectrum falls as f^2 to zero at 0 Hz, a notch that the DFT does not resolve: here it is a bin wide.
+    frequency = np.hypot(np.fft.rfftfreq(n, scenario.dt), 1.0 / (n * scenario.dt))
+    found = flow_spectra(scenario, mode, frequency)
+    scaled = {id(part): 0.5 / scenario.dt * part for part in found}  # on the axis the NGS shares its arrays with the truth
+    return TurbulenceSpectra(*(scaled[id(part)] for part in found))
 
 
 def _vibration(scenario: Scenario, mode: int, n: int) -> Array:

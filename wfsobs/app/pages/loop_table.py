@@ -14,8 +14,8 @@ from wfsobs.app.render import Row, macro, table
 from wfsobs.app.style import swatch
 from wfsobs.app.views.table import BEST
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
-from wfsobs.evaluation.bound import BOUND
 from wfsobs.evaluation.rows import Row as Score
+from wfsobs.evaluation.scores import BOUNDS
 
 UNSTABLE = macro("tag", "above", "unstable")
 
@@ -27,7 +27,7 @@ def of_mode(results: LoopResults, display: Display) -> list[Score]:
 
 
 def loop_html(results: LoopResults, display: Display) -> str:
-    """Residual and Strehl of every controller, and the bound."""
+    """Residual and Strehl of every controller, and the bounds."""
     unit = display.unit_label
     columns = {
         "Controller": "",
@@ -39,7 +39,7 @@ def loop_html(results: LoopResults, display: Display) -> str:
         "Needs": TERMS[NEEDS],
     }
     rows = of_mode(results, display)
-    best = next((r["controller"] for r in rows if r["controller"] != BOUND and r["residual_rms_nm"] is not None), None)
+    best = next((r["controller"] for r in rows if r["controller"] not in BOUNDS and r["residual_rms_nm"] is not None), None)
     scale = 1e-3 * per_micrometre(display.unit, results.result.scenario.telescope.diameter)
     body = [_row(r, display, scale, r["controller"] == best) for r in rows]
     notes = {r["note"]: label(r["controller"]) for r in reversed(rows) if r["note"] and not r["limited"]}

@@ -26,7 +26,7 @@ from wfsobs.app.style import PRIMARY, asset, look, observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, marked_peaks
 from wfsobs.app.work import TRUTH
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE
-from wfsobs.evaluation.scores import BOUND
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.sensors.modes import TIP_TILT
@@ -93,7 +93,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _line_names() -> list[str]:
-    return [TRUTH, *OBSERVERS, BOUND]
+    return [TRUTH, *OBSERVERS, *BOUNDS]
 
 
 # ---------------------------------------------------------------------- for the script

@@ -27,7 +27,7 @@ from wfsobs.evaluation.rows import (
     score_rows,
     scored_interval,
 )
-from wfsobs.evaluation.scores import BOUND, LOOP, RESIDUAL, Score
+from wfsobs.evaluation.scores import BOUNDS, LOOP, RESIDUAL, Score
 from wfsobs.observers.base import TARGETS
 
 BEST, TIED, ABOVE = macro("tag", "best", "best"), macro("tag", "tied", "tied"), macro("tag", "above", "above truth")
@@ -103,7 +103,7 @@ class Table:
         shown = self.run.result
         scores = {
             name: find(shown, name, target, self.display.mode) if shown else None
-            for name in (*observers_of(target, with_hidden=True), BOUND)
+            for name in (*observers_of(target, with_hidden=True), *BOUNDS)
         }
         marks = self._marks(target, scores)
         order = list(scores.items())
@@ -147,7 +147,7 @@ class Table:
 
     def _head(self, name: str) -> Markup:
         label = row_label(name)
-        return swatch(name, self.display.dark) + (term(TERM_OF_BOUND, label) if name == BOUND else label)
+        return swatch(name, self.display.dark) + (term(TERM_OF_BOUND, label) if name in BOUNDS else label)
 
     def _pinned_cells(self, name: str, target: str, score: Score | None) -> list[str]:
         """Write the pinned run's error and the change since; nothing while nothing is pinned."""

@@ -1,0 +1,85 @@
+"""Bound of both sensors: the minimum error of any causal linear observer of the mean of the LGS and of the NGS.
+
+Like the bound of the LGS alone (`bound`) it is that of the true spectra and noises, after an infinitely long record, and a mean
+over records; undamped lines are then known, others have the width that the record has. It is periodic: least when an NGS frame
+has just been read. An observer that takes every LGS by itself, or modes together, may be better where these see different
+turbulence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+from scipy.special import diric
+
+from wfsobs.evaluation.bound import TOTAL
+from wfsobs.scenario import Scenario
+from wfsobs.signal.slow_sensor import SlowSensor, variance_from_frames
+from wfsobs.signal.wiener import Complex, advance_spectrum, causal_error, factorise
+from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
+from wfsobs.typing import Array
+
+
+@dataclass(frozen=True)
+class PeriodicError:
+    """Minimum error of both sensors.
+
+    Attributes
+    ----------
+    variance : Array
+        Variance in a step with an NGS frame, one step later, ..., (ratio,) [um^2].
+    """
+
+    variance: Array
+
+    @property
+    def rms(self) -> float:
+        """Rms over all steps [um]."""
+        return float(np.sqrt(self.variance.mean()))
+
+    @property
+    def phases(self) -> tuple[float, ...]:
+        """Rms in a step with an NGS frame, one step later, ... [um]."""
+        return tuple(np.sqrt(self.variance).tolist())
+
+
+def least_errors_of_both(spectra: TrueSpectra, ahead: int = 0) -> dict[str, PeriodicError]:
+    """Compute the minimum error of phi[k + ahead] from all of z and all NGS frames up to step k.
+
+    Parameters
+    ----------
+    spectra : TrueSpectra
+        Spectra of one mode.
+    ahead : int
+        Steps of prediction.
+
+    Returns
+    -------
+    dict of str to PeriodicError
+        Target -> error; TOTAL is that of both together.
+    """
+    known, names = spectra.without_lines, list(spectra.signal)
+    ngs, whitener = known.ngs, factorise(known.measurement)
+    exposure = exposure_response(ngs.ratio, known.measurement.size)
+    frames = SlowSensor(
+        ngs.signal * np.abs(exposure) ** 2, advance_spectrum(ngs.measurement_cross * exposure, 1), ngs.noise, ngs.ratio
+    )
+    fast = [advance_spectrum(known.cross[name], 1 + ahead) for name in names]
+    slow = [advance_spectrum(ngs.cross[name] * exposure.conj(), ahead) for name in names]
+    gained = variance_from_frames(list(zip(fast, slow, strict=True)), whitener, frames)
+    alone = {name: causal_error(known.signal[name], fast[i], whitener) - gained[:, i, i] for i, name in enumerate(names)}
+    total = causal_error(known.total[0], np.sum(fast, axis=0), whitener) - gained.sum(axis=(1, 2))
+    return {name: PeriodicError(np.maximum(variance, 0.0)) for name, variance in (*alone.items(), (TOTAL, total))}
+
+
+def exposure_response(ratio: int, size: int) -> Complex:
+    """Return the response of the mean of the last `ratio` steps before the present one, at `size` frequencies from 0 to 1/2."""
+    omega = pi * np.arange(size) / (size - 1)
+    return np.asarray(np.exp(-0.5j * (ratio + 1) * omega) * diric(omega, ratio), dtype=np.complex128)
+
+
+def bound_rms_of_both(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:
+    """Return target -> rms [um] of the minimum error, as `least_errors_of_both`, of one mode of a scenario."""
+    return {name: error.rms for name, error in least_errors_of_both(true_spectra(scenario, mode), ahead).items()}

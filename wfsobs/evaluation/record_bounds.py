@@ -1,0 +1,89 @@
+"""The bounds of a simulated record as rows of its table: that of the LGS alone and that of LGS and NGS."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from wfsobs.evaluation.bound import LeastError, least_errors
+from wfsobs.evaluation.bound_both import PeriodicError, least_errors_of_both
+from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, Score
+from wfsobs.observers.base import TARGETS
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.signal.welch import rms
+from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Minimum error of a target in a mode of a record.
+
+    Attributes
+    ----------
+    row : str
+        BOUND or BOUND_BOTH.
+    target, mode : str
+        Whose.
+    column : int
+        Index of the mode.
+    error : LeastError or PeriodicError
+        The error.
+    """
+
+    row: str
+    target: str
+    mode: str
+    column: int
+    error: LeastError | PeriodicError
+
+
+def record_bounds(scenario: Scenario, record: Record) -> list[Bound]:
+    """Compute the bounds of a record that was simulated from the scenario; none where its spectra are not known."""
+    if not has_known_spectra(scenario):
+        return []
+    modes = scenario.modes[: record.n_modes]
+
+    def of_mode(mode: int) -> dict[str, dict[str, LeastError] | dict[str, PeriodicError]]:
+        spectra = true_spectra(scenario, mode)
+        return {BOUND: least_errors(spectra, n_steps=record.n_steps), BOUND_BOTH: least_errors_of_both(spectra)}
+
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(of_mode, range(len(modes))))
+    return [
+        Bound(row, target, it.name, i, errors[target])
+        for i, it in enumerate(modes)
+        for row, errors in found[i].items()
+        for target in TARGETS
+    ]
+
+
+def bound_scores(bounds: Sequence[Bound], record: Record, scores: Sequence[Score], warm_up: float) -> list[Score]:
+    """Return the scores of bounds, on the samples of the observers' scores, or on all after the warm-up [s]."""
+    stretches = {(s.target, s.mode): (s.start, s.stop) for s in scores if not s.apart}
+    out = []
+    for it in bounds:
+        start, stop = stretches.get((it.target, it.mode), (None, None))
+        first = round((warm_up if start is None else start) / record.dt)
+        last = record.n_steps if stop is None else round(stop / record.dt)
+        truth = record.truth(it.target)
+        if truth is not None and first < last:
+            scale = rms(truth[first:last, it.column])
+            out.append(
+                Score(
+                    it.row,
+                    it.target,
+                    it.mode,
+                    it.error.rms,
+                    scale,
+                    it.error.rms / scale if scale > 0 else None,
+                    None,
+                    0.0,
+                    first * record.dt,
+                    last * record.dt,
+                    interval=it.error.interval(first, last) if isinstance(it.error, LeastError) else None,
+                    phases=it.error.phases if isinstance(it.error, PeriodicError) else None,
+                )
+            )
+    return out

@@ -1,0 +1,166 @@
+"""What a slow sensor adds to a fast one: the minimum error of any causal linear observer of both.
+
+The fast sensor gives z[k] at every step, the slow one a frame y[k] = x[k] + v[k] at every n-th, v white. Signals are stationary,
+the two sensors together are so only from one cycle of n steps to the next. With e the innovations of z, of variance one
+(`wiener`),
+
+    y[k] = sum_j c[j] e[k-j] + y'[k],
+
+over all j, past and future, where y' is what all of z leaves of the frames: it has the spectrum S_x - |S_xz|^2 / S_z, aliased,
+plus that of v. At a step k the last frame is p steps old, p = 0 ... n - 1, and innovations after k are not known. Of the frame of
+age p + n i remains
+
+    r_i = y'[k - p - n i] + sum_{t > 0} C[t + p + n i] e[k+t],    C[j] = c[-j],
+
+and of the target likewise s' + sum G[t] e[k+t]. What is to be gained by the frames is the regression of this rest on all r_i. A
+causal factor of the spectrum of y' turns it into white noise, in which a Hankel matrix K_ti = C'[t + p + n i] remains:
+
+    gain = b' (I + K' K)^-1 b,    b_i = E s' y'_i + sum_t G[t] K_ti.
+
+I + K' K has few eigenvalues that are not one, so that conjugate gradients need few steps, and no matrix spectrum has to be
+factorised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+
+from wfsobs.signal.wiener import Complex, Whitener, factorise
+from wfsobs.typing import Array
+
+KEPT = 0.875
+"""Share of the frames that half the DFT holds that is used: the oldest are whitened without those before them."""
+
+TAIL = 1e-7
+"""Maximum trace of the part of K' K, of the oldest frames, that is left out."""
+
+LONGEST = 8192
+"""Maximum number of frames of which K' K is not left out."""
+
+TOLERANCE = 1e-4
+"""Residual of a solution over its right-hand side; the gain is wrong by its square at most, since I + K' K is no less than I."""
+
+
+@dataclass(frozen=True)
+class SlowSensor:
+    """A slow sensor beside a fast one.
+
+    Attributes
+    ----------
+    spectrum : Array
+        Spectrum of x, what a frame measures, at every fast step, (n // 2 + 1,).
+    cross : Array
+        S_xz, the transform over n of E x[k] z[k-n], (n // 2 + 1,).
+    noise : float
+        Variance of v, above zero.
+    ratio : int
+        Fast steps from frame to frame.
+    """
+
+    spectrum: Array
+    cross: Complex
+    noise: float
+    ratio: int
+
+
+def variance_from_frames(targets: Sequence[tuple[Complex, Complex]], whitener: Whitener, slow: SlowSensor) -> Array:
+    """Return how much the frames lower the variance of the minimum error of z alone.
+
+    Parameters
+    ----------
+    targets : sequence of tuple
+        (S_sz, S_sx) of each target, the transforms over n of E s[k] z[k-n] and E s[k] x[k-n], (n // 2 + 1,).
+    whitener : Whitener
+        Factor of the spectrum of z.
+    slow : SlowSensor
+        The other sensor.
+
+    Returns
+    -------
+    Array
+        Explained covariance of the targets, (ratio, n_targets, n_targets), p steps after a frame.
+    """
+    n, ratio = whitener.n, slow.ratio
+    frames = n // 2 // ratio
+    whiten = 1.0 / (whitener.H.conj() * np.sqrt(whitener.innovation_variance))
+    left = slow.spectrum - np.abs(slow.cross) ** 2 / whitener.spectrum
+    noise = _frame_whitener(fft.irfft(left, n)[: frames * ratio + 1 : ratio], slow.noise)
+
+    ahead = _whiten_frames(_of_future(slow.cross * whiten, n), noise, ratio)  # C'
+    spectrum = fft.rfft(ahead.ravel(), n)
+    rest = np.empty((len(targets), frames, ratio))
+    for i, (fast, frame) in enumerate(targets):
+        own = fft.irfft(frame - fast * slow.cross.conj() / whitener.spectrum, n)[: n // 2]
+        future = _of_future(fast * whiten, n)
+        future[0] = 0.0
+        known = fft.irfft(spectrum * fft.rfft(future, n).conj(), n)[: frames * ratio]
+        rest[i] = _whiten_frames(own, noise, ratio) + known.reshape(frames, ratio)
+    kept = max(round(KEPT * frames), 1)
+    return _gains(ahead[:kept], rest[:, :kept])
+
+
+def _of_future(whitened: Complex, n: int) -> Array:
+    """Return the coefficients of e[k], e[k+1], ..., (n // 2,)."""
+    backwards = fft.irfft(whitened.conj(), n)
+    return backwards[: n // 2].copy()
+
+
+def _frame_whitener(covariance: Array, noise: float) -> Whitener:
+    """Return the factor of the spectrum of y', from its autocovariance without noise at the lags of frames."""
+    circle = np.concatenate([covariance, covariance[-2:0:-1]])
+    return factorise(np.maximum(fft.rfft(circle).real, 0.0) + noise)
+
+
+def _whiten_frames(x: Array, noise: Whitener, ratio: int) -> Array:
+    """Return F^-1 x for every age up to `ratio`, (frames, ratio), where F is the factor of the covariance of y' by age."""
+    frames = noise.n // 2
+    by_age = x[: frames * ratio].reshape(frames, ratio)
+    response = 1.0 / (noise.H.conj() * np.sqrt(noise.innovation_variance))
+    return fft.irfft(fft.rfft(by_age, noise.n, axis=0) * response[:, None], noise.n, axis=0)[:frames]
+
+
+def _gains(ahead: Array, rest: Array) -> Array:
+    """Return b' (I + K' K)^-1 b of all pairs of targets at every age.
+
+    ahead : C', (frames, ratio);  rest : b, (n_targets, frames, ratio)
+    """
+    tail = np.cumsum((np.arange(1, len(ahead) + 1) * np.sum(ahead**2, axis=1))[::-1])[::-1]
+    length = min(max(int(np.searchsorted(-tail, -TAIL)), 1), LONGEST)
+    near = rest[:, :length].transpose(2, 0, 1)
+    out = near @ _solve(ahead, near, length).transpose(0, 2, 1)
+    out += np.einsum("aip,bip->pab", rest[:, length:], rest[:, length:])
+    return 0.5 * (out + out.transpose(0, 2, 1))
+
+
+def _solve(ahead: Array, b: Array, length: int) -> Array:
+    """Solve (I + K' K) x = b for every age, (ratio, n_targets, length), by conjugate gradients."""
+    ratio = ahead.shape[1]
+    size = fft.next_fast_len(2 * length, real=True)
+    common = fft.rfft(ahead[1 : 2 * length + 1].T, size)
+    # Of the innovations in the present cycle, those after the step are not known.
+    first = ahead[:length] * (np.arange(ratio)[:, None, None] < np.arange(ratio))
+
+    def apply(x: Array) -> Array:
+        reversed_x = fft.rfft(x, size).conj()
+        out = x + (x @ first) @ first.transpose(0, 2, 1)
+        total = np.zeros_like(reversed_x)
+        for hankel in common:
+            known = fft.irfft(hankel * reversed_x, size)[..., :length]
+            total += hankel * fft.rfft(known, size).conj()
+        return out + fft.irfft(total, size)[..., :length]
+
+    x, residual = np.zeros_like(b), b.copy()
+    direction, power = b.copy(), np.sum(b**2, axis=-1)
+    wanted, smallest = TOLERANCE**2 * power, np.finfo(float).tiny
+    while (power > wanted).any():
+        moved = apply(direction)
+        step = power / np.maximum(np.sum(direction * moved, axis=-1), smallest)
+        x += step[..., None] * direction
+        residual -= step[..., None] * moved
+        before, power = power, np.sum(residual**2, axis=-1)
+        direction = residual + (power / np.maximum(before, smallest))[..., None] * direction
+    return x
