@@ -26,6 +26,7 @@ from wfsobs.campaign.store import RESULTS, add_settings, need_pyarrow, read_resu
 from wfsobs.campaign.work import run_rows
 from wfsobs.cli.show import show_table
 from wfsobs.evaluation.rows import NOT_OBSERVERS
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.settings.errors import SettingError
 
 ROW_BYTES, FILE_BYTES = 60, 12_000
@@ -92,7 +93,8 @@ def _core_hours(plan: Campaign) -> tuple[float, str]:
 
 def _rows_of_a_run(plan: Campaign) -> int:
     modes = len(plan.cells[0].scenario().modes)
-    return modes * (2 * (len(plan.observers) + 1) * bool(plan.observers) + (len(plan.controllers) + 1) * bool(plan.controllers))
+    observers, controllers = ((len(names) + len(BOUNDS)) * bool(names) for names in (plan.observers, plan.controllers))
+    return modes * (2 * observers + controllers)
 
 
 @campaign.command()

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best
-from wfsobs.evaluation.scores import BOUND, Score
+from wfsobs.evaluation.scores import BOUNDS, Score
 from wfsobs.typing import Array
 
 LEVEL = 0.05
@@ -67,7 +67,7 @@ class Evidence:
 
 def gather_evidence(seeds: Sequence[Iterable[Score]]) -> Evidence:
     """Gather the scores of several seeds, one sequence each: of rows that all of them have and that can be compared."""
-    known = [{(s.observer, s.target, s.mode): s for s in scores if not s.apart and s.observer != BOUND} for scores in seeds]
+    known = [{(s.observer, s.target, s.mode): s for s in scores if not s.apart and s.observer not in BOUNDS} for scores in seeds]
     keys = [key for key in known[0] if all(key in of for of in known)] if known else []
     return Evidence(
         {key: np.array([of[key].rms for of in known]) for key in keys},
