@@ -61,7 +61,7 @@ def test_simulated_records_have_these_spectra() -> None:
     s = FLOW.replace(
         {"sensors.lgs_count": 1, "sensors.lgs_radius": 40.0, "sensors.lgs_noise": 0.0, "loop.closed": False, "run.duration": 20.0}
     )
-    names, total = ("own", "seen", "shared"), np.zeros((3, 4097), complex)
+    names, total = ("own", "measurement", "cross"), np.zeros((3, 4097), complex)
     for seed in range(8):
         record = simulate(s.replace({"run.seed": seed}))
         assert record.turbulence is not None
@@ -82,7 +82,7 @@ def test_a_step_is_the_mean_of_the_steps_of_a_faster_sensor() -> None:
     f = np.linspace(1.0, 500.0, 200)
     slow, fast = (flow_spectra(FLOW.replace({"sensors.lgs_rate": rate}), 0, f) for rate in (1000.0, 4000.0))
     mean = np.abs(np.exp(-2j * np.pi * np.multiply.outer(f, np.arange(4)) / 4000.0).mean(axis=1)) ** 2
-    for name in ("own", "seen", "shared"):
+    for name in ("own", "measurement", "cross"):
         # both are interpolated between frequencies 5 % apart, which cuts (0.05 x 2 pi / 2)^2 / 8 = 0.003 off their bend at most
         assert np.abs(getattr(slow, name)) == pytest.approx(mean * np.abs(getattr(fast, name)), rel=3e-3, abs=0)
 

@@ -29,8 +29,8 @@ TERMS: Mapping[str, str] = MappingProxyType(
             "RMS error over the RMS of the truth. 0 is perfect, 1 is as good as no estimate; above 1 the estimate does harm."
         ),
         BOUND: (
-            "Smallest RMS error that a causal linear observer of the mean LGS measurement, or of both sensors, can have, from the "
-            "true spectra (Wiener). It is a mean over records: on one record an observer may come out a little below."
+            "Smallest RMS error that a causal linear observer of the mean LGS measurement, or of both sensors, can have, from "
+            "the true spectra (Wiener). It is a mean over records: on one record an observer may come out a little below."
         ),
         NEEDS: ("What an observer must be given beside measurements: a model, the true lines, frequency bands or training data."),
         LAG: "Delay of the estimate: where its cross-correlation with the truth has its maximum. Negative if the estimate leads.",

@@ -35,9 +35,6 @@ from wfsobs.typing import Array
 KEPT = 0.875
 """Share of the frames that half the DFT holds that is used: the oldest are whitened without those before them."""
 
-TAIL = 1e-7
-"""Maximum trace of the part of K' K, of the oldest frames, that is left out."""
-
 LONGEST = 8192
 """Maximum number of frames of which K' K is not left out."""
 
@@ -128,8 +125,7 @@ def _gains(ahead: Array, rest: Array) -> Array:
 
     ahead : C', (frames, ratio);  rest : b, (n_targets, frames, ratio)
     """
-    tail = np.cumsum((np.arange(1, len(ahead) + 1) * np.sum(ahead**2, axis=1))[::-1])[::-1]
-    length = min(max(int(np.searchsorted(-tail, -TAIL)), 1), LONGEST)
+    length = min(len(ahead), LONGEST)
     near = rest[:, :length].transpose(2, 0, 1)
     out = near @ _solve(ahead, near, length).transpose(0, 2, 1)
     out += np.einsum("aip,bip->pab", rest[:, length:], rest[:, length:])
