@@ -88,8 +88,8 @@ def test_where_the_truth_is_its_model_it_is_the_error_of_the_optimal_filter(
 def test_the_wrapped_line_is_all_that_differs_from_the_riccati_covariance() -> None:
     for ahead, expected in enumerate(riccati_errors(MATCHED)):
         for name, error in least_errors_of_both(true_spectra(MATCHED, 0), ahead).items():
-            # conjugate gradients stop at 1e-4, wrong by its square of a variance that is 10 times the least one
-            assert error.phases == pytest.approx(expected[name], rel=1e-6), (name, ahead)
+            # conjugate gradients stop at 1e-4, wrong by its square of variances up to 100 times that of both together
+            assert error.phases == pytest.approx(expected[name], rel=1e-5), (name, ahead)
 
 
 SLOW_RATE = MATCHED.replace(
