@@ -130,7 +130,7 @@ def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     """10 um^2/Hz over 1 Hz about 30 Hz on tip, nothing on tilt; without a unit it is asked for."""
     rows = "29.4,0,0\n29.5,10,0\n30.5,10,0\n30.6,0,0\n"
     previewed(dashboard, loop, f"frequency,tip,tilt\n{rows}".encode(), "lines.csv")
-    assert dashboard.upload.picker.said.startswith("lines.csv: does not say the unit of tip")
+    assert dashboard.upload.picker.said.startswith("lines.csv: has no unit of tip")
     dashboard.upload.unit.value = "nm"
     loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
     assert "4 frequencies from 29.4 to 30.6 Hz" in dashboard.upload.text.object and "3.317 nm rms of tip, 0 nm" in (

@@ -62,8 +62,8 @@ def test_saved_settings_give_the_tuned_scenario(tuned) -> None:
     ("observer", "names", "says"),
     [
         ("kf-lgs", ["kalman.frequenc"], "no such setting"),
-        ("kf-lgs", ["kalman.process_noise"], "not one number"),
-        ("kf-lgs", ["butterworth.frequencies"], "not one number"),
+        ("kf-lgs", ["kalman.process_noise"], "not a single number"),
+        ("kf-lgs", ["butterworth.frequencies"], "not a single number"),
         ("kf-lgs", ["gpr_online.depth"], "not a setting of kf-lgs"),
         ("kf-lgs", ["turbulence.wind_speed"], "not a setting of kf-lgs"),
         ("kf-lgs", ["kalman.damping", "kalman.damping"], "twice"),
