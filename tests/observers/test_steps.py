@@ -4,18 +4,25 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import wfsobs
 from wfsobs import PRESETS, simulate
+from wfsobs.control.mirror import Mirror, Plant
+from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.gpr.offline import training_targets
 from wfsobs.observers.kalman.step import matrix_power
+from wfsobs.observers.missing import fill_missing
 from wfsobs.observers.step import StepError
-from wfsobs.prior import Lines, Model
+from wfsobs.prior import Bands, Lines, Model, Prior, Training
 from wfsobs.priors_from.scenario import arguments, kalman_model, measurement_noise, prior_of
-from wfsobs.record import Record
+from wfsobs.progress import QUIET
+from wfsobs.record import Record, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.signal.riccati import steady_state
 from wfsobs.testing import QUICK
@@ -154,3 +161,70 @@ def test_wrong_input_is_one_line_and_takes_no_frame() -> None:
         observer.load_state_dict(wfsobs.design("kf-lgs", PRESETS["paper"]()).state_dict())
     with refused("not from kf-lgs"):
         observer.take_over(wfsobs.design("kf-lgs", PRESETS["paper"]()))
+
+
+@pytest.mark.parametrize(("name", "ahead"), [("gpr-offline", gpr_offline_ahead), ("gpr-online", gpr_online_ahead)])
+def test_a_gpr_for_one_frame_ahead_is_the_prediction_of_the_closed_loop(name: str, ahead: Any) -> None:
+    """Oracle: what a controller commands against at a delay of two frames, computed over the record."""
+    record, scenario = with_gaps("paper")
+    scenario = scenario.replace({"gpr_offline.inputs": "z", "gpr_online.inputs": "z"})
+    measurements = fill_missing(record.measurements(), Prior())
+    prior = prior_of(scenario, record, (Bands, Training))
+    settings = SimpleNamespace(gpr_offline=scenario.gpr_offline, gpr_online=scenario.gpr_online)
+    want = ahead(measurements, prior, Plant(Mirror(2.0), record.dt, 5), settings, QUIET)
+    observer = wfsobs.design(name, scenario, sampling=record.sampling, train=record.training, horizon=1)
+    got = np.empty_like(want)
+    for k, z in enumerate(replace(record, u=hold_last(record.u)).z):
+        observer.update(z)
+        got[k] = observer.predict(1)[0]
+    np.testing.assert_allclose(got, want, rtol=0, atol=GPR * np.nanstd(want))
+    with refused("designed for 1 frames ahead; design it with horizon = 0"):
+        observer.predict(0)
+
+
+def test_the_linear_predictor_for_two_frames_ahead() -> None:
+    """Oracle: least squares of the reference two steps later on the last 30 measurements, by numpy's solver."""
+    record, scenario = with_gaps("paper")
+    observer = wfsobs.design("ridge-30", scenario, sampling=record.sampling, train=record.training, horizon=2)
+    z, training = fill_missing(record.measurements(), Prior()).z, record.training
+    known = pseudo_open_loop(training.y_lgs, training.u)
+    target = training_targets(training, prior_of(scenario, record, (Bands,)).bands, record.dt)
+    for mode in range(2):
+        m = len(known) - 32
+        X = np.lib.stride_tricks.sliding_window_view(known[:-3, mode], 30)[:m]
+        f = target[31 : 31 + m, mode]
+        lam = 1e-6 * m * np.mean(known[:, mode] ** 2)
+        centred = np.vstack([X - X.mean(axis=0), np.sqrt(lam) * np.eye(30)])
+        w = np.linalg.lstsq(centred, np.append(f - f.mean(), np.zeros(30)), rcond=None)[0]
+        observer.reset()
+        for row in z[:200]:
+            observer.update(row)
+        want = f.mean() + (z[170:200, mode] - X.mean(axis=0)) @ w
+        np.testing.assert_allclose(observer.predict(2)[0][mode], want, rtol=1e-6)  # the condition number of the windows is 1e6
+
+
+def test_a_horizon_that_cannot_be_is_refused() -> None:
+    record, scenario = with_gaps("paper")
+    with refused("takes a whole number of frames ahead"):
+        wfsobs.design("ridge-30", scenario, train=record.training, horizon=0.5)
+    with refused("band-passes predict nothing"):
+        wfsobs.design("butterworth-cl", scenario, horizon=1)
+
+
+@pytest.mark.parametrize("name", ["ridge-30", "gpr-online", "kf-ngs", "butterworth-cl", "kf-adaptive", "persistence"])
+def test_every_kind_takes_over_its_own_state(name: str) -> None:
+    """A design with the same numbers goes on as if it were the old one."""
+    record, scenario = with_gaps("paper")
+    old, new = (wfsobs.design(name, scenario, sampling=record.sampling, train=record.training) for _ in range(2))
+    base = run_steps(old, record.measurements(), range(500))
+    new.take_over(old)
+    later = range(500, 520)
+    for target, values in run_steps(old, record.measurements(), later).items():
+        assert np.isfinite(base[target][400:500]).all()
+        np.testing.assert_allclose(
+            run_steps(new, record.measurements(), later)[target][500:520],
+            values[500:520],
+            rtol=0,
+            atol=1e-9 * np.std(record.vibration),
+        )
+        break
