@@ -121,7 +121,7 @@ class Table:
         return {n: BEST for n, s in scores.items() if s and s.rms == best and can_be_best(n, s.apart)}
 
     def _over_seeds(self, name: str, target: str, scale: float) -> Markup:
-        """Write the interval of the mean error over several seeds, to stand behind that of the record."""
+        """Write the interval of the mean error over several seeds, to stand before that of the record."""
         evidence = self.seeds.evidence if self.seeds else None
         interval = evidence.interval((name, target, self.display.mode)) if evidence else None
         if evidence is None or interval is None:
@@ -134,7 +134,11 @@ class Table:
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             cells = [
-                mark + number(score.rms * scale) + (_interval(score.interval, scale) or self._over_seeds(name, target, scale)),
+                # The number last, so that numbers stand below each other.
+                (_interval(score.interval, scale) or self._over_seeds(name, target, scale))
+                + " "
+                + mark
+                + number(score.rms * scale),
                 *pinned,
                 number(score.truth_rms * scale),
                 (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
@@ -173,7 +177,7 @@ def _own(score: Score | None) -> Markup:
 
 
 def _interval(interval: Sequence[float] | None, scale: float) -> Markup:
-    """Write the interval of a bound, to stand behind it."""
+    """Write the interval of a bound, to stand before it."""
     return macro("interval", *(number(x * scale) for x in interval), IN_MOST) if interval else Markup()
 
 
