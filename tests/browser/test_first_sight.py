@@ -7,6 +7,8 @@ from typing import Any
 
 from playwright.sync_api import expect
 
+from wfsobs.scenario.presets import PRESETS
+
 
 def test_a_setting_is_found_and_gets_the_focus(open_page: Any) -> None:
     page = open_page()
@@ -77,3 +79,15 @@ def test_a_heading_says_what_differs(open_page: Any) -> None:
     page.get_by_role("textbox", name="m/s").fill("20")
     page.get_by_role("textbox", name="m/s").press("Enter")
     expect(page.get_by_role("button", name=re.compile("Turbulence · 1 changed"))).to_be_visible()
+
+
+def test_a_preset_is_chosen_from_the_gallery(open_page: Any) -> None:
+    page = open_page(390, 844)
+    page.get_by_role("button", name="Open drawer").click()
+    page.get_by_role("button", name="Gallery").click()
+    sheet = page.get_by_role("dialog", name="Gallery of presets")
+    expect(sheet.get_by_role("button")).to_have_count(len(PRESETS))
+    expect(sheet.locator("svg")).to_have_count(len(PRESETS))
+    sheet.get_by_role("button", name=re.compile("Strong turbulence")).click()
+    expect(sheet).to_be_hidden()
+    expect(page.get_by_role("combobox", name="Preset")).to_have_text("Strong turbulence")

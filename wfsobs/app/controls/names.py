@@ -84,3 +84,16 @@ def _item(p: param.List, number: str, *keys: str) -> str:
 def _labels() -> Counter[str]:
     """How many settings have a label."""
     return Counter(str(p.label) for _, _, p in Scenario().walk())
+
+
+ACRONYMS = ("ut4", "galacsi", "nfm", "wfm")
+
+
+def preset_title(preset: str) -> str:
+    """Write a preset's name as the page does.
+
+    >>> preset_title("ut4-floor"), preset_title("strong-turbulence")
+    ('UT4 floor', 'Strong turbulence')
+    """
+    words = [word.upper() if word in ACRONYMS else word for word in preset.split("-")]
+    return " ".join([words[0] if words[0].isupper() else words[0].capitalize(), *words[1:]])

@@ -13,7 +13,8 @@ import param
 from panel.custom import JSComponent
 
 from wfsobs.app.controls.fields import ROOM, TAG, Field, make_field
-from wfsobs.app.controls.names import setting_name
+from wfsobs.app.controls.gallery import Gallery
+from wfsobs.app.controls.names import preset_title, setting_name
 from wfsobs.app.controls.rows import RowEditor
 from wfsobs.app.controls.search import Search
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
@@ -93,7 +94,7 @@ class Controls:
             label="Preset",
             tags=[TAG + PRESET],
             value=store.preset,
-            options={_title(name): name for name in PRESETS},
+            options={preset_title(name): name for name in PRESETS},
             helper_text=NO_CHANGES,
             size="small",
             stylesheets=[TWO_LINES],
@@ -109,6 +110,7 @@ class Controls:
         )
         self.cancel = pmui.Button(label="Cancel", icon="stop", variant="outlined", size="small", margin=(0, 10, 0, 8), sx=ON_BAR)
         self.status = Status(sizing_mode="stretch_width", max_width=220, margin=0, stylesheets=[STATUS_ON_BAR])
+        self.gallery = Gallery(store.choose, width=78, margin=(4, 6, 4, 0))
         self.search = Search(self.open_setting, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
         self.topics = _names()
         self.rooms = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
@@ -131,7 +133,7 @@ class Controls:
         first = [self._field(path) for path in FIRST]
         return pn.Column(
             self.preset,
-            pn.Row(self.undo, self.redo, self.reset, sizing_mode="stretch_width", margin=0),
+            pn.Row(self.gallery, self.undo, self.redo, self.reset, sizing_mode="stretch_width", margin=0),
             *(f.view for f in first),
             self.search,
             self.accordion,
@@ -280,16 +282,3 @@ def _names() -> dict[str, str]:
     """Topic -> title, in the order of the drawer."""
     settings = {name: str(p.label) for name, p in Scenario.settings().items()}
     return {name: settings[name] for name in (*TOPICS, *(n for n in settings if n not in TOPICS))}
-
-
-ACRONYMS = ("ut4", "galacsi", "nfm", "wfm")
-
-
-def _title(preset: str) -> str:
-    """Write a preset's name as the page does.
-
-    >>> _title("ut4-floor"), _title("strong-turbulence")
-    ('UT4 floor', 'Strong turbulence')
-    """
-    words = [word.upper() if word in ACRONYMS else word for word in preset.split("-")]
-    return " ".join([words[0] if words[0].isupper() else words[0].capitalize(), *words[1:]])

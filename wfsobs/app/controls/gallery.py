@@ -1,0 +1,49 @@
+"""The presets with a line and a picture each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.controls.names import preset_title
+from wfsobs.app.style import asset
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.disturbance import vibration_lines
+
+
+class Gallery(JSComponent):
+    """The button and what it opens; it gets the presets when it is first opened, and says which one was chosen."""
+
+    items = param.List([], doc="{name, title, line, peaks: [Hz, um], events} of every preset.")
+
+    _esm = asset("gallery.js")
+    _stylesheets = [asset("gallery.css")]  # noqa: RUF012
+
+    def __init__(self, choose: Callable[[str], None], **params: Any):
+        """Make the button. choose : starts from the preset of a name."""
+        self._choose = choose
+        super().__init__(**params)
+
+    def _handle_msg(self, data: dict[str, Any]) -> None:
+        if data.get("open") and not self.items:
+            self.items = presets_shown()
+        elif data.get("choose") in PRESETS:
+            self._choose(str(data["choose"]))
+
+
+def presets_shown() -> list[dict[str, Any]]:
+    """Describe every preset by the first line of its documentation, the lines of its vibration, and whether it has events."""
+    return [
+        {
+            "name": name,
+            "title": preset_title(name),
+            "line": str(make.__doc__).strip().partition("\n")[0],
+            "peaks": [[float(frequency), float(rms)] for frequency, _, rms in vibration_lines(scenario, 0)],
+            "events": bool(scenario.events),
+        }
+        for name, make in PRESETS.items()
+        for scenario in [make()]
+    ]
