@@ -85,11 +85,11 @@ class TestChoice:
 
 
 class TestFirstWindow:
-    def test_two_seconds_from_the_warm_up_on(self, dashboard: Dashboard, loop: Any) -> None:
+    def test_two_seconds_in_the_middle_of_what_counts(self, dashboard: Dashboard, loop: Any) -> None:
         assert first_window(dashboard.store.run.result) == (0.0, 2.0), "a record of two seconds"
         dashboard.store.change("run.duration", 4.0)
         loop.finish(dashboard.store)
-        assert first_window(dashboard.store.run.result) == (0.5, 2.5)
+        assert first_window(dashboard.store.run.result) == (1.25, 3.25)
 
     def test_around_the_first_event(self, dashboard: Dashboard, loop: Any, short: Scenario) -> None:
         events = [{"kind": "wind", "start": 2.5, "wind_factor": 2.0}]

@@ -27,6 +27,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import asset, theme
 from wfsobs.app.upload import Upload
 from wfsobs.app.views.modes import ModeSwitch, UnitSwitch
+from wfsobs.app.views.readout import Readout
 from wfsobs.scenario import Scenario
 
 ACTIONS = """
@@ -111,6 +112,7 @@ class Dashboard:
                     self.pages.view,
                     self.frame,
                     self.connection,
+                    Readout(styles={"position": "absolute"}),
                     sizing_mode="stretch_width",
                     margin=12,
                     stylesheets=[":host { gap: 10px; }"],

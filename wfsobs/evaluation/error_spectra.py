@@ -50,6 +50,12 @@ def spectra(record: Record, target: str, values: Array, warm_up: float) -> tuple
     return frequency, signal, error
 
 
+def band_rms(frequency: Array, density: Array, low: float, high: float) -> float:
+    """Return the root of the variance at the frequencies [Hz] from `low` to `high`, both included; density (n,)."""
+    inside = (frequency >= low) & (frequency <= high)
+    return float(np.sqrt(density[inside].sum() * (frequency[1] - frequency[0])))
+
+
 def cumulative_rms(frequency: Array, density: Array) -> Array:
     """Return the root of the variance above each frequency, from high to low (the AO habit); same shape as `density`."""
     df = frequency[1] - frequency[0]

@@ -23,6 +23,7 @@ from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.plots import call
 from wfsobs.app.views.seed_switch import SeedSwitch
 from wfsobs.app.views.spectra import MODEL, PEAKS, SpectraFigures
+from wfsobs.app.views.stretch import Stretch
 from wfsobs.app.views.strip import Strip
 from wfsobs.app.views.table import Table
 from wfsobs.app.views.traces import Traces
@@ -49,9 +50,12 @@ class Explore:
     def __init__(self, run: BackgroundTask, display: Display, seeds: SeedRuns | None = None):
         self.display, self.seeds = display, seeds
         self.lines = MainLines(run, display)
-        self.traces, self.spectra = Traces(run, display), SpectraFigures(run, display)
+        self.traces = Traces(run, display)
+        self.spectra = SpectraFigures(run, display, self.traces.x_range)
         self.strips = {target: Strip(target, run, display, seeds) for target in TARGETS}
         self.verdicts = {target: VerdictLine(target, run, display, seeds) for target in TARGETS}
+        axes = self.traces.x_range, self.spectra.x_range
+        self.stretches = {target: Stretch(target, run, display, *axes) for target in TARGETS}
         self.table = Table(run, display, seeds)
         self.pinning = Pinning(run, display)
         self.budget = BudgetView(seeds.store, display) if seeds else None
@@ -77,6 +81,7 @@ class Explore:
             group(self.display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS}),
             group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
             self._zoom_buttons(),
+            pmui.Checkbox.from_param(self.display.param.windowed, size="small", margin=0),
             *self.pinning.view(),
             gap="12px",
             align_items="center",
@@ -112,7 +117,7 @@ class Explore:
             **WIDE,
             stylesheets=[GRID],
         )
-        return box(target.capitalize(), self.verdicts[target].pane, cards, figures)
+        return box(target.capitalize(), self.verdicts[target].pane, cards, figures, self.stretches[target].pane)
 
     def _hide(self, target: str, names: list[str]) -> None:
         if names != self.display.hidden.get(target, []):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from bokeh.models import ColumnDataSource, HoverTool, Range1d, VSpan
 
@@ -9,9 +11,10 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, PinnedLines, add_line, marked_peaks, new_figure, send
+from wfsobs.app.views.settle import on_settle, zoomed
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
-from wfsobs.app.work import TRUTH, Array, RunResults, SignalAndError
-from wfsobs.evaluation.error_spectra import cumulative_rms
+from wfsobs.app.work import TRUTH, Array, Key, RunResults, SignalAndError
+from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
 from wfsobs.observers.base import TARGETS, VIBRATION
 
 DECADES = 8
@@ -21,14 +24,19 @@ DECADES = 8
 class SpectraFigures(TargetFigures):
     """The figures, redrawn when the results or the switches change."""
 
-    def __init__(self, run: BackgroundTask, display: Display):
-        self.x_range = Range1d(start=0.5, end=500.0)
+    def __init__(self, run: BackgroundTask, display: Display, times: Range1d):
+        """Watch the results, the switches, and the axis of time where only what it shows counts."""
+        self.x_range = Range1d(start=0.5, end=500.0, reset_start=0.5, reset_end=500.0)
+        self.times = times
         self.spectra = {target: _Spectrum(target, self.x_range) for target in TARGETS}
-        super().__init__(run, display, self.spectra, ["mode", "show", "unit", "spectrum", "pinned"])
+        super().__init__(run, display, self.spectra, ["mode", "show", "unit", "spectrum", "pinned", "windowed"])
+        on_settle([times], lambda: self._redraw() if display.windowed else None)
 
     def _draw(self, results: RunResults) -> None:
+        window = zoomed(self.times) if self.display.windowed else None
+        spectra = results.spectra if window is None else window_spectra(results, *window)
         for spectrum in self.spectra.values():
-            spectrum.draw(results, self.display)
+            spectrum.draw(results, spectra, self.display)
         frequencies = next((s.frequency for s in results.spectra.values()), None)
         if frequencies is not None:
             limits = {"start": float(frequencies[1]), "end": float(frequencies[-1])}
@@ -62,12 +70,12 @@ class _Spectrum:
         model = self.figure.add_glyph(self.model, VSpan(x="x", line_color=MODEL, line_dash=[4, 3], line_width=1.5))
         self.figure.add_tools(HoverTool(renderers=[peaks, model], tooltips="@text"))
 
-    def draw(self, results: RunResults, display: Display) -> None:
+    def draw(self, results: RunResults, spectra: Mapping[Key, SignalAndError], display: Display) -> None:
         """Send every line, its axis and the marks."""
         diameter, error = results.scenario.telescope.diameter, shows_error(results, self.target, display)
         drawn: list[Array] = []
         for name, source in self.sources.items():
-            spectrum = results.spectra.get((name, self.target))
+            spectrum = spectra.get((name, self.target))
             if spectrum is None:
                 send(source, {"x": [], "y": []})
                 continue
@@ -122,6 +130,25 @@ class _Spectrum:
                 "text": [f"model of the Kalman filters {kalman.frequency:.5g} Hz"],
             },
         )
+
+
+def window_spectra(results: RunResults, start: float, end: float) -> dict[Key, SignalAndError]:
+    """Compute the spectra of the truth and of every estimate between two times [s]; without those that are too short."""
+    record = results.result.record
+    cut = slice(max(round(start / record.dt), 0), round(end / record.dt) + 1)
+    out: dict[Key, SignalAndError] = {}
+    for (name, target), whole in results.spectra.items():
+        values = results.values(name, target)
+        if values is None:
+            continue
+        inside = np.full_like(values, np.nan)
+        inside[cut] = values[cut]
+        if (found := spectra(record, target, inside, start)) is not None:
+            frequency, signal, error = found
+            out[name, target] = SignalAndError(
+                frequency, signal, error if np.isfinite(whole.error).all() else np.full_like(error, np.nan)
+            )
+    return out
 
 
 def _curve(spectrum: SignalAndError, error: bool, display: Display, diameter: float) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import panel as pn
 from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, Range1d, Span
 from numpy.typing import NDArray
 
@@ -15,6 +14,7 @@ from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.event_marks import EventMarks, events_of, room
 from wfsobs.app.views.plots import PinnedLines, add_line, new_figure, send
+from wfsobs.app.views.settle import on_settle
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.recovery import trailing_rms
@@ -34,22 +34,17 @@ WINDOW_S = 1.0
 FIRST_S = 2.0
 """How much of a record is shown at first [s]: of ten seconds a vibration is a block."""
 
-SETTLE_MS = 60
-"""A zoom is answered when the window has not moved for this long."""
-
 
 class Traces(TargetFigures):
     """The figures, redrawn when the results, the switches or the window change."""
 
     def __init__(self, run: BackgroundTask, display: Display):
-        self.x_range = Range1d(start=0.0, end=10.0)
+        self.x_range = Range1d(start=0.0, end=10.0, reset_start=0.0, reset_end=10.0)
         self.length = 0.0
-        self._waiting = False
         crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
         self.traces = {target: _Trace(target, self.x_range, crosshair) for target in TARGETS}
         super().__init__(run, display, self.traces, ["mode", "show", "unit", "pinned"])
-        for end in ("start", "end"):
-            self.x_range.on_change(end, self._on_move)
+        on_settle([self.x_range], self._redraw)
 
     def _draw(self, results: RunResults) -> None:
         record = results.result.record
@@ -68,15 +63,6 @@ class Traces(TargetFigures):
         margin = 0.0 if end - start >= self.length else MARGIN * (end - start)
         first = max(int((start - margin) / dt), 0)
         return min(first, n_steps - 2), min(max(int((end + margin) / dt) + 2, 2), n_steps)
-
-    def _on_move(self, attr: str, old: object, new: object) -> None:
-        if not self._waiting:
-            self._waiting = True
-            later(self._on_settle, SETTLE_MS)
-
-    def _on_settle(self) -> None:
-        self._waiting = False
-        self._redraw()
 
     def zoom(self, seconds: float | None) -> None:
         """Show a stretch of the record around the middle of the one in view, or all of it."""
@@ -150,12 +136,12 @@ class _Trace:
 
 
 def first_window(results: RunResults) -> tuple[float, float]:
-    """Choose what is shown of a record at first [s]: around its first event, or from the end of the warm-up."""
+    """Choose what is shown of a record at first [s]: around its first event, or the middle of what counts."""
     record = results.result.record
     length = record.n_steps * record.dt
     events = events_of(results)
-    start = events[0].start - 0.5 * FIRST_S if events else results.scenario.run.warm_up
-    start = max(min(start, length - FIRST_S), 0.0)
+    middle = events[0].start if events else 0.5 * (results.scenario.run.warm_up + length)
+    start = max(min(middle - 0.5 * FIRST_S, length - FIRST_S), 0.0)
     return start, min(start + FIRST_S, length)
 
 
@@ -183,12 +169,3 @@ def _line(results: RunResults, name: str, target: str, display: Display, first: 
     if display.running:  # where there is no estimate yet, that of a while ago is not results in its place
         error = np.where(np.isnan(error), np.nan, trailing_rms(error, n))
     return error[before:, 0]
-
-
-def later(function: Any, milliseconds: int) -> None:
-    """Call a function a little later on the session's thread; at once where there is no session."""
-    doc = pn.state.curdoc
-    if doc is None or doc.session_context is None:
-        function()
-    else:
-        doc.add_timeout_callback(function, milliseconds)

@@ -1,0 +1,125 @@
+// The values of all lines of a figure where the pointer is, or where the arrow keys have led a figure that has the focus.
+
+const STEP = 0.01, LEAP = 0.1 // of the width, for an arrow key alone and with Shift
+
+export function render({model, el}) {
+  const box = document.createElement("div")
+  Object.assign(box, {className: "values", popover: "manual"})
+  const mark = document.createElement("div")
+  Object.assign(mark, {className: "mark", popover: "manual"})
+  el.append(mark, box)
+  const views = new WeakMap()
+  let at = null // {view, share of the width} by keyboard
+
+  const viewOf = (event) => {
+    const figure = event.composedPath().find((it) => it.classList?.contains("bk-Figure"))
+    if (figure && !views.has(figure)) {
+      for (const view of Bokeh.index.query((it) => it.model.type === "Figure")) views.set(view.el, view)
+    }
+    return figure && views.get(figure)
+  }
+
+  const hide = () => {
+    for (const it of [box, mark]) if (it.matches(":popover-open")) it.hidePopover()
+    box.removeAttribute("role")
+  }
+
+  const show = (view, sx, byKey) => {
+    const rect = view.el.getBoundingClientRect(), frame = view.frame.bbox
+    const lines = linesOf(view, model.labels)
+    const x = view.frame.x_scale.invert(sx)
+    const rows = lines.map((line) => ({...line, value: valueAt(line, x)})).filter((line) => Number.isFinite(line.value))
+    if (!rows.length) return hide()
+    const [across, unitX] = named(view.model.below[0]), [, unitY] = named(view.model.left[0])
+    if (byKey) box.setAttribute("role", "status")
+    else box.removeAttribute("role")
+    box.replaceChildren(...[{label: across, value: x, unit: unitX}, ...rows.map((row) => ({...row, unit: unitY}))].map(rowOf))
+    if (!box.matches(":popover-open")) box.showPopover()
+    const room = window.innerWidth - box.offsetWidth - 4, right = rect.left + sx + 14
+    box.style.left = `${right <= room ? right : Math.max(4, rect.left + sx - box.offsetWidth - 14)}px`
+    box.style.top = `${Math.max(4, Math.min(rect.top + frame.top + 6, window.innerHeight - box.offsetHeight - 4))}px`
+    if (byKey) {
+      if (!mark.matches(":popover-open")) mark.showPopover()
+      Object.assign(mark.style, {left: `${rect.left + sx}px`, top: `${rect.top + frame.top}px`, height: `${frame.height}px`})
+    } else if (mark.matches(":popover-open")) mark.hidePopover()
+  }
+
+  const stop = new AbortController()
+  const on = (type, heard) => document.addEventListener(type, heard, {signal: stop.signal, capture: true, passive: true})
+  let moved = null
+  on("pointermove", (event) => {
+    const view = event.buttons ? null : viewOf(event)
+    const asked = moved !== null
+    moved = {view, x: event.clientX, y: event.clientY}
+    if (!asked) requestAnimationFrame(() => {
+      const {view, x, y} = moved
+      moved = null
+      const rect = view?.el.getBoundingClientRect()
+      if (view && inside(view, x - rect.left, y - rect.top)) show(view, x - rect.left, false)
+      else if (!at) hide()
+    })
+  })
+  on("pointerdown", () => { at = null; hide() })
+  on("scroll", () => { at = null; hide() })
+  on("keydown", (event) => {
+    const step = {ArrowLeft: -1, ArrowRight: 1}[event.key]
+    const view = step && viewOf(event)
+    if (!view) { at = null; hide(); return }
+    const share = at?.view === view ? at.share + step * (event.shiftKey ? LEAP : STEP) : 0.5
+    at = {view, share: Math.min(Math.max(share, 0), 1)}
+    const frame = view.frame.bbox
+    show(view, frame.left + at.share * frame.width, true)
+  })
+  on("focusout", () => { at = null; hide() })
+  model.on("remove", () => stop.abort())
+}
+
+const inside = (view, sx, sy) => {
+  const {left, right, top, bottom} = view.frame.bbox
+  return sx >= left && sx <= right && sy >= top && sy <= bottom
+}
+
+function linesOf(view, labels) {
+  return view.model.renderers
+    .filter((it) => it.visible && it.name in labels && it.glyph?.type === "Line")
+    .map((it) => ({
+      label: labels[it.name], colour: it.glyph.line_color?.value ?? it.glyph.line_color,
+      xs: it.data_source.data[it.glyph.x.field], ys: it.data_source.data[it.glyph.y.field]}))
+    .filter(({xs, ys}) => xs?.length && ys?.length === xs.length)
+}
+
+// The value of the sample that is nearest, nothing beyond the ends of the line.
+function valueAt({xs, ys}, x) {
+  let low = 0, high = xs.length - 1
+  if (x < xs[low] || x > xs[high]) return NaN
+  while (high - low > 1) {
+    const middle = (low + high) >> 1
+    if (xs[middle] <= x) low = middle
+    else high = middle
+  }
+  return ys[x - xs[low] <= xs[high] - x ? low : high]
+}
+
+// What an axis is of, and its unit.
+function named(axis) {
+  const [, name, unit] = /^(.*?)(?:\s*\[(.*)\])?$/.exec(axis?.axis_label ?? "") ?? []
+  return [name ?? "", unit ?? ""]
+}
+
+function rowOf({label, colour, value, unit}) {
+  const row = document.createElement("div")
+  const swatch = document.createElement("i")
+  swatch.style.background = colour ?? "transparent"
+  const name = document.createElement("span")
+  name.textContent = label
+  const number = document.createElement("b")
+  number.textContent = `${written(value)} ${unit}`
+  row.append(swatch, name, number)
+  return row
+}
+
+function written(value) {
+  const size = Math.abs(value)
+  const text = size !== 0 && (size < 1e-3 || size >= 1e5) ? value.toExponential(2) : Number(value.toPrecision(4)).toString()
+  return text.replace("-", "−")
+}
