@@ -21,6 +21,7 @@ from wfsobs.app.share import FILE, Link, from_file, from_query, to_file, to_quer
 from wfsobs.app.sources import SimulatedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, labels
+from wfsobs.app.view_state import ViewState
 from wfsobs.app.work import RunResults
 from wfsobs.settings.errors import SettingError
 
@@ -34,6 +35,7 @@ class Toolbar(JSComponent):
     """The row in the browser: texts down, messages {action, ...} up, files down as messages."""
 
     query = param.String("", doc="What a link to the settings has after its ?.")
+    view = param.String("", doc="What the address has beside the settings, of the view.")
     linked = param.Boolean(True, doc="Whether the settings are short enough for a link.")
     command = param.String("", doc="The settings as a command line.")
     python = param.String("", doc="The settings as Python.")
@@ -71,6 +73,7 @@ class Actions:
         self._tasks: dict[str, BackgroundTask] = {}
         self._under_way: dict[str, tuple[str, Callable[[Any], None]]] = {}
         self._pages: Pages | None = None
+        self._view: ViewState | None = None
         store.param.watch(self._refresh, ["scenario", "preset", "source"])
         store.run.param.watch(self._refresh_ready, "result")
         self._refresh()
@@ -80,6 +83,16 @@ class Actions:
         self._pages = pages
         self._watched: set[str] = set()
         pages.param.watch(self._turn, "current")
+
+    def follow_view(self, state: ViewState) -> None:
+        """Keep the view in the address."""
+        self._view = state
+        state.param.watch(lambda event: self.toolbar.param.update(view=event.new), "query")
+
+    def open_view(self, query: str) -> None:
+        """Bring the page to the view of an address, and name what cannot be taken."""
+        if self._view is not None and (refused := self._view.open(query)):
+            self.toolbar.notes = [*self.toolbar.notes, *(f"Not used from the link: {line}" for line in refused)]
 
     @property
     def _offers(self) -> PageActions | None:
@@ -102,6 +115,7 @@ class Actions:
             "redo": self.store.redo,
             "open": lambda: self.open_file(str(msg.get("name", "")), msg.get("text")),
             "unlinked": lambda: self._note("These settings are too long for a link: save the scenario and send the file."),
+            "view": lambda: self.open_view(str(msg.get("query", ""))),
             "report": self.make_report,
             "toml": self.save_scenario,
             "csv": lambda: self.save_data("wfsobs.csv", "text/csv", data_csv),

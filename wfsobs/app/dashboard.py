@@ -26,6 +26,7 @@ from wfsobs.app.service import Post, Session
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, theme
 from wfsobs.app.upload import Upload
+from wfsobs.app.view_state import ViewState
 from wfsobs.app.views.modes import ModeSwitch, UnitSwitch
 from wfsobs.app.views.readout import Readout
 from wfsobs.scenario import Scenario
@@ -75,6 +76,7 @@ class Dashboard:
         self.store = Store(post, session, scenario)
         self.upload = Upload(self.store)
         self.display = Display()
+        self._theme_chosen = False
         self.controls = Controls(self.store)
         self.actions = Actions(self.store)
         self.modes, self.units = ModeSwitch(self.store.run, self.display), UnitSwitch(self.display)
@@ -92,6 +94,8 @@ class Dashboard:
         """Build the whole page."""
         self.pages = Pages(self.explore, self.store, self.display)
         self.actions.attach(self.pages)
+        self.view_state = ViewState(self.display, self.pages, self.explore.lines, self.explore.traces)
+        self.actions.follow_view(self.view_state)
         page = pmui.Page(
             title="wfsobs",
             header=[self.controls.bar(), Help(styles={"margin-left": "auto"})],
@@ -138,6 +142,10 @@ class Dashboard:
 
     def _on_theme(self, event: param.parameterized.Event) -> None:
         self.display.dark = self.frame.dark = event.new
+        if event.new != self.frame.wants_dark:
+            self._theme_chosen = True
+        if self._theme_chosen:
+            self.view_state.choose_theme(event.new)
 
     def _top(self) -> pn.FlexBox:
         """Lay out the buttons of the pages, and the switches that all pages share."""

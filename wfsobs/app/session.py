@@ -28,6 +28,8 @@ def session_page(build: Callable[[Post], Dashboard]) -> Any:
         if query := page_query():
             dashboard.actions.open_link(query)
         session_page = dashboard.page()
+        if query:
+            dashboard.actions.open_view(query)
         dashboard.start()
         pn.state.on_session_destroyed(lambda _context: dashboard.close())
         return session_page

@@ -35,8 +35,8 @@ ROUNDS = 3
 MOST = 200
 """Fields of a query that are read."""
 
-PASSED_OVER = ("theme",)
-"""Keys of a query that are not ours."""
+PASSED_OVER = ("theme", "view.")
+"""Starts of the keys of a query that are not settings."""
 
 KEPT = "simulation"
 """The field, and before a dot the prefix, of a simulation that is kept."""
@@ -95,7 +95,7 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
             (f"The link has {len(query)} characters, at most {LONGEST} are allowed: the link is ignored.",),
         )
     pairs = parse_qsl(query.removeprefix("?").replace("+", "%2B"), keep_blank_values=True)
-    fields = {key: text for key, text in pairs[:MOST] if key not in PASSED_OVER}
+    fields = {key: text for key, text in pairs[:MOST] if not key.startswith(PASSED_OVER)}
     name = fields.pop("preset", SHORTEST_NAME)
     rejected = []
     if name not in PRESETS:

@@ -159,11 +159,34 @@ function noteBox(el, model) {
   draw()
 }
 
+// Parts of a view that are one of their own, to which the browser's Back returns; the others belong to the one they are changed in.
+const OWN = ["view.page", "view.mode", "view.unit", "view.show", "view.spectrum"]
+
+// Keep the address in step with the view, and the view with where Back and Forward lead.
+function travel(model, replace, push) {
+  const own = (query) => JSON.stringify(OWN.map((key) => new URLSearchParams(query).get(key)))
+  let travelling = false
+  model.on("view", () => {
+    if (!travelling && own(model.view) !== own(location.search)) push()
+    else replace()
+    if (own(model.view) === own(location.search)) travelling = false
+  })
+  const went = () => {
+    travelling = own(model.view) !== own(location.search)
+    model.send_msg({action: "view", query: location.search})
+  }
+  window.addEventListener("popstate", went)
+  model.on("remove", () => window.removeEventListener("popstate", went))
+}
+
 const known = new WeakSet() // documents; one may be drawn anew after a connection was lost
 
 export function render({model, view, el}) {
   const bar = tag("div", el, {className: "bar"})
-  const here = () => location.origin + location.pathname + (model.query ? `?${model.query}` : "")
+  const here = () => {
+    const query = [model.query, model.view].filter(Boolean).join("&")
+    return location.origin + location.pathname + (query ? `?${query}` : "")
+  }
   const copyLink = () => model.linked ? copy(here(), "link") : model.send_msg({action: "unlinked"})
   const ask = (action) => () => {
     model.said = "Preparing the file …"
@@ -200,6 +223,7 @@ export function render({model, view, el}) {
   const address = () => history.replaceState(history.state, "", here() + location.hash)
   model.on("said", speak)
   model.on("query", address)
+  travel(model, address, () => history.pushState(null, "", here()))
   if (known.has(view.model.document)) address()
   known.add(view.model.document)
   model.on("msg:custom", (event) => {

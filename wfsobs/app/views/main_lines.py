@@ -50,6 +50,10 @@ class MainLines:
         self._chosen.add(target)
         self.display.hidden = {**self.display.hidden, target: list(hidden_names)}
 
+    def chosen(self) -> dict[str, list[str]]:
+        """Return the hidden lines of the targets where the visitor has chosen."""
+        return {target: self.display.hidden.get(target, []) for target in TARGETS if target in self._chosen}
+
     def reset(self, target: str) -> None:
         """Show those that matter again."""
         self._chosen.discard(target)

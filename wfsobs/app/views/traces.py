@@ -14,7 +14,7 @@ from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.event_marks import EventMarks, events_of, room
 from wfsobs.app.views.plots import PinnedLines, add_line, new_figure, send
-from wfsobs.app.views.settle import on_settle
+from wfsobs.app.views.settle import on_settle, zoomed
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.recovery import trailing_rms
@@ -41,6 +41,7 @@ class Traces(TargetFigures):
     def __init__(self, run: BackgroundTask, display: Display):
         self.x_range = Range1d(start=0.0, end=10.0, reset_start=0.0, reset_end=10.0)
         self.length = 0.0
+        self._wanted: tuple[float, float] | None = None
         crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
         self.traces = {target: _Trace(target, self.x_range, crosshair) for target in TARGETS}
         super().__init__(run, display, self.traces, ["mode", "show", "unit", "pinned"])
@@ -50,9 +51,11 @@ class Traces(TargetFigures):
         record = results.result.record
         length = record.n_steps * record.dt
         if length != self.length:
+            whole = self.length > 0 and zoomed(self.x_range) is None  # stays so
             self.length = length
-            start, end = first_window(results)
-            self.x_range.update(start=start, end=end, reset_start=0.0, reset_end=length)
+            start, end = self._wanted or ((0.0, length) if whole else first_window(results))
+            self._wanted = None
+            self.x_range.update(start=start, end=min(end, length), reset_start=0.0, reset_end=length)
         first, last = self._window(record.n_steps, record.dt)
         for trace in self.traces.values():
             trace.draw(results, self.display, first, last)
@@ -63,6 +66,22 @@ class Traces(TargetFigures):
         margin = 0.0 if end - start >= self.length else MARGIN * (end - start)
         first = max(int((start - margin) / dt), 0)
         return min(first, n_steps - 2), min(max(int((end + margin) / dt) + 2, 2), n_steps)
+
+    def open_window(self, window: tuple[float, float] | None) -> None:
+        """Show a stretch of the record [s], that of a fresh page if None; with the first results where there are none yet."""
+        if self.run.result is None:
+            self._wanted = window
+        else:
+            start, end = window or first_window(self.run.result)
+            self.x_range.update(start=start, end=min(end, self.length))
+
+    def chosen_window(self) -> tuple[float, float] | None:
+        """Return the stretch in view [s]; None where it is that of a fresh page."""
+        if self.run.result is None:
+            return self._wanted
+        start, end = float(self.x_range.start), float(self.x_range.end)  # type: ignore[arg-type]
+        first = first_window(self.run.result)
+        return None if abs(start - first[0]) + abs(end - first[1]) < 1e-9 else (start, end)
 
     def zoom(self, seconds: float | None) -> None:
         """Show a stretch of the record around the middle of the one in view, or all of it."""
