@@ -32,7 +32,7 @@ def on_settle(axes: Iterable[Range1d], function: Callable[[], None]) -> None:
         axis.on_change("end", moved)
 
 
-def zoomed(axis: Range1d) -> tuple[float, float] | None:
+def zoom_of(axis: Range1d) -> tuple[float, float] | None:
     """Return what of an axis is in view; None where all of it is."""
     start, end, first, last = (float(x) for x in (axis.start, axis.end, axis.reset_start, axis.reset_end) if x is not None)  # type: ignore[arg-type]
     start, end = min(start, end), max(start, end)

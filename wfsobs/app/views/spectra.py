@@ -11,7 +11,7 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, PinnedLines, add_line, marked_peaks, new_figure, send
-from wfsobs.app.views.settle import on_settle, zoomed
+from wfsobs.app.views.settle import on_settle, zoom_of
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, Array, Key, RunResults, SignalAndError
 from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
@@ -33,7 +33,7 @@ class SpectraFigures(TargetFigures):
         on_settle([times], lambda: self._redraw() if display.windowed else None)
 
     def _draw(self, results: RunResults) -> None:
-        window = zoomed(self.times) if self.display.windowed else None
+        window = zoom_of(self.times) if self.display.windowed else None
         spectra = results.spectra if window is None else window_spectra(results, *window)
         for spectrum in self.spectra.values():
             spectrum.draw(results, spectra, self.display)

@@ -12,7 +12,7 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.numbers import number
 from wfsobs.app.style import asset, look, observers_of, swatch
-from wfsobs.app.views.settle import on_settle, zoomed
+from wfsobs.app.views.settle import on_settle, zoom_of
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.error_spectra import band_rms
 
@@ -39,9 +39,9 @@ class Stretch:
         hidden = self.display.hidden.get(self.target, [])
         names = [name for name in observers_of(self.target) if name not in hidden]
         lines = []
-        if (ends := zoomed(self.times)) is not None:
+        if (ends := zoom_of(self.times)) is not None:
             lines.append(self._line(f"{ends[0]:.2f} – {ends[1]:.2f} s", self._over_time(results, names, *ends), results))
-        if (ends := zoomed(self.frequencies)) is not None:
+        if (ends := zoom_of(self.frequencies)) is not None:
             lines.append(self._line(f"{ends[0]:.3g} – {ends[1]:.3g} Hz", self._in_band(results, names, *ends), results))
         return "".join(lines)
 

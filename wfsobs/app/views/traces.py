@@ -14,7 +14,7 @@ from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.event_marks import EventMarks, events_of, room
 from wfsobs.app.views.plots import PinnedLines, add_line, new_figure, send
-from wfsobs.app.views.settle import on_settle, zoomed
+from wfsobs.app.views.settle import on_settle, zoom_of
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, RunResults
 from wfsobs.evaluation.recovery import trailing_rms
@@ -51,7 +51,7 @@ class Traces(TargetFigures):
         record = results.result.record
         length = record.n_steps * record.dt
         if length != self.length:
-            whole = self.length > 0 and zoomed(self.x_range) is None  # stays so
+            whole = self.length > 0 and zoom_of(self.x_range) is None  # stays so
             self.length = length
             start, end = self._wanted or ((0.0, length) if whole else first_window(results))
             self._wanted = None
