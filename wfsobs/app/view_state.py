@@ -100,7 +100,7 @@ class ViewState(param.Parameterized):
     def _refresh(self, *_: object) -> None:
         fields = {} if self.pages.current == EXPLORE else {PAGE: self.pages.current}
         fields |= {name: value for name in SWITCHES if (value := getattr(self.display, name)) != self._fresh[name]}
-        fields |= {HIDE + target: ",".join(hidden) for target, hidden in self.lines.chosen().items()}
+        fields |= {HIDE + target: ",".join(hidden) for target, hidden in self.lines.choices().items()}
         if (window := self.traces.chosen_window()) is not None:
             fields[WINDOW] = f"{window[0]:.4g},{window[1]:.4g}"
         parts = [f"{PREFIX}{key}={quote(value, safe=',-')}" for key, value in fields.items()]

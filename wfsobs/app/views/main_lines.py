@@ -50,7 +50,7 @@ class MainLines:
         self._chosen.add(target)
         self.display.hidden = {**self.display.hidden, target: list(hidden_names)}
 
-    def chosen(self) -> dict[str, list[str]]:
+    def choices(self) -> dict[str, list[str]]:
         """Return the hidden lines of the targets where the visitor has chosen."""
         return {target: self.display.hidden.get(target, []) for target in TARGETS if target in self._chosen}
 
