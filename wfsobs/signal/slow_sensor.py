@@ -100,9 +100,9 @@ def variance_from_frames(targets: Sequence[tuple[Complex, Complex]], whitener: W
     return _gains(ahead[:kept], rest[:, :kept])
 
 
-def _of_future(whitened: Complex, n: int) -> Array:
+def _of_future(cross: Complex, n: int) -> Array:
     """Return the coefficients of e[k], e[k+1], ..., (n // 2,)."""
-    backwards = fft.irfft(whitened.conj(), n)
+    backwards = fft.irfft(cross.conj(), n)
     return backwards[: n // 2].copy()
 
 

@@ -46,7 +46,7 @@ INTRO = (
 )
 ABOUT = (
     "± is one standard deviation. The residual of a mode is called white if no candidate peak remains and it passes two tests "
-    "of level 1 %: Bartlett's on the cumulated ratio of the measured to the fitted spectrum, and Ljung and Box's on the "
+    "of level 1 %: Bartlett's on the cumulative ratio of the measured to the fitted spectrum, and Ljung and Box's on the "
     "innovations of the model's Kalman filter. p is the probability that white noise deviates from whiteness by more."
 )
 EARLIER = "This model was identified from an earlier record than the one shown."
