@@ -20,7 +20,7 @@ from wfsobs.settings.group import SettingError
 def design(
     preset: str | None, config: str | None, assignments: tuple[str, ...], prior: str | None, name: str, form: str, out: str
 ) -> None:
-    """Write a controller for a program elsewhere: C99 with a test, arrays, python-control (docs/your-loop.md)."""
+    """Write a controller for a program elsewhere: C99 with a test, arrays, python-control."""
     scenario = configfile.scenario_from(preset, config, assignments)
     if prior is not None:
         scenario = told_by(configfile.load_scenario(prior), scenario)

@@ -21,14 +21,16 @@ class Place(NamedTuple):
 COMMANDS = {
     "bench": Place("bench", "Time the observers beside textbook versions, and other libraries if installed."),
     "campaign": Place("campaign", "Run many scenarios and seeds, on many processes or machines."),
-    "design": Place("design", "Write a controller for a program elsewhere: C99, arrays, python-control."),
+    "design": Place("design", "Write a controller for a program elsewhere: C99 with a test, arrays, python-control."),
     "export": Place("export", "Write a report: one HTML file with figures and numbers that opens without a network."),
     "identify": Place("telemetry", "Find noise, turbulence and vibration peaks in a record."),
     "live": Place("live", "Run the simulated loop by the clock, every observer beside it, frame by frame."),
     "loop": Place("simulate", "Close the loop with every controller on the same disturbance and print what is left of it."),
     "observe": Place("telemetry", "Run the observers on a record: .npz, .csv, .fits or AOT."),
     "presets": Place("presets", "List the presets, or print one as TOML."),
-    "rt-check": Place("realtime", "Tell what this machine can hold as a real-time loop."),
+    "rt-check": Place(
+        "realtime", "Tell what this machine can hold: how late a loop at the LGS rate wakes, and what a step takes in it."
+    ),
     "run": Place("simulate", "Simulate the loop, run every observer and print the RMS table."),
     "serve": Place("serve", "Serve the dashboard."),
     "tune": Place("tuning", "Search for the settings of an observer that are best on a validation record."),
