@@ -66,7 +66,7 @@ class Scenario(Group):
     >>> s.set("turbulence.wind_speed", 200)
     Traceback (most recent call last):
     ...
-    wfsobs.settings.group.SettingError: turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s
+    wfsobs.settings.errors.SettingError: turbulence.wind_speed = 200: takes a number from 0.1 to 100 m/s
     """
 
     telescope = section(Telescope, "Telescope")
