@@ -172,7 +172,7 @@ class TestNumbers:
         for score in dashboard.store.run.result.result.scores:
             if score.mode == "tip":
                 assert number(1e3 * score.rms) in html
-        assert html.count("<tr data-observer") == 2 + sum(len(o.targets) for o in OBSERVERS.values()), "and the bounds"
+        assert html.count("<tr data-observer") == 4 + sum(len(o.targets) for o in OBSERVERS.values()), "two bounds each"
         assert "RMS error [nm]" in html and "Turbulence, tip" in html
 
     def test_the_table_follows_mode_and_unit(self, dashboard: Dashboard) -> None:
