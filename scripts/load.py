@@ -233,7 +233,7 @@ async def clicks(server: Server, report: Report, busy: int) -> None:
     visitor = await Visitor(server.base).open(query_of(SHORT))
     await visitor.until(lambda: visitor.status.startswith("Done"))
     switches = [
-        (visitor.find("RadioButtonGroup", value="Signal"), ("Error", "Signal")),
+        (visitor.find("RadioButtonGroup", value="Error"), ("Signal", "Error")),
         (visitor.find("RadioButtonGroup", value="Tip"), ("Tilt", "Tip")),
     ]
     drawings, seconds, quiet = [], [], []
