@@ -11,13 +11,18 @@ from wfsobs.app.jobs.job import FAILED
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
 
+NO_STEPPERS = ".MuiIconButton-root { display: none !important; }"
+"""The buttons of panel-material-ui beside a number have no names; the arrow keys do the same."""
+
 
 class SeedSwitch:
     """The number of seeds, to be set, beside the table."""
 
     def __init__(self, seeds: SeedRuns):
         self.seeds = seeds
-        self.field = pmui.IntInput.from_param(seeds.param.count, size="small", width=90, margin=(0, 0, 4, 0))
+        self.field = pmui.IntInput.from_param(
+            seeds.param.count, size="small", width=90, margin=(0, 0, 4, 0), stylesheets=[NO_STEPPERS]
+        )
         self.line = pn.pane.HTML(self.text(), margin=0, stylesheets=[asset("style.css")])
         seeds.param.watch(self._refresh, ["evidence", "count"])
         seeds.run.param.watch(self._refresh, ["state", "result"])
