@@ -158,6 +158,7 @@ async def session(base: str, changes: int, rng: random.Random, door: asyncio.Loc
         visitor = await Visitor(base).open(query_of(SHORT))
     await visitor.until(lambda: visitor.status.startswith("Done"))
     await visitor.ask("SERVER-INFO-REQ", {})  # all that was sent with it has arrived
+    await visitor.set(visitor.find("IntInput", label="Seeds"), value=1)  # further seeds change the table while it says "Done"
     box = visitor.find("TextInput", label="Wind speed V₀ [m/s]")
     seen: list[Seen] = []
     seconds: list[float] = []

@@ -8,7 +8,7 @@ import psutil
 import pytest
 from distributed import Client
 
-from tests.campaign.test_run import COMMAND, ENVIRONMENT, TINY
+from tests.campaign.test_run import COMMAND, ENVIRONMENT, SHORT_BATCHES, TINY
 
 
 @pytest.fixture
@@ -43,16 +43,14 @@ def test_a_worker_that_dies_changes_nothing(cluster, tmp_path):
     address, nannies = cluster
     plan, out, alone = tmp_path / "plan.toml", tmp_path / "out", tmp_path / "alone"
     plan.write_text(TINY.format(seeds=40), encoding="utf-8")
-    running = subprocess.Popen(
-        [*COMMAND, "campaign", "run", str(plan), "--out", str(out), "--scheduler", address],
-        env=ENVIRONMENT,
-        stderr=subprocess.PIPE,
-    )
-    while not (out / "rows").exists() and running.poll() is None:
-        time.sleep(0.05)
-    time.sleep(1.0)  # into a batch
+    command = [sys.executable, "-c", SHORT_BATCHES, "campaign", "run", str(plan), "--out", str(out), "--scheduler", address]
+    running = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE)
+    while not list(out.glob("rows/*.parquet")):
+        assert running.poll() is None
+        time.sleep(0.01)
     worker = max(psutil.Process(nannies[0].pid).children(recursive=True), key=lambda p: p.memory_info().rss)  # not its tracker
     worker.kill()
+    assert running.poll() is None and len(list(out.glob("rows/*.parquet"))) < 40
     _, said = running.communicate(timeout=200)
     assert running.returncode == 0, said
     assert b"80 of 80 runs are done" in said

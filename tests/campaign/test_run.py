@@ -1,7 +1,6 @@
 """Campaigns as they are run: resumed, shared, disturbed; the table is that of an undisturbed run, byte by byte."""
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -25,6 +24,16 @@ run.warm_up = 0.1
 [grid]
 turbulence.wind_speed = [5, 10]
 """
+SHORT_BATCHES = """
+from wfsobs.campaign import run
+from wfsobs.cli import main
+
+run.MOST_RUNS = 2
+if __name__ == "__main__":
+    main()
+"""
+"""The command line with batches of two runs, so that there is something to disturb."""
+
 COMMAND = [sys.executable, "-m", "wfsobs"]
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
 
@@ -73,37 +82,34 @@ def test_shares_make_up_the_whole(plan, undisturbed, tmp_path):
     assert campaign("table", tmp_path, "--csv").stdout == campaign("table", undisturbed, "--csv").stdout
 
 
+def start_short(plan, out):
+    """Start a campaign of many batches, and wait until it has written one more of them."""
+    before = len(list(out.glob("rows/*.parquet")))
+    command = [sys.executable, "-c", SHORT_BATCHES, "campaign", "run", str(plan), "--out", str(out), "--workers", "2"]
+    process = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE)
+    while len(list(out.glob("rows/*.parquet"))) == before:
+        assert process.poll() is None
+        time.sleep(0.01)
+    workers = [p for p in psutil.Process(process.pid).children() if "spawn_main" in " ".join(p.cmdline())]
+    assert len(workers) == 2 and process.poll() is None
+    return process, workers
+
+
 def test_killed_workers_and_a_killed_campaign_change_nothing(plan, undisturbed, tmp_path):
-    chance = random.Random(1)
-    client_killed = False
-    for _ in range(20):
-        process = subprocess.Popen(
-            [*COMMAND, "campaign", "run", str(plan), "--out", str(tmp_path), "--workers", "2"],
-            env=ENVIRONMENT,
-            stderr=subprocess.PIPE,
-        )
-        family = psutil.Process(process.pid)
-        deadline = time.monotonic() + 200
-        while process.poll() is None and time.monotonic() < deadline:
-            try:
-                process.wait(chance.uniform(2.0, 4.0))
-                break
-            except subprocess.TimeoutExpired:
-                pass
-            workers = [p for p in family.children() if "spawn_main" in " ".join(p.cmdline())]
-            if not client_killed and list((tmp_path / "rows").glob("*")):
-                client_killed = True
-                process.kill()
-                psutil.wait_procs(workers, timeout=20)
-                assert not [p for p in workers if p.is_running()], "workers do not outlive the campaign"
-            elif workers and client_killed:
-                chance.choice(workers).kill()
-                break
-        process.wait(200)
-        process.stderr.close()
-        if process.returncode == 0:
-            break
-    assert process.returncode == 0 and client_killed
+    process, workers = start_short(plan, tmp_path)
+    process.kill()
+    process.communicate()
+    _, alive = psutil.wait_procs(workers, timeout=60)
+    assert not alive, "workers do not outlive the campaign"
+    assert 0 < len(list(tmp_path.glob("rows/*.parquet"))) < 40
+    for victim in (0, 1):
+        process, workers = start_short(plan, tmp_path)
+        workers[victim].kill()
+        if victim == 0:
+            time.sleep(0.2)
+            process.kill()
+        _, said = process.communicate(timeout=200)
+    assert process.returncode == 0 and b"80 of 80 runs are done" in said and b"workers were lost" in said
     assert campaign("table", tmp_path, "--csv").stdout == campaign("table", undisturbed, "--csv").stdout
 
 

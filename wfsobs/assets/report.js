@@ -213,7 +213,7 @@ function zoom(figure, state) {
 function cards(target) {
   const watchers = {items: [], hidden: []}
   const model = {
-    items: [],
+    items: [], terms: {},  // the report has a section of them
     get hidden() { return hidden[target] },
     set hidden(names) { hidden[target] = names; toggled(target); watchers.hidden.forEach((f) => f()) },
     on(name, f) { watchers[name].push(f) },

@@ -56,7 +56,10 @@ class Processes:
         self._executor: ProcessPoolExecutor | None = None
 
     def executor(self) -> Executor:
-        """Return a fresh executor."""
+        """Return a fresh executor; what is left of a broken one is killed, since workers do not end by a signal to terminate."""
+        if self._executor is not None:
+            for process in list((self._executor._processes or {}).values()):
+                process.kill()
         self.close()
         os.environ["OPENBLAS_NUM_THREADS"] = "1"  # inherited by the processes, and read when they import numpy
         self._executor = ProcessPoolExecutor(self.count, mp_context=get_context("spawn"), initializer=_start_worker)

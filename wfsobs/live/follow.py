@@ -133,6 +133,9 @@ def follow(
         An observer is unknown or does not run frame by frame, or the scenario has events.
     """
     check_live(scenario)
+    for name in observers or ():
+        if name not in OBSERVERS:
+            raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
     chosen = list(observers) if observers else default_observers()
     pace = scenario.dt / speed
     first = round(scenario.run.warm_up / scenario.dt)
