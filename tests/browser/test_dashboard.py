@@ -202,7 +202,7 @@ def test_figures_take_the_height_of_the_window(open_page: Any) -> None:
 
 
 def test_cancel(open_page: Any, server: Any) -> None:
-    page = open_page(url=f"{server.url}?run.duration=60&run.seed=77", wait=False)  # nobody has its results yet
+    page = open_page(url=f"{server.url}?run.duration=30&run.seed=77", wait=False)  # nobody has its results yet
     cancel = page.get_by_role("button", name="Cancel", exact=True)
     expect(cancel).to_be_enabled()
     cancel.click()
