@@ -14,7 +14,7 @@ from wfsobs.evaluation.scores import score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Observer
 from wfsobs.priors_from.identification import told_by
-from wfsobs.priors_from.scenario import arguments
+from wfsobs.priors_from.scenario import arguments, as_sampled
 from wfsobs.priors_from.training import trained_until, with_training
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record
@@ -141,12 +141,7 @@ def _from(estimate: Estimate, first: int) -> Estimate:
 
 def as_stated(record: Record, scenario: Scenario) -> Scenario:
     """Return the scenario with the time step and exposure ratio of the record."""
-    changes: dict[str, float] = {}
-    if abs(record.dt * scenario.sensors.lgs_rate - 1.0) > 1e-12:
-        changes["sensors.lgs_rate"] = 1.0 / record.dt
-    if record.ratio is not None and record.ratio != scenario.sensors.exposure_ratio:
-        changes["sensors.exposure_ratio"] = record.ratio
-    return scenario.replace(changes) if changes else scenario
+    return as_sampled(scenario, record.sampling)
 
 
 def collect(

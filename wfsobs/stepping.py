@@ -12,7 +12,7 @@ from wfsobs.observers.step import StepError
 from wfsobs.prior import Part, Prior, Training
 from wfsobs.priors_from.controllers import own_settings, plant_of
 from wfsobs.priors_from.identification import told_by
-from wfsobs.priors_from.scenario import observer_settings, prior_of
+from wfsobs.priors_from.scenario import as_sampled, observer_settings, prior_of
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
@@ -125,16 +125,6 @@ def _sampling(prior: Prior | Identification | Scenario, scenario: Scenario) -> S
 def sampling_of(scenario: Scenario) -> Sampling:
     """Return modes, step and NGS ratio of a scenario."""
     return Sampling(len(scenario.modes), scenario.dt, scenario.sensors.exposure_ratio)
-
-
-def as_sampled(scenario: Scenario, sampling: Sampling) -> Scenario:
-    """Return the scenario with the time step and exposure ratio of a loop."""
-    changes: dict[str, float] = {}
-    if abs(sampling.dt * scenario.sensors.lgs_rate - 1.0) > 1e-12:
-        changes["sensors.lgs_rate"] = 1.0 / sampling.dt
-    if sampling.ratio is not None and sampling.ratio != scenario.sensors.exposure_ratio:
-        changes["sensors.exposure_ratio"] = sampling.ratio
-    return scenario.replace(changes) if changes else scenario
 
 
 def _of_modes(prior: Prior, name: str, n: int) -> Prior:

@@ -56,8 +56,8 @@ def run_campaign(
     plan: Campaign,
     folder: Path,
     workers: Workers,
-    shard: tuple[int, int] = (1, 1),
     *,
+    shard: tuple[int, int] = (1, 1),
     report: Callable[[Progress], None] = lambda _: None,
     must_stop: Callable[[], bool] = lambda: False,
 ) -> Progress:
@@ -159,7 +159,8 @@ class _Batches:
     def cost(self, cell: int) -> float:
         """Return the expected time of a run [s]."""
         if cell not in self._cost:
-            self._cost = {cell: run_cost(self.plan, cell)} if len(self._cost) > MOST_RUNS else self._cost
+            if len(self._cost) > MOST_RUNS:
+                self._cost.clear()
             self._cost[cell] = run_cost(self.plan, cell)
         return self._cost[cell]
 

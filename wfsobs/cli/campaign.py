@@ -127,7 +127,7 @@ def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, sh
         def tell(state: State) -> None:
             bar.update(task, completed=state.n_done, total=state.total)
 
-        state = run_campaign(plan, Path(out), place, share, report=tell, must_stop=stop)
+        state = run_campaign(plan, Path(out), place, shard=share, report=tell, must_stop=stop)
     if as_json:
         click.echo(
             json.dumps(

@@ -11,7 +11,7 @@ import numpy as np
 from wfsobs.observers.base import Observer
 from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
 from wfsobs.prior import Bands, LgsError, Line, Lines, Model, Part, Prior, Spectra, Training
-from wfsobs.record import Measurements, Record
+from wfsobs.record import Measurements, Record, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import Group
 from wfsobs.signal.ar2 import Ar2
@@ -174,3 +174,13 @@ def predicted_rms(scenario: Scenario, mode: int) -> float:
     row = np.sum(list(model.outputs.values()), axis=0)
     _, steady = steady_filter(model, measurement_noise(scenario, mode)[0])
     return sqrt(float(row @ steady.P @ row))
+
+
+def as_sampled(scenario: Scenario, sampling: Sampling) -> Scenario:
+    """Return the scenario with the time step and exposure ratio of a loop."""
+    changes: dict[str, float] = {}
+    if abs(sampling.dt * scenario.sensors.lgs_rate - 1.0) > 1e-12:
+        changes["sensors.lgs_rate"] = 1.0 / sampling.dt
+    if sampling.ratio is not None and sampling.ratio != scenario.sensors.exposure_ratio:
+        changes["sensors.exposure_ratio"] = sampling.ratio
+    return scenario.replace(changes) if changes else scenario
