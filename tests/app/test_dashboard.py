@@ -87,6 +87,15 @@ def test_results_are_marked_stale_until_new_ones_land(loop: Any, short: Scenario
     assert not faded(dashboard)
 
 
+def test_done_is_said_of_what_stands_in_the_table(dashboard: Dashboard, loop: Any) -> None:
+    status, table, seen = dashboard.controls.status, dashboard.explore.table, list[tuple[str, str]]()
+    status.param.watch(lambda event: seen.append((event.new, table.pane.object)), "text")
+    dashboard.store.change("turbulence.wind_speed", 31)
+    loop.finish(dashboard.store)
+    text, drawn = seen[-1]
+    assert text.startswith("Done in") and drawn == table.html()
+
+
 def test_the_page(dashboard: Dashboard) -> None:
     page = dashboard.page()
     assert page.title == "wfsobs" and page.sidebar and page.main

@@ -67,10 +67,21 @@ class TestChoice:
         dashboard.display.mode = "tilt"
         assert dashboard.display.hidden["vibration"] == ["truth", "kf-lgs"]
         dashboard.display.mode = "tip"
-        dashboard.explore.strips["vibration"].cards._handle_msg("main")
+        dashboard.explore.strips["vibration"].cards._handle_msg({"main": True})
         scores = dashboard.store.run.result.result.scores
         assert set(hidden(dashboard, "vibration")) == {*observers_of("vibration")} - {*main_observers(scores, "vibration", "tip")}
         assert at_first
+
+    def test_a_click_that_crosses_a_result_counts(self, dashboard: Dashboard) -> None:
+        """The browser asks; what the page sends meanwhile does not undo it, and it hears what became of it."""
+        cards = dashboard.explore.strips["vibration"].cards
+        told: list[list[str]] = []
+        cards.param.watch(lambda event: told.append(event.new), "hidden")
+        cards._handle_msg({"hidden": ["truth", "kf-lgs"]})
+        assert told == [["truth", "kf-lgs"]] and dashboard.display.hidden["vibration"] == ["truth", "kf-lgs"]
+        for wrong in ("main", {"hidden": "truth"}, None):
+            cards._handle_msg(wrong)
+        assert told == [["truth", "kf-lgs"]]
 
     def test_the_axis_fits_the_lines_that_are_shown(self, dashboard: Dashboard) -> None:
         view = dashboard.explore.traces.traces["vibration"]

@@ -1,5 +1,7 @@
 // A strip of cards, one per line of the figures below it: what it is, its number, and a switch for the line.
 // A click hides or shows a line, a double click or the key S shows it alone, and once more all of them.
+// What is hidden is the server's to say: the strip asks for it by message and shows it at once, so that what the server
+// sends while a click is on its way cannot leave the two apart.
 
 export function render({model, el}) {
   const strip = document.createElement("div")
@@ -20,15 +22,25 @@ export function render({model, el}) {
     return div
   }
 
-  const toggle = (name) => {
-    const others = model.hidden.filter((it) => it !== name)
-    model.hidden = others.length < model.hidden.length ? others : [...others, name]
+  let hidden = model.hidden
+  let before = hidden  // the click: a double click is about what stood there before its first one
+
+  const hide = (names) => {
+    hidden = names
+    mark()
+    model.send_msg({hidden: names})
   }
 
-  const solo = (name) => {
+  const toggle = (name) => {
+    before = hidden
+    const others = hidden.filter((it) => it !== name)
+    hide(others.length < hidden.length ? others : [...others, name])
+  }
+
+  const solo = (name, among) => {
     const others = model.items.map((item) => item.name).filter((it) => it !== name)
-    const alone = !model.hidden.includes(name) && others.every((it) => model.hidden.includes(it))
-    model.hidden = alone ? [] : others
+    const alone = !among.includes(name) && others.every((it) => among.includes(it))
+    hide(alone ? [] : others)
   }
 
   const cardOf = (item) => {
@@ -48,21 +60,21 @@ export function render({model, el}) {
     part(card, "note", item.note)
     if (item.range) part(card, "note", item.range).title = "where the mean error over seeds lies, at 95 % confidence"
     card.onclick = (event) => { if (event.detail < 2) toggle(item.name) }  // the second one of a double click does not count
-    card.ondblclick = () => solo(item.name)
+    card.ondblclick = () => solo(item.name, before)
     card.onkeydown = (event) => {
-      if (event.key.toLowerCase() === "s" && !event.ctrlKey && !event.metaKey && !event.altKey) solo(item.name)
+      if (event.key.toLowerCase() === "s" && !event.ctrlKey && !event.metaKey && !event.altKey) solo(item.name, hidden)
     }
     return card
   }
 
   const mark = () => {
     for (const card of strip.children) {
-      const shown = !model.hidden.includes(card.dataset.name)
+      const shown = !hidden.includes(card.dataset.name)
       const label = card.querySelector(".name").textContent
       card.setAttribute("aria-pressed", shown)
       card.title = `${shown ? "Hide" : "Show"} ${label}; double click or S: ${label} alone`
     }
-    const n = strip.children.length - [...strip.children].filter((it) => model.hidden.includes(it.dataset.name)).length
+    const n = strip.children.length - [...strip.children].filter((it) => hidden.includes(it.dataset.name)).length
     count.textContent = n < strip.children.length ? `${n} of ${strip.children.length} lines shown` : ""
     all.disabled = n === strip.children.length
   }
@@ -86,8 +98,8 @@ export function render({model, el}) {
   }
   const count = document.createElement("span")
   hint.append(count)
-  const all = button("Show all", () => { model.hidden = [] })
-  if (model.main) button(model.main, () => model.send_msg("main"))
+  const all = button("Show all", () => hide([]))
+  if (model.main) button(model.main, () => model.send_msg({main: true}))
 
   for (const [word, meaning] of Object.entries(model.terms)) {
     const it = button(word)
@@ -100,6 +112,9 @@ export function render({model, el}) {
   }
 
   model.on("items", draw)
-  model.on("hidden", mark)
+  model.on("hidden", () => {
+    hidden = model.hidden
+    mark()
+  })
   draw()
 }

@@ -222,7 +222,8 @@ class Controls:
         self.store.param.watch(self._refresh_preset, ["scenario", "preset", "can_undo", "can_redo"])
         self.store.param.watch(self._refresh_parts, "scenario")
         self.store.param.watch(self._refresh_run, ["errors", "waiting"])
-        self.store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"])
+        # Last, so that "Done" is said of what has been drawn.
+        self.store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"], precedence=1)
 
     def _on_choice(self, event: param.parameterized.Event) -> None:
         if event.new != self.store.preset:

@@ -39,8 +39,13 @@ class Cards(JSComponent):
         super().__init__(**params)
 
     def _handle_msg(self, data: object) -> None:
-        if data == "main":
+        """Take a click: the names to hide, or the wish for the main lines."""
+        if not isinstance(data, dict):
+            return
+        if data.get("main"):
             self.on_main()
+        elif isinstance(names := data.get("hidden"), list):
+            self.hidden = [name for name in names if isinstance(name, str)]
 
 
 class Strip:
