@@ -162,7 +162,7 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         words, out = (words[:-2], words[-1]) if ">" in words else (words, None)
         if "--seeds" in words:
             words[words.index("--seeds") + 1] = "2"
-        short = SHORT if words[1] in ("run", "observe", "tune", "loop", "export") else ()
+        short = SHORT if words[1] in ("run", "observe", "tune", "loop", "export", "sweep") else ()
         result = CliRunner().invoke(main, [*words[1:], *short])
         assert result.exit_code == 0, (line, result.output)
         if out:

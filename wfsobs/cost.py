@@ -9,6 +9,8 @@ moment from a wait.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from wfsobs.atmosphere.von_karman import FIELD
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.per_mode import AT_ONCE
@@ -16,19 +18,24 @@ from wfsobs.priors_from.scenario import observer_settings
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import TRAINING_MARGIN
 
+REST = "rest"
+"""What is not one of the observers whose time is estimated by itself."""
 
-def run_seconds(scenario: Scenario) -> float:
-    """Estimate the time of simulation, every observer and the scores [s].
+
+def run_seconds(scenario: Scenario, observers: Sequence[str] | None = None) -> float:
+    """Estimate the time of simulation, every observer or these ids, and the scores [s].
 
     >>> from wfsobs.scenario.presets import paper
     >>> round(run_seconds(paper()), 1), round(run_seconds(paper().replace({"run.duration": 300})))
     (0.6, 20)
     """
-    return sum(part_seconds(scenario).values())
+    return sum(
+        seconds for part, seconds in part_seconds(scenario).items() if part == REST or observers is None or part in observers
+    )
 
 
 def part_seconds(scenario: Scenario) -> dict[str, float]:
-    """Estimate the parts of `run_seconds` [s]: the two GPR, the adaptive filter, and all else as "rest"."""
+    """Estimate the parts of `run_seconds` [s]: the two GPR, the adaptive filter, and all else as REST."""
     n, n_modes, offline = scenario.n_steps, len(scenario.modes), scenario.gpr_offline
     training = offline.depth + offline.training_size + round(TRAINING_MARGIN * scenario.sensors.lgs_rate)
     air = _steps_of_air(scenario)
@@ -38,7 +45,7 @@ def part_seconds(scenario: Scenario) -> dict[str, float]:
             for o in OBSERVERS.values()
             if o.seconds is not None
         },
-        "rest": 2.5e-6 * n_modes * (n + training) + frozen_flow_seconds(scenario, air + training),
+        REST: 2.5e-6 * n_modes * (n + training) + frozen_flow_seconds(scenario, air + training),
     }
 
 

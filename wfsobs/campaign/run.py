@@ -15,7 +15,7 @@ from wfsobs.campaign.state import finished_runs, open_folder
 from wfsobs.campaign.stopping import wanted_seeds
 from wfsobs.campaign.store import read_results
 from wfsobs.campaign.work import Batch, Summary, wfsobs_batch
-from wfsobs.cost import part_seconds
+from wfsobs.cost import run_seconds
 from wfsobs.settings.errors import SettingError
 from wfsobs.typing import Array
 
@@ -171,8 +171,7 @@ def run_cost(plan: Campaign, cell: int) -> float:
         scenario = plan.cells[cell].scenario()
     except SettingError:
         return 1e-3
-    parts = part_seconds(scenario)
-    return 2e-3 + sum(seconds for name, seconds in parts.items() if name == "rest" or name in plan.observers)
+    return 2e-3 + run_seconds(scenario, plan.observers)
 
 
 def _drive(

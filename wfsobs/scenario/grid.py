@@ -29,7 +29,7 @@ class Variation:
         return f"{self.path}={','.join(map(format_value, self.values))}"
 
 
-def parse_variation(text: str) -> Variation:
+def parse_variation(text: str, option: str = "--vary") -> Variation:
     """Return the Variation of "a.b=v1,v2,v3"; values in TOML's syntax, or bare words. Raises SettingError.
 
     >>> parse_variation("turbulence.wind_speed=5,10,15")
@@ -41,17 +41,17 @@ def parse_variation(text: str) -> Variation:
     """
     path, equals, listed = (part.strip() for part in text.partition("="))
     if not (path and equals and listed):
-        raise SettingError(f"--vary {text}: takes name=value,value, such as turbulence.wind_speed=5,10,15")
+        raise SettingError(f"{option} {text}: takes name=value,value, such as turbulence.wind_speed=5,10,15")
     try:
         parsed = parse_toml(f"values = [{listed}]")
     except NotToml:
         parsed = {}
     except SettingError as error:
-        raise SettingError(f"--vary {path}: {error}") from None
+        raise SettingError(f"{option} {path}: {error}") from None
     values = parsed["values"] if set(parsed) == {"values"} else [_word(part.strip()) for part in listed.split(",")]
     for i, value in enumerate(values):
         if value in values[:i]:
-            raise SettingError(f"--vary {path}: has {value!r} twice")
+            raise SettingError(f"{option} {path}: has {value!r} twice")
     return Variation(path, tuple(values))
 
 

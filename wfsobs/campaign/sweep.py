@@ -1,0 +1,316 @@
+"""Errors over one or two settings: a grid of scenarios, each with several seeds, and the observer that is best in each."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from wfsobs.campaign.points import Changes, grid
+from wfsobs.cost import run_seconds
+from wfsobs.evaluation.evidence import FEWEST, Evidence, Key, gather_evidence
+from wfsobs.evaluation.scores import BOUNDS, Score
+from wfsobs.observers import OBSERVERS
+from wfsobs.pipeline import run
+from wfsobs.progress import QUIET, Watch
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.grid import Variation, parse_variation
+from wfsobs.settings.errors import SettingError
+
+MOST_CELLS = 400
+"""Maximum number of scenarios."""
+
+MOST_VALUES = 50
+"""Maximum number of values of a setting."""
+
+MOST_SEEDS = 100
+SEED = "run.seed"
+RANGE = re.compile(r"([^:,]+):([^:,]+):([^:,]+?)(:log)?")
+
+
+def parse_axis(text: str) -> Variation:
+    """Return a setting and its values.
+
+    Parameters
+    ----------
+    text : str
+        "a.b=low:high:number", evenly spaced, with ":log" at the end on a logarithmic scale; or "a.b=v1,v2,v3" as
+        `wfsobs export --vary` takes them.
+
+    Returns
+    -------
+    Variation
+        Setting and values.
+
+    Raises
+    ------
+    SettingError
+        The text has another form.
+
+    Examples
+    --------
+    >>> parse_axis("turbulence.wind_speed=5:20:4").values
+    (5, 10, 15, 20)
+    >>> parse_axis("kalman.frequency=1:100:3:log").values
+    (1, 10, 100)
+    >>> parse_axis("sensors.exposure_ratio=2,5,10").values
+    (2, 5, 10)
+    """
+    path, _, listed = (part.strip() for part in text.partition("="))
+    found = RANGE.fullmatch(listed)
+    if not found:
+        return parse_variation(text, "--over")
+    allowed = f"--over {text}: takes low:high:number with a number from 2 to {MOST_VALUES}, such as 5:20:4, or values with commas"
+    try:
+        low, high, count = float(found[1]), float(found[2]), int(found[3])
+    except ValueError:
+        raise SettingError(allowed) from None
+    if not (isfinite(low) and isfinite(high) and 2 <= count <= MOST_VALUES):
+        raise SettingError(allowed)
+    if not low < high or (found[4] and low <= 0):
+        raise SettingError(f"--over {text}: the first number must be below the second{' and above 0' if found[4] else ''}")
+    values = np.geomspace(low, high, count) if found[4] else np.linspace(low, high, count)
+    return Variation(path, tuple(_round_off(v) for v in values.tolist()))
+
+
+def _round_off(value: float) -> float | int:
+    """Return a number without the last digits, a whole one as such."""
+    value = float(f"{value:.6g}")
+    return int(value) if value.is_integer() else value
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What a sweep runs; made by `plan_sweep`.
+
+    Attributes
+    ----------
+    base : Scenario
+        All other settings; its seed is the first one.
+    axes : tuple of Variation
+        One or two settings and their values.
+    seeds : int
+        Number of seeds of each scenario, the same ones in all.
+    observers : tuple of str
+        Ids.
+    """
+
+    base: Scenario
+    axes: tuple[Variation, ...]
+    seeds: int
+    observers: tuple[str, ...]
+
+    @cached_property
+    def cells(self) -> list[Changes]:
+        """Changes of each scenario, dotted path -> value; the last setting changes fastest."""
+        return grid({axis.path: list(axis.values) for axis in self.axes})
+
+    @property
+    def n_runs(self) -> int:
+        """Number of runs."""
+        return len(self.cells) * self.seeds
+
+    def scenario(self, cell: int, number: int = 0) -> Scenario:
+        """Return the scenario of a cell with one of the seeds, from 0. Raises SettingError."""
+        made = self.base.replace({**self.cells[cell], SEED: self.base.run.seed + number})
+        made.validate()
+        return made
+
+    @cached_property
+    def edge(self) -> list[int]:
+        """Cells in which every value of every setting occurs: all others are checked when they run."""
+        last = len(self.axes[-1].values)
+        return sorted({*range(last), *range(0, len(self.cells), last)})
+
+    @cached_property
+    def seconds(self) -> float:
+        """Estimated time of all runs [s], from the mean of `edge`."""
+        return self.n_runs * float(np.mean([run_seconds(self.scenario(cell), self.observers) for cell in self.edge]))
+
+
+def plan_sweep(base: Scenario, axes: Sequence[Variation], seeds: int, observers: Sequence[str] | None = None) -> Sweep:
+    """Return the sweep over one or two settings.
+
+    Parameters
+    ----------
+    base : Scenario
+        All other settings.
+    axes : sequence of Variation
+        Settings and their values, of `parse_axis`.
+    seeds : int
+        Number of seeds of each scenario: base.run.seed, base.run.seed + 1, ...
+    observers : sequence of str, optional
+        Ids; by default all.
+
+    Returns
+    -------
+    Sweep
+        What is to be run.
+
+    Raises
+    ------
+    SettingError
+        A setting refuses one of its values, or there are too many.
+    """
+    if not 1 <= len(axes) <= 2:
+        raise SettingError(f"--over: takes one or two settings, not {len(axes)}")
+    if len(axes) == 2 and axes[0].path == axes[1].path:
+        raise SettingError(f"--over {axes[0].path}: is given twice")
+    for axis in axes:
+        if axis.path == SEED:
+            raise SettingError(f"--over {SEED}: every scenario has the same seeds; give their number")
+        if not 2 <= len(axis.values) <= MOST_VALUES:
+            raise SettingError(f"--over {axis.path}: {len(axis.values)} values; takes 2 to {MOST_VALUES}")
+    if unknown := set(observers or ()) - set(OBSERVERS):
+        raise SettingError(f"observer {min(unknown)!r}: no such observer; there are {', '.join(OBSERVERS)}")
+    if not 1 <= seeds <= MOST_SEEDS:
+        raise SettingError(f"seeds = {seeds}: takes a whole number from 1 to {MOST_SEEDS}")
+    chosen = tuple(name for name in OBSERVERS if observers is None or name in observers)
+    sweep = Sweep(base, tuple(axes), seeds, chosen)
+    if len(sweep.cells) > MOST_CELLS:
+        counts = " x ".join(str(len(axis.values)) for axis in axes)
+        raise SettingError(f"--over: {counts} = {len(sweep.cells)} scenarios, at most {MOST_CELLS} are allowed")
+    for cell in sweep.edge:
+        sweep.scenario(cell)
+    return sweep
+
+
+def run_cell(sweep: Sweep, cell: int, number: int, watch: Watch = QUIET) -> tuple[Score, ...]:
+    """Run a scenario with one of the seeds, and return the scores. Raises SettingError, Cancelled."""
+    return run(sweep.scenario(cell, number), observers=sweep.observers, watch=watch).scores
+
+
+@dataclass(frozen=True)
+class Winner:
+    """The best observer in a scenario, for a target and mode.
+
+    Attributes
+    ----------
+    name : str
+        Observer with the smallest mean error over the seeds.
+    rms : float
+        That mean [um].
+    margin : float or None
+        Mean error of the second over that of the best, less 1; None where there is no second.
+    ties : tuple of str
+        Observers whose errors do not differ significantly from those of the best.
+    seeds : int
+        Number of seeds.
+    """
+
+    name: str
+    rms: float
+    margin: float | None
+    ties: tuple[str, ...]
+    seeds: int
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether all others are significantly worse; never with fewer than FEWEST seeds."""
+        return self.seeds >= FEWEST and not self.ties
+
+
+@dataclass(frozen=True)
+class SweepResults:
+    """What is known of a sweep so far.
+
+    Attributes
+    ----------
+    sweep : Sweep
+        What is run.
+    scores : mapping
+        Cell -> scores of its seeds in order.
+    evidence : mapping
+        Cell -> errors over its seeds.
+    failures : mapping
+        Cell -> why it cannot be run.
+    """
+
+    sweep: Sweep
+    scores: Mapping[int, tuple[tuple[Score, ...], ...]] = field(default_factory=dict)
+    evidence: Mapping[int, Evidence] = field(default_factory=dict)
+    failures: Mapping[int, str] = field(default_factory=dict)
+
+    def add(self, cell: int, scores: Sequence[Score]) -> SweepResults:
+        """Return the results with those of one more seed of a cell."""
+        seeds = (*self.scores.get(cell, ()), tuple(scores))
+        return replace(self, scores={**self.scores, cell: seeds}, evidence={**self.evidence, cell: gather_evidence(seeds)})
+
+    def add_failure(self, cell: int, reason: str) -> SweepResults:
+        """Return the results with the reason why a cell cannot be run."""
+        return replace(self, failures={**self.failures, cell: reason})
+
+    def seeds(self, cell: int) -> int:
+        """Return the number of seeds of a cell that have been run."""
+        return len(self.scores.get(cell, ()))
+
+    @property
+    def n_done(self) -> int:
+        """Number of runs that are done or cannot be done."""
+        return sum(self.sweep.seeds if cell in self.failures else self.seeds(cell) for cell in range(len(self.sweep.cells)))
+
+    def next_run(self) -> tuple[int, int] | None:
+        """Return (cell, number of the seed) of the next run: every cell has its first seed before any has its second."""
+        left = [cell for cell in range(len(self.sweep.cells)) if cell not in self.failures]
+        cell = min(left, key=self.seeds, default=None)
+        return None if cell is None or self.seeds(cell) >= self.sweep.seeds else (cell, self.seeds(cell))
+
+    def winner(self, cell: int, target: str, mode: str) -> Winner | None:
+        """Return the best observer of a cell; None where nothing is known."""
+        evidence = self.evidence.get(cell)
+        ranked = evidence.ranking(target, mode) if evidence else []
+        if evidence is None or not ranked:
+            return None
+        errors = [evidence.mean((name, target, mode)) or 0.0 for name in ranked[:2]]
+        margin = errors[1] / errors[0] - 1.0 if len(errors) > 1 and errors[0] > 0 else None
+        return Winner(ranked[0], errors[0], margin, evidence.leaders(target, mode)[1:], evidence.n_seeds)
+
+    def error(self, cell: int, key: Key) -> tuple[float, float, float] | None:
+        """Return the mean error of an observer over the seeds of a cell, and the interval of that mean [um].
+
+        Without an interval, the ends are the mean; a bound has none. None where the error is not known.
+        """
+        if key[0] in BOUNDS:
+            known = [s.rms for scores in self.scores.get(cell, ()) for s in scores if (s.observer, s.target, s.mode) == key]
+            return (float(np.mean(known)),) * 3 if known else None  # type: ignore[return-value]
+        evidence = self.evidence.get(cell)
+        mean = evidence.mean(key) if evidence else None
+        if evidence is None or mean is None:
+            return None
+        return (mean, *(evidence.interval(key) or (mean, mean)))
+
+    def known_keys(self) -> list[Key]:
+        """Return (observer, target, mode) of all that is known in some cell, in the order of the scores."""
+        known = {(s.observer, s.target, s.mode): None for seeds in self.scores.values() for s in seeds[0]}
+        return list(known)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return one plain dictionary per cell, target, mode and observer, errors in [nm]."""
+        out = []
+        for cell, changes in enumerate(self.sweep.cells):
+            for key in self.known_keys():
+                error, best = self.error(cell, key), self.winner(cell, *key[1:])
+                if error is None:
+                    continue
+                few = self.seeds(cell) < FEWEST or key[0] in BOUNDS
+                first = best is not None and key[0] == best.name
+                out.append(
+                    {
+                        **changes,
+                        "target": key[1],
+                        "mode": key[2],
+                        "observer": key[0],
+                        "seeds": self.seeds(cell),
+                        "mean_rms_nm": 1e3 * error[0],
+                        "low_nm": None if few else 1e3 * error[1],
+                        "high_nm": None if few else 1e3 * error[2],
+                        "rank": "best" if first else "tied" if best and key[0] in best.ties else "",
+                        "margin": best.margin if best and first else None,
+                    }
+                )
+        return out
