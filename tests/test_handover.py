@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from click.testing import CliRunner
 from scipy.io import loadmat
 
@@ -139,15 +140,57 @@ def test_the_module_for_python_control(tmp_path: Path, controller: str, whole: t
     np.testing.assert_allclose(got, want, rtol=0, atol=ROUNDING * want.std())
 
 
+def in_a_loop(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Commands of a system that is given y[k] = z[k] + u[k-2], as a sensor in a loop gives it."""
+    x, u = np.zeros(len(A)), np.zeros((len(z) + 2, 2))
+    for k, disturbance in enumerate(z):
+        y = disturbance + u[k]
+        u[k + 2] = C @ x + D @ y
+        x = A @ x + B @ y
+    return u[2:]
+
+
+@pytest.mark.parametrize("controller", ["integrator", "lqg-kf-multi"])
+def test_the_file_for_specula(tmp_path: Path, controller: str, whole: tuple) -> None:
+    path = write(tmp_path, controller, "specula")
+    with fits.open(path) as file:
+        header = file[0].header
+        A, B, C, D = (np.asarray(file[name].data, float) for name in "ABCD")
+    assert (header["VERSION"], header["NFILTER"], header["NSTATES"]) == (1, 2, len(A))
+    assert "1 u[k-2]" in str(header["COMMENT"]) and "delay: 1" in str(header["COMMENT"])
+    given, commands = whole
+    want = commands[controller]
+    got = in_a_loop(A, B, -C, -D, given[:, :2])  # SPECULA's mirror subtracts
+    # Rounding comes back through the loop: its largest gain, some 10, times that of one pass
+    np.testing.assert_allclose(got, want, rtol=0, atol=10 * ROUNDING * want.std())
+
+
+@pytest.mark.parametrize("controller", ["integrator", "lqg-kf-multi"])
+def test_the_matrices_for_compass(tmp_path: Path, controller: str, whole: tuple) -> None:
+    path = write(tmp_path, controller, "compass")
+    with np.load(path) as file:
+        assert "polc False" in str(file["conventions"]) and {file[name].dtype for name in "ALKF"} == {np.dtype("f4")}
+        A, L, K, F = (file[name].astype(float) for name in "ALKF")
+    given, commands = whole
+    want = commands[controller]
+    # x[k] = A x[k-1] + L s[k], u[k] = F K x[k], as a system whose state is x[k-1]
+    got = in_a_loop(A, L, F @ K @ A, F @ K @ L, given[:, :2])
+    # Single precision is what COMPASS has: 6e-8 of numbers, some hundred of which add up, many cancelling
+    np.testing.assert_allclose(got, want, rtol=0, atol=1e-4 * want.std())
+
+
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
         (("lqg-multirate", "control"), "repeats every 5 steps"),
+        (("lqg-multirate-multi", "specula"), "repeats every 5 steps"),
+        (("lqg-multirate-multi", "compass"), "repeats every 5 steps"),
+        (("gpr-online", "specula"), "no such controller"),
         (("integrator+gpr-online", "c99"), "no linear form"),
         (("none", "npz"), "there is no law"),
         (("integrator", "npz", "--set", "control.stroke=1"), "limits of the mirror"),
         (("kf-lgs", "npz"), "no such controller"),
-        (("integrator", "pdf"), "takes one of c99, control, mat, npz"),
+        (("integrator", "pdf"), "takes one of c99, compass, control, mat, npz, specula"),
     ],
 )
 def test_what_a_format_cannot_hold_is_refused_in_one_line(tmp_path: Path, arguments: tuple[str, ...], reason: str) -> None:

@@ -49,12 +49,17 @@ def write_mat(path: str | Path, design: LinearDesign) -> None:
     write_whole(path, lambda file: file.write(buffer.getvalue()))
 
 
-def state_space(design: LinearDesign) -> tuple[Array, Array, Array, Array]:
-    """Return (A, B, C, D) from z to u of all modes together. Raises StepError for a controller that changes from step to step."""
+def check_time_invariant(design: LinearDesign) -> None:
+    """Refuse a controller that changes from step to step. Raises StepError."""
     if design.period > 1 or design.ratio:
         raise StepError(
             f"{design.id}: repeats every {design.period} steps, which no time-invariant system does; c99, npz and mat do"
         )
+
+
+def state_space(design: LinearDesign) -> tuple[Array, Array, Array, Array]:
+    """Return (A, B, C, D) from z to u of all modes together. Raises StepError for a controller that changes from step to step."""
+    check_time_invariant(design)
     modes = [mode.gains.filter(mode.row[None]).steps[0] for mode in design.modes]
     A, B, C, D = (block_diag(*parts) for parts in zip(*modes, strict=True))
     return A, B, C, D

@@ -8,16 +8,17 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.handover.arrays import write_control, write_mat, write_npz
 from wfsobs.handover.c99 import write_c99
 from wfsobs.handover.linear import linear_design
+from wfsobs.handover.simulators import write_compass, write_specula
 from wfsobs.handover.vectors import make_vectors
 from wfsobs.priors_from.controllers import own_settings, plant_of
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import prior_in, sampling_of
 
-FORMATS = ("c99", "control", "mat", "npz")
+FORMATS = ("c99", "compass", "control", "mat", "npz", "specula")
 """What a design can be written as."""
 
-ARRAYS = {"control": write_control, "mat": write_mat, "npz": write_npz}
+ARRAYS = {"compass": write_compass, "control": write_control, "mat": write_mat, "npz": write_npz, "specula": write_specula}
 
 
 def write_design(name: str, scenario: Scenario, form: str, path: str | Path) -> None:
