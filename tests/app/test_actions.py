@@ -170,6 +170,17 @@ def test_too_much_data_is_refused_with_a_line(actions: Actions, loop: Any, monke
     assert "wfsobs run --save" in actions.toolbar.notes[0]
 
 
+def test_what_was_read_is_taken_back_and_nothing_that_came_meanwhile(actions: Actions) -> None:
+    toolbar = actions.toolbar
+    toolbar.param.update(said="Opened b.toml.", notes=["a.toml: no"])
+    actions.handle({"action": "read", "text": "Opened a.toml."})
+    assert toolbar.said == "Opened b.toml."
+    actions.handle({"action": "read", "text": "Opened b.toml."})
+    assert toolbar.said == "" and toolbar.notes == ["a.toml: no"]
+    actions.handle({"action": "dismiss"})
+    assert toolbar.notes == []
+
+
 def test_settings_too_long_for_a_link(actions: Actions) -> None:
     many = [1.0 + i / 100 for i in range(3000)]
     actions.store.change("vibration.psd.frequency", many)

@@ -172,6 +172,15 @@ def test_a_bad_value_shows_beside_its_setting(controls: Controls, path: str, tex
     assert status_of(controls.store)[1] == f"Not accepted: {setting_name(path)}" == controls.status.note
 
 
+def test_what_is_being_typed_stays_when_another_setting_changes(controls: Controls) -> None:
+    box = field_of(controls, "turbulence.wind_speed").widgets[-1]
+    box.value_input = "2"  # on the way to 20
+    controls.store.change("run.seed", 5)
+    assert box.value_input == "2"
+    controls.store.change("turbulence.wind_speed", 30)
+    assert box.value == box.value_input == "30"
+
+
 def test_correcting_a_bad_value_clears_the_message(controls: Controls, loop: Any) -> None:
     path = "turbulence.wind_speed"
     text = field_of(controls, path).widgets[-1]

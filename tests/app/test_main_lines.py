@@ -77,7 +77,8 @@ class TestChoice:
         cards = dashboard.explore.strips["vibration"].cards
         told: list[list[str]] = []
         cards.param.watch(lambda event: told.append(event.new), "hidden")
-        cards._handle_msg({"hidden": ["truth", "kf-lgs"]})
+        cards._handle_msg({"hidden": ["truth", "kf-lgs"], "number": 7})
+        assert cards.heard == 7
         assert told == [["truth", "kf-lgs"]] and dashboard.display.hidden["vibration"] == ["truth", "kf-lgs"]
         for wrong in ("main", {"hidden": "truth"}, None):
             cards._handle_msg(wrong)

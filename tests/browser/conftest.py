@@ -34,7 +34,7 @@ CLOSED_MID_UPDATE = ("WebSocketClosedError", "StreamClosedError", "self.connecti
 nothing else is let through."""
 
 
-expect.set_options(timeout=30_000)  # a busy machine is no fault
+expect.set_options(timeout=60_000)  # a busy machine is no fault
 
 
 class Server:
@@ -130,7 +130,7 @@ def open_page(server: Server, browser: Browser) -> Iterator[Any]:
 
     def open_it(width: int = 1400, height: int = 1000, url: str = "", wait: bool = True, **options: Any) -> Page:
         page = browser.new_page(viewport={"width": width, "height": height}, **options)
-        page.set_default_timeout(60_000)
+        page.set_default_timeout(120_000)
         opened.append((page, Watched(page)))
         page.goto(url or server.url)
         if wait:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from playwright.sync_api import expect
@@ -16,12 +17,13 @@ def test_controllers_side_by_side(open_page: Any, server: Any) -> None:
     page.get_by_role("button", name="Closed loop", exact=True).click()
     expect(page.get_by_role("heading", name="Residual in closed loop")).to_be_visible(timeout=SLOW)
     rows = page.get_by_role("region", name="Controllers").locator("tr[data-controller]")
-    last = page.locator('tr[data-controller="integrator+gpr-online"] td').first
-    expect(last).to_be_visible(timeout=SLOW)
-    values = {row.get_attribute("data-controller"): row.locator("td").first.inner_text() for row in rows.all()}
+    for name in ("integrator+gpr-online", "lqg-multirate-multi", "integrator", "none"):
+        expect(page.locator(f'tr[data-controller="{name}"] td').first).to_have_text(re.compile(r"\d$"), timeout=SLOW)
+    best = page.locator('tr[data-controller="lqg-multirate-multi"]')
+    expect(best.locator(".best")).to_be_visible(timeout=SLOW)
+    values = rows.evaluate_all("rows => Object.fromEntries(rows.map(it => [it.dataset.controller, it.cells[1].innerText]))")
     residual = {name: float(text.split()[-1]) for name, text in values.items()}
     assert residual["lqg-multirate-multi"] < residual["integrator"] < residual["none"]
-    assert "best" in values["lqg-multirate-multi"]
     card = page.locator('button.card[data-name="integrator"]')
     card.click()
     expect(card).to_have_attribute("aria-pressed", "false")

@@ -91,7 +91,7 @@ def page(browser: Browser, cable: Cable, serve: Any) -> Iterator[Page]:
     """The page at the end of the cable, its first run over."""
     context = browser.new_context(viewport={"width": 1400, "height": 1000})
     page = context.new_page()
-    page.set_default_timeout(60_000)
+    page.set_default_timeout(120_000)
     page.server = serve()  # type: ignore[attr-defined]
     page.goto(f"http://localhost:{cable.port}/{QUICK}")
     done(page)

@@ -24,10 +24,17 @@ def becomes(page: Page, expected: bool) -> None:
     )
 
 
+def remembered(page: Page, theme: str) -> None:
+    """Wait until the theme that was chosen is in the address and in what the browser keeps."""
+    page.wait_for_function("theme => location.search.includes(`theme=${theme}`)", arg=theme)
+    page.wait_for_function("theme => localStorage.getItem('wfsobs-theme') === theme", arg=theme)
+
+
 def test_nothing_moves_under_the_pointer(open_page: Any, server: Any) -> None:
     page = open_page(url=server.url + QUICK)
     load, source = page.get_by_role("button", name="Load data"), page.get_by_role("combobox", name="Source").first
     run, box = page.get_by_role("button", name="Run", exact=True).first, page.get_by_role("textbox", name="m/s")
+    page.wait_for_function("() => document.fonts.status === 'loaded'")
     before = [place(it) for it in (load, run, box, source)]
     page.evaluate("() => { navigator.clipboard.writeText = () => Promise.resolve() }")
     page.get_by_role("button", name="Share", exact=True).click()
@@ -58,12 +65,14 @@ def test_the_theme_of_the_system_unless_another_is_chosen(open_page: Any, server
     becomes(page, False)
     page.get_by_role("button", name=re.compile("theme", re.I)).click()
     becomes(page, True)
+    remembered(page, "dark")
     page.reload()
     page.locator("[role=status]", has_text="Done in").first.wait_for(state="attached", timeout=240_000)
     becomes(page, True)
     page.emulate_media(color_scheme="dark")
     page.get_by_role("button", name=re.compile("theme", re.I)).click()
     becomes(page, False)
+    remembered(page, "light")
     page.emulate_media(color_scheme="light")
     page.emulate_media(color_scheme="dark")
     page.reload()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ VISIBLE_LINES = f"""() => {MODELS}.filter(m => m.type === "GlyphRenderer" && m.g
 PINNED = f"""() => {MODELS}.filter(m => m.type === "GlyphRenderer" && m.name === "pinned")
     .map(m => m.data_source.data.xs.length)"""
 LABELS = f"""() => {MODELS}.filter(m => m.type === "LinearAxis" || m.type === "LogAxis").map(m => m.axis_label).join()"""
-SLOW = 30_000
+SLOW = 60_000
 """What a page may take on a machine that is busy with other things [ms]."""
 IN_EACH = [1 + len(observers_of(target)) for target in TARGETS]
 LINES_OF_FIRST_PAGE = 2 * sum(IN_EACH)
@@ -32,7 +33,7 @@ def cells(page: Page, observer: str, target: str) -> list[str]:
 
 
 def no_wider_than(page: Page, width: int) -> None:
-    assert page.evaluate("() => document.documentElement.scrollWidth") <= width
+    page.wait_for_function("width => document.documentElement.scrollWidth <= width", arg=width)
 
 
 def test_the_figures_of_the_paper(open_page: Any, tmp_path: Path) -> None:
@@ -41,8 +42,9 @@ def test_the_figures_of_the_paper(open_page: Any, tmp_path: Path) -> None:
     turn(page, "Paper figures")
     for number in ("4a", "4b", "5", "6"):
         expect(page.get_by_text(f"Figure {number} of the paper")).to_be_visible(timeout=SLOW)
-    points = page.evaluate(VISIBLE_LINES)
-    assert len(points) == LINES_OF_FIRST_PAGE + LINES_OF_FIGURES and min(points) > 100
+    expected = LINES_OF_FIRST_PAGE + LINES_OF_FIGURES
+    drawn = f"n => {{ const all = ({VISIBLE_LINES})(); return all.length === n && Math.min(...all) > 100 }}"
+    page.wait_for_function(drawn, arg=expected)
     expect(page.get_by_role("heading", name="RMS errors")).to_be_hidden()
     page.screenshot(path=tmp_path / "figures.png")
     turn(page, "Explore")
@@ -93,7 +95,7 @@ def test_pin_and_compare(open_page: Any) -> None:
     expect(page.get_by_text("Wind speed V₀ 15 → 30 m/s")).to_be_visible(timeout=SLOW)
     expect(page.get_by_role("columnheader", name="Change [%]")).to_be_visible(timeout=SLOW)
     row = page.locator('tr[data-observer="kf-lgs"][data-target="turbulence"] td')
-    expect(row.nth(2)).not_to_have_text("+0.0", timeout=SLOW)
+    expect(row.nth(2)).to_have_text(re.compile(r"^(?!\+0\.0).*\d$"), timeout=SLOW)  # nor a dash, of one at work
     value, pinned, change = (text.split()[-1] for text in row.all_inner_texts()[:3])
     assert pinned == before
     assert abs(float(change) - 100 * (float(value) / float(pinned) - 1)) < 1
@@ -114,7 +116,7 @@ def test_cumulative_rms(open_page: Any) -> None:
 def test_best_first(open_page: Any) -> None:
     page = open_page()
     rows = page.locator('tr[data-target="turbulence"]:not([data-observer^=bound])')
-    assert rows.first.get_attribute("data-observer") == "multirate-optimal"
-    expect(rows.first).to_contain_text("best")
+    expect(rows.first).to_have_attribute("data-observer", "multirate-optimal")
+    expect(rows.first).to_contain_text(re.compile("best|tied"))  # the second once further seeds have come
     page.get_by_role("checkbox", name="Best first").click()
     expect(rows.first).to_have_attribute("data-observer", "kf-lgs", timeout=SLOW)

@@ -33,6 +33,41 @@ def test_seeds_give_intervals_and_go_with_the_settings(open_page: Any, server: A
     expect(page.locator("p.verdict").first).not_to_contain_text("over 3 seeds")
 
 
+def test_what_one_is_at_stays_when_seeds_come(open_page: Any, server: Any) -> None:
+    """What stands in a text or a card changes; the word that is open, the focus and the card do not go with it."""
+    page: Page = open_page(url=f"{server.url}{QUICK}&run.seed=4711")  # nobody has its seeds yet
+    set_seeds(page, 3)
+    card = page.locator('.card[data-name="kf-lgs"]').first
+    card.evaluate("card => { card.same = true }")
+    word = page.get_by_role("button", name="Lag [ms]", exact=True)
+    word.focus()
+    page.keyboard.press("Enter")
+    definition = page.get_by_role("note").filter(has_text="cross-correlation")
+    expect(definition).to_be_visible()
+    expect(page.locator(".seeds")).to_have_text("over 3 seeds", timeout=120_000)
+    expect(page.locator('tr[data-target="vibration"][data-observer="kf-lgs"] .range')).to_have_attribute(
+        "title", re.compile("3 seeds$")
+    )
+    expect(card).to_contain_text(re.compile(r"\d – \d"))
+    assert card.evaluate("card => card.same")
+    expect(definition).to_be_visible()
+    expect(word).to_be_focused()
+
+
+def test_what_is_being_typed_stays_when_what_was_typed_before_is_taken(open_page: Any, server: Any) -> None:
+    page: Page = open_page(url=server.url + QUICK)
+    first, second = (page.locator(f'input[data-cell="0.{key}"]') for key in ("frequency", "damping"))
+    first.fill("6.50")
+    page.keyboard.press("Tab")
+    page.keyboard.press("ControlOrMeta+a")
+    page.keyboard.type("0.0123")
+    expect(first).to_have_value("6.5")  # as the server writes it
+    expect(second).to_have_value("0.0123")
+    expect(second).to_be_focused()
+    page.keyboard.press("Enter")
+    page.wait_for_function("() => location.search.includes('vibration.peaks=6.5,0.0123,')")
+
+
 def test_the_error_budget_is_drawn_when_it_is_asked_for(open_page: Any, server: Any) -> None:
     page: Page = open_page(url=server.url + QUICK)
     figure = page.locator("[aria-label='Error budget, vibration']")

@@ -38,7 +38,7 @@ def visit(browser: Browser, serve: Any) -> Iterator[Callable[..., Page]]:
         context = browser.new_context(viewport={"width": 1400, "height": 1000})
         opened.append(context)
         page = context.new_page()
-        page.set_default_timeout(60_000)
+        page.set_default_timeout(120_000)
         page.goto(serve.url + query)
         return page
 
@@ -59,7 +59,7 @@ def start(page: Page) -> None:
 
 def test_serve(open_page: Any, serve: Any) -> None:
     page = open_page(url=serve.url)
-    assert page.title() == "wfsobs"
+    expect(page).to_have_title("wfsobs")
     assert serve.errors(0) == []
 
 
@@ -82,7 +82,7 @@ def test_every_kind_of_work_is_in_that_line_and_a_click_goes_first(visit: Callab
     status(second, "Waiting: position 1")
     (tmp_path / "log.csv").write_text("seeing,airmass\n1,2\n", encoding="utf-8")
     second.get_by_label("Record file").set_input_files(tmp_path / "log.csv")
-    expect(second.get_by_text("Waiting: position 1")).to_be_visible()  # the reading of the file
+    expect(second.locator(".said", has_text="Waiting: position 1")).to_be_visible()  # the reading of the file
     status(second, "Waiting: position 2")
     first.get_by_role("button", name="Cancel", exact=True).click()
     expect(second.get_by_text("log.csv: has no y_lgs").first).to_be_visible()

@@ -75,7 +75,8 @@ def test_undo_by_key_and_by_button(open_short: Any) -> None:
     expect(speed(page)).to_have_value("20")
     expect(page.get_by_role("button", name="Redo", exact=True)).to_be_disabled()
     speed(page).press("Control+z")
-    page.wait_for_timeout(500)
+    page.get_by_role("button", name="Tilt", exact=True).click()
+    page.wait_for_function("location.search.includes('view.mode=tilt')")  # the answer to what came after the keys
     assert "turbulence.wind_speed=20" in page.url, "in a text the keys belong to the text"
 
 
@@ -89,7 +90,6 @@ def test_a_link_with_one_bad_field(open_short: Any, open_page: Any) -> None:
     page.wait_for_function("location.search.includes('turbulence.wind_speed=25')")
     link = copied(page, "Copy link")
     assert link == page.url
-    expect(page.locator("[role=status]", has_text="Done in").first).to_be_attached()
 
     other = open_page(url=link)
     expect(speed(other)).to_have_value("25")
@@ -97,8 +97,8 @@ def test_a_link_with_one_bad_field(open_short: Any, open_page: Any) -> None:
     expect(other.get_by_text("Not used")).to_have_count(0)
     cell = 'tr[data-observer="kf-lgs"][data-target="turbulence"] td'
     expect(other.locator(cell).first).to_have_text(re.compile(r"\d\s*$"))
-    numbers = [it.locator(cell).first.inner_text().split()[-1] for it in (page, other)]  # an interval over seeds comes before
-    assert numbers[0] == numbers[1]
+    value = other.locator(cell).first.inner_text().split()[-1]  # an interval over seeds comes before
+    expect(page.locator(cell).first).to_have_text(re.compile(rf"(^|\s){re.escape(value)}\s*$"))
 
 
 def test_other_languages(open_short: Any) -> None:
@@ -119,7 +119,7 @@ def test_data_and_figures(open_short: Any, tmp_path: Path) -> None:
         root = ET.parse(saved(page, f"{name} as SVG", tmp_path)).getroot()
         assert root.tag == "{http://www.w3.org/2000/svg}svg" and len(list(root.iter())) > 50
         strip = page.locator(".strip").nth(0 if name.startswith("Turbulence") else 1)
-        cards = [card.get_attribute("data-name") for card in strip.locator(".card[aria-pressed=true]").all()]
+        cards = strip.locator(".card[aria-pressed=true]").evaluate_all("cards => cards.map(it => it.dataset.name)")
         labels = {look(line).label for line in cards if line != "truth"}  # of errors at first, which truth has none of
         assert len(labels) >= 3
         assert labels <= {it.text for it in root.iter("{http://www.w3.org/2000/svg}text")}, "the legend"
@@ -182,7 +182,8 @@ def test_back_and_reload_return_to_the_view(open_page: Any) -> None:
     page.get_by_role("button", name="Time window: 0.2 s").click()
     page.wait_for_function("location.search.includes('view.window=')")
     page.locator(".card[data-name=kf-lgs]").first.dblclick()
-    page.wait_for_function("location.search.includes('view.hide.turbulence=')")
+    # Not that of the first click of the two, which hides the line.
+    page.wait_for_function("/view.hide.turbulence=/.test(location.search) && !/kf-lgs/.test(location.search)")
     address = page.evaluate("location.search")
     page.reload()
     expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")

@@ -17,6 +17,7 @@ def test_identify_and_use_it(open_page: Any, server: Any) -> None:
     page.get_by_role("button", name="Identify the record").click()
     expect(page.get_by_text(re.compile("tip: residual is (NOT )?white at 1%"))).to_be_visible()
     row = page.get_by_role("region", name="Identified in tip").locator("tr", has_text="turbulence")
+    expect(row.locator("td").first).to_have_text(re.compile(r"^\s*\d"))
     corner = float(row.locator("td").first.inner_text().split()[0])
     assert 0.4 < corner < 3.0, "the paper's is 1.125 Hz, of 5 s a third of an octave wide"
     wind = page.get_by_role("textbox", name="m/s")

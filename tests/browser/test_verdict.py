@@ -31,6 +31,8 @@ def test_the_verdict_names_the_best_of_the_table_in_the_mode_and_unit_shown(open
         for target in ("turbulence", "vibration"):
             start = sentences(page, target)
             expect(start).to_contain_text(re.compile(rf"^{target.capitalize()}, {mode.lower()}: .* {unit}[,;]"))
+            expect(page.get_by_role("columnheader", name=f"RMS error [{unit}]", exact=True)).to_be_visible()
+            expect(page.locator("th.target", has_text=f"{target.capitalize()}, {mode.lower()}")).to_be_visible()
             label, error = best(page, target)
             expect(start).to_contain_text(f"{mode.lower()}: {label} ")
             said = re.search(rf"([\d.]+) {unit}[,;]", start.inner_text())

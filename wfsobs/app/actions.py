@@ -115,6 +115,8 @@ class Actions:
             "redo": self.store.redo,
             "open": lambda: self.open_file(str(msg.get("name", "")), msg.get("text")),
             "unlinked": lambda: self._note("These settings are too long for a link: save the scenario and send the file."),
+            "dismiss": lambda: self.toolbar.param.update(notes=[]),
+            "read": lambda: self._take_back(msg.get("text")),
             "view": lambda: self.open_view(str(msg.get("query", ""))),
             "report": self.make_report,
             "toml": self.save_scenario,
@@ -203,6 +205,11 @@ class Actions:
 
     def _note(self, line: str) -> None:
         self.toolbar.param.update(notes=[line], said="")
+
+    def _take_back(self, text: object) -> None:
+        """Unsay what has been read, unless something else has been said meanwhile."""
+        if self.toolbar.said == text:
+            self.toolbar.said = ""
 
     def _refresh(self, *_: object) -> None:
         scenario, preset, source = self.store.scenario, self.store.preset, self.store.source

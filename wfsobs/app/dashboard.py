@@ -53,7 +53,7 @@ class Frame(JSComponent):
     dark = param.Boolean(False, doc="Whether the page is dark; where it is not as wanted, the visitor has chosen so.")
     stale = param.Boolean(False, doc="Whether to fade the results.")
 
-    _esm = asset("frame.js")
+    _esm = asset("patch.js") + asset("frame.js")
 
 
 class Keyboard(JSComponent):

@@ -72,13 +72,29 @@ function ground(element) {
 
 // ------------------------------------------------------------------ figures
 
-async function saveFigure(name, view, kind, model) {
-  const blob = await exported(view, kind, model.labels)
+async function saveFigure(name, view, kind, labels, say) {
+  const blob = await exported(view, kind, labels)
   save(`${name.toLowerCase().replaceAll(/[^a-z0-9]+/g, "-")}.${kind}`, blob)
-  model.said = `Saved ${name} as ${kind.toUpperCase()}.`
+  say(`Saved ${name} as ${kind.toUpperCase()}.`)
 }
 
 // ------------------------------------------------------------------ the row
+
+// What was done, in one line: in words of the browser, or of the server, which is told when they have been there for long enough.
+function speaker(line, model) {
+  let over
+  const say = (text) => {
+    line.textContent = text
+    clearTimeout(over)
+    if (text && !text.endsWith("…")) over = setTimeout(() => {
+      line.textContent = ""
+      if (text === model.said) model.send_msg({action: "read", text})
+    }, SAID_MS)
+  }
+  model.on("said", () => say(model.said))
+  say(model.said)
+  return say
+}
 
 function isText(target) {
   const kind = target?.type ?? ""
@@ -100,7 +116,7 @@ function keys(model) {
   model.on("remove", () => document.removeEventListener("keydown", pressed))
 }
 
-function textBox(el, model) {
+function textBox(el, say) {
   const box = tag("div", el, {className: "text", hidden: true})
   const label = tag("label", box, {textContent: "Copy this by hand"})
   const area = tag("textarea", label, {readOnly: true})
@@ -109,12 +125,12 @@ function textBox(el, model) {
     try {
       await navigator.clipboard.writeText(text)
       box.hidden = true
-      model.said = `Copied the ${what}.`
+      say(`Copied the ${what}.`)
     } catch {
       area.value = text
       box.hidden = false
       area.select()
-      model.said = "The browser does not let this page copy."
+      say("The browser does not let this page copy.")
     }
   }
 }
@@ -146,17 +162,24 @@ function reporter(bar, model) {
   draw()
 }
 
-function noteBox(el, model) {
+// What was refused; the function that takes it away.
+function noteBox(el, model, say) {
   const box = tag("div", el, {className: "notes", hidden: true})
   const lines = tag("div", box, {}, {role: "alert"})
-  tag("button", box, {type: "button", textContent: "Dismiss"}).onclick = () => { model.notes = [] }
+  const dismiss = () => {
+    box.hidden = true
+    model.send_msg({action: "dismiss"})
+  }
+  tag("button", box, {type: "button", textContent: "Dismiss"}).onclick = dismiss
   const draw = () => {
     lines.replaceChildren()
     model.notes.forEach((note) => tag("p", lines, {textContent: note}))
     box.hidden = model.notes.length === 0
+    if (!box.hidden) say(model.said)
   }
   model.on("notes", draw)
   draw()
+  return dismiss
 }
 
 // Parts of a view that are one of their own, to which the browser's Back returns; the others belong to the one they are changed in.
@@ -188,9 +211,10 @@ export function render({model, view, el}) {
     return location.origin + location.pathname + (query ? `?${query}` : "")
   }
   const copyLink = () => model.linked ? copy(here(), "link") : model.send_msg({action: "unlinked"})
-  const ask = (action) => () => {
-    model.said = "Preparing the file …"
-    model.send_msg({action})
+  const ask = (message) => () => {
+    dismiss()
+    say("Preparing the file …")
+    model.send_msg(message)
   }
   menu(bar, "Share", () => [
     ["Copy link", copyLink],
@@ -198,30 +222,20 @@ export function render({model, view, el}) {
     ["Copy as Python", () => copy(model.python, "Python")],
   ])
   menu(bar, "Save", () => [
-    ["Scenario as TOML", ask("toml")],
-    ...model.saves.map((name) => [name, () => {
-      model.said = "Preparing the file …"
-      model.send_msg({action: "page", name})
-    }]),
-    ...(model.ready ? [["Data as CSV", ask("csv")], ["Data as NPZ", ask("npz")]] : []),
+    ["Scenario as TOML", ask({action: "toml"})],
+    ...model.saves.map((name) => [name, ask({action: "page", name})]),
+    ...(model.ready ? [["Data as CSV", ask({action: "csv"})], ["Data as NPZ", ask({action: "npz"})]] : []),
     ...figures().flatMap(([name, view]) =>
-      KINDS.map((kind) => [`${name} as ${kind.toUpperCase()}`, () => saveFigure(name, view, kind, model)])),
+      KINDS.map((kind) => [`${name} as ${kind.toUpperCase()}`, () => saveFigure(name, view, kind, model.labels, say)])),
   ])
   reporter(bar, model)
   opener(bar, model)
-  const said = tag("span", bar, {className: "said below"}, {role: "status"})
-  const copy = textBox(el, model)
-  noteBox(el, model)
+  const say = speaker(tag("span", bar, {className: "said below"}, {role: "status"}), model)
+  const copy = textBox(el, say)
+  const dismiss = noteBox(el, model, say)
   keys(model)
 
-  let over
-  const speak = () => {
-    said.textContent = model.said
-    clearTimeout(over)
-    if (model.said && !model.said.endsWith("…")) over = setTimeout(() => { model.said = "" }, SAID_MS)
-  }
   const address = () => history.replaceState(history.state, "", here() + location.hash)
-  model.on("said", speak)
   model.on("query", address)
   travel(model, address, () => history.pushState(null, "", here()))
   if (known.has(view.model.document)) address()
@@ -229,7 +243,6 @@ export function render({model, view, el}) {
   model.on("msg:custom", (event) => {
     const {name, kind, content} = event.data ?? event
     save(name, new Blob([Uint8Array.from(atob(content), (c) => c.charCodeAt(0))], {type: kind}))
-    model.said = `Saved ${name}.`
+    say(`Saved ${name}.`)
   })
-  speak()
 }

@@ -241,7 +241,10 @@ export function render({model, view, el}) {
     text.textContent = said
     button.hidden = state !== "gone"
     box.togglePopover(said !== "")
-    if (state === "connected") hiding = setTimeout(() => box.hidePopover(), 3_000)
+    if (state === "connected") requestAnimationFrame(() => { // from when it is seen
+      clearTimeout(hiding)
+      hiding = setTimeout(() => { if (box.dataset.state === "connected") box.hidePopover() }, 3_000)
+    })
   }
   doc.wfsobs ??= new Link(doc)
   doc.wfsobs.attach(model, draw)

@@ -33,7 +33,22 @@ function themes(model) {
   follow()
 }
 
-export function render({model, el}) {
+// A text is brought to what it is to say, where Panel would draw all of it anew: a table may get numbers while one reads in it.
+function patchTexts(doc) {
+  const kind = [...doc._all_models.values()].find((it) => it.type === "panel.models.markup.HTML")?.default_view.prototype
+  if (!kind || kind.patched) return
+  const set = kind.set_html
+  kind.patched = true
+  kind.set_html = function (html) {
+    if (!html || !this.container?.hasChildNodes() || /<(script|a)\b|codehilite/.test(html)) return set.call(this, html)
+    const wanted = document.createElement("div")
+    wanted.innerHTML = html
+    patch(this.container, [...wanted.childNodes])
+  }
+}
+
+export function render({model, view, el}) {
+  patchTexts(view.model.document)
   model.width_px = window.innerWidth
   themes(model)
   const fade = () => {

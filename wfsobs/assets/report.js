@@ -1,5 +1,5 @@
 // The script of a report: reads the data embedded in the page and keeps figures, cards and table in step with the controls.
-// What draws the cards, `render`, stands above it in the same script.
+// What draws the cards, `render`, stands above it in the same script, and what that needs.
 
 const read = (id) => JSON.parse(document.getElementById(id).textContent)
 const data = read("data")
@@ -211,11 +211,15 @@ function zoom(figure, state) {
 // ------------------------------------------------------------------ cards and table
 
 function cards(target) {
-  const watchers = {items: [], hidden: []}
+  const watchers = {items: [], hidden: [], heard: []}
   const model = {
     items: [], terms: {},  // the report has a section of them
-    get hidden() { return hidden[target] },
-    set hidden(names) { hidden[target] = names; toggled(target); watchers.hidden.forEach((f) => f()) },
+    hidden: hidden[target], heard: 0,
+    send_msg({hidden: names, number: asked}) {
+      hidden[target] = names
+      Object.assign(model, {hidden: names, heard: asked})
+      toggled(target)
+    },
     on(name, f) { watchers[name].push(f) },
   }
   render({model, el: document.getElementById(`cards-${target}`)})

@@ -9,6 +9,8 @@ export function render({model, el}) {
   const note = document.createElement("div")
   note.className = "note"
   note.setAttribute("role", "alert")
+  const known = new WeakMap() // cell -> its text as sent or received
+  let shape = "" // which cells there are
   let next = "" // where the focus goes when the rows have changed
   const add = document.createElement("button")
   add.type = "button"
@@ -26,13 +28,24 @@ export function render({model, el}) {
   const cell = (row, column, value) => {
     const input = document.createElement(column.choices.length ? "select" : "input")
     input.append(...column.choices.map((choice) => new Option(choice)))
-    input.value = value
+    put(input, value)
     input.inputMode = "decimal"
     input.dataset.cell = `${row}.${column.key}`
     input.setAttribute("aria-label", `${noun} ${row + 1}: ${column.name}`)
     input.title = column.doc
-    input.onchange = () => model.send_msg({action: "edit", row, key: column.key, text: input.value})
+    input.onchange = () => {
+      known.set(input, input.value)
+      model.send_msg({action: "edit", row, key: column.key, text: input.value})
+    }
     return input
+  }
+
+  // Give a cell its text, unless one is being typed there.
+  const put = (input, text) => {
+    const typing = input === el.getRootNode().activeElement && input.value !== known.get(input)
+    if (known.get(input) === text) return
+    known.set(input, text)
+    if (!typing) input.value = text
   }
 
   const remover = (i) => {
@@ -88,6 +101,13 @@ export function render({model, el}) {
   })
 
   const draw = () => {
+    const before = shape
+    shape = JSON.stringify(model.rows.map((row) => row.map((text) => text === null)))
+    if (shape === before) mark()
+    else redraw()
+  }
+
+  const redraw = () => {
     const focused = el.getRootNode().activeElement?.dataset?.cell
     const top = scroll.scrollTop
     scroll.replaceChildren(...(model.columns.length > MOST ? drawBlocks() : drawTable()))
@@ -123,16 +143,16 @@ export function render({model, el}) {
   const mark = () => {
     const errors = model.errors
     scroll.querySelectorAll("input, select").forEach((input) => {
+      const [row, ...key] = input.dataset.cell.split(".")
+      const column = model.columns.findIndex((it) => it.key === key.join("."))
       const error = errors[input.dataset.cell]
-      if (error) {
-        input.value = error.text
-      }
+      put(input, error?.text ?? model.rows[row]?.[column] ?? known.get(input))
       input.setAttribute("aria-invalid", error ? "true" : "false")
     })
     note.textContent = Object.values(errors).map((error) => error.reason).join("\n")
   }
 
   model.on("rows", draw)
-  model.on("errors", draw)
+  model.on("errors", mark)
   draw()
 }

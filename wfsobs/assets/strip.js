@@ -1,7 +1,7 @@
 // A strip of cards, one per line of the figures below it: what it is, its number, and a switch for the line.
 // A click hides or shows a line, a double click or the key S shows it alone, and once more all of them.
-// What is hidden is the server's to say: the strip asks for it by message and shows it at once, so that what the server
-// sends while a click is on its way cannot leave the two apart.
+// What is hidden is the server's to say: the strip asks for it by message and shows it at once. What the server sends counts
+// once it has heard the last click, so that neither undoes the other.
 
 export function render({model, el}) {
   const strip = document.createElement("div")
@@ -24,11 +24,13 @@ export function render({model, el}) {
 
   let hidden = model.hidden
   let before = hidden  // the click: a double click is about what stood there before its first one
+  let asked = model.heard
 
   const hide = (names) => {
     hidden = names
     mark()
-    model.send_msg({hidden: names})
+    asked += 1
+    model.send_msg({hidden: names, number: asked})
   }
 
   const toggle = (name) => {
@@ -59,33 +61,39 @@ export function render({model, el}) {
     }
     part(card, "note", item.note)
     if (item.range) part(card, "note", item.range).title = "where the mean error over seeds lies, at 95 % confidence"
-    card.onclick = (event) => { if (event.detail < 2) toggle(item.name) }  // the second one of a double click does not count
-    card.ondblclick = () => solo(item.name, before)
-    card.onkeydown = (event) => {
-      if (event.key.toLowerCase() === "s" && !event.ctrlKey && !event.metaKey && !event.altKey) solo(item.name, hidden)
-    }
     return card
   }
 
-  const mark = () => {
-    for (const card of strip.children) {
+  const nameAt = (event) => event.target.closest(".card")?.dataset.name
+  strip.onclick = (event) => {
+    const name = nameAt(event)
+    if (name && event.detail < 2) toggle(name)  // the second one of a double click does not count
+  }
+  strip.ondblclick = (event) => {
+    const name = nameAt(event)
+    if (name) solo(name, before)
+  }
+  strip.onkeydown = (event) => {
+    const name = nameAt(event)
+    if (name && event.key.toLowerCase() === "s" && !event.ctrlKey && !event.metaKey && !event.altKey) solo(name, hidden)
+  }
+
+  const mark = (cards = [...strip.children]) => {
+    for (const card of cards) {
       const shown = !hidden.includes(card.dataset.name)
       const label = card.querySelector(".name").textContent
       card.setAttribute("aria-pressed", shown)
       card.title = `${shown ? "Hide" : "Show"} ${label}; double click or S: ${label} alone`
     }
-    const n = strip.children.length - [...strip.children].filter((it) => hidden.includes(it.dataset.name)).length
-    count.textContent = n < strip.children.length ? `${n} of ${strip.children.length} lines shown` : ""
-    all.disabled = n === strip.children.length
+    const n = cards.filter((it) => !hidden.includes(it.dataset.name)).length
+    count.textContent = n < cards.length ? `${n} of ${cards.length} lines shown` : ""
+    all.disabled = n === cards.length
   }
 
   const draw = () => {
-    const focused = el.getRootNode().activeElement?.dataset?.name
-    strip.replaceChildren(...model.items.map(cardOf))
-    mark()
-    if (focused) {
-      strip.querySelector(`[data-name="${focused}"]`)?.focus()
-    }
+    const cards = model.items.map(cardOf)
+    mark(cards)
+    patch(strip, cards)
   }
 
   const button = (text, act) => {
@@ -112,9 +120,12 @@ export function render({model, el}) {
   }
 
   model.on("items", draw)
-  model.on("hidden", () => {
+  const follow = () => {
+    if (asked !== model.heard) return  // another click is on its way
     hidden = model.hidden
     mark()
-  })
+  }
+  model.on("hidden", follow)
+  model.on("heard", follow)
   draw()
 }

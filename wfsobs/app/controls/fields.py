@@ -142,9 +142,10 @@ class TextField(Field):
             self.store.change(self.path, self.from_text(event.new))
 
     def show(self, value: Any) -> None:
-        """Put a value into the text."""
-        written = self.to_text(value)
-        self.widgets[-1].param.update(value=written, value_input=written)
+        """Put a value into the text, unless it stands there: what is being typed over it stays."""
+        written, box = self.to_text(value), self.widgets[-1]
+        if box.value != written:
+            box.param.update(value=written, value_input=written)
 
     def enter(self, value: Any) -> None:
         """Type a text, or the number that the slider stands at."""

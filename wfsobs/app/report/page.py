@@ -38,7 +38,7 @@ START = 'document.documentElement.classList.add("js")'
 def page(report: Report, date: datetime) -> str:
     """Write the whole file; date: now, in the zone to write it in."""
     bokeh = "\n".join(Resources(mode="inline", components=["bokeh"], minified=True, log_level="warn").js_raw)
-    scripts = {"start": START, "bokeh": bokeh, "page": f"{asset('strip.js')}\n{asset('report.js')}"}
+    scripts = {"start": START, "bokeh": bokeh, "page": f"{asset('patch.js')}\n{asset('strip.js')}\n{asset('report.js')}"}
     names = [state_name(report, state, i) or "All modes" for i, state in enumerate(report.states)]
     states = list(zip(report.states, names, strict=True))
     return render(

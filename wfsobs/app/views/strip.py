@@ -28,10 +28,11 @@ class Cards(JSComponent):
 
     items = param.List([], doc="{name, label, colour, dash, value, unit, note, range} of every card.")
     hidden = param.List([], doc="Names of the cards whose lines are hidden.")
+    heard = param.Integer(0, doc="Number of the last click that has arrived, and all before it.")
     terms = param.Dict({}, doc="Word that stands on the cards -> what it means.")
     main = param.String("", doc="What the button is called that shows the lines that matter; none if empty.")
 
-    _esm = asset("strip.js")
+    _esm = asset("patch.js") + asset("strip.js")
     _stylesheets = [asset("style.css"), asset("strip.css")]  # noqa: RUF012
 
     def __init__(self, **params: Any):
@@ -45,7 +46,11 @@ class Cards(JSComponent):
         if data.get("main"):
             self.on_main()
         elif isinstance(names := data.get("hidden"), list):
-            self.hidden = [name for name in names if isinstance(name, str)]
+            number = data.get("number")
+            self.param.update(
+                hidden=[name for name in names if isinstance(name, str)],
+                heard=number if isinstance(number, int) else self.heard,
+            )
 
 
 class Strip:
