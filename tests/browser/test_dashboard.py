@@ -63,9 +63,9 @@ def test_first_paint(open_page: Any, tmp_path: Path) -> None:
         assert float(value) > 0 and float(truth) > 0
         assert float(relative) == pytest.approx(float(value) / float(truth), rel=0.02)
         assert lag and float(seconds) > 0
-    points = page.evaluate(POINTS)
     lines = sum(1 + len(observers_of(target)) for target in TARGETS)
-    assert len(points) == 2 * lines and min(points) > 300, "every line of the four figures has points"
+    drawn = f"n => {{ const all = ({POINTS})(); return all.length === n && Math.min(...all) > 300 }}"
+    page.wait_for_function(drawn, arg=2 * lines)  # every line of the four figures has points
     shot(page, tmp_path, "light")
 
 

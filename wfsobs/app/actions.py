@@ -115,7 +115,7 @@ class Actions:
             "redo": self.store.redo,
             "open": lambda: self.open_file(str(msg.get("name", "")), msg.get("text")),
             "unlinked": lambda: self._note("These settings are too long for a link: save the scenario and send the file."),
-            "dismiss": lambda: self.toolbar.param.update(notes=[]),
+            "dismiss": self._dismiss,
             "read": lambda: self._take_back(msg.get("text")),
             "view": lambda: self.open_view(str(msg.get("query", ""))),
             "report": self.make_report,
@@ -205,6 +205,9 @@ class Actions:
 
     def _note(self, line: str) -> None:
         self.toolbar.param.update(notes=[line], said="")
+
+    def _dismiss(self) -> None:
+        self.toolbar.notes = []
 
     def _take_back(self, text: object) -> None:
         """Unsay what has been read, unless something else has been said meanwhile."""

@@ -60,7 +60,8 @@ export function render({model, el}) {
       value.append(unit)
     }
     part(card, "note", item.note)
-    if (item.range) part(card, "note", item.range).title = "where the mean error over seeds lies, at 95 % confidence"
+    // Its line is there before it comes, so that nothing moves then.
+    if (item.range !== undefined) part(card, "note", item.range).title = "where the mean error over seeds lies, at 95 % confidence"
     return card
   }
 
