@@ -57,7 +57,8 @@ class TestTraces:
         dashboard.display.show = "signal"
         shown = dashboard.store.run.result
         data = trace(dashboard, "turbulence")
-        assert set(data) == {"x", TRUTH, "kf-lgs", "kf-multi", "kf-adaptive", "kf-ngs", "multirate", "multirate-optimal"}
+        filters = {"kf-lgs", "kf-multi", "kf-adaptive", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi"}
+        assert set(data) == {"x", TRUTH, *filters}
         expected = 1e3 * envelope(shown.values("kf-lgs", "turbulence")[:, 0], BINS)
         assert np.allclose(data["kf-lgs"], expected, rtol=1e-6)
         assert data["x"][0] >= 0 and data["x"][-1] <= 2.0 and data["x"].size == data[TRUTH].size

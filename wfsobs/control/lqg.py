@@ -18,7 +18,8 @@ from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.multirate import filter_of_gains, multirate_gains, multirate_noise
-from wfsobs.observers.kalman.multirate_optimal import optimal_gains, optimal_model
+from wfsobs.observers.kalman.multirate_multi import every_peak_model
+from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_gains, optimal_model
 from wfsobs.observers.kalman.single import steady_gains
 from wfsobs.prior import Prior
 from wfsobs.signal.statespace import DisturbanceModel
@@ -70,19 +71,17 @@ def lqg_multirate(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
 
 def lqg_multirate_optimal(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the optimal multi-rate filter."""
-    return _optimal(prior, mode, plant, settings, None)
+    return _optimal(optimal_model(settings.multirate, prior, mode, plant.ratio), plant.mirror)
 
 
 def lqg_multirate_multi(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the optimal multi-rate filter and every peak of the vibration in its model."""
-    return _optimal(prior, mode, plant, settings, prior.lines[mode].disturbance(settings.multipeak.line_width))
+    return _optimal(every_peak_model(settings.multirate, settings.multipeak, prior, mode, plant.ratio), plant.mirror)
 
 
-def _optimal(prior: Prior, mode: int, plant: Plant, settings: Any, model: DisturbanceModel | None) -> Law:
-    model = model or prior.model[mode].disturbance()
-    cycle, rows = optimal_model(settings.multirate, prior, mode, plant.ratio, model)
-    row = command_rows(cycle[0][0], rows.sum(axis=0), plant.mirror)
-    return _two_sensors(optimal_gains(cycle)[0], row, model)
+def _optimal(cycle: Cycle, mirror: Mirror) -> Law:
+    row = command_rows(cycle.steps[0][0], cycle.rows.sum(axis=0), mirror)
+    return _two_sensors(optimal_gains(cycle.steps)[0], row, cycle.model)
 
 
 def _two_sensors(gains: GainCycle, row: Array, model: DisturbanceModel) -> Law:

@@ -169,7 +169,7 @@ def _multirate(prior: Model, settings: MultiRate, ratio: int) -> tuple[Gains, Ar
 def _optimal(prior: Prior, settings: MultiRate, ratio: int) -> tuple[Gains, Array]:
     """Return the gains of the first step and of the step with the frame, and the product of the A - K C of one cycle."""
     model = prior.model[0].disturbance()
-    made, states = optimal_filter(*optimal_model(settings, prior, 0, ratio))
+    made, states = optimal_filter(*optimal_model(settings, prior, 0, ratio)[:2])
     n = len(model.A)
     gains = {"LGS with NGS": states[-1].L[:n, 0], "NGS": states[-1].L[:n, 1]}
     if len(states) > 1:

@@ -10,6 +10,7 @@ from wfsobs.observers.gpr.online import GPR_ONLINE
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE
 from wfsobs.observers.kalman.multi import KF_MULTI
 from wfsobs.observers.kalman.multirate import MULTIRATE
+from wfsobs.observers.kalman.multirate_multi import MULTIRATE_MULTI
 from wfsobs.observers.kalman.multirate_optimal import MULTIRATE_OPTIMAL
 from wfsobs.observers.kalman.single import KF_LGS, KF_NGS
 from wfsobs.observers.ridge import RIDGE, RIDGE_30
@@ -22,6 +23,7 @@ BUILT_IN = (
     KF_NGS,
     MULTIRATE,
     MULTIRATE_OPTIMAL,
+    MULTIRATE_MULTI,
     BUTTERWORTH_OL,
     BUTTERWORTH_CL,
     GPR_OFFLINE,

@@ -16,7 +16,7 @@ from wfsobs.typing import Array
 
 
 class MultiPeak(Group):
-    """The Kalman filter with every peak of the scenario in its model."""
+    """The Kalman filters with every peak of the scenario in their models."""
 
     turbulence_order = Whole(
         2,
@@ -50,6 +50,8 @@ def step_kf_multi(prior: Prior, settings: MultiPeak, _sampling: Sampling, _horiz
     return KalmanEstimator(modes, bridges=True)
 
 
+PEAKS = Section("multipeak", "Multi-peak Kalman filter", MultiPeak)
+
 KF_MULTI = Observer(
     "kf-multi",
     "Multi-peak KF",
@@ -57,7 +59,7 @@ KF_MULTI = Observer(
     kf_multi,
     help="every line of the scenario in its model, turbulence of order 2 or 3; not in the paper",
     prior=(Lines,),
-    settings=Section("multipeak", "Multi-peak Kalman filter", MultiPeak),
+    settings=PEAKS,
     linear=True,
     tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
     look=Look("Multi-peak", "#00707F", "#4DD0E1", (14, 3)),

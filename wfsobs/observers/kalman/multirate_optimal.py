@@ -10,6 +10,9 @@ the periodic Riccati equation of the n steps. Optimal for its model only; the pa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from scipy.linalg import block_diag
 
@@ -82,33 +85,49 @@ def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[MultiRateFilter, 
     return filter_of_gains(gains, outputs), states
 
 
-def optimal_model(
-    settings: MultiRate, prior: Prior, mode: int, ratio: int, model: DisturbanceModel | None = None
-) -> tuple[list[Step], Array]:
-    """Return the cycle and output rows of one mode; model: of the disturbance, by default that of one peak."""
+class Cycle(NamedTuple):
+    """What is estimated in one mode: (A, C, Q, R) of the steps, rows of the state per target, and the disturbance alone."""
+
+    steps: list[Step]
+    rows: Array
+    model: DisturbanceModel
+
+    def filter(self) -> MultiRateFilter:
+        """Return the optimal filter."""
+        return optimal_filter(self.steps, self.rows)[0]
+
+
+def optimal_model(settings: MultiRate, prior: Prior, mode: int, ratio: int, model: DisturbanceModel | None = None) -> Cycle:
+    """Return the cycle of one mode; model: of the disturbance, by default that of one peak."""
     model = model or prior.model[mode].disturbance()
     error = prior.lgs_error[mode].process if settings.model_lgs_error else None
     cycle = optimal_cycle(model, ratio, *multirate_noise(settings, prior.model[mode]), error)
     rows = model.output_rows(TARGETS)
-    return cycle, np.hstack([rows, np.zeros((len(rows), len(cycle[0][0]) - rows.shape[1]))])
+    return Cycle(cycle, np.hstack([rows, np.zeros((len(rows), len(cycle[0][0]) - rows.shape[1]))]), model)
+
+
+def steps_of(modes: Sequence[Cycle]) -> KalmanEstimator:
+    """Return the filters of all modes, one frame at a time."""
+    filters = []
+    for one in modes:
+        gains, states = optimal_gains(one.steps)
+        filters.append(ModeFilter(one.model, gains, tuple(s.posterior for s in states)))
+    return KalmanEstimator(filters)
 
 
 def multirate_optimal(measurements: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> dict[str, Array]:
     """Run the optimal multi-rate filter over a record."""
     assert measurements.ratio is not None
     ratio = measurements.ratio
-    columns = run_modes(measurements, watch, lambda mode: optimal_filter(*optimal_model(settings, prior, mode, ratio))[0])
+    columns = run_modes(measurements, watch, lambda mode: optimal_model(settings, prior, mode, ratio).filter())
     return by_target(columns)
 
 
 def step_multirate_optimal(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:
     """Return the filters of all modes, one frame at a time."""
     assert sampling.ratio is not None
-    modes = []
-    for mode, known in enumerate(prior.model):
-        gains, states = optimal_gains(optimal_model(settings, prior, mode, sampling.ratio)[0])
-        modes.append(ModeFilter(known.disturbance(), gains, tuple(s.posterior for s in states)))
-    return KalmanEstimator(modes)
+    ratio = sampling.ratio
+    return steps_of([optimal_model(settings, prior, mode, ratio) for mode in range(sampling.n_modes)])
 
 
 MULTIRATE_OPTIMAL = Observer(
