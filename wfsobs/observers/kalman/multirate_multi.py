@@ -9,7 +9,7 @@ from __future__ import annotations
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.kalman.multi import PEAKS, MultiPeak
 from wfsobs.observers.kalman.multirate import MultiRate, run_modes
-from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_model, steps_of
+from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_model, step_filters
 from wfsobs.observers.kalman.single import NGS, by_target
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.prior import LgsError, Lines, Model, Prior
@@ -36,7 +36,7 @@ def step_multirate_multi(prior: Prior, settings: MultiPeak, sampling: Sampling, 
     """Return the filters of all modes, one frame at a time."""
     assert sampling.ratio is not None
     ratio, rates = sampling.ratio, MultiRate()
-    return steps_of([every_peak_model(rates, settings, prior, mode, ratio) for mode in range(sampling.n_modes)])
+    return step_filters([every_peak_model(rates, settings, prior, mode, ratio) for mode in range(sampling.n_modes)])
 
 
 MULTIRATE_MULTI = Observer(

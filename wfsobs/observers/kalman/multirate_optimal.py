@@ -106,7 +106,7 @@ def optimal_model(settings: MultiRate, prior: Prior, mode: int, ratio: int, mode
     return Cycle(cycle, np.hstack([rows, np.zeros((len(rows), len(cycle[0][0]) - rows.shape[1]))]), model)
 
 
-def steps_of(modes: Sequence[Cycle]) -> KalmanEstimator:
+def step_filters(modes: Sequence[Cycle]) -> KalmanEstimator:
     """Return the filters of all modes, one frame at a time."""
     filters = []
     for one in modes:
@@ -127,7 +127,7 @@ def step_multirate_optimal(prior: Prior, settings: MultiRate, sampling: Sampling
     """Return the filters of all modes, one frame at a time."""
     assert sampling.ratio is not None
     ratio = sampling.ratio
-    return steps_of([optimal_model(settings, prior, mode, ratio) for mode in range(sampling.n_modes)])
+    return step_filters([optimal_model(settings, prior, mode, ratio) for mode in range(sampling.n_modes)])
 
 
 MULTIRATE_OPTIMAL = Observer(
