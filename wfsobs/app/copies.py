@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +15,7 @@ from wfsobs.scenario import Scenario, configfile
 RECORD, SIMULATION = "wfsobs-record.npz", "wfsobs-simulation.toml"
 """Files of a command: a simulation that is saved, and its settings where they are too long to be written out."""
 
-OBSERVE, LOOP, IDENTIFY, TUNE = "observe", "loop", "identify", "tune"
+OBSERVE, LOOP, IDENTIFY, TUNE, SWEEP = "observe", "loop", "identify", "tune", "sweep"
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,9 @@ EXPLORED = CopiedTask()
 def to_command(scenario: Scenario, preset: str, source: Source | None = None, task: CopiedTask = EXPLORED) -> str:
     """Write the command that prints what a page shows; two where the record has to be simulated first."""
     given = _options(scenario, preset, FILE)
-    more = [word for name, value in task.arguments.items() for word in (f"--{name}", str(value))]
+    more = [word for name, value in task.arguments.items() for one in _as_list(value) for word in (f"--{name}", str(one))]
+    if task.what == SWEEP:  # it simulates the settings, whatever is shown
+        source = None
     if source is None and task.what != IDENTIFY:
         return shlex.join(["wfsobs", "run" if task.what == OBSERVE else task.what, *more, *given])
     file, said = (source.name, _stated_options(source)) if isinstance(source, LoadedRecord) else (RECORD, [])
@@ -47,6 +49,10 @@ def to_command(scenario: Scenario, preset: str, source: Source | None = None, ta
         return command
     simulation = _options(source.simulation, preset, SIMULATION) if source else given
     return f"{shlex.join(['wfsobs', 'run', *simulation, '--save', RECORD])} &&\n{command}"
+
+
+def _as_list(value: Any) -> Sequence[Any]:
+    return value if isinstance(value, (list, tuple)) else [value]
 
 
 def _options(scenario: Scenario, preset: str, file: str) -> list[str]:
@@ -75,6 +81,7 @@ def _stated_options(source: LoadedRecord) -> list[str]:
 
 def to_python(scenario: Scenario, preset: str, source: Source | None = None, task: CopiedTask = EXPLORED) -> str:
     """Write a script that computes and prints what a page shows."""
+    source = None if task.what == SWEEP else source
     imports, lines = {"import wfsobs"}, [f"scenario = {_scenario_code(scenario, preset, FILE)}"]
     if isinstance(source, LoadedRecord):
         stated = "".join(f"{name}={value!r}, " for name, value in vars(source.declaration).items() if value is not None)
@@ -147,4 +154,14 @@ def _arguments(arguments: Mapping[str, Any]) -> str:
     return ", ".join(f"{name}={value!r}" for name, value in arguments.items())
 
 
-_DOES = {OBSERVE: _observe, LOOP: _loop, IDENTIFY: _identify, TUNE: _tune}
+def _sweep(_has_record: bool, arguments: Mapping[str, Any]) -> Lines:
+    axes = ", ".join(f"parse_axis({text!r})" for text in arguments["over"])
+    observers = f", {arguments['observer']!r}" if arguments["observer"] else ""
+    return {"from wfsobs.campaign.sweep import parse_axis, plan_sweep, run_sweep"}, [
+        f"results = run_sweep(plan_sweep(scenario, [{axes}], {arguments['seeds']}{observers}))",
+        "for row in results.rows():",
+        "    print(*row.values())",
+    ]
+
+
+_DOES = {OBSERVE: _observe, LOOP: _loop, IDENTIFY: _identify, TUNE: _tune, SWEEP: _sweep}

@@ -24,6 +24,7 @@ class Limits:
     seconds       : how long a run takes, as estimated from its settings [s]
     megabytes     : memory of a run, likewise [MB]
     sessions      : open pages
+    sweep_seconds : how long all runs of a sweep take, as estimated [s]
     """
 
     duration: float = math.inf
@@ -34,6 +35,7 @@ class Limits:
     seconds: float = math.inf
     megabytes: float = math.inf
     sessions: float = math.inf
+    sweep_seconds: float = math.inf
 
     def check(self, scenario: Scenario) -> None:
         """Raise SettingError, one line, where a run of this scenario is more than the server allows."""
@@ -60,6 +62,14 @@ class Limits:
         if seconds > self.seconds:
             raise SettingError(f"The {what} would take about {seconds:.0f} s, at most {self.seconds:g} on this server")
 
+    def check_sweep(self, seconds: float, runs: int) -> None:
+        """Raise SettingError where a sweep of so many runs would take longer than one may."""
+        if seconds > self.sweep_seconds:
+            raise SettingError(
+                f"{runs} runs would take about {seconds:.0f} s, at most {self.sweep_seconds:g} on this server: take fewer "
+                "values, seeds or observers, or a shorter run.duration"
+            )
+
     def check_steps(self, n_steps: int) -> None:
         """Raise SettingError where a loaded record is longer than the server allows."""
         if n_steps > self.steps:
@@ -70,7 +80,15 @@ NONE = Limits()
 """For those who serve themselves."""
 
 PUBLIC = Limits(
-    duration=120.0, steps=120_000, training_size=1024, depth=1000, items=100, seconds=20.0, megabytes=600.0, sessions=100
+    duration=120.0,
+    steps=120_000,
+    training_size=1024,
+    depth=1000,
+    items=100,
+    seconds=20.0,
+    megabytes=600.0,
+    sessions=100,
+    sweep_seconds=300.0,
 )
 """For a server that strangers reach."""
 

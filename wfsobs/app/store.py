@@ -82,10 +82,7 @@ class Store(param.Parameterized):
 
     def value(self, path: str) -> Any:
         """Look up the accepted value of a setting, by dotted path."""
-        node: Any = self.scenario
-        for key in path.split("."):
-            node = node[int(key)] if isinstance(node, list) else getattr(node, key)
-        return node
+        return self.scenario.lookup(path)
 
     def change(self, path: str, value: Any) -> bool:
         """Set one setting and run; a refused value changes nothing and is noted in `errors`.

@@ -1,6 +1,5 @@
 // A box that finds settings by their name, their meaning or their path; choosing one opens its topic and goes to it.
 
-const TAG = "setting:"
 const MOST = 8 // of what is found
 
 export function render({model, el}) {
@@ -70,6 +69,7 @@ export function render({model, el}) {
     }
   }
   model.on("items", show)
+  offerSweep(model, el)
 }
 
 // Those in which every word stands, first in whose name they do.

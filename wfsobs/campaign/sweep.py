@@ -16,11 +16,12 @@ from wfsobs.cost import run_seconds
 from wfsobs.evaluation.evidence import FEWEST, Evidence, Key, gather_evidence
 from wfsobs.evaluation.scores import BOUNDS, Score
 from wfsobs.observers import OBSERVERS
-from wfsobs.pipeline import run
+from wfsobs.pipeline import observe
 from wfsobs.progress import QUIET, Watch
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation, parse_variation
 from wfsobs.settings.errors import SettingError
+from wfsobs.simulation.loop import simulate
 
 MOST_CELLS = 400
 """Maximum number of scenarios."""
@@ -29,6 +30,9 @@ MOST_VALUES = 50
 """Maximum number of values of a setting."""
 
 MOST_SEEDS = 100
+EACH_RUN = 0.3
+"""Time of a run that does not depend on its length: designs of the observers, bounds [s]."""
+
 SEED = "run.seed"
 RANGE = re.compile(r"([^:,]+):([^:,]+):([^:,]+?)(:log)?")
 
@@ -121,6 +125,10 @@ class Sweep:
         made.validate()
         return made
 
+    def value(self, cell: int, path: str) -> Any:
+        """Return the value of a setting in a cell."""
+        return self.cells[cell][path] if path in self.cells[cell] else self.base.lookup(path)
+
     @cached_property
     def edge(self) -> list[int]:
         """Cells in which every value of every setting occurs: all others are checked when they run."""
@@ -130,7 +138,8 @@ class Sweep:
     @cached_property
     def seconds(self) -> float:
         """Estimated time of all runs [s], from the mean of `edge`."""
-        return self.n_runs * float(np.mean([run_seconds(self.scenario(cell), self.observers) for cell in self.edge]))
+        costs = [EACH_RUN + run_seconds(self.scenario(cell), self.observers) for cell in self.edge]
+        return self.n_runs * float(np.mean(costs))
 
 
 def plan_sweep(base: Scenario, axes: Sequence[Variation], seeds: int, observers: Sequence[str] | None = None) -> Sweep:
@@ -181,8 +190,13 @@ def plan_sweep(base: Scenario, axes: Sequence[Variation], seeds: int, observers:
 
 
 def run_cell(sweep: Sweep, cell: int, number: int, watch: Watch = QUIET) -> tuple[Score, ...]:
-    """Run a scenario with one of the seeds, and return the scores. Raises SettingError, Cancelled."""
-    return run(sweep.scenario(cell, number), observers=sweep.observers, watch=watch).scores
+    """Run a scenario with one of the seeds, and return the scores; with the first also the bounds, which no seed changes.
+
+    Raises SettingError, Cancelled.
+    """
+    scenario = sweep.scenario(cell, number)
+    record = simulate(scenario, watch=watch)
+    return observe(record, scenario, observers=sweep.observers, watch=watch, is_simulated=number == 0).scores
 
 
 @dataclass(frozen=True)
@@ -314,3 +328,34 @@ class SweepResults:
                     }
                 )
         return out
+
+
+def run_sweep(sweep: Sweep, watch: Watch = QUIET) -> SweepResults:
+    """Run all cells of a sweep with all seeds.
+
+    Parameters
+    ----------
+    sweep : Sweep
+        What is to be run.
+    watch : Watch, optional
+        Receives the progress, and is asked at every block of work whether to stop.
+
+    Returns
+    -------
+    SweepResults
+        Errors of every cell.
+
+    Raises
+    ------
+    Cancelled
+        `watch` asks to stop.
+    """
+    results = SweepResults(sweep)
+    while (following := results.next_run()) is not None:
+        done = results.n_done
+        inner = Watch(lambda f, done=done: watch.progress((done + f) / sweep.n_runs), watch.is_cancelled)
+        try:
+            results = results.add(following[0], run_cell(sweep, *following, inner))
+        except SettingError as error:
+            results = results.add_failure(following[0], str(error))
+    return results

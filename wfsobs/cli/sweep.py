@@ -10,7 +10,7 @@ from typing import Any
 import click
 from rich.table import Table
 
-from wfsobs.campaign.sweep import MOST_SEEDS, SweepResults, parse_axis, plan_sweep, run_cell
+from wfsobs.campaign.sweep import MOST_SEEDS, SweepResults, parse_axis, plan_sweep, run_sweep
 from wfsobs.cli.options import scenario_options
 from wfsobs.cli.show import progress_bar, show_table
 from wfsobs.evaluation.evidence import FEWEST
@@ -18,7 +18,6 @@ from wfsobs.evaluation.rows import row_label
 from wfsobs.files import check_writable, write_whole
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
-from wfsobs.settings.errors import SettingError
 
 
 @click.command()
@@ -56,15 +55,8 @@ def sweep(
     if csv_file:
         check_writable(csv_file)
     click.echo(f"wfsobs: {len(plan.cells)} scenarios x {seeds} seeds = {plan.n_runs} runs, about {plan.seconds:.2g} s", err=True)
-    results = SweepResults(plan)
     with progress_bar("runs") as update:
-        while (following := results.next_run()) is not None:
-            done = results.n_done
-            watch = Watch(progress=lambda f, done=done: update((done + f) / plan.n_runs))
-            try:
-                results = results.add(following[0], run_cell(plan, *following, watch))
-            except SettingError as error:
-                results = results.add_failure(following[0], str(error))
+        results = run_sweep(plan, Watch(progress=update))
     if csv_file:
         text = _csv(results.rows())
         write_whole(csv_file, lambda file: file.write(text.encode()))

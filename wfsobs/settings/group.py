@@ -167,6 +167,24 @@ class Group(param.Parameterized):
         for name in self.settings():
             setattr(self, name, getattr(fresh, name))
 
+    def lookup(self, path: str) -> Any:
+        """Return the value of a setting.
+
+        Parameters
+        ----------
+        path : str
+            Dotted path; items of lists by number.
+
+        Returns
+        -------
+        object
+            Value.
+        """
+        node: Any = self
+        for key in path.split("."):
+            node = node[int(key)] if isinstance(node, list) else getattr(node, key)
+        return node
+
     def replace(self, changes: Mapping[str, Any]) -> Self:
         """Return a copy with some settings changed.
 

@@ -1,4 +1,4 @@
-"""A box that finds settings: what it knows of them, and what it asks of the drawer."""
+"""A box that finds settings, and the button beside the setting in use that asks for the error over it."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ class Search(JSComponent):
 
     items = param.List([], doc="{path, label, topic, doc} of every setting.")
 
-    _esm = asset("search.js")
+    _esm = asset("over.js") + asset("search.js")
     _stylesheets = [asset("search.css")]  # noqa: RUF012
 
     def __init__(self, reveal: Callable[[str], None], **params: Any):
         """Make the box. reveal : opens the topic of the setting of a path."""
         self._reveal = reveal
+        self.on_sweep: Callable[[str], None] = lambda path: None
         super().__init__(**params)
 
     def _handle_msg(self, data: dict[str, Any]) -> None:
@@ -31,6 +32,8 @@ class Search(JSComponent):
             self.items = settings_found()
         elif (path := str(data.get("path", ""))) in {item["path"] for item in self.items}:
             self._reveal(path)
+        elif isinstance(over := data.get("over"), str):
+            self.on_sweep(over)
 
 
 def settings_found() -> list[dict[str, str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import Any, Protocol
 
@@ -15,13 +16,23 @@ from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.figures import Figures
 from wfsobs.app.pages.identify import IdentifyPage
 from wfsobs.app.pages.model import ModelPage
+from wfsobs.app.pages.sweep import SweepPage
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.store import Store
 from wfsobs.app.style import HEARD
 
-EXPLORE, IDENTIFY, TUNE, LOOP, FIGURES, MODEL = "explore", "identify", "tune", "loop", "figures", "model"
+EXPLORE, IDENTIFY, TUNE, SWEEP, LOOP = "explore", "identify", "tune", "sweep", "loop"
+FIGURES, MODEL = "figures", "model"
 TITLES: Mapping[str, str] = MappingProxyType(
-    {"Explore": EXPLORE, "Identify": IDENTIFY, "Tune": TUNE, "Closed loop": LOOP, "Paper figures": FIGURES, "Model": MODEL}
+    {
+        "Explore": EXPLORE,
+        "Identify": IDENTIFY,
+        "Tune": TUNE,
+        "Sweep": SWEEP,
+        "Closed loop": LOOP,
+        "Paper figures": FIGURES,
+        "Model": MODEL,
+    }
 )
 
 WRAPPED = {"flexWrap": "wrap", "& .MuiToggleButton-root": {"width": "auto"}}
@@ -48,6 +59,7 @@ class Pages(param.Parameterized):
         self._makers: dict[str, Callable[[], Page]] = {
             IDENTIFY: lambda: IdentifyPage(store, display),
             TUNE: lambda: TunePage(store, display),
+            SWEEP: lambda: SweepPage(store, display, partial(setattr, self, "current", EXPLORE)),
             LOOP: lambda: ClosedLoopPage(store.run, display),
             FIGURES: lambda: Figures(store.run, display),
             MODEL: lambda: ModelPage(store, display),
@@ -62,6 +74,13 @@ class Pages(param.Parameterized):
         )
         self.view = pn.Column(*self.rooms.values(), sizing_mode="stretch_width", margin=0)
         self.param.watch(self._turn, "current")
+
+    def sweep_over(self, path: str) -> None:
+        """Turn to the error over one setting."""
+        self.current = SWEEP
+        page = self.made[SWEEP]
+        assert isinstance(page, SweepPage)
+        page.choose(path)
 
     def _turn(self, _event: object) -> None:
         name = self.current

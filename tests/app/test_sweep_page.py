@@ -1,0 +1,233 @@
+"""The page of sweeps: true to the core, one run at a time, behind whoever clicks, within limits."""
+
+from __future__ import annotations
+
+import csv
+import io
+import threading
+from html import unescape
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app import sweep_work
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING, Job
+from wfsobs.app.limits import NONE, Limits
+from wfsobs.app.numbers import number
+from wfsobs.app.pages.pages import EXPLORE, SWEEP
+from wfsobs.app.pages.sweep import EVERY, SweepPage, sweep_settings, usual_values
+from wfsobs.app.pages.sweep_views import FULL_MARGIN, GROUNDS, mix
+from wfsobs.app.seeds import SeedScores
+from wfsobs.app.service import Service
+from wfsobs.app.sources import SimulatedRecord
+from wfsobs.app.style import look
+from wfsobs.app.sweep_work import SweepTask
+from wfsobs.campaign.sweep import parse_axis, plan_sweep, run_sweep
+from wfsobs.scenario import Scenario
+
+WAIT = 60.0
+"""As long as one run is waited for elsewhere [s]."""
+
+WIND, RATIO = "turbulence.wind_speed", "sensors.exposure_ratio"
+
+
+@pytest.fixture
+def page(dashboard: Dashboard) -> SweepPage:
+    dashboard.pages.current = SWEEP
+    page = dashboard.pages.made[SWEEP]
+    assert isinstance(page, SweepPage)
+    return page
+
+
+def finish(page: SweepPage, loop: Any) -> None:
+    page.starter.start.param.trigger("clicks")
+    loop.until(lambda: page.work.state != RUNNING, 4 * WAIT)  # several runs
+    assert page.work.state == DONE, page.work.message
+
+
+def cell(page: SweepPage, index: int, target: str) -> dict[str, Any]:
+    return next(c for row in page.maps[target].grid["cells"] for c in row if c["index"] == index)
+
+
+def test_a_map_is_what_the_core_finds(page: SweepPage, dashboard: Dashboard, loop: Any) -> None:
+    store = dashboard.store
+    page.values[0].value, page.values[1].value, page.seeds.value = "5,20", "5,10", "3"
+    assert page.estimate.object.startswith('<p class="text" role="status">2 × 2 scenarios × 3 seeds = 12 runs, about 4 s')
+    sweep = page.plan()
+    assert "kf-adaptive" not in sweep.observers and "kf-multi" in sweep.observers
+    finish(page, loop)
+    results, expected = page.results, run_sweep(sweep)
+    assert results is not None
+    for row, one in zip(results.rows(), expected.rows(), strict=True):
+        assert {k: v for k, v in row.items() if not isinstance(v, float)} == {
+            k: v for k, v in one.items() if not isinstance(v, float)
+        }
+        # The same computation; rounding may depend on the threads of BLAS.
+        assert row["mean_rms_nm"] == pytest.approx(one["mean_rms_nm"], rel=1e-6)
+    grid = page.maps["vibration"].grid
+    assert (grid["columns"], grid["rows"]) == (["5", "20"], ["10", "5"]), "the smallest value is at the bottom"
+    assert [[c["index"] for c in row] for row in grid["cells"]] == [[1, 3], [0, 2]]
+    decided = set()
+    for index in range(4):
+        for target in ("turbulence", "vibration"):
+            best, shown = results.winner(index, target, "tip"), cell(page, index, target)
+            assert best is not None and best.margin is not None
+            assert shown["text"] == number(1e3 * best.rms)
+            assert shown["state"] == ("decided" if best.is_significant else "open")
+            assert f"{100 * best.margin:.0f} % before the next" in shown["title"] and shown["title"].endswith("; 3 seeds")
+            if best.is_significant:
+                share = 0.35 + 0.65 * min(1.0, best.margin / FULL_MARGIN)
+                assert shown["ground"] == mix(look(best.name).light, GROUNDS[False], share)
+            else:
+                assert "tied with" in shown["title"]
+            decided.add(best.is_significant)
+    assert decided == {True, False}
+    dashboard.display.unit = "mas"
+    best = results.winner(0, "vibration", "tip")
+    mas_per_um = 4e-6 / store.scenario.telescope.diameter * np.degrees(1.0) * 3.6e6
+    assert best is not None and cell(page, 0, "vibration")["text"] == number(mas_per_um * best.rms)
+    save = page.saves()["Sweep as CSV"]
+    assert save is not None
+    saved = list(csv.DictReader(io.StringIO(save.content().decode())))
+    assert [float(row["mean_rms_nm"]) for row in saved] == [row["mean_rms_nm"] for row in results.rows()]
+    a_cell_is_loaded_and_undone(page, dashboard, loop)
+
+
+def a_cell_is_loaded_and_undone(page: SweepPage, dashboard: Dashboard, loop: Any) -> None:
+    store = dashboard.store
+    before = store.scenario
+    page.maps["vibration"]._handle_msg({"load": 3})
+    assert store.scenario == before.replace({WIND: 20.0, RATIO: 10}) and dashboard.pages.current == EXPLORE
+    loop.finish(store)
+    assert store.run.result is not None and store.run.result.scenario == store.scenario
+    dashboard.pages.current = SWEEP
+    assert not page.stale.visible, "the settings of the axes differ, and no others"
+    store.change("kalman.frequency", 20.0)
+    assert page.stale.visible
+    store.undo()
+    store.undo()
+    assert store.scenario == before and not page.stale.visible
+    for nonsense in ({"load": 99}, {"load": -1}, {"load": "3"}, {}, None):
+        page.maps["vibration"]._handle_msg(nonsense)
+    assert store.scenario == before
+
+
+def test_lines_over_one_setting(page: SweepPage, dashboard: Dashboard, loop: Any) -> None:
+    page.choose(WIND)
+    assert (page.settings[0].value, page.values[0].value, page.settings[1].value) == (WIND, "1:40:5", "")
+    assert page.values[1].disabled
+    page.values[0].value, page.seeds.value = "20,5", "3"
+    finish(page, loop)
+    results = page.results
+    assert results is not None
+    lines = page.lines["vibration"]
+    data = lines.sources["kf-multi"].data
+    assert list(data["x"]) == [5.0, 20.0], "sorted"
+    for i, index in enumerate((1, 0)):
+        error = results.error(index, ("kf-multi", "vibration", "tip"))
+        assert error is not None and error[1] < error[0] < error[2]
+        assert [data[name][i] for name in ("y", "low", "high")] == pytest.approx([1e3 * e for e in error])
+    assert np.isfinite(lines.sources["bound"].data["y"]).all() and "kf-adaptive" not in lines.sources
+    assert lines.figure.xaxis[0].axis_label == "Wind speed V₀ [m/s]"
+    assert len(page.maps["vibration"].grid["cells"]) == 1
+    assert page.panes["vibration"].visible
+
+
+def test_settings_and_their_usual_values(page: SweepPage, dashboard: Dashboard) -> None:
+    scenario = dashboard.store.scenario
+    paths = list(sweep_settings(scenario).values())
+    assert {WIND, RATIO, "vibration.source", "run.duration"} <= set(paths) and len(set(paths)) == len(paths)
+    assert "run.seed" not in paths and not any(path.startswith("vibration.peaks") for path in paths)
+    for path in paths:
+        axis = parse_axis(f"{path}={usual_values(scenario, path)}")
+        assert len(axis.values) >= 2
+        for value in axis.values:  # each is one that the setting takes
+            scenario.replace({path: value})
+    assert usual_values(scenario, RATIO) == "1,6,10,15,20"
+    dashboard.pages.sweep_over("vibration.peaks.0.frequency")
+    assert page.settings[0].value == "vibration.peaks.0.frequency" and page.plan().axes[0].values[0] == 5
+    dashboard.controls.search._handle_msg({"over": RATIO})
+    assert page.settings[0].value == RATIO and page.values[0].value == "1,6,10,15,20"
+    dashboard.controls.search._handle_msg({"over": "no.such"})
+    assert page.settings[0].value == RATIO
+
+
+def test_what_cannot_be_run_is_said_in_one_line(page: SweepPage, dashboard: Dashboard) -> None:
+    store = dashboard.store
+    for field, text, line in (
+        (page.values[0], "20:5:4", "Wind speed V₀=20:5:4: the first number must be below the second"),
+        (page.values[0], "5:500:3", "Wind speed V₀ = 252.5: takes a number from 0.1 to 100 m/s"),
+        (page.values[1], "", "Exposure ratio n: takes values, such as 5:20:4 or 5,10,20"),
+        (page.seeds, "many", "Seeds of each = 'many': takes a whole number from 1 to 100"),
+        (page.seeds, "0", "seeds = 0: takes a whole number from 1 to 100"),
+    ):
+        before = field.value
+        field.value = text
+        assert (
+            line in unescape(page.estimate.object) and 'class="failure"' in page.estimate.object and page.starter.start.disabled
+        )
+        page.start()
+        assert page.work.state == FAILED and line in page.starter.status.note and "\n" not in page.starter.status.note
+        field.value = before
+        assert 'class="text"' in page.estimate.object and not page.starter.start.disabled
+    store.limits = Limits(sweep_seconds=10.0)
+    page.observers.value = EVERY
+    seconds = plan_sweep(store.scenario, [parse_axis(f"{WIND}=5:25:5"), parse_axis(f"{RATIO}=2,5,10,20")], 4).seconds
+    assert f"80 runs would take about {seconds:.0f} s, at most 10 on this server" in page.estimate.object
+    store.limits = Limits(duration=1.0)
+    page.seeds.value = "3"
+    assert "Duration = 2: at most 1 s on this server" in page.estimate.object
+    store.limits = NONE
+    store.source = SimulatedRecord(store.scenario)
+    assert "go back to the simulation first" in page.estimate.object
+
+
+@pytest.fixture
+def service() -> Any:
+    service = Service(NONE, 1, 1_000_000)
+    yield service
+    service.close(20.0)
+
+
+def test_a_click_waits_for_one_run_at_most_and_what_was_run_is_kept(
+    service: Service, short: Scenario, loop: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, begun, go = [], threading.Event(), threading.Event()
+
+    def compute(_sweep: Any, cell: int, number: int, *_: Any) -> SeedScores:
+        log.append((cell, number))
+        begun.set()
+        go.wait(30)
+        return SeedScores((), np.zeros(1))
+
+    monkeypatch.setattr(sweep_work, "compute", compute)
+    session = service.enter()
+    session.post = loop.queue.put
+    task = SweepTask(session)
+    task.begin(plan_sweep(short, [parse_axis(f"{WIND}=5,10,15")], 2))
+    assert begun.wait(30)
+    service.queue.submit(Job("run", lambda *_: log.append("click")), "another", lambda _news: None)
+    go.set()
+    loop.until(lambda: len(log) >= 4)
+    assert log[:3] == [(0, 0), "click", (1, 0)], "one worker: the click came during the first run"
+    task.cancel()
+    assert task.state == CANCELLED and 2 <= task.result.n_done < 6
+    task.begin(plan_sweep(short, [parse_axis(f"{WIND}=5,10,15")], 2))
+    loop.until(lambda: task.state == DONE)
+    assert task.result.n_done == 6 and task.progress == 1.0
+    runs = [entry for entry in log if entry != "click"]
+    assert len(runs) - len(set(runs)) <= 1, "what was done before the stop is not done again, but for the run under way"
+    session.leave()
+
+
+def test_a_cell_that_cannot_be_run_says_why(page: SweepPage, loop: Any) -> None:
+    """The warm-up is longer than the record in one combination alone."""
+    page.settings[0].value, page.settings[1].value = "run.duration", "run.warm_up"
+    page.values[0].value, page.values[1].value, page.seeds.value = "2,1", "0.2,1.5", "1"
+    finish(page, loop)
+    assert page.results is not None and set(page.results.failures) == {3} and page.results.n_done == 4
+    shown = cell(page, 3, "vibration")
+    assert shown["state"] == "failed" and shown["text"] == "×" and "warm_up" in shown["title"]
+    assert cell(page, 0, "vibration")["title"].endswith("; too few seeds to tell; 1 seed")

@@ -1,0 +1,299 @@
+"""Errors over one setting, or a map over two with the best observer of each cell, over several seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from html import escape
+from time import monotonic
+from typing import Any
+
+import panel as pn
+import panel_material_ui as pmui
+import param
+
+from wfsobs.app.controls.fields import number_text, parse_number
+from wfsobs.app.controls.names import name_settings
+from wfsobs.app.copies import SWEEP, CopiedTask
+from wfsobs.app.display import Display
+from wfsobs.app.downloads import Save, table_csv
+from wfsobs.app.jobs.job import RUNNING
+from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
+from wfsobs.app.pages.sweep_views import SweepLines, SweepMap, axis_title, legend_of_shades, map_grid
+from wfsobs.app.store import Store
+from wfsobs.app.style import look
+from wfsobs.app.sweep_work import SweepTask
+from wfsobs.campaign.sweep import MOST_SEEDS, SEED, Sweep, SweepResults, parse_axis, plan_sweep
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.grid import Variation
+from wfsobs.settings.errors import SettingError
+
+INTRO = (
+    "Runs the scenario in the drawer over the values of one setting, or every combination of two, with several seeds of each. "
+    "Values are low:high:number, low:high:number:log, or a list with commas. A single setting gives the error of every observer "
+    "over it, with the interval of its mean; two give a map of the best observer."
+)
+EARLIER = "The settings in the drawer have changed since this sweep."
+FIRST = (("turbulence.wind_speed", "5:25:5"), ("sensors.exposure_ratio", "2,5,10,20"))
+SEEDS = 4
+NONE = ""
+QUICK, EVERY = "quick", "every"
+OBSERVERS_OF = {"Without those that learn as they run": QUICK, "All": EVERY}
+REDRAW = 0.3
+"""Least time between two pictures while runs come in [s]."""
+
+
+class SweepPage(PageActions):
+    """The page. Nothing is run before it is asked for."""
+
+    def __init__(self, store: Store, display: Display, explore: Callable[[], None]):
+        """Make the page. explore : turns to the page that shows a scenario."""
+        self.store, self.display, self._explore = store, display, explore
+        self.work = SweepTask(store.session)
+        self.starter = Starter(self.work, "Run the sweep", "Progress of the sweep", self._so_far, uses=())
+        names = sweep_settings(store.scenario)
+        self.settings = [
+            pmui.Select(label=label, options=options, value=path, size="small", width=290, margin=0, searchable=True)
+            for label, options, (path, _) in zip(
+                ("Error over", "and over"), (names, {"no second setting": NONE, **names}), FIRST, strict=True
+            )
+        ]
+        self.values = [
+            pmui.TextInput(label=label, value=values, size="small", width=150, margin=0)
+            for label, (_, values) in zip(("Values", "Values of the second"), FIRST, strict=True)
+        ]
+        self.seeds = pmui.TextInput(label="Seeds of each", value=str(SEEDS), size="small", width=120, margin=0)
+        self.observers = pmui.Select(label="Observers", options=OBSERVERS_OF, value=QUICK, size="small", width=290, margin=0)
+        self.inputs = (*self.settings, *self.values, self.seeds, self.observers)
+        self.estimate = html()
+        self.maps = {target: SweepMap(self.load, grid={}, **WIDE) for target in TARGETS}
+        self.lines: dict[str, SweepLines] = {}
+        self.panes = {target: pn.Column(**WIDE) for target in TARGETS}
+        self.legends = {target: html() for target in TARGETS}
+        self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
+        self.boxes = [box(target.capitalize(), self.legends[target], self.panes[target], self.maps[target]) for target in TARGETS]
+        self.shades = text(legend_of_shades())
+        self.visible, self._drawn = False, 0.0
+        for part in (*self.boxes, self.shades):
+            part.visible = False
+        self._watch()
+
+    def _watch(self) -> None:
+        self.starter.start.on_click(lambda _event: self.start())
+        for select, values in zip(self.settings, self.values, strict=True):
+            select.param.watch(lambda event, values=values: self._suggest(event, values), "value")
+        for field in self.inputs:
+            field.param.watch(self._estimate, "value")
+        self.work.param.watch(self._take, ["state", "result"])
+        self.store.param.watch(self._follow, ["scenario", "source"])
+        self.display.param.watch(self._redraw, ["mode", "unit", "dark"])
+
+    def view(self) -> pn.Column:
+        """Return the contents of the page."""
+        row = line(*(field for pair in zip(self.settings, self.values, strict=True) for field in pair))
+        more = line(self.seeds, self.observers, *self.starter.view())
+        return pn.Column(
+            box("Sweep", text(INTRO), row, more, self.estimate, self.starter.status, self.stale),
+            *self.boxes,
+            self.shades,
+            **WIDE,
+            stylesheets=[":host { gap: 10px; }"],
+        )
+
+    def show(self, visible: bool) -> None:
+        """Draw what has come meanwhile, and go on while visible."""
+        self.visible = visible
+        self._estimate()
+        self._redraw()
+
+    def choose(self, path: str) -> None:
+        """Prepare the error over one setting, by its path."""
+        first = self.settings[0]
+        if path not in first.options.values():
+            if not any(path == known for known, _, _ in self.store.scenario.walk()):
+                return
+            first.options = {**first.options, axis_title(self.store.scenario, path): path}
+        self.settings[1].value = NONE
+        if first.value == path:
+            self.values[0].value = usual_values(self.store.scenario, path)
+        first.value = path
+
+    def plan(self) -> Sweep:
+        """Return the sweep that the fields describe. Raises SettingError."""
+        if self.store.source is not None:
+            raise SettingError("A sweep simulates the settings: go back to the simulation first")
+        axes = [
+            read_axis(select.value, values.value)
+            for select, values in zip(self.settings, self.values, strict=True)
+            if select.value != NONE
+        ]
+        seeds = parse_number(str(self.seeds.value))
+        if not isinstance(seeds, int):
+            raise SettingError(f"Seeds of each = {str(seeds)[:40]!r}: takes a whole number from 1 to {MOST_SEEDS}")
+        quick = [o.id for o in OBSERVERS.values() if not o.slow]
+        sweep = plan_sweep(self.store.scenario, axes, seeds, quick if self.observers.value == QUICK else None)
+        for cell in sweep.edge:
+            self.store.limits.check(sweep.scenario(cell))
+        self.store.limits.check_sweep(sweep.seconds, sweep.n_runs)
+        return sweep
+
+    def start(self) -> None:
+        """Run the sweep that the fields describe, or say in one line why not."""
+        try:
+            sweep = self.plan()
+        except SettingError as error:
+            self.work.refuse(_line_of(error))
+        else:
+            self.lines = {}
+            self.work.begin(sweep)
+
+    def load(self, cell: int) -> None:
+        """Take the scenario of a cell into the drawer, and show it."""
+        results = self.results
+        if results is None or not 0 <= cell < len(results.sweep.cells):
+            return
+        try:
+            self.store.run_on(None, results.sweep.scenario(cell))
+        except SettingError as error:
+            self.work.refuse(_line_of(error))
+        else:
+            self._explore()
+
+    @property
+    def results(self) -> SweepResults | None:
+        """What is known of the last sweep."""
+        return self.work.result
+
+    @property
+    def task(self) -> CopiedTask:
+        """To run the sweep."""
+        given = [
+            f"{select.value}={values.value}"
+            for select, values in zip(self.settings, self.values, strict=True)
+            if select.value != NONE
+        ]
+        chosen = [o.id for o in OBSERVERS.values() if not o.slow] if self.observers.value == QUICK else []
+        return CopiedTask(SWEEP, {"over": given, "seeds": self.seeds.value, "observer": chosen})
+
+    def saves(self) -> Mapping[str, Save | None]:
+        """Offer the errors of all cells, as `wfsobs sweep --csv` writes them."""
+        results = self.results
+        known = results is not None and results.rows()
+        return {"Sweep as CSV": Save("wfsobs-sweep.csv", "text/csv", lambda: table_csv(known)) if known else None}
+
+    def _suggest(self, event: param.parameterized.Event, values: pmui.TextInput) -> None:
+        """Offer values of a setting that has been chosen."""
+        if event.new != NONE:
+            values.value = usual_values(self.store.scenario, event.new)
+        values.disabled = event.new == NONE
+
+    def _follow(self, *_: object) -> None:
+        self._compare()
+        self._estimate()
+
+    def _estimate(self, *_: object) -> None:
+        """Say what would be run, or why it cannot be."""
+        if not self.visible:
+            return
+        try:
+            sweep = self.plan()
+        except SettingError as error:
+            said, kind = _line_of(error), "failure"
+        else:
+            counts = " × ".join(str(len(axis.values)) for axis in sweep.axes)
+            said = f"{counts} scenarios × {sweep.seeds} seeds = {sweep.n_runs} runs, about {max(sweep.seconds, 1.0):.0f} s"
+            kind = "text"
+        self.starter.start.disabled = kind == "failure"
+        self.estimate.object = f'<p class="{kind}" role="status">{escape(said)}</p>'
+
+    def _so_far(self) -> str:
+        results = self.results
+        if results is None:
+            return ""
+        left = self.work.seconds_left
+        said = f" · {results.n_done} of {results.sweep.n_runs} runs"
+        return f"{said}, about {left:.0f} s left" if left and self.work.state == RUNNING else said
+
+    def _take(self, *_: object) -> None:
+        """Draw what has come, not too often."""
+        if self.work.state != RUNNING or monotonic() - self._drawn >= REDRAW:
+            self._redraw()
+
+    def _redraw(self, *_: object) -> None:
+        results = self.results
+        if not self.visible or results is None:
+            return
+        self._drawn = monotonic()
+        single = len(results.sweep.axes) == 1
+        with pn.io.hold():
+            for target in TARGETS:
+                self.maps[target].grid = map_grid(results, target, self.display)
+                if single:
+                    self._draw_lines(results, target)
+                self.panes[target].visible = self.legends[target].visible = single
+            for part in (*self.boxes, self.shades):
+                part.visible = True
+            self._compare()
+
+    def _draw_lines(self, results: SweepResults, target: str) -> None:
+        if target not in self.lines:
+            self.lines[target] = SweepLines(results, target)
+            self.panes[target][:] = [pn.pane.Bokeh(self.lines[target].figure, **WIDE)]
+        lines = self.lines[target]
+        lines.draw(results, self.display)
+        lines.restyle(self.display.dark)
+        self.legends[target].object = legend({name: look(name).label for name in lines.sources}, self.display.dark)
+
+    def _compare(self, *_: Any) -> None:
+        """Whether all other settings are still those of the sweep."""
+        results = self.results
+        if results is None or not self.visible:
+            return
+        sweep, now = results.sweep, self.store.scenario
+        try:
+            self.stale.visible = now.replace({axis.path: sweep.value(0, axis.path) for axis in sweep.axes}) != sweep.scenario(0)
+        except SettingError:
+            self.stale.visible = True
+
+
+def _line_of(error: SettingError) -> str:
+    return name_settings(str(error).removeprefix("--over ").partition("\n")[0])
+
+
+def read_axis(path: str, values: str) -> Variation:
+    """Read the values of a setting as they were typed. Raises SettingError."""
+    if not values.strip():
+        raise SettingError(f"{path}: takes values, such as 5:20:4 or 5,10,20")
+    return parse_axis(f"{path}={values.replace('−', '-').strip()}")
+
+
+def sweep_settings(scenario: Scenario) -> dict[str, str]:
+    """Name -> path of every setting that a sweep can be over; those of lists, and those with one choice, are left out."""
+    lists = tuple(f"{path}." for path, _ in scenario.lists())
+    kinds = (param.Number, param.Selector, param.Boolean)
+    topics = Scenario.settings()
+    out = {}
+    for path, _, p in scenario.walk():
+        several = not isinstance(p, param.Selector) or len(p.objects) > 1
+        if path != SEED and isinstance(p, kinds) and several and not path.startswith(lists):
+            topic, name = str(topics[path.split(".")[0]].label), axis_title(scenario, path)
+            out[name if name.startswith(f"{topic}:") else f"{topic}: {name}"] = path
+    return out
+
+
+def usual_values(scenario: Scenario, path: str) -> str:
+    """Suggest values of a setting: over its usual range, or around its present value."""
+    p: Any = {known: p for known, _, p in scenario.walk()}[path]
+    if isinstance(p, param.Boolean):
+        return "false,true"
+    if isinstance(p, param.Selector):
+        return ",".join(map(str, p.objects))
+    least, most = p.bounds
+    now = float(scenario.lookup(path))
+    low, high = p.softbounds or ((0.5 * now, 2.0 * now) if now else (least, least + 1.0))
+    low, high = max(low, least), min(high, most)
+    if isinstance(p, param.Integer):
+        count = min(5, int(high) - int(low) + 1)
+        return ",".join(str(v) for v in dict.fromkeys(round(low + (high - low) * i / (count - 1)) for i in range(count)))
+    return f"{number_text(low)}:{number_text(high)}:5"
