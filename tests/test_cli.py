@@ -39,6 +39,10 @@ KEYS = {
     "needs",
     "interval_um",
     "phases_um",
+    "sd_um",
+    "within_68",
+    "within_95",
+    "crps_um",
     "seed",
 }
 SHORT = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50, "adaptive.window": 0.5}

@@ -12,7 +12,7 @@ import numpy as np
 from wfsobs.evaluation.record_bounds import Bound, bound_scores, record_bounds
 from wfsobs.evaluation.scores import score
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import Estimate, Observer
+from wfsobs.observers.base import Estimate, Estimates, Observer
 from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.scenario import arguments, as_sampled
 from wfsobs.priors_from.training import trained_until, with_training
@@ -136,7 +136,11 @@ def _from(estimate: Estimate, first: int) -> Estimate:
     """Return the estimate without its first steps."""
     if first == 0:
         return estimate
-    return replace(estimate, values=np.vstack([np.full_like(estimate.values[:first], np.nan), estimate.values[first:]]))
+
+    def cut(x: Array) -> Array:
+        return np.vstack([np.full_like(x[:first], np.nan), x[first:]])
+
+    return replace(estimate, values=cut(estimate.values), sd=None if estimate.sd is None else cut(estimate.sd))
 
 
 def as_stated(record: Record, scenario: Scenario) -> Scenario:
@@ -217,7 +221,7 @@ def _only_forward(tell: Callable[[float], None]) -> Callable[[float], None]:
     return told
 
 
-def run_observer(name: str, record: Record, scenario: Scenario, watch: Watch = QUIET) -> dict[str, Array]:
+def run_observer(name: str, record: Record, scenario: Scenario, watch: Watch = QUIET) -> Estimates:
     """Return {target: (n_steps, n_modes) [um]} of one observer.
 
     Raises ValueError with the reason where there is none, Cancelled.
@@ -238,4 +242,4 @@ def _one(observer: Observer, record: Record, scenario: Scenario, watch: Watch) -
     except ValueError as error:
         return [Failure(observer.id, f"{observer.id} left out: {error}")]
     seconds = (perf_counter() - start) / max(record.n_steps * record.n_modes, 1)
-    return [Estimate(observer.id, target, values[target], seconds) for target in observer.targets]
+    return [Estimate(observer.id, target, values[target], seconds, values.sd.get(target)) for target in observer.targets]

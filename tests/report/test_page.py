@@ -97,6 +97,7 @@ def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any)
                 lag,
                 number(row[TIME]),
                 "–" if row[TIME] is None else number(row[TIME] / 1000.0, 2),
+                "–" if row["sd_um"] is None else number(1e3 * row["sd_um"]),
             ]
         plain = {key: [re.sub(r"^(best|above truth) ", "", cell) for cell in cells] for key, cells in got.items()}
         assert plain == want

@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 import param
 
-from wfsobs.app.glossary import LAG, NEEDS, REAL_TIME, RELATIVE, RMS_ERROR, TERMS
+from wfsobs.app.glossary import LAG, NEEDS, REAL_TIME, RELATIVE, RMS_ERROR, STATED, TERMS
 from wfsobs.app.pin import Pin
 from wfsobs.sensors.modes import HIGHEST_ORDER, TIP_TILT, Mode, modes_up_to
 from wfsobs.settings.parameters import unit_of
@@ -73,6 +73,7 @@ def score_columns(unit: str, base: str = "truth", pin_columns: Mapping[str, str]
         "Lag [ms]": TERMS[LAG],
         "Time per step [µs]": "Computing time per step and mode",
         "Real-time factor": TERMS[REAL_TIME],
+        f"Stated [{unit}]": TERMS[STATED],
     }
 
 

@@ -9,7 +9,7 @@ from markupsafe import Markup, escape
 
 from wfsobs.app.render import macro
 
-BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME = (
+BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME, STATED = (
     "Bound",
     "Needs",
     "Lag",
@@ -17,6 +17,7 @@ BOUND, NEEDS, LAG, STREHL, RELATIVE, RMS_ERROR, REAL_TIME = (
     "× truth",
     "RMS error",
     "Real-time factor",
+    "Stated",
 )
 
 TERMS: Mapping[str, str] = MappingProxyType(
@@ -35,6 +36,10 @@ TERMS: Mapping[str, str] = MappingProxyType(
         NEEDS: ("What an observer must be given beside measurements: a model, the true lines, frequency bands or training data."),
         LAG: "Delay of the estimate: where its cross-correlation with the truth has its maximum. Negative if the estimate leads.",
         REAL_TIME: "Computing time per step over the period of the loop. Below 1 the observer is fast enough for it.",
+        STATED: (
+            "Standard deviation that the observer's own model gives its estimates. Equal to the RMS error where that model is "
+            "true; far below it, the observer is too sure of itself. A line that is shown alone has its 95 % band."
+        ),
         STREHL: "Peak intensity over that of an image without error, from the residual of the simulated modes; at most 1.",
     }
 )

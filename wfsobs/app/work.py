@@ -88,6 +88,11 @@ class RunResults:
         estimate = self.result.estimate(observer, target)
         return estimate.values if estimate else self.partial.get((observer, target))
 
+    def sd(self, observer: str, target: str) -> Array | None:
+        """(n_steps, n_modes) [um], the standard deviation that a finished estimate states, or None."""
+        estimate = self.result.estimate(observer, target)
+        return estimate.sd if estimate else None
+
 
 def one_blas_thread() -> None:
     """Let BLAS use one thread: the observers bring their own, and sessions share the processors."""

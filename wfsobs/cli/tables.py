@@ -25,7 +25,7 @@ def score_table(rows: Sequence[Row]) -> Table:
         table.add_column(name, no_wrap=True)
     bounded = ("95 %, nm",) if any(r["interval_um"] for r in rows) else ()
     spread = ("spread, nm",) if several else ()
-    for name in ("error, nm", *spread, *bounded, f"{base}, nm", f"error / {base}", "lag, ms", "us / step"):
+    for name in ("error, nm", *spread, *bounded, "stated, nm", f"{base}, nm", f"error / {base}", "lag, ms", "us / step"):
         table.add_column(name, justify="right", no_wrap=True)
     last = None
     for target, mode, observer in sorted({(r["target"], r["mode"], r["observer"]) for r in rows}, key=_order(rows)):
@@ -42,6 +42,7 @@ def score_table(rows: Sequence[Row]) -> Table:
             f"{median(errors):.2f}",
             *((f"{min(errors):.2f} - {max(errors):.2f}",) if several else ()),
             *((interval_text(same[0]["interval_um"], 1e3),) if bounded else ()),
+            _number(same, "sd_um", 1e3, 2),
             f"{median(r['truth_rms_um'] for r in same) * 1e3:.2f}",
             _number(same, "normalised_rms", 1.0, 3),
             _number(same, "lag_s", 1e3, 2),

@@ -39,11 +39,18 @@ def score_rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
             "needs": row_needs(s.observer),
             "interval_um": None if s.interval is None else list(s.interval),
             "phases_um": None if s.phases is None else list(s.phases),
+            **_calibration(s),
             "seed": seed,
             TIME: None if s.observer in NOT_OBSERVERS else s.seconds_per_step * 1e6,
         }
         for s in scores
     ]
+
+
+def _calibration(score: Score) -> Row:
+    """Return what the observer states of its errors, and how it fits them; None where it states nothing."""
+    names = ("sd_um", "within_68", "within_95", "crps_um")
+    return dict(zip(names, score.calibration or (None,) * len(names), strict=True))
 
 
 def interval_text(interval: Sequence[float] | None, scale: float) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wfsobs.evaluation.calibration import Calibration, calibration
 from wfsobs.evaluation.lag import lag
 from wfsobs.observers.base import TARGETS, Estimate
 from wfsobs.record import Record
@@ -54,6 +55,8 @@ class Score:
         Of the bound of the LGS: range of the rms of an optimal observer in 95 % of records [um].
     phases : tuple of float or None
         Of the bound of both sensors: the bound in steps with an NGS frame, one step later, ... [um]; `rms` is over all.
+    calibration : Calibration or None
+        How the standard deviation that the observer states fits its errors; None where it states none.
     """
 
     observer: str
@@ -69,6 +72,7 @@ class Score:
     apart: bool = False
     interval: tuple[float, float] | None = None
     phases: tuple[float, ...] | None = None
+    calibration: Calibration | None = None
 
 
 def common_samples(samples: Sequence[Array]) -> list[tuple[Array, bool]]:
@@ -156,6 +160,7 @@ def supervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: fl
                         e.seconds_per_step,
                         *_stretch(samples, record.dt),
                         apart,
+                        calibration=None if e.sd is None else calibration(value - t, e.sd[samples, mode]),
                     )
                 )
     return out

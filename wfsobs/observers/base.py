@@ -6,7 +6,7 @@ the prior that it asked for and its own settings: the truth is out of reach.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, NamedTuple
 
@@ -73,6 +73,23 @@ PLAIN = Look(dash=(4, 2))
 """Default look."""
 
 
+class Estimates(dict[str, Array]):
+    """Estimates of an observer, target -> (n_steps, n_modes) [um], and how sure it is of them.
+
+    Parameters
+    ----------
+    values : mapping of str to Array
+        Target -> estimate, NaN where there is none.
+    sd : mapping of str to Array, optional
+        Target -> standard deviation of the estimate's error by the observer's own model in its steady state,
+        (n_steps, n_modes) [um], perhaps a read-only view of fewer numbers; no target without a model, NaN where not known.
+    """
+
+    def __init__(self, values: Mapping[str, Array], sd: Mapping[str, Array] | None = None):
+        super().__init__(values)
+        self.sd = dict(sd or {})
+
+
 def _nothing(_settings: Group | None) -> tuple[Part, ...]:
     return ()
 
@@ -88,7 +105,8 @@ class Observer:
     targets : tuple of str
         What it estimates, of "turbulence" and "vibration".
     run : callable
-        (measurements without gaps, prior, settings, watch) -> {target: (n_steps, n_modes) [um]}, NaN without an estimate.
+        (measurements without gaps, prior, settings, watch) -> {target: (n_steps, n_modes) [um]}, NaN without an estimate;
+        `Estimates` where it has a standard deviation.
     help : str
         One line of description.
     prior : tuple
@@ -142,7 +160,7 @@ class Observer:
 
     def estimate(
         self, measurements: Measurements, prior: Prior, settings: Group | None = None, watch: Watch = QUIET
-    ) -> dict[str, Array]:
+    ) -> Estimates:
         """Run the observer on measurements; missing samples are filled by the model of its prior.
 
         Parameters
@@ -158,8 +176,8 @@ class Observer:
 
         Returns
         -------
-        dict of str to Array
-            Target -> estimate, (n_steps, n_modes) [um]; NaN where there is none.
+        Estimates
+            Target -> estimate, (n_steps, n_modes) [um]; NaN where there is none. With `sd`, their standard deviations.
 
         Raises
         ------
@@ -169,7 +187,8 @@ class Observer:
             `watch` asks to stop.
         """
         whole = fill_missing(measurements, prior, getattr(settings, "line_width", LINE_WIDTH))
-        return self.run(whole, prior, settings, watch)
+        found = self.run(whole, prior, settings, watch)
+        return found if isinstance(found, Estimates) else Estimates(found)
 
     def design(self, prior: Prior, settings: Group | None, sampling: Sampling, horizon: float = 0.0) -> StepObserver:
         """Return the observer one frame at a time; missing samples are filled as in `estimate`.
@@ -229,12 +248,23 @@ class Observer:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate of one target by one observer: values (n_steps, n_modes) [um] and computing time per step and mode [s].
+    """Estimate of one target by one observer.
 
-    NaN where there is no estimate.
+    Attributes
+    ----------
+    observer, target : str
+        Of whom, and of what.
+    values : Array
+        Estimate, (n_steps, n_modes) [um]; NaN where there is none.
+    seconds_per_step : float
+        Computing time per step and mode [s].
+    sd : Array or None
+        Standard deviation of its error by the observer's own model, (n_steps, n_modes) [um]; None where it has no model, NaN
+        where there is no number.
     """
 
     observer: str
     target: str
     values: Array
     seconds_per_step: float
+    sd: Array | None = None

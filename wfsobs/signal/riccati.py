@@ -209,6 +209,39 @@ def _lyapunov_around(cycle: Sequence[Step], states: Sequence[SteadyState]) -> Ar
     return lyapunov(F, W)
 
 
+def posteriors_of_gains(cycle: Sequence[Step], gains: Sequence[Array]) -> list[Array]:
+    """Return the covariances of a filter whose gains need not be optimal, in its steady state.
+
+    Parameters
+    ----------
+    cycle : sequence of Step
+        (A, C, Q, R) of every step of the cycle, as for `steady_state`.
+    gains : sequence of Array
+        Filter gain of every step, (n, m).
+
+    Returns
+    -------
+    list of Array
+        Covariance after the measurement of every step, (n, n).
+
+    Raises
+    ------
+    RiccatiError
+        The filter is not stable.
+    """
+    F, W = np.eye(len(cycle[0][0])), np.zeros_like(cycle[0][0])
+    for (A, C, Q, R), L in zip(cycle, gains, strict=True):
+        reduced = np.eye(len(A)) - L @ C
+        W = A @ (reduced @ W @ reduced.T + L @ R @ L.T) @ A.T + Q
+        F = A @ reduced @ F
+    P, out = lyapunov(F, W), []
+    for (A, C, Q, R), L in zip(cycle, gains, strict=True):
+        reduced = np.eye(len(A)) - L @ C
+        out.append(reduced @ P @ reduced.T + L @ R @ L.T)
+        P = A @ out[-1] @ A.T + Q
+    return out
+
+
 def _closed_loop(cycle: Sequence[Step], states: Sequence[SteadyState]) -> Array:
     F = np.eye(len(cycle[0][0]))
     for (A, C, _, _), state in zip(cycle, states, strict=True):

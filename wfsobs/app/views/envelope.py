@@ -33,5 +33,14 @@ def envelope(x: Array, bins: int) -> Array:
     return np.column_stack([np.where(falling, high, low), np.where(falling, low, high)]).ravel()
 
 
+def band_envelope(low: Array, high: Array, bins: int) -> tuple[Array, Array]:
+    """Return the lowest and the highest of a band in every bin, at the times of `envelope_times`."""
+    n = low.size
+    if n <= 2 * bins:
+        return low, high
+    starts = _edges(n, bins)[:-1]
+    return np.repeat(np.fmin.reduceat(low, starts), 2), np.repeat(np.fmax.reduceat(high, starts), 2)
+
+
 def _edges(n: int, bins: int) -> NDArray[np.int64]:
     return np.linspace(0, n, bins + 1).astype(np.int64)

@@ -93,6 +93,7 @@ class Table:
                 row_needs(score.observer),
                 NOTHING,
                 *_times(score, shown.result.record.dt),
+                NOTHING,
             ]
             head = "Recorded loop, residual" if score.observer == LOOP else self._head(score.observer) + _own(score)
             found.append(Row(head, cells, {"observer": score.observer, "target": score.target}))
@@ -130,7 +131,7 @@ class Table:
 
     def _row(self, name: str, target: str, score: Score | None, mark: Markup) -> Row:
         shown, pinned = self.run.result, self._pinned_cells(name, target, score)
-        cells = [NOTHING, *pinned, *[NOTHING] * 2, row_needs(name), *[NOTHING] * 3]
+        cells = [NOTHING, *pinned, *[NOTHING] * 2, row_needs(name), *[NOTHING] * 4]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             cells = [
@@ -145,6 +146,7 @@ class Table:
                 row_needs(name),
                 NOTHING if score.lag is None else f"{1e3 * score.lag:.2f}".replace("-", "−"),
                 *_times(score, shown.result.record.dt),
+                NOTHING if score.calibration is None else number(score.calibration.sd * scale),
             ]
         head = self._head(name) + macro("note", "looks ahead" if is_non_causal(name) else "") + _own(score)
         return Row(head, cells, {"observer": name, "target": target})

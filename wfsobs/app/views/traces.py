@@ -5,18 +5,20 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, Range1d, Span
+from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, GlyphRenderer, Range1d, Span
+from bokeh.plotting import figure
 from numpy.typing import NDArray
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.style import observers_of
-from wfsobs.app.views.envelope import envelope, envelope_times
+from wfsobs.app.style import look, observers_of
+from wfsobs.app.views.envelope import band_envelope, envelope, envelope_times
 from wfsobs.app.views.event_marks import EventMarks, events_of, room
 from wfsobs.app.views.plots import PinnedLines, add_line, new_figure, send
 from wfsobs.app.views.settle import on_settle, zoom_of
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, RunResults
+from wfsobs.evaluation.calibration import half_width
 from wfsobs.evaluation.recovery import trailing_rms
 from wfsobs.observers.base import TARGETS
 
@@ -91,6 +93,28 @@ class Traces(TargetFigures):
         self.x_range.update(start=start, end=start + length)
 
 
+class _Band:
+    """The band around a line that is alone; nothing in the figure until there is one."""
+
+    def __init__(self, fig: figure):
+        self.figure, self.source = fig, ColumnDataSource({"x": [], "low": [], "high": []})
+        self.renderer: GlyphRenderer | None = None
+
+    def draw(self, x: Array, low: Array, high: Array, colour: str) -> None:
+        """Shade what is between two edges."""
+        send(self.source, {"x": x, "low": low.astype(np.float32), "high": high.astype(np.float32)})
+        if self.renderer is None:
+            look_of = {"fill_alpha": 0.2, "name": "band", "level": "underlay"}
+            self.renderer = self.figure.varea("x", "low", "high", source=self.source, **look_of)
+        self.renderer.glyph.fill_color = colour
+        self.renderer.visible = True
+
+    def hide(self) -> None:
+        """Show no band."""
+        if self.renderer is not None:
+            self.renderer.visible = False
+
+
 class _Trace:
     """One figure: the truth and the estimates of one target, all lines in one data source."""
 
@@ -106,6 +130,7 @@ class _Trace:
         self.lines = {name: add_line(self.figure, name, self.source, name) for name in self.names}
         self.faint = PinnedLines(self.figure)
         self.events = EventMarks(self.figure)
+        self.band = _Band(self.figure)
 
     def draw(self, results: RunResults, display: Display, first: int, last: int) -> None:
         """Send the samples first ... last - 1 of every line."""
@@ -118,11 +143,29 @@ class _Trace:
         warm_up = results.scenario.run.warm_up
         self.warm_up.right = warm_up
         settled = warm_up + WINDOW_S * display.running
-        self._fit(data, settled, self._draw_pinned(display, data["x"]), room(results))
+        extra = self._draw_pinned(display, data["x"]) | self._draw_band(results, display, first, last, data["x"])
+        self._fit(data, settled, extra, room(results))
         self.events.draw(results, display.dark)
         error = shows_error(results, self.target, display)
         what = f"{'running rms of ' if error and display.running else ''}{'error of ' if error else ''}{display.mode_label}"
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
+
+    def _draw_band(
+        self, results: RunResults, display: Display, first: int, last: int, times: Array
+    ) -> dict[str, tuple[Array, Array]]:
+        """Shade the 95 % band of the one observer that is shown, where it states one; its edges."""
+        shown = [name for name, line in self.lines.items() if line.visible and name != TRUTH]
+        sd = results.sd(shown[0], self.target) if len(shown) == 1 and not display.running else None
+        if sd is None:
+            self.band.hide()
+            return {}
+        scale, cut = per_micrometre(display.unit, results.scenario.telescope.diameter), slice(first, last)
+        half = half_width(0.95) * sd[cut, display.column]
+        values = None if shows_error(results, self.target, display) else results.values(shown[0], self.target)
+        middle = 0.0 if values is None else values[cut, display.column]
+        low, high = (scale * edge for edge in band_envelope(middle - half, middle + half, BINS))
+        self.band.draw(times, low, high, look(shown[0]).colour(display.dark))
+        return {"low": (times, low), "high": (times, high)}
 
     def _draw_pinned(self, display: Display, times: Array) -> dict[str, tuple[Array, Array]]:
         """Send the pinned run's visible lines between the first and the last of the times; what was sent."""

@@ -4,7 +4,11 @@ The target of a window is the zero-phase Butterworth reference of the training r
 window's last step; without a twin, that of its z. With w = a - b c and c = (delta.a) / (1 / s2 + delta.b) (`kernels` has
 a, b, delta), a prediction is
 
-    mean = kappa.w + delta_t c.
+    mean = kappa.w + delta_t c,
+    variance = M_tt - |L^-1 kappa|^2 + (delta_t - kappa.b)^2 / (1 / s2 + delta.b),    L L' = M + sigma_n^2 I.
+
+The variance, that of the vibration without the noise of a target, costs m^2 operations where the mean costs m: it is computed
+once in so many steps and held.
 """
 
 from __future__ import annotations
@@ -15,8 +19,9 @@ from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
+from scipy.linalg import solve_triangular
 
-from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
+from wfsobs.observers.base import VIBRATION, Estimates, Look, Observer, Tunable
 from wfsobs.observers.baselines import open_loop_reference
 from wfsobs.observers.gpr.inputs import Gpr, scale_of, scales_of, training_signals, tunable, window_signals
 from wfsobs.observers.gpr.kernels import (
@@ -42,6 +47,8 @@ from wfsobs.typing import Array
 
 ROWS = 256
 """Steps predicted at a time."""
+HELD = 16
+"""Steps over which a standard deviation is held, a divisor of ROWS; windows change little in them."""
 
 
 class OfflineGpr(Gpr):
@@ -53,7 +60,10 @@ OFFLINE = Section("gpr_offline", "Offline GPR", OfflineGpr)
 
 @dataclass(frozen=True)
 class TrainedGpr:
-    """A trained GPR: the signals (d + m - 1, channels) [l] of its m windows, the windows as points, their weights (m,), and c."""
+    """A trained GPR: the signals (d + m - 1, channels) [l] of its m windows, the windows as points, their weights (m,), and c.
+
+    factor, b, pivot : for the variance, L (m, m), b (m,) and 1 / s2 + delta.b
+    """
 
     signals: Array
     depth: int
@@ -61,9 +71,15 @@ class TrainedGpr:
     weights: Array
     constant: float
     kernel: SquaredExponential
+    factor: Array
+    b: Array
+    pivot: float
 
-    def predict(self, signals: Array, watch: Watch = QUIET) -> Array:
-        """Mean at every step of signals (n, channels), (n,); NaN before the first full window."""
+    def predict(self, signals: Array, watch: Watch = QUIET, sd: Array | None = None) -> Array:
+        """Mean at every step of signals (n, channels), (n,); NaN before the first full window.
+
+        sd : (n,), receives the standard deviations where it is given
+        """
         n, m, d = signals.shape[0], self.weights.size, self.depth
         out = np.full(n, np.nan)
         signals = signals / self.kernel.length_scale
@@ -76,9 +92,20 @@ class TrainedGpr:
             row, item = products.strides
             G = as_strided(products[:, rows - 1 :], (rows, m), (row - item, item))
             here = tests.select(lambda p, start=start, rows=rows: p[start : start + rows])
+            if sd is not None:
+                held = np.repeat(self._sd(G[::HELD].copy(), here.select(lambda p: p[::HELD])), HELD)
+                sd[start : start + rows] = held[:rows]
             known = self.kernel.split_times(G, here, self.points, self.weights)
             out[start : start + rows] = known + here.delta * self.constant
         return out
+
+    def _sd(self, G: Array, tests: Points) -> Array:
+        """Return the standard deviations (n,) of windows with these inner products G (n, m) [l^2]; uses up G."""
+        self.kernel.split(G, tests.select(lambda p: p[:, None]), self.points)
+        whitened = solve_triangular(self.factor, G.T, lower=True, check_finite=False)
+        border = tests.delta - G @ self.b
+        variance = self.kernel.own(tests) - np.sum(whitened**2, axis=0) + border**2 / self.pivot
+        return np.sqrt(np.maximum(variance, 0.0))
 
     def predict_one(self, window: Array) -> float:
         """Mean for one window, (channels, depth), the oldest sample first."""
@@ -105,8 +132,10 @@ def train(signals: Array, targets: Array, depth: int, m: int, kernel: SquaredExp
     check_condition(S[:m, :m], kernel)
     eliminate(S, m, watch.check)
     a, b = solve_rows(S, m)
-    constant = (points.delta @ a) / (1.0 / kernel.variance + points.delta @ b)
-    return TrainedGpr(signals[: first + m] / kernel.length_scale, depth, points, a - b * constant, float(constant), kernel)
+    pivot = float(1.0 / kernel.variance + points.delta @ b)
+    constant = float(points.delta @ a) / pivot
+    known = signals[: first + m] / kernel.length_scale
+    return TrainedGpr(known, depth, points, a - b * constant, constant, kernel, S[:m, :m], b, pivot)
 
 
 def training_targets(training: Training, bands: Bands, dt: float, delay: int = DELAY, horizon: int = 0) -> Array:
@@ -131,18 +160,23 @@ def train_mode(
     return train(training_signals(g, training, mode, dt, delay), targets, g.depth, g.training_size, kernel_of(g), watch)
 
 
-def gpr_offline(measurements: Measurements, prior: Prior, settings: OfflineGpr, watch: Watch) -> dict[str, Array]:
+def gpr_offline(measurements: Measurements, prior: Prior, settings: OfflineGpr, watch: Watch) -> Estimates:
     """Train on the training record and predict over the measurements, all modes at the same time."""
-    g, dt, delay = settings, measurements.dt, measurements.delay
-    if measurements.n_steps < g.depth:
-        raise RecordError(f"the record has {measurements.n_steps} steps; depth needs {g.depth}")
+    g, dt, delay, n_steps = settings, measurements.dt, measurements.delay, measurements.n_steps
+    if n_steps < g.depth:
+        raise RecordError(f"the record has {n_steps} steps; depth needs {g.depth}")
 
     def one(mode: int, watch: Watch) -> Array:
         model = train_mode(prior, g, mode, dt, delay, watch=watch)
         scale = scale_of(g, prior.training, delay, mode)
-        return model.predict(window_signals(g, measurements.y_lgs, measurements.u, measurements.z, mode, dt, scale), watch)
+        signals, sd = (
+            window_signals(g, measurements.y_lgs, measurements.u, measurements.z, mode, dt, scale),
+            np.full(n_steps, np.nan),
+        )
+        return np.column_stack([model.predict(signals, watch, sd), sd])
 
-    return {VIBRATION: over_modes(measurements.n_modes, one, watch)}
+    found = over_modes(measurements.n_modes, one, watch)
+    return Estimates({VIBRATION: found[:, ::2]}, {VIBRATION: found[:, 1::2]})
 
 
 def step_gpr_offline(prior: Prior, settings: OfflineGpr, sampling: Sampling, horizon: float) -> OfflineEstimator:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
+from wfsobs.observers.base import VIBRATION, Estimates, Look, Observer, Tunable
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.gpr.inputs import Gpr, scale_of, scales_of, tunable, window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
@@ -62,7 +62,7 @@ def online_targets(record: Signals, bands: Bands) -> Array:
     return np.vstack([f[1:], np.zeros((1, record.n_modes))])
 
 
-def gpr_online(measurements: Measurements, prior: Prior, settings: OnlineGpr, watch: Watch) -> dict[str, Array]:
+def gpr_online(measurements: Measurements, prior: Prior, settings: OnlineGpr, watch: Watch) -> Estimates:
     """Run the online GPR over a record, all modes at the same time, in blocks."""
     if measurements.n_steps < settings.depth + settings.training_size:
         needed = settings.depth + settings.training_size
@@ -81,11 +81,15 @@ def gpr_online(measurements: Measurements, prior: Prior, settings: OnlineGpr, wa
 
         scale = scale_of(settings, prior.training, measurements.delay, mode)
         signals = window_signals(settings, measurements.y_lgs, measurements.u, measurements.z, mode, measurements.dt, scale)
-        return predict_sliding(
-            signals, targets[:, mode], settings.depth, settings.training_size, kernel_of(settings), deliver, watch.check
-        )[0]
+        return np.column_stack(
+            predict_sliding(
+                signals, targets[:, mode], settings.depth, settings.training_size, kernel_of(settings), deliver, watch.check
+            )
+        )
 
-    return {VIBRATION: over_modes(measurements.n_modes, one, watch)}
+    found = over_modes(measurements.n_modes, one, watch)
+    latent = np.sqrt(np.maximum(found[:, 1::2] - settings.noise_std**2, 0.0))  # of the vibration, not of a noisy target
+    return Estimates({VIBRATION: found[:, ::2]}, {VIBRATION: latent})
 
 
 def predict_sliding(

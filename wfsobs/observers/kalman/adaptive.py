@@ -11,9 +11,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
+from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
 from wfsobs.observers.kalman.adaptive_step import AdaptiveEstimator
-from wfsobs.observers.kalman.single import by_target
+from wfsobs.observers.kalman.spread import target_sd
 from wfsobs.observers.kalman.window_model import NOT_YET, WindowModel, identify_window, lengths, mode_of
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
@@ -57,7 +57,7 @@ class Adaptive(Group):
     )
 
 
-def kf_adaptive(measurements: Measurements, _prior: Prior, settings: Adaptive, watch: Watch) -> dict[str, Array]:
+def kf_adaptive(measurements: Measurements, _prior: Prior, settings: Adaptive, watch: Watch) -> Estimates:
     """Run the filter on the LGS measurement, at every fast step; NaN until the first window is full.
 
     Raises RecordError for a record shorter than a window, or a window of too few samples.
@@ -73,18 +73,19 @@ def kf_adaptive(measurements: Measurements, _prior: Prior, settings: Adaptive, w
         def tell(fraction: float, mode: int = mode) -> None:
             watch.step((mode + fraction) / measurements.n_modes)
 
-        before = np.full((measurements.delay, len(TARGETS)), np.nan)
-        columns.append(np.vstack([before, adapt(z[:, mode], measurements.dt, settings, tell)]))
-    return by_target(columns)
+        before = np.full((2, measurements.delay, len(TARGETS)), np.nan)
+        columns.append(np.concatenate([before, adapt(z[:, mode], measurements.dt, settings, tell)], axis=1))
+    values, sd = np.stack(columns, axis=-1)
+    return Estimates(*({target: x[:, i] for i, target in enumerate(TARGETS)} for x in (values, sd)))
 
 
 def adapt(z: Array, dt: float, settings: Adaptive, tell: Callable[[float], None]) -> Array:
-    """Turbulence and vibration (n, 2) [um] of one mode's z (n,) [um]; tell : told the fraction done.
+    """Turbulence and vibration of one mode's z (n,) [um], and their standard deviations, (2, n, 2) [um].
 
-    A window whose model or filter cannot be found leaves the filter before it in charge.
+    A window whose model or filter cannot be found leaves the filter before it in charge. tell : told the fraction done
     """
     n, window, interval = len(z), *lengths(settings, dt)
-    out = np.full((n, len(TARGETS)), np.nan)
+    out, sd = np.full((2, n, len(TARGETS)), np.nan)
     found = NOT_YET
     for start in range(0, n - window + 1, interval):
         tell(start / n)
@@ -94,7 +95,9 @@ def adapt(z: Array, dt: float, settings: Adaptive, tell: Callable[[float], None]
             mean = z[start : now + 1].mean()  # what does not move in a window is turbulence, whatever its model says
             estimate = found.filter.run((z[start:stop] - mean)[:, None, None])
             out[now:stop] = estimate[window - 1 :, :, 0] + [mean, 0.0]
-    return out
+            if found.mode is not None:
+                sd[now:stop] = target_sd(found.mode.model.output_rows(TARGETS), found.mode.posterior)
+    return np.array([out, sd])
 
 
 def filter_of(spectrum: Spectrum) -> PeriodicFilter:

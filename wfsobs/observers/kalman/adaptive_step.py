@@ -36,7 +36,6 @@ class AdaptiveEstimator:
         self.settings, self.sampling = settings, sampling
         self.window, self.interval = lengths(settings, sampling.dt)
         self._samples = np.zeros((sampling.n_modes, 2 * self.window))  # newest last; moved to the front at the end
-        self._sd = np.full(sampling.n_modes, np.nan)
         self._outputs: dict[tuple[float, str], Array] = {}
         self.reset()
 
@@ -86,12 +85,14 @@ class AdaptiveEstimator:
         self.filters[mode] = None if one is None else KalmanEstimator([one])
 
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
-        """Return the mean; NaN before the first full window."""
-        out = self._outputs.setdefault((frames, target), np.empty(len(self.means)))
+        """Return mean and standard deviation; NaN before the first full window."""
+        out, sd = self._outputs.setdefault((frames, target), np.empty((2, len(self.means))))
         for mode, (kalman, mean) in enumerate(zip(self.filters, self.means, strict=True)):
-            moving = 0.0 if kalman is None else kalman.predict(frames, target)[0][0]
+            moving, sd[mode] = 0.0, np.nan
+            if kalman is not None:
+                (moving,), (sd[mode],) = kalman.predict(frames, target)
             out[mode] = moving + (mean if target == TURBULENCE else 0.0 * mean)
-        return out, self._sd
+        return out, sd
 
     def settle(self) -> None:
         """Have nothing left to do."""

@@ -5,14 +5,13 @@ The filter is that of `kalman.single`, its model one AR(2) per line of the vibra
 
 from __future__ import annotations
 
-from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
-from wfsobs.observers.kalman.single import by_target, steady_filter, steady_mode
+from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
+from wfsobs.observers.kalman.single import run_steady, steady_mode
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.prior import Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.settings import Group, Real, Section, Whole
-from wfsobs.typing import Array
 
 
 class MultiPeak(Group):
@@ -33,15 +32,9 @@ class MultiPeak(Group):
     )
 
 
-def kf_multi(measurements: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> dict[str, Array]:
+def kf_multi(measurements: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> Estimates:
     """Run the filter on the LGS measurement, at every fast step."""
-    z = measurements.z
-    columns = []
-    for mode, model in enumerate(prior.lines):
-        watch.step(mode / measurements.n_modes)
-        kalman, _ = steady_filter(model.disturbance(settings.line_width), model.noise)
-        columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
-    return by_target(columns)
+    return run_steady(measurements, [(model.disturbance(settings.line_width), model.noise) for model in prior.lines], watch)
 
 
 def step_kf_multi(prior: Prior, settings: MultiPeak, _sampling: Sampling, _horizon: float) -> KalmanEstimator:

@@ -16,15 +16,16 @@ from dataclasses import dataclass
 import numpy as np
 import param
 
-from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
-from wfsobs.observers.kalman.single import MODEL, NGS, by_target
+from wfsobs.observers.base import TARGETS, TURBULENCE, Estimates, Look, Observer, Tunable
+from wfsobs.observers.kalman.single import MODEL, NGS
+from wfsobs.observers.kalman.spread import by_target, target_sd
 from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
 from wfsobs.prior import Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.settings import Group, Real, Section
 from wfsobs.signal.periodic import FilterStep, PeriodicFilter
-from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.riccati import posteriors_of_gains, steady_state
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
@@ -127,27 +128,36 @@ def multirate_filter(
     return filter_of_gains(gains, model.output_rows(TARGETS) if outputs is None else outputs)
 
 
-def run_modes(measurements: Measurements, watch: Watch, make: Callable[[int], MultiRateFilter]) -> list[Array]:
-    """Run the filter that `make` gives for each mode; per mode (n_steps, n_targets)."""
+def multirate_posteriors(model: DisturbanceModel, gains: GainCycle, lgs_noise: float, ngs_noise: float) -> list[Array]:
+    """Return the covariances after the measurement at steps 1 ... n, by the model that the gains are of."""
+    R = np.diag([lgs_noise**2, ngs_noise**2])
+    return posteriors_of_gains([(A, C, model.Q, R) for A, C, _ in gains.steps], [step.L for step in gains.steps])
+
+
+def run_modes(measurements: Measurements, watch: Watch, make: Callable[[int], tuple[MultiRateFilter, Array]]) -> Estimates:
+    """Run the filter that `make` gives for each mode, with its standard deviations at steps 1 ... n, (n, n_targets) [um]."""
     z = np.stack([measurements.z, np.nan_to_num(measurements.z_ngs)], axis=1)
-    columns = []
+    columns, sd = [], []
     for mode in range(measurements.n_modes):
         watch.step(mode / measurements.n_modes)
-        columns.append(make(mode).run(z[:, :, mode]))
-    return columns
+        filter_, spread = make(mode)
+        columns.append(filter_.run(z[:, :, mode]))
+        sd.append(spread)
+    return by_target(columns, sd, first=1)
 
 
-def multirate(measurements: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> dict[str, Array]:
+def multirate(measurements: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> Estimates:
     """Run the multi-rate filter over a record, for turbulence."""
     assert measurements.ratio is not None
     ratio = measurements.ratio
 
-    def of_mode(mode: int) -> MultiRateFilter:
-        model = prior.model[mode]
-        return multirate_filter(model.disturbance(), ratio, *multirate_noise(settings, model))
+    def of_mode(mode: int) -> tuple[MultiRateFilter, Array]:
+        model, noises = prior.model[mode].disturbance(), multirate_noise(settings, prior.model[mode])
+        gains, rows = multirate_gains(model, ratio, *noises), model.output_rows(TARGETS)
+        return filter_of_gains(gains, rows), target_sd(rows, multirate_posteriors(model, gains, *noises))
 
-    columns = run_modes(measurements, watch, of_mode)
-    return {TURBULENCE: by_target(columns)[TURBULENCE]}
+    both = run_modes(measurements, watch, of_mode)
+    return Estimates({TURBULENCE: both[TURBULENCE]}, {TURBULENCE: both.sd[TURBULENCE]})
 
 
 def step_multirate(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:
@@ -155,8 +165,9 @@ def step_multirate(prior: Prior, settings: MultiRate, sampling: Sampling, _horiz
     assert sampling.ratio is not None
     modes = []
     for known in prior.model:
-        model = known.disturbance()
-        modes.append(ModeFilter(model, multirate_gains(model, sampling.ratio, *multirate_noise(settings, known))))
+        model, noises = known.disturbance(), multirate_noise(settings, known)
+        gains = multirate_gains(model, sampling.ratio, *noises)
+        modes.append(ModeFilter(model, gains, tuple(multirate_posteriors(model, gains, *noises))))
     return KalmanEstimator(modes)
 
 

@@ -6,16 +6,15 @@ that it is, with the periodic gains of `kalman.multirate_optimal`.
 
 from __future__ import annotations
 
-from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
+from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
 from wfsobs.observers.kalman.multi import PEAKS, MultiPeak
 from wfsobs.observers.kalman.multirate import MultiRate, run_modes
 from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_model, step_filters
-from wfsobs.observers.kalman.single import NGS, by_target
+from wfsobs.observers.kalman.single import NGS
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.prior import LgsError, Lines, Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
-from wfsobs.typing import Array
 
 
 def every_peak_model(rates: MultiRate, peaks: MultiPeak, prior: Prior, mode: int, ratio: int) -> Cycle:
@@ -23,13 +22,11 @@ def every_peak_model(rates: MultiRate, peaks: MultiPeak, prior: Prior, mode: int
     return optimal_model(rates, prior, mode, ratio, prior.lines[mode].disturbance(peaks.line_width))
 
 
-def multirate_multi(measurements: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> dict[str, Array]:
+def multirate_multi(measurements: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> Estimates:
     """Run the filter over a record."""
     assert measurements.ratio is not None
     ratio, rates = measurements.ratio, MultiRate()
-
-    columns = run_modes(measurements, watch, lambda mode: every_peak_model(rates, settings, prior, mode, ratio).filter())
-    return by_target(columns)
+    return run_modes(measurements, watch, lambda mode: every_peak_model(rates, settings, prior, mode, ratio).filter())
 
 
 def step_multirate_multi(prior: Prior, settings: MultiPeak, sampling: Sampling, _horizon: float) -> KalmanEstimator:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from wfsobs.observers.base import TARGETS, Look, Observer
+from wfsobs.observers.base import TARGETS, Estimates, Look, Observer
 from wfsobs.observers.kalman.multirate import (
     RATES,
     TUNABLE,
@@ -26,7 +26,8 @@ from wfsobs.observers.kalman.multirate import (
     multirate_noise,
     run_modes,
 )
-from wfsobs.observers.kalman.single import NGS, by_target
+from wfsobs.observers.kalman.single import NGS
+from wfsobs.observers.kalman.spread import target_sd
 from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
 from wfsobs.prior import LgsError, Model, Prior
 from wfsobs.progress import Watch
@@ -92,9 +93,10 @@ class Cycle(NamedTuple):
     rows: Array
     model: DisturbanceModel
 
-    def filter(self) -> MultiRateFilter:
-        """Return the optimal filter."""
-        return optimal_filter(self.steps, self.rows)[0]
+    def filter(self) -> tuple[MultiRateFilter, Array]:
+        """Return the optimal filter, and its standard deviations at steps 1 ... n, (n, n_targets) [um]."""
+        filter_, states = optimal_filter(self.steps, self.rows)
+        return filter_, target_sd(self.rows, [state.posterior for state in states])
 
 
 def optimal_model(settings: MultiRate, prior: Prior, mode: int, ratio: int, model: DisturbanceModel | None = None) -> Cycle:
@@ -115,12 +117,11 @@ def step_filters(modes: Sequence[Cycle]) -> KalmanEstimator:
     return KalmanEstimator(filters)
 
 
-def multirate_optimal(measurements: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> dict[str, Array]:
+def multirate_optimal(measurements: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> Estimates:
     """Run the optimal multi-rate filter over a record."""
     assert measurements.ratio is not None
     ratio = measurements.ratio
-    columns = run_modes(measurements, watch, lambda mode: optimal_model(settings, prior, mode, ratio).filter())
-    return by_target(columns)
+    return run_modes(measurements, watch, lambda mode: optimal_model(settings, prior, mode, ratio).filter())
 
 
 def step_multirate_optimal(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:

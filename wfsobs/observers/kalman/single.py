@@ -8,11 +8,13 @@ y up to k - 1. Here phi_hat[k] uses y[k] too, like the GPR. The mirror's part is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
+from wfsobs.observers.base import TARGETS, TURBULENCE, Estimates, Look, Observer, Tunable
+from wfsobs.observers.kalman.spread import FrameErrors, by_target, target_sd
 from wfsobs.observers.kalman.step import FrameEstimator, KalmanEstimator, ModeFilter
 from wfsobs.prior import Model, Prior
 from wfsobs.progress import Watch
@@ -52,15 +54,21 @@ def steady_filter(model: DisturbanceModel, noise: float, outputs: Array | None =
     return gains.filter(model.output_rows(TARGETS) if outputs is None else outputs), steady
 
 
-def kf_lgs(measurements: Measurements, prior: Prior, _settings: None, watch: Watch) -> dict[str, Array]:
+def kf_lgs(measurements: Measurements, prior: Prior, _settings: None, watch: Watch) -> Estimates:
     """Run the Kalman filter on the LGS measurement, at every fast step."""
-    z = measurements.z
-    columns = []
-    for mode, model in enumerate(prior.model):
+    return run_steady(measurements, [(model.disturbance(), model.lgs_noise) for model in prior.model], watch)
+
+
+def run_steady(measurements: Measurements, models: Sequence[tuple[DisturbanceModel, float]], watch: Watch) -> Estimates:
+    """Run the steady-state filter of every mode's model and noise [um] on its z."""
+    z, columns, sd = measurements.z, [], []
+    for mode, (model, noise) in enumerate(models):
         watch.step(mode / measurements.n_modes)
-        kalman, _ = steady_filter(model.disturbance(), model.lgs_noise)
+        rows = model.output_rows(TARGETS)
+        kalman, steady = steady_filter(model, noise, rows)
         columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
-    return by_target(columns)
+        sd.append(target_sd(rows, [steady.posterior]))
+    return by_target(columns, sd)
 
 
 def step_kf_lgs(prior: Prior, _settings: None, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
@@ -74,7 +82,7 @@ def steady_mode(model: DisturbanceModel, noise: float) -> ModeFilter:
     return ModeFilter(model, gains, (steady.posterior,))
 
 
-def kf_ngs(measurements: Measurements, prior: Prior, settings: Kalman, watch: Watch) -> dict[str, Array]:
+def kf_ngs(measurements: Measurements, prior: Prior, settings: Kalman, watch: Watch) -> Estimates:
     """Run the Kalman filter on NGS frames, with the coefficients for T_NGS.
 
     A frame at k = n i measures slow step i - 1 (fast steps k - n ... k - 1); the estimate is that of slow
@@ -83,19 +91,25 @@ def kf_ngs(measurements: Measurements, prior: Prior, settings: Kalman, watch: Wa
     assert measurements.ratio is not None
     n = measurements.ratio
     frames = measurements.z_ngs[n::n]
-    columns = []
+    columns, sd = [], []
     for mode, model in enumerate(prior.model):
         watch.step(mode / measurements.n_modes)
         of_frames = model.at(n * measurements.dt).disturbance()
-        kalman, _ = steady_filter(of_frames, model.ngs_noise, of_frames.pairs)
+        gains, _ = steady_gains(of_frames, model.ngs_noise)
+        kalman, truth, spreads = gains.filter(of_frames.pairs), model.disturbance(), np.empty((n, len(TARGETS)))
+        errors = FrameErrors(truth, gains.steps[0], n, model.ngs_noise)
         slow = kalman.run(frames[:, None, mode, None])[:, :, 0]  # of each process, slow steps i and i - 1
         fast = np.full((measurements.n_steps, len(TARGETS)), np.nan)
         for target, process in enumerate((model.turbulence, model.vibration)):
             spread = between_frames(process, n, settings.ngs_between_frames)
-            values = slow[:, 2 * target : 2 * target + 2] @ spread.T
+            pair = slice(2 * target, 2 * target + 2)
+            values = slow[:, pair] @ spread.T
             fast[n:, target] = values.ravel()[: measurements.n_steps - n]
+            now = truth.outputs[TARGETS[target]]
+            spreads[:, target] = [errors.sd(now, weights @ of_frames.pairs[pair], j) for j, weights in enumerate(spread)]
         columns.append(fast)
-    return by_target(columns)
+        sd.append(spreads)
+    return by_target(columns, sd, first=n)
 
 
 def step_kf_ngs(prior: Prior, settings: Kalman, sampling: Sampling, _horizon: float) -> FrameEstimator:
@@ -112,7 +126,16 @@ def step_kf_ngs(prior: Prior, settings: Kalman, sampling: Sampling, _horizon: fl
         weights = between_frames((model.turbulence, model.vibration)[at], n, how, max(since + 1, n))[since]
         return weights @ modes[mode].model.pairs[2 * at : 2 * at + 2]
 
-    return FrameEstimator(modes, spread, holds=how == "hold")
+    truths = [model.disturbance() for model in prior.model]
+    errors = [
+        FrameErrors(truth, mode.gains.steps[0], n, model.ngs_noise)
+        for truth, mode, model in zip(truths, modes, prior.model, strict=True)
+    ]
+
+    def sd(mode: int, target: str, since: float, row: Array) -> float:
+        return errors[mode].sd(truths[mode].outputs[target], row, since)
+
+    return FrameEstimator(modes, spread, sd, holds=how == "hold")
 
 
 def between_frames(process: Ar2, n: int, how: str, steps: int | None = None) -> Array:
@@ -130,12 +153,6 @@ def between_frames(process: Ar2, n: int, how: str, steps: int | None = None) -> 
     means = np.kron(np.eye(2), np.full((1, n), 1.0 / n))[::-1]  # rows: slow step i, slow step i - 1
     cross, between = covariance[n:] @ means.T, means @ covariance[: 2 * n] @ means.T
     return np.linalg.lstsq(between, cross.T, rcond=1e-14)[0].T
-
-
-def by_target(columns: list[Array]) -> dict[str, Array]:
-    """Per-mode results (n_steps, n_targets) as {target: (n_steps, n_modes)}."""
-    stacked = np.stack(columns, axis=-1)
-    return {target: stacked[:, i] for i, target in enumerate(TARGETS)}
 
 
 KF_LGS = Observer(

@@ -22,6 +22,7 @@ from wfsobs.signal.stepping import FilterBank, GainCycle, Saved
 from wfsobs.typing import Array
 
 Spread = Callable[[int, str, int], Array]
+SpreadSd = Callable[[int, str, float, Array], float]
 
 
 class ModeFilter(NamedTuple):
@@ -66,7 +67,6 @@ class LinearEstimator:
         self.modes = tuple(modes)
         self.bank = FilterBank([mode.gains.estimator() for mode in modes])
         self._state = self.bank.x[:, :, None]
-        self._plans: dict[tuple[float, str], Plan] = {}
         self._expected = expected_rows([mode.gains for mode in modes])
 
     def settle(self) -> None:
@@ -110,6 +110,7 @@ class KalmanEstimator(LinearEstimator):
     def __init__(self, modes: Sequence[ModeFilter], bridges: bool = False):
         super().__init__(modes)
         self.bridges = bridges
+        self._plans: dict[tuple[float, str], Plan] = {}
         v = self.bank.v
         self._lgs, self._ngs = v[:, 0], v[:, 1] if v.shape[1] > 1 else None
 
@@ -189,14 +190,18 @@ class FrameEstimator(LinearEstimator):
         The slow filters, one per mode.
     spread : callable
         (mode, target, fast steps since the frame) -> row of the slow filter's state.
+    sd : callable
+        (mode, target, fast steps from the frame to what is estimated, row) -> standard deviation of that estimate [um].
     held : bool
         Whether an estimate is held until the next frame, so that any fraction of a frame is defined.
     """
 
-    def __init__(self, modes: Sequence[ModeFilter], spread: Spread, holds: bool):
+    def __init__(self, modes: Sequence[ModeFilter], spread: Spread, sd: SpreadSd, holds: bool):
         super().__init__(modes)
-        self._spread, self._holds = spread, holds
+        self._spread, self._sd, self._holds = spread, sd, holds
         self._since = -1
+        self._frame_plans: dict[tuple[int, float, str], Plan] = {}
+        self._unknown = np.full(len(self.modes), np.nan)
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
@@ -209,17 +214,18 @@ class FrameEstimator(LinearEstimator):
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
         """Return the mean of the target; NaN before the first NGS frame."""
         ahead = 0 if self._holds else whole_frames(frames, "an estimate between NGS frames")
-        key = (max(self._since, 0) + ahead, target)
-        one = self._plans.get(key) or self._plan(*key)
+        since = max(self._since, 0)
+        one = self._frame_plans.get((since, frames, target)) or self._plan(since, frames, ahead, target)
         np.matmul(one.rows, self._state, out=one.product)
         if self._since < 0:
             one.mean[...] = np.nan
-        return one.mean, one.sd[0]
+        return one.mean, self._unknown if self._since < 0 else one.sd[0]
 
-    def _plan(self, since: int, target: str) -> Plan:
+    def _plan(self, since: int, frames: float, ahead: int, target: str) -> Plan:
         n_modes, n = self.bank.x.shape
-        rows = [self._spread(mode, target, since) for mode in range(n_modes)]
-        self._plans[since, target] = out = plan(rows, n, np.full((1, n_modes), np.nan))
+        rows = [self._spread(mode, target, since + ahead) for mode in range(n_modes)]
+        sd = np.array([[self._sd(mode, target, since + frames, row) for mode, row in enumerate(rows)]])
+        self._frame_plans[since, frames, target] = out = plan(rows, n, sd)
         return out
 
     def reset(self) -> None:
