@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from wfsobs.observers.gp.kernels import Kernel, Matern, QuasiPeriodic, Sho, SquaredExponential, Sum
+from wfsobs.observers.gp.kernels import Kernel, Matern, QuasiPeriodic, Sho, SquaredExponentialInTime, Sum
 from wfsobs.observers.gp.likelihood import log_likelihood, regress
 from wfsobs.typing import Array
 
@@ -49,7 +49,7 @@ CLOSED["sum"] = (
 )
 RATIONAL: dict[str, Kernel] = {
     "quasi-periodic": QuasiPeriodic(0.1, 0.02, 0.5, 1.0, 8),
-    "squared exponential": SquaredExponential(0.1, 0.02, 6),
+    "squared exponential": SquaredExponentialInTime(0.1, 0.02, 6),
 }
 LAGS = DT * np.arange(N)
 
@@ -95,7 +95,7 @@ def test_state_spaces_are_stationary_with_their_kernel(name: str) -> None:
     assert np.abs(residual).max() < 1e-13 * np.abs(space.F).max() * np.abs(space.P).max()
     if closed is not None:
         np.testing.assert_allclose(space.covariance(LAGS), closed(LAGS), rtol=0, atol=1e-12 * closed(LAGS[:1])[0])
-    A, Q = space.sampled(DT)
+    A, Q = space.discretise(DT)
     # P = A P A' + Q to rounding of P
     np.testing.assert_allclose(A @ space.P @ A.T + Q, space.P, rtol=0, atol=1e-13 * np.abs(space.P).max())
 
@@ -104,7 +104,7 @@ def test_the_drive_of_a_slow_process_keeps_its_digits() -> None:
     """Q of a Matern 5/2 over a short step h is q h^(9 - i - j) / ((5 - i - j) ...), by its series; P - A P A' has none left."""
     kernel = Matern(1.0, 100.0, 5)
     rate = np.sqrt(5.0) / 100.0
-    _, Q = kernel.state_space().sampled(DT)
+    _, Q = kernel.state_space().discretise(DT)
     x = rate * DT
     density = 16.0 / 3.0  # of the drive of f'' over rate^2, per rate
     # leading terms: the drive integrated 0, 1 and 2 times; the next ones are 3 x smaller by about three times x
@@ -115,7 +115,7 @@ def test_the_drive_of_a_slow_process_keeps_its_digits() -> None:
 @pytest.mark.parametrize(("order", "distance"), [(2, 0.15), (4, 0.03), (6, 6e-3), (8, 2e-3)])
 def test_a_squared_exponential_gets_closer_with_its_order(order: int, distance: float) -> None:
     """Its distance to the true kernel, over the variance: below what the docs state, above a third of it."""
-    kernel = SquaredExponential(1.0, 0.02, order)
+    kernel = SquaredExponentialInTime(1.0, 0.02, order)
     worst = np.abs(kernel.state_space().covariance(LAGS) - kernel.exact(LAGS)).max()
     assert distance / 3.0 < worst < distance
 
@@ -167,7 +167,12 @@ def test_the_likelihood_of_celerite() -> None:
 
 def model(p: Array) -> tuple[Kernel, float]:
     x = np.exp(p)
-    parts = Matern(x[0], x[1], 5), Sho(x[2], x[3], x[4]), QuasiPeriodic(x[5], x[6], 0.5, x[7], 3), SquaredExponential(x[8], x[9])
+    parts = (
+        Matern(x[0], x[1], 5),
+        Sho(x[2], x[3], x[4]),
+        QuasiPeriodic(x[5], x[6], 0.5, x[7], 3),
+        SquaredExponentialInTime(x[8], x[9]),
+    )
     return Sum(parts), x[10]
 
 

@@ -39,7 +39,7 @@ class StateSpace(NamedTuple):
     h: Array
     P: Array
 
-    def sampled(self, dt: float) -> tuple[Array, Array]:
+    def discretise(self, dt: float) -> tuple[Array, Array]:
         """Return transition A and covariance Q of the drive over a step dt [s], both (n, n).
 
         Q is an integral of squares, by quadrature over so short a time that ten nodes are exact to rounding, and doubled:
@@ -148,7 +148,7 @@ class QuasiPeriodic:
 
 
 @dataclass(frozen=True)
-class SquaredExponential:
+class SquaredExponentialInTime:
     """exp(-t^2 / 2 scale^2), its spectrum over a Taylor polynomial.
 
     rms : standard deviation [any unit];  scale : length scale [s];  order : number of poles, even

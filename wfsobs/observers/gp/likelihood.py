@@ -56,9 +56,10 @@ def regress(kernel: Kernel, noise: float, dt: float, z: Array) -> Regression:
         Means, variances and likelihood.
     """
     space = kernel.state_space()
-    A, Q = space.sampled(dt)
+    A, Q = space.discretise(dt)
     found = _filter(A[None], Q[None], space.h[None], space.P[None], np.array([noise**2]), z)
-    return Regression(*(x[:, 0] for x in found[:4]), float(found[4][0]))
+    mean, variance, ahead, innovation = (x[:, 0] for x in found[:4])
+    return Regression(mean, variance, ahead, innovation, float(found[4][0]))
 
 
 def log_likelihood(make: Callable[[Array], tuple[Kernel, float]], parameters: Array, dt: float, z: Array) -> tuple[float, Array]:
@@ -85,10 +86,10 @@ def log_likelihood(make: Callable[[Array], tuple[Kernel, float]], parameters: Ar
     for moved in np.asarray(parameters) + 1j * TINY * np.eye(p):
         kernel, noise = make(moved)
         space = kernel.state_space()
-        found.append((*space.sampled(dt), space.h, space.P, noise**2))
+        found.append((*space.discretise(dt), space.h, space.P, noise**2))
     A, Q, h, P, r = (np.array(parts) for parts in zip(*found, strict=True))
     total = _filter(A, Q, h, P, r, z)[4]
-    return float(total[0].real), total.imag / TINY
+    return float(np.real(total[0])), np.imag(total) / TINY
 
 
 def _filter(A: Array, Q: Array, h: Array, P: Array, r: Array, z: Array) -> tuple[Array, Array, Array, Array, Array]:

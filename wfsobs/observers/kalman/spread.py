@@ -25,7 +25,7 @@ def target_sd(rows: Array, posteriors: Sequence[Array]) -> Array:
     return np.sqrt([np.maximum(np.sum((rows @ P[:n, :n]) * rows, axis=1), 0.0) for P in posteriors])
 
 
-def repeated(sd: Array, n_steps: int, first: int = 0) -> Array:
+def over_record(sd: Array, n_steps: int, first: int = 0) -> Array:
     """Return numbers that repeat, (steps that repeat, n_modes), for every step of a record from `first` on, NaN before."""
     if len(sd) == 1 and first == 0:
         return np.broadcast_to(sd, (n_steps, sd.shape[1]))
@@ -43,7 +43,7 @@ def by_target(columns: Sequence[Array], sd: Sequence[Array] = (), first: int = 0
     spreads = np.stack(sd, axis=-1) if len(sd) else None
     return Estimates(
         {target: values[:, i] for i, target in enumerate(TARGETS)},
-        None if spreads is None else {target: repeated(spreads[:, i], n_steps, first) for i, target in enumerate(TARGETS)},
+        None if spreads is None else {target: over_record(spreads[:, i], n_steps, first) for i, target in enumerate(TARGETS)},
     )
 
 
