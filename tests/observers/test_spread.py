@@ -26,7 +26,7 @@ from wfsobs.typing import Array
 
 RECORDS, STEPS, SETTLED, RATIO = 200, 3000, 1000, 5
 
-WITH_MODEL = ["kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal"]
+WITH_MODEL = ["kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi"]
 
 
 def told(name: str, between: str) -> tuple[Prior, object]:
@@ -50,16 +50,14 @@ def own_record(name: str, prior: Prior, rng: np.random.Generator) -> tuple[Measu
     def draw(process: Ar2) -> Array:
         return np.column_stack([process.sample(STEPS, rng) for _ in range(RECORDS)])
 
-    if name == "kf-multi":
-        lines = prior.lines[0]
-        width = MultiPeak().line_width * pi
-        peaks = [Ar2(2 * pi * f, max(xi, width / (2 * pi * f)), rms, lines.dt) for f, xi, rms in lines.lines]
+    dt = 1e-3
+    if prior.lines:
+        lines, least = prior.lines[0], MultiPeak().line_width * pi
+        peaks = [Ar2(2 * pi * f, max(xi, least / (2 * pi * f)), rms, dt) for f, xi, rms in lines.lines]
         truth = {"turbulence": sum(draw(p) for p in lines.turbulence), "vibration": sum(draw(p) for p in peaks)}
-        lgs, ngs, dt = lines.noise, 0.01, lines.dt
     else:
-        model = prior.model[0]
-        truth = {"turbulence": draw(model.turbulence), "vibration": draw(model.vibration)}
-        lgs, ngs, dt = model.lgs_noise, model.ngs_noise, model.turbulence.dt
+        truth = {"turbulence": draw(prior.model[0].turbulence), "vibration": draw(prior.model[0].vibration)}
+    lgs, ngs = (prior.model[0].lgs_noise, prior.model[0].ngs_noise) if prior.model else (prior.lines[0].noise, 0.01)
     total = truth["turbulence"] + truth["vibration"]
     late = np.vstack([np.zeros((1, RECORDS)), total[:-1]])
     y = late + lgs * rng.standard_normal(late.shape)
