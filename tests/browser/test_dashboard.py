@@ -210,13 +210,16 @@ def test_figures_take_the_height_of_the_window(open_page: Any) -> None:
 
 
 def test_cancel(open_page: Any, server: Any) -> None:
-    page = open_page(url=f"{server.url}?run.duration=30&run.seed=77", wait=False)  # nobody has its results yet
+    # Long enough not to be over before the click, whatever the browser takes to draw the page.
+    page = open_page(url=f"{server.url}?run.duration=100&run.seed=77", wait=False)
+    page.locator("[role=status]", has_text="press Run").first.wait_for(state="attached")
+    page.get_by_role("button", name="Run", exact=True).first.click()
     cancel = page.get_by_role("button", name="Cancel", exact=True)
     expect(cancel).to_be_enabled()
     cancel.click()
     page.locator("[role=status]", has_text="Cancelled").first.wait_for(state="attached")
     expect(cancel).to_be_disabled()
-    page.get_by_role("button", name="Run", exact=True).first.click()
+    page.get_by_role("button", name="Reset", exact=True).click()
     finished(page)
 
 

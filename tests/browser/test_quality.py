@@ -115,7 +115,7 @@ def test_accessibility(open_page: Any, width: int, dark: bool) -> None:
             page.get_by_role("textbox", name="Evaluations").fill("2")
             page.keyboard.press("Enter")
         page.get_by_role("button", name=start).click()
-        expect(page.get_by_role("region", name=done)).to_be_visible()
+        expect(page.get_by_role("region", name=done)).to_be_visible(timeout=240_000)
         accessible(page)
         fits(page, width)
 
@@ -293,11 +293,11 @@ def test_a_long_run_grows_and_stops_at_once(open_page: Any) -> None:
     page.get_by_role("button", name="Time window: whole record").click()
     page.get_by_role("button", name="Run", exact=True).last.click()  # the topic
     duration = page.get_by_role("textbox", name="Duration [s]", exact=True)
-    duration.fill("40")
+    duration.fill("60")
     duration.press("Enter")
     expect(page.get_by_text(re.compile("changed: .*run.duration"))).to_be_visible()
     page.get_by_role("button", name="Run", exact=True).first.click()
-    page.wait_for_function(f"() => {{ const part = ({ONLINE})(); return part > 0.02 && part < 0.9 }}")
+    page.wait_for_function(f"() => {{ const part = ({ONLINE})(); return part > 0.02 && part < 0.9 }}", timeout=240_000)
     part = page.evaluate(ONLINE)
     page.wait_for_function(f"part => ({ONLINE})() > part", arg=part)
     page.get_by_role("button", name="Cancel", exact=True).click()
