@@ -23,6 +23,7 @@ from wfsobs.simulation.layers import relative_rms
 from wfsobs.simulation.sensor_noise import noise_rms
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, lgs_turbulence_spectrum, true_spectra
 from wfsobs.simulation.turbulence import processes, turbulence_process, turbulence_rms
+from wfsobs.typing import Array
 
 
 def arguments(observer: Observer, record: Record, scenario: Scenario) -> tuple[Measurements, Prior, Group | None]:
@@ -40,12 +41,20 @@ def observer_settings(observer: Observer, scenario: Scenario) -> Group | None:
     return None if observer.group is None else getattr(scenario, observer.group).copy()
 
 
-def prior_of(scenario: Scenario, record: Record | None, parts: Iterable[Part], spectra: Sequence[Spectra] = ()) -> Prior:
+def prior_of(
+    scenario: Scenario,
+    record: Record | None,
+    parts: Iterable[Part],
+    spectra: Sequence[Spectra] = (),
+    modes: Sequence[int] | None = None,
+) -> Prior:
     """Return these parts of a scenario's prior for the modes of a record, or without a record for its own.
 
-    spectra : one per mode, where already computed. Raises ValueError where the scenario does not have a part.
+    spectra : one per mode, where already computed; modes : only these. Raises ValueError where the scenario does not have a part.
     """
-    asked, modes = set(parts), range(record.n_modes if record else len(scenario.modes))
+    asked = set(parts)
+    if modes is None:
+        modes = range(record.n_modes if record else len(scenario.modes))
     dt = record.dt if record else scenario.dt
     return Prior(
         model=tuple(model_of(scenario, mode, dt) for mode in modes) if Model in asked else (),
@@ -96,12 +105,18 @@ def modelled_processes(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2, A
     """Return the turbulence and the one vibration peak of the model, sampled every `dt` [s] (paper, Tables 1 and 2)."""
     k, tip_tilt = scenario.kalman, scenario.modes[mode].radial_order == 1
     manual = k.process_noise == "manual"
-    turbulence = turbulence_process(scenario, mode, dt)
-    if manual:
-        turbulence = replace(turbulence, rms=k.turbulence_rms * relative_rms(scenario, mode))
     vibration_rms = k.vibration_rms if manual and tip_tilt else float(np.sqrt(vibration_variance(scenario, mode)))
     frequency, damping = modelled_peak(scenario, mode)
-    return turbulence, Ar2(2.0 * np.pi * frequency, max(damping, MIN_MODEL_DAMPING), vibration_rms, dt)
+    vibration = Ar2(2.0 * np.pi * frequency, max(damping, MIN_MODEL_DAMPING), vibration_rms, dt)
+    return _one_process(scenario, mode, dt), vibration
+
+
+def _one_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
+    """Return the turbulence of the model with one peak."""
+    turbulence = turbulence_process(scenario, mode, dt)
+    if scenario.kalman.process_noise == "manual":
+        return replace(turbulence, rms=scenario.kalman.turbulence_rms * relative_rms(scenario, mode))
+    return turbulence
 
 
 def modelled_peak(scenario: Scenario, mode: int) -> tuple[float, float]:
@@ -129,15 +144,18 @@ def measurement_noise(scenario: Scenario, mode: int) -> tuple[float, float]:
 # ---------------------------------------------------------------------- every line
 
 
-def lines_of(scenario: Scenario, mode: int, dt: float | None = None) -> Lines:
-    """Noise, turbulence and all the lines of one mode. Raises ValueError where the vibration names no lines."""
+def lines_of(scenario: Scenario, mode: int, dt: float | None = None, turbulence: tuple[Ar2 | Ar3, ...] | None = None) -> Lines:
+    """Noise, turbulence and all the lines of one mode. Raises ValueError where the vibration names no lines.
+
+    turbulence : that of the same scenario, where already fitted
+    """
     if scenario.vibration.source == "psd":
         raise ValueError("vibration.source = psd is a table, not lines that a model could have")
     dt = dt or scenario.dt
     return Lines(
         measurement_noise(scenario, mode)[0],
         dt,
-        _turbulence(scenario, mode, dt),
+        lines_turbulence(scenario, mode, dt) if turbulence is None else turbulence,
         tuple(Line(*line) for line in vibration_lines(scenario, mode)),
     )
 
@@ -147,25 +165,28 @@ def multi_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
     return lines_of(scenario, mode, dt).disturbance(scenario.multipeak.line_width)
 
 
-def _turbulence(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2 | Ar3, ...]:
-    """Return a scenario's own processes, in the strength of the model; else one process."""
+def lines_turbulence(scenario: Scenario, mode: int, dt: float, spectrum: Array | None = None) -> tuple[Ar2 | Ar3, ...]:
+    """Return a scenario's own processes, in the strength of the model; else one process, as `modelled_turbulence`."""
     found = processes(scenario, mode, dt) if scenario.turbulence.source == "processes" else []
     if not found:
-        return (modelled_turbulence(scenario, mode, dt),)
+        return (modelled_turbulence(scenario, mode, dt, spectrum),)
     if scenario.kalman.process_noise == "matched":
         return tuple(found)
-    factor = modelled_processes(scenario, mode, dt)[0].rms / turbulence_rms(scenario, mode)
+    factor = _one_process(scenario, mode, dt).rms / turbulence_rms(scenario, mode)
     return tuple(replace(p, rms=factor * p.rms) for p in found)
 
 
-def modelled_turbulence(scenario: Scenario, mode: int, dt: float) -> Ar2 | Ar3:
-    """Return the turbulence of the model: that of one peak, or of third order and nearest to the true spectrum of the LGS."""
-    process, _ = modelled_processes(scenario, mode, dt)
+def modelled_turbulence(scenario: Scenario, mode: int, dt: float, spectrum: Array | None = None) -> Ar2 | Ar3:
+    """Return the turbulence of the model: that of one peak, or of third order and nearest to the true spectrum of the LGS.
+
+    spectrum : that of the turbulence in the LGS (`lgs_turbulence_spectrum`), where already computed
+    """
+    process = _one_process(scenario, mode, dt)
     if scenario.multipeak.turbulence_order == 2 or process.rms == 0:
         return process
     noise, _ = measurement_noise(scenario, mode)
     start = Ar3(process.omega, process.damping, 5.0 * process.omega, process.rms, dt)
-    return fit_ar3(lgs_turbulence_spectrum(scenario, mode), noise**2, start)
+    return fit_ar3(lgs_turbulence_spectrum(scenario, mode) if spectrum is None else spectrum, noise**2, start)
 
 
 def predicted_rms(scenario: Scenario, mode: int) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -168,7 +169,7 @@ def _dft_vibration(scenario: Scenario, mode: int, n: int, rng: np.random.Generat
             amplitude = np.sqrt(2.0) * peak_rms(peak.rms, mode) * strength(changes, t)
             out += amplitude * np.cos(2.0 * np.pi * (peak.frequency * t + phase_turns(changes, t) + stream.random()))
         elif i in moving:
-            power = _below_cutoff(scenario, _resonance(scenario, peak, mode, period, width), period)
+            power = _below_cutoff(scenario.vibration.cutoff, _resonance(scenario, peak, mode, period, width), period, scenario.dt)
             out += events.shift_peak(signal(power, period, stream), changes, scenario.dt)[:n]
     return out
 
@@ -189,33 +190,55 @@ def _bin_power(scenario: Scenario, mode: int, n: int, width: float, without: Col
         for i, peak in enumerate(v.peaks):
             if peak.damping > 0 and i not in without:
                 power = power + _resonance(scenario, peak, mode, n, width)
-        return _below_cutoff(scenario, power, n)
+        return _below_cutoff(v.cutoff, power, n, dt)
+    if v.source == "measured":
+        return _measured_power(v.spectrum, v.part, mode, v.cutoff, n, dt, width)
     if v.source == "psd":
-        power = mode_power(v.psd, scenario, mode, n)
-    elif v.source == "measured":
-        spectrum = measured_spectrum(v.spectrum)
-        if mode < spectrum.density.shape[1]:
-            power = table_power(spectrum.frequency, spectrum.part(v.part)[:, mode], n, dt)
-    power = _below_cutoff(scenario, power, n)
+        power = _widened(_below_cutoff(v.cutoff, mode_power(v.psd, scenario, mode, n), n, dt), v.cutoff, n, dt, width)
+    return power
+
+
+@lru_cache(maxsize=8)
+def _measured_power(name: str, part: str, mode: int, cutoff: float, n: int, dt: float, width: float) -> Array:
+    """Return the variance [um^2] of a measured spectrum in each DFT bin; read-only."""
+    spectrum, power = measured_spectrum(name), np.zeros(n // 2 + 1)
+    if mode < spectrum.density.shape[1]:
+        power = table_power(spectrum.frequency, spectrum.part(part)[:, mode], n, dt)
+    power = _widened(_below_cutoff(cutoff, power, n, dt), cutoff, n, dt, width)
+    power.flags.writeable = False
+    return power
+
+
+def _widened(power: Array, cutoff: float, n: int, dt: float, width: float) -> Array:
+    """Return the power with nothing narrower than `width` [Hz], none of it above the cut-off."""
     if width > 0:
         power = widen_lines(power, width * dt)
-        power[bin_frequencies(n, dt) > v.cutoff] = 0.0
+        power[bin_frequencies(n, dt) > cutoff] = 0.0
     return power
 
 
 def _resonance(scenario: Scenario, peak: Peak, mode: int, n: int, width: float) -> Array:
     """Return the variance [um^2] of one damped peak in each DFT bin up to the cut-off."""
-    edges = bin_edges(n, scenario.dt)
-    used = min(int(np.searchsorted(edges, scenario.vibration.cutoff)) + 2, edges.size)
     damping = damping_for_width(width, peak.frequency, peak.damping)
-    power = np.zeros(edges.size - 1)
-    power[: used - 1] = peak_rms(peak.rms, mode) ** 2 * resonance_power(peak.frequency, damping, edges[:used])
+    power = np.zeros(n // 2 + 1)
+    if (strength := peak_rms(peak.rms, mode)) > 0:
+        share = _resonance_share(peak.frequency, damping, scenario.vibration.cutoff, n, scenario.dt)
+        power[: share.size] = strength**2 * share
     return power
 
 
-def _below_cutoff(scenario: Scenario, power: Array, n: int) -> Array:
-    f = bin_frequencies(n, scenario.dt)
-    return np.where((f > 0) & (f <= scenario.vibration.cutoff) & (f < 0.5 / scenario.dt), power, 0.0)
+@lru_cache(maxsize=64)
+def _resonance_share(frequency: float, damping: float, cutoff: float, n: int, dt: float) -> Array:
+    """Return the share of a resonance's variance in each DFT bin up to the cut-off; read-only."""
+    edges = bin_edges(n, dt)
+    share = resonance_power(frequency, damping, edges[: int(np.searchsorted(edges, cutoff)) + 2])
+    share.flags.writeable = False
+    return share
+
+
+def _below_cutoff(cutoff: float, power: Array, n: int, dt: float) -> Array:
+    f = bin_frequencies(n, dt)
+    return np.where((f > 0) & (f <= cutoff) & (f < 0.5 / dt), power, 0.0)
 
 
 VIBRATION: dict[str, ModeSource] = {

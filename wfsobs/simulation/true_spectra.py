@@ -96,6 +96,11 @@ class TrueSpectra:
     pure: tuple[tuple[float, float], ...] = ()
 
     @property
+    def n(self) -> int:
+        """Length of the DFT."""
+        return 2 * (self.measurement.size - 1)
+
+    @property
     def total(self) -> tuple[Array, Complex | Array]:
         """(signal, shared) of the whole disturbance; turbulence and vibration are independent."""
         return sum(self.signal.values(), np.zeros(1)), sum(self.cross.values(), np.zeros(1))
@@ -123,7 +128,7 @@ class TrueSpectra:
         return sum((variance * np.cos(2.0 * pi * f * lag) for f, variance in self.pure), np.zeros(n))
 
 
-def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
+def true_spectra(scenario: Scenario, mode: int, air: TurbulenceSpectra | None = None) -> TrueSpectra:
     """Compute the spectra of one mode, from the settings alone.
 
     Parameters
@@ -132,6 +137,8 @@ def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
         Settings.
     mode : int
         Index of the mode.
+    air : TurbulenceSpectra, optional
+        Its turbulence, where already computed.
 
     Returns
     -------
@@ -139,7 +146,7 @@ def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
         Spectra.
     """
     n = n_frequencies(scenario)
-    air = TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n)
+    air = air or turbulence_spectra(scenario, mode, n)
     vibration, gain = _vibration(scenario, mode, n), lgs_weights(scenario)[mode, :, mode].sum()
     lines = _pure_lines(scenario, mode, n)
     if lines is not None:
@@ -163,7 +170,12 @@ def true_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
 
 def lgs_turbulence_spectrum(scenario: Scenario, mode: int) -> Array:
     """Return the spectrum of the turbulence in the combined LGS, on the frequencies of `true_spectra`."""
-    return TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n_frequencies(scenario)).measurement
+    return turbulence_spectra(scenario, mode, n_frequencies(scenario)).measurement
+
+
+def turbulence_spectra(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
+    """Return the spectra of the turbulence of one mode alone, for a DFT of `n` steps."""
+    return TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n)
 
 
 def n_frequencies(scenario: Scenario) -> int:

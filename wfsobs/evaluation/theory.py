@@ -1,0 +1,261 @@
+"""Predicted error spectra: what the linear observers of a scenario do on average, without a simulation.
+
+With H the response of an observer from z to its estimate of s, and the true spectra of the scenario (`true_spectra`), its error
+has the spectrum
+
+    S_e = S_s + |H|^2 S_z - 2 Re(S_sz H*),
+
+whatever the model that the observer is built on. H is the transform of the estimates from a single sample of one. That is the
+expectation over records after an infinitely long start. A record is one of them, and the scores of a short one scatter around it.
+
+Observers of the LGS that are linear have a prediction. Those that train on a record or learn during it have none, nor has one
+that looks ahead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from math import sqrt
+from typing import Any
+
+import numpy as np
+
+from wfsobs.evaluation.scores import BOUND
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Observer
+from wfsobs.prior import Lines, Prior, Training
+from wfsobs.priors_from.scenario import lines_of, lines_turbulence, observer_settings, prior_of
+from wfsobs.progress import QUIET
+from wfsobs.record import Measurements
+from wfsobs.scenario import Scenario
+from wfsobs.signal.welch import expected_psd
+from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, error_spectrum, factorise
+from wfsobs.simulation.true_spectra import (
+    TrueSpectra,
+    TurbulenceSpectra,
+    has_known_spectra,
+    n_frequencies,
+    true_spectra,
+    turbulence_spectra,
+)
+from wfsobs.typing import Array
+
+TRUTH = "truth"
+"""Name of the prediction of the target itself: the error of an estimate of zero."""
+
+SETTLED = 1e-6
+"""What may be left at the end of a response, over its maximum."""
+
+SHORTEST = 2**11
+"""Steps of the first look at a response; each next one is twice as long."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Prediction of one observer, target and mode.
+
+    Attributes
+    ----------
+    observer, target : str
+        Of what: an observer, BOUND, or TRUTH for the target itself.
+    rms : float
+        Rms error [um].
+    frequency : Array
+        Frequencies, (n,) [Hz].
+    density : Array
+        Expected Welch estimate of the spectrum of the error, or of the estimate, (n,) [um^2/Hz].
+    """
+
+    observer: str
+    target: str
+    rms: float
+    frequency: Array
+    density: Array
+
+
+def is_predicted(observer: Observer, target: str) -> bool:
+    """Return whether an observer's errors have a prediction."""
+    known = observer.linear and observer.causal and observer.sensors == ("lgs",)
+    return known and target in observer.targets and Training not in observer.prior
+
+
+class Identity:
+    """An object as a key: equal to the same object only, which it keeps from being thrown away."""
+
+    def __init__(self, it: object):
+        self.it = it
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Identity) and other.it is self.it
+
+    def __hash__(self) -> int:
+        return id(self.it)
+
+
+@dataclass
+class Theory:
+    """Predictions for one scenario after another; what two of them share is computed once.
+
+    Attributes
+    ----------
+    resolution : float
+        Resolution of the Welch estimates [Hz].
+    """
+
+    resolution: float = 0.5
+    _kept: dict[str, tuple[Any, Any]] = field(default_factory=dict, repr=False)
+    _lengths: dict[str, int] = field(default_factory=dict, repr=False)
+
+    def predict(
+        self, scenario: Scenario, mode: int, target: str, observers: Iterable[str] | None = None, of_error: bool = True
+    ) -> list[Prediction]:
+        """Predict the errors of observers.
+
+        Parameters
+        ----------
+        scenario : Scenario
+            Settings.
+        mode : int
+            Index of the mode.
+        target : str
+            "turbulence" or "vibration".
+        observers : iterable of str, optional
+            Ids of the observers, and BOUND; by default all. Those without a prediction are left out.
+        of_error : bool
+            Whether densities are those of errors, else of estimates.
+
+        Returns
+        -------
+        list of Prediction
+            That of the target itself (TRUTH), then one per observer.
+
+        Raises
+        ------
+        ValueError
+            The spectra of the scenario are not known.
+        """
+        if not has_known_spectra(scenario):
+            raise ValueError("no prediction: the spectra of this scenario are not known, or events change them")
+        spectra = self._spectra(scenario, mode)
+        cross = self._keep(f"cross {target}", Identity(spectra), lambda: advance_spectrum(spectra.cross[target], 1))
+        n_steps = scenario.n_steps - round(scenario.run.warm_up / scenario.dt)
+        out = []
+        for name in (TRUTH, *([*OBSERVERS, BOUND] if observers is None else observers)):
+            observer = OBSERVERS.get(name)
+            if observer is not None and not is_predicted(observer, target):
+                continue
+            H = None if observer is None else self._response(observer, scenario, mode, target, spectra.n)
+            made_of = Identity(spectra), Identity(H), n_steps, of_error
+
+            def make(name: str = name, H: Complex | None = H) -> Prediction:
+                signal, error = _own(spectra, name, target) if H is None else _through(H, spectra, cross, target)
+                frequency, density = expected_psd(error if of_error else signal, scenario.dt, n_steps, self.resolution)
+                return Prediction(name, target, sqrt(max(circle_mean(error), 0.0)), frequency, density)
+
+            out.append(self._keep(f"{name}, {target}", made_of, make))
+        return out
+
+    # ------------------------------------------------------------------ what is kept
+
+    def _keep(self, name: str, key: Any, make: Callable[[], Any]) -> Any:
+        """Return what was made last under a name if its key is the same, else make it."""
+        kept = self._kept.get(name)
+        if kept is None or kept[0] != key:
+            self._kept[name] = kept = key, make()
+        return kept[1]
+
+    def _spectra(self, scenario: Scenario, mode: int) -> TrueSpectra:
+        key = mode, _groups(scenario, *AIR, "vibration")
+        return self._keep("spectra", key, lambda: true_spectra(scenario, mode, self._air(scenario, mode)))
+
+    def _air(self, scenario: Scenario, mode: int) -> TurbulenceSpectra:
+        n = n_frequencies(scenario)
+        return self._keep("air", (mode, n, _groups(scenario, *AIR)), lambda: turbulence_spectra(scenario, mode, n))
+
+    def _response(self, observer: Observer, scenario: Scenario, mode: int, target: str, n: int) -> Complex:
+        settings, prior, name = observer_settings(observer, scenario), self._prior(observer, scenario, mode), observer.id
+
+        def taps() -> dict[str, Array]:
+            found = impulse_response(observer, prior, settings, scenario.dt, n, self._lengths.get(name, SHORTEST))
+            self._lengths[name] = len(found[target])
+            return found
+
+        h = self._keep(f"response {name}", (prior, settings, n), taps)[target]
+        return self._keep(f"response {name}, {target}", Identity(h), lambda: np.fft.rfft(h, n))
+
+    def _prior(self, observer: Observer, scenario: Scenario, mode: int) -> Prior:
+        if Lines not in observer.prior:
+            return prior_of(scenario, None, observer.prior, modes=[mode])
+        air, k = self._air(scenario, mode), scenario.kalman
+        key = (
+            Identity(air),
+            scenario.multipeak.turbulence_order,
+            k.process_noise,
+            k.turbulence_rms,
+            k.measurement_noise,
+            k.lgs_noise,
+        )
+        turbulence = self._keep("turbulence", key, lambda: lines_turbulence(scenario, mode, scenario.dt, air.measurement))
+        return Prior(lines=(lines_of(scenario, mode, turbulence=turbulence),))
+
+
+AIR = ("telescope", "turbulence", "sensors", "run")
+"""Groups of settings that the turbulence and its sensors depend on."""
+
+
+def _groups(scenario: Scenario, *names: str) -> list[dict[str, Any]]:
+    return [getattr(scenario, name).to_dict() for name in names]
+
+
+def impulse_response(
+    observer: Observer, prior: Prior, settings: Any, dt: float, most: int, first: int = SHORTEST
+) -> dict[str, Array]:
+    """Compute the estimates of a linear observer of one mode from a single sample of one.
+
+    Parameters
+    ----------
+    observer : Observer
+        The observer.
+    prior, settings : Prior, Group or None
+        What it is given, of one mode.
+    dt : float
+        Time step [s].
+    most : int
+        Maximum number of steps.
+    first : int
+        Steps of the first try, twice as many in each next, until the response has settled.
+
+    Returns
+    -------
+    dict of str to Array
+        Target -> response, (n_steps,).
+    """
+    steps = min(first, most)
+    while True:
+        impulse = np.zeros((steps, 1))
+        impulse[0] = 1.0
+        found = observer.run(Measurements(impulse, np.zeros_like(impulse), dt), prior, settings, QUIET)
+        taps = {target: np.nan_to_num(values)[:, 0] for target, values in found.items()}
+        if steps == most or all(_has_settled(h) for h in taps.values()):
+            return taps
+        steps = min(2 * steps, most)
+
+
+def _has_settled(h: Array) -> bool:
+    return float(np.abs(h[-h.size // 8 :]).max()) <= SETTLED * float(np.abs(h).max())
+
+
+def _through(H: Complex, spectra: TrueSpectra, cross: Complex, target: str) -> tuple[Array, Array]:
+    """Return the spectra of an estimate and of its error; H : the response, cross : S_sz."""
+    power = (H.real**2 + H.imag**2) * spectra.measurement
+    return power, spectra.signal[target] + power - 2.0 * (cross.real * H.real + cross.imag * H.imag)
+
+
+def _own(spectra: TrueSpectra, name: str, target: str) -> tuple[Array, Array]:
+    """Return, twice, the spectrum of the target, or that of the minimum error from the mean of the LGS."""
+    if name == TRUTH:
+        return spectra.signal[target], spectra.signal[target]
+    known = spectra.without_lines
+    least = error_spectrum(known.signal[target], advance_spectrum(known.cross[target], 1), factorise(known.measurement))
+    return least, least
