@@ -130,7 +130,7 @@ class TestSpectrum:
             density = (error if of_error else signal)[:, 0]
             np.testing.assert_allclose(found[name].frequency, frequency)
             for low, high in ((2.0, 9.0), (9.0, 13.0), (13.0, 22.0), (22.0, 28.0), (40.0, 50.0), (50.0, 400.0)):
-                # 200 s of lines half a hertz wide are a hundred independent values: 7 % of their variance, 3.5 % of the rms, thrice
+                # 200 s of a line half a hertz wide are a hundred independent values: 3.5 % of the rms, thrice
                 expected = band_rms(frequency, found[name].density, low, high)
                 assert band_rms(frequency, density, low, high) == pytest.approx(expected, rel=0.11), (name, low)
             total = next(s.rms for s in result.scores if (s.observer, s.target, s.mode) == (name, "vibration", "tip"))

@@ -96,6 +96,7 @@ class Display(param.Parameterized):
     dark = param.Boolean(False, doc="Dark mode.")
     spectrum = param.Selector(default=PSD, objects=[PSD, CUMULATIVE], label="Spectrum")
     windowed = param.Boolean(False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone.")
+    editing = param.Boolean(False, label="Edit on the figure", doc="Handles on the spectra, and what theory predicts.")
     best_first = param.Boolean(True, label="Best first", doc="Sort the observers of the table by their error.")
     pinned = param.ClassSelector(class_=Pin, default=None, allow_None=True, doc="The run to compare with.")
 

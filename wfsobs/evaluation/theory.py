@@ -104,7 +104,7 @@ class Theory:
     """
 
     resolution: float = 0.5
-    _kept: dict[str, tuple[Any, Any]] = field(default_factory=dict, repr=False)
+    _memory: dict[str, tuple[Any, Any]] = field(default_factory=dict, repr=False)
     _lengths: dict[str, int] = field(default_factory=dict, repr=False)
 
     def predict(
@@ -160,9 +160,9 @@ class Theory:
 
     def _keep(self, name: str, key: Any, make: Callable[[], Any]) -> Any:
         """Return what was made last under a name if its key is the same, else make it."""
-        kept = self._kept.get(name)
+        kept = self._memory.get(name)
         if kept is None or kept[0] != key:
-            self._kept[name] = kept = key, make()
+            self._memory[name] = kept = key, make()
         return kept[1]
 
     def _spectra(self, scenario: Scenario, mode: int) -> TrueSpectra:

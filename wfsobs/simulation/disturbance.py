@@ -194,7 +194,7 @@ def _bin_power(scenario: Scenario, mode: int, n: int, width: float, without: Col
     if v.source == "measured":
         return _measured_power(v.spectrum, v.part, mode, v.cutoff, n, dt, width)
     if v.source == "psd":
-        power = _widened(_below_cutoff(v.cutoff, mode_power(v.psd, scenario, mode, n), n, dt), v.cutoff, n, dt, width)
+        power = _widen(_below_cutoff(v.cutoff, mode_power(v.psd, scenario, mode, n), n, dt), v.cutoff, n, dt, width)
     return power
 
 
@@ -204,12 +204,12 @@ def _measured_power(name: str, part: str, mode: int, cutoff: float, n: int, dt: 
     spectrum, power = measured_spectrum(name), np.zeros(n // 2 + 1)
     if mode < spectrum.density.shape[1]:
         power = table_power(spectrum.frequency, spectrum.part(part)[:, mode], n, dt)
-    power = _widened(_below_cutoff(cutoff, power, n, dt), cutoff, n, dt, width)
+    power = _widen(_below_cutoff(cutoff, power, n, dt), cutoff, n, dt, width)
     power.flags.writeable = False
     return power
 
 
-def _widened(power: Array, cutoff: float, n: int, dt: float, width: float) -> Array:
+def _widen(power: Array, cutoff: float, n: int, dt: float, width: float) -> Array:
     """Return the power with nothing narrower than `width` [Hz], none of it above the cut-off."""
     if width > 0:
         power = widen_lines(power, width * dt)

@@ -47,6 +47,7 @@ class Job:
     time_limit : of the work, after which it is told to stop [s]
     wait_limit : of the time in the line, after which it is given up [s]
     refusal    : exceptions of the work that are a reason in one line; others are bugs, and logged
+    quiet      : one of many in a second, of which the log says nothing unless it is asked for everything
     """
 
     numbers = itertools.count(1)
@@ -62,12 +63,14 @@ class Job:
         time_limit: float = math.inf,
         wait_limit: float = math.inf,
         refusal: type[Exception] = ValueError,
+        quiet: bool = False,
     ):
         self.kind, self.key, self.cost = kind, key, cost
         self.priority = (CLICK if cost <= LONG else SWEEP) if priority is None else priority
         self.time_limit, self.wait_limit = time_limit, wait_limit
         self.number, self.since, self.turn = next(Job.numbers), monotonic(), 0
         self._work, self._refusal = work, refusal
+        self._level = logging.DEBUG if quiet else logging.INFO
         self._lock = threading.RLock()  # where a session has no thread of its own, a listener may leave
         self._listeners: dict[Listener, Hashable] = {}
         self._unwanted = False
@@ -114,7 +117,14 @@ class Job:
         Keep is given the key, if there is one, and the result; busy tells a job for idle time that there is other work.
         """
         start, told = monotonic(), 0.0
-        event(f"{self.kind}-start", **{self.kind: self.number}, session=self.owner, wait=start - self.since, estimate=self.cost)
+        event(
+            f"{self.kind}-start",
+            self._level,
+            **{self.kind: self.number},
+            session=self.owner,
+            wait=start - self.since,
+            estimate=self.cost,
+        )
 
         def progress(fraction: float) -> None:
             nonlocal told
@@ -154,7 +164,7 @@ class Job:
             log.exception("%s %d failed", self.kind, self.number)
             news["message"] = f"{type(error).__name__}: {error}"
         finally:
-            level = logging.ERROR if said == "failed" else logging.INFO
+            level = logging.ERROR if said == "failed" else self._level
             event(f"{self.kind}-end", level, **{self.kind: self.number}, state=said, seconds=monotonic() - start)
             if said != "gave way":
                 self.tell(**news)

@@ -18,11 +18,13 @@ from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import HEARD, asset
 from wfsobs.app.views.budget import BudgetView
+from wfsobs.app.views.frames import Frames
 from wfsobs.app.views.main_lines import MainLines
 from wfsobs.app.views.pinning import Pinning
 from wfsobs.app.views.plots import call
 from wfsobs.app.views.seed_switch import SeedSwitch
 from wfsobs.app.views.spectra import MODEL, PEAKS, SpectraFigures
+from wfsobs.app.views.spectrum_editor import SpectrumEditor
 from wfsobs.app.views.stretch import Stretch
 from wfsobs.app.views.strip import Strip
 from wfsobs.app.views.table import Table
@@ -58,6 +60,9 @@ class Explore:
         self.stretches = {target: Stretch(target, run, display, *axes) for target in TARGETS}
         self.table = Table(run, display, seeds)
         self.pinning = Pinning(run, display)
+        self.rooms: dict[str, pn.Column] = {}
+        self.editors: dict[str, SpectrumEditor] = {}
+        display.param.watch(self._edit, "editing")
         self.budget = BudgetView(seeds.store, display) if seeds else None
 
     def view(self) -> pn.Column:
@@ -82,6 +87,7 @@ class Explore:
             group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
             self._zoom_buttons(),
             pmui.Checkbox.from_param(self.display.param.windowed, size="small", margin=0),
+            *([pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0)] if self.seeds else []),
             *self.pinning.view(),
             gap="12px",
             align_items="center",
@@ -111,13 +117,25 @@ class Explore:
         cards.param.watch(lambda event: self._hide(target, event.new), "hidden")
         cards.on_main = lambda: self.lines.reset(target)
         marks = MARKS if target == VIBRATION else ""
+        self.rooms[target] = pn.Column(_caption("Spectrum", marks), self.spectra.pane(target), **TALL)
         figures = pn.Column(
             pn.Column(_caption("Time trace"), self.traces.pane(target), **TALL),
-            pn.Column(_caption("Spectrum", marks), self.spectra.pane(target), **TALL),
+            self.rooms[target],
             **WIDE,
             stylesheets=[GRID],
         )
         return box(target.capitalize(), self.verdicts[target].pane, cards, figures, self.stretches[target].pane)
+
+    def _edit(self, *_: object) -> None:
+        """Make the handles when they are first wanted."""
+        if self.editors or self.seeds is None:
+            return
+        frames = Frames(self.seeds.store.session)
+        with pn.io.hold():
+            for target, room in self.rooms.items():
+                fig = self.spectra.spectra[target].figure
+                self.editors[target] = SpectrumEditor(target, fig, self.seeds.store, self.display, frames)
+                room.append(self.editors[target].layer)
 
     def _hide(self, target: str, names: list[str]) -> None:
         if names != self.display.hidden.get(target, []):

@@ -89,8 +89,9 @@ def restyle(lines: dict[str, GlyphRenderer], dark: bool, hidden_names: list[str]
 class PinnedLines:
     """The lines of the pinned run in a figure, faint under those of the present one; nothing until there is one."""
 
-    def __init__(self, fig: figure):
-        self.figure = fig
+    def __init__(self, fig: figure, name: str = "pinned", **style: Any):
+        self.figure, self.name = fig, name
+        self.style = {"line_alpha": 0.4, "line_width": 1.0, "level": "underlay", **style}
         self.source: ColumnDataSource | None = None
 
     def draw(self, lines: dict[str, tuple[ArrayLike, ArrayLike]], dark: bool) -> None:
@@ -99,16 +100,7 @@ class PinnedLines:
             if not lines:
                 return
             self.source = ColumnDataSource({"xs": [], "ys": [], "colour": []})
-            self.figure.multi_line(
-                "xs",
-                "ys",
-                line_color="colour",
-                line_alpha=0.4,
-                line_width=1.0,
-                source=self.source,
-                name="pinned",
-                level="underlay",
-            )
+            self.figure.multi_line("xs", "ys", line_color="colour", source=self.source, name=self.name, **self.style)
         self.source.data = {
             "xs": [x for x, _ in lines.values()],
             "ys": [y for _, y in lines.values()],

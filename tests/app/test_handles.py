@@ -1,0 +1,184 @@
+"""Handles on the spectra: from messages of the browser to settings, and from settings to what is shown."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.handles import changes_of, handles_of, with_new_peak, without_peak
+from wfsobs.app.views.frames import Frames, Wish
+from wfsobs.app.views.spectrum_editor import SpectrumEditor
+from wfsobs.evaluation.theory import TRUTH, Prediction, Theory
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.settings.errors import SettingError
+from wfsobs.signal.spectrum import resonance_power, resonance_rms
+from wfsobs.simulation.turbulence import turbulence_process
+
+
+def moved(scenario: Scenario, target: str, name: str, mode: int = 0, **by: float) -> Scenario:
+    handle = next(h for h in handles_of(scenario, target, mode) if h.id == name)
+    return scenario.replace(changes_of(scenario, target, mode, handle.at(**by)))
+
+
+class TestSettings:
+    @pytest.mark.parametrize("preset", sorted(PRESETS))
+    @pytest.mark.parametrize("target", ["turbulence", "vibration"])
+    def test_each_handle_goes_where_it_is_moved(self, preset: str, target: str) -> None:
+        scenario = PRESETS[preset]()
+        for handle in handles_of(scenario, target, 0):
+            to = handle.at(1.1 * handle.frequency, 1.5, 1.2)
+            after = scenario.replace(changes_of(scenario, target, 0, to))
+            (found,) = [h for h in handles_of(after, target, 0) if h.id == handle.id]
+            assert found.frequency == pytest.approx(1.1 * handle.frequency, rel=1e-9)
+            assert (found.rms, found.damping) == (pytest.approx(to.rms), pytest.approx(to.damping))
+            others = [h for h in handles_of(after, target, 0) if h.id != handle.id]
+            assert others == [h for h in handles_of(scenario, target, 0) if h.id != handle.id], "the others stay"
+
+    def test_a_peak_changes_in_the_mode_shown_alone(self) -> None:
+        scenario = moved(PRESETS["paper"](), "vibration", "peak-14", mode=1, frequency=50.0, strength=2.0)
+        assert scenario.vibration.peaks[14].rms == [0.0079, pytest.approx(2 * 0.0027)]
+        assert scenario.vibration.peaks[14].frequency == 50.0
+
+    def test_a_peak_that_is_not_there_in_a_mode_can_grow(self) -> None:
+        assert moved(PRESETS["paper"](), "vibration", "peak-3", strength=2.0).vibration.peaks[3].rms[0] == pytest.approx(2e-4)
+        assert moved(PRESETS["paper"](), "vibration", "peak-3", frequency=12.5).vibration.peaks[3].rms[0] == 0.0
+
+    def test_the_corner_goes_with_the_wind(self) -> None:
+        scenario = PRESETS["ut4"]()
+        before = turbulence_process(scenario, 0, scenario.dt).omega / (2.0 * np.pi)
+        after = moved(scenario, "turbulence", "corner-0", frequency=2.0 * before)
+        assert after.turbulence.wind_speed == pytest.approx(2.0 * scenario.turbulence.wind_speed)
+
+    def test_matched_models_and_measured_lines_have_no_handles(self) -> None:
+        scenario = PRESETS["ut4"]().replace({"kalman.peak": "matched"})
+        assert {h.kind for h in handles_of(scenario, "vibration", 0)} == {"band"}
+
+    def test_a_new_peak_is_as_high_as_where_it_was_put(self) -> None:
+        scenario = PRESETS["paper"]()
+        after = scenario.replace(with_new_peak(scenario, 0, 30.0, 1e-6))
+        peak = after.vibration.peaks[-1]
+        share = resonance_power(30.0, peak.damping, [29.99, 30.01])[0] / 0.02
+        assert peak.rms[0] ** 2 * share == pytest.approx(1e-6, rel=0.02)  # of a Lorentzian, as damped as this
+        assert peak.rms[1] == 0.0
+        assert after.replace(without_peak(after, 15)) == scenario
+        with pytest.raises(SettingError, match="measured"):
+            with_new_peak(PRESETS["ut4"](), 0, 30.0)
+
+    def test_rms_of_a_height(self) -> None:
+        assert resonance_rms(resonance_power(20.0, 1e-3, [19.9999, 20.0001])[0] / 2e-4, 20.0, 1e-3) == pytest.approx(
+            1.0, rel=0.01
+        )
+
+
+@pytest.fixture
+def editor(dashboard: Dashboard, loop: Any) -> SpectrumEditor:
+    assert dashboard.explore.editors == {}, "made when first wanted"
+    dashboard.display.editing = True
+    editor = dashboard.explore.editors["vibration"]
+    loop.until(lambda: bool(editor.layer.frame["numbers"]))
+    return editor
+
+
+def numbers(editor: SpectrumEditor) -> dict[str, str]:
+    return {it["name"]: it["value"] for it in editor.layer.frame["numbers"]}
+
+
+def drag(number: int, action: str = "drag", **to: float) -> dict[str, Any]:
+    return {"action": action, "id": "peak-14", "number": number, "frequency": 47.44, "strength": 1.0, "damping": 1.0, **to}
+
+
+class TestMessages:
+    def test_a_drag_moves_numbers_and_line_and_sets_nothing(self, editor: SpectrumEditor, loop: Any) -> None:
+        store, before = editor.store, numbers(editor)
+        scenario, line = store.scenario, editor.lines.source.data["ys"][0]
+        editor.layer._handle_msg(drag(1, frequency=60.0, strength=3.0))
+        loop.until(lambda: editor.layer.frame["answered"] == 1)
+        assert store.scenario is scenario and not store.can_undo
+        assert numbers(editor)["kf-multi"] != before["kf-multi"]
+        assert not np.array_equal(editor.lines.source.data["ys"][0], line)
+        (handle,) = [h for h in editor.layer.frame["handles"] if h["id"] == "peak-14"]
+        assert (handle["frequency"], handle["text"]) == (60.0, "60 Hz, 23.7 nm rms, damping 0.004")
+        trial = scenario.replace({"vibration.peaks.14.frequency": 60.0, "vibration.peaks.14.rms": [3 * 0.0079, 0.0027]})
+        expected = {p.observer: p for p in Theory().predict(trial, 0, "vibration")}
+        assert float(numbers(editor)["kf-multi"]) == pytest.approx(1e3 * expected["kf-multi"].rms, rel=5e-3)  # three digits
+
+    def test_letting_go_sets_and_runs_and_undo_takes_it_back(self, editor: SpectrumEditor, loop: Any) -> None:
+        store, before = editor.store, numbers(editor)
+        editor.layer._handle_msg(drag(1, "release", frequency=60.0))
+        assert store.scenario.vibration.peaks[14].frequency == 60.0
+        assert store.run.state == "running"
+        loop.finish(store)
+        assert store.run.result.scenario == store.scenario
+        store.undo()
+        loop.until(lambda: numbers(editor) == before)
+        assert store.scenario.vibration.peaks[14].frequency == 47.44
+        loop.finish(store)
+
+    def test_giving_up_brings_it_back(self, editor: SpectrumEditor, loop: Any) -> None:
+        before = numbers(editor)
+        editor.layer._handle_msg(drag(1, frequency=60.0))
+        editor.layer._handle_msg({"action": "cancel", "number": 2})
+        loop.until(lambda: editor.layer.frame["answered"] == 2)
+        assert numbers(editor) == before
+        assert not editor.store.can_undo
+
+    @pytest.mark.parametrize(
+        "wrong",
+        [
+            {"frequency": -1.0},
+            {"frequency": float("nan")},
+            {"frequency": "x"},
+            {"frequency": 1e9},
+            {"strength": 1e12},
+            {"id": "peak-99"},
+            {"id": None},
+        ],
+    )
+    def test_what_cannot_be_is_refused_in_one_line(self, editor: SpectrumEditor, wrong: dict[str, Any]) -> None:
+        scenario = editor.store.scenario
+        editor.layer._handle_msg(drag(1, "release", **wrong))
+        assert editor.store.scenario is scenario
+        assert editor.layer.frame["answered"] == 1
+        assert editor.layer.frame["note"] and "\n" not in editor.layer.frame["note"]
+
+    def test_messages_without_sense_are_none(self, editor: SpectrumEditor) -> None:
+        frame = editor.layer.frame
+        for message in ("drag", 3, None, [1]):
+            editor.layer._handle_msg(message)
+        assert editor.layer.frame is frame
+
+    def test_what_has_no_prediction_says_why(self, editor: SpectrumEditor, loop: Any) -> None:
+        event = {"kind": "peak", "start": 1.0, "peak": 2, "frequency_shift": 3.0}
+        editor.store.replace({"events": [event]})
+        loop.until(lambda: bool(editor.layer.frame["note"]))
+        assert "events" in editor.layer.frame["note"]
+        assert editor.layer.frame["numbers"] == []
+        assert len(editor.layer.frame["handles"]) == 22, "they can be moved all the same"
+        loop.finish(editor.store)
+
+    def test_another_mode_or_none(self, editor: SpectrumEditor, loop: Any) -> None:
+        editor.display.mode = "tilt"
+        loop.until(lambda: editor.layer.frame["handles"][14]["text"].startswith("47.44 Hz, 2.70 nm"))
+        editor.display.editing = False
+        assert not editor.layer.visible
+        assert editor.lines.source.data["ys"] == []
+
+
+def test_the_newest_wish_wins(dashboard: Dashboard, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[float] = []
+
+    def predict(_self: Theory, scenario: Scenario, _mode: int, target: str, *_: Any) -> list[Prediction]:
+        asked.append(scenario.kalman.frequency)
+        return [Prediction(TRUTH, target, 1.0, np.zeros(1), np.zeros(1))]
+
+    monkeypatch.setattr(Theory, "predict", predict)
+    frames, landed = Frames(dashboard.store.session), []
+    for i in range(1, 11):
+        scenario = dashboard.store.scenario.replace({"kalman.frequency": float(i)})
+        frames.ask(Wish(scenario, "vibration", 0, (), True, i), lambda wish, found, why: landed.append(wish.number))
+    loop.until(lambda: len(landed) == 2)
+    assert landed == [1, 10] and asked == [1.0, 10.0], "one at a time, and those between are dropped"

@@ -1,0 +1,114 @@
+"""Handles on the spectra: drag one, and theory's numbers move; let go, and the settings are those; all of it by keyboard too."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+from playwright.sync_api import Locator, Page, expect
+
+STANDS = "47.44 Hz, 7.90 nm rms, damping 0.004"
+
+
+@pytest.fixture
+def page(open_page: Any) -> Page:
+    page = open_page()
+    expect(page.get_by_role("slider", name="Peak 15", exact=True)).to_have_count(0)
+    page.get_by_role("checkbox", name="Edit on the figure").check()
+    expect(predicted(page, "kf-multi")).to_have_text("10.9")
+    return page
+
+
+def handle(page: Page, name: str) -> Locator:
+    return page.get_by_role("slider", name=name, exact=True)
+
+
+def predicted(page: Page, name: str) -> Locator:
+    """What theory says of an observer, of the vibration."""
+    return page.locator(f".numbers span[data-name={name}] b").last
+
+
+def middle(of: Locator) -> tuple[float, float]:
+    of.scroll_into_view_if_needed()
+    box = of.bounding_box()
+    assert box is not None
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+
+def test_by_mouse(page: Page) -> None:
+    peak = handle(page, "Peak 15")
+    expect(peak).to_have_attribute("aria-valuetext", STANDS)
+    curve = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
+        .filter(m => m.type === "GlyphRenderer" && m.name === "predicted" && m.data_source.data.ys?.length > 3)
+        .map(m => m.data_source.data.ys[0][60])[0]"""
+    page.wait_for_function(curve)
+    before = page.evaluate(curve)
+    x, y = middle(peak)
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 40, y - 30, steps=6)
+    expect(predicted(page, "kf-multi")).not_to_have_text("10.9")
+    expect(peak).not_to_have_attribute("aria-valuetext", STANDS)
+    page.wait_for_function(f"before => ({curve})() !== before", arg=before)
+    expect(page.get_by_role("button", name="Undo")).to_be_disabled()  # nothing has been set yet
+    page.mouse.up()
+    expect(page.get_by_role("button", name="Undo")).to_be_enabled()
+    moved = float(re.findall(r"[\d.]+", peak.get_attribute("aria-valuetext") or "")[0])
+    assert moved > 60.0
+    expect(page.locator(".card[data-name=kf-multi] .value").last).not_to_have_text("10.4 nm")  # the run, of 14 and the moved line
+    page.get_by_role("button", name="Undo").click()
+    expect(peak).to_have_attribute("aria-valuetext", STANDS)
+    expect(predicted(page, "kf-multi")).to_have_text("10.9")
+
+
+def test_by_keyboard(page: Page) -> None:
+    peak = handle(page, "Peak 15")
+    peak.focus()
+    for key in ("Shift+ArrowRight", "Shift+ArrowUp", "PageUp"):
+        page.keyboard.press(key)
+    # 5 % in frequency, 1.06^4 in rms, 1.12 in damping
+    expect(peak).to_have_attribute("aria-valuetext", "49.81 Hz, 9.97 nm rms, damping 0.00448")
+    expect(predicted(page, "kf-multi")).not_to_have_text("10.9")
+    expect(page.get_by_role("button", name="Undo")).to_be_enabled()  # some time after the last key
+    expect(peak).to_be_focused()
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("Escape")
+    expect(peak).to_have_attribute("aria-valuetext", "49.81 Hz, 9.97 nm rms, damping 0.00448")
+    page.get_by_role("button", name="Undo").click()
+    expect(peak).to_have_attribute("aria-valuetext", STANDS)
+
+
+def test_one_more_and_one_less(page: Page) -> None:
+    add = page.get_by_role("button", name="Add a peak")
+    add.focus()
+    page.keyboard.press("Enter")
+    expect(handle(page, "Peak 16")).to_be_focused()
+    page.keyboard.press("Delete")
+    expect(handle(page, "Peak 16")).to_have_count(0)
+    figure = page.get_by_role("figure", name="Vibration spectrum")
+    x, y = middle(figure)
+    page.mouse.click(x + 50, y)  # a click by itself adds nothing
+    add.click()
+    expect(add).to_have_attribute("aria-pressed", "true")
+    page.mouse.click(x + 50, y)
+    expect(handle(page, "Peak 16")).to_be_focused()
+    expect(add).to_have_attribute("aria-pressed", "false")
+    expect(handle(page, "Peak 17")).to_have_count(0)
+
+
+def test_other_handles(page: Page) -> None:
+    for name, target in (("Peak of the Kalman filters", "kf-lgs"), ("Band 1", "kf-multi")):
+        before = handle(page, name).get_attribute("aria-valuetext")
+        handle(page, name).focus()
+        page.keyboard.press("Shift+ArrowRight")
+        expect(handle(page, name)).not_to_have_attribute("aria-valuetext", before or "")
+        page.keyboard.press("Escape")
+        expect(handle(page, name)).to_have_attribute("aria-valuetext", before or "")
+        expect(predicted(page, target)).to_be_visible()
+    corner = handle(page, "Corner of the turbulence")
+    corner.focus()
+    page.keyboard.press("Shift+ArrowRight")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("textbox", name=re.compile("Wind speed")).or_(page.get_by_role("spinbutton")).first).to_be_visible()
+    expect(page.get_by_role("button", name="Undo")).to_be_enabled()

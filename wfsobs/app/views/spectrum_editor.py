@@ -1,0 +1,206 @@
+"""A spectrum that can be taken hold of: its handles, what theory expects while one is moved, and the settings after it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from math import isfinite
+from typing import Any
+
+import numpy as np
+import panel as pn
+import param
+from bokeh.plotting import figure
+from panel.custom import JSComponent
+
+from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.handles import PEAK, Handle, changes_of, handles_of, has_peaks, with_new_peak, without_peak
+from wfsobs.app.numbers import number
+from wfsobs.app.store import Store
+from wfsobs.app.style import asset, look, observers_of
+from wfsobs.app.views.frames import Frames, Wish
+from wfsobs.app.views.plots import PinnedLines
+from wfsobs.evaluation.error_spectra import cumulative_rms
+from wfsobs.evaluation.scores import BOUND
+from wfsobs.evaluation.theory import TRUTH, Prediction
+from wfsobs.observers.base import VIBRATION
+from wfsobs.scenario import Scenario
+from wfsobs.settings.errors import SettingError
+from wfsobs.typing import Array
+
+CAPTION = "Predicted rms error"
+
+
+class HandleLayer(JSComponent):
+    """The handles in the browser, and the numbers below the figure. All that it shows is one frame, made here."""
+
+    figure = param.String("", doc="Name of the figure that the handles lie over.")
+    frame = param.Dict({}, doc="What is shown: handles, numbers, a note, and the number of the message that is answered.")
+
+    _esm = asset("handles.js")
+    _stylesheets = [asset("handles.css")]  # noqa: RUF012
+
+    def __init__(self, hear: Callable[[Mapping[str, Any]], None], **params: Any):
+        self._hear = hear
+        super().__init__(**params)
+
+    def _handle_msg(self, data: object) -> None:
+        if isinstance(data, dict):
+            self._hear(data)
+
+
+class SpectrumEditor:
+    """One figure's."""
+
+    def __init__(self, target: str, fig: figure, store: Store, display: Display, frames: Frames):
+        self.target, self.store, self.display, self.frames = target, store, display, frames
+        self.figure = fig
+        self.trial = store.scenario
+        self.layer = HandleLayer(
+            self.hear, figure=str(fig.name), frame=self._frame(), sizing_mode="stretch_width", margin=0, visible=False
+        )
+        self.lines = PinnedLines(fig, "predicted", line_alpha=1.0, line_width=1.6, line_dash=[2, 2], level="glyph")
+        self._number = 0
+        self._was: dict[str, float] = {}
+        self._last: tuple[Wish, list[Prediction]] | None = None
+        store.param.watch(self._follow, "scenario")
+        display.param.watch(self._ask, ["mode", "unit", "spectrum", "show", "hidden", "dark"])
+        display.param.watch(self._turn, "editing")
+        self._turn()
+
+    # ------------------------------------------------------------------ what comes in
+
+    def hear(self, message: Mapping[str, Any]) -> None:
+        """Take a wish of the browser: a handle on its way, let go or given up, a peak to add or to remove."""
+        self._number = int(message.get("number", 0))
+        base, note = self.store.scenario, ""
+        try:
+            changes = self._changes(base, message)
+            trial = base.replace(changes) if changes else base
+            self.store.validate(trial)
+            self.trial = trial
+            if changes and message.get("action") != "drag":
+                self.store.replace(changes)
+        except (SettingError, ValueError, TypeError) as error:
+            note = str(error)
+            if message.get("action") != "drag":
+                self.trial = base
+        self._ask(note=note)
+
+    def _changes(self, base: Scenario, message: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings that a message is about; none for one that gives up. Raises SettingError, ValueError."""
+        action, mode = message.get("action"), self.display.column
+        if action in ("drag", "release"):
+            handle = self._handle(base, message)
+            frequency, strength, damping = (_positive(message[name]) for name in ("frequency", "strength", "damping"))
+            return changes_of(base, self.target, mode, handle.at(frequency, strength, damping))
+        if action == "add":
+            height = message.get("height")
+            own = None if height is None or self.display.cumulative else _positive(height) / self._scale(base) ** 2
+            return with_new_peak(base, mode, _positive(message["frequency"]), own)
+        if action == "remove":
+            return without_peak(base, self._handle(base, message).index)
+        return {}
+
+    def _handle(self, scenario: Scenario, message: Mapping[str, Any]) -> Handle:
+        found = [h for h in handles_of(scenario, self.target, self.display.column) if h.id == message.get("id")]
+        if not found:
+            raise SettingError("this handle is no longer there")
+        return found[0]
+
+    def _follow(self, *_: object) -> None:
+        """Take over settings that have changed, here or elsewhere."""
+        self.trial, self._was = self.store.scenario, {}
+        self._ask()
+
+    def _turn(self, *_: object) -> None:
+        self.layer.visible = self.display.editing
+        if self.display.editing:
+            self.trial = self.store.scenario
+            self._ask()
+        else:
+            self.lines.draw({}, self.display.dark)
+
+    # ------------------------------------------------------------------ what goes out
+
+    def _ask(self, *_: object, note: str = "") -> None:
+        """Have theory say what it expects of the settings as they would be."""
+        if not self.display.editing or self.display.column >= len(self.trial.modes):
+            return
+        if note:
+            self._show(note)
+            return
+        hidden = self.display.hidden.get(self.target, [])
+        names = (*(name for name in observers_of(self.target) if name not in hidden), BOUND)
+        wish = Wish(self.trial, self.target, self.display.column, names, self.display.error, self._number)
+        self.frames.ask(wish, self._land)
+
+    def _land(self, wish: Wish, predictions: list[Prediction], why: str) -> None:
+        if not self.display.editing:
+            return
+        self._last = wish, predictions
+        if wish.scenario == self.store.scenario:
+            self._was = {p.observer: p.rms for p in predictions}
+        with pn.io.hold():
+            self.lines.draw({p.observer: self._curve(p) for p in predictions}, self.display.dark)
+            self._show(why, wish.number)
+
+    def _show(self, note: str, reply_to: int | None = None) -> None:
+        self.layer.frame = self._frame(note, self._number if reply_to is None else reply_to)
+
+    def _frame(self, note: str = "", reply_to: int = 0) -> dict[str, Any]:
+        """Describe all that is shown."""
+        last = getattr(self, "_last", None)
+        found = last[1] if last else []
+        frame: dict[str, Any] = {
+            "handles": [self._entry(handle, found) for handle in handles_of(self.trial, self.target, self.display.column)],
+            "numbers": [self._number_of(p) for p in found if p.observer != TRUTH],
+            "note": note,
+            "answered": reply_to,
+            "exponent": 1.0 if self.display.cumulative else 0.5,
+            "limits": [0.01, 0.5 / self.trial.dt],
+        }
+        if self.target == VIBRATION:
+            frame["add"] = "" if has_peaks(self.trial) else f"vibration.source = {self.trial.vibration.source} has no peaks"
+            frame["added"] = f"{PEAK}-{len(self.trial.vibration.peaks) - 1}"
+        return frame
+
+    def _entry(self, handle: Handle, predictions: list[Prediction]) -> dict[str, Any]:
+        truth = next((self._curve(p) for p in predictions if p.observer == TRUTH), None)
+        return {
+            "id": handle.id,
+            "kind": handle.kind,
+            "label": handle.label,
+            "text": handle.text,
+            "frequency": handle.frequency,
+            "y": None if truth is None else float(np.interp(handle.frequency, *truth)),
+            "strength": handle.rms is not None,
+            "damping": handle.damping is not None,
+        }
+
+    def _number_of(self, p: Prediction) -> dict[str, Any]:
+        scale, was, it = self._scale(self.trial), self._was.get(p.observer), look(p.observer)
+        value, before = number(p.rms * scale), "" if was is None else number(was * scale)
+        return {
+            "name": p.observer,
+            "label": it.label,
+            "colour": it.colour(self.display.dark),
+            "value": value,
+            "was": "" if before == value else before,
+            "unit": self.display.unit_label,
+        }
+
+    def _scale(self, scenario: Scenario) -> float:
+        return per_micrometre(self.display.unit, scenario.telescope.diameter)
+
+    def _curve(self, p: Prediction) -> tuple[Array, Array]:
+        """Return what is drawn: frequencies and densities above zero frequency, or the rms from each on."""
+        scale, frequency = self._scale(self.trial), p.frequency[1:]
+        density = p.density[1:]
+        return frequency, scale * cumulative_rms(frequency, density) if self.display.cumulative else scale**2 * density
+
+
+def _positive(x: object) -> float:
+    """Return a number of a message. Raises ValueError where it is none above 0."""
+    if isinstance(x, (int, float)) and isfinite(x) and x > 0:
+        return float(x)
+    raise ValueError("a handle can be moved to positive numbers only")
