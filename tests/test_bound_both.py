@@ -40,7 +40,7 @@ MATCHED = Scenario().replace(
 def riccati_errors(scenario: Scenario) -> tuple[dict[str, Array], dict[str, Array]]:
     """Target -> rms errors of phi[k] and of phi[k + 1] at every phase, from the periodic Riccati equation of the true model."""
     model, ratio = kalman_model(scenario, 0, scenario.dt), scenario.sensors.exposure_ratio
-    cycle = optimal_cycle(model, ratio, *measurement_noise(scenario, 0), lgs_error_process(scenario, 0, scenario.dt))
+    cycle = optimal_cycle(model, ratio, *measurement_noise(scenario, 0), [lgs_error_process(scenario, 0, scenario.dt)])
     states = periodic_steady_state(cycle)
     extra = len(states[0].P) - len(model.A)
     rows = {name: np.append(row, np.zeros(extra)) for name, row in model.outputs.items()}

@@ -129,7 +129,7 @@ def sampling_of(scenario: Scenario) -> Sampling:
 
 def _of_modes(prior: Prior, name: str, n: int) -> Prior:
     """Return the prior of the first n modes. Raises StepError where it has fewer."""
-    parts = {"model": prior.model, "lgs_error": prior.lgs_error, "lines": prior.lines, "spectra": prior.spectra}
+    parts = {part: getattr(prior, part) for part in ("model", "lgs_error", "lines", "beams", "spectra")}
     for part, given in parts.items():
         if given and len(given) < n:
             raise StepError(f"{name}: the prior has {part} of {len(given)} modes, the loop has {n}")

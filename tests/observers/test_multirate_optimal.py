@@ -75,7 +75,7 @@ def run_cycle(cycle, z, outputs):
 def test_innovations_are_white_and_errors_as_predicted(with_error):
     """Ljung-Box over 20 lags at 1 % on 1e6 steps; covariances against Monte Carlo within 3 standard errors."""
     error = Ar2(7.0686, 0.9, 0.05, DT) if with_error else None
-    cycle = optimal_cycle(MODEL, 5, 0.014, 0.01, error)
+    cycle = optimal_cycle(MODEL, 5, 0.014, 0.01, [error] if error else [])
     processes = [TURBULENCE, VIBRATION, *([error] if error else [])]
     x, z = simulated(cycle, processes, 200_000, np.random.default_rng(11))
     outputs = padded(OUTPUTS, cycle)
@@ -135,7 +135,7 @@ def test_never_worse_than_the_better_single_sensor_filter(ratio, lgs, ngs, wind,
         [Ar2(0.6 * np.pi * 2 * wind / 8, 0.9, 0.5, DT)], [Ar2(2 * np.pi * frequency, 10**damping, 10**rms, DT)]
     )
     slow = None if error is None else Ar2(0.6 * np.pi * 2 * wind / 8, 0.9, 10**error, DT)
-    cycle = optimal_cycle(model, ratio, 10**lgs, 10**ngs, slow)
+    cycle = optimal_cycle(model, ratio, 10**lgs, 10**ngs, [slow] if slow else [])
     rows = padded(OUTPUTS, cycle)
 
     def mean_error(rows_kept):

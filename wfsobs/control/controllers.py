@@ -12,7 +12,7 @@ from wfsobs.control.lqg import lqg_kf_lgs, lqg_kf_multi, lqg_multirate, lqg_mult
 from wfsobs.control.mirror import Plant
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead, step_gpr_offline_ahead, step_gpr_online_ahead
 from wfsobs.observers.base import Look
-from wfsobs.prior import Bands, LgsError, Lines, Model, Part, Prior, Spectra, Training
+from wfsobs.prior import Bands, Beams, LgsError, Lines, Model, Part, Prior, Spectra, Training
 from wfsobs.registry import Registry
 
 
@@ -97,7 +97,7 @@ CONTROLLERS = Registry(
             "LQG, multi-rate multi-peak KF",
             lqg_multirate_multi,
             help="minus what the optimal multi-rate filter of every peak predicts",
-            prior=(Model, LgsError, Lines),
+            prior=(Model, Lines, Beams),
             settings=("multirate", "multipeak"),
             ngs=True,
             look=Look("LQG opt. peaks", "#B40000", "#FF7A70", (8, 3)),

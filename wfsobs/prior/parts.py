@@ -69,12 +69,32 @@ class Lines:
 
     def disturbance(self, line_width: float) -> DisturbanceModel:
         """Return the state-space model, with `line_width` the minimum line width (FWHM) [Hz]."""
+        return disturbance_model(self.turbulence, self.peaks(line_width))
+
+    def peaks(self, line_width: float) -> list[Ar2]:
+        """Return the processes of the lines."""
         least = pi * line_width  # as xi w
         peaks = []
         for frequency, damping, rms in self.lines:
             omega = 2.0 * pi * frequency
             peaks.append(Ar2(omega, min(max(damping, least / omega), 1.0), rms, self.dt))
-        return disturbance_model(self.turbulence, peaks)
+        return peaks
+
+
+@dataclass(frozen=True)
+class Beams:
+    """Turbulence of one mode as the target has it and as the LGS together see it: independent processes at the fast step.
+
+    common : in both;  gain : of the LGS for them
+    target, lgs : in one alone
+    line_gain   : of the LGS for the vibration
+    """
+
+    common: tuple[Ar2 | Ar3, ...]
+    target: tuple[Ar2 | Ar3, ...] = ()
+    lgs: tuple[Ar2 | Ar3, ...] = ()
+    gain: float = 1.0
+    line_gain: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from wfsobs.prior import Bands, LgsError, Lines, Model, Part, Prior
+from wfsobs.prior import Bands, Beams, LgsError, Lines, Model, Part, Prior
 from wfsobs.priors_from import scenario as priors
 from wfsobs.scenario import Scenario
 
@@ -31,7 +31,7 @@ def told_by(model: Scenario | Identification, scenario: Scenario) -> Scenario:
     return out
 
 
-KNOWN: tuple[Part, ...] = (Model, LgsError, Lines, Bands)
+KNOWN: tuple[Part, ...] = (Model, LgsError, Lines, Beams, Bands)
 """What an identification tells."""
 
 
@@ -43,4 +43,9 @@ def prior_of(identification: Identification, parts: Iterable[Part] = KNOWN, scen
     """
     prior, n = priors.prior_of(told_by(identification, scenario or Scenario()), None, parts), len(identification.modes)
     lines = tuple(mode.prior for mode in identification.modes) if prior.lines else ()
-    return replace(prior, model=prior.model[:n], lgs_error=prior.lgs_error[:n], lines=lines, spectra=prior.spectra[:n])
+    beams = tuple(
+        replace(one, common=mode.prior.turbulence) for one, mode in zip(prior.beams, identification.modes, strict=False)
+    )
+    return replace(
+        prior, model=prior.model[:n], lgs_error=prior.lgs_error[:n], lines=lines, beams=beams, spectra=prior.spectra[:n]
+    )

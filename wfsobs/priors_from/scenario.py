@@ -4,24 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from math import sqrt
 
 import numpy as np
 
 from wfsobs.observers.base import Observer
 from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
-from wfsobs.prior import Bands, LgsError, Line, Lines, Model, Part, Prior, Spectra, Training
+from wfsobs.prior import Bands, Beams, LgsError, Line, Lines, Model, Part, Prior, Spectra, Training
 from wfsobs.record import Measurements, Record, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import Group
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3, fit_ar3
+from wfsobs.signal.shared_process import SharedProcess, fit_shared_process
 from wfsobs.signal.statespace import MIN_MODEL_DAMPING, DisturbanceModel
 from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
-from wfsobs.simulation.guide_stars import lgs_error_process, lgs_noise_rms
+from wfsobs.simulation.guide_stars import lgs_error_process, lgs_noise_rms, lgs_weights
 from wfsobs.simulation.layers import relative_rms
 from wfsobs.simulation.sensor_noise import noise_rms
-from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, lgs_turbulence_spectrum, true_spectra
+from wfsobs.simulation.true_spectra import (
+    TrueSpectra,
+    has_known_spectra,
+    lgs_turbulence_spectrum,
+    n_frequencies,
+    true_spectra,
+    turbulence_spectra,
+)
 from wfsobs.simulation.turbulence import processes, turbulence_process, turbulence_rms
 from wfsobs.typing import Array
 
@@ -60,6 +69,7 @@ def prior_of(
         model=tuple(model_of(scenario, mode, dt) for mode in modes) if Model in asked else (),
         lgs_error=tuple(lgs_error_of(scenario, mode, dt) for mode in modes) if LgsError in asked else (),
         lines=tuple(lines_of(scenario, mode, dt) for mode in modes) if Lines in asked else (),
+        beams=tuple(beams_of(scenario, mode, dt) for mode in modes) if Beams in asked else (),
         bands=bands_of(scenario) if Bands in asked else None,
         spectra=tuple(spectra or [spectra_of(scenario, mode) for mode in modes]) if Spectra in asked else (),
         training=record.training.copy() if Training in asked and record and record.training else None,
@@ -182,11 +192,44 @@ def modelled_turbulence(scenario: Scenario, mode: int, dt: float, spectrum: Arra
     spectrum : that of the turbulence in the LGS (`lgs_turbulence_spectrum`), where already computed
     """
     process = _one_process(scenario, mode, dt)
-    if scenario.multipeak.turbulence_order == 2 or process.rms == 0:
+    if not _is_third_order(scenario, process):
         return process
     noise, _ = measurement_noise(scenario, mode)
-    start = Ar3(process.omega, process.damping, 5.0 * process.omega, process.rms, dt)
-    return fit_ar3(lgs_turbulence_spectrum(scenario, mode) if spectrum is None else spectrum, noise**2, start)
+    spectrum = lgs_turbulence_spectrum(scenario, mode) if spectrum is None else spectrum
+    return fit_ar3(spectrum, noise**2, _third_order(process))
+
+
+def beams_of(scenario: Scenario, mode: int, dt: float | None = None) -> Beams:
+    """Return turbulence as the target has it and as the LGS see it in one mode; dt [s]: by default that of the scenario.
+
+    Of third order it is fitted to the true spectra of both and to the cross spectrum, else the slow error of the LGS is beside it.
+    """
+    dt = dt or scenario.dt
+    line_gain = float(lgs_weights(scenario)[mode, :, mode].sum())
+    process = _one_process(scenario, mode, dt)
+    if scenario.turbulence.source == "processes" or not _is_third_order(scenario, process):
+        return Beams(lines_turbulence(scenario, mode, dt), lgs=(lgs_error_of(scenario, mode, dt).process,), line_gain=line_gain)
+    found = _shared_turbulence(scenario, mode, dt)
+    factor = process.rms / turbulence_process(scenario, mode, dt).rms  # where the strength is set by hand
+    common, target, lgs = (tuple(replace(p, rms=factor * p.rms) for p in part) for part in found[1:])
+    return Beams(common, target, lgs, found.gain, line_gain)
+
+
+@lru_cache(maxsize=32)
+def _shared_turbulence(scenario: Scenario, mode: int, dt: float) -> SharedProcess:
+    """Return the fit to the spectra, which takes a while."""
+    seen, (noise, _) = turbulence_spectra(scenario, mode, n_frequencies(scenario)), measurement_noise(scenario, mode)
+    start = _third_order(turbulence_process(scenario, mode, dt))
+    return fit_shared_process(seen.own, seen.measurement, np.real(seen.cross), noise**2, start)
+
+
+def _is_third_order(scenario: Scenario, process: Ar2) -> bool:
+    return scenario.multipeak.turbulence_order == 3 and process.rms > 0
+
+
+def _third_order(process: Ar2) -> Ar3:
+    """Return a first guess for fits."""
+    return Ar3(process.omega, process.damping, 5.0 * process.omega, process.rms, process.dt)
 
 
 def predicted_rms(scenario: Scenario, mode: int) -> float:

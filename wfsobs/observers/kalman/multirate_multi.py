@@ -1,25 +1,46 @@
 """The optimal multi-rate filter that knows every peak: what `kalman.multi` models, from both sensors.
 
-Turbulence of second or third order, one AR(2) per line of the vibration, the slow error of the LGS and the NGS frame as the mean
-that it is, with the periodic gains of `kalman.multirate_optimal`.
+Its model has one AR(2) per line of the vibration, and turbulence in the beams of target and LGS as sums of independent processes:
+in both, in the target's alone, in that of the LGS alone. The NGS frame is the mean that it is, with the periodic gains of
+`kalman.multirate_optimal`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
 from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
 from wfsobs.observers.kalman.multi import PEAKS, MultiPeak
-from wfsobs.observers.kalman.multirate import MultiRate, run_modes
-from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_model, step_filters
+from wfsobs.observers.kalman.multirate import MultiRate, multirate_noise, run_modes
+from wfsobs.observers.kalman.multirate_optimal import Cycle, estimated_cycle, step_filters
 from wfsobs.observers.kalman.single import NGS
 from wfsobs.observers.kalman.step import KalmanEstimator
-from wfsobs.prior import LgsError, Lines, Model, Prior
+from wfsobs.prior import Beams, Lines, Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
 
 
 def every_peak_model(rates: MultiRate, peaks: MultiPeak, prior: Prior, mode: int, ratio: int) -> Cycle:
     """Return the cycle of one mode with every peak of the vibration in its model."""
-    return optimal_model(rates, prior, mode, ratio, prior.lines[mode].disturbance(peaks.line_width))
+    beams = prior.beams[mode]
+    error = beams.lgs if rates.model_lgs_error else ()
+    noises = multirate_noise(rates, prior.model[mode])
+    return estimated_cycle(beam_model(beams, prior.lines[mode].peaks(peaks.line_width)), ratio, *noises, error)
+
+
+def beam_model(beams: Beams, peaks: Sequence[Ar2]) -> DisturbanceModel:
+    """Return the model of the target's disturbance, measured as the LGS see it but for what they see alone."""
+    turbulence = (*beams.common, *beams.target)
+    model = disturbance_model(turbulence, peaks)
+    gains = [*[beams.gain] * len(beams.common), *[0.0] * len(beams.target), *[beams.line_gain] * len(peaks)]
+    poles = [3 if isinstance(process, Ar3) else 2 for process in (*turbulence, *peaks)]
+    return replace(model, C=model.C * np.repeat(gains, poles))
 
 
 def multirate_multi(measurements: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> Estimates:
@@ -42,7 +63,7 @@ MULTIRATE_MULTI = Observer(
     TARGETS,
     multirate_multi,
     help="both sensors, every line of the scenario in the model; not in the paper",
-    prior=(Model, LgsError, Lines),
+    prior=(Model, Lines, Beams),
     settings=PEAKS,
     needs=NGS,
     linear=True,

@@ -33,26 +33,27 @@ from wfsobs.prior import LgsError, Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.riccati import SteadyState, Step, periodic_steady_state
-from wfsobs.signal.statespace import DisturbanceModel, process_model
+from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
 from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 
 
 def optimal_cycle(
-    model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, lgs_error: Ar2 | None = None
+    model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, lgs_error: Sequence[Ar2 | Ar3] = ()
 ) -> list[Step]:
     """Return (A, C, Q, R) of the steps k = 1 ... n, the NGS frame at the last; noises as standard deviations [um].
 
-    State (disturbance model, slow LGS error if any, frame). C has two rows at every step, LGS and NGS; where there is no
+    State (disturbance model, slow LGS errors if any, frame). C has two rows at every step, LGS and NGS; where there is no
     frame the second is zero.
     """
     A0, C0, Q0 = model.A, model.C, model.Q
     now = sum(model.outputs.values()) / ratio
-    if lgs_error is not None:
-        error = process_model(lgs_error)
+    if lgs_error:
+        error = disturbance_model(lgs_error, ())
         A0, Q0 = block_diag(A0, error.A), block_diag(Q0, error.Q)
-        C0, now = np.append(C0, error.now), np.append(now, [0.0, 0.0])
+        C0, now = np.append(C0, error.C), np.append(now, np.zeros(len(error.A)))
     n = len(A0)
     R = np.diag([lgs_noise**2, ngs_noise**2])
     steps: list[Step] = []
@@ -102,10 +103,17 @@ class Cycle(NamedTuple):
 def optimal_model(settings: MultiRate, prior: Prior, mode: int, ratio: int, model: DisturbanceModel | None = None) -> Cycle:
     """Return the cycle of one mode; model: of the disturbance, by default that of one peak."""
     model = model or prior.model[mode].disturbance()
-    error = prior.lgs_error[mode].process if settings.model_lgs_error else None
-    cycle = optimal_cycle(model, ratio, *multirate_noise(settings, prior.model[mode]), error)
+    error = [prior.lgs_error[mode].process] if settings.model_lgs_error else []
+    return estimated_cycle(model, ratio, *multirate_noise(settings, prior.model[mode]), error)
+
+
+def estimated_cycle(
+    model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float, lgs_error: Sequence[Ar2 | Ar3]
+) -> Cycle:
+    """Return `optimal_cycle` with the rows of all targets."""
+    steps = optimal_cycle(model, ratio, lgs_noise, ngs_noise, lgs_error)
     rows = model.output_rows(TARGETS)
-    return Cycle(cycle, np.hstack([rows, np.zeros((len(rows), len(cycle[0][0]) - rows.shape[1]))]), model)
+    return Cycle(steps, np.hstack([rows, np.zeros((len(rows), len(steps[0][0]) - rows.shape[1]))]), model)
 
 
 def step_filters(modes: Sequence[Cycle]) -> KalmanEstimator:
