@@ -202,7 +202,7 @@ def modelled_turbulence(scenario: Scenario, mode: int, dt: float, spectrum: Arra
 def beams_of(scenario: Scenario, mode: int, dt: float | None = None) -> Beams:
     """Return turbulence as the target has it and as the LGS see it in one mode; dt [s]: by default that of the scenario.
 
-    Of third order it is fitted to the true spectra of both and to the cross spectrum, else the slow error of the LGS is beside it.
+    Of third order it is fitted to the true spectra of both and to their cross spectrum, else it is the AR(2) and the slow error.
     """
     dt = dt or scenario.dt
     line_gain = float(lgs_weights(scenario)[mode, :, mode].sum())
