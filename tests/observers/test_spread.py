@@ -34,12 +34,13 @@ def told(name: str, between: str) -> tuple[Prior, object]:
     scenario = wfsobs.PRESETS["paper"]().replace({"kalman.ngs_between_frames": between})
     observer = OBSERVERS[name]
     one = prior_of(scenario, None, observer.prior)
+    slow = Ar2(2 * pi * 2.0, 0.9, 0.03, scenario.dt)  # of 2 Hz, so that a record of seconds holds many of its times
     prior = replace(
         one,
         model=one.model[:1] * RECORDS,
-        # a slow error of 2 Hz, so that a record of seconds holds many of its times
-        lgs_error=(LgsError(Ar2(2 * pi * 2.0, 0.9, 0.03, scenario.dt)),) * RECORDS if one.lgs_error else (),
+        lgs_error=(LgsError(slow),) * RECORDS if one.lgs_error else (),
         lines=one.lines[:1] * RECORDS,
+        beams=tuple(replace(beams, lgs=(slow,)) for beams in one.beams[:1]) * RECORDS,
     )
     return prior, observer_settings(observer, scenario)
 
@@ -61,9 +62,8 @@ def own_record(name: str, prior: Prior, rng: np.random.Generator) -> tuple[Measu
     total = truth["turbulence"] + truth["vibration"]
     late = np.vstack([np.zeros((1, RECORDS)), total[:-1]])
     y = late + lgs * rng.standard_normal(late.shape)
-    if prior.lgs_error:
-        error = draw(prior.lgs_error[0].process)
-        y[1:] += error[:-1]
+    for slow in (*(error.process for error in prior.lgs_error[:1]), *(p for beams in prior.beams[:1] for p in beams.lgs)):
+        y[1:] += draw(slow)[:-1]
     y_ngs = np.full_like(y, np.nan)
     for k in range(RATIO, STEPS, RATIO):
         seen = total[k - 1] if name == "multirate" else total[k - RATIO : k].mean(axis=0)
