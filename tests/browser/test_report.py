@@ -330,7 +330,7 @@ def test_the_button_saves_what_is_shown(open_page: Any, server: Any, tmp_path: P
     page = open_page(url=f"{server.url}?{link}&turbulence.wind_speed=22")
     button = page.get_by_role("button", name="Report", exact=True)
     button.evaluate(SEEN)
-    with page.expect_download() as waiting:
+    with page.expect_download(timeout=240_000) as waiting:
         button.click()
     page.wait_for_function("() => window.seen.includes('Making the report …, true')")
     assert waiting.value.suggested_filename == "wfsobs-report.html"
