@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from wfsobs.atmosphere.von_karman import FIELD
+from wfsobs.dependence import observers_reached
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.per_mode import AT_ONCE
 from wfsobs.priors_from.scenario import observer_settings
@@ -32,6 +33,19 @@ def run_seconds(scenario: Scenario, observers: Sequence[str] | None = None) -> f
     return sum(
         seconds for part, seconds in part_seconds(scenario).items() if part == REST or observers is None or part in observers
     )
+
+
+def rerun_seconds(before: Scenario, now: Scenario) -> float:
+    """Estimate the time of a run where the results of other settings are known [s].
+
+    >>> from wfsobs.scenario.presets import paper
+    >>> round(rerun_seconds(paper(), paper().replace({"multipeak.line_width": 0.5})), 1)
+    0.0
+    """
+    reached, parts = observers_reached(before, now), part_seconds(now)
+    if reached is None:
+        return sum(parts.values())
+    return sum(seconds for name, seconds in parts.items() if name in reached)
 
 
 def part_seconds(scenario: Scenario) -> dict[str, float]:

@@ -78,13 +78,20 @@ def test_only_what_counts_is_in_the_drawer(make_store: Callable[..., Store]) -> 
         assert own == ["kind", "start", "duration", *OF_KIND[str(event["kind"])]]
     assert [key for names in OF_KIND.values() for key in names] == list(Event.settings())[3:]
 
-    visible = {path: view.visible for path, view in controls.parts}
-    assert visible["vibration.peaks"] and visible["vibration.cutoff"] and visible["turbulence.r0"] and visible["events"]
-    for path in ("vibration.psd", "vibration.psd.tip", "vibration.spectrum", "vibration.part", "turbulence.layers"):
-        assert not visible[path]
+    def seen(path: str) -> bool:
+        return dict(controls.parts)[path].visible
+
+    source = "Used only where Source is "
+    assert controls.fields["vibration.cutoff"].idle == "" and controls.lists["vibration.peaks"].idle == ""
+    grey = {"vibration.spectrum": "measured", "vibration.part": "measured", "turbulence.r0": "frozen-flow"}
+    for path, value in grey.items():
+        field = controls.fields[path]
+        assert field.idle == source + value and seen(path) and all(widget.disabled for widget in field.widgets)
+    assert controls.lists["turbulence.layers"].idle == source + "frozen-flow"
+    assert source + "psd" in controls.headings["vibration.psd"][1].object and not seen("vibration.psd.tip")
     store.load(store.scenario.replace({"events": [], "vibration.source": "measured", "turbulence.source": "frozen-flow"}))
-    visible = {path: view.visible for path, view in controls.parts}
-    assert visible["vibration.spectrum"] and visible["turbulence.layers"] and not visible["vibration.peaks"]
+    assert not any(controls.fields[path].idle or controls.fields[path].widgets[0].disabled for path in grey)
+    assert controls.lists["turbulence.layers"].idle == "" and controls.lists["vibration.peaks"].idle == source + "peaks or ar2"
 
 
 def test_a_kind_that_needs_a_duration_waits_for_it(make_store: Callable[..., Store]) -> None:

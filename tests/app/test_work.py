@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 
 from wfsobs.app import work
 from wfsobs.app.work import TRUTH, RunResults, compute
+from wfsobs.dependence import Memo
 from wfsobs.evaluation.error_spectra import scored_samples
 from wfsobs.observers import OBSERVERS
 from wfsobs.progress import QUIET, Cancelled, Watch
@@ -62,6 +64,34 @@ def test_deliveries_are_held_back(short: Scenario, monkeypatch: pytest.MonkeyPat
     assert shown is not None
     here = {name for name, _ in keys(shown)}
     assert here == set(OBSERVERS) - {"gpr-online", "kf-adaptive"}, "all but those that learn during the run, at once"
+
+
+def test_only_what_depends_runs(short: Scenario) -> None:
+    memo, told = Memo(), []
+    first = compute(short, QUIET, lambda **_: None, None, memo)
+    assert set(first.ran) == set(OBSERVERS)
+    changed = short.replace({"multipeak.line_width": 0.7})
+    shown = compute(changed, QUIET, lambda **news: told.append(news), None, memo)
+    assert shown.ran == ("kf-multi",) and shown.scenario == changed and shown.result.record is first.result.record
+    assert not told, "one picture, as there is nothing to wait for"
+    assert shown.bounds is first.bounds and shown.spectra["kf-lgs", "vibration"] is first.spectra["kf-lgs", "vibration"]
+    whole = compute(changed, QUIET, lambda **_: None)
+    assert [replace(s, seconds_per_step=0.0) for s in shown.result.scores] == [
+        replace(s, seconds_per_step=0.0) for s in whole.result.scores
+    ]
+    unused = changed.replace({"gpr_online.highpass": 3.0, "sensors.spots.read_noise": 2.0, "control.gain": 0.1})
+    assert compute(unused, QUIET, lambda **_: None, None, memo).ran == ()
+
+
+def test_another_warm_up_scores_the_same_estimates(short: Scenario) -> None:
+    memo = Memo()
+    first = compute(short, QUIET, lambda **_: None, None, memo)
+    changed = short.replace({"run.warm_up": short.run.warm_up + 0.05})
+    shown, whole = (compute(changed, QUIET, lambda **_: None, None, m) for m in (memo, Memo()))
+    assert "kf-multi" not in shown.ran and "gpr-offline" in shown.ran, "the training record starts after the warm-up"
+    key = "kf-multi", "vibration"
+    assert not np.array_equal(shown.spectra[key].signal, first.spectra[key].signal)
+    assert np.array_equal(shown.spectra[key].signal, whole.spectra[key].signal)
 
 
 def test_spectra_are_of_what_is_scored(reports: Any) -> None:

@@ -9,19 +9,21 @@ from time import perf_counter, sleep
 import numpy as np
 import param
 
+from wfsobs.app.cache import size_of
 from wfsobs.app.jobs.job import DONE, IDLE_TIME, Job, Tell
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults
 from wfsobs.cost import run_seconds
+from wfsobs.dependence import Known, Memo, simulate_once
 from wfsobs.evaluation.evidence import Evidence, gather_evidence
 from wfsobs.evaluation.scores import Score
 from wfsobs.pipeline import observe
 from wfsobs.progress import Watch
+from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
-from wfsobs.simulation.loop import simulate
 
 SEEDS = 8
 """How many seeds there are unless chosen, the one shown among them."""
@@ -35,23 +37,36 @@ PATIENCE = 20.0
 """A scenario whose run takes longer has no further seeds [s]."""
 
 
+LIGHT = 5_000_000
+"""A seed whose record and estimates take less is kept whole [bytes], so that a change of one observer runs that one alone."""
+
+
 @dataclass(frozen=True)
 class SeedScores:
-    """The scores of one seed, and their errors as an array, whose size the cache counts."""
+    """The scores of one seed, their errors as an array, whose size the cache counts, and its result where that is light."""
 
     scores: tuple[Score, ...]
     errors: np.ndarray
+    result: Result | None = None
 
 
-def run_seed(scenario: Scenario, source: Source | None, seed: int, watch: Watch, _tell: Tell) -> SeedScores:
-    """Run every observer on the record of another seed, after a rest. Raises SettingError, Cancelled."""
+def run_seed(
+    scenario: Scenario, source: Source | None, seed: int, watch: Watch, _tell: Tell, memo: Memo | None = None
+) -> SeedScores:
+    """Run every observer on the record of another seed, after a rest. Raises SettingError, Cancelled.
+
+    memo : what is known in it by what it depends on does not run
+    """
+    memo = Memo() if memo is None else memo
     until = perf_counter() + REST
     while perf_counter() < until:
         watch.check()
         sleep(0.02)
     simulation = (scenario if source is None or source.simulation is None else source.simulation).replace({"run.seed": seed})
-    result = observe(simulate(simulation, watch=watch), scenario, watch=watch)
-    return SeedScores(result.scores, np.array([s.rms for s in result.scores]))
+    record = simulate_once(simulation, memo, watch)
+    result = observe(record, scenario, watch=watch, known=Known(memo, record))
+    errors = np.array([s.rms for s in result.scores])
+    return SeedScores(result.scores, errors, result if size_of(result) <= LIGHT else None)
 
 
 class SeedRuns(param.Parameterized):
@@ -112,7 +127,7 @@ class SeedRuns(param.Parameterized):
         seed = simulated.run.seed + number
         return Job(
             "seed",
-            lambda watch, tell: run_seed(of.scenario, source, seed, watch, tell),
+            lambda watch, tell: run_seed(of.scenario, source, seed, watch, tell, self.task.session.service.memo),
             key=self.task.session.service.seed_key(of.scenario, source, seed),
             cost=run_seconds(of.scenario),
             priority=IDLE_TIME,

@@ -7,6 +7,7 @@ import itertools
 import logging
 import threading
 from collections.abc import Callable
+from functools import partial
 from time import monotonic
 
 from wfsobs.app.cache import Cache, key_of
@@ -18,6 +19,7 @@ from wfsobs.app.logs import event
 from wfsobs.app.sources import Source
 from wfsobs.app.work import RunResults, compute
 from wfsobs.cost import run_seconds
+from wfsobs.dependence import Memo
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
@@ -38,12 +40,12 @@ class Service:
     most_bytes : of results kept
     """
 
-    def __init__(self, limits: Limits, workers: int, most_bytes: int, work: Compute = compute):
-        self.limits = limits
+    def __init__(self, limits: Limits, workers: int, most_bytes: int, work: Compute | None = None):
+        self.limits, self.memo = limits, Memo()
         self.cache: Cache[RunResults] = Cache(most_bytes)
         self.queue = JobQueue(workers, self.cache)
         self.sessions = 0
-        self._work = work
+        self._work = work or partial(compute, memo=self.memo)
         self._lock = threading.Lock()
         self._numbers = itertools.count(1)
 
@@ -76,13 +78,17 @@ class Service:
             gc.collect()
             release_memory()
 
-    def run(self, scenario: Scenario, source: Source | None = None) -> Job:
-        """Make the job that computes a scenario, or the observers on another record. Raises SettingError."""
+    def run(self, scenario: Scenario, source: Source | None = None, seconds: float | None = None) -> Job:
+        """Make the job that computes a scenario, or the observers on another record. Raises SettingError.
+
+        seconds : about how long it takes, where what is known makes it shorter than a whole run
+        """
         self.limits.check(scenario)
         if source is not None:
             source.check(self.limits)
         work: Work = lambda watch, tell: self._work(scenario, watch, tell, source)  # noqa: E731
-        return Job("run", work, key=_key(scenario, source), cost=run_seconds(scenario), refusal=SettingError)
+        cost = run_seconds(scenario) if seconds is None else seconds
+        return Job("run", work, key=_key(scenario, source), cost=cost, refusal=SettingError)
 
     def seed_key(self, scenario: Scenario, source: Source | None, seed: int) -> str:
         """Name the scores of a scenario's observers on the record of another seed."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 from wfsobs.app.cache import key_of
 from wfsobs.app.limits import Limits
+from wfsobs.dependence import Memo, simulate_once
 from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.intake import DeclaredFormat
 
 
@@ -30,7 +30,7 @@ class LoadedRecord:
 
     simulation = None
 
-    def make(self, _watch: Watch) -> Record:
+    def make(self, _watch: Watch, _memo: Memo | None = None) -> Record:
         """Return the record."""
         return self.record
 
@@ -55,9 +55,9 @@ class SimulatedRecord:
         """The same settings, the same key."""
         return key_of(self.simulation)
 
-    def make(self, watch: Watch) -> Record:
+    def make(self, watch: Watch, memo: Memo | None = None) -> Record:
         """Simulate the record. Raises SettingError, Cancelled."""
-        return simulate(self.simulation, watch=watch)
+        return simulate_once(self.simulation, memo, watch)
 
     def check(self, limits: Limits) -> None:
         """Raise SettingError where the simulation is impossible, or more than a server allows."""

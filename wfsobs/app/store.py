@@ -10,10 +10,11 @@ from typing import Any
 
 import param
 
+from wfsobs.app.jobs.job import DONE
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.service import Post, Session
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, give_same_record
-from wfsobs.cost import run_seconds
+from wfsobs.cost import rerun_seconds, run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import reference_preset
 from wfsobs.scenario.presets import PRESETS
@@ -55,18 +56,26 @@ class Store(param.Parameterized):
         """Run the settings as they stand."""
         self.waiting = 0.0
         try:
-            self.run.start(self.session.service.run(self.scenario, self.source))
+            self.run.start(self.session.service.run(self.scenario, self.source, self.seconds))
         except SettingError as error:
             self.run.refuse(str(error))
 
     def follow(self) -> None:
         """Run the settings as they stand, unless that takes long: then stop, and wait to be asked."""
-        seconds = run_seconds(self.scenario)
+        seconds = self.seconds
         if seconds <= AT_ONCE or self.session.service.is_cached(self.scenario, self.source):
             self.start()
         else:
             self.run.cancel()
             self.waiting = seconds
+
+    @property
+    def seconds(self) -> float:
+        """About how long the run of the settings takes, without what is known from the results shown [s]."""
+        shown = self.run.result
+        if shown is None or self.run.state != DONE or not give_same_record(shown.source, self.source):
+            return run_seconds(self.scenario)
+        return rerun_seconds(shown.scenario, self.scenario)
 
     def undo(self) -> None:
         """Take back the last change that was accepted."""

@@ -8,7 +8,7 @@ come in parts.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter, sleep
 
@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from wfsobs.app.jobs.job import INTERVAL, Tell
 from wfsobs.app.sources import Source
+from wfsobs.dependence import Known, Memo, digest, simulate_once
 from wfsobs.evaluation.error_spectra import spectra
 from wfsobs.evaluation.record_bounds import Bound, record_bounds
 from wfsobs.observers import OBSERVERS
@@ -27,7 +28,7 @@ from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.result import Failure, Result
 from wfsobs.scenario import Scenario
-from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.loop import record_settings
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
@@ -58,6 +59,8 @@ class RunResults:
     partial : values so far, NaN where there are none yet, of observers still at work
     spectra : of the truth and of every finished estimate
     source : what they are of where that is not the simulation of the settings
+    bounds : of the record
+    ran    : observers that ran for it, None for all; nothing changed that the others depend on, so their estimates were known
     """
 
     result: Result
@@ -65,6 +68,8 @@ class RunResults:
     spectra: Mapping[Key, SignalAndError] = field(default_factory=dict)
     seconds: float = 0.0
     source: Source | None = None
+    bounds: Sequence[Bound] = ()
+    ran: tuple[str, ...] | None = None
 
     @property
     def is_recorded(self) -> bool:
@@ -99,23 +104,29 @@ def one_blas_thread() -> None:
     threadpool_limits(limits=1, user_api="blas")
 
 
-def compute(scenario: Scenario, watch: Watch, tell: Tell, source: Source | None = None) -> RunResults:
+class _Bounds(list[Bound]):
+    """A list that a memo can hold."""
+
+
+def compute(scenario: Scenario, watch: Watch, tell: Tell, source: Source | None = None, memo: Memo | None = None) -> RunResults:
     """Run everything on a scenario, or the observers on another record; report results as they come.
+
+    memo : what is known in it by what it depends on does not run
 
     Raises SettingError, Cancelled.
     """
-    return _Work(scenario, watch, tell, source).run()
+    return _Work(scenario, watch, tell, source, Memo() if memo is None else memo).run()
 
 
 class _Work:
-    def __init__(self, scenario: Scenario, watch: Watch, tell: Tell, source: Source | None):
-        self.scenario, self.tell, self.source = scenario, tell, source
+    def __init__(self, scenario: Scenario, watch: Watch, tell: Tell, source: Source | None, memo: Memo):
+        self.scenario, self.tell, self.source, self.memo = scenario, tell, source, memo
         self.simulation = scenario if source is None else source.simulation
         self.report = watch.progress
         self.watch = Watch(progress=self._progress, is_cancelled=watch.is_cancelled)
         self.estimates: list[Estimate] = []
         self.failures: list[Failure] = []
-        self.bounds: list[Bound] = []
+        self.bounds: _Bounds | None = None
         self.growing: dict[Key, Array] = {}  # written to by the observers' threads
         self.spectra: dict[Key, SignalAndError] = {}
         self.started = self.told = self.delivered = perf_counter()
@@ -128,31 +139,40 @@ class _Work:
         self.watch.step(0.0)
         stated = self.scenario
         if self.source is None:
-            record = simulate(stated, watch=self.watch)
+            record = simulate_once(stated, self.memo, self.watch)
         else:
-            record = self.source.make(self.watch)
+            record = self.source.make(self.watch, self.memo)
             stated = as_stated(record, stated)
             stated.validate()
-        self.record = record
+        self.record, self.known = record, Known(self.memo, record)
+        self.bounds = self.memo.get(self._name_of_bounds(record)) if self.simulation is not None else _Bounds()
         self._add_truth(record)
         handed_over = False  # the quick ones
-        for item in each_estimate(record, stated, self.watch, on_partial=self._grow):
+        for item in each_estimate(record, stated, self.watch, on_partial=self._grow, known=self.known):
             with self.lock:
                 if isinstance(item, Failure):
                     self.failures.append(item)
                 else:
                     self._add(record, item)
                 self.news = True
-                quick = not handed_over and all(OBSERVERS[name].slow for name in self._left())
+                left = self._left()
+                quick = not handed_over and all(OBSERVERS[name].slow for name in left) and (left or self.bounds is None)
                 shown = self._deliver(record) if quick else None
             if shown is not None:
                 handed_over = True
                 self.report(self.fraction)
                 self.tell(result=shown)
                 self._let_draw()
-                if self.simulation is not None:
-                    self.bounds = record_bounds(self.simulation, record)
+                if self.bounds is None and self.simulation is not None:
+                    self.bounds = self.memo.put(self._name_of_bounds(record), _Bounds(record_bounds(self.simulation, record)))
         return self._so_far(record)
+
+    def _name_of_bounds(self, record: Record) -> str:
+        """Name the bounds by what they depend on: the simulation, whatever its seed."""
+        assert self.simulation is not None
+        settings = record_settings(self.simulation)
+        del settings["run"]["seed"]
+        return digest("bounds", settings, record.n_steps, record.n_modes)
 
     def _left(self) -> set[str]:
         """List the observers that have not delivered everything."""
@@ -172,9 +192,11 @@ class _Work:
         return self._so_far(record)
 
     def _so_far(self, record: Record) -> RunResults:
-        result = collect(self.scenario, record, self.estimates, self.failures, least=self.bounds)
+        least = self.bounds or ()
+        result = collect(self.scenario, record, self.estimates, self.failures, least=least)
         partial = {key: values.copy() for key, values in self.growing.items()}
-        return RunResults(result, partial, dict(self.spectra), perf_counter() - self.started, self.source)
+        ran = tuple(name for name in OBSERVERS if name not in self.known.reused)
+        return RunResults(result, partial, dict(self.spectra), perf_counter() - self.started, self.source, least, ran)
 
     def _progress(self, fraction: float) -> None:
         """Take the progress of the observers; called from any of their threads."""
@@ -215,5 +237,10 @@ class _Work:
 
     def _spectrum(self, record: Record, target: str, values: Array) -> SignalAndError | None:
         """Over the samples that count for the scores; None where there are too few."""
-        found = spectra(record, target, values, self.scenario.run.warm_up)
-        return SignalAndError(*found) if found else None
+        warm_up = self.scenario.run.warm_up
+        name = digest("spectra", self.known.record, target, values, warm_up)
+        known = self.memo.get(name)
+        if known is None:
+            found = spectra(record, target, values, warm_up)
+            known = self.memo.put(name, SignalAndError(*found)) if found else None
+        return known

@@ -40,9 +40,16 @@ def arguments(observer: Observer, record: Record, scenario: Scenario) -> tuple[M
 
     Raises ValueError where the scenario has no such prior.
     """
+    return record.measurements(open_loop="open_loop_y" in observer.needs), *told(observer, record, scenario)
+
+
+def told(observer: Observer, record: Record, scenario: Scenario) -> tuple[Prior, Group | None]:
+    """Return the prior and the settings of its own that an observer receives beside the measurements of a record.
+
+    Raises ValueError where the scenario has no such prior.
+    """
     settings = observer_settings(observer, scenario)
-    prior = prior_of(scenario, record, (*observer.prior, *observer.asks(settings)))
-    return record.measurements(open_loop="open_loop_y" in observer.needs), prior, settings
+    return prior_of(scenario, record, (*observer.prior, *observer.asks(settings))), settings
 
 
 def observer_settings(observer: Observer, scenario: Scenario) -> Group | None:

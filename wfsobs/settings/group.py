@@ -7,7 +7,8 @@ TOML files and shareable links all go through the functions here.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Self, cast
+from types import MappingProxyType
+from typing import Any, ClassVar, Self, cast
 
 import param
 
@@ -26,7 +27,11 @@ class Group(param.Parameterized):
     Values out of bounds raise `SettingError` at once when they come by path, dictionary or file, and
     `ValueError` (from param, naming the parameter) on plain attribute assignment. Names that do not
     exist are refused on every way in.
+
+    used_when : setting -> another one of the group, and the values of it with which it has an effect
     """
+
+    used_when: ClassVar[Mapping[str, tuple[str, tuple[Any, ...]]]] = MappingProxyType({})
 
     def __init_subclass__(cls) -> None:
         """Make a declaration that of the class: without this param copies it for every object whose value is set."""
@@ -50,9 +55,18 @@ class Group(param.Parameterized):
             raise AttributeError(f"{type(self).__name__} has no setting {name!r}")
         super().__setattr__(name, to_native(value))
 
-    def idle(self) -> tuple[str, ...]:
-        """Return the settings without effect for the present values of the others."""
-        return ()
+    def idle(self) -> dict[str, str]:
+        """Return the settings without effect for the present values of the others: name -> reason in one line."""
+        return {
+            name: f"Used only where {self.settings()[other].label} is {_either(values)}"
+            for name, (other, values) in self.used_when.items()
+            if getattr(self, other) not in values
+        }
+
+    def used(self) -> Plain:
+        """Return the tree as nested plain values, without the settings that have no effect."""
+        idle = self.idle()
+        return {name: _used(getattr(self, name)) for name in self.settings() if name not in idle}
 
     def __repr__(self) -> str:
         changed = self._changed_settings()
@@ -229,6 +243,18 @@ class Group(param.Parameterized):
                 yield from value.lists(f"{prefix}{name}.")
             elif isinstance(p, param.List) and holds_groups(p):
                 yield f"{prefix}{name}", p
+
+
+def _either(values: tuple[Any, ...]) -> str:
+    """Name the values of a setting."""
+    return " or ".join({True: "on", False: "off"}[v] if isinstance(v, bool) else str(v) for v in values)
+
+
+def _used(value: Any) -> Any:
+    """Return a value as plain values, without settings that have no effect."""
+    if isinstance(value, Group):
+        return value.used()
+    return [_used(v) for v in value] if isinstance(value, list) else _plain(value)
 
 
 def _plain(value: Any) -> Any:

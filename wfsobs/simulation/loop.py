@@ -11,10 +11,16 @@ from scipy.signal import lfilter
 
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import DELAY, Measurements, Record, Training, delay_signal, frame_mean
+from wfsobs.registry import sections
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.idle import used_settings
+from wfsobs.settings.tree import Plain
 from wfsobs.simulation.disturbance import make_disturbance
 from wfsobs.simulation.sensing import OpenLoop, measure_noise, measure_open_loop
 from wfsobs.typing import Array
+
+TOLD = ("kalman", "butterworth", "control")
+"""Groups of what observers and controllers are told, which no simulation reads; nor does it read their own."""
 
 TRAINING_MARGIN = 0.5
 """Time after the last window of a training record [s]; it keeps the end of the zero-phase filter out of the targets."""
@@ -52,7 +58,24 @@ def _holding_integrator(open_loop_y: Sequence[float], gain: float, leak: float) 
     return u
 
 
-def simulate(scenario: Scenario, *, rng: np.random.Generator | None = None, watch: Watch = QUIET) -> Record:
+def record_settings(scenario: Scenario) -> Plain:
+    """Return the settings that a record depends on without its training data, those with an effect, as plain values."""
+    tree = used_settings(scenario)
+    for name in (*TOLD, *sections()):
+        del tree[name]
+    del tree["run"]["warm_up"]
+    return tree
+
+
+def training_settings(scenario: Scenario) -> Plain:
+    """Return the settings that a record depends on together with its training data, as plain values."""
+    g = scenario.gpr_offline
+    return {**record_settings(scenario), "training": [scenario.run.warm_up, g.training_size, g.depth]}
+
+
+def simulate(
+    scenario: Scenario, *, rng: np.random.Generator | None = None, watch: Watch = QUIET, known: Record | None = None
+) -> Record:
     """Simulate the loop over the scenario's duration.
 
     Parameters
@@ -63,6 +86,8 @@ def simulate(scenario: Scenario, *, rng: np.random.Generator | None = None, watc
         Source of all random numbers; by default one seeded with `scenario.run.seed`.
     watch : Watch
         Receives the progress, and is asked at every block of work whether to stop.
+    known : Record, optional
+        A record of the same `record_settings` and generator: it is not simulated again, only its training data.
 
     Returns
     -------
@@ -79,7 +104,7 @@ def simulate(scenario: Scenario, *, rng: np.random.Generator | None = None, watc
     scenario.validate()
     rng = np.random.default_rng(scenario.run.seed) if rng is None else rng
     record_rng, training_rng = rng.spawn(2)
-    record = _run(scenario, scenario.n_steps, record_rng, watch)
+    record = known if known is not None else _run(scenario, scenario.n_steps, record_rng, watch)
     return replace(record, training=_training(scenario, training_rng, watch))
 
 

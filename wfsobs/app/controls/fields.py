@@ -30,6 +30,9 @@ UNNAMED = {
 }
 """A box whose name is heard but not seen: the slider beside it has the same."""
 
+HELP = {"& .MuiFormHelperText-root.Mui-disabled": {"color": "text.secondary"}}
+"""Why a setting is grey can be read all the same."""
+
 TAG = "setting:"
 """Stands before the path of its setting in the tag of a widget: the browser knows by it what was changed."""
 
@@ -56,8 +59,12 @@ def parse_number(text: str) -> float | str:
 class Field:
     """The widgets of one setting; `view` is what the page shows."""
 
+    helped = False
+    """Whether its box has a line of help, which says why it has no effect; else a line below does."""
+
     def __init__(self, store: Store, path: str, p: param.Parameter):
         self.store, self.path, self.parameter = store, path, p
+        self.idle = self._noted = ""
         self.widgets = self._widgets()
         self.view = pn.Column(self._row(), sizing_mode="stretch_width", margin=0)
         self.refresh()
@@ -68,12 +75,26 @@ class Field:
         reason = self.store.errors.get(self.path, "")
         if not reason:
             self.show(self.store.value(self.path))
-        if reason or len(self.view) > 1:
-            note = [pn.pane.HTML(error_html(name_settings(reason)), margin=(0, 0, 6, 0))] if reason else []
-            self.view[1:] = note
+        self._note(error_html(name_settings(reason)) or ("" if self.helped else idle_html(self.idle)))
         for widget in self.widgets:
             if "error_state" in widget.param:
                 widget.error_state = bool(reason)
+
+    def rest(self, why: str) -> None:
+        """Grey the widgets of a setting without effect, and say why; with an empty text they can be used again."""
+        if why != self.idle:
+            self.idle = why
+            for widget in self.widgets:
+                widget.disabled = bool(why)
+            if self.helped:
+                self.widgets[-1].helper_text = why
+            self.refresh()
+
+    def _note(self, html: str) -> None:
+        """Show a line below the widgets; none where it is empty."""
+        if html != self._noted:
+            self._noted = html
+            self.view[1:] = [pn.pane.HTML(html, margin=(0, 0, 6, 0))] if html else []
 
     def show(self, value: Any) -> None:
         """Put a value into the widgets."""
@@ -103,8 +124,10 @@ class Field:
 class ChoiceField(Field):
     """One of several words."""
 
+    helped = True
+
     def _widgets(self) -> list[Any]:
-        select = pmui.Select(options=list(self.parameter.objects), size="small", **self._names(), **ROOM)
+        select = pmui.Select(options=list(self.parameter.objects), size="small", sx=HELP, **self._names(), **ROOM)
         select.param.watch(self._change, "value")
         return [select]
 
@@ -129,8 +152,10 @@ class SwitchField(Field):
 class TextField(Field):
     """A number, typed."""
 
+    helped = True
+
     def _widgets(self) -> list[Any]:
-        return [self._text(**self._names(), **ROOM)]
+        return [self._text(sx=HELP, **self._names(), **ROOM)]
 
     def _text(self, **options: Any) -> pmui.TextInput:
         text = pmui.TextInput(size="small", **options)
@@ -175,6 +200,7 @@ class NumbersField(TextField):
 class SliderField(TextField):
     """A number with a usual range: a slider over that range, and the number itself to type."""
 
+    helped = False
     _value: Any = None
     """What the slider stands at, as far as it has said or was told."""
 
@@ -240,6 +266,11 @@ def make_field(store: Store, path: str, p: param.Parameter) -> Field:
 def error_html(reason: str) -> str:
     """Write the reason of a refusal, to stand beside its setting."""
     return f'<div role="alert" style="color:#d93025;font-size:12px">{escape(reason)}</div>' if reason else ""
+
+
+def idle_html(why: str) -> str:
+    """Write why a setting has no effect, to stand below it."""
+    return f'<div style="font-size:12px;opacity:0.75">{escape(why)}</div>' if why else ""
 
 
 def _step(low: float, high: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
+from collections.abc import Sequence
 from html import escape
 from typing import Any
 
@@ -12,7 +13,7 @@ import panel_material_ui as pmui
 import param
 from panel.custom import JSComponent
 
-from wfsobs.app.controls.fields import ROOM, TAG, Field, make_field
+from wfsobs.app.controls.fields import ROOM, TAG, Field, idle_html, make_field
 from wfsobs.app.controls.gallery import Gallery
 from wfsobs.app.controls.names import preset_title, setting_name
 from wfsobs.app.controls.rows import RowEditor
@@ -20,7 +21,9 @@ from wfsobs.app.controls.search import Search
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.store import Store
 from wfsobs.app.style import PRIMARY, asset
+from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.idle import idle_settings
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.group import Group
 
@@ -90,6 +93,7 @@ class Controls:
         self.fields: dict[str, Field] = {}
         self.lists: dict[str, RowEditor] = {}
         self.parts: list[tuple[str, Any]] = []
+        self.headings: dict[str, tuple[str, pn.pane.HTML]] = {}
         self.preset = pmui.Select(
             label="Preset",
             tags=[TAG + PRESET],
@@ -111,7 +115,7 @@ class Controls:
         self.cancel = pmui.Button(label="Cancel", icon="stop", variant="outlined", size="small", margin=(0, 10, 0, 8), sx=ON_BAR)
         self.status = Status(sizing_mode="stretch_width", max_width=220, margin=0, stylesheets=[STATUS_ON_BAR])
         self.gallery = Gallery(store.choose, width=78, margin=(4, 6, 4, 0))
-        self.search = Search(self.open_setting, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
+        self.search = Search(self.open_setting, self._idle, sizing_mode="stretch_width", margin=(8, 0, 4, 0))
         self.topics = _names()
         self.rooms = {name: pn.Column(sizing_mode="stretch_width", margin=0) for name in self.topics}
         self.accordion = pmui.Accordion(
@@ -179,13 +183,21 @@ class Controls:
                 elif path in self.lists and isinstance(message, dict):
                     self.lists[path].handle(message)
 
+    def _idle(self) -> dict[str, str]:
+        return idle_settings(self.store.scenario, is_simulated=self.store.source is None)
+
     def _refresh_parts(self, *_: object) -> None:
-        """Hide what has no meaning for the settings as they are."""
+        """Grey what has no effect for the settings as they are, and say why; of groups and tables only the name is left."""
+        idle = self._idle()
         with pn.io.hold():
             for path, view in self.parts:
-                topic, *below = path.split(".")
-                if below:
-                    view.visible = below[0] not in getattr(self.store.scenario, topic).idle()
+                view.visible = not any(path.startswith(f"{group}.") for group in idle if group != topic_of(group))
+            for path, field in self.fields.items():
+                field.rest(idle.get(path, idle.get(topic_of(path), "")))
+            for path, editor in self.lists.items():
+                editor.rest(idle.get(path, ""))
+            for path, (title, pane) in self.headings.items():
+                pane.object = f"<b>{title}</b>{idle_html(idle.get(path, ''))}"
 
     def _fields_of(self, name: str) -> list[tuple[str, Any]]:
         """Make the fields of a topic under the headings of its groups, with the paths of both; none where it is a list."""
@@ -200,8 +212,9 @@ class Controls:
             *_, above, _name = setting.split(".")
             if above != heading:
                 heading = above
-                title = escape(str(group.settings()[above].label))
-                views.append((f"{name}.{above}", pn.pane.HTML(f"<b>{title}</b>", margin=(8, 0, 0, 0))))
+                pane = pn.pane.HTML(margin=(8, 0, 0, 0))
+                self.headings[f"{name}.{above}"] = escape(str(group.settings()[above].label)), pane
+                views.append((f"{name}.{above}", pane))
             views.append((setting, self._field(setting).view))
         return views
 
@@ -220,7 +233,7 @@ class Controls:
         self.cancel.on_click(lambda _event: self.store.run.cancel())
         self.accordion.param.watch(self._on_open, "active")
         self.store.param.watch(self._refresh_preset, ["scenario", "preset", "can_undo", "can_redo"])
-        self.store.param.watch(self._refresh_parts, "scenario")
+        self.store.param.watch(self._refresh_parts, ["scenario", "source"])
         self.store.param.watch(self._refresh_run, ["errors", "waiting"])
         # Last, so that "Done" is said of what has been drawn.
         self.store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"], precedence=1)
@@ -253,10 +266,15 @@ class Controls:
         self.status.param.update(progress=run.progress, text=text, note=note)
 
 
+def topic_of(path: str) -> str:
+    """Return the topic of a setting."""
+    return path.split(".")[0]
+
+
 def status_of(store: Store) -> tuple[str, str]:
     """Describe the run in one line, and what was refused in another."""
     run = store.run
-    seconds = f" in {run.result.seconds:.2f} s" if run.result and run.state == DONE else ""
+    seconds = f" in {run.result.seconds:.2f} s{_share(run.result.ran)}" if run.result and run.state == DONE else ""
     text = {
         RUNNING: run.line(),
         DONE: f"Done{seconds}",
@@ -267,6 +285,11 @@ def status_of(store: Store) -> tuple[str, str]:
         text = waiting_text(store.waiting)
     note = f"Not accepted: {', '.join(map(setting_name, store.errors))}" if store.errors else ""
     return text, note
+
+
+def _share(ran: Sequence[str] | None) -> str:
+    """Say how many observers ran where not all did."""
+    return f", {len(ran)} of {len(OBSERVERS)} ran" if ran is not None and len(ran) < len(OBSERVERS) else ""
 
 
 def waiting_text(seconds: float) -> str:

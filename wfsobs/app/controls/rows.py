@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from html import escape
 from typing import Any
 
 import panel as pn
 import param
 from panel.custom import JSComponent
 
-from wfsobs.app.controls.fields import TAG, number_text, parse_number, unit_text
+from wfsobs.app.controls.fields import TAG, idle_html, number_text, parse_number, unit_text
 from wfsobs.app.controls.names import column_of, name_settings
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset
@@ -52,9 +53,17 @@ class RowEditor:
             margin=(0, 0, 8, 0),
         )
         self.table.on_edit = self.handle
+        self.label, self.idle = str(p.label), ""
         self.view = pn.Column(self.table, sizing_mode="stretch_width", margin=0)
         self.refresh()
         store.param.watch(self.refresh, ["scenario", "errors"])
+
+    def rest(self, why: str) -> None:
+        """Leave the name of a list without effect, and say why; with an empty text the table comes back."""
+        if why != self.idle:
+            self.idle = why
+            name = f"<b>{escape(self.label)}</b>{idle_html(why)}"
+            self.view[:] = [pn.pane.HTML(name, margin=(8, 0))] if why else [self.table]
 
     def handle(self, msg: dict[str, Any]) -> None:
         """Do what a message of the table says."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import param
@@ -16,28 +16,37 @@ from wfsobs.scenario import Scenario
 class Search(JSComponent):
     """The box in the browser; it gets the settings when it is first used, and says which one has been chosen."""
 
-    items = param.List([], doc="{path, label, topic, doc} of every setting.")
+    items = param.List([], doc="{path, label, topic, doc, unused} of every setting.")
 
     _esm = asset("over.js") + asset("search.js")
     _stylesheets = [asset("search.css")]  # noqa: RUF012
 
-    def __init__(self, reveal: Callable[[str], None], **params: Any):
-        """Make the box. reveal : opens the topic of the setting of a path."""
-        self._reveal = reveal
+    def __init__(self, reveal: Callable[[str], None], idle: Callable[[], Mapping[str, str]], **params: Any):
+        """Make the box.
+
+        reveal : opens the topic of the setting of a path
+        idle   : the settings without effect, and why
+        """
+        self._reveal, self._idle = reveal, idle
         self.on_sweep: Callable[[str], None] = lambda path: None
         super().__init__(**params)
 
     def _handle_msg(self, data: dict[str, Any]) -> None:
-        if data.get("open") and not self.items:
-            self.items = settings_found()
+        if data.get("open"):
+            self.items = settings_found(self._idle())
         elif (path := str(data.get("path", ""))) in {item["path"] for item in self.items}:
             self._reveal(path)
         elif isinstance(over := data.get("over"), str):
             self.on_sweep(over)
 
 
-def settings_found() -> list[dict[str, str]]:
-    """List every setting and every list of settings, with its topic in words."""
+def settings_found(idle: Mapping[str, str]) -> list[dict[str, str]]:
+    """List every setting and every list of settings, with its topic in words, and why it has no effect where it has none."""
+
+    def why(path: str) -> str:
+        keys = path.split(".")
+        return next((idle[above] for i in range(len(keys)) if (above := ".".join(keys[: i + 1])) in idle), "")
+
     scenario, topics = Scenario(), Scenario.settings()
     lists = dict(scenario.lists())
     inner = tuple(f"{path}." for path in lists)
@@ -48,6 +57,7 @@ def settings_found() -> list[dict[str, str]]:
             "label": label_of(p),
             "topic": str(topics[path.split(".")[0]].label),
             "doc": unit_text(p.doc or ""),
+            "unused": why(path),
         }
         for path, p in known
     ]

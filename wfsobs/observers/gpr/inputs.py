@@ -8,6 +8,7 @@ from rest at the first sample, and the means and deviations are those of the tra
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,8 @@ from wfsobs.typing import Array
 
 class Gpr(Group):
     """What both GPR share; the numbers are those of Table 4."""
+
+    used_when = MappingProxyType({"highpass": ("inputs_filter", ("high-pass",))})
 
     inputs = param.Selector(
         default="u-y",

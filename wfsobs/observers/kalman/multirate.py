@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 import param
@@ -33,6 +34,10 @@ from wfsobs.typing import Array
 
 class MultiRate(Group):
     """Noise weights of the multi-rate Kalman filter."""
+
+    used_when = MappingProxyType(
+        {"lgs_noise": ("measurement_noise", ("manual",)), "ngs_noise": ("measurement_noise", ("manual",))}
+    )
 
     measurement_noise = param.Selector(
         default="matched",

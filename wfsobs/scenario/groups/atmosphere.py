@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import param
 
 from wfsobs.sensors.modes import HIGHEST_ORDER
@@ -126,6 +128,17 @@ class Process(Group):
 class Turbulence(Group):
     """Atmospheric turbulence."""
 
+    used_when = MappingProxyType(
+        {
+            "third_corner": ("source", ("ar3",)),
+            "rms": ("source", ("ar2", "ar3")),
+            "r0": ("source", ("frozen-flow",)),
+            "layers": ("source", ("frozen-flow",)),
+            "processes": ("source", ("processes",)),
+            "psd": ("source", ("psd",)),
+        }
+    )
+
     source = param.Selector(
         default="ar2",
         objects=["ar2", "ar3", "processes", "frozen-flow", "psd", "none"],
@@ -191,8 +204,3 @@ class Turbulence(Group):
         doc="Processes whose sum is the turbulence, for source processes.",
     )
     psd = section(PsdTable, "PSD table", "Spectrum of the turbulence as a table, for source psd.")
-
-    def idle(self) -> tuple[str, ...]:
-        """Return the settings of other sources; r0 and L0 set the ratio of the modes in all of them."""
-        of_one = {"third_corner": "ar3", "processes": "processes", "layers": "frozen-flow", "psd": "psd"}
-        return tuple(name for name, source in of_one.items() if source != self.source)

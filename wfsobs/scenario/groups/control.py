@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import param
 
 from wfsobs.settings.group import Group
@@ -10,6 +12,8 @@ from wfsobs.settings.parameters import Real
 
 class Control(Group):
     """The mirror and the controllers of the closed-loop comparison; the loop's own integrator makes the record."""
+
+    used_when = MappingProxyType({"gain": ("integrator", ("manual",))})
 
     delay = Real(
         2.0,

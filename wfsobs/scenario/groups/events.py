@@ -23,6 +23,8 @@ class Event(Group):
     Changes of a peak and of the wind ramp up over `duration` and stay; a laser outage and missing frames end after it.
     """
 
+    used_when = MappingProxyType({name: ("kind", (kind,)) for kind, names in OF_KIND.items() for name in names})
+
     kind = param.Selector(
         default=PEAK,
         objects=[PEAK, WIND, LASER, FRAMES],
@@ -81,7 +83,3 @@ class Event(Group):
         default="lgs", objects=["lgs", "ngs"], label="Sensor", doc="For kind frames: sensor with missing frames."
     )
     share = Real(0.1, bounds=(0.0, 1.0), step=0.01, label="Share of frames", doc="For kind frames: share of missing frames.")
-
-    def idle(self) -> tuple[str, ...]:
-        """Return the settings of the other kinds."""
-        return tuple(name for kind, names in OF_KIND.items() if kind != self.kind for name in names)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import param
 
 from wfsobs.scenario.groups.vibration import PAPER_PEAK_HZ
@@ -11,6 +13,15 @@ from wfsobs.settings.parameters import Real, Reals, Whole
 
 class Kalman(Group):
     """The model inside the Kalman filters: AR(2) turbulence plus one vibration peak."""
+
+    used_when = MappingProxyType(
+        {
+            "turbulence_rms": ("process_noise", ("manual",)),
+            "vibration_rms": ("process_noise", ("manual",)),
+            "lgs_noise": ("measurement_noise", ("manual",)),
+            "ngs_noise": ("measurement_noise", ("manual",)),
+        }
+    )
 
     peak = param.Selector(
         default="manual",

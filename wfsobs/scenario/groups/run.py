@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import param
 
 from wfsobs.settings.group import Group
@@ -10,6 +12,8 @@ from wfsobs.settings.parameters import Real, Whole
 
 class Loop(Group):
     """The control loop that makes the record."""
+
+    used_when = MappingProxyType({"gain": ("closed", (True,)), "leak": ("closed", (True,))})
 
     closed = param.Boolean(True, label="Closed loop", doc="Drive the deformable mirror; off keeps u = 0.")
     gain = Real(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import param
 
 from wfsobs.scenario.groups.shack_hartmann import LensletArrays, Spots
@@ -12,6 +14,15 @@ from wfsobs.settings.sections import section
 
 class Sensors(Group):
     """Wavefront sensors: a natural guide star (NGS) and laser guide stars (LGS)."""
+
+    used_when = MappingProxyType(
+        {
+            "lgs_noise": ("noise_from", ("nm",)),
+            "lgs_noise_per_mode": ("noise_from", ("nm",)),
+            "ngs_noise": ("noise_from", ("nm",)),
+            "spots": ("noise_from", ("photons",)),
+        }
+    )
 
     lgs_rate = Real(
         1000.0,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import param
 
 from wfsobs.scenario.groups.atmosphere import PsdTable
@@ -44,6 +46,17 @@ class Peak(Group):
 class Vibration(Group):
     """Structural vibration of the telescope."""
 
+    used_when = MappingProxyType(
+        {
+            "synthesis": ("source", ("peaks", "psd", "measured")),
+            "spectrum": ("source", ("measured",)),
+            "part": ("source", ("measured",)),
+            "cutoff": ("source", ("peaks", "psd", "measured")),
+            "peaks": ("source", ("peaks", "ar2")),
+            "psd": ("source", ("psd",)),
+        }
+    )
+
     source = param.Selector(
         default="peaks",
         objects=["peaks", "psd", "measured", "ar2", "none"],
@@ -81,13 +94,3 @@ class Vibration(Group):
     )
     peaks = param.List([Peak()], item_type=Peak, bounds=(0, 2000), label="Peaks", doc="Peaks of the vibration spectrum.")
     psd = section(PsdTable, "PSD table", "Spectrum of the vibration as a table, for source psd.")
-
-    def idle(self) -> tuple[str, ...]:
-        """Return the settings of other sources."""
-        uses = {
-            "peaks": ("synthesis", "peaks"),
-            "ar2": ("peaks",),
-            "psd": ("synthesis", "psd"),
-            "measured": ("synthesis", "spectrum", "part"),
-        }.get(self.source, ())
-        return tuple(name for name in ("synthesis", "spectrum", "part", "peaks", "psd") if name not in uses)

@@ -1,0 +1,247 @@
+"""What results depend on: what is known is what a run would give, bit by bit, and nothing else runs."""
+
+from __future__ import annotations
+
+import gc
+from typing import Any
+
+import numpy as np
+import param
+import pytest
+
+from wfsobs.dependence import Known, Memo, digest, observers_reached, record_digest, simulate_once
+from wfsobs.evaluation.record_bounds import record_bounds
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Estimate
+from wfsobs.pipeline import each_estimate
+from wfsobs.priors_from.scenario import told
+from wfsobs.record import Record
+from wfsobs.result import Failure
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.idle import idle_settings, used_settings
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.settings.errors import SettingError
+from wfsobs.settings.parameters import Reals
+from wfsobs.simulation.loop import record_settings, simulate, training_settings
+from wfsobs.testing.common import QUICK
+
+BASE = PRESETS["paper"]().replace(QUICK)
+
+SOURCES: dict[str, dict[str, Any]] = {
+    "paper": {},
+    "frozen-flow": {"turbulence.source": "frozen-flow", "sensors.lenslets.lgs_subapertures": 8, "vibration.source": "ar2"},
+    "ideal sensors": {"turbulence.source": "frozen-flow", "sensors.kind": "zernike", "kalman.peak": "matched"},
+    "photons": {"sensors.noise_from": "photons", "turbulence.source": "ar3", "sensors.lgs_combination": "minimum-variance"},
+    "processes": {"turbulence.source": "processes", "vibration.source": "measured", "loop.closed": False},
+    "tables": {
+        "turbulence.source": "psd",
+        "turbulence.psd": {"frequency": [0.0, 50.0, 400.0], "tip": [1e-3, 1e-5, 0.0], "tilt": [1e-3, 1e-5, 0.0]},
+        "vibration.source": "none",
+        "multipeak.turbulence_order": 2,
+    },
+    "second order modes": {"telescope.radial_order": 2, "kalman.peak": "matched", "multirate.measurement_noise": "manual"},
+    "nothing": {"turbulence.source": "none", "vibration.source": "none"},
+}
+"""Between them every source, sensor and choice."""
+
+
+def scenario_of(name: str) -> Scenario:
+    return BASE.replace(SOURCES[name])
+
+
+def other_values(p: param.Parameter, value: Any) -> list[Any]:
+    """Return other values that a setting takes, the nearest first."""
+    if isinstance(p, param.Boolean):
+        return [not value]
+    if isinstance(p, param.Selector):
+        return [v for v in p.objects if v != value]
+    if isinstance(p, Reals):
+        return [[1.01 * v for v in value], [0.5 * v for v in value], [*value, 1.0]]
+    if isinstance(p, param.Integer):
+        return [value + 1, value - 1]
+    return [1.01 * value, 0.99 * value, 0.5]
+
+
+def changes_of(scenario: Scenario) -> dict[str, Scenario]:
+    """Return the scenario with one setting changed, for every setting of which some change is accepted."""
+    out = {}
+    for path, _, p in scenario.walk():
+        for value in other_values(p, scenario_value(scenario, path)):
+            try:
+                changed = scenario.replace({path: value})
+                changed.validate()
+            except SettingError:
+                continue
+            if changed != scenario:
+                out[path] = changed
+                break
+    return out
+
+
+def scenario_value(scenario: Scenario, path: str) -> Any:
+    node: Any = scenario
+    for key in path.split("."):
+        node = node[int(key)] if isinstance(node, list) else getattr(node, key)
+    return node
+
+
+def estimates(record: Record, scenario: Scenario, observers: list[str], known: Known | None = None) -> dict[Any, Any]:
+    """Return the values of estimates, and the reasons of those that there are not."""
+    found = each_estimate(record, scenario, observers=observers, known=known)
+    return {e.observer if isinstance(e, Failure) else (e.observer, e.target): value_of(e) for e in found}
+
+
+def value_of(item: Estimate | Failure) -> Any:
+    return item.reason if isinstance(item, Failure) else item.values.tobytes()
+
+
+def same(one: Record, other: Record) -> bool:
+    return digest(one) == digest(other)
+
+
+class TestSettingsWithoutEffect:
+    @pytest.mark.parametrize("name", SOURCES)
+    def test_record_priors_and_bounds_stay(self, name: str) -> None:
+        scenario = scenario_of(name)
+        idle = idle_settings(scenario)
+        changes = {p: s for p, s in changes_of(scenario).items() if any(f"{p}.".startswith(f"{group}.") for group in idle)}
+        assert len(changes) > 10
+        values = {path: scenario_value(changed, path) for path, changed in changes.items()}
+        whole = scenario.replace(values)
+        assert used_settings(whole) == used_settings(scenario), "one without effect does not give another one an effect"
+        record, again = simulate(scenario), simulate(whole)
+        assert same(record, again)
+        assert digest(record_bounds(whole, record)) == digest(record_bounds(scenario, record))
+        for observer in OBSERVERS.values():
+            assert given(observer, record, whole) == given(observer, record, scenario)
+
+    def test_every_reason_is_one_line_and_every_path_exists(self) -> None:
+        for name in SOURCES:
+            scenario = scenario_of(name)
+            for path, reason in idle_settings(scenario, is_simulated=False).items():
+                scenario_value(scenario, path)
+                assert reason.startswith("Used only") and "\n" not in reason
+
+    def test_a_setting_in_use_is_not_among_them(self) -> None:
+        scenario = Scenario().replace({"sensors.noise_from": "photons", "gpr_online.inputs_filter": "high-pass"})
+        idle = idle_settings(scenario)
+        assert "gpr_online.highpass" not in idle and "gpr_offline.highpass" in idle
+        assert "sensors.spots" not in idle and "sensors.lgs_noise" in idle
+        manual = {"kalman.process_noise": "manual", "control.integrator": "manual", "kalman.peak": "matched"}
+        assert {"kalman.vibration_rms", "control.gain"} <= set(idle)
+        idle = idle_settings(scenario.replace(manual))
+        assert not {"kalman.vibration_rms", "control.gain"} & set(idle) and "kalman.frequency" in idle
+
+    def test_a_given_record_needs_no_simulation(self) -> None:
+        assert {"loop", "events", "run.seed"} <= set(idle_settings(BASE, is_simulated=False))
+        assert not {"loop", "events", "run.seed"} & set(idle_settings(BASE))
+
+
+def given(observer: Any, record: Record, scenario: Scenario) -> str:
+    """Return a digest of what an observer receives beside measurements, or why there is nothing."""
+    try:
+        return digest(told(observer, record, scenario)[0], used_settings(scenario).get(observer.group))
+    except ValueError as error:
+        return str(error)
+
+
+def test_what_is_known_is_what_a_whole_run_gives() -> None:
+    """Change every setting with an effect that the record does not depend on, one at a time."""
+    memo, idle = Memo(), idle_settings(BASE)
+    record = simulate_once(BASE, memo)
+    kept = list(each_estimate(record, BASE, known=Known(memo, record)))
+    changes = {path: s for path, s in changes_of(BASE).items() if record_settings(s) == record_settings(BASE)}
+    for path, changed in changes.items():
+        if any(f"{path}.".startswith(f"{group}.") for group in idle):
+            continue  # test_record_priors_and_bounds_stay
+        now, reached = simulate_once(changed, memo), observers_reached(BASE, changed)
+        assert reached is not None and record_digest(now) == record_digest(record), path
+        names = [o.id for o in OBSERVERS.values() if not o.slow or o.id in reached]
+        known = Known(memo, now)
+        found = estimates(now, changed, names, known)
+        assert set(names) - known.reused <= reached, path
+        assert found == estimates(simulate(changed), changed, names), path
+    assert kept and {"multipeak.line_width", "control.delay", "gpr_online.length_scale"} <= set(changes)
+    told_otherwise = BASE.replace({path: scenario_value(changed, path) for path, changed in changes.items()})
+    assert digest(record_bounds(told_otherwise, record)) == digest(record_bounds(BASE, record))
+
+
+CASES = {
+    "multipeak.line_width": {"kf-multi"},
+    "multirate.model_lgs_error": {"multirate", "multirate-optimal"},
+    "kalman.ngs_between_frames": {"kf-ngs"},
+    "gpr_online.length_scale": {"gpr-online"},
+    "gpr_offline.length_scale": {"gpr-offline", "ridge"},
+    "adaptive.peak_count": {"kf-adaptive"},
+    "sensors.spots.lgs_photons": set(),
+    "gpr_online.highpass": set(),
+    "kalman.lgs_noise": set(),
+    "control.gain": set(),
+    "control.delay": set(),
+}
+"""Setting of the paper's scenario -> observers that run again."""
+
+
+@pytest.fixture(scope="module")
+def before() -> tuple[Memo, Record, list[Any]]:
+    """A memo, and what is held of the base scenario."""
+    memo = Memo()
+    record = simulate_once(BASE, memo)
+    return memo, record, list(each_estimate(record, BASE, known=Known(memo, record)))
+
+
+class TestReuse:
+    @pytest.mark.parametrize("path", CASES)
+    def test_only_what_depends_runs(self, path: str, before: tuple[Memo, Record, list[Any]]) -> None:
+        memo, record, kept = before
+        assert not any(isinstance(item, Failure) for item in kept)
+        changed = changes_of(BASE)[path]
+        now = simulate_once(changed, memo)
+        assert now is record
+        found = list(each_estimate(now, changed, known=Known(memo, now)))
+        assert {e.observer for e in found if not any(e is old for old in kept)} == CASES[path]
+
+    def test_other_training_data_leave_the_record(self, before: tuple[Memo, Record, list[Any]]) -> None:
+        memo, record, _ = before
+        changed = BASE.replace({"gpr_offline.training_size": 61})
+        assert record_settings(changed) == record_settings(BASE) and training_settings(changed) != training_settings(BASE)
+        now = simulate_once(changed, memo)
+        assert now.y_lgs is record.y_lgs and now.training is not None and record.training is not None
+        assert len(now.training.y_lgs) == len(record.training.y_lgs) + 1 and same(now, simulate(changed))
+
+    def test_known_ones_come_before_any_runs(self, before: tuple[Memo, Record, list[Any]]) -> None:
+        memo, record, _ = before
+        changed = BASE.replace({"multipeak.line_width": 0.7})
+        order = [e.observer for e in each_estimate(record, changed, known=Known(memo, record)) if isinstance(e, Estimate)]
+        assert set(order[-2:]) == {"kf-multi"} and "kf-multi" not in order[:-2]
+
+    def test_other_measurements_are_another_record(self, before: tuple[Memo, Record, list[Any]]) -> None:
+        memo, record, _ = before
+        y = record.y_lgs.copy()
+        y[-1, 0] = np.nextafter(y[-1, 0], np.inf)
+        moved = Record(**{**vars(record), "y_lgs": y})
+        known = Known(memo, moved)
+        list(each_estimate(moved, BASE, observers=["kf-lgs", "persistence"], known=known))
+        assert known.reused == set()
+
+    def test_nothing_is_kept_that_nobody_holds(self) -> None:
+        memo = Memo()
+        record = simulate_once(BASE, memo)
+        kept = list(each_estimate(record, BASE, observers=["kf-lgs"], known=Known(memo, record)))
+        assert len(memo) == 4, "a record by two names, and two estimates"
+        del record, kept
+        gc.collect()
+        assert len(memo) == 0
+
+
+class TestDigest:
+    def test_it_tells_values_from_each_other(self) -> None:
+        one = np.array([1.0, 2.0])
+        values = [1, 1.0, True, "1", None, (1,), [1], one, one.astype(np.float32), one.reshape(1, 2), one[::-1], {"a": 1}]
+        assert len({digest(value) for value in values}) == len(values)
+        assert len({digest("ab", "c"), digest("a", "bc"), digest("abc")}) == 3
+        assert digest(one[::-1]) == digest(np.array([2.0, 1.0])), "the same numbers, whatever their layout"
+
+    def test_what_has_no_value_is_refused(self) -> None:
+        with pytest.raises(TypeError, match="a function has no digest"):
+            digest(lambda: 1)

@@ -1,0 +1,147 @@
+"""What results depend on, by name: a record on the settings that its simulation reads, an estimate on what its observer receives.
+
+The name of an estimate is a digest of the record, of the observer's prior as it was built and of its own settings as they count:
+what changed nothing of these changes nothing of the estimate. So there is no list of which setting reaches which observer.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar
+from weakref import WeakValueDictionary
+
+import numpy as np
+
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Estimate, Observer
+from wfsobs.prior import Prior, Training
+from wfsobs.progress import QUIET, Watch
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+from wfsobs.settings.tree import Plain
+from wfsobs.simulation.loop import record_settings, simulate, training_settings
+
+T = TypeVar("T")
+
+MODELS = frozenset(("kalman", "butterworth"))
+"""Groups of what all observers are told."""
+
+
+class Memo:
+    """Values by name, as long as somebody else holds them: it takes no memory of its own. For any thread."""
+
+    def __init__(self) -> None:
+        self._known: WeakValueDictionary[str, Any] = WeakValueDictionary()
+
+    def get(self, name: str) -> Any:
+        """Return the value of a name, or None."""
+        return self._known.get(name)
+
+    def put(self, name: str, value: T) -> T:
+        """Note a value under a name, and return it."""
+        self._known[name] = value
+        return value
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+
+def digest(*values: Any) -> str:
+    """Return a digest of numbers, texts, arrays and what is made of these.
+
+    Raises TypeError for anything else, which has no value to compare.
+
+    >>> digest(1, [2.0]) == digest(1, [2.0]) != digest(1, 2.0)
+    True
+    """
+    h = hashlib.blake2b(digest_size=16)
+    for part in _parts(values):
+        h.update(len(part).to_bytes(8, "big"))
+        h.update(part)
+    return h.hexdigest()
+
+
+def _parts(value: Any) -> Iterator[Any]:
+    if value is None or isinstance(value, (bool, int, float, complex, str)):
+        yield f"{type(value).__name__} {value!r}".encode()
+    elif isinstance(value, np.generic):
+        yield from _parts(value.item())
+    elif isinstance(value, np.ndarray):
+        yield f"{value.dtype.str} {value.shape}".encode()
+        yield np.ascontiguousarray(value).reshape(-1).view(np.uint8)
+    elif isinstance(value, (tuple, list)):
+        yield f"{type(value).__name__} {len(value)}".encode()
+        for item in value:
+            yield from _parts(item)
+    elif isinstance(value, Mapping):
+        yield from _parts(sorted(value.items()))
+    elif is_dataclass(value):
+        yield type(value).__name__.encode()
+        for field in fields(value):
+            yield from _parts(getattr(value, field.name))
+    else:
+        raise TypeError(f"a {type(value).__name__} has no digest")
+
+
+def record_digest(record: Record) -> str:
+    """Return the digest of a record without its training data."""
+    return digest(replace(record, training=None))
+
+
+def simulate_once(scenario: Scenario, memo: Memo | None = None, watch: Watch = QUIET) -> Record:
+    """Simulate a record, unless one of the same settings is known. Raises SettingError, Cancelled.
+
+    Where the training data alone differs, the record stays and the training data is simulated.
+    """
+    if memo is None:
+        return simulate(scenario, watch=watch)
+    whole, measured = digest(training_settings(scenario)), digest(record_settings(scenario))
+    scenario.validate()
+    found = memo.get(f"training {whole}")
+    if found is None:
+        found = simulate(scenario, watch=watch, known=memo.get(f"record {measured}"))
+        memo.put(f"record {measured}", found)
+        memo.put(f"training {whole}", found)
+    return found
+
+
+def observers_reached(before: Scenario, now: Scenario) -> set[str] | None:
+    """Return the observers that a change of settings may reach, before their priors are built; None where the record changes.
+
+    A group of an observer's own reaches that observer; training data those that ask for it; the model and the bands of all
+    observers those that ask for a prior.
+    """
+    if record_settings(before) != record_settings(now):
+        return None
+    changed = {name for name, used in now.used().items() if used != before.used()[name]}
+    shared, trained = changed & MODELS, training_settings(before) != training_settings(now)
+    return {o.id for o in OBSERVERS.values() if o.group in changed or (shared and o.prior) or (trained and Training in o.prior)}
+
+
+class Known:
+    """The estimates that are known of a record: looked for in a memo, and noted there.
+
+    record : digest of the record;  reused : observers whose estimates were known
+    """
+
+    def __init__(self, memo: Memo, record: Record):
+        self.memo, self.record = memo, record_digest(record)
+        self.reused: set[str] = set()
+
+    def find(self, observer: Observer, prior: Prior, own: Plain | None) -> tuple[str, list[Estimate]]:
+        """Return the name of an observer's estimates, and the estimates, one per target; none unless all are known.
+
+        own : its settings that have an effect
+        """
+        name = digest(observer.id, self.record, prior, own)
+        found = [self.memo.get(f"{name} {target}") for target in observer.targets]
+        if any(e is None for e in found):
+            return name, []
+        self.reused.add(observer.id)
+        return name, found
+
+    def note(self, name: str, estimate: Estimate) -> None:
+        """Note an estimate of this name."""
+        self.memo.put(f"{name} {estimate.target}", estimate)
