@@ -9,12 +9,12 @@ import numpy as np
 import param
 import pytest
 
-from wfsobs.dependence import Known, Memo, digest, observers_reached, record_digest, simulate_once
+from wfsobs.dependence import Memo, RecordMemo, digest, observers_reached, record_digest, simulate_once
 from wfsobs.evaluation.record_bounds import record_bounds
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate
 from wfsobs.pipeline import each_estimate
-from wfsobs.priors_from.scenario import told
+from wfsobs.priors_from.scenario import prior_and_settings
 from wfsobs.record import Record
 from wfsobs.result import Failure
 from wfsobs.scenario import Scenario
@@ -85,9 +85,9 @@ def scenario_value(scenario: Scenario, path: str) -> Any:
     return node
 
 
-def estimates(record: Record, scenario: Scenario, observers: list[str], known: Known | None = None) -> dict[Any, Any]:
+def estimates(record: Record, scenario: Scenario, observers: list[str], known: RecordMemo | None = None) -> dict[Any, Any]:
     """Return the values of estimates, and the reasons of those that there are not."""
-    found = each_estimate(record, scenario, observers=observers, known=known)
+    found = each_estimate(record, scenario, observers=observers, memo=known)
     return {e.observer if isinstance(e, Failure) else (e.observer, e.target): value_of(e) for e in found}
 
 
@@ -140,7 +140,7 @@ class TestSettingsWithoutEffect:
 def given(observer: Any, record: Record, scenario: Scenario) -> str:
     """Return a digest of what an observer receives beside measurements, or why there is nothing."""
     try:
-        return digest(told(observer, record, scenario)[0], used_settings(scenario).get(observer.group))
+        return digest(prior_and_settings(observer, record, scenario)[0], used_settings(scenario).get(observer.group))
     except ValueError as error:
         return str(error)
 
@@ -149,7 +149,7 @@ def test_what_is_known_is_what_a_whole_run_gives() -> None:
     """Change every setting with an effect that the record does not depend on, one at a time."""
     memo, idle = Memo(), idle_settings(BASE)
     record = simulate_once(BASE, memo)
-    kept = list(each_estimate(record, BASE, known=Known(memo, record)))
+    kept = list(each_estimate(record, BASE, memo=RecordMemo(memo, record)))
     changes = {path: s for path, s in changes_of(BASE).items() if record_settings(s) == record_settings(BASE)}
     for path, changed in changes.items():
         if any(f"{path}.".startswith(f"{group}.") for group in idle):
@@ -157,7 +157,7 @@ def test_what_is_known_is_what_a_whole_run_gives() -> None:
         now, reached = simulate_once(changed, memo), observers_reached(BASE, changed)
         assert reached is not None and record_digest(now) == record_digest(record), path
         names = [o.id for o in OBSERVERS.values() if not o.slow or o.id in reached]
-        known = Known(memo, now)
+        known = RecordMemo(memo, now)
         found = estimates(now, changed, names, known)
         assert set(names) - known.reused <= reached, path
         assert found == estimates(simulate(changed), changed, names), path
@@ -187,7 +187,7 @@ def before() -> tuple[Memo, Record, list[Any]]:
     """A memo, and what is held of the base scenario."""
     memo = Memo()
     record = simulate_once(BASE, memo)
-    return memo, record, list(each_estimate(record, BASE, known=Known(memo, record)))
+    return memo, record, list(each_estimate(record, BASE, memo=RecordMemo(memo, record)))
 
 
 class TestReuse:
@@ -198,7 +198,7 @@ class TestReuse:
         changed = changes_of(BASE)[path]
         now = simulate_once(changed, memo)
         assert now is record
-        found = list(each_estimate(now, changed, known=Known(memo, now)))
+        found = list(each_estimate(now, changed, memo=RecordMemo(memo, now)))
         assert {e.observer for e in found if not any(e is old for old in kept)} == CASES[path]
 
     def test_other_training_data_leave_the_record(self, before: tuple[Memo, Record, list[Any]]) -> None:
@@ -212,7 +212,7 @@ class TestReuse:
     def test_known_ones_come_before_any_runs(self, before: tuple[Memo, Record, list[Any]]) -> None:
         memo, record, _ = before
         changed = BASE.replace({"multipeak.line_width": 0.7})
-        order = [e.observer for e in each_estimate(record, changed, known=Known(memo, record)) if isinstance(e, Estimate)]
+        order = [e.observer for e in each_estimate(record, changed, memo=RecordMemo(memo, record)) if isinstance(e, Estimate)]
         assert set(order[-2:]) == {"kf-multi"} and "kf-multi" not in order[:-2]
 
     def test_other_measurements_are_another_record(self, before: tuple[Memo, Record, list[Any]]) -> None:
@@ -220,14 +220,14 @@ class TestReuse:
         y = record.y_lgs.copy()
         y[-1, 0] = np.nextafter(y[-1, 0], np.inf)
         moved = Record(**{**vars(record), "y_lgs": y})
-        known = Known(memo, moved)
-        list(each_estimate(moved, BASE, observers=["kf-lgs", "persistence"], known=known))
+        known = RecordMemo(memo, moved)
+        list(each_estimate(moved, BASE, observers=["kf-lgs", "persistence"], memo=known))
         assert known.reused == set()
 
     def test_nothing_is_kept_that_nobody_holds(self) -> None:
         memo = Memo()
         record = simulate_once(BASE, memo)
-        kept = list(each_estimate(record, BASE, observers=["kf-lgs"], known=Known(memo, record)))
+        kept = list(each_estimate(record, BASE, observers=["kf-lgs"], memo=RecordMemo(memo, record)))
         assert len(memo) == 4, "a record by two names, and two estimates"
         del record, kept
         gc.collect()

@@ -101,7 +101,7 @@ def simulate_once(scenario: Scenario, memo: Memo | None = None, watch: Watch = Q
     scenario.validate()
     found = memo.get(f"training {whole}")
     if found is None:
-        found = simulate(scenario, watch=watch, known=memo.get(f"record {measured}"))
+        found = simulate(scenario, watch=watch, like=memo.get(f"record {measured}"))
         memo.put(f"record {measured}", found)
         memo.put(f"training {whole}", found)
     return found
@@ -115,12 +115,12 @@ def observers_reached(before: Scenario, now: Scenario) -> set[str] | None:
     """
     if record_settings(before) != record_settings(now):
         return None
-    changed = {name for name, used in now.used().items() if used != before.used()[name]}
+    changed = {name for name, used in now.effective_values().items() if used != before.effective_values()[name]}
     shared, trained = changed & MODELS, training_settings(before) != training_settings(now)
     return {o.id for o in OBSERVERS.values() if o.group in changed or (shared and o.prior) or (trained and Training in o.prior)}
 
 
-class Known:
+class RecordMemo:
     """The estimates that are known of a record: looked for in a memo, and noted there.
 
     record : digest of the record;  reused : observers whose estimates were known

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wfsobs.dependence import Known
+from wfsobs.dependence import RecordMemo
 from wfsobs.evaluation.record_bounds import Bound, bound_scores, record_bounds
 from wfsobs.evaluation.scores import score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Estimates, Observer
 from wfsobs.priors_from.identification import told_by
-from wfsobs.priors_from.scenario import arguments, as_sampled, told
+from wfsobs.priors_from.scenario import arguments, as_sampled, prior_and_settings
 from wfsobs.priors_from.training import trained_until, with_training
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record
@@ -79,7 +79,7 @@ def observe(
     train: Record | float | None = None,
     watch: Watch = QUIET,
     is_simulated: bool = False,
-    known: Known | None = None,
+    memo: RecordMemo | None = None,
 ) -> Result:
     """Run observers on a record.
 
@@ -103,7 +103,7 @@ def observe(
         Receives the progress, and is asked at every block of work whether to stop.
     is_simulated : bool
         Whether the record was simulated from the scenario, so that its Wiener bounds are known.
-    known : Known, optional
+    memo : RecordMemo, optional
         Estimates of this record that are known by what they depend on; they do not run, the others are noted there.
 
     Returns
@@ -129,7 +129,7 @@ def observe(
     start = trained_until(train)
     estimates: list[Estimate] = []
     failures: list[Failure] = []
-    for item in each_estimate(record, scenario, watch, observers, known=known):
+    for item in each_estimate(record, scenario, watch, observers, memo=memo):
         if isinstance(item, Failure):
             failures.append(item)
         else:
@@ -186,14 +186,14 @@ def each_estimate(
     watch: Watch = QUIET,
     observers: Sequence[str] | None = None,
     on_partial: Callable[[str, str, Array], None] | None = None,
-    known: Known | None = None,
+    memo: RecordMemo | None = None,
 ) -> Iterator[Estimate | Failure]:
     """Run observers, and yield the estimates of each as soon as they are done, the slow ones last.
 
     Each receives measurements, its prior and its settings: neither record nor scenario.
 
     on_partial : receives (observer, target, values so far) from observers that compute in blocks
-    known      : estimates that are known by what they depend on; they come first, without a run
+    memo       : estimates that are known by what they depend on; they come first, without a run
     """
     scenario = scenario.before_events  # no observer is told
     unknown = set(observers or ()) - set(OBSERVERS)
@@ -201,11 +201,11 @@ def each_estimate(
         raise SettingError(f"observer {sorted(unknown)[0]!r}: no such observer; there are {', '.join(OBSERVERS)}")
     chosen = list(OBSERVERS.values()) if observers is None else [OBSERVERS[name] for name in dict.fromkeys(observers)]
     names: dict[str, str] = {}
-    if known is not None:
+    if memo is not None:
         used = used_settings(scenario)
         for observer in tuple(chosen):
             watch.check()
-            name, found = _recall(observer, record, scenario, used.get(observer.group or ""), known)
+            name, found = _recall(observer, record, scenario, used.get(observer.group or ""), memo)
             if found:
                 yield from found
                 chosen.remove(observer)
@@ -223,8 +223,8 @@ def each_estimate(
             partial=lambda target, values, o=observer: on_partial(o.id, target, values) if on_partial else None,
         )
         for item in _one(observer, record, scenario, inner):
-            if known is not None and isinstance(item, Estimate):
-                known.note(names[observer.id], item)
+            if memo is not None and isinstance(item, Estimate):
+                memo.note(names[observer.id], item)
             yield item
         done += weights[observer.id]
         watch.check()
@@ -253,13 +253,13 @@ def run_observer(name: str, record: Record, scenario: Scenario, watch: Watch = Q
 
 
 def _recall(
-    observer: Observer, record: Record, scenario: Scenario, own: Plain | None, known: Known
+    observer: Observer, record: Record, scenario: Scenario, own: Plain | None, memo: RecordMemo
 ) -> tuple[str, list[Estimate]]:
     """Return the name of an observer's estimates, empty where there are none, and those that are known."""
     if observer.missing(record):
         return "", []
     try:
-        return known.find(observer, told(observer, record, scenario)[0], own)
+        return memo.find(observer, prior_and_settings(observer, record, scenario)[0], own)
     except ValueError:
         return "", []
 

@@ -16,7 +16,7 @@ from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults
 from wfsobs.cost import run_seconds
-from wfsobs.dependence import Known, Memo, simulate_once
+from wfsobs.dependence import Memo, RecordMemo, simulate_once
 from wfsobs.evaluation.evidence import Evidence, gather_evidence
 from wfsobs.evaluation.scores import Score
 from wfsobs.pipeline import observe
@@ -64,7 +64,7 @@ def run_seed(
         sleep(0.02)
     simulation = (scenario if source is None or source.simulation is None else source.simulation).replace({"run.seed": seed})
     record = simulate_once(simulation, memo, watch)
-    result = observe(record, scenario, watch=watch, known=Known(memo, record))
+    result = observe(record, scenario, watch=watch, memo=RecordMemo(memo, record))
     errors = np.array([s.rms for s in result.scores])
     return SeedScores(result.scores, errors, result if size_of(result) <= LIGHT else None)
 

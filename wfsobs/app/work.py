@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from wfsobs.app.jobs.job import INTERVAL, Tell
 from wfsobs.app.sources import Source
-from wfsobs.dependence import Known, Memo, digest, simulate_once
+from wfsobs.dependence import Memo, RecordMemo, digest, simulate_once
 from wfsobs.evaluation.error_spectra import spectra
 from wfsobs.evaluation.record_bounds import Bound, record_bounds
 from wfsobs.observers import OBSERVERS
@@ -144,11 +144,11 @@ class _Work:
             record = self.source.make(self.watch, self.memo)
             stated = as_stated(record, stated)
             stated.validate()
-        self.record, self.known = record, Known(self.memo, record)
+        self.record, self.known = record, RecordMemo(self.memo, record)
         self.bounds = self.memo.get(self._name_of_bounds(record)) if self.simulation is not None else _Bounds()
         self._add_truth(record)
         handed_over = False  # the quick ones
-        for item in each_estimate(record, stated, self.watch, on_partial=self._grow, known=self.known):
+        for item in each_estimate(record, stated, self.watch, on_partial=self._grow, memo=self.known):
             with self.lock:
                 if isinstance(item, Failure):
                     self.failures.append(item)

@@ -40,10 +40,10 @@ def arguments(observer: Observer, record: Record, scenario: Scenario) -> tuple[M
 
     Raises ValueError where the scenario has no such prior.
     """
-    return record.measurements(open_loop="open_loop_y" in observer.needs), *told(observer, record, scenario)
+    return record.measurements(open_loop="open_loop_y" in observer.needs), *prior_and_settings(observer, record, scenario)
 
 
-def told(observer: Observer, record: Record, scenario: Scenario) -> tuple[Prior, Group | None]:
+def prior_and_settings(observer: Observer, record: Record, scenario: Scenario) -> tuple[Prior, Group | None]:
     """Return the prior and the settings of its own that an observer receives beside the measurements of a record.
 
     Raises ValueError where the scenario has no such prior.

@@ -53,7 +53,7 @@ def idle_settings(scenario: Scenario, *, is_simulated: bool = True) -> dict[str,
 
 def used_settings(scenario: Scenario) -> Plain:
     """Return the settings that have an effect, as nested plain values."""
-    tree = scenario.used()
+    tree = scenario.effective_values()
     for path, _ in _across(scenario):
         *above, name = path.split(".")
         node = tree

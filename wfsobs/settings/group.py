@@ -63,10 +63,10 @@ class Group(param.Parameterized):
             if getattr(self, other) not in values
         }
 
-    def used(self) -> Plain:
+    def effective_values(self) -> Plain:
         """Return the tree as nested plain values, without the settings that have no effect."""
         idle = self.idle()
-        return {name: _used(getattr(self, name)) for name in self.settings() if name not in idle}
+        return {name: _effective(getattr(self, name)) for name in self.settings() if name not in idle}
 
     def __repr__(self) -> str:
         changed = self._changed_settings()
@@ -250,11 +250,11 @@ def _either(values: tuple[Any, ...]) -> str:
     return " or ".join({True: "on", False: "off"}[v] if isinstance(v, bool) else str(v) for v in values)
 
 
-def _used(value: Any) -> Any:
+def _effective(value: Any) -> Any:
     """Return a value as plain values, without settings that have no effect."""
     if isinstance(value, Group):
-        return value.used()
-    return [_used(v) for v in value] if isinstance(value, list) else _plain(value)
+        return value.effective_values()
+    return [_effective(v) for v in value] if isinstance(value, list) else _plain(value)
 
 
 def _plain(value: Any) -> Any:

@@ -74,7 +74,7 @@ def training_settings(scenario: Scenario) -> Plain:
 
 
 def simulate(
-    scenario: Scenario, *, rng: np.random.Generator | None = None, watch: Watch = QUIET, known: Record | None = None
+    scenario: Scenario, *, rng: np.random.Generator | None = None, watch: Watch = QUIET, like: Record | None = None
 ) -> Record:
     """Simulate the loop over the scenario's duration.
 
@@ -86,7 +86,7 @@ def simulate(
         Source of all random numbers; by default one seeded with `scenario.run.seed`.
     watch : Watch
         Receives the progress, and is asked at every block of work whether to stop.
-    known : Record, optional
+    like : Record, optional
         A record of the same `record_settings` and generator: it is not simulated again, only its training data.
 
     Returns
@@ -104,7 +104,7 @@ def simulate(
     scenario.validate()
     rng = np.random.default_rng(scenario.run.seed) if rng is None else rng
     record_rng, training_rng = rng.spawn(2)
-    record = known if known is not None else _run(scenario, scenario.n_steps, record_rng, watch)
+    record = like if like is not None else _run(scenario, scenario.n_steps, record_rng, watch)
     return replace(record, training=_training(scenario, training_rng, watch))
 
 
