@@ -70,9 +70,9 @@ def test_only_what_depends_runs(short: Scenario) -> None:
     memo, told = Memo(), []
     first = compute(short, QUIET, lambda **_: None, None, memo)
     assert set(first.ran) == set(OBSERVERS)
-    changed = short.replace({"multipeak.line_width": 0.7})
+    changed = short.replace({"kalman.ngs_between_frames": "propagate"})
     shown = compute(changed, QUIET, lambda **news: told.append(news), None, memo)
-    assert shown.ran == ("kf-multi",) and shown.scenario == changed and shown.result.record is first.result.record
+    assert shown.ran == ("kf-ngs",) and shown.scenario == changed and shown.result.record is first.result.record
     assert not told, "one picture, as there is nothing to wait for"
     assert shown.bounds is first.bounds and shown.spectra["kf-lgs", "vibration"] is first.spectra["kf-lgs", "vibration"]
     whole = compute(changed, QUIET, lambda **_: None)
