@@ -3,15 +3,15 @@
     python scripts/measure_theory.py [PRESET ...]
 
 Every frame moves one setting a little further, as a drag does, and predicts all linear observers of the target in one mode. It
-prints the median, the 95th percentile and the maximum [ms]; the first frame of a drag, which computes what the others share,
-stands by itself.
+prints the median, the 95th percentile and the maximum [ms], and the median of the processor's time, which does not count others at
+work on the machine; the first frame of a drag, which computes what the others share, stands by itself.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from time import perf_counter
+from time import perf_counter, process_time
 
 import numpy as np
 
@@ -58,20 +58,21 @@ DRAGS: dict[str, tuple[str, Callable[[Scenario, int], Scenario | None]]] = {
 def main(names: list[str]) -> None:
     """Print a line per preset and drag."""
     one_blas_thread()
-    print(f"{'preset':16}{'drag':20}{'first':>9}{'p50':>9}{'p95':>9}{'max':>9}   ms, {FRAMES} frames")
+    print(f"{'preset':16}{'drag':20}{'first':>9}{'p50':>9}{'p95':>9}{'max':>9}{'CPU':>9}   ms, {FRAMES} frames")
     for name in names:
         for drag, (target, move) in DRAGS.items():
-            theory, times = Theory(), []
+            theory, times, busy = Theory(), [], []
             for i in range(FRAMES + 1):
                 scenario = move(PRESETS[name](), i)
                 if scenario is None:
                     break
-                start = perf_counter()
+                start, at_work = perf_counter(), process_time()
                 theory.predict(scenario, 0, target)
                 times.append(1e3 * (perf_counter() - start))
+                busy.append(1e3 * (process_time() - at_work))
             if times:
                 p50, p95 = np.percentile(times[1:], [50, 95])
-                print(f"{name:16}{drag:20}{times[0]:9.1f}{p50:9.1f}{p95:9.1f}{max(times[1:]):9.1f}")
+                print(f"{name:16}{drag:20}{times[0]:9.1f}{p50:9.1f}{p95:9.1f}{max(times[1:]):9.1f}{np.median(busy[1:]):9.1f}")
 
 
 if __name__ == "__main__":

@@ -9,9 +9,13 @@ import pytest
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.handles import changes_of, handles_of, with_new_peak, without_peak
-from wfsobs.app.views.frames import Frames, Wish
+from wfsobs.app.pages.pages import LOOP
+from wfsobs.app.views.frames import Frames
+from wfsobs.app.views.gain_editor import GainEditor
 from wfsobs.app.views.spectrum_editor import SpectrumEditor
-from wfsobs.evaluation.theory import TRUTH, Prediction, Theory
+from wfsobs.closed_loop.design import design
+from wfsobs.evaluation.theory import Theory
+from wfsobs.priors_from.controllers import plant_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
@@ -168,17 +172,71 @@ class TestMessages:
         assert editor.lines.source.data["ys"] == []
 
 
-def test_the_newest_wish_wins(dashboard: Dashboard, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[float] = []
+def test_the_newest_wish_of_each_figure_wins(dashboard: Dashboard, loop: Any) -> None:
+    frames, worked, landed = Frames(dashboard.store.session), [], []
 
-    def predict(_self: Theory, scenario: Scenario, _mode: int, target: str, *_: Any) -> list[Prediction]:
-        asked.append(scenario.kalman.frequency)
-        return [Prediction(TRUTH, target, 1.0, np.zeros(1), np.zeros(1))]
+    def ask(name: str, i: int) -> None:
+        frames.ask(name, lambda: worked.append(i) or i, lambda result, why: landed.append((name, result, why)))
 
-    monkeypatch.setattr(Theory, "predict", predict)
-    frames, landed = Frames(dashboard.store.session), []
     for i in range(1, 11):
-        scenario = dashboard.store.scenario.replace({"kalman.frequency": float(i)})
-        frames.ask(Wish(scenario, "vibration", 0, (), True, i), lambda wish, found, why: landed.append(wish.number))
-    loop.until(lambda: len(landed) == 2)
-    assert landed == [1, 10] and asked == [1.0, 10.0], "one at a time, and those between are dropped"
+        ask("a", i)
+    ask("b", 20)
+    loop.until(lambda: len(landed) == 3)
+    assert landed == [("a", 1, ""), ("a", 10, ""), ("b", 20, "")], "those between are dropped"
+    assert worked == [1, 10, 20], "one at a time"
+
+
+def test_a_wish_that_fails_says_why(dashboard: Dashboard, loop: Any) -> None:
+    def fail() -> None:
+        raise ValueError("not today")
+
+    landed: list[Any] = []
+    Frames(dashboard.store.session).ask("a", fail, lambda *told: landed.append(told))
+    loop.until(lambda: bool(landed))
+    assert landed == [(None, "not today")]
+
+
+class TestGain:
+    @pytest.fixture
+    def gain(self, dashboard: Dashboard, loop: Any) -> GainEditor:
+        dashboard.pages.current = LOOP
+        page = dashboard.pages.made[LOOP]
+        loop.until(lambda: page.results is not None and page.results.complete)
+        assert page.editor is None, "made when first wanted"
+        dashboard.display.editing = True
+        loop.until(lambda: bool(page.editor.layer.frame.get("handles")))
+        return page.editor
+
+    def test_a_drag_says_what_the_loop_would_do(self, gain: GainEditor, loop: Any) -> None:
+        store = gain.store
+        (handle,) = gain.layer.frame["handles"]
+        gain.layer._handle_msg({"action": "drag", "id": "gain-0", "number": 1, "frequency": 0.5 * handle["frequency"]})
+        loop.until(lambda: gain.layer.frame["answered"] == 1)
+        (after,) = gain.layer.frame["handles"]
+        # between two points of the curve the level is taken as linear
+        assert after["frequency"] == pytest.approx(0.5 * handle["frequency"], rel=5e-3)
+        values = {it["name"]: it["value"] for it in gain.layer.frame["numbers"]}
+        scenario = store.scenario.replace({"control.integrator": "manual", "control.gain": float(values["gain"])})
+        expected = design(scenario, ["integrator"]).laws["integrator"][0].predicted_rms
+        assert expected is not None
+        assert float(values["integrator"]) == pytest.approx(1e3 * expected, rel=0.01)  # three digits, of the gain too
+        assert store.scenario.control.integrator == "optimised" and not store.can_undo
+
+    def test_letting_go_sets_the_gain(self, gain: GainEditor, loop: Any) -> None:
+        gain.layer._handle_msg({"action": "release", "id": "gain-0", "number": 1, "frequency": 40.0})
+        control = gain.store.scenario.control
+        assert control.integrator == "manual"
+        mirror, dt = plant_of(gain.store.scenario).mirror, gain.store.scenario.dt
+        at = np.array([2.0 * np.pi * 40.0 * dt])
+        L = control.gain * mirror.response(at) / (1.0 - control.leak * np.exp(-1j * at))
+        assert abs(1.0 / (1.0 + L[0])) == pytest.approx(1.0, abs=1e-3)  # four decimals of the gain
+        loop.finish(gain.store)
+
+    def test_no_handle_makes_the_loop_unstable(self, gain: GainEditor, loop: Any) -> None:
+        for i, frequency in enumerate((120.0, 300.0, 499.0), 1):
+            gain.layer._handle_msg({"action": "drag", "id": "gain-0", "number": i, "frequency": frequency})
+            loop.until(lambda i=i: gain.layer.frame["answered"] == i)
+            assert gain.layer.frame["note"] == "" and gain.layer.frame["numbers"]
+        gain.layer._handle_msg({"action": "drag", "id": "gain-0", "number": 4, "frequency": -1.0})
+        loop.until(lambda: gain.layer.frame["answered"] == 4)
+        assert "positive" in gain.layer.frame["note"]

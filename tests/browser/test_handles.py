@@ -129,3 +129,21 @@ def test_other_handles(page: Page) -> None:
     page.keyboard.press("Enter")
     expect(page.get_by_role("textbox", name=re.compile("Wind speed")).or_(page.get_by_role("spinbutton")).first).to_be_visible()
     expect(page.get_by_role("button", name="Undo")).to_be_enabled()
+
+
+def test_gain_of_the_integrator(page: Page) -> None:
+    page.get_by_role("button", name="Closed loop").click()
+    gain = handle(page, "Integrator gain")
+    expect(gain).to_be_visible()
+    margin = page.locator(".numbers span[data-name=gain-margin] b")
+    before = margin.inner_text()
+    x, y = middle(gain)
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x - 30, y, steps=5)
+    expect(margin).not_to_have_text(before)
+    expect(page.get_by_role("button", name="Undo")).to_be_disabled()
+    page.mouse.up()
+    expect(page.get_by_role("button", name="Undo")).to_be_enabled()
+    page.get_by_role("button", name="Undo").click()
+    expect(margin).to_have_text(before)

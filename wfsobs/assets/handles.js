@@ -97,7 +97,7 @@ export function render({model, el}) {
       if (!it) continue
       const held = move?.id === handle.id
       const sx = x_scale.compute(held ? move.frequency : handle.frequency)
-      let sy = {model: box.bottom - 28, band: box.bottom - 9}[handle.kind] ?? (handle.y > 0 ? y_scale.compute(handle.y) : (box.top + box.bottom) / 2)
+      let sy = {model: box.bottom - 28, band: box.bottom - 9}[handle.kind] ?? (Number.isFinite(handle.y) ? y_scale.compute(handle.y) : (box.top + box.bottom) / 2)
       if (held && move.sy !== undefined && handle.strength) sy = move.sy
       it.hidden = sx < box.left - 1 || sx > box.right + 1
       it.style.left = `${there.left - here.left + sx}px`

@@ -89,6 +89,12 @@ def design(scenario: Scenario, controllers: Sequence[str] | None = None, start: 
     return Design(scenario, plant, laws, bounds, priors, max(scenario.run.warm_up, start))
 
 
+def design_mode(controller: str, scenario: Scenario, mode: int, spectra: Spectra | None) -> LawDesign:
+    """Make and judge the law of a controller that is told nothing, in one mode; spectra : where known, for the residual."""
+    found = CONTROLLERS[controller]
+    return _of_mode(found, Prior(), mode, plant_of(scenario), own_settings(found, scenario), spectra)
+
+
 def select_controllers(controllers: Sequence[str] | None) -> list[Controller]:
     """Return the controllers of these ids, in the order of the registry; all for None. Raises SettingError."""
     unknown = set(controllers or ()) - set(CONTROLLERS)

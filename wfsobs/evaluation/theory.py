@@ -137,7 +137,7 @@ class Theory:
         """
         if not has_known_spectra(scenario):
             raise ValueError("no prediction: the spectra of this scenario are not known, or events change them")
-        spectra = self._spectra(scenario, mode)
+        spectra = self.spectra(scenario, mode)
         cross = self._keep(f"cross {target}", Identity(spectra), lambda: advance_spectrum(spectra.cross[target], 1))
         n_steps = scenario.n_steps - round(scenario.run.warm_up / scenario.dt)
         out = []
@@ -165,7 +165,8 @@ class Theory:
             self._memory[name] = kept = key, make()
         return kept[1]
 
-    def _spectra(self, scenario: Scenario, mode: int) -> TrueSpectra:
+    def spectra(self, scenario: Scenario, mode: int) -> TrueSpectra:
+        """Return the true spectra of a mode."""
         key = mode, _groups(scenario, *AIR, "vibration")
         return self._keep("spectra", key, lambda: true_spectra(scenario, mode, self._air(scenario, mode)))
 

@@ -8,6 +8,7 @@ from html import escape
 from typing import Any
 
 import panel as pn
+import panel_material_ui as pmui
 
 from wfsobs.app.copies import LOOP, CopiedTask
 from wfsobs.app.display import Display, per_micrometre
@@ -20,7 +21,9 @@ from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.pages.loop_figures import LoopSpectrum, Nyquist, Response, Trace
 from wfsobs.app.pages.loop_table import loop_html, margins_html
 from wfsobs.app.pages.parts import WIDE, PageActions, box, figure_with_caption, html, text
+from wfsobs.app.store import Store
 from wfsobs.app.style import look
+from wfsobs.app.views.gain_editor import GainEditor
 from wfsobs.app.views.strip import Cards
 from wfsobs.control.controllers import CONTROLLERS
 
@@ -45,14 +48,19 @@ ABOUT = (
 class ClosedLoopPage(PageActions):
     """The page; computed anew when the results change, while it is visible."""
 
-    def __init__(self, run: BackgroundTask, display: Display):
-        self.run, self.display = run, display
-        self.work = BackgroundTask(run.session)
+    def __init__(self, store: Store, display: Display):
+        self.store, self.run, self.display = store, store.run, display
+        run = store.run
+        self.work = BackgroundTask(store.session)
         self.visible, self._of = False, object()
         self.note, self.table, self.margins = html(), html(), html()
         self.cards = Cards(items=[], hidden=[], terms={STREHL: TERMS[STREHL]}, sizing_mode="stretch_width", margin=0)
         self.whole, self.zoomed = Trace("whole record"), Trace("zoomed")
         self.spectrum, self.response, self.nyquist = LoopSpectrum(), Response(), Nyquist()
+        self.room = figure_with_caption("Rejection and noise transfer", self.response.figure)
+        self.editor: GainEditor | None = None
+        display.param.watch(self._edit, "editing")
+        self._edit()
         self._drawn = (self.whole, self.zoomed, self.spectrum, self.response, self.nyquist)
         self.work.param.watch(self._say, ["state", "place", "message"])
         self.work.param.watch(self._redraw, "result")
@@ -70,9 +78,9 @@ class ClosedLoopPage(PageActions):
                     ("Residual, whole record", self.whole),
                     ("Spectrum of the residual", self.spectrum),
                     ("Residual, zoomed", self.zoomed),
-                    ("Rejection and noise transfer", self.response),
                 )
             ),
+            self.room,
             **WIDE,
             stylesheets=[GRID],
         )
@@ -83,12 +91,21 @@ class ClosedLoopPage(PageActions):
             stylesheets=[GRID],
         )
         return pn.Column(
-            box("Residual in closed loop", text(INTRO), self.note, self.cards, figures),
+            box("Residual in closed loop", text(INTRO), self.note, self.cards, self._switch(), figures),
             box("Controllers", self.table),
             box("Stability", stability),
             **WIDE,
             stylesheets=[":host { gap: 10px; }"],
         )
+
+    def _switch(self) -> pmui.Checkbox:
+        return pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0)
+
+    def _edit(self, *_: object) -> None:
+        """Make the handle when it is first wanted."""
+        if self.display.editing and self.editor is None:
+            self.editor = GainEditor(self.response.figure, self.store, self.display, lambda: self.results)
+            self.room.append(self.editor.layer)
 
     def show(self, visible: bool) -> None:
         """Compute what has changed meanwhile, and go on while visible."""
@@ -150,6 +167,8 @@ class ClosedLoopPage(PageActions):
             for drawn in (self.spectrum, self.response, self.nyquist):
                 drawn.draw(shown, self.display)
             self._restyle()
+            if self.editor is not None:
+                self.editor.follow()
 
     def _restyle(self, *_: object) -> None:
         with pn.io.hold():

@@ -30,6 +30,7 @@ from wfsobs.app.views.strip import Strip
 from wfsobs.app.views.table import Table
 from wfsobs.app.views.traces import Traces
 from wfsobs.app.views.verdict import VerdictLine
+from wfsobs.evaluation.theory import Theory
 from wfsobs.observers.base import TARGETS, VIBRATION
 
 GRID = """
@@ -130,11 +131,11 @@ class Explore:
         """Make the handles when they are first wanted."""
         if self.editors or self.seeds is None:
             return
-        frames = Frames(self.seeds.store.session)
+        frames, theory = Frames(self.seeds.store.session), Theory()
         with pn.io.hold():
             for target, room in self.rooms.items():
                 fig = self.spectra.spectra[target].figure
-                self.editors[target] = SpectrumEditor(target, fig, self.seeds.store, self.display, frames)
+                self.editors[target] = SpectrumEditor(target, fig, self.seeds.store, self.display, frames, theory)
                 room.append(self.editors[target].layer)
 
     def _hide(self, target: str, names: list[str]) -> None:

@@ -60,7 +60,7 @@ class Pages(param.Parameterized):
             IDENTIFY: lambda: IdentifyPage(store, display),
             TUNE: lambda: TunePage(store, display),
             SWEEP: lambda: SweepPage(store, display, partial(setattr, self, "current", EXPLORE)),
-            LOOP: lambda: ClosedLoopPage(store.run, display),
+            LOOP: lambda: ClosedLoopPage(store, display),
             FIGURES: lambda: Figures(store.run, display),
             MODEL: lambda: ModelPage(store, display),
         }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from math import isfinite
 from typing import Any
 
@@ -17,11 +18,11 @@ from wfsobs.app.handles import PEAK, Handle, changes_of, handles_of, has_peaks, 
 from wfsobs.app.numbers import number
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, look, observers_of
-from wfsobs.app.views.frames import Frames, Wish
+from wfsobs.app.views.frames import Frames
 from wfsobs.app.views.plots import PinnedLines
 from wfsobs.evaluation.error_spectra import cumulative_rms
 from wfsobs.evaluation.scores import BOUND
-from wfsobs.evaluation.theory import TRUTH, Prediction
+from wfsobs.evaluation.theory import TRUTH, Prediction, Theory
 from wfsobs.observers.base import VIBRATION
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
@@ -51,17 +52,16 @@ class HandleLayer(JSComponent):
 class SpectrumEditor:
     """One figure's."""
 
-    def __init__(self, target: str, fig: figure, store: Store, display: Display, frames: Frames):
-        self.target, self.store, self.display, self.frames = target, store, display, frames
+    def __init__(self, target: str, fig: figure, store: Store, display: Display, frames: Frames, theory: Theory):
+        self.target, self.store, self.display, self.frames, self.theory = target, store, display, frames, theory
         self.figure = fig
-        self.trial = store.scenario
+        self.trial, self._last = store.scenario, list[Prediction]()
         self.layer = HandleLayer(
             self.hear, figure=str(fig.name), frame=self._frame(), sizing_mode="stretch_width", margin=0, visible=False
         )
         self.lines = PinnedLines(fig, "predicted", line_alpha=1.0, line_width=1.6, line_dash=[2, 2], level="glyph")
         self._number = 0
         self._was: dict[str, float] = {}
-        self._last: tuple[Wish, list[Prediction]] | None = None
         store.param.watch(self._follow, "scenario")
         display.param.watch(self._ask, ["mode", "unit", "spectrum", "show", "hidden", "dark"])
         display.param.watch(self._turn, "editing")
@@ -91,12 +91,12 @@ class SpectrumEditor:
         action, mode = message.get("action"), self.display.column
         if action in ("drag", "release"):
             handle = self._handle(base, message)
-            frequency, strength, damping = (_positive(message[name]) for name in ("frequency", "strength", "damping"))
+            frequency, strength, damping = (positive(message[name]) for name in ("frequency", "strength", "damping"))
             return changes_of(base, self.target, mode, handle.at(frequency, strength, damping))
         if action == "add":
             height = message.get("height")
-            own = None if height is None or self.display.cumulative else _positive(height) / self._scale(base) ** 2
-            return with_new_peak(base, mode, _positive(message["frequency"]), own)
+            own = None if height is None or self.display.cumulative else positive(height) / self._scale(base) ** 2
+            return with_new_peak(base, mode, positive(message["frequency"]), own)
         if action == "remove":
             return without_peak(base, self._handle(base, message).index)
         return {}
@@ -131,26 +131,29 @@ class SpectrumEditor:
             return
         hidden = self.display.hidden.get(self.target, [])
         names = (*(name for name in observers_of(self.target) if name not in hidden), BOUND)
-        wish = Wish(self.trial, self.target, self.display.column, names, self.display.error, self._number)
-        self.frames.ask(wish, self._land)
+        trial, mode, of_error = self.trial, self.display.column, self.display.error
+        self.frames.ask(
+            self.target,
+            lambda: self.theory.predict(trial, mode, self.target, names, of_error),
+            partial(self._land, trial, self._number),
+        )
 
-    def _land(self, wish: Wish, predictions: list[Prediction], why: str) -> None:
+    def _land(self, trial: Scenario, reply_to: int, predictions: list[Prediction] | None, why: str) -> None:
         if not self.display.editing:
             return
-        self._last = wish, predictions
-        if wish.scenario == self.store.scenario:
+        self._last = predictions = predictions or []
+        if trial == self.store.scenario:
             self._was = {p.observer: p.rms for p in predictions}
         with pn.io.hold():
             self.lines.draw({p.observer: self._curve(p) for p in predictions}, self.display.dark)
-            self._show(why, wish.number)
+            self._show(why, reply_to)
 
     def _show(self, note: str, reply_to: int | None = None) -> None:
         self.layer.frame = self._frame(note, self._number if reply_to is None else reply_to)
 
     def _frame(self, note: str = "", reply_to: int = 0) -> dict[str, Any]:
         """Describe all that is shown."""
-        last = getattr(self, "_last", None)
-        found = last[1] if last else []
+        found = self._last
         frame: dict[str, Any] = {
             "handles": [self._entry(handle, found) for handle in handles_of(self.trial, self.target, self.display.column)],
             "numbers": [self._number_of(p) for p in found if p.observer != TRUTH],
@@ -199,7 +202,7 @@ class SpectrumEditor:
         return frequency, scale * cumulative_rms(frequency, density) if self.display.cumulative else scale**2 * density
 
 
-def _positive(x: object) -> float:
+def positive(x: object) -> float:
     """Return a number of a message. Raises ValueError where it is none above 0."""
     if isinstance(x, (int, float)) and isfinite(x) and x > 0:
         return float(x)
