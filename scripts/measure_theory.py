@@ -3,8 +3,8 @@
     python scripts/measure_theory.py [PRESET ...]
 
 Every frame moves one setting a little further, as a drag does, and predicts all linear observers of the target in one mode. It
-prints the median, the 95th percentile and the maximum [ms], and the median of the processor's time, which does not count others at
-work on the machine; the first frame of a drag, which computes what the others share, stands by itself.
+prints the median, the 95th percentile and the maximum [ms], and the median of the processor's time, which does not count others
+at work on the machine; the first frame of a drag, which computes what the others share, stands by itself.
 """
 
 from __future__ import annotations
