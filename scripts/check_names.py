@@ -31,6 +31,7 @@ PARTICIPLES = {
 DOUBLES = {
     "prior_of": "the same of a scenario and of an identification: the module says of which",
     "read": "every file format has a function of this name: `Format.read`",
+    "columns": "every file format whose columns have names of their own: `Format.columns`",
     "write": "every file format has a function of this name: `Format.write`",
     "design": "of one observer or controller for a user's loop, and of all controllers for a comparison",
     "compute": "what a kind of job of the dashboard does: the module says which kind",

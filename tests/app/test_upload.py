@@ -21,6 +21,7 @@ from wfsobs.app.service import Service
 from wfsobs.app.upload import SILENT
 from wfsobs.pipeline import observe
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats import format_of
 from wfsobs.telemetry.records import read_record, record_arrays
@@ -145,6 +146,93 @@ def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     assert dashboard.store.run.result.result.record.vibration.std(axis=0) == pytest.approx([np.sqrt(1.1e-5), 0.0], rel=0.02)
     previewed(dashboard, loop, b"seeing,airmass\n1,2\n", "log.csv")
     assert dashboard.upload.picker.said.startswith("log.csv: has no y_lgs")
+
+
+NAMES = {"wfs_x": "y_lgs/tip_um", "wfs_y": "y_lgs/tilt_um", "dm_x": "u/tip_um", "dm_y": "u/tilt_um"}
+
+
+def renamed(content: bytes) -> bytes:
+    """The same file with columns of other names, and silent on its unit, sign and delay."""
+    for name, own in NAMES.items():
+        content = content.replace(own.encode(), name.encode())
+    for line in (b"# unit: um\n", b"# command_sign: 1\n", b"# delay: 2\n"):
+        content = content.replace(line, b"")
+    return content
+
+
+def test_columns_of_other_names(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    """Names that say enough are read at once; a choice moves a role; the copy names the columns."""
+    content = renamed(file_of(short))
+    previewed(dashboard, loop, content)
+    loop.until(lambda: not dashboard.upload.picker.said)
+    form = dashboard.upload.form
+    assert form is not None and form.visible and form in dashboard.upload.room.objects
+    wanted = {own.removesuffix("_um"): name for name, own in NAMES.items()}
+    assert form.roles == wanted, "the columns y_ngs/tip_um have the names of a record, but no role until it is said"
+    assert "750 steps at 500 Hz" in dashboard.upload.text.object
+
+    form._handle_msg({"column": "wfs_y", "role": "y_lgs/tip"})
+    loop.until(lambda: "u has the modes tip, tilt; y_lgs has tip" in dashboard.upload.picker.said)
+    assert form.roles["y_lgs/tip"] == "wfs_y" and "y_lgs/tilt" not in form.roles and dashboard.upload.use.disabled
+    form._handle_msg({"column": "wfs_x", "role": "y_lgs/tilt"})
+    loop.until(lambda: not dashboard.upload.picker.said)
+    form._handle_msg({"column": "nothing", "role": "time"})
+    form._handle_msg({"column": "wfs_x", "role": "nothing"})
+    assert form.roles == wanted | {"y_lgs/tip": "wfs_y", "y_lgs/tilt": "wfs_x"}
+    dashboard.upload.confirm()
+    loop.finish(dashboard.store)
+    record = read_record(io.BytesIO(file_of(short)), "a.csv")
+    shown = dashboard.store.run.result.result.record
+    np.testing.assert_array_equal(shown.y_lgs, record.y_lgs[:, ::-1])
+    assert "--column y_lgs/tip=wfs_y" in dashboard.actions.toolbar.command
+    assert "columns={" in dashboard.actions.toolbar.python and not form.visible
+    previewed(dashboard, loop, file_of(short))
+    assert not form.visible and dashboard.upload._preview is not None, "the next file has names of its own"
+
+
+def test_the_data_propose_sign_and_delay(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
+    """A loop of sign -1 and delay 3, written out, in a file that says nothing of either."""
+    rng = np.random.default_rng(4)
+    k = np.arange(6000)[:, None]
+    disturbance = np.sin(2 * np.pi * k / [400.0, 300.0])
+    y, u = 0.2 * rng.standard_normal(disturbance.shape) + disturbance, np.zeros_like(disturbance)
+    for i in range(3, len(y)):
+        y[i] -= u[i - 3]
+        u[i] = 0.99 * u[i - 1] + 0.3 * y[i]
+    file = io.BytesIO()
+    np.savez(file, y_lgs=y, u=u, dt=np.array(1e-3))
+    previewed(dashboard, loop, file.getvalue(), "night.npz")
+    text = dashboard.upload.text.object
+    assert "sign -1: commands move with the measurement" in text and "delay 3: commands 3 steps earlier explain" in text
+    assert "unit undecided: the numbers are plausible as um (" in text and "or arcsec (" in text
+    assert dashboard.upload.take.visible and dashboard.upload._preview.record.delay == 2
+    dashboard.upload.take_proposals()
+    loop.until(lambda: dashboard.upload._preview is not None and not dashboard.upload.take.visible)
+    found = dashboard.upload._preview
+    assert found.record.delay == 3 and found.record.origin == "command sign -1"
+    # the disturbance and the noise of one sample are all that is left of z
+    assert found.rms["z"][0] == pytest.approx(np.sqrt(0.5 + 0.04), rel=0.02)
+    assert "sign -1: commands move with the measurement" in dashboard.upload.text.object, "of the file, however it is read"
+
+
+def test_template_and_sample(dashboard: Dashboard, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    sent: list[dict[str, str]] = []
+    monkeypatch.setattr(dashboard.upload.picker, "_send_msg", sent.append)
+    dashboard.upload.handle({"action": "template"})
+    dashboard.upload.handle({"action": "sample"})
+    loop.until(lambda: len(sent) == 2)
+    files = {it["name"]: base64.b64decode(it["content"]) for it in sent}
+    template = read_record(io.BytesIO(files["wfsobs-template.csv"]), "t.csv")
+    assert (template.n_steps, template.ratio, template.delay, template.missing) == (6, 5, 2, 1)
+    np.testing.assert_allclose(template.y_ngs[5], [0.0089, -0.0016])
+    record = read_record(io.BytesIO(files["wfsobs-sample.csv"]), "s.csv")
+    np.testing.assert_array_equal(record.u, simulate(paper().replace({"run.duration": 5.0})).u)
+    assert record.turbulence is not None and len(files["wfsobs-sample.csv"]) < LARGEST
+
+
+def test_a_scenario_that_is_dropped(dashboard: Dashboard, loop: Any) -> None:
+    dashboard.upload.handle({"action": "scenario", "name": "a.toml", "text": "run.seed = 77\nrun.duration = 2.0"})
+    loop.until(lambda: dashboard.store.scenario.run.seed == 77)
 
 
 def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:

@@ -73,7 +73,8 @@ def _stated_options(source: LoadedRecord) -> list[str]:
         "rate": stated.rate,
         "sha256": source.sha256 or None,
     }
-    return [word for name, value in named.items() if value is not None for word in (f"--{name}", str(value))]
+    words = [word for name, value in named.items() if value is not None for word in (f"--{name}", str(value))]
+    return words + [word for role, name in stated.columns.items() for word in ("--column", f"{role}={name}")]
 
 
 # ---------------------------------------------------------------------- Python
@@ -84,7 +85,7 @@ def to_python(scenario: Scenario, preset: str, source: Source | None = None, tas
     source = None if task.what == SWEEP else source
     imports, lines = {"import wfsobs"}, [f"scenario = {_scenario_code(scenario, preset, FILE)}"]
     if isinstance(source, LoadedRecord):
-        stated = "".join(f"{name}={value!r}, " for name, value in vars(source.declaration).items() if value is not None)
+        stated = "".join(f"{name}={value!r}, " for name, value in vars(source.declaration).items() if value not in (None, {}))
         imports |= {"from wfsobs.telemetry.intake import DeclaredFormat", "from wfsobs.telemetry.records import load_record"}
         check = f", sha256={source.sha256!r}" if source.sha256 else ""
         lines.append(f"record = load_record({source.name!r}, scenario, DeclaredFormat({stated.removesuffix(', ')}){check})")

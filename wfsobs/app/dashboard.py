@@ -79,6 +79,7 @@ class Dashboard:
         self._theme_chosen = False
         self.controls = Controls(self.store)
         self.actions = Actions(self.store)
+        self.upload.open_scenario = self.actions.open_file
         self.modes, self.units = ModeSwitch(self.store.run, self.display), UnitSwitch(self.display)
         self.seeds = SeedRuns(self.store)
         self.explore = Explore(self.store.run, self.display, self.seeds)

@@ -34,6 +34,10 @@ class Picker(JSComponent):
         self.on_message: Callable[[dict[str, Any]], None] | None = None
         super().__init__(**params)
 
+    def save(self, name: str, kind: str, content: bytes) -> None:
+        """Have the browser save a file."""
+        self._send_msg({"name": name, "kind": kind, "content": base64.b64encode(content).decode()})
+
     def _handle_msg(self, data: dict[str, Any]) -> None:
         if self.on_message is not None:
             self.on_message(data)

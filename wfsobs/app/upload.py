@@ -7,6 +7,7 @@ is confirmed. Reading is done beside the page, in a thread.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any
 
@@ -15,7 +16,8 @@ import panel as pn
 import panel_material_ui as pmui
 from bokeh.models import ColumnDataSource
 
-from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job, Tell
+from wfsobs.app.column_form import ColumnForm
+from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING, Job, Tell
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.picker import PartialFile, Picker, too_large
 from wfsobs.app.sources import LoadedRecord
@@ -28,13 +30,18 @@ from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.parameters import hint
+from wfsobs.telemetry.examples import TEMPLATE, sample_csv
 from wfsobs.telemetry.intake import DeclaredFormat
-from wfsobs.telemetry.preview import Preview, SpectrumPreview, preview_any, safe_name
+from wfsobs.telemetry.preview import ColumnsPreview, Preview, SpectrumPreview, preview_any, safe_name
 from wfsobs.units import UNITS
 
 SILENT = "as the file says"
 NOTHING = np.empty(0)
 COLOURS = ("#0B4F6C", "#FF6600")
+
+
+AnyPreview = Preview | SpectrumPreview | ColumnsPreview
+TEMPLATE_NAME, SAMPLE_NAME = "wfsobs-template.csv", "wfsobs-sample.csv"
 
 
 class Upload:
@@ -56,10 +63,18 @@ class Upload:
         self.sources = [ColumnDataSource({"x": [], "y": []}) for _ in TIP_TILT]
         for source, colour, mode in zip(self.sources, COLOURS, TIP_TILT, strict=True):
             self.figure.line("x", "y", source=source, color=colour, line_width=1.4, legend_label=mode.name)
+        self.form: ColumnForm | None = None
+        self.take = pmui.Button(
+            label="Take the proposed sign and delay", variant="outlined", size="small", margin=4, visible=False
+        )
+        self.take.on_click(lambda _event: self.take_proposals())
+        self.saving = BackgroundTask(store.session)
+        self.saving.param.watch(self._save, ["state", "place"])
+        self.open_scenario: Callable[[str, object], None] = lambda _name, _text: None
         self.room = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
         self._parcel: PartialFile | None = None
         self._name, self._content = "", b""
-        self._preview: Preview | SpectrumPreview | None = None
+        self._preview: AnyPreview | None = None
         self.reading = BackgroundTask(store.session)
         self.reading.param.watch(self._read, ["state", "place", "message"])
         self.use.on_click(lambda _event: self.confirm())
@@ -90,6 +105,18 @@ class Upload:
             self._say(too_large(safe_name(str(msg.get("name", "")))))
         elif action == "part":
             self._take(msg)
+        elif action == "template":
+            self.picker.save(TEMPLATE_NAME, "text/csv", TEMPLATE.encode())
+        elif action == "sample":
+            self.saving.start(Job("save", lambda watch, _tell: sample_csv(watch)))
+        elif action == "scenario":
+            self.open_scenario(str(msg.get("name", "")), msg.get("text"))
+
+    def _save(self, *_: object) -> None:
+        task = self.saving
+        self._say("" if task.state == DONE else task.message if task.state == FAILED else task.line("Simulating a sample"))
+        if task.state == DONE:
+            self.picker.save(SAMPLE_NAME, "text/csv", task.result)
 
     def _take(self, msg: dict[str, Any]) -> None:
         if msg.get("index") == 0:
@@ -127,7 +154,15 @@ class Upload:
             return value
 
         unit = None if self.unit.value == SILENT else self.unit.value
-        return DeclaredFormat(unit, self.sign.value or None, number(self.delay, int, 1), number(self.rate, float, 1e-3))
+        roles = self.form.roles if self.form is not None else {}
+        return DeclaredFormat(unit, self.sign.value or None, number(self.delay, int, 1), number(self.rate, float, 1e-3), roles)
+
+    def take_proposals(self) -> None:
+        """Fill in the sign and the delay that the data propose."""
+        found = self._preview.reading.response if isinstance(self._preview, Preview) else None
+        if found is not None:
+            self.sign.value = found.sign or self.sign.value
+            self.delay.value = str(found.delay) if found.delay else self.delay.value
 
     def look(self) -> None:
         """Read the file, beside the page, as what the fields say."""
@@ -141,7 +176,7 @@ class Upload:
             self.reading.refuse(str(error))
             return
 
-        def read(_watch: Watch, _tell: Tell) -> Preview | SpectrumPreview:
+        def read(_watch: Watch, _tell: Tell) -> AnyPreview:
             try:
                 return preview_any(content, name, scenario, stated)
             except RecordError:
@@ -158,7 +193,10 @@ class Upload:
         elif self._content and task.state != CANCELLED:
             self._show(RecordError(task.message) if task.state == FAILED else task.result)
 
-    def _show(self, preview: Preview | SpectrumPreview | RecordError) -> None:
+    def _show(self, preview: AnyPreview | RecordError) -> None:
+        if isinstance(preview, ColumnsPreview):
+            self._ask(preview)
+            return
         self._preview = None if isinstance(preview, RecordError) else preview
         spectrum = isinstance(preview, SpectrumPreview)
         self.use.label = "Use this spectrum" if spectrum else "Use this record"
@@ -166,15 +204,33 @@ class Upload:
         self.picker.said = "" if self._preview else str(preview)
         self.use.disabled = self._preview is None
         lines = self._preview.lines() if self._preview else [str(preview)]
-        self.text.object = f"<p><b>{escape(self._name)}</b></p><ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
+        self.text.object = f"<p><b>{escape(self._name)}</b></p>{_list(lines)}"
+        if isinstance(preview, Preview):
+            self.text.object += f'<p>What the data say:</p><div class="evidence">{_list(preview.reading.lines())}</div>'
+        self.take.visible = isinstance(preview, Preview) and _differs(preview)
         for mode, source in enumerate(self.sources):
             there = self._preview is not None and mode < self._preview.spectrum.shape[1]
             x, y = (self._preview.frequency, self._preview.spectrum[:, mode]) if self._preview and there else (NOTHING, NOTHING)
             send(source, {"x": x[x > 0], "y": y[x > 0]})
+        self._lay_out()
+
+    def _ask(self, preview: ColumnsPreview) -> None:
+        """Ask which column is what; read the file at once if its names tell enough."""
+        if self.form is None:
+            self.form = ColumnForm(self.look, sizing_mode="stretch_width", margin=(4, 0))
+            self.room.clear()
+        self.form.show(preview.columns, preview.roles)
+        self.form.visible = True
+        self._show(RecordError(preview.why))
+        if any(role.startswith("y_lgs/") for role in preview.roles) and any(role.startswith("u/") for role in preview.roles):
+            self.look()
+
+    def _lay_out(self) -> None:
         if not len(self.room):
             self.room[:] = [
                 self.text,
-                pn.FlexBox(self.unit, self.sign, self.delay, self.rate, gap="8px", margin=0),
+                *([self.form] if self.form is not None else []),
+                pn.FlexBox(self.unit, self.sign, self.delay, self.rate, self.take, gap="8px", align_items="center", margin=0),
                 pn.pane.Bokeh(self.figure, sizing_mode="stretch_width", margin=0),
                 pn.Row(self.use, self.drop, margin=0),
             ]
@@ -215,6 +271,9 @@ class Upload:
     def discard(self, why: str = "") -> None:
         """Forget the file that is being looked at."""
         self._content, self._parcel, self._preview = b"", None, None
+        if self.form is not None:
+            self.form.visible = False
+            self.form.show({}, {})
         self.reading.cancel()
         self.room.visible = False
         self._say(why)
@@ -228,6 +287,19 @@ class Upload:
 
     def _text(self, label: str) -> pmui.TextInput:
         return pmui.TextInput(label=label, value="", placeholder=SILENT, size="small", width=190, margin=(4, 0))
+
+
+def _list(lines: Sequence[str]) -> str:
+    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
+
+
+def _differs(preview: Preview) -> bool:
+    """Whether the data propose another sign or delay than those with which the record was read."""
+    found = preview.reading.response
+    read = preview.reading.sign, preview.record.delay
+    return found is not None and any(
+        new is not None and new != old for new, old in zip((found.sign, found.delay), read, strict=True)
+    )
 
 
 def fit_to_record(record: Any, scenario: Scenario) -> Scenario:

@@ -16,6 +16,53 @@ async function send(model, file) {
   }
 }
 
+// A file may be dropped anywhere; while one is over the page, a cover says so.
+function takeDrops(model, root) {
+  const cover = Object.assign(document.createElement("div"), {className: "cover", hidden: true, textContent: "Drop a record, a spectrum or a scenario"})
+  root.append(cover)
+  const isFile = (event) => [...(event.dataTransfer?.types ?? [])].includes("Files")
+  const over = (event) => {
+    if (!isFile(event)) return
+    event.preventDefault()
+    event.dataTransfer.dropEffect = "copy"
+    cover.hidden = false
+  }
+  const leave = (event) => { if (!event.relatedTarget) cover.hidden = true }
+  const drop = async (event) => {
+    cover.hidden = true
+    if (!isFile(event)) return
+    event.preventDefault()
+    const file = event.dataTransfer.files[0]
+    if (!file) return
+    if (/\.toml$/i.test(file.name) && file.size <= model.part) model.send_msg({action: "scenario", name: file.name, text: await file.text()})
+    else send(model, file)
+  }
+  const listeners = {dragover: over, dragenter: over, dragleave: leave, drop}
+  for (const [name, act] of Object.entries(listeners)) document.addEventListener(name, act)
+  model.on("remove", () => { for (const [name, act] of Object.entries(listeners)) document.removeEventListener(name, act) })
+}
+
+function save(name, kind, content) {
+  const url = URL.createObjectURL(new Blob([Uint8Array.from(atob(content), (c) => c.charCodeAt(0))], {type: kind}))
+  Object.assign(document.createElement("a"), {href: url, download: name}).click()
+  setTimeout(() => URL.revokeObjectURL(url), 60_000)
+}
+
+// What a file looks like: a template to fill in, and a sample.
+function examples(model, bar) {
+  const details = document.createElement("details")
+  details.append(Object.assign(document.createElement("summary"), {textContent: "File format"}))
+  const list = document.createElement("div")
+  list.append(Object.assign(document.createElement("p"), {textContent: "CSV, NPZ, FITS or AOT: a row per step, measurements, commands and the time or the rate. A file may be dropped anywhere on the page; columns of other names can be said what they are."}))
+  for (const [action, textContent] of [["template", "Template CSV"], ["sample", "Sample record"]]) {
+    const button = Object.assign(document.createElement("button"), {type: "button", textContent})
+    button.onclick = () => model.send_msg({action})
+    list.append(button)
+  }
+  details.append(list)
+  bar.append(details)
+}
+
 export function render({model, el}) {
   const bar = document.createElement("div")
   bar.className = "bar"
@@ -33,8 +80,15 @@ export function render({model, el}) {
   const loaded = document.createElement("span")
   const said = Object.assign(document.createElement("span"), {className: "said"})
   said.setAttribute("role", "status")
-  bar.append(input, open, loaded, back, said)
+  bar.append(input, open)
+  examples(model, bar)
+  bar.append(loaded, back, said)
   el.append(bar)
+  takeDrops(model, el)
+  model.on("msg:custom", (event) => {
+    const {name, kind, content} = event.data ?? event
+    save(name, kind, content)
+  })
   const draw = () => {
     loaded.textContent = model.loaded
     back.hidden = !model.loaded

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import click
 
@@ -33,9 +33,16 @@ def scenario_options(command: Callable) -> Callable:
 
 
 def record_options(command: Callable) -> Callable:
-    """Add --unit, --command-sign, --command-delay, --rate and --sha256, the declarations on a record file."""
+    """Add --unit, --command-sign, --command-delay, --rate, --column and --sha256, the declarations on a record file."""
     for option in (
         click.option("--sha256", metavar="HEX", help="Refuse the record unless its file has this SHA-256."),
+        click.option(
+            "--column",
+            "columns",
+            multiple=True,
+            metavar="ROLE=NAME",
+            help="Which column of the file is what, such as y_lgs/tip=slope_x; can be given many times.",
+        ),
         click.option("--rate", type=click.FloatRange(0, min_open=True), metavar="HZ", help="Rate of rows without time stamps."),
         click.option(
             "--command-delay",
@@ -52,6 +59,19 @@ def record_options(command: Callable) -> Callable:
     ):
         command = option(command)
     return command
+
+
+def declare_format(
+    unit: str | None, command_sign: str | None, command_delay: int | None, rate: float | None, columns: Sequence[str]
+) -> DeclaredFormat:
+    """Collect what the options say of a record file. Raises SettingError."""
+    roles = {}
+    for text in columns:
+        role, equals, name = text.partition("=")
+        if not equals:
+            raise SettingError(f"--column {text}: takes ROLE=NAME, such as y_lgs/tip=slope_x")
+        roles[role.strip()] = name
+    return DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate, roles)
 
 
 def training_options(command: Callable) -> Callable:

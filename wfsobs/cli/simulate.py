@@ -7,7 +7,7 @@ import json
 import click
 
 from wfsobs.cli.loop_table import loop_table
-from wfsobs.cli.options import load_declared, record_options, scenario_options, training, training_options
+from wfsobs.cli.options import declare_format, load_declared, record_options, scenario_options, training, training_options
 from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.show import (
     add_budgets,
@@ -33,7 +33,6 @@ from wfsobs.scenario import configfile
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.loop import simulate
 from wfsobs.telemetry.formats.psd import load_psd
-from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import save_record
 from wfsobs.units import UNITS
 
@@ -127,6 +126,7 @@ def loop(
     command_sign: str | None,
     command_delay: int | None,
     rate: float | None,
+    columns: tuple[str, ...],
     sha256: str | None,
     train: str | None,
     train_until: float | None,
@@ -139,7 +139,7 @@ def loop(
     if record_file is not None:
         if seeds > 1:
             raise SettingError("--seeds: only for simulated records, not with --record")
-        stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
+        stated = declare_format(unit, command_sign, command_delay, rate, columns)
         record = load_declared(record_file, scenario, stated, sha256)
         scenario = as_stated(record, scenario)
         learnt = training(train, train_until, record, scenario, stated)

@@ -7,7 +7,7 @@ import json
 import click
 
 from wfsobs.cli.identification_table import identification_table
-from wfsobs.cli.options import load_declared, record_options, scenario_options, training, training_options
+from wfsobs.cli.options import declare_format, load_declared, record_options, scenario_options, training, training_options
 from wfsobs.cli.show import progress_bar, show, show_table, warn
 from wfsobs.evaluation.rows import score_rows
 from wfsobs.files import check_writable, write_whole
@@ -20,7 +20,6 @@ from wfsobs.priors_from.identification import told_by
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
 from wfsobs.spectral.search import LOWEST
-from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import save_arrays
 
 
@@ -41,6 +40,7 @@ def observe(
     command_sign: str | None,
     command_delay: int | None,
     rate: float | None,
+    columns: tuple[str, ...],
     sha256: str | None,
     train: str | None,
     train_until: float | None,
@@ -54,7 +54,7 @@ def observe(
         scenario = told_by(configfile.load_scenario(prior), scenario)
         for path, value in map(configfile.parse_assignment, assignments):
             scenario.set(path, value)
-    stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
+    stated = declare_format(unit, command_sign, command_delay, rate, columns)
     record = load_declared(record_file, scenario, stated, sha256)
     learnt = training(train, train_until, record, scenario, stated)
     with progress_bar() as update:
@@ -99,6 +99,7 @@ def identify(
     command_sign: str | None,
     command_delay: int | None,
     rate: float | None,
+    columns: tuple[str, ...],
     sha256: str | None,
     level: float,
     lowest: float,
@@ -107,7 +108,7 @@ def identify(
 ) -> None:
     """Find noise, turbulence and vibration peaks in a record (docs/identification.md)."""
     scenario = configfile.scenario_from(preset, config, assignments)
-    stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
+    stated = declare_format(unit, command_sign, command_delay, rate, columns)
     record = load_declared(record_file, scenario, stated, sha256)
     if out:
         check_writable(out)

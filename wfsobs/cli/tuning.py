@@ -6,7 +6,7 @@ import json
 
 import click
 
-from wfsobs.cli.options import load_declared, record_options, scenario_options
+from wfsobs.cli.options import declare_format, load_declared, record_options, scenario_options
 from wfsobs.cli.show import progress_bar, show_table
 from wfsobs.cli.tuning_tables import errors_table, settings_table
 from wfsobs.files import check_writable, write_whole
@@ -15,7 +15,6 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
 from wfsobs.settings.errors import SettingError
-from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.tuning import report
 from wfsobs.tuning import tune as search
 from wfsobs.tuning.tuning import EVALUATIONS
@@ -68,6 +67,7 @@ def tune(
     command_sign: str | None,
     command_delay: int | None,
     rate: float | None,
+    columns: tuple[str, ...],
     sha256: str | None,
     out: str | None,
     as_json: bool,
@@ -77,7 +77,7 @@ def tune(
     if record_file is not None:
         if validation is not None:
             raise SettingError("--validation: only for simulated records, not with --record")
-        stated = DeclaredFormat(unit, int(command_sign) if command_sign else None, command_delay, rate)
+        stated = declare_format(unit, command_sign, command_delay, rate, columns)
         record = load_declared(record_file, scenario, stated, sha256)
     if out:
         check_writable(out)

@@ -8,7 +8,7 @@ training_u and training_open_loop_y (n, n_modes).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -34,12 +34,16 @@ class DeclaredFormat:
         Steps from a command to the first measurement that sees it, 1 or more.
     rate : float or None
         Rate of the fast steps [Hz].
+    columns : mapping
+        Which column of the file is what, {role: name in the file}, of `wfsobs.telemetry.columns.ROLES`; empty where the names
+        are those of a record.
     """
 
     unit: str | None = None
     command_sign: int | None = None
     command_delay: int | None = None
     rate: float | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
 
 
 def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredFormat) -> Record:

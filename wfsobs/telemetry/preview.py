@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import io
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import rms, welch_psd
+from wfsobs.telemetry.columns import describe_values, suggest_roles
+from wfsobs.telemetry.command_response import CommandResponse, command_response
+from wfsobs.telemetry.formats.contents import Contents
 from wfsobs.telemetry.formats.psd import NoSpectrumError, read_psd
-from wfsobs.telemetry.intake import DeclaredFormat
-from wfsobs.telemetry.records import read_record
+from wfsobs.telemetry.intake import DeclaredFormat, to_record
+from wfsobs.telemetry.records import read_columns, read_contents
 from wfsobs.typing import Array
+from wfsobs.units import UNITS, micrometres_per
 
 MOST_FILE = 64_000_000
 """Maximum bytes of an uploaded file."""
@@ -27,6 +31,38 @@ MOST_NUMBERS = 256_000_000
 """Maximum bytes of numbers in it."""
 
 LONGEST_NAME = 80
+MOST_OFFERED = 100
+"""Maximum columns that are offered to be said what they are."""
+
+PLAUSIBLE = (0.02, 5.0)
+"""Rms of tip or tilt of turbulence and vibration on telescopes of 1 to 40 m, with a margin [um]."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a record was read, and what the data say of it.
+
+    Attributes
+    ----------
+    sign : int
+        Sign of the commands, as the file or the user states it, 1 where neither does.
+    response : CommandResponse or None
+        What the data say of sign and delay, of the commands as they are in the file.
+    units : dict of str to float
+        Units under which the size of z is plausible -> its rms [um]; empty where the file or the user states the unit.
+    """
+
+    sign: int = 1
+    response: CommandResponse | None = None
+    units: dict[str, float] = field(default_factory=dict)
+
+    def lines(self) -> list[str]:
+        """Return the evidence, a line each."""
+        lines = self.response.lines() if self.response else ["sign and delay: too few steps, or commands that do not move"]
+        if self.units:
+            ways = " or ".join(f"{unit} ({1e3 * rms:.3g} nm rms of z)" for unit, rms in self.units.items())
+            lines.append(f"unit {'undecided' if len(self.units) > 1 else 'proposed'}: the numbers are plausible as {ways}")
+        return lines
 
 
 @dataclass(frozen=True)
@@ -52,6 +88,7 @@ class Preview:
     rms: dict[str, tuple[float, ...]]
     frequency: Array
     spectrum: Array
+    reading: Reading = field(default_factory=lambda: Reading())
 
     @property
     def rate(self) -> float:
@@ -81,6 +118,32 @@ class Preview:
 
 
 @dataclass(frozen=True)
+class ColumnsPreview:
+    """Preview of a file whose columns have other names than those of a record.
+
+    Attributes
+    ----------
+    name : str
+        Name of the file, safe to show.
+    why : str
+        Why it is no record as it stands.
+    columns : dict of str to str
+        Name of a column -> its values in a few words.
+    roles : dict of str to str
+        Roles that the names suggest, {role: name}.
+    """
+
+    name: str
+    why: str
+    columns: dict[str, str]
+    roles: dict[str, str]
+
+    def lines(self) -> list[str]:
+        """Return the line to act on."""
+        return [self.why]
+
+
+@dataclass(frozen=True)
 class SpectrumPreview:
     """Preview of a vibration spectrum; table : the setting vibration.psd, the rest as in `Preview`."""
 
@@ -101,33 +164,63 @@ class SpectrumPreview:
 
 def preview_any(
     data: bytes, name: str, scenario: Scenario | None = None, declaration: DeclaredFormat | None = None
-) -> Preview | SpectrumPreview:
-    """Preview the bytes of a record, or of a vibration spectrum. Raises RecordError with one clear line."""
+) -> Preview | SpectrumPreview | ColumnsPreview:
+    """Preview the bytes of a record, of a vibration spectrum, or of columns that have to be said what they are.
+
+    Raises RecordError with one clear line.
+    """
     try:
         return preview(data, name, scenario, declaration)
     except RecordError as error:
-        if "has no y_lgs" not in str(error):
+        if not re.search(r": has no (y_lgs|u);", str(error)) or (declaration and declaration.columns):
             raise
         no_record = error
     shown, diameter = safe_name(name), (scenario or Scenario()).telescope.diameter
     try:
         table = read_psd(io.BytesIO(data), shown, declaration.unit if declaration else None, diameter)
     except NoSpectrumError:
-        raise no_record from None
+        return _preview_columns(data, shown, no_record)
     return SpectrumPreview(table, shown, np.array(table["frequency"]), np.column_stack([table["tip"], table["tilt"]]))
+
+
+def _preview_columns(data: bytes, name: str, no_record: RecordError) -> ColumnsPreview:
+    """Return the columns of a file that is no record as it stands. Raises why it is none where it has no two columns."""
+    try:
+        columns = read_columns(io.BytesIO(data), name, MOST_NUMBERS).columns
+    except RecordError:
+        columns = {}
+    long = {key: values for key, values in columns.items() if values.size > 1}
+    if len(long) < 2:
+        raise no_record from None
+    offered = dict(list(long.items())[:MOST_OFFERED])
+    return ColumnsPreview(name, str(no_record), {k: describe_values(v) for k, v in offered.items()}, suggest_roles(offered))
 
 
 def preview(data: bytes, name: str, scenario: Scenario | None = None, declaration: DeclaredFormat | None = None) -> Preview:
     """Preview the bytes of a record; its name gives the format. Raises RecordError with one clear line."""
-    shown = safe_name(name)
+    shown, scenario, stated = safe_name(name), scenario or Scenario(), declaration or DeclaredFormat()
     if len(data) > MOST_FILE:
         raise RecordError(f"{shown}: has {len(data) / 1e6:.0f} MB, at most {MOST_FILE / 1e6:.0f} MB are taken")
-    record = read_record(io.BytesIO(data), shown, scenario, declaration, MOST_NUMBERS)
+    try:
+        contents = read_contents(io.BytesIO(data), shown, stated.columns, MOST_NUMBERS)
+        record = to_record(contents, scenario, stated)
+    except RecordError as error:
+        raise RecordError(f"{shown}: {error}") from None
     z = record.z
     signals = {"y_lgs": record.y_lgs, "u": record.u, "z": z}
     values = {key: tuple(rms(column[~np.isnan(column)]) for column in signal.T) for key, signal in signals.items()}
     frequency, spectrum = welch_psd(hold_last(z), record.dt)
-    return Preview(record, shown, values, frequency, spectrum)
+    return Preview(record, shown, values, frequency, spectrum, _read_off(record, contents, stated, scenario, max(values["z"])))
+
+
+def _read_off(record: Record, contents: Contents, declaration: DeclaredFormat, scenario: Scenario, size: float) -> Reading:
+    """Return what the data say of sign, delay and unit; size : rms of z, as read [um]."""
+    sign = int(contents.arrays.get("command_sign", declaration.command_sign or 1))
+    response = command_response(replace(record, u=sign * record.u))
+    if declaration.unit or contents.units or "unit" in contents.arrays:
+        return Reading(sign, response)
+    units = {unit: size * micrometres_per(unit, scenario.telescope.diameter) for unit in UNITS}
+    return Reading(sign, response, {unit: x for unit, x in units.items() if PLAUSIBLE[0] <= x <= PLAUSIBLE[1]})
 
 
 def safe_name(name: str) -> str:

@@ -12,7 +12,9 @@ import numpy as np
 from wfsobs.files import write_whole
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
+from wfsobs.telemetry.columns import map_columns
 from wfsobs.telemetry.formats import format_of
+from wfsobs.telemetry.formats.contents import Contents, FileColumns
 from wfsobs.telemetry.formats.npz import write as write_npz
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
 from wfsobs.typing import Array
@@ -118,6 +120,20 @@ def read_record(
 ) -> Record:
     """Read the record of an open file; its name gives the format and is never opened. most : maximum bytes of numbers."""
     try:
-        return to_record(format_of(name).read(file, most), scenario or Scenario(), declaration or DeclaredFormat())
+        stated = declaration or DeclaredFormat()
+        return to_record(read_contents(file, name, stated.columns, most), scenario or Scenario(), stated)
     except RecordError as error:
         raise RecordError(f"{name}: {error}") from None
+
+
+def read_contents(file: IO[bytes], name: str, roles: Mapping[str, str], most: int = MOST_BYTES) -> Contents:
+    """Read the named arrays of an open file, by the roles of its columns where there are any. Raises RecordError."""
+    return map_columns(read_columns(file, name, most), roles) if roles else format_of(name).read(file, most)
+
+
+def read_columns(file: IO[bytes], name: str, most: int = MOST_BYTES) -> FileColumns:
+    """Read the columns of an open file under its own names. Raises RecordError."""
+    fmt = format_of(name)
+    if fmt.columns is None:
+        raise RecordError("columns of its format have names of their own")
+    return fmt.columns(file, most)

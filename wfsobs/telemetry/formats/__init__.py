@@ -12,7 +12,7 @@ from typing import IO
 
 from wfsobs.record import RecordError
 from wfsobs.telemetry.formats import aot, csv, fits, npz
-from wfsobs.telemetry.formats.contents import Contents
+from wfsobs.telemetry.formats.contents import Contents, FileColumns
 from wfsobs.typing import Array
 
 
@@ -28,18 +28,21 @@ class Format:
         (open file, maximum bytes of numbers) -> Contents.
     write : callable
         (open file, arrays) -> None.
+    columns : callable or None
+        (open file, maximum bytes of numbers) -> FileColumns, under the file's own names; None where they have no choice.
     """
 
     endings: tuple[str, ...]
     read: Callable[[IO[bytes], int], Contents]
     write: Callable[[IO[bytes], Mapping[str, Array]], None]
+    columns: Callable[[IO[bytes], int], FileColumns] | None = None
 
 
 FORMATS = (
-    Format((".npz",), npz.read, npz.write),
-    Format((".csv", ".txt"), csv.read, csv.write),
+    Format((".npz",), npz.read, npz.write, npz.columns),
+    Format((".csv", ".txt"), csv.read, csv.write, csv.columns),
     Format((".aot.fits",), aot.read, aot.write),
-    Format((".fits", ".fit", ".fts"), fits.read, fits.write),  # reads AOT as well, which says so inside
+    Format((".fits", ".fit", ".fts"), fits.read, fits.write, fits.columns),  # reads AOT as well, which says so inside
 )
 
 

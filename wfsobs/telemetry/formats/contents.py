@@ -32,6 +32,9 @@ NAMES = (*SIGNALS, *CLOCKS, *NUMBERS, *TEXTS)
 COLUMN = re.compile(r"(?:truth/)?(?P<array>[a-z_]+)/(?P<mode>[A-Za-z0-9 -]+?)(?:_(?P<unit>[A-Za-zµμ]+))?$")
 """Name of a column of one mode, such as y_lgs/tip_um."""
 
+MOST_COLUMNS = 64
+"""Maximum columns of one array that a file offers under names of its own."""
+
 
 @dataclass
 class Contents:
@@ -55,6 +58,36 @@ class Contents:
             raise RecordError(f"{name} is in {text!r}, which is no unit of a wavefront")
         if self.units.setdefault(name, unit) != unit:
             raise RecordError(f"{name} is in {self.units[name]} and in {unit}")
+
+
+@dataclass
+class FileColumns:
+    """Columns of a file under its own names.
+
+    Attributes
+    ----------
+    columns : dict of str to Array
+        Name in the file -> values, (n,).
+    plain : dict of str to Array
+        Numbers and texts of known names (NUMBERS, TEXTS).
+    units : dict of str to str
+        Name in the file -> unit beside it, as written.
+    """
+
+    columns: dict[str, Array] = field(default_factory=dict)
+    plain: dict[str, Array] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+
+    def add(self, name: str, values: Array, unit: str = "") -> None:
+        """Add an array of one or two dimensions; the columns of two are name[0], name[1], ..., the longer axis being time."""
+        if values.ndim == 2:
+            for i, column in enumerate(values.T if values.shape[0] >= values.shape[1] else values):
+                if i < MOST_COLUMNS:
+                    self.add(f"{name}[{i}]", column, unit)
+        elif values.ndim == 1 and values.size > 1 and values.dtype.kind in "fiu":
+            self.columns[name] = values.astype(np.float64)
+            if unit:
+                self.units[name] = unit
 
 
 def from_columns(columns: Mapping[str, Array]) -> Contents:
@@ -85,6 +118,15 @@ def from_columns(columns: Mapping[str, Array]) -> Contents:
         longest = max(map(len, by_mode.values()))
         contents.arrays[name] = np.column_stack([_pad(by_mode[mode], longest) for mode in modes])
     return contents
+
+
+def pad_fast(contents: Contents) -> None:
+    """Extend all fast signals to the length of the longest: what ends early has missing samples there."""
+    fast = [name for name in FAST if name in contents.arrays]
+    n = max((len(contents.arrays[name]) for name in (*fast, *((TIME,) if TIME in contents.arrays else ()))), default=0)
+    for name in fast:
+        values = contents.arrays[name]
+        contents.arrays[name] = np.pad(values, ((0, n - len(values)), (0, 0)), constant_values=np.nan)
 
 
 def to_columns(arrays: Mapping[str, Array], unit: str = "um") -> dict[str, Array]:

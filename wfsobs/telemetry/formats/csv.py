@@ -8,20 +8,21 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator, Mapping
+from itertools import chain
 from typing import IO
 
 import numpy as np
 
 from wfsobs.record import RecordError
 from wfsobs.telemetry.formats.contents import (
-    FAST,
     NUMBERS,
     TEXTS,
-    TIME,
     Contents,
+    FileColumns,
     TooLargeError,
     from_columns,
     numbers_and_texts,
+    pad_fast,
     to_columns,
 )
 from wfsobs.typing import Array
@@ -32,11 +33,20 @@ LONGEST_LINE = 65_536
 
 def read(file: IO[bytes], most: int) -> Contents:
     """Read a CSV file. Raises RecordError naming the line, TooLargeError."""
+    table = columns(file, most)
+    contents = from_columns(table.columns)
+    pad_fast(contents)
+    contents.arrays |= table.plain
+    return contents
+
+
+def columns(file: IO[bytes], most: int) -> FileColumns:
+    """Read every column, whatever its name; without a heading they are column 1, column 2, ... Raises as `read`."""
     plain, heading, rows = _head(file)
     if len(set(heading)) < len(heading):
         raise RecordError("two columns have the same heading")
     width = len(heading)
-    columns, ends = [array("d") for _ in heading], [0] * width
+    cells_of, ends = [array("d") for _ in heading], [0] * width
     for step, (line, cells) in enumerate(rows):
         if len(cells) != width:
             raise RecordError(f"line {line} has {len(cells)} cells, the heading {width}; cells are separated by commas")
@@ -47,13 +57,10 @@ def read(file: IO[bytes], most: int) -> Contents:
             if text:
                 ends[i] = step + 1
             try:
-                columns[i].append(float(text or "nan"))
+                cells_of[i].append(float(text or "nan"))
             except ValueError:
                 raise RecordError(f"line {line}, {heading[i]}: {text[:40]!r} is not a number") from None
-    contents = from_columns({name: np.array(c[:end]) for name, c, end in zip(heading, columns, ends, strict=True)})
-    _level(contents)
-    contents.arrays |= plain
-    return contents
+    return FileColumns({name: np.array(c[:end]) for name, c, end in zip(heading, cells_of, ends, strict=True)}, plain)
 
 
 def numbered_lines(file: IO[bytes]) -> Iterator[tuple[int, str]]:
@@ -80,7 +87,10 @@ def _head(file: IO[bytes]) -> tuple[dict[str, Array], list[str], Iterator[tuple[
     for number, text in lines:
         if not text.startswith("#"):
             heading = [cell.strip().strip('"') for cell in text.split(",")]
-            return plain, heading, ((n, t.split(",")) for n, t in lines if not t.startswith("#"))
+            rows = ((n, t.split(",")) for n, t in lines if not t.startswith("#"))
+            if not all(map(_is_number, heading)):
+                return plain, heading, rows
+            return plain, [f"column {i + 1}" for i in range(len(heading))], chain([(number, heading)], rows)
         name, colon, value = text.lstrip("# ").partition(":")
         if colon and name in TEXTS:
             plain[name] = np.array(value.strip())
@@ -92,13 +102,12 @@ def _head(file: IO[bytes]) -> tuple[dict[str, Array], list[str], Iterator[tuple[
     raise RecordError("holds no table")
 
 
-def _level(contents: Contents) -> None:
-    """Extend all fast signals to the length of the longest: empty cells at the end are missing samples."""
-    fast = [name for name in FAST if name in contents.arrays]
-    n = max((len(contents.arrays[name]) for name in (*fast, *((TIME,) if TIME in contents.arrays else ()))), default=0)
-    for name in fast:
-        values = contents.arrays[name]
-        contents.arrays[name] = np.pad(values, ((0, n - len(values)), (0, 0)), constant_values=np.nan)
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def write(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
@@ -107,9 +116,9 @@ def write(file: IO[bytes], arrays: Mapping[str, Array]) -> None:
     scenario = str(plain.pop("scenario", ""))
     head = [f"# {name}: {value}" for name, value in plain.items()]
     head += [f"# {line}".rstrip() for line in scenario.splitlines()]
-    columns = to_columns(arrays)
-    file.write("\n".join([*head, ",".join(columns), ""]).encode())
-    texts = [list(map(repr, values.astype(float).tolist())) for values in columns.values()]
+    named = to_columns(arrays)
+    file.write("\n".join([*head, ",".join(named), ""]).encode())
+    texts = [list(map(repr, values.astype(float).tolist())) for values in named.values()]
     longest = max(map(len, texts), default=0)
     padded = [text + [""] * (longest - len(text)) for text in texts]
     for row in zip(*padded, strict=True):

@@ -22,6 +22,7 @@ from wfsobs.telemetry.formats.contents import (
     SIGNALS,
     TRAINING,
     Contents,
+    FileColumns,
     TooLargeError,
     from_columns,
     numbers_and_texts,
@@ -40,6 +41,25 @@ AOT = "AOT-VERS"
 
 DAMAGED = "damaged, or not a FITS file of tables and images"
 MOST_HDUS = 200
+
+
+def columns(file: IO[bytes], most: int) -> FileColumns:
+    """Read every column of the tables and images, whatever its name. Raises RecordError, TooLargeError."""
+    fits = astropy_fits()
+    out = FileColumns()
+    with open_fits(file, most) as hdus:
+        if AOT in hdus[0].header:
+            raise RecordError("columns of an AOT file have names of their own")
+        for number, hdu in enumerate(hdus):
+            out.plain |= {key: value for key, value in _plain(hdu).items() if key != "unit"}  # of one image alone
+            if isinstance(hdu, fits.BinTableHDU):
+                for column in hdu.columns:
+                    if "P" not in column.format and "Q" not in column.format and hdu.data[column.name].dtype.kind in "fiu":
+                        out.add(column.name, _native(hdu.data[column.name], column.name, column.null), column.unit or "")
+            elif hdu.data is not None and hdu.data.dtype.kind in "fiu":
+                name = hdu.name or f"image {number}"
+                out.add(name, _native(hdu.data, name, hdu.header.get("BLANK")), str(hdu.header.get("BUNIT", "")))
+    return out
 
 
 def astropy_fits() -> Any:
@@ -122,15 +142,17 @@ def _contents(hdus: HDUList) -> Contents:
             contents.arrays[name] = _native(hdu.data, name, hdu.header.get("BLANK"))
             if name in SIGNALS and "BUNIT" in hdu.header:
                 contents.state_unit(name, str(hdu.header["BUNIT"]))
-        for key, keyword in KEYWORDS.items():
-            if keyword in hdu.header and not (key == "unit" and hdu.name.lower() in SIGNALS):
-                contents.arrays[key] = np.array(hdu.header[keyword])
-        if EXACT in hdu.header:
-            contents.arrays["dt"] = np.array(float(hdu.header[EXACT]))
-    columns = from_columns(flat)
-    contents.arrays |= columns.arrays
-    contents.units |= columns.units
+        contents.arrays |= {key: value for key, value in _plain(hdu).items() if not (key == "unit" and name in SIGNALS)}
+    of_modes = from_columns(flat)
+    contents.arrays |= of_modes.arrays
+    contents.units |= of_modes.units
     return contents
+
+
+def _plain(hdu: Any) -> dict[str, Array]:
+    """Return the numbers and texts of a header."""
+    found = {key: np.array(hdu.header[keyword]) for key, keyword in KEYWORDS.items() if keyword in hdu.header}
+    return found | ({"dt": np.array(float(hdu.header[EXACT]))} if EXACT in hdu.header else {})
 
 
 def _read_table(hdu: Any, contents: Contents, flat: dict[str, Array]) -> None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import IO
 
 import numpy as np
 from numpy.lib import format as npy
 
 from wfsobs.record import RecordError
-from wfsobs.telemetry.formats.contents import NAMES, Contents, TooLargeError
+from wfsobs.telemetry.formats.contents import NAMES, NUMBERS, TEXTS, Contents, FileColumns, TooLargeError
 from wfsobs.typing import Array
 
 KINDS = "fiuUb"
@@ -25,15 +25,31 @@ HEADER = 10_000
 
 def read(file: IO[bytes], most: int) -> Contents:
     """Read the arrays of known names, and no others. Raises RecordError, and TooLargeError before the memory is used."""
+    return Contents(_arrays(file, most, NAMES))
+
+
+def columns(file: IO[bytes], most: int) -> FileColumns:
+    """Read the columns of every array, whatever its name. Raises as `read`."""
+    out = FileColumns()
+    for name, values in _arrays(file, most).items():
+        if name in (*NUMBERS, *TEXTS):
+            out.plain[name] = values
+        else:
+            out.add(name, values)
+    return out
+
+
+def _arrays(file: IO[bytes], most: int, names: Iterable[str] | None = None) -> dict[str, Array]:
+    """Return the arrays of these names, of all names by default."""
     if not zipfile.is_zipfile(file):
         raise RecordError("not an .npz file; a record is an .npz with y_lgs, u and dt")
     try:
         with zipfile.ZipFile(file) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            known = {name: members[name] for name in NAMES if name in members}
+            known = {name: members[name] for name in names or members if name in members}
             if sum(info.file_size for info in known.values()) > most:
                 raise TooLargeError(most)
-            return Contents({name: _array(_member(archive, info), name) for name, info in known.items()})
+            return {name: _array(_member(archive, info), name) for name, info in known.items()}
     except RecordError:
         raise
     except (ValueError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError, NotImplementedError, MemoryError):

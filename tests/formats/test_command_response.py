@@ -1,0 +1,77 @@
+"""Sign and delay from a record: simulated closed loops whose sign and delay are known."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from wfsobs.record import Record
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.loop import simulate
+from wfsobs.telemetry.command_response import DECIDED, command_response
+from wfsobs.typing import Array
+
+GAIN, LEAK, NOISE = 0.4, 0.995, 0.05
+
+
+def closed_loop(disturbance: Array, noise: Array, sign: int, delay: int) -> Record:
+    """A leaky integrator, written out: y[k] = phi[k-1] + sign u[k-delay] + noise."""
+    y, u = np.zeros_like(disturbance), np.zeros_like(disturbance)
+    for k in range(1, len(y)):
+        y[k] = disturbance[k - 1] + noise[k] + (sign * u[k - delay] if k >= delay else 0.0)
+        u[k] = LEAK * u[k - 1] - sign * GAIN * y[k]
+    return Record(y, u, 1e-3)
+
+
+@pytest.fixture(scope="module", params=["paper", "ut4"])
+def disturbance(request: pytest.FixtureRequest) -> Array:
+    record = simulate(PRESETS[request.param]().replace({"run.duration": 20.0}))
+    assert record.turbulence is not None and record.vibration is not None
+    return record.turbulence + record.vibration
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("delay", [1, 2, 3])
+def test_of_a_loop_that_is_known(disturbance: Array, sign: int, delay: int) -> None:
+    """The sign is found always; a delay is the right one, or left open where two steps explain nearly the same."""
+    noise = NOISE * np.random.default_rng(3).standard_normal(disturbance.shape)
+    found = command_response(closed_loop(disturbance, noise, sign, delay))
+    assert found is not None and found.sign == sign
+    assert found.reply == pytest.approx(-sign, abs=1e-6), "an integrator's command follows from its measurement alone"
+    assert found.peak == delay and found.delay in ((delay,) if delay == 3 else (delay, None)), found.lines()
+    if delay > 1:
+        assert found.scale == pytest.approx(1.0, abs=0.15), "to the scatter of 20 s"
+        assert found.shares[delay] == pytest.approx(1.0, abs=0.1), "nothing else jumps"
+
+
+def test_what_the_simulator_records(disturbance: Array) -> None:
+    """The loop of the simulation has a delay of 2."""
+    record = simulate(PRESETS["paper"]().replace({"run.duration": 20.0, "loop.gain": 0.5}))
+    found = command_response(record)
+    assert found is not None and (found.sign, found.delay) == (1, 2)
+    assert found.lines()[0].startswith("sign +1: commands move against the measurement of their row, correlation -1.00")
+    line = (
+        r"delay 2: commands 2 steps earlier explain \d+ % \(correlation \+0\.9\d\) of the measurements' jumps, those \d steps? "
+    )
+    assert re.match(line, found.lines()[1]), found.lines()
+    assert found.shares[2] == max(found.shares.values()) > 0.8, "of a disturbance that is smooth but not a polynomial"
+
+
+def test_undecided_where_the_record_does_not_say() -> None:
+    """Commands that follow nothing; a loop so slow that its commands are lost in the noise; one that is too short, or at rest."""
+    rng = np.random.default_rng(5)
+    noise = rng.standard_normal((5000, 2))
+    apart = command_response(Record(noise, rng.standard_normal((5000, 2)).cumsum(axis=0), 1e-3))
+    assert apart is not None and apart.sign is None and apart.delay is None
+    assert apart.lines()[0].startswith("sign and delay undecided: commands do not follow the measurements")
+    y, u = noise.copy(), np.zeros_like(noise)
+    for k in range(2, len(y)):
+        y[k] += u[k - 2]
+        u[k] = u[k - 1] - 0.001 * y[k]
+    slow = command_response(Record(y, u, 1e-3))
+    assert slow is not None and slow.sign == 1 and slow.delay is None and slow.margin < DECIDED
+    assert "delay undecided" in slow.lines()[1] and slow.lines()[1].endswith("3 are needed")
+    assert command_response(Record(y[:300], u[:300], 1e-3)) is None
+    assert command_response(Record(y, np.zeros_like(u), 1e-3)) is None

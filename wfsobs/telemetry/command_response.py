@@ -1,0 +1,182 @@
+"""Sign and delay of the commands of a closed loop, from the record itself.
+
+A loop whose commands follow from its measurements alone cannot be told from another disturbance under another loop, unless
+something is known of the disturbance. Here it is that the disturbance is smooth: over a few steps its response to what is new in
+a measurement is a polynomial, while that of the commands jumps. See U. Forssell and L. Ljung, Automatica 35, 1999, on what a
+closed loop hides.
+
+With w[k], the error of the prediction of y[k] from the past of y and u, h[i] = cov(y[k+i], w[k]) / var(w) and g[i] the same of
+u, a sign s and a delay d are right where h[i] - s g[i-d] is smooth for i = 1, 2, ... The sign comes from g[0] as well: a loop
+that reduces an error moves against it, s g[0] < 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from wfsobs.record import Record, hold_last
+from wfsobs.sensors.modes import TIP_TILT
+from wfsobs.typing import Array
+
+LONGEST = 6
+"""Largest delay that is compared [steps]."""
+
+SPAN = 12
+"""Steps after a measurement over which responses are compared."""
+
+DEGREE = 4
+"""Of the polynomial that a smooth response is: with SPAN it follows lines up to about a tenth of the rate."""
+
+ORDER = 16
+"""Steps of the past that predict a measurement."""
+
+MOST_STEPS = 100_000
+"""Steps of a record that are looked at, its first."""
+
+BLOCKS = 10
+"""Parts of a record whose scatter says how sure a difference is."""
+
+DECIDED = 3.0
+"""Standard errors by which the best delay has to be better than any other."""
+
+
+@dataclass(frozen=True)
+class CommandResponse:
+    """What a record says of sign and delay of its commands.
+
+    Attributes
+    ----------
+    sign : int or None
+        +1, y = disturbance + u, or -1; None where the commands do not follow the measurements.
+    delay : int or None
+        Steps from a command to the first measurement that sees it; None where the record does not decide.
+    reply : float
+        Correlation of what is new in a command with what is new in the measurement of the same row.
+    correlations : mapping of int to float
+        Delay -> correlation of the measurements' response with that of the commands so much earlier, times the sign.
+    shares : mapping of int to float
+        Delay -> part of the measurements' response, less a polynomial, that commands of that delay, sign and unit gain explain.
+    peak, second : int
+        Delays of the best and of the second best agreement.
+    margin : float
+        How much better the best one is than any other, or none [standard errors].
+    scale : float
+        Units of the measurement by which a unit of command changes it, at the peak; 1 where both have one unit. A delay of 1
+        tells little of it: the disturbance jumps there as well.
+    """
+
+    sign: int | None
+    delay: int | None
+    reply: float
+    correlations: Mapping[int, float]
+    shares: Mapping[int, float]
+    peak: int
+    second: int
+    margin: float
+    scale: float
+
+    def lines(self) -> list[str]:
+        """Return the evidence, a line for the sign and a line for the delay."""
+        if self.sign is None:
+            return [f"sign and delay undecided: commands do not follow the measurements (correlation {self.reply:+.2f} in a row)"]
+        way = "against" if self.sign > 0 else "with"
+        sign = f"sign {self.sign:+d}: commands move {way} the measurement of their row, correlation {self.reply:+.2f}"
+        said = f"delay {self.delay}" if self.delay is not None else "delay undecided"
+        peak = (
+            f"{said}: commands {_steps(self.peak)} earlier explain {self._share(self.peak)} of the measurements' jumps, those "
+            f"{_steps(self.second)} earlier {self._share(self.second)}; {self.margin:.1f} standard errors apart"
+        )
+        return [sign, peak + ("" if self.delay is not None else f", {DECIDED:g} are needed")]
+
+    def _share(self, delay: int) -> str:
+        share = f"{100.0 * max(self.shares[delay], 0.0):.0f} %"
+        return f"{share} (correlation {self.correlations[delay]:+.2f})"
+
+
+def command_response(record: Record) -> CommandResponse | None:
+    """Compare the sign and delay under which the disturbance of a closed loop is smooth.
+
+    The record's own delay plays no part; its sign is that of u as it stands. Of the modes, the first two.
+    None for a record of fewer than 40 steps per block, or with commands that never move.
+    """
+    y, u = (hold_last(x[:MOST_STEPS, : len(TIP_TILT)]) for x in (record.y_lgs, record.u))
+    moving = np.ptp(u, axis=0) > 0
+    if len(y) - ORDER - SPAN < 40 * BLOCKS or not moving.any():
+        return None
+    y, u = y[:, moving], u[:, moving]
+    h, g, reply = (np.array(part) for part in zip(*map(_responses, y.T, u.T), strict=True))
+    h, shifted = _rough(h[:, :, 1:]), {d: _rough(_shift(g, d)) for d in range(1, LONGEST + 1)}
+    sign = -int(np.sign(reply.mean()))
+    moves = abs(reply.mean()) > DECIDED * max(reply.std(), 0.03)
+    misfits = {d: _misfits(h, sign * x) for d, x in shifted.items()}
+    ranked = sorted(misfits, key=lambda d: float(misfits[d].sum()))
+    peak, second = ranked[:2]
+    margin = min(_in_errors(misfits[d] - misfits[peak]) for d in ranked[1:])
+    margin = min(margin, _in_errors(_misfits(h, np.zeros_like(h)) - misfits[peak]))
+    correlations = {d: sign * _correlation(h, x) for d, x in shifted.items()}
+    best, power = shifted[peak].mean(axis=1), float((h.mean(axis=1) ** 2).sum())
+    scale = sign * float((h.mean(axis=1) * best).sum() / (best**2).sum())
+    decided = moves and margin >= DECIDED
+    return CommandResponse(
+        sign if moves else None,
+        peak if decided else None,
+        float(reply.mean()),
+        correlations,
+        {d: -float(misfits[d].mean()) / max(power, 1e-300) for d in misfits},
+        peak,
+        second,
+        margin,
+        scale,
+    )
+
+
+def _responses(y: Array, u: Array) -> tuple[Array, Array, float]:
+    """Return the responses of y and u to what is new in y, (blocks, 1 + SPAN) each, and the correlation of what is new in u."""
+    n = len(y) - ORDER
+    past = np.column_stack([x[ORDER - i : ORDER - i + n] for x in (y, u) for i in range(1, ORDER + 1)])
+    new = [x[ORDER:] - past @ np.linalg.lstsq(past, x[ORDER:], rcond=1e-10)[0] for x in (y, u)]
+    w, reply = new[0], float(np.corrcoef(new[0], new[1])[0, 1]) if np.ptp(new[1]) > 0 else 0.0
+    length = (n - SPAN) // BLOCKS
+    starts = range(0, BLOCKS * length, length)
+    power = w[: BLOCKS * length] @ w[: BLOCKS * length] / BLOCKS
+
+    def response(x: Array) -> Array:
+        late = x[ORDER:]
+        return np.array([[late[a + i : a + i + length] @ w[a : a + length] for i in range(SPAN + 1)] for a in starts]) / power
+
+    return response(y), response(u), reply
+
+
+def _shift(g: Array, delay: int) -> Array:
+    """Return g[i - delay] for i = 1 ... SPAN, zero before the command."""
+    i = np.arange(1, SPAN + 1)
+    return np.where(i >= delay, g[..., np.maximum(i - delay, 0)], 0.0)
+
+
+def _rough(x: Array) -> Array:
+    """Return what a polynomial leaves of the last axis."""
+    basis, _ = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, SPAN), DEGREE + 1))
+    return x - x @ basis @ basis.T
+
+
+def _misfits(h: Array, g: Array) -> Array:
+    """Return per block the squared distance of h from the mean response g, less what does not depend on g."""
+    mean = g.mean(axis=1, keepdims=True)
+    return (mean**2 - 2.0 * h * mean).sum(axis=(0, 2))
+
+
+def _in_errors(differences: Array) -> float:
+    """Return the mean over blocks in standard errors."""
+    return float(differences.mean() / max(differences.std(ddof=1) / np.sqrt(differences.size), 1e-300))
+
+
+def _correlation(h: Array, g: Array) -> float:
+    one, other = h.mean(axis=1), g.mean(axis=1)
+    return float((one * other).sum() / max(np.sqrt((one**2).sum() * (other**2).sum()), 1e-300))
+
+
+def _steps(count: int) -> str:
+    return f"{count} step{'s' * (count > 1)}"
