@@ -130,7 +130,7 @@ def test_a_report_is_made_aside_of_what_is_shown_one_at_a_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[tuple[Any, str]] = []
-    monkeypatch.setattr(module, "make", lambda shown, preset, *_: asked.append((shown, preset)) or b"<!doctype html>")
+    monkeypatch.setattr(module, "make", lambda shown, preset, *_, **__: asked.append((shown, preset)) or b"<!doctype html>")
     shown = actions.store.run.result
     actions.handle({"action": "report"})
     assert actions.toolbar.reporting
@@ -151,7 +151,7 @@ def test_a_report_that_fails_is_one_line(
     error: Exception,
     line: str,
 ) -> None:
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise error
 
     monkeypatch.setattr(module, "make", fail)

@@ -168,11 +168,12 @@ def test_columns_of_other_names(dashboard: Dashboard, loop: Any, short: Scenario
     form = dashboard.upload.form
     assert form is not None and form.visible and form in dashboard.upload.room.objects
     wanted = {own.removesuffix("_um"): name for name, own in NAMES.items()}
-    assert form.roles == wanted, "the columns y_ngs/tip_um have the names of a record, but no role until it is said"
+    wanted |= {f"y_ngs/{mode}": f"y_ngs/{mode}_um" for mode in ("tip", "tilt")}  # names of a record suggest what they say
+    assert form.roles == wanted
     assert "750 steps at 500 Hz" in dashboard.upload.text.object
 
     form._handle_msg({"column": "wfs_y", "role": "y_lgs/tip"})
-    loop.until(lambda: "u has the modes tip, tilt; y_lgs has tip" in dashboard.upload.picker.said)
+    loop.until(lambda: "has the modes tip, tilt; y_lgs has tip" in dashboard.upload.picker.said)
     assert form.roles["y_lgs/tip"] == "wfs_y" and "y_lgs/tilt" not in form.roles and dashboard.upload.use.disabled
     form._handle_msg({"column": "wfs_x", "role": "y_lgs/tilt"})
     loop.until(lambda: not dashboard.upload.picker.said)
@@ -204,7 +205,7 @@ def test_the_data_propose_sign_and_delay(dashboard: Dashboard, loop: Any, short:
     previewed(dashboard, loop, file.getvalue(), "night.npz")
     text = dashboard.upload.text.object
     assert "sign -1: commands move with the measurement" in text and "delay 3: commands 3 steps earlier explain" in text
-    assert "unit undecided: the numbers are plausible as um (" in text and "or arcsec (" in text
+    assert "unit proposed: the numbers are plausible as um (" in text, "on 8 m an arcsec would be 10 um"
     assert dashboard.upload.take.visible and dashboard.upload._preview.record.delay == 2
     dashboard.upload.take_proposals()
     loop.until(lambda: dashboard.upload._preview is not None and not dashboard.upload.take.visible)

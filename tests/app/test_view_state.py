@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.seeds import SEEDS
 
 
 def other(dashboard: Dashboard, query: str) -> list[str]:
@@ -20,17 +21,20 @@ class TestViewState:
         dashboard.explore.strips["vibration"].cards.hidden = ["truth", "kf-lgs"]
         dashboard.explore.traces.x_range.update(start=0.75, end=1.25)
         dashboard.pages.current = "model"
+        dashboard.seeds.count = 3
         query = dashboard.actions.toolbar.view
         assert query == (
             "view.page=model&view.mode=tilt&view.unit=mas&view.show=signal&view.spectrum=cumulative"
-            "&view.hide.vibration=truth,kf-lgs&view.window=0.75,1.25"
+            "&view.hide.vibration=truth,kf-lgs&view.window=0.75,1.25&view.seeds=3"
         )
         assert other(dashboard, "") == []
         assert dashboard.view_state.query == "" and dashboard.pages.current == "explore"
         assert dashboard.display.show == "error" and dashboard.explore.traces.x_range.end == 2.0
+        assert dashboard.seeds.count == SEEDS
         assert other(dashboard, f"?run.seed=3&{query}") == []
         assert dashboard.view_state.query == query
         assert dashboard.explore.strips["vibration"].cards.hidden == ["truth", "kf-lgs"]
+        assert dashboard.seeds.count == 3
 
     @pytest.mark.parametrize(
         ("field", "reason"),
@@ -39,6 +43,8 @@ class TestViewState:
             ("view.window=3,1", "view.window = 3,1: takes two times [s], the first one smaller"),
             ("view.window=nan,1", "view.window = nan,1: takes two times"),
             ("view.hide.vibration=truth,nobody", "nobody: no line of that name"),
+            ("view.seeds=0", "view.seeds = 0: takes a whole number from 1 to 50"),
+            ("view.seeds=many", "view.seeds = many: takes a whole number from 1 to 50"),
             ("view.colour=red", "view.colour: there is no such part of a view"),
         ],
     )

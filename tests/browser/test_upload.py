@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from playwright.sync_api import expect
 
 from wfsobs.scenario.presets import paper
@@ -38,3 +39,50 @@ def test_a_record_is_previewed_used_and_taken_back(open_page: Any, server: Any, 
     page.get_by_role("button", name="Back to the simulation").click()
     expect(page.get_by_text(re.compile(r"^Turbulence, tip, [\d.]+ to"))).to_be_visible()
     expect(page.get_by_text("Record night.csv")).to_have_count(0)
+
+
+def test_a_dropped_file_whose_columns_are_said_what_they_are(open_page: Any, server: Any) -> None:
+    """Dropped on the table, far from the button; names that say nothing; every choice by a menu of the form."""
+    record = simulate(paper().replace({"run.duration": 3.0}))
+    table = np.column_stack([record.y_lgs, record.u]).tolist()
+    text = "\n".join(["a,b,c,d", *(",".join(map(repr, row)) for row in table)])
+    page = open_page(url=f"{server.url}?{SHORT}")
+    page.evaluate(
+        """([name, text]) => {
+            const files = new DataTransfer()
+            files.items.add(new File([text], name, {type: "text/csv"}))
+            for (const kind of ["dragenter", "dragover", "drop"])
+                document.querySelector("main, body").dispatchEvent(
+                    new DragEvent(kind, {bubbles: true, composed: true, cancelable: true, dataTransfer: files}))
+        }""",
+        ["odd.csv", text],
+    )
+    expect(page.get_by_text("odd.csv: has no y_lgs").first).to_be_visible()
+    for name, label in zip("abcd", ("measurement, tip", "measurement, tilt", "command, tip", "command, tilt"), strict=True):
+        page.get_by_label(f"Meaning of {name}", exact=True).select_option(label=label)
+        expect(page.get_by_label(f"Meaning of {name}", exact=True).locator("option:checked")).to_have_text(label)
+    expect(page.get_by_text("odd.csv: has no dt and no time").first).to_be_visible()
+    page.get_by_label("Rate [Hz]").fill("1000")
+    page.get_by_label("Rate [Hz]").press("Enter")
+    expect(page.get_by_text("3000 steps at 1000 Hz, 3 s, 0 missing")).to_be_visible()
+    expect(page.get_by_text("sign +1: commands move against the measurement of their row")).to_be_visible()
+    page.get_by_role("button", name="Use this record").click()
+    expect(page.get_by_text("Record odd.csv: 3000 steps")).to_be_visible()
+    expect(page.get_by_text("Recorded loop, residual")).to_be_visible()
+
+
+def test_template_and_sample(open_page: Any, server: Any, tmp_path: Path) -> None:
+    """The sample is a record that can be loaded at once."""
+    page = open_page(url=f"{server.url}?{SHORT}")
+    page.get_by_text("File format").click()
+    with page.expect_download() as waiting:
+        page.get_by_role("button", name="Template CSV").click()
+    assert waiting.value.suggested_filename == "wfsobs-template.csv"
+    with page.expect_download(timeout=60_000) as waiting:
+        page.get_by_role("button", name="Sample record").click()
+    waiting.value.save_as(tmp_path / "sample.csv")
+    page.get_by_label("Record file").set_input_files(tmp_path / "sample.csv")
+    expect(page.get_by_text("5000 steps at 1000 Hz, 5 s, 0 missing")).to_be_visible()
+    expect(page.get_by_text("truth: turbulence and vibration")).to_be_visible()
+    page.get_by_role("button", name="Discard").click()
+    expect(page.get_by_text("5000 steps at 1000 Hz, 5 s, 0 missing")).not_to_be_visible()

@@ -298,3 +298,19 @@ def test_aot_opens_nothing_else(tmp_path, monkeypatch) -> None:
 def noted(opened: list[object], function, what, *args, **kwargs):
     opened.append(what)
     return function(what, *args, **kwargs)
+
+
+def test_units_that_the_size_of_z_leaves_open() -> None:
+    """An arcsec is 4.848 urad, on 8 m 9.696 um of tip: numbers of 0.1 may be um or arcsec, and 1 um is 0.103 arcsec."""
+    rng = np.random.default_rng(1)
+    y = 0.1 * rng.standard_normal((2000, 2))
+    file = io.BytesIO()
+    np.savez(file, y_lgs=y, u=np.zeros_like(y), dt=np.array(1e-3))
+    reading = preview(file.getvalue(), "a.npz").reading
+    assert set(reading.units) == {"um", "arcsec"} and reading.response is None
+    assert reading.units["arcsec"] == pytest.approx(9.696 * reading.units["um"], rel=1e-3)
+    assert reading.units["um"] == pytest.approx(0.1, rel=0.05), "to the scatter of 2000 samples"
+    assert reading.lines()[0] == "sign and delay: too few steps, or commands that do not move"
+    assert reading.lines()[1].startswith("unit undecided: the numbers are plausible as um (")
+    stated = preview(file.getvalue(), "a.npz", declaration=DeclaredFormat(unit="nm")).reading
+    assert stated.units == {}

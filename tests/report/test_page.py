@@ -19,6 +19,7 @@ import pytest
 from wfsobs import __version__
 from wfsobs.app.numbers import number
 from wfsobs.app.report.data import Grid, Report, state_of
+from wfsobs.app.report.packing import pack, unpack
 from wfsobs.app.report.page import page
 from wfsobs.app.report.text import FILE, LONGEST, command_of
 from wfsobs.evaluation.rows import TIME, is_non_causal, row_label, scored_interval
@@ -190,6 +191,10 @@ def test_a_loaded_record_promises_no_simulation(result: Result, parse: Any) -> N
     state = state_of(observe(record, result.scenario, observers=["kf-lgs", "zero"]))
     said = parse(page(Report("paper", result.scenario, (), (state,), is_recorded=True), MADE)).text
     assert "of a loaded record" in said and f"wfsobs observe RECORD --config {FILE}" in said and "wfsobs export" not in said
+    command = "wfsobs observe night.csv --preset paper --sha256 0a1b"
+    named = Report("paper", result.scenario, (), (state,), is_recorded=True, command=command)
+    said = parse(page(unpack(pack(named)), MADE)).text
+    assert command in said and "RECORD" not in said and "saved as" not in said
     assert {row["target"] for row in state.rows} == {"next z", "residual y"}
     assert "Next z, tip" in said and "psd/vibration/kf-lgs/tip" in state.lines and "error/vibration/kf-lgs/tip" not in state.lines
 

@@ -181,7 +181,10 @@ class Actions:
         shown, preset = self.store.run.result, self.store.preset
         if shown is None or self.toolbar.reporting:
             return
-        job = Job("report", partial(make, shown, preset), time_limit=LIMIT, wait_limit=LIMIT, refusal=ReportError)
+        command = to_command(shown.scenario, preset, shown.source) if shown.is_recorded else ""
+        job = Job(
+            "report", partial(make, shown, preset, command=command), time_limit=LIMIT, wait_limit=LIMIT, refusal=ReportError
+        )
         self._start("report", "Report", job, partial(self.toolbar.save, REPORT, "text/html"))
 
     def _start(self, which: str, name: str, job: Job, then: Callable[[Any], None]) -> None:

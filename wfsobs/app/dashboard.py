@@ -96,7 +96,7 @@ class Dashboard:
         self.pages = Pages(self.explore, self.store, self.display)
         self.actions.attach(self.pages)
         self.controls.search.on_sweep = self.pages.sweep_over
-        self.view_state = ViewState(self.display, self.pages, self.explore.lines, self.explore.traces)
+        self.view_state = ViewState(self.display, self.pages, self.explore.lines, self.explore.traces, self.seeds)
         self.actions.follow_view(self.view_state)
         page = pmui.Page(
             title="wfsobs",

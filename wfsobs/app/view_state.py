@@ -1,4 +1,4 @@
-"""What of the page is in its address beside the settings: page, mode, unit, switches, lines, window, theme.
+"""What of the page is in its address beside the settings: page, mode, unit, switches, lines, window, seeds, theme.
 
 `view.page=tune&view.mode=tilt&view.window=1,3&view.hide.vibration=kf-lgs,truth`; only what differs from a fresh page. What cannot
 be used is named, and the rest is used.
@@ -13,6 +13,7 @@ import param
 
 from wfsobs.app.display import Display
 from wfsobs.app.pages.pages import EXPLORE, Pages
+from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.main_lines import MainLines
 from wfsobs.app.views.settle import on_settle
@@ -24,7 +25,7 @@ PREFIX = "view."
 SWITCHES = ("mode", "unit", "show", "spectrum")
 """Switches of the display, by their names there."""
 
-PAGE, WINDOW, HIDE, THEME = "page", "window", "hide.", "theme"
+PAGE, WINDOW, HIDE, SEEDS, THEME = "page", "window", "hide.", "seeds", "theme"
 MOST = 50
 """Fields of a query that are read."""
 
@@ -34,13 +35,14 @@ class ViewState(param.Parameterized):
 
     query = param.String("", doc="What the address has of the view, without ?.")
 
-    def __init__(self, display: Display, pages: Pages, lines: MainLines, traces: Traces):
+    def __init__(self, display: Display, pages: Pages, lines: MainLines, traces: Traces, seeds: SeedRuns):
         super().__init__()
-        self.display, self.pages, self.lines, self.traces = display, pages, lines, traces
+        self.display, self.pages, self.lines, self.traces, self.seeds = display, pages, lines, traces, seeds
         self._fresh = {name: getattr(display, name) for name in SWITCHES}
         self._theme = ""
         display.param.watch(self._refresh, [*SWITCHES, "hidden"])
         pages.param.watch(self._refresh, "current")
+        seeds.param.watch(self._refresh, "count")
         on_settle([traces.x_range], self._refresh)
 
     def choose_theme(self, dark: bool) -> None:
@@ -67,7 +69,8 @@ class ViewState(param.Parameterized):
                 refused.append(f"{PREFIX}{key} = {value[:80]}: takes one of {', '.join(of.param[name].objects)}")
         refused += self._open_lines(fields)
         refused += self._open_window(fields.get(WINDOW, ""))
-        known = {PAGE, WINDOW, *SWITCHES, *(HIDE + target for target in TARGETS)}
+        refused += self._open_seeds(fields.get(SEEDS, str(self.seeds.param["count"].default)))
+        known = {PAGE, WINDOW, SEEDS, *SWITCHES, *(HIDE + target for target in TARGETS)}
         refused += [f"{PREFIX}{key}: there is no such part of a view" for key in fields if key not in known]
         self._refresh()
         return refused
@@ -97,11 +100,23 @@ class ViewState(param.Parameterized):
         self.traces.open_window((start, end))
         return []
 
+    def _open_seeds(self, text: str) -> list[str]:
+        low, high = self.seeds.param["count"].bounds
+        try:
+            if not low <= int(text) <= high:
+                raise ValueError
+        except ValueError:
+            return [f"{PREFIX}{SEEDS} = {text[:80]}: takes a whole number from {low} to {high}"]
+        self.seeds.count = int(text)
+        return []
+
     def _refresh(self, *_: object) -> None:
         fields = {} if self.pages.current == EXPLORE else {PAGE: self.pages.current}
         fields |= {name: value for name in SWITCHES if (value := getattr(self.display, name)) != self._fresh[name]}
         fields |= {HIDE + target: ",".join(hidden) for target, hidden in self.lines.choices().items()}
         if (window := self.traces.chosen_window()) is not None:
             fields[WINDOW] = f"{window[0]:.4g},{window[1]:.4g}"
+        if self.seeds.count != self.seeds.param["count"].default:
+            fields[SEEDS] = str(self.seeds.count)
         parts = [f"{PREFIX}{key}={quote(value, safe=',-')}" for key, value in fields.items()]
         self.query = "&".join([*parts, *([f"{THEME}={self._theme}"] if self._theme else [])])

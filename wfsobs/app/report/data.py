@@ -119,7 +119,7 @@ class Report:
     """All of a report: states are the product of the variations, the last one running fastest.
 
     preset : what the settings are compared with; base : the settings that were varied; is_recorded : whether on a record
-    that was loaded, not simulated
+    that was loaded or kept, not simulated from the settings; command : what makes the estimates of such a record again
     """
 
     preset: str
@@ -127,6 +127,7 @@ class Report:
     variations: tuple[Variation, ...]
     states: tuple[State, ...]
     is_recorded: bool = False
+    command: str = ""
 
     @property
     def start(self) -> int:

@@ -28,9 +28,12 @@ class ReportError(Exception):
     """Why there is no report, in one line."""
 
 
-def make(results: RunResults, preset: str, watch: Watch, _tell: object = None) -> bytes:
-    """Make the file of the results shown; blocks, so call it in a job. Raises ReportError, Cancelled."""
-    content = pack(Report(preset, results.scenario, (), (state_of(results.result),), results.is_recorded))
+def make(results: RunResults, preset: str, watch: Watch, _tell: object = None, command: str = "") -> bytes:
+    """Make the file of the results shown; blocks, so call it in a job. Raises ReportError, Cancelled.
+
+    command : what makes the estimates again, of a record that is not the simulation of the settings
+    """
+    content = pack(Report(preset, results.scenario, (), (state_of(results.result),), results.is_recorded, command))
     root = str(Path(wfsobs.__file__).parents[1])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}
     # A file, not a pipe: what a pipe has not taken when `communicate` times out is never sent.

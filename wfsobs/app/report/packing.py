@@ -18,6 +18,7 @@ def pack(report: Report) -> bytes:
         "preset": report.preset,
         "base": to_toml(report.base),
         "recorded": report.is_recorded,
+        "command": report.command,
         "variations": [[v.path, v.values] for v in report.variations],
         "states": [
             {
@@ -50,4 +51,4 @@ def unpack(content: bytes) -> Report:
         for s, of in zip(words["states"], lines, strict=True)
     )
     variations = tuple(Variation(path, tuple(values)) for path, values in words["variations"])
-    return Report(words["preset"], from_toml(words["base"]), variations, states, words["recorded"])
+    return Report(words["preset"], from_toml(words["base"]), variations, states, words["recorded"], words["command"])

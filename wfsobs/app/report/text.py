@@ -124,7 +124,7 @@ def meaning_values(report: Report) -> dict[str, Any]:
 
 def origin_values(report: Report, date: datetime) -> dict[str, Any]:
     """Collect versions, date, seed, and the command that makes the report again."""
-    command, by_file = (f"wfsobs observe RECORD --config {FILE}", True) if report.is_recorded else command_of(report)
+    command, by_file = command_of(report)
     facts = {"Program": f"wfsobs {__version__}, {machine(('bokeh',))}", "Made": f"{date:%Y-%m-%d %H:%M:%S %Z}".rstrip()}
     if not report.is_recorded:
         facts["Seed"] = str(report.base.run.seed)
@@ -133,6 +133,9 @@ def origin_values(report: Report, date: datetime) -> dict[str, Any]:
 
 def command_of(report: Report) -> tuple[str, bool]:
     """Write the command line of a report; say whether it takes its settings from FILE, being too long otherwise."""
+    if report.is_recorded:
+        command = report.command or f"wfsobs observe RECORD --config {FILE}"
+        return command, f"--config {FILE}" in command
     changed = changed_settings(report.base, reference_preset(report.preset))
     ends = _words("--vary", report.variations)
     command = _command(
