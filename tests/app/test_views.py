@@ -72,6 +72,27 @@ class TestTraces:
         assert np.isnan(data[TRUTH]).all()
         assert "error of tip [nm]" in dashboard.explore.traces.traces["vibration"].figure.yaxis.axis_label
 
+    def test_a_line_alone_has_its_band(self, dashboard: Dashboard) -> None:
+        """Of 95 %, 1.96 standard deviations around the estimate, or around no error; none with more lines, nor of no model."""
+        drawn = dashboard.explore.traces.traces["turbulence"]
+        shown = dashboard.store.run.result.result.estimate("multirate-optimal", "turbulence")
+        assert drawn.band.renderer is None, "nothing is made for it at first"
+        others = [name for name in drawn.lines if name not in (TRUTH, "multirate-optimal")]
+        dashboard.display.hidden = {"turbulence": others}
+        assert drawn.band.renderer is not None and drawn.band.renderer.visible
+        band, half = drawn.band.source.data, 1.959964e3 * shown.sd[:, 0]
+        start = round(band["x"][100] / 1e-3)  # bins of 4 steps hold nearly every phase of 5
+        assert band["high"][100] == pytest.approx(np.nanmax(half[start : start + 3]), rel=0.05)
+        assert np.allclose(band["low"], -band["high"], rtol=1e-6, equal_nan=True)
+        dashboard.display.show = "signal"
+        middle = 0.5 * (band := drawn.band.source.data)["high"] + 0.5 * band["low"]
+        line = np.array(trace(dashboard, "turbulence")["multirate-optimal"])
+        assert np.nanmax(np.abs(middle - line)[10:]) < 0.1 * np.nanstd(line)
+        dashboard.display.hidden = {"turbulence": others[1:]}
+        assert not drawn.band.renderer.visible
+        dashboard.display.hidden = {"turbulence": [name for name in drawn.lines if name not in (TRUTH, "persistence")]}
+        assert not drawn.band.renderer.visible
+
     def test_mode_and_unit(self, dashboard: Dashboard) -> None:
         dashboard.display.param.update(mode="tilt", unit="mas", show="signal")
         truth = dashboard.store.run.result.values(TRUTH, "vibration")[:, 1]

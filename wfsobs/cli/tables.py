@@ -15,7 +15,8 @@ def score_table(rows: Sequence[Row]) -> Table:
     """Return the RMS table, of errors or, without truth, of predictions.
 
     Over several seeds the medians, with the smallest and the largest error. The bound has the interval of an optimal observer's
-    error in 95 % of records. The caption gives the interval of the scored samples.
+    error in 95 % of records,
+    and observers may state their standard deviation. The caption gives the interval of the scored samples.
     """
     several = len({r["seed"] for r in rows}) > 1
     unknown = any(r["target"] == RESIDUAL for r in rows)
@@ -24,8 +25,9 @@ def score_table(rows: Sequence[Row]) -> Table:
     for name in ("Target", "Mode", "Observer", "Needs"):
         table.add_column(name, no_wrap=True)
     bounded = ("95 %, nm",) if any(r["interval_um"] for r in rows) else ()
+    stated = ("stated, nm",) if any(r["sd_um"] for r in rows) else ()
     spread = ("spread, nm",) if several else ()
-    for name in ("error, nm", *spread, *bounded, "stated, nm", f"{base}, nm", f"error / {base}", "lag, ms", "us / step"):
+    for name in ("error, nm", *spread, *bounded, *stated, f"{base}, nm", f"error / {base}", "lag, ms", "us / step"):
         table.add_column(name, justify="right", no_wrap=True)
     last = None
     for target, mode, observer in sorted({(r["target"], r["mode"], r["observer"]) for r in rows}, key=_order(rows)):
@@ -42,7 +44,7 @@ def score_table(rows: Sequence[Row]) -> Table:
             f"{median(errors):.2f}",
             *((f"{min(errors):.2f} - {max(errors):.2f}",) if several else ()),
             *((interval_text(same[0]["interval_um"], 1e3),) if bounded else ()),
-            _number(same, "sd_um", 1e3, 2),
+            *((_number(same, "sd_um", 1e3, 2),) if stated else ()),
             f"{median(r['truth_rms_um'] for r in same) * 1e3:.2f}",
             _number(same, "normalised_rms", 1.0, 3),
             _number(same, "lag_s", 1e3, 2),
