@@ -175,13 +175,35 @@ def _rational(order: int) -> tuple[tuple[float, ...], Array]:
     squares = np.roots(even)
     poles = -np.sqrt(squares.astype(complex))
     coefficients = np.poly(poles).real[:0:-1]
+    return tuple(coefficients.tolist()), _chain_covariance(coefficients)
+
+
+def _chain_covariance(coefficients: Array) -> Array:
+    """Return the covariance of a chain of this last row, of variance one, (n, n)."""
     n = len(coefficients)
     F = np.diag(np.ones(n - 1), 1)
     F[-1] = -coefficients
     drive = np.zeros((n, n))
     drive[-1, -1] = 1.0
     P = np.linalg.solve(np.kron(F, np.eye(n)) + np.kron(np.eye(n), F), -drive.ravel()).reshape(n, n)
-    return tuple(coefficients.tolist()), 0.5 * (P + P.T) / P[0, 0]
+    return 0.5 * (P + P.T) / P[0, 0]
+
+
+@dataclass(frozen=True)
+class Poles:
+    """Process of some poles and no zeros, driven by white noise.
+
+    rms : standard deviation [any unit];  poles : in conjugate pairs, real parts below 0 [rad/s]
+    """
+
+    rms: float
+    poles: tuple[complex, ...]
+
+    def state_space(self) -> StateSpace:
+        """Return its stochastic equation."""
+        rate = float(np.exp(np.mean(np.log(np.abs(self.poles)))))
+        coefficients = np.poly(np.array(self.poles) / rate).real[:0:-1]
+        return _chain(rate, self.rms, coefficients.tolist(), _chain_covariance(coefficients))
 
 
 @dataclass(frozen=True)

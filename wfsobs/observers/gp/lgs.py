@@ -1,0 +1,148 @@
+"""Gaussian process regression in time on the LGS measurement: a sum of kernels, as a steady-state Kalman filter.
+
+Turbulence is one kernel, every line of the vibration an oscillator, and the sensor's error may have a colour: a Matern 1/2 background
+of its own, part of the measurement and of no target. The state has one element more, the sum one step ago, which is what a
+measurement sees:
+
+    z[k] = f[k-1] + noise,    (x, f)[k+1] = (A x[k] + v, h x[k]).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import pi, sqrt
+
+import numpy as np
+import param
+from scipy.linalg import block_diag
+
+from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
+from wfsobs.observers.gp.kernels import Kernel, Matern, Poles, Sho, SquaredExponentialInTime, Sum
+from wfsobs.observers.kalman.spread import by_target, target_sd
+from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
+from wfsobs.observers.missing import LINE_WIDTH
+from wfsobs.prior import Lines, Prior
+from wfsobs.progress import Watch
+from wfsobs.record import Measurements, Sampling
+from wfsobs.settings import Group, Real, Section
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.statespace import DisturbanceModel
+from wfsobs.signal.stepping import Gain, GainCycle
+from wfsobs.typing import Array
+
+POLES, MATERN, SMOOTH = "as told", {"matern-1/2": 1, "matern-3/2": 3, "matern-5/2": 5}, "squared-exponential"
+
+
+class GaussianProcess(Group):
+    """Gaussian process regression in time, with a sum of kernels."""
+
+    turbulence = param.Selector(
+        default=POLES,
+        objects=[POLES, *MATERN, SMOOTH],
+        label="Kernel of the turbulence",
+        doc="as told: the poles of the model; the others have its rms and its corner frequency.",
+    )
+    background_rms = Real(
+        0.0,
+        bounds=(0.0, 100.0),
+        softbounds=(0.0, 0.1),
+        label="Coloured background",
+        doc="RMS of a Matern 1/2 background of the measurement [um]; 0 for none.",
+    )
+    background_scale = Real(
+        1.5,
+        bounds=(0.01, 1e4),
+        softbounds=(0.1, 100.0),
+        label="Time of the background",
+        doc="Length scale of the background [ms].",
+    )
+
+
+def kernels_of(lines: Lines, settings: GaussianProcess) -> tuple[Kernel, Kernel, Kernel]:
+    """Return the kernels of turbulence, vibration and background of one mode; a sum of none is zero."""
+    turbulence = Sum(tuple(_turbulence(process, settings.turbulence) for process in lines.turbulence if process.rms))
+    peaks = []
+    for frequency, damping, rms in lines.lines:
+        omega = 2.0 * pi * frequency
+        peaks.append(Sho(rms, omega, min(max(damping, pi * LINE_WIDTH / omega), 1.0)))
+    colour = (Matern(settings.background_rms, settings.background_scale * 1e-3, 1),) if settings.background_rms else ()
+    return turbulence, Sum(tuple(peak for peak in peaks if peak.rms)), Sum(colour)
+
+
+def _turbulence(process: Ar2 | Ar3, kind: str) -> Kernel:
+    """Return the kernel of a told process: its own, or one with its rms and corner."""
+    if kind in MATERN:
+        return Matern(process.rms, sqrt(MATERN[kind]) / process.omega, MATERN[kind])
+    if kind == SMOOTH:
+        return SquaredExponentialInTime(process.rms, 1.0 / process.omega)
+    if isinstance(process, Ar2):
+        return Sho(process.rms, process.omega, process.damping)
+    return Poles(process.rms, tuple(-process.decays / process.dt))
+
+
+def steady_mode(kernels: Sequence[Kernel], noise: float, dt: float) -> ModeFilter:
+    """Return the steady-state filter of z of one mode.
+
+    Parameters
+    ----------
+    kernels : sequence of Kernel
+        Of turbulence and vibration, then of what is of neither.
+    noise : float
+        RMS of the white noise [um].
+    dt : float
+        Step [s].
+    """
+    found = [(one, *one.discretise(dt)) for one in (kernel.state_space() for kernel in kernels)]
+    A, Q, P = (block_diag(*parts) for parts in ([A for _, A, _ in found], [Q for _, _, Q in found], [o.P for o, _, _ in found]))
+    h = np.concatenate([one.h for one, _, _ in found])
+    ends = np.cumsum([len(one.h) for one, _, _ in found])
+    place = np.arange(len(h))
+    turbulence, vibration = place < ends[0], (place >= ends[0]) & (place < ends[1])
+    now = np.array([np.where(turbulence, h, 0.0), np.where(vibration, h, 0.0)])
+    before = np.linalg.lstsq(P, (now @ P @ A.T).T, rcond=1e-14)[0].T  # the likeliest value one step ago
+    pairs = np.stack([now, before], axis=1).reshape(4, -1)
+    model = DisturbanceModel(A, h, Q, dict(zip(TARGETS, now, strict=True)), pairs)
+    n = len(h)
+    late = np.zeros((n + 1, n + 1))
+    late[:n, :n], late[n, :n] = A, h
+    seen = np.eye(n + 1)[-1:]
+    steady = steady_state(late, seen, block_diag(Q, [[0.0]]), np.array(noise**2))
+    return ModeFilter(model, GainCycle([Gain(late, seen, steady.L)]), (steady.posterior,))
+
+
+def filters_of(prior: Prior, settings: GaussianProcess) -> list[ModeFilter]:
+    """Return the filters of all modes."""
+    return [steady_mode(kernels_of(lines, settings), lines.noise, lines.dt) for lines in prior.lines]
+
+
+def gp_lgs(measurements: Measurements, prior: Prior, settings: GaussianProcess, watch: Watch) -> Estimates:
+    """Run the regression on the LGS measurement, at every fast step."""
+    z, columns, sd = measurements.z, [], []
+    for mode, one in enumerate(filters_of(prior, settings)):
+        watch.step(mode / measurements.n_modes)
+        rows = one.model.output_rows(TARGETS)
+        columns.append(one.gains.filter(np.pad(rows, ((0, 0), (0, 1)))).run(z[:, None, mode, None])[:, :, 0])
+        sd.append(target_sd(rows, one.posterior))
+    return by_target(columns, sd)
+
+
+def step_gp_lgs(prior: Prior, settings: GaussianProcess, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
+    """Return the filters of all modes, one frame at a time."""
+    return KalmanEstimator(filters_of(prior, settings))
+
+
+GP_LGS = Observer(
+    "gp-lgs",
+    "GP in time",
+    TARGETS,
+    gp_lgs,
+    help="Gaussian process in time, a kernel for the turbulence and one per line, as a filter; not in the paper",
+    prior=(Lines,),
+    settings=Section("gp", "Gaussian process in time", GaussianProcess),
+    linear=True,
+    tunable=Tunable(("gp.background_rms", "gp.background_scale"), ("kalman.lgs_noise", "kalman.turbulence_rms")),
+    look=Look("GP in time", "#5B4B00", "#E0C95A", (6, 2, 2, 2), in_figures=False),
+    step=step_gp_lgs,
+)
