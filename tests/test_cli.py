@@ -201,4 +201,4 @@ def test_the_file_of_an_identification_is_all_that_telemetry_needs(tmp_path):
     as_prior, without = errors("--prior", found, *light), errors(*light)
     assert as_prior == errors("--config", found, *light) and as_prior.keys() == without.keys()
     moved = {key[0] for key, value in as_prior.items() if value != without[key]}
-    assert moved == {"kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi"}
+    assert moved == {"kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi", "gp-lgs", "gp-both"}

@@ -26,7 +26,7 @@ from wfsobs.typing import Array
 
 RECORDS, STEPS, SETTLED, RATIO = 200, 3000, 1000, 5
 
-WITH_MODEL = ["kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi"]
+WITH_MODEL = ["kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi", "gp-lgs", "gp-both"]
 
 
 def told(name: str, between: str) -> tuple[Prior, object]:
@@ -109,7 +109,7 @@ def test_stated_frame_by_frame_as_over_a_record(name: str) -> None:
 def test_every_observer_with_a_model_states_something(name: str) -> None:
     changes = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50, "adaptive.window": 0.5}
     found = wfsobs.run(wfsobs.PRESETS["paper"]().replace(changes), observers=[name])
-    with_model = name.startswith(("kf", "multirate", "gpr"))
+    with_model = name.startswith(("kf", "multirate", "gp"))
     assert found.estimates
     for estimate in found.estimates:
         assert (estimate.sd is not None) == with_model

@@ -5,6 +5,8 @@ from __future__ import annotations
 from wfsobs import registry
 from wfsobs.observers.base import Observer
 from wfsobs.observers.baselines import BUTTERWORTH_CL, BUTTERWORTH_OL, PERSISTENCE, ZERO
+from wfsobs.observers.gp.both import GP_BOTH
+from wfsobs.observers.gp.lgs import GP_LGS
 from wfsobs.observers.gpr.offline import GPR_OFFLINE
 from wfsobs.observers.gpr.online import GPR_ONLINE
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE
@@ -24,6 +26,8 @@ BUILT_IN = (
     MULTIRATE,
     MULTIRATE_OPTIMAL,
     MULTIRATE_MULTI,
+    GP_LGS,
+    GP_BOTH,
     BUTTERWORTH_OL,
     BUTTERWORTH_CL,
     GPR_OFFLINE,

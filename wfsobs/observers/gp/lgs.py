@@ -1,8 +1,8 @@
 """Gaussian process regression in time on the LGS measurement: a sum of kernels, as a steady-state Kalman filter.
 
-Turbulence is one kernel, every line of the vibration an oscillator, and the sensor's error may have a colour: a Matern 1/2 background
-of its own, part of the measurement and of no target. The state has one element more, the sum one step ago, which is what a
-measurement sees:
+Turbulence is one kernel, every line of the vibration an oscillator, and the sensor's error may have a colour: a Matern 1/2
+background of its own, part of the measurement and of no target. The state has one element more, the sum one step ago, which is
+what a measurement sees:
 
     z[k] = f[k-1] + noise,    (x, f)[k+1] = (A x[k] + v, h x[k]).
 """
@@ -18,6 +18,7 @@ from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
 from wfsobs.observers.gp.kernels import Kernel, Matern, Poles, Sho, SquaredExponentialInTime, Sum
+from wfsobs.observers.kalman.single import steady_gains
 from wfsobs.observers.kalman.spread import by_target, target_sd
 from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
 from wfsobs.observers.missing import LINE_WIDTH
@@ -27,12 +28,13 @@ from wfsobs.record import Measurements, Sampling
 from wfsobs.settings import Group, Real, Section
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
-from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import DisturbanceModel
-from wfsobs.signal.stepping import Gain, GainCycle
-from wfsobs.typing import Array
 
 POLES, MATERN, SMOOTH = "as told", {"matern-1/2": 1, "matern-3/2": 3, "matern-5/2": 5}, "squared-exponential"
+
+
+NOTHING = (Matern(0.0, 1.0, 1),)
+"""A sum of no kernel."""
 
 
 class GaussianProcess(Group):
@@ -60,15 +62,18 @@ class GaussianProcess(Group):
     )
 
 
+GP = Section("gp", "Gaussian process in time", GaussianProcess)
+
+
 def kernels_of(lines: Lines, settings: GaussianProcess) -> tuple[Kernel, Kernel, Kernel]:
-    """Return the kernels of turbulence, vibration and background of one mode; a sum of none is zero."""
-    turbulence = Sum(tuple(_turbulence(process, settings.turbulence) for process in lines.turbulence if process.rms))
+    """Return the kernels of turbulence, vibration and background of one mode."""
+    turbulence = tuple(_turbulence(process, settings.turbulence) for process in lines.turbulence)
     peaks = []
     for frequency, damping, rms in lines.lines:
         omega = 2.0 * pi * frequency
         peaks.append(Sho(rms, omega, min(max(damping, pi * LINE_WIDTH / omega), 1.0)))
     colour = (Matern(settings.background_rms, settings.background_scale * 1e-3, 1),) if settings.background_rms else ()
-    return turbulence, Sum(tuple(peak for peak in peaks if peak.rms)), Sum(colour)
+    return Sum(turbulence or NOTHING), Sum(tuple(peaks) or NOTHING), Sum(colour or NOTHING)
 
 
 def _turbulence(process: Ar2 | Ar3, kind: str) -> Kernel:
@@ -82,39 +87,36 @@ def _turbulence(process: Ar2 | Ar3, kind: str) -> Kernel:
     return Poles(process.rms, tuple(-process.decays / process.dt))
 
 
-def steady_mode(kernels: Sequence[Kernel], noise: float, dt: float) -> ModeFilter:
-    """Return the steady-state filter of z of one mode.
-
-    Parameters
-    ----------
-    kernels : sequence of Kernel
-        Of turbulence and vibration, then of what is of neither.
-    noise : float
-        RMS of the white noise [um].
-    dt : float
-        Step [s].
-    """
+def sampled_model(kernels: Sequence[Kernel], dt: float) -> DisturbanceModel:
+    """Return the model of kernels at steps dt [s]: of turbulence and vibration, then of what is of neither; C is the sum now."""
     found = [(one, *one.discretise(dt)) for one in (kernel.state_space() for kernel in kernels)]
     A, Q, P = (block_diag(*parts) for parts in ([A for _, A, _ in found], [Q for _, _, Q in found], [o.P for o, _, _ in found]))
     h = np.concatenate([one.h for one, _, _ in found])
     ends = np.cumsum([len(one.h) for one, _, _ in found])
     place = np.arange(len(h))
-    turbulence, vibration = place < ends[0], (place >= ends[0]) & (place < ends[1])
-    now = np.array([np.where(turbulence, h, 0.0), np.where(vibration, h, 0.0)])
+    now = np.array([np.where(place < ends[0], h, 0.0), np.where((place >= ends[0]) & (place < ends[1]), h, 0.0)])
     before = np.linalg.lstsq(P, (now @ P @ A.T).T, rcond=1e-14)[0].T  # the likeliest value one step ago
     pairs = np.stack([now, before], axis=1).reshape(4, -1)
-    model = DisturbanceModel(A, h, Q, dict(zip(TARGETS, now, strict=True)), pairs)
-    n = len(h)
-    late = np.zeros((n + 1, n + 1))
-    late[:n, :n], late[n, :n] = A, h
-    seen = np.eye(n + 1)[-1:]
-    steady = steady_state(late, seen, block_diag(Q, [[0.0]]), np.array(noise**2))
-    return ModeFilter(model, GainCycle([Gain(late, seen, steady.L)]), (steady.posterior,))
+    return DisturbanceModel(A, h, Q, dict(zip(TARGETS, now, strict=True)), pairs)
+
+
+def measured_late(model: DisturbanceModel) -> DisturbanceModel:
+    """Return the model with one state more, the sum one step ago: what a measurement sees."""
+    n = len(model.A)
+    A = np.zeros((n + 1, n + 1))
+    A[:n, :n], A[n, :n] = model.A, model.C
+    outputs = {target: np.append(row, 0.0) for target, row in model.outputs.items()}
+    return DisturbanceModel(A, np.eye(n + 1)[-1], block_diag(model.Q, [[0.0]]), outputs, np.pad(model.pairs, ((0, 0), (0, 1))))
 
 
 def filters_of(prior: Prior, settings: GaussianProcess) -> list[ModeFilter]:
-    """Return the filters of all modes."""
-    return [steady_mode(kernels_of(lines, settings), lines.noise, lines.dt) for lines in prior.lines]
+    """Return the steady-state filters of z of all modes."""
+    out = []
+    for lines in prior.lines:
+        model = sampled_model(kernels_of(lines, settings), lines.dt)
+        gains, steady = steady_gains(measured_late(model), lines.noise)
+        out.append(ModeFilter(model, gains, (steady.posterior,)))
+    return out
 
 
 def gp_lgs(measurements: Measurements, prior: Prior, settings: GaussianProcess, watch: Watch) -> Estimates:
@@ -140,7 +142,7 @@ GP_LGS = Observer(
     gp_lgs,
     help="Gaussian process in time, a kernel for the turbulence and one per line, as a filter; not in the paper",
     prior=(Lines,),
-    settings=Section("gp", "Gaussian process in time", GaussianProcess),
+    settings=GP,
     linear=True,
     tunable=Tunable(("gp.background_rms", "gp.background_scale"), ("kalman.lgs_noise", "kalman.turbulence_rms")),
     look=Look("GP in time", "#5B4B00", "#E0C95A", (6, 2, 2, 2), in_figures=False),
