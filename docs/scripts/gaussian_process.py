@@ -1,6 +1,6 @@
 """The table of docs/gaussian-processes.md: from windows to time, vibration of tip, preset `paper`, five seeds.
 
-A Gaussian process in time that sees the last d measurements alone predicts linearly from windows; with all of them it is a filter.
+A Gaussian process in time that sees the last d measurements alone is a linear predictor of windows; with all it is a filter.
 """
 
 from __future__ import annotations

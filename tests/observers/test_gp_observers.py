@@ -56,7 +56,7 @@ def test_the_estimate_is_that_of_the_dense_regression(kernel: str, background: f
 
 
 def test_a_background_is_of_neither_target() -> None:
-    """Told of a coloured background that is there, the filter is better than one that takes it for white noise or for turbulence."""
+    """Told of a coloured background that is there, the filter is better than one that takes it for white noise or turbulence."""
     s = scenario(ONE_PEAK)
     record = wfsobs.simulate(s)
     rng = np.random.default_rng(1)
