@@ -23,12 +23,16 @@ from wfsobs.app.work import RunResults
 from wfsobs.cost import run_seconds
 from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE, TERMS, Budget, error_budget
 from wfsobs.evaluation.rows import row_label
+from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.observers.base import TARGETS
 
 COLOURS: Mapping[str, str] = MappingProxyType(
     {NOISE: "#8A8F98", LAG: "#3C7FC0", LINES: "#E8912D", MISMATCH: "#B5539C", CONE: "#3F9E6B"}
 )
-BOUND = "#D64533"
+MARKS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
+    {BOUND: ("#D64533", "dashed", "bound of the LGS"), BOUND_BOTH: ("#7A4FBF", "dotted", "bound of both sensors")}
+)
+"""Bound -> its colour, its dash, and how it is called."""
 
 COLUMNS = ("observer", "left", "right", "colour", "term", "part", "share", "rms")
 
@@ -93,7 +97,10 @@ class BudgetView:
                 self.room[:] = [term_legend(), *(pn.pane.Bokeh(bars.figure, **WIDE) for bars in self.bars.values())]
             for target, bars in self.bars.items():
                 scale = per_micrometre(self.display.unit, results.scenario.telescope.diameter)
-                bars.draw([b for b in found if b.target == target and b.terms], mode, scale, self.display.unit_label)
+                of = [s for s in results.result.scores if s.target == target and s.mode == mode]
+                bounds = {s.observer: s.rms**2 for s in of if s.observer in MARKS}
+                shown = [b for b in found if b.target == target and b.terms]
+                bars.draw(shown, bounds, mode, scale, self.display.unit_label)
 
 
 def budget_job(results: RunResults, mode: str) -> Job:
@@ -111,8 +118,10 @@ def term_legend() -> pn.pane.HTML:
         f'<span class="mark" style="padding-left:6px; border-left:10px solid {COLOURS[name]}">{escape(label)}</span>'
         for name, label in TERMS.items()
     )
-    bound = f'<span class="mark" style="border-left:2px dashed {BOUND}">bound of the LGS</span>'
-    return html(f'<div class="caption legend">{marks}{bound}</div>')
+    bounds = "".join(
+        f'<span class="mark" style="border-left:2px {dash} {colour}">{label}</span>' for colour, dash, label in MARKS.values()
+    )
+    return html(f'<div class="caption legend">{marks}{bounds}</div>')
 
 
 class Bars:
@@ -130,13 +139,17 @@ class Bars:
         self.figure.hbar(y="observer", left="left", right="right", height=0.7, color="colour", source=self.source)
         tips = [("", "@observer"), ("", "@term"), ("", "@part"), ("", "@share of the mean square error"), ("", "@rms")]
         self.figure.add_tools(HoverTool(tooltips=tips))
-        self.bound = Span(dimension="height", line_color=BOUND, line_dash="dashed", line_width=2, visible=False)
-        self.figure.add_layout(self.bound)
+        self.bounds = {
+            name: Span(dimension="height", line_color=colour, line_dash=dash, line_width=2, visible=False)
+            for name, (colour, dash, _) in MARKS.items()
+        }
+        for mark in self.bounds.values():
+            self.figure.add_layout(mark)
         self.figure.ygrid.visible = False
         self.figure.outline_line_color = None
 
-    def draw(self, budgets: Sequence[Budget], mode: str, scale: float, unit: str) -> None:
-        """Draw the budgets, the smallest error on top; scale: from um to the unit."""
+    def draw(self, budgets: Sequence[Budget], bounds: Mapping[str, float], mode: str, scale: float, unit: str) -> None:
+        """Draw the budgets, the smallest error on top; bounds: mean squares [um^2]; scale: from um to the unit."""
         ranked = sorted(budgets, key=lambda b: b.total)
         name = f"{self.target.capitalize()}, {mode}: mean square error [{unit}²]"
         call(self.figure, f"Error budget, {self.target}")
@@ -144,8 +157,8 @@ class Bars:
         self.observers.factors = [bar_label(b, scale, unit) for b in reversed(ranked)]
         self.figure.height = FRAME + ROW * max(len(ranked), 1)
         self.source.data = bar_data(ranked, scale, unit)  # type: ignore[assignment]
-        bound = next((b.bound for b in ranked if b.bound is not None), None)
-        self.bound.update(location=0.0 if bound is None else bound * scale**2, visible=bound is not None)
+        for name, mark in self.bounds.items():
+            mark.update(location=bounds.get(name, 0.0) * scale**2, visible=name in bounds)
 
 
 def bar_label(budget: Budget, scale: float, unit: str) -> str:
