@@ -160,12 +160,12 @@ def test_a_zoom_fetches_more_samples(open_page: Any) -> None:
 
 def test_cards_hide_lines(open_page: Any) -> None:
     page = open_page()
-    card = page.get_by_role("button", name=re.compile("NGS KF"))
+    card = page.locator(".card[data-name=gpr-online]")  # always among those that are shown at first
     expect(card).to_have_attribute("aria-pressed", "true")
     card.click()
     expect(card).to_have_attribute("aria-pressed", "false")
     visible = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
-        .filter(m => m.type === "GlyphRenderer" && m.name === "kf-ngs").map(m => m.visible)"""
+        .filter(m => m.type === "GlyphRenderer" && m.name === "gpr-online").map(m => m.visible)"""
     page.wait_for_function(f"({visible})().every(v => !v)")
 
 

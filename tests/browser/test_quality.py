@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
+from wfsobs.app.style import observers_of
+
 ALLOWED: Mapping[str, tuple[str, int, str]] = MappingProxyType(
     {
         "aria-prohibited-attr": (
@@ -247,7 +249,8 @@ def test_the_figures_are_not_far(open_page: Any) -> None:
     expect(page.get_by_role("button", name="Skip to figures")).to_be_in_viewport()
     press(page, "Enter")
     assert until(page, "Truth", most=10), "a card of the first strip"
-    assert until(page, "Turbulence time trace", most=10), "a figure has a name"
+    stops = len(observers_of("turbulence")) + 4  # a card each, three buttons below them, and the figure
+    assert until(page, "Turbulence time trace", most=stops), "a figure has a name"
     for name in ("Page", "Mode", "Unit", "Show", "Spectrum"):
         expect(page.get_by_role("group", name=name, exact=True)).to_be_visible()
     for name in ("Turbulence time trace", "Turbulence spectrum", "Vibration time trace", "Vibration spectrum"):
