@@ -149,7 +149,8 @@ def open_page(server: Server, browser: Browser) -> Iterator[Any]:
     for page, _ in opened:
         page.close()
     assert faults == []
-    assert server.errors(start) == []
+    errors = server.errors(start)
+    assert not errors, "\n".join(errors)
 
 
 DONE = """() => [...(window.Bokeh?.index?.roots?.[0]?.model.document._all_models.values() ?? [])]
