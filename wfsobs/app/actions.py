@@ -183,9 +183,18 @@ class Actions:
             return
         command = to_command(shown.scenario, preset, shown.source) if shown.is_recorded else ""
         job = Job(
-            "report", partial(make, shown, preset, command=command), time_limit=LIMIT, wait_limit=LIMIT, refusal=ReportError
+            "report",
+            partial(make, shown, preset, command=command, **self._extras()),
+            time_limit=LIMIT,
+            wait_limit=LIMIT,
+            refusal=ReportError,
         )
         self._start("report", "Report", job, partial(self.toolbar.save, REPORT, "text/html"))
+
+    def _extras(self) -> dict[str, Any]:
+        """Return what the report has beside the results shown."""
+        sweep = self._pages.sweep_shown() if self._pages else None
+        return {"sweep": sweep} if sweep else {}
 
     def _start(self, which: str, name: str, job: Job, then: Callable[[Any], None]) -> None:
         """Have a job done, one of each at a time, say under a name how it goes, and then do something with its result."""

@@ -3,52 +3,48 @@
 
 const TAG = "setting:"
 
-// The setting of an event: that of the component it went through, and in a table that of the cell.
+// The setting of an event, and where it is drawn: that of the component it went through, and in a table that of the cell.
 function settingAt(event) {
   const path = event.composedPath()
-  if (!path.some((it) => it.matches?.(".sidebar, .MuiDrawer-root"))) return null
-  for (const view of Bokeh.index.query((it) => it.model.tags?.some((tag) => tag.startsWith?.(TAG)))) {
-    if (!path.includes(view.el)) continue
-    const name = view.model.tags.find((tag) => tag.startsWith?.(TAG)).slice(TAG.length)
-    const cell = path.find((it) => it.dataset?.cell)
-    if (cell) return {name: `${name}.${cell.dataset.cell}`, box: cell}
-    return name.includes(".") && !view.el.shadowRoot?.querySelector(".peaks") ? {name, box: view.el} : null
-  }
-  return null
+  const views = [...Bokeh.index.query((it) => it.model.tags?.some((tag) => tag.startsWith?.(TAG)))]
+  const view = views.find((it) => path.includes(it.el))
+  if (!view) return null
+  const name = view.model.tags.find((tag) => tag.startsWith?.(TAG)).slice(TAG.length)
+  const cell = path.find((it) => it.dataset?.cell)
+  if (cell) return {name: `${name}.${cell.dataset.cell}`, box: cell}
+  return name.includes(".") && !view.el.shadowRoot?.querySelector(".peaks") ? {name, box: view.el} : null
 }
 
 function offerSweep(model, el) {
   const button = document.createElement("button")
-  Object.assign(button, {type: "button", className: "over", textContent: "error over this", hidden: true, popover: "manual"})
+  Object.assign(button, {type: "button", className: "over", textContent: "error over this", popover: "manual"})
   button.title = "Run the scenario over values of this setting"
   el.append(button)
-  let over = ""
-  const offer = (event) => {
-    if (event.composedPath().includes(button)) return
-    const found = settingAt(event)
-    if (!found) return withdraw()
-    over = found.name
-    const box = found.box.getBoundingClientRect()
-    button.hidden = false
-    button.setAttribute("aria-label", `Error over ${over}`)
-    button.style.top = `${box.top - 2}px`
+  let found = null, at = null
+
+  const place = () => {
+    const box = found?.box.getBoundingClientRect()
+    const seen = box && box.height > 0 && box.top >= 0 && box.bottom <= window.innerHeight
+    if (button.matches(":popover-open") !== Boolean(seen)) button.togglePopover(Boolean(seen))
+    if (!seen) return
+    button.style.top = `${box.top - 8}px`
     button.style.left = `${Math.max(box.right - button.offsetWidth, 0)}px`
-    if (!button.matches(":popover-open")) button.showPopover()
   }
-  const withdraw = () => {
-    if (button.matches(":popover-open")) button.hidePopover()
-    button.hidden = true
+  const offer = (event) => {
+    const under = event.composedPath()[0]
+    if (under === at || under === button) return
+    at = under
+    found = settingAt(event)
+    if (found) button.setAttribute("aria-label", `Error over ${found.name}`)
+    place()
   }
   button.onclick = () => {
-    withdraw()
-    model.send_msg({over})
+    model.send_msg({over: found.name})
+    found = null
+    place()
   }
-  document.addEventListener("pointerover", offer)
-  document.addEventListener("focusin", offer)
-  document.addEventListener("scroll", withdraw, true)
-  model.on("remove", () => {
-    document.removeEventListener("pointerover", offer)
-    document.removeEventListener("focusin", offer)
-    document.removeEventListener("scroll", withdraw, true)
-  })
+  // Not pointerover and focusin: between two parts of the page they do not leave its shadow tree.
+  const events = [["pointermove", offer], ["keyup", offer], ["scroll", place]]
+  for (const [name, act] of events) document.addEventListener(name, act, true)
+  model.on("remove", () => { for (const [name, act] of events) document.removeEventListener(name, act, true) })
 }

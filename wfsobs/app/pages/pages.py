@@ -17,6 +17,7 @@ from wfsobs.app.pages.figures import Figures
 from wfsobs.app.pages.identify import IdentifyPage
 from wfsobs.app.pages.model import ModelPage
 from wfsobs.app.pages.sweep import SweepPage
+from wfsobs.app.pages.sweep_views import report_part
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.store import Store
 from wfsobs.app.style import HEARD
@@ -81,6 +82,11 @@ class Pages(param.Parameterized):
         page = self.made[SWEEP]
         assert isinstance(page, SweepPage)
         page.choose(path)
+
+    def sweep_shown(self) -> dict[str, Any] | None:
+        """Return what a report has of the last sweep; None where there is none."""
+        page = self.made.get(SWEEP)
+        return report_part(page.results) if isinstance(page, SweepPage) and page.results else None
 
     def _turn(self, _event: object) -> None:
         name = self.current

@@ -73,7 +73,7 @@ class SweepPage(PageActions):
         self.legends = {target: html() for target in TARGETS}
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
         self.boxes = [box(target.capitalize(), self.legends[target], self.panes[target], self.maps[target]) for target in TARGETS]
-        self.shades = text(legend_of_shades())
+        self.shades = text(f"{legend_of_shades()} Click a cell to load its scenario in Explore.")
         self.visible, self._drawn = False, 0.0
         for part in (*self.boxes, self.shades):
             part.visible = False

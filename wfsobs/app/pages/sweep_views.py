@@ -23,6 +23,7 @@ from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.scenario import Scenario
 from wfsobs.settings.parameters import unit_of
+from wfsobs.typing import Array
 
 FULL_MARGIN = 0.3
 """Margin of the best from which its colour is full: the second is 30 % worse."""
@@ -30,6 +31,10 @@ FULL_MARGIN = 0.3
 GROUNDS = {False: "#FFFFFF", True: "#1E1E1E"}
 """What lies under the cells in light and dark mode."""
 
+MOST_ROWS = 3000
+"""Of the table in a report."""
+
+REPORT_COLUMNS = ("target", "mode", "observer", "seeds", "mean rms [nm]", "95 % [nm]", "")
 OPEN, DECIDED, WAITING, FAILED = "open", "decided", "waiting", "failed"
 
 
@@ -75,6 +80,33 @@ def map_grid(results: SweepResults, target: str, display: Display) -> dict[str, 
         "cells": [[_cell(results, i * count + j, target, display) for i in range(len(x.values))] for j in reversed(range(count))],
         "key": [[look(name).colour(display.dark), look(name).label] for name in names],
     }
+
+
+def report_part(results: SweepResults) -> dict[str, Any]:
+    """Describe the maps of every target and mode and the errors of all cells, as plain values for a report; errors in [nm]."""
+    groups = list(dict.fromkeys(key[1:] for key in results.known_keys()))
+    rows = results.rows()
+    axes = [axis.path for axis in results.sweep.axes]
+    return {
+        "maps": [map_grid(results, target, Display(mode=mode, unit="nm", dark=False)) for target, mode in groups],
+        "columns": [*(axis_title(results.sweep.base, path) for path in axes), *REPORT_COLUMNS],
+        "rows": [[*(value_of(row[path]) for path in axes), *_report_cells(row)] for row in rows[:MOST_ROWS]],
+        "left_out": max(0, len(rows) - MOST_ROWS),
+        "shades": legend_of_shades(),
+    }
+
+
+def _report_cells(row: dict[str, Any]) -> list[str]:
+    interval = "" if row["low_nm"] is None else f"{number(row['low_nm'])} – {number(row['high_nm'])}"
+    return [
+        row["target"],
+        row["mode"],
+        row_label(row["observer"]),
+        str(row["seeds"]),
+        number(row["mean_rms_nm"]),
+        interval,
+        row["rank"],
+    ]
 
 
 def _cell(results: SweepResults, cell: int, target: str, display: Display) -> dict[str, Any]:
@@ -134,7 +166,7 @@ def _channels(colour: str) -> list[int]:
 
 
 class SweepLines:
-    """Errors over one setting: a line per observer and bound, and the intervals of the means as bands."""
+    """Errors over one setting: a line per observer and bound, and the intervals of the means as bars."""
 
     def __init__(self, results: SweepResults, target: str):
         self.target, (axis,) = target, results.sweep.axes
@@ -143,7 +175,7 @@ class SweepLines:
         self.x = np.array(values if self.numeric else range(len(values)), dtype=float)
         order = np.argsort(self.x)
         self.order = order.tolist()
-        logarithmic = self.numeric and self.x.min() > 0 and self.x.max() / self.x.min() > 30
+        logarithmic = self.numeric and self.x.min() > 0 and _unevenness(np.log(self.x)) < _unevenness(self.x)
         low, high = float(self.x.min()), float(self.x.max())
         room = 0.03 * (high - low)
         ends = (low / 1.1, high * 1.1) if logarithmic else (low - room, high + room)
@@ -161,9 +193,9 @@ class SweepLines:
         self.sources, self.glyphs = {}, {}
         for name in (BOUND, BOUND_BOTH, *self.names):
             source = self.sources[name] = ColumnDataSource({"x": [], "y": [], "low": [], "high": []})
-            band = self.figure.varea("x", "low", "high", source=source, fill_alpha=0.12, level="underlay")
+            bar = self.figure.segment("x", "low", "x", "high", source=source, line_width=2, line_alpha=0.35, level="underlay")
             line = add_line(self.figure, name, source)
-            self.glyphs[name] = line, band, self.figure.scatter("x", "y", source=source, size=5)
+            self.glyphs[name] = line, bar, self.figure.scatter("x", "y", source=source, size=5)
 
     def draw(self, results: SweepResults, display: Display) -> None:
         """Send what is known of every line."""
@@ -183,16 +215,21 @@ class SweepLines:
 
     def restyle(self, dark: bool) -> None:
         """Set the colours of light or dark mode."""
-        for name, (line, band, dots) in self.glyphs.items():
+        for name, (line, bar, dots) in self.glyphs.items():
             colour = look(name).colour(dark)
-            line.glyph.line_color = band.glyph.fill_color = colour
+            line.glyph.line_color = bar.glyph.line_color = colour
             dots.glyph.update(line_color=colour, fill_color=colour)
+
+
+def _unevenness(x: Array) -> float:
+    """Return the range of the steps between sorted values over their mean; without steps to compare, 0."""
+    steps = np.diff(np.sort(x))
+    return float(np.ptp(steps) / steps.mean())
 
 
 def legend_of_shades() -> str:
     """Say what the shades of a map mean."""
     return (
         f"A full colour: the next is at least {100 * FULL_MARGIN:.0f} % worse. Striped: another does not differ significantly, "
-        f"or there are fewer than {FEWEST} seeds. Numbers are the mean rms error of the best. Click a cell to load its scenario "
-        "in Explore."
+        f"or there are fewer than {FEWEST} seeds. Numbers are the mean rms error of the best."
     )

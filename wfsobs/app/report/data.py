@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,7 +120,8 @@ class Report:
     """All of a report: states are the product of the variations, the last one running fastest.
 
     preset : what the settings are compared with; base : the settings that were varied; is_recorded : whether on a record
-    that was loaded or kept, not simulated from the settings; command : what makes the estimates of such a record again
+    that was loaded or kept, not simulated from the settings; command : what makes the estimates of such a record again;
+    sweep : maps of the last sweep, a title, axes, and cells row by row, and its rows
     """
 
     preset: str
@@ -128,6 +130,7 @@ class Report:
     states: tuple[State, ...]
     is_recorded: bool = False
     command: str = ""
+    sweep: Mapping[str, Any] | None = None
 
     @property
     def start(self) -> int:

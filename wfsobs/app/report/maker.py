@@ -6,8 +6,10 @@ import logging
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import Any
 
 import wfsobs
 from wfsobs.app.report.data import Report, state_of
@@ -28,12 +30,20 @@ class ReportError(Exception):
     """Why there is no report, in one line."""
 
 
-def make(results: RunResults, preset: str, watch: Watch, _tell: object = None, command: str = "") -> bytes:
+def make(
+    results: RunResults,
+    preset: str,
+    watch: Watch,
+    _tell: object = None,
+    command: str = "",
+    sweep: Mapping[str, Any] | None = None,
+) -> bytes:
     """Make the file of the results shown; blocks, so call it in a job. Raises ReportError, Cancelled.
 
-    command : what makes the estimates again, of a record that is not the simulation of the settings
+    command : what makes the estimates again, of a record that is not the simulation of the settings; sweep : what `Report` has
+    of a sweep
     """
-    content = pack(Report(preset, results.scenario, (), (state_of(results.result),), results.is_recorded, command))
+    content = pack(Report(preset, results.scenario, (), (state_of(results.result),), results.is_recorded, command, sweep))
     root = str(Path(wfsobs.__file__).parents[1])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}
     # A file, not a pipe: what a pipe has not taken when `communicate` times out is never sent.

@@ -19,6 +19,7 @@ def pack(report: Report) -> bytes:
         "base": to_toml(report.base),
         "recorded": report.is_recorded,
         "command": report.command,
+        "sweep": report.sweep,
         "variations": [[v.path, v.values] for v in report.variations],
         "states": [
             {
@@ -51,4 +52,6 @@ def unpack(content: bytes) -> Report:
         for s, of in zip(words["states"], lines, strict=True)
     )
     variations = tuple(Variation(path, tuple(values)) for path, values in words["variations"])
-    return Report(words["preset"], from_toml(words["base"]), variations, states, words["recorded"], words["command"])
+    return Report(
+        words["preset"], from_toml(words["base"]), variations, states, words["recorded"], words["command"], words["sweep"]
+    )

@@ -1,0 +1,68 @@
+"""A sweep in a browser: from a setting in the drawer to the cells, stopped and gone on with, a cell loaded and taken back."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from playwright.sync_api import Locator, Page, expect
+
+QUICK = "?run.duration=1&run.warm_up=0.2&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.3"
+
+
+def enter(page: Page, label: str, text: str) -> None:
+    box = page.get_by_role("textbox", name=label, exact=True)
+    box.fill(text)
+    box.press("Enter")
+
+
+def known(page: Page) -> Locator:
+    """The cells of which something is known."""
+    return page.get_by_role("region", name="Best observers, vibration, tip").locator('button:not([data-state="waiting"])')
+
+
+def test_a_map_comes_cell_by_cell_and_one_is_loaded(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK)
+    page.get_by_role("button", name="Sweep", exact=True).click()
+    expect(page.get_by_text(re.compile(r"5 × 4 scenarios × 4 seeds = 80 runs, about \d+ s"))).to_be_visible()
+    enter(page, "Values", "25:5:5")
+    expect(page.get_by_text("the first number must be below the second").first).to_be_visible()
+    expect(page.get_by_role("button", name="Run the sweep")).to_be_disabled()
+    enter(page, "Values", "5,20")
+    enter(page, "Values of the second", "5,10")
+    enter(page, "Seeds of each", "40")
+    expect(page.get_by_text("2 × 2 scenarios × 40 seeds = 160 runs")).to_be_visible()
+    page.get_by_role("button", name="Run the sweep").click()
+    expect(known(page)).to_have_count(4, timeout=120_000)  # each with its first seed
+    page.get_by_role("button", name="Stop").click()
+    expect(page.get_by_text(re.compile(r"Stopped · \d+ of 160 runs"))).to_be_visible()
+    expect(known(page)).to_have_count(4)
+    wind = page.get_by_role("textbox", name="Wind speed V₀ [m/s]")
+    expect(wind).to_have_value("15")
+    page.get_by_role("region", name="Best observers, vibration, tip").get_by_role(
+        "button", name=re.compile("^Wind speed V₀ 20, Exposure ratio n 10: ")
+    ).click()
+    expect(page.get_by_role("button", name="Explore", exact=True)).to_have_attribute("aria-pressed", "true")
+    expect(wind).to_have_value("20")
+    expect(page.get_by_role("textbox", name="Exposure ratio n")).to_have_value("10")
+    page.get_by_role("button", name="Undo", exact=True).click()
+    expect(wind).to_have_value("15")
+    page.go_back()
+    expect(page.get_by_role("button", name="Sweep", exact=True)).to_have_attribute("aria-pressed", "true")
+    expect(page.get_by_role("region", name="Best observers, vibration, tip")).to_be_visible()
+
+
+def test_error_over_a_setting_of_the_drawer(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK)
+    page.get_by_role("textbox", name="Peak 1: f [Hz]").hover()
+    expect(page.get_by_role("button", name="Error over vibration.peaks.0.frequency")).to_be_visible()
+    page.get_by_role("textbox", name="Exposure ratio n").hover()
+    page.get_by_role("button", name="Error over sensors.exposure_ratio").click()
+    expect(page.get_by_role("textbox", name="Values", exact=True)).to_have_value("1,6,10,15,20")
+    enter(page, "Values", "5,10")
+    enter(page, "Seeds of each", "3")
+    expect(page.get_by_text("2 scenarios × 3 seeds = 6 runs")).to_be_visible()
+    page.get_by_role("button", name="Run the sweep").click()
+    expect(page.get_by_text("Finished · 6 of 6 runs")).to_be_visible(timeout=90_000)
+    expect(page.get_by_role("figure", name="Error over Exposure ratio n, turbulence")).to_be_visible()
+    expect(page.get_by_role("button", name=re.compile(r"^Exposure ratio n 10: .*3 seeds$"))).to_have_count(2)
