@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from wfsobs.evaluation.rows import can_be_best, row_label
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
 from wfsobs.evaluation.verdict import BATCHES, LEVEL, differs, verdict
+from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import run
 from wfsobs.result import Result
 from wfsobs.scenario.presets import PRESETS
@@ -53,7 +54,9 @@ def test_the_best_is_the_least_error_of_the_table_and_the_sentence_has_its_numbe
             found = verdict(
                 result.scenario, result.record, result.estimates, result.scores, target, mode, simulation=result.scenario
             )
-            assert found is not None and found.best.observer == min(rivals, key=rivals.__getitem__)
+            least = min(rivals.values())
+            same = [name for name in OBSERVERS if rivals.get(name, np.inf) <= 1.001 * least]  # two ways of one filter
+            assert found is not None and found.best.observer == same[0]
             first = found.sentences()[0]
             assert first.startswith(f"{target.capitalize()}, {mode}: {row_label(found.best.observer)} ")
             # Three digits, so that half of the last is at most 0.5 %.

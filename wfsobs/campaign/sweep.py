@@ -281,7 +281,7 @@ class SweepResults:
         if evidence is None or not ranked:
             return None
         errors = [evidence.mean((name, target, mode)) or 0.0 for name in ranked[:2]]
-        margin = errors[1] / errors[0] - 1.0 if len(errors) > 1 and errors[0] > 0 else None
+        margin = max(errors[1] / errors[0] - 1.0, 0.0) if len(errors) > 1 and errors[0] > 0 else None
         return Winner(ranked[0], errors[0], margin, evidence.leaders(target, mode)[1:], evidence.n_seeds)
 
     def error(self, cell: int, key: Key) -> tuple[float, float, float] | None:

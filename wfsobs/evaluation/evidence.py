@@ -11,6 +11,7 @@ from scipy.stats import t as student
 
 from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best
 from wfsobs.evaluation.scores import BOUNDS, Score
+from wfsobs.observers import OBSERVERS
 from wfsobs.typing import Array
 
 LEVEL = 0.05
@@ -18,6 +19,9 @@ LEVEL = 0.05
 
 FEWEST = 3
 """Least number of seeds that say anything."""
+
+SAME = 1e-3
+"""Errors that differ by a smaller share of them are the same: two ways of one filter, or the third digit of a table."""
 
 Key = tuple[str, str, str]
 """Observer, target, mode."""
@@ -54,7 +58,7 @@ class Evidence:
     def ranking(self, target: str, mode: str) -> list[str]:
         """Return the observers that can be best, the smallest mean error first."""
         of = [key for key in self.errors if key[1:] == (target, mode) and can_be_best(key[0], False) and key[0] != NO_ESTIMATE]
-        return [key[0] for key in sorted(of, key=lambda key: float(self.errors[key].mean()))]
+        return rank({key[0]: float(self.errors[key].mean()) for key in of})
 
     def leaders(self, target: str, mode: str) -> tuple[str, ...]:
         """Return the observer with the smallest mean error, and all whose errors do not differ significantly from its own."""
@@ -63,6 +67,17 @@ class Evidence:
             return ()
         first = self.errors[ranked[0], target, mode]
         return (ranked[0], *(name for name in ranked[1:] if not differ_in_pairs(first, self.errors[name, target, mode])))
+
+
+def rank(errors: Mapping[str, float]) -> list[str]:
+    """Order observers by their errors, the smallest first; of those that are the SAME as the smallest the first in the tables.
+
+    >>> rank({"gp-both": 15.10, "kf-lgs": 40.0, "multirate-multi": 15.11})
+    ['multirate-multi', 'gp-both', 'kf-lgs']
+    """
+    ranked = sorted(errors, key=errors.__getitem__)
+    same = [name for name in OBSERVERS if name in errors and errors[name] <= errors[ranked[0]] * (1.0 + SAME)]
+    return [*same[:1], *(name for name in ranked if name not in same[:1])]
 
 
 def gather_evidence(seeds: Sequence[Iterable[Score]]) -> Evidence:

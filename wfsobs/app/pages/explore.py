@@ -43,6 +43,8 @@ TALL: Mapping[str, Any] = MappingProxyType(
 """A figure as high as the window has room for, so that a target has its verdict, its cards and its figures in one view."""
 
 GAP = ":host { gap: 10px; }"
+SMALL_LABEL = ".MuiFormControlLabel-label.MuiTypography-root { font-size: 0.8125rem; }"
+"""As large as that of the buttons beside it."""
 ZOOMS: Mapping[str, float | None] = MappingProxyType({"Whole record": None, "2 s": 2.0, "0.2 s": 0.2})
 MARKS = macro("marks", PEAKS, MODEL)
 
@@ -87,13 +89,16 @@ class Explore:
             group(self.display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS}),
             group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
             self._zoom_buttons(),
-            pmui.Checkbox.from_param(self.display.param.windowed, size="small", margin=0),
-            *([pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0)] if self.seeds else []),
+            self._tick("windowed"),
+            *([self._tick("editing")] if self.seeds else []),
             *self.pinning.view(),
             gap="12px",
             align_items="center",
             **WIDE,
         )
+
+    def _tick(self, switch: str) -> pmui.Checkbox:
+        return pmui.Checkbox.from_param(self.display.param[switch], size="small", margin=0, stylesheets=[SMALL_LABEL])
 
     def _above_table(self) -> pn.FlexBox:
         seeds = SeedSwitch(self.seeds).view() if self.seeds else []

@@ -40,7 +40,7 @@ def step_gp_both(prior: Prior, settings: GaussianProcess, sampling: Sampling, _h
 
 GP_BOTH = Observer(
     "gp-both",
-    "GP in time, both",
+    "GP in time on both",
     TARGETS,
     gp_both,
     help="that of `gp-lgs` on both sensors; not in the paper",
