@@ -141,5 +141,5 @@ def test_a_scenario_made_before_has_the_settings_too() -> None:
 
 def test_groups_of_our_own_stand_in_the_order_of_the_registry() -> None:
     names = [s.name for s in sections().values()]
-    assert names == ["multipeak", "adaptive", "multirate", "gpr_offline", "gpr_online"]
+    assert names == ["multipeak", "adaptive", "multirate", "gp", "gpr_offline", "gpr_online"]
     assert [name for name in Scenario.settings() if name in names] == names

@@ -72,7 +72,7 @@ class TestRms:
 
     def test_only_of_linear_observers_of_the_lgs(self) -> None:
         names = set(predictions(PRESETS["paper"](), "vibration"))
-        assert names == {TRUTH, BOUND, "kf-lgs", "kf-multi", "butterworth-cl", "zero"}
+        assert names == {TRUTH, BOUND, "kf-lgs", "kf-multi", "gp-lgs", "butterworth-cl", "zero"}
         assert all(OBSERVERS[name].linear for name in names - {TRUTH, BOUND})
 
     def test_none_where_events_change_the_spectra(self) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Observer
-from wfsobs.prior import Prior, Training
+from wfsobs.prior import Lines, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -27,6 +27,9 @@ T = TypeVar("T")
 
 MODELS = frozenset(("kalman", "butterworth"))
 """Groups of what all observers are told."""
+
+LINES = "multipeak"
+"""Group of how the lines are told, to those that ask for them."""
 
 
 class Memo:
@@ -110,14 +113,17 @@ def simulate_once(scenario: Scenario, memo: Memo | None = None, watch: Watch = Q
 def observers_reached(before: Scenario, now: Scenario) -> set[str] | None:
     """Return the observers that a change of settings may reach, before their priors are built; None where the record changes.
 
-    A group of an observer's own reaches that observer; training data those that ask for it; the model and the bands of all
-    observers those that ask for a prior.
+    A group of an observer's own reaches that observer; training data and lines those that ask for them; the model and the bands
+    of all observers those that ask for a prior.
     """
     if record_settings(before) != record_settings(now):
         return None
     changed = {name for name, used in now.effective_values().items() if used != before.effective_values()[name]}
-    shared, trained = changed & MODELS, training_settings(before) != training_settings(now)
-    return {o.id for o in OBSERVERS.values() if o.group in changed or (shared and o.prior) or (trained and Training in o.prior)}
+    parts = {Lines} if LINES in changed else set()
+    if training_settings(before) != training_settings(now):
+        parts.add(Training)
+    shared = bool(changed & MODELS)
+    return {o.id for o in OBSERVERS.values() if o.group in changed or (shared and o.prior) or parts.intersection(o.prior)}
 
 
 class RecordMemo:

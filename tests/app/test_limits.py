@@ -17,6 +17,7 @@ from wfsobs.app.service import Full, Service
 from wfsobs.app.share import from_query, to_file
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults
+from wfsobs.cli.serve import serve
 from wfsobs.cost import run_bytes, run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS, paper
@@ -185,24 +186,13 @@ def test_limits_are_on_unless_only_this_machine_reaches_the_page(given: dict[str
 
 
 def test_every_limit_has_a_flag() -> None:
-    flags = {"max_duration": 1, "max_training_size": 2, "max_depth": 3, "max_seconds": 4, "max_memory": 5, "max_sessions": 6}
+    names = ["duration", "training_size", "depth", "seconds", "sweep_seconds", "megabytes", "sessions"]
+    flags = {"max_memory" if name == "megabytes" else f"max_{name}": i for i, name in enumerate(names, start=1)}
     limits = options(**flags).limits
-    assert (limits.duration, limits.training_size, limits.depth, limits.seconds, limits.megabytes, limits.sessions) == (
-        1,
-        2,
-        3,
-        4,
-        5,
-        6,
-    )
-    assert {f.name for f in fields(Limits)} - {"steps", "items"} == {
-        "duration",
-        "training_size",
-        "depth",
-        "seconds",
-        "megabytes",
-        "sessions",
-    }
+    assert [getattr(limits, name) for name in names] == list(flags.values())
+    assert {f.name for f in fields(Limits)} - {"steps", "items"} == set(names)
+    given = {option.name for option in serve.params}
+    assert set(flags) <= given
 
 
 def test_pages_come_from_where_the_server_is_reached() -> None:

@@ -237,6 +237,7 @@ def test_every_tunable_setting_is_read() -> None:
             "adaptive.window": 2.5,  # and the record holds two of them, half a second apart
             "kalman.measurement_noise": "manual",
             "multirate.measurement_noise": "manual",
+            "gp.background_rms": 0.02,
         }
     )
     record = simulate(base)

@@ -32,6 +32,9 @@ from wfsobs.settings.errors import SettingError
 @click.option("--max-training-size", type=click.IntRange(2), metavar="M", help="Maximum training size of a GPR.")
 @click.option("--max-depth", type=click.IntRange(1), metavar="D", help="Maximum window length of a GPR.")
 @click.option("--max-seconds", type=click.FloatRange(0, min_open=True), metavar="S", help="Maximum estimated time of a run.")
+@click.option(
+    "--max-sweep-seconds", type=click.FloatRange(0, min_open=True), metavar="S", help="Maximum estimated time of a sweep."
+)
 @click.option("--max-memory", type=click.FloatRange(0, min_open=True), metavar="MB", help="Maximum estimated memory of a run.")
 @click.option("--max-sessions", type=click.IntRange(1), metavar="N", help="Maximum number of open pages.")
 @click.option(
