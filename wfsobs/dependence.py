@@ -16,7 +16,7 @@ import numpy as np
 
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate, Observer
-from wfsobs.prior import Lines, Prior, Training
+from wfsobs.prior import Lines, Part, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -119,7 +119,7 @@ def observers_reached(before: Scenario, now: Scenario) -> set[str] | None:
     if record_settings(before) != record_settings(now):
         return None
     changed = {name for name, used in now.effective_values().items() if used != before.effective_values()[name]}
-    parts = {Lines} if LINES in changed else set()
+    parts: set[Part] = {Lines} if LINES in changed else set()
     if training_settings(before) != training_settings(now):
         parts.add(Training)
     shared = bool(changed & MODELS)

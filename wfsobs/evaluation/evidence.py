@@ -58,7 +58,7 @@ class Evidence:
     def ranking(self, target: str, mode: str) -> list[str]:
         """Return the observers that can be best, the smallest mean error first."""
         of = [key for key in self.errors if key[1:] == (target, mode) and can_be_best(key[0], False) and key[0] != NO_ESTIMATE]
-        return rank({key[0]: float(self.errors[key].mean()) for key in of})
+        return rank_observers({key[0]: float(self.errors[key].mean()) for key in of})
 
     def leaders(self, target: str, mode: str) -> tuple[str, ...]:
         """Return the observer with the smallest mean error, and all whose errors do not differ significantly from its own."""
@@ -69,10 +69,10 @@ class Evidence:
         return (ranked[0], *(name for name in ranked[1:] if not differ_in_pairs(first, self.errors[name, target, mode])))
 
 
-def rank(errors: Mapping[str, float]) -> list[str]:
+def rank_observers(errors: Mapping[str, float]) -> list[str]:
     """Order observers by their errors, the smallest first; of those that are the SAME as the smallest the first in the tables.
 
-    >>> rank({"gp-both": 15.10, "kf-lgs": 40.0, "multirate-multi": 15.11})
+    >>> rank_observers({"gp-both": 15.10, "kf-lgs": 40.0, "multirate-multi": 15.11})
     ['multirate-multi', 'gp-both', 'kf-lgs']
     """
     ranked = sorted(errors, key=errors.__getitem__)

@@ -9,7 +9,7 @@ from math import sqrt
 import numpy as np
 from scipy.stats import t as student
 
-from wfsobs.evaluation.evidence import LEVEL, Evidence, differ_in_pairs, rank
+from wfsobs.evaluation.evidence import LEVEL, Evidence, differ_in_pairs, rank_observers
 from wfsobs.evaluation.known_lines import given_lines, is_near
 from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best, row_label
 from wfsobs.evaluation.scores import BOUND_BOTH, Score
@@ -86,7 +86,7 @@ def verdict(
     """
     of = [s for s in scores if (s.target, s.mode) == (target, mode)]
     rivals = {s.observer: s for s in of if can_be_best(s.observer, s.apart) and s.observer != NO_ESTIMATE}
-    ranked = [rivals[name] for name in rank({name: s.rms for name, s in rivals.items()})]
+    ranked = [rivals[name] for name in rank_observers({name: s.rms for name, s in rivals.items()})]
     truth = record.truth(target)
     if not ranked or truth is None or not ranked[0].truth_rms > 0:
         return None
