@@ -50,7 +50,7 @@ class Frame(JSComponent):
 
     width_px = param.Integer(0, doc="Width when the page opened [px].")
     wants_dark = param.Boolean(False, doc="Whether the visitor's system has a dark theme, unless one was chosen here.")
-    dark = param.Boolean(False, doc="Whether the page is dark; where it is not as wanted, the visitor has chosen so.")
+    chosen = param.Selector(default="", objects=["", "dark", "light"], doc="The theme that was chosen, for the browser to keep.")
     stale = param.Boolean(False, doc="Whether to fade the results.")
 
     _esm = asset("patch.js") + asset("frame.js")
@@ -143,10 +143,11 @@ class Dashboard:
         self.store.close()
 
     def _on_theme(self, event: param.parameterized.Event) -> None:
-        self.display.dark = self.frame.dark = event.new
+        self.display.dark = event.new
         if event.new != self.frame.wants_dark:
             self._theme_chosen = True
         if self._theme_chosen:
+            self.frame.chosen = "dark" if event.new else "light"
             self.view_state.choose_theme(event.new)
 
     def _top(self) -> pn.FlexBox:

@@ -15,19 +15,15 @@ function remembered() {
 
 function themes(model) {
   const system = matchMedia("(prefers-color-scheme: dark)")
-  let wanted = false
   const follow = () => {
     const chosen = remembered()
-    wanted = chosen ? chosen === "dark" : system.matches
-    model.wants_dark = wanted
+    model.wants_dark = chosen ? chosen === "dark" : system.matches
   }
   system.addEventListener("change", follow)
   model.on("remove", () => system.removeEventListener("change", follow))
-  model.on("dark", () => {
-    if (model.dark === wanted) return
-    wanted = model.dark
+  model.on("chosen", () => {
     try {
-      localStorage.setItem(THEME, wanted ? "dark" : "light")
+      localStorage.setItem(THEME, model.chosen)
     } catch { /* a browser that keeps nothing */ }
   })
   follow()

@@ -23,6 +23,7 @@ function offerSweep(model, el) {
   let found = null, at = null
 
   const place = () => {
+    if (!button.isConnected) return // drawn anew, and not in the page yet or no longer
     const box = found?.box.getBoundingClientRect()
     const seen = box && box.height > 0 && box.top >= 0 && box.bottom <= window.innerHeight
     if (button.matches(":popover-open") !== Boolean(seen)) button.togglePopover(Boolean(seen))
