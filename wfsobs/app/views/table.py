@@ -17,6 +17,7 @@ from wfsobs.app.render import Row, macro, table
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset, observers_of, swatch
 from wfsobs.app.work import RunResults
+from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.rows import (
     NOT_OBSERVERS,
     can_be_best,
@@ -118,8 +119,8 @@ class Table:
         evidence = self.seeds.evidence if self.seeds else None
         if evidence and (leaders := evidence.leaders(target, self.display.mode)):
             return dict.fromkeys(leaders, TIED if len(leaders) > 1 else BEST)
-        best = min((s.rms for n, s in scores.items() if s and can_be_best(n, s.apart)), default=None)
-        return {n: BEST for n, s in scores.items() if s and s.rms == best and can_be_best(n, s.apart)}
+        rivals = {n: s.rms for n, s in scores.items() if s and can_be_best(n, s.apart)}
+        return dict.fromkeys(rank_observers(rivals)[:1], BEST)
 
     def _over_seeds(self, name: str, target: str, scale: float) -> Markup:
         """Write the interval of the mean error over several seeds, to stand before that of the record."""
