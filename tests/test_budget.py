@@ -14,7 +14,8 @@ from scipy.linalg import solve_discrete_lyapunov
 
 import wfsobs
 from wfsobs.cli import main
-from wfsobs.evaluation.budget import AVERAGED, TERMS, Budget, _shapley_share, error_budget
+from wfsobs.evaluation.budget import AVERAGED, TERMS, Budget, error_budget
+from wfsobs.evaluation.responses import _shapley_share
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.evaluation.sources import split_lines, split_record, sum_sources
 from wfsobs.observers.kalman.single import steady_filter

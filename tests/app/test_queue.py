@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.app.cache import Cache
-from wfsobs.app.controls.panel import status_of
+from wfsobs.app.controls.status import status_of
 from wfsobs.app.jobs import queue as module
 from wfsobs.app.jobs.job import CANCELLED, CLICK, DONE, FAILED, LONG, RUNNING, SWEEP, Job
 from wfsobs.app.jobs.queue import JobQueue

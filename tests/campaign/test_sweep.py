@@ -12,7 +12,8 @@ from scipy.stats import t as student
 from scipy.stats import ttest_rel
 
 import wfsobs
-from wfsobs.campaign.sweep import EACH_RUN, MOST_CELLS, SweepResults, parse_axis, plan_sweep, run_sweep
+from wfsobs.campaign.sweep import EACH_RUN, MOST_CELLS, parse_axis, plan_sweep
+from wfsobs.campaign.sweep_results import SweepResults, run_sweep
 from wfsobs.cli import main
 from wfsobs.evaluation.scores import BOUND, Score
 from wfsobs.scenario import Scenario

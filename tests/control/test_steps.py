@@ -11,7 +11,7 @@ import pytest
 import wfsobs
 from wfsobs import PRESETS, simulate
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.observers.step import StepError
+from wfsobs.observers.step_checks import StepError
 from wfsobs.prior import Lines
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.record import Record

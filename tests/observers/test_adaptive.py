@@ -17,7 +17,7 @@ from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record, RecordError, delay_signal
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.riccati import RiccatiError
+from wfsobs.signal.filter_covariance import RiccatiError
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.densities import densities
 from wfsobs.spectral.model import Spectrum

@@ -12,7 +12,8 @@ from wfsobs.app.pages.sweep_views import report_part
 from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.packing import pack, unpack
 from wfsobs.app.report.page import page
-from wfsobs.campaign.sweep import SweepResults, parse_axis, plan_sweep
+from wfsobs.campaign.sweep import parse_axis, plan_sweep
+from wfsobs.campaign.sweep_results import SweepResults
 from wfsobs.evaluation.scores import Score
 from wfsobs.result import Result
 from wfsobs.scenario import Scenario

@@ -13,7 +13,8 @@ from panel.util.parameters import edit_readonly
 from wfsobs.app.actions import Actions
 from wfsobs.app.connection import Connection
 from wfsobs.app.controls.names import name_settings
-from wfsobs.app.controls.panel import Controls, waiting_text
+from wfsobs.app.controls.panel import Controls
+from wfsobs.app.controls.status import waiting_text
 from wfsobs.app.display import Display
 from wfsobs.app.help import Help
 from wfsobs.app.jobs.job import FAILED

@@ -12,7 +12,8 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.limits import Limits
 from wfsobs.app.seeds import SeedScores
 from wfsobs.app.service import Session
-from wfsobs.campaign.sweep import Sweep, SweepResults, run_cell
+from wfsobs.campaign.sweep import Sweep
+from wfsobs.campaign.sweep_results import SweepResults, run_cell
 from wfsobs.progress import Watch
 from wfsobs.settings.errors import SettingError
 

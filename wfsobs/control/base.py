@@ -27,7 +27,7 @@ from wfsobs.control.step_laws import Integrators, LinearLaws, StepLaw, StepPredi
 from wfsobs.observers.base import NOTHING, PLAIN, Look
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
-from wfsobs.observers.step import StepError
+from wfsobs.observers.step_checks import StepError
 from wfsobs.prior import PARTS, Bands, Part, Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling

@@ -10,7 +10,8 @@ import numpy as np
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers.kalman.step import carry_state
-from wfsobs.observers.step import Estimator, StepError
+from wfsobs.observers.step import Estimator
+from wfsobs.observers.step_checks import StepError
 from wfsobs.prior import Bands, Prior
 from wfsobs.record import Sampling
 from wfsobs.signal.bandpass import bandpass_bank, bank_recursion

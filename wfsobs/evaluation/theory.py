@@ -31,14 +31,8 @@ from wfsobs.record import Measurements
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import expected_psd
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, error_spectrum, factorise
-from wfsobs.simulation.true_spectra import (
-    TrueSpectra,
-    TurbulenceSpectra,
-    has_known_spectra,
-    n_frequencies,
-    true_spectra,
-    turbulence_spectra,
-)
+from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, n_frequencies, true_spectra
+from wfsobs.simulation.turbulence_spectra import TurbulenceSpectra, turbulence_spectra
 from wfsobs.typing import Array
 
 TRUTH = "truth"

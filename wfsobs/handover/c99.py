@@ -14,7 +14,7 @@ import numpy as np
 from wfsobs.files import write_whole
 from wfsobs.handover.linear import LinearDesign, predicts_itself
 from wfsobs.handover.vectors import Vectors
-from wfsobs.observers.step import StepError
+from wfsobs.observers.step_checks import StepError
 from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from wfsobs.control.step import StepController
 from wfsobs.control.step_laws import Integrators, LinearLaws
-from wfsobs.observers.step import StepError
+from wfsobs.observers.step_checks import StepError
 from wfsobs.signal.stepping import GainCycle
 from wfsobs.typing import Array
 

@@ -16,7 +16,7 @@ from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record, RecordError, hold_last, pseudo_open_loop
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.ar3 import Ar3
-from wfsobs.signal.riccati import RiccatiError
+from wfsobs.signal.filter_covariance import RiccatiError
 from wfsobs.spectral.periodogram import fast_length, periodogram
 from wfsobs.spectral.search import LOWEST, PAD, Candidate, SearchResult, search_peaks
 from wfsobs.typing import Array

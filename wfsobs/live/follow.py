@@ -13,7 +13,8 @@ from wfsobs.live.blocks import check_live
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.source import SimulatedSource
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.step import StepError, StepObserver
+from wfsobs.observers.step import StepObserver
+from wfsobs.observers.step_checks import StepError
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import design

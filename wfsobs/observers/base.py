@@ -11,7 +11,8 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any, NamedTuple
 
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
-from wfsobs.observers.step import MakeEstimator, StepError, StepObserver
+from wfsobs.observers.step import MakeEstimator, StepObserver
+from wfsobs.observers.step_checks import StepError
 from wfsobs.prior import PARTS, Part, Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Record, Sampling

@@ -16,7 +16,7 @@ from wfsobs.observers.gpr.inputs import scale_of, scales_of, training_signals, t
 from wfsobs.observers.gpr.kernels import sliding_products, square_from_band
 from wfsobs.observers.gpr.offline import OFFLINE, OfflineGpr, training_targets
 from wfsobs.observers.per_mode import over_modes
-from wfsobs.observers.step import whole_frames
+from wfsobs.observers.step_checks import whole_frames
 from wfsobs.observers.windows import LinearPredictor, Windows
 from wfsobs.prior import Bands, Prior, Training
 from wfsobs.progress import QUIET, Watch

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs.observers.gpr.inputs import Gpr, Scale, StreamingInputs
-from wfsobs.observers.step import StepError
+from wfsobs.observers.step_checks import StepError
 from wfsobs.record import Sampling
 from wfsobs.signal.stepping import Saved
 from wfsobs.typing import Array

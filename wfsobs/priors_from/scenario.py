@@ -23,15 +23,9 @@ from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
 from wfsobs.simulation.guide_stars import lgs_error_process, lgs_noise_rms, lgs_weights
 from wfsobs.simulation.layers import relative_rms
 from wfsobs.simulation.sensor_noise import noise_rms
-from wfsobs.simulation.true_spectra import (
-    TrueSpectra,
-    has_known_spectra,
-    lgs_turbulence_spectrum,
-    n_frequencies,
-    true_spectra,
-    turbulence_spectra,
-)
+from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, lgs_turbulence_spectrum, n_frequencies, true_spectra
 from wfsobs.simulation.turbulence import processes, turbulence_process, turbulence_rms
+from wfsobs.simulation.turbulence_spectra import turbulence_spectra
 from wfsobs.typing import Array
 
 

@@ -7,24 +7,21 @@ a controller they are taken `line_width` wide at half maximum.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import pi
-from typing import NamedTuple
 
 import numpy as np
 
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.wiener import Complex
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.disturbance import peak_rms, pure_lines, vibration_power
-from wfsobs.simulation.flow_spectra import flow_spectra
-from wfsobs.simulation.guide_stars import lgs_noise_rms, lgs_weights, low_frequency_process
+from wfsobs.simulation.guide_stars import lgs_noise_rms, lgs_weights
 from wfsobs.simulation.sensor_noise import noise_rms
 from wfsobs.simulation.synthesis import damping_for_width, line_width, widen_lines
-from wfsobs.simulation.turbulence import processes, table_variance, third_order_process, turbulence_process
+from wfsobs.simulation.turbulence import processes, turbulence_process
+from wfsobs.simulation.turbulence_spectra import TURBULENCE_SPECTRA, TurbulenceSpectra, density, turbulence_spectra
 from wfsobs.typing import Array
 
 DECAYED = 2.5
@@ -173,11 +170,6 @@ def lgs_turbulence_spectrum(scenario: Scenario, mode: int) -> Array:
     return turbulence_spectra(scenario, mode, n_frequencies(scenario)).measurement
 
 
-def turbulence_spectra(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
-    """Return the spectra of the turbulence of one mode alone, for a DFT of `n` steps."""
-    return TURBULENCE_SPECTRA[scenario.turbulence.source](scenario, mode, n)
-
-
 def n_frequencies(scenario: Scenario) -> int:
     """Return the length of the DFT, a power of two: the slowest correlation has decayed by its half."""
     return min(_wanted_frequencies(scenario), MOST)
@@ -216,60 +208,6 @@ def _decay_rates(scenario: Scenario) -> list[float]:
     return rates
 
 
-def _density(process: Ar2 | Ar3, n: int) -> Array:
-    """Return the spectrum of an autoregressive process, per sample."""
-    return process.psd(np.fft.rfftfreq(n, process.dt)) / (2.0 * process.dt)
-
-
-class TurbulenceSpectra(NamedTuple):
-    """Spectra of turbulence, per sample, as `FlowSpectra`; the combined LGS with its errors."""
-
-    own: Array
-    measurement: Array
-    cross: Complex | Array
-    ngs: Array
-    ngs_cross: Complex | Array
-    sensors_cross: Complex | Array
-
-
-def _through_lgs(scenario: Scenario, mode: int, own: Array) -> TurbulenceSpectra:
-    """Return the spectra of turbulence that is common to all stars, each LGS with a slow error of its own."""
-    weights = lgs_weights(scenario)[mode, :, mode]
-    error = _density(low_frequency_process(scenario, mode), 2 * (own.size - 1)) * np.sum(weights**2)
-    blind = scenario.sensors.tip_tilt_indetermination and scenario.modes[mode].radial_order == 1
-    gain = 0.0 if blind else weights.sum()
-    return TurbulenceSpectra(own, gain**2 * own + error, gain * own, own, own, gain * own)
-
-
-def _ar2_turbulence(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
-    return _through_lgs(scenario, mode, _density(turbulence_process(scenario, mode, scenario.dt), n))
-
-
-def _ar3_turbulence(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
-    return _through_lgs(scenario, mode, _density(third_order_process(scenario, mode, scenario.dt), n))
-
-
-def _sum_of_processes(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
-    own = [_density(p, n) for p in processes(scenario, mode, scenario.dt)]
-    return _through_lgs(scenario, mode, sum(own, np.zeros(n // 2 + 1)))
-
-
-def _no_turbulence(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
-    return _through_lgs(scenario, mode, np.zeros(n // 2 + 1))
-
-
-def _table(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
-    return _through_lgs(scenario, mode, 0.5 * n * table_variance(scenario, mode, n))
-
-
-def _frozen_flow(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
-    # Along the wind the spectrum falls as f^2 to zero at 0 Hz, a notch that the DFT does not resolve: here it is a bin wide.
-    frequency = np.hypot(np.fft.rfftfreq(n, scenario.dt), 1.0 / (n * scenario.dt))
-    found = flow_spectra(scenario, mode, frequency)
-    scaled = {id(part): 0.5 / scenario.dt * part for part in found}  # on the axis the NGS shares its arrays with the truth
-    return TurbulenceSpectra(*(scaled[id(part)] for part in found))
-
-
 def _vibration(scenario: Scenario, mode: int, n: int) -> Array:
     v, dt = scenario.vibration, scenario.dt
     if v.source == "ar2":
@@ -277,7 +215,7 @@ def _vibration(scenario: Scenario, mode: int, n: int) -> Array:
         for peak in v.peaks:
             omega = 2.0 * pi * peak.frequency
             damping = damping_for_width(line_width(scenario), peak.frequency, peak.damping)
-            out += _density(Ar2(omega, damping, peak_rms(peak.rms, mode), dt), n)
+            out += density(Ar2(omega, damping, peak_rms(peak.rms, mode), dt), n)
         return out
     return 0.5 * n * vibration_power(scenario, mode, n)
 
@@ -288,14 +226,3 @@ def _pure_lines(scenario: Scenario, mode: int, n: int) -> Array | None:
     for frequency, variance in pure_lines(scenario, mode):
         power[min(round(frequency * n * scenario.dt), n // 2)] += variance
     return widen_lines(0.5 * n * power, line_width(scenario) * scenario.dt) if power.any() else None
-
-
-TURBULENCE_SPECTRA: dict[str, Callable[[Scenario, int, int], TurbulenceSpectra]] = {
-    "ar2": _ar2_turbulence,
-    "ar3": _ar3_turbulence,
-    "processes": _sum_of_processes,
-    "frozen-flow": _frozen_flow,
-    "psd": _table,
-    "none": _no_turbulence,
-}
-"""Source of turbulence -> its spectra."""

@@ -12,7 +12,7 @@ import panel_material_ui as pmui
 from bokeh.plotting import figure
 
 from wfsobs.app.controls.names import name_settings
-from wfsobs.app.controls.panel import Status
+from wfsobs.app.controls.status import Status
 from wfsobs.app.copies import EXPLORED, CopiedTask
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs.job import CANCELLED, DONE, RUNNING

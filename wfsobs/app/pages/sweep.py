@@ -11,22 +11,21 @@ import panel as pn
 import panel_material_ui as pmui
 import param
 
-from wfsobs.app.controls.fields import number_text, parse_number
-from wfsobs.app.controls.names import name_settings
+from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.copies import SWEEP, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save, table_csv
 from wfsobs.app.jobs.job import RUNNING
 from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
+from wfsobs.app.pages.sweep_settings import line_of, read_axis, sweep_settings, usual_values
 from wfsobs.app.pages.sweep_views import SweepLines, SweepMap, axis_title, legend_of_shades, map_grid
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.sweep_work import SweepTask
-from wfsobs.campaign.sweep import MOST_SEEDS, SEED, Sweep, SweepResults, parse_axis, plan_sweep
+from wfsobs.campaign.sweep import MOST_SEEDS, Sweep, plan_sweep
+from wfsobs.campaign.sweep_results import SweepResults
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.scenario import Scenario
-from wfsobs.scenario.grid import Variation
 from wfsobs.settings.errors import SettingError
 
 INTRO = (
@@ -123,27 +122,30 @@ class SweepPage(PageActions):
         """Return the sweep that the fields describe. Raises SettingError."""
         if self.store.source is not None:
             raise SettingError("A sweep simulates the settings: go back to the simulation first")
-        axes = [
-            read_axis(select.value, values.value)
-            for select, values in zip(self.settings, self.values, strict=True)
-            if select.value != NONE
-        ]
+        axes = [read_axis(path, values) for path, values in self._axes()]
         seeds = parse_number(str(self.seeds.value))
         if not isinstance(seeds, int):
             raise SettingError(f"Seeds of each = {str(seeds)[:40]!r}: takes a whole number from 1 to {MOST_SEEDS}")
-        quick = [o.id for o in OBSERVERS.values() if not o.slow]
-        sweep = plan_sweep(self.store.scenario, axes, seeds, quick if self.observers.value == QUICK else None)
+        sweep = plan_sweep(self.store.scenario, axes, seeds, self._observers())
         for cell in sweep.edge:
             self.store.limits.check(sweep.scenario(cell))
         self.store.limits.check_sweep(sweep.seconds, sweep.n_runs)
         return sweep
+
+    def _axes(self) -> list[tuple[str, str]]:
+        """Return the settings that are chosen, and their values as they were typed."""
+        return [(s.value, v.value) for s, v in zip(self.settings, self.values, strict=True) if s.value != NONE]
+
+    def _observers(self) -> list[str] | None:
+        """Return the ids of the observers; None for all."""
+        return [o.id for o in OBSERVERS.values() if not o.slow] if self.observers.value == QUICK else None
 
     def start(self) -> None:
         """Run the sweep that the fields describe, or say in one line why not."""
         try:
             sweep = self.plan()
         except SettingError as error:
-            self.work.refuse(_line_of(error))
+            self.work.refuse(line_of(error))
         else:
             self.lines = {}
             self.work.begin(sweep)
@@ -156,7 +158,7 @@ class SweepPage(PageActions):
         try:
             self.store.run_on(None, results.sweep.scenario(cell))
         except SettingError as error:
-            self.work.refuse(_line_of(error))
+            self.work.refuse(line_of(error))
         else:
             self._explore()
 
@@ -168,13 +170,8 @@ class SweepPage(PageActions):
     @property
     def task(self) -> CopiedTask:
         """To run the sweep."""
-        given = [
-            f"{select.value}={values.value}"
-            for select, values in zip(self.settings, self.values, strict=True)
-            if select.value != NONE
-        ]
-        chosen = [o.id for o in OBSERVERS.values() if not o.slow] if self.observers.value == QUICK else []
-        return CopiedTask(SWEEP, {"over": given, "seeds": self.seeds.value, "observer": chosen})
+        over = [f"{path}={values}" for path, values in self._axes()]
+        return CopiedTask(SWEEP, {"over": over, "seeds": self.seeds.value, "observer": self._observers() or []})
 
     def saves(self) -> Mapping[str, Save | None]:
         """Offer the errors of all cells, as `wfsobs sweep --csv` writes them."""
@@ -199,7 +196,7 @@ class SweepPage(PageActions):
         try:
             sweep = self.plan()
         except SettingError as error:
-            said, kind = _line_of(error), "failure"
+            said, kind = line_of(error), "failure"
         else:
             counts = " × ".join(str(len(axis.values)) for axis in sweep.axes)
             said = f"{counts} scenarios × {sweep.seeds} seeds = {sweep.n_runs} runs, about {max(sweep.seconds, 1.0):.0f} s"
@@ -247,53 +244,5 @@ class SweepPage(PageActions):
 
     def _compare(self, *_: Any) -> None:
         """Whether all other settings are still those of the sweep."""
-        results = self.results
-        if results is None or not self.visible:
-            return
-        sweep, now = results.sweep, self.store.scenario
-        try:
-            self.stale.visible = now.replace({axis.path: sweep.value(0, axis.path) for axis in sweep.axes}) != sweep.scenario(0)
-        except SettingError:
-            self.stale.visible = True
-
-
-def _line_of(error: SettingError) -> str:
-    return name_settings(str(error).removeprefix("--over ").partition("\n")[0])
-
-
-def read_axis(path: str, values: str) -> Variation:
-    """Read the values of a setting as they were typed. Raises SettingError."""
-    if not values.strip():
-        raise SettingError(f"{path}: takes values, such as 5:20:4 or 5,10,20")
-    return parse_axis(f"{path}={values.replace('−', '-').strip()}")
-
-
-def sweep_settings(scenario: Scenario) -> dict[str, str]:
-    """Name -> path of every setting that a sweep can be over; those of lists, and those with one choice, are left out."""
-    lists = tuple(f"{path}." for path, _ in scenario.lists())
-    kinds = (param.Number, param.Selector, param.Boolean)
-    topics = Scenario.settings()
-    out = {}
-    for path, _, p in scenario.walk():
-        several = not isinstance(p, param.Selector) or len(p.objects) > 1
-        if path != SEED and isinstance(p, kinds) and several and not path.startswith(lists):
-            topic, name = str(topics[path.split(".")[0]].label), axis_title(scenario, path)
-            out[name if name.startswith(f"{topic}:") else f"{topic}: {name}"] = path
-    return out
-
-
-def usual_values(scenario: Scenario, path: str) -> str:
-    """Suggest values of a setting: over its usual range, or around its present value."""
-    p: Any = {known: p for known, _, p in scenario.walk()}[path]
-    if isinstance(p, param.Boolean):
-        return "false,true"
-    if isinstance(p, param.Selector):
-        return ",".join(map(str, p.objects))
-    least, most = p.bounds
-    now = float(scenario.lookup(path))
-    low, high = p.softbounds or ((0.5 * now, 2.0 * now) if now else (least, least + 1.0))
-    low, high = max(low, least), min(high, most)
-    if isinstance(p, param.Integer):
-        count = min(5, int(high) - int(low) + 1)
-        return ",".join(str(v) for v in dict.fromkeys(round(low + (high - low) * i / (count - 1)) for i in range(count)))
-    return f"{number_text(low)}:{number_text(high)}:5"
+        if self.visible and (results := self.results) is not None:
+            self.stale.visible = not results.sweep.has_base(self.store.scenario)

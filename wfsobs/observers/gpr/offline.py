@@ -35,7 +35,7 @@ from wfsobs.observers.gpr.kernels import (
 )
 from wfsobs.observers.gpr.online import kernel_of
 from wfsobs.observers.per_mode import over_modes, turns
-from wfsobs.observers.step import whole_frames
+from wfsobs.observers.step_checks import whole_frames
 from wfsobs.observers.windows import Windows
 from wfsobs.prior import Bands, Prior
 from wfsobs.progress import QUIET, Watch

@@ -17,7 +17,7 @@ from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_conditi
 from wfsobs.observers.gpr.online_step import OnlineEstimator
 from wfsobs.observers.gpr.sliding import finish, run_lengths, slide
 from wfsobs.observers.per_mode import over_modes, turns
-from wfsobs.observers.step import whole_frames
+from wfsobs.observers.step_checks import whole_frames
 from wfsobs.observers.windows import Windows
 from wfsobs.prior import Bands, Part, Prior, Training
 from wfsobs.progress import QUIET, Watch

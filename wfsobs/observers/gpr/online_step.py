@@ -14,7 +14,7 @@ import numpy as np
 from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.late_regression import LateRegression
 from wfsobs.observers.gpr.sliding_regression import SlidingRegression
-from wfsobs.observers.step import StepError
+from wfsobs.observers.step_checks import StepError
 from wfsobs.observers.windows import Windows
 from wfsobs.prior import Bands
 from wfsobs.record import Sampling

@@ -18,7 +18,7 @@ from wfsobs.observers.kalman.window_model import (
     pack_spectrum,
     unpack_spectrum,
 )
-from wfsobs.observers.step import StepError
+from wfsobs.observers.step_checks import StepError
 from wfsobs.record import Sampling
 from wfsobs.signal.stepping import Saved
 from wfsobs.typing import Array

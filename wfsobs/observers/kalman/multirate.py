@@ -25,8 +25,9 @@ from wfsobs.prior import Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.settings import Group, Real, Section
+from wfsobs.signal.filter_covariance import posteriors_of_gains
 from wfsobs.signal.periodic import FilterStep, PeriodicFilter
-from wfsobs.signal.riccati import posteriors_of_gains, steady_state
+from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array

@@ -34,7 +34,8 @@ from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
-from wfsobs.signal.riccati import SteadyState, Step, periodic_steady_state
+from wfsobs.signal.filter_covariance import Step
+from wfsobs.signal.riccati import SteadyState, periodic_steady_state
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
 from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array

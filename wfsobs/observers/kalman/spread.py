@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, Estimates
 from wfsobs.observers.kalman.step import matrix_power
-from wfsobs.signal.riccati import lyapunov
+from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.signal.stepping import Gain
 from wfsobs.typing import Array

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.linalg import fractional_matrix_power
 
 from wfsobs.observers.missing import expected_rows
-from wfsobs.observers.step import StepError, whole_frames
-from wfsobs.signal.riccati import lyapunov
+from wfsobs.observers.step_checks import StepError, whole_frames
+from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.signal.stepping import FilterBank, GainCycle, Saved
 from wfsobs.typing import Array

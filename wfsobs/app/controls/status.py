@@ -1,0 +1,82 @@
+"""The bar at the top: its style, and the state of the run in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.controls.names import setting_name
+from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
+from wfsobs.app.store import Store
+from wfsobs.app.style import asset
+from wfsobs.observers import OBSERVERS
+
+ON_BAR = {
+    "color": "#fff",
+    "borderColor": "#fff",
+    "&.Mui-disabled": {"color": "#ffffff80", "borderColor": "#ffffff60"},
+    "&:hover": {"backgroundColor": "#ffffff30", "borderColor": "#fff", "color": "#fff"},
+    "@media (max-width: 600px)": {
+        "fontSize": 0,
+        "minWidth": "40px",
+        "height": "34px",
+        "padding": 0,
+        "& .MuiButton-startIcon": {"margin": 0, "fontSize": "22px"},
+    },
+}
+"""Buttons on the bar at the top, which is dark in either mode; on a phone their icons alone are seen."""
+
+BAR = ":host { align-items: center; }"
+
+STATUS_ON_BAR = """
+:host { color: #fff; }
+progress::-webkit-progress-value { background: #8fd3f0; }
+progress::-moz-progress-bar { background: #8fd3f0; }
+.line { white-space: nowrap; }
+.note { color: #ffc9c2; height: auto; }
+"""
+
+
+class Status(JSComponent):
+    """The state of the run in the browser."""
+
+    progress = param.Number(0.0, doc="Fraction done.")
+    text = param.String("", doc="The state, in words.")
+    note = param.String("", doc="What was refused.")
+    label = param.String("Progress of the run", doc="What the bar is the progress of.")
+
+    _esm = asset("status.js")
+    _stylesheets = [asset("status.css")]  # noqa: RUF012
+
+
+def status_of(store: Store) -> tuple[str, str]:
+    """Describe the run in one line, and what was refused in another."""
+    run = store.run
+    seconds = f" in {run.result.seconds:.2f} s{_share(run.result.ran)}" if run.result and run.state == DONE else ""
+    text = {
+        RUNNING: run.line(),
+        DONE: f"Done{seconds}",
+        CANCELLED: "Cancelled",
+        FAILED: "The run failed",
+    }.get(run.state, "")
+    if store.waiting:
+        text = waiting_text(store.waiting)
+    note = f"Not accepted: {', '.join(map(setting_name, store.errors))}" if store.errors else ""
+    return text, note
+
+
+def _share(ran: Sequence[str] | None) -> str:
+    """Say how many observers ran where not all did."""
+    return f", {len(ran)} of {len(OBSERVERS)} ran" if ran is not None and len(ran) < len(OBSERVERS) else ""
+
+
+def waiting_text(seconds: float) -> str:
+    """How long a run takes that waits to be asked for.
+
+    >>> waiting_text(12.3), waiting_text(1000.0)
+    ('About 12 s: press Run', 'About 17 min: press Run')
+    """
+    length = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+    return f"About {length}: press Run"
