@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from wfsobs.evaluation.budget import error_budget
 from wfsobs.evaluation.rows import can_be_best, row_label
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
-from wfsobs.evaluation.verdict import BATCHES, LEVEL, differs, verdict
+from wfsobs.evaluation.verdict import BATCHES, LEVEL, differs, explain_harm, verdict
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import run
 from wfsobs.result import Result
@@ -104,6 +105,56 @@ def test_a_filter_of_one_line_does_harm_at_the_others_and_not_where_there_are_no
     assert "LGS KF is worse than no estimate: it is given a model with one line" in by_name["paper"].sentences()[1]
     # With one line both filters have the same model.
     assert not by_name["one line"].harms and by_name["one line"].ties
+
+
+NAMES = {
+    "noise": "noise of the sensors",
+    "lag": "lag",
+    "lines": "not model",
+    "mismatch": "model mismatch",
+    "cone": "cone effect and aliasing",
+}
+
+
+CAUSED = {
+    "noise": ("vibration", {"sensors.lgs_noise": 0.2, "kalman.measurement_noise": "manual", "kalman.lgs_noise": 0.002}),
+    "cone": ("turbulence", {"sensors.lgs_low_frequency_rms": 2.0}),
+}
+"""A noise that the filters do not know; a slow error of the LGS larger than the turbulence."""
+
+
+@pytest.mark.parametrize("name", ["paper", "strong turbulence", *CAUSED])
+def test_who_does_harm_is_named_with_the_largest_term_of_its_error_budget(name: str) -> None:
+    target, changes = CAUSED.get(name, ("vibration", {}))
+    scenario = SCENARIOS["one line"].replace(changes) if changes else SCENARIOS[name]
+    result = run(scenario, observers=QUICK)
+    budgets = error_budget(result, observers=QUICK[:-1], mode="tip")
+    given = (scenario, result.record, result.estimates, result.scores, target, "tip")
+    found = verdict(*given, simulation=scenario, budgets=budgets)
+    assert found is not None and found.harms
+    errors = {s.observer: s.rms for s in result.scores if (s.target, s.mode) == (target, "tip")}
+    terms = {b.observer: b.terms for b in budgets if b.target == target}
+    sentences = found.sentences()[1:]
+    for harm in found.harms:
+        of = terms[harm.observer]
+        assert harm.cause == max(of, key=of.__getitem__)
+        # Rounding: the terms add up to the square of the error in the table.
+        assert harm.share == pytest.approx(of[harm.cause] / errors[harm.observer] ** 2, rel=1e-6)
+        (said,) = (s for s in sentences if row_label(harm.observer) in s.partition(" than no estimate")[0])
+        assert said.endswith(f"{NAMES[harm.cause]}.")
+        together = [
+            h.share for h in found.harms if h.cause == harm.cause and row_label(h.observer) in said.partition(" than no")[0]
+        ]
+        percent = re.search(r"(?:(\d+) %|all) of (?:its|their) error is", said)
+        assert percent and float(percent[1] or 100.0) == pytest.approx(100.0 * np.mean(together), abs=0.51)
+    if name in CAUSED:
+        assert {harm.cause for harm in found.harms if harm.observer.startswith(("kf", "multirate"))} == {name}
+
+
+def test_budgets_are_made_of_those_that_do_harm_and_of_a_simulation_alone() -> None:
+    result = run(SCENARIOS["paper"], observers=("kf-lgs", "kf-multi", "zero"))
+    assert {(b.observer, b.mode) for b in explain_harm(result, "tilt")} == {("kf-lgs", "tilt")}
+    assert not explain_harm(replace(result, record=replace(result.record, vibration=None)))
 
 
 def test_without_truth_there_is_no_verdict_and_without_a_simulation_no_lines() -> None:

@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from wfsobs.app.causes import Causes
 from wfsobs.app.display import Display
 from wfsobs.app.jobs.job import DONE, FAILED, RUNNING
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.views.budget import BudgetView, bar_data
+from wfsobs.app.views.verdict import VerdictLine
 from wfsobs.evaluation.budget import TERMS, Budget
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.simulation.loop import simulate
@@ -67,3 +69,21 @@ def test_negative_terms_lie_left_of_zero() -> None:
     np.testing.assert_allclose(data["left"], [0.0, 4.0, 0.0, -1.0, 7.0])
     np.testing.assert_allclose(data["right"], [4.0, 7.0, -1.0, -1.5, 9.0])
     assert data["share"] == ["53 %", "40 %", "-13 %", "-7 %", "27 %"]
+
+
+def test_the_verdict_says_the_largest_term_of_those_that_do_harm_when_it_is_known(make_store: Any, loop: Any) -> None:
+    store, display = make_store(), Display()
+    causes = Causes(store, display)
+    line = VerdictLine("vibration", store.run, display, None, causes)
+    store.start()
+    for mode in ("tip", "tilt"):
+        display.mode = mode
+        loop.until(lambda: store.run.state == DONE and bool(causes.budgets))
+        terms = {b.observer: b.terms for b in causes.budgets if (b.target, b.mode) == ("vibration", mode)}
+        assert max(terms["kf-lgs"], key=terms["kf-lgs"].__getitem__) == "lines"
+        assert "error is lines that they do not model." in line.html()
+        assert line.pane.object == line.html()
+    store.run_on(LoadedRecord(simulate(store.scenario), "mine", "key"), store.scenario)
+    assert not causes.budgets
+    loop.finish(store)
+    assert not causes.budgets and "error is lines" not in line.html()

@@ -41,3 +41,7 @@ def test_the_verdict_names_the_best_of_the_table_in_the_mode_and_unit_shown(open
     expect(sentences(page, "vibration")).to_contain_text(
         re.compile("than no estimate: (they are|it is) given a model with one line")
     )
+    # Known a moment later, from the error budgets.
+    expect(sentences(page, "vibration")).to_contain_text(
+        re.compile(r"% of (their|its) error is lines that (they do|it does) not model")
+    )

@@ -16,7 +16,7 @@ from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.cli.tables import score_table
 from wfsobs.evaluation.budget import Budget, budget_row, error_budget
 from wfsobs.evaluation.rows import TIME, Row
-from wfsobs.evaluation.verdict import verdict
+from wfsobs.evaluation.verdict import explain_harm, verdict
 from wfsobs.progress import Watch
 from wfsobs.result import Result
 
@@ -43,12 +43,12 @@ def show_table(table: Table) -> None:
     (console if console.is_terminal else Console(width=180)).print(table)
 
 
-def show_verdicts(result: Result) -> None:
-    """Print what the table of a simulated record says, a paragraph per target and mode."""
+def show_verdicts(result: Result, budgets: Sequence[Budget] = ()) -> None:
+    """Print what the table of a simulated record says, a paragraph per target and mode; budgets : those that are known."""
     of = dict.fromkeys((s.target, s.mode) for s in result.scores)
-    found = (
-        verdict(result.scenario, result.record, result.estimates, result.scores, *key, simulation=result.scenario) for key in of
-    )
+    known = [*explain_harm(result), *budgets]
+    given = result.scenario, result.record, result.estimates, result.scores
+    found = (verdict(*given, *key, simulation=result.scenario, budgets=known) for key in of)
     for it in found:
         if it is not None:
             click.echo("\n" + "\n".join(f"{'  ' * bool(i)}{line}" for i, line in enumerate(it.sentences())))

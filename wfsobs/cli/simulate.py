@@ -99,7 +99,7 @@ def run(
     budgets = find_budgets(result, budget_of or None) if budget or budget_of else []
     show(add_budgets(all_rows, budgets), as_json)
     if seeds == 1 and not as_json:
-        show_verdicts(result)
+        show_verdicts(result, budgets)
         show_budgets(budgets)
 
 

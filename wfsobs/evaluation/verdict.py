@@ -9,14 +9,17 @@ from math import sqrt
 import numpy as np
 from scipy.stats import t as student
 
+from wfsobs.evaluation.budget import Budget, error_budget
 from wfsobs.evaluation.evidence import LEVEL, Evidence, differ_in_pairs, rank_observers
 from wfsobs.evaluation.known_lines import given_lines, is_near
-from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best, row_label
+from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best
 from wfsobs.evaluation.scores import BOUND_BOTH, Score
+from wfsobs.evaluation.verdict_words import best_sentence, harm_sentences
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate
-from wfsobs.prior import Bands, Lines, Model, Part, Training
+from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
+from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import welch_psd
 from wfsobs.simulation.disturbance import vibration_lines
@@ -25,6 +28,9 @@ from wfsobs.typing import Array
 BATCHES = 20
 """Pieces of the record whose mean squared errors are compared."""
 
+QUICK = 0.5
+"""Computing time of an observer whose error budget is worth waiting for [s]; the budget takes five times as long."""
+
 
 @dataclass(frozen=True)
 class Harm:
@@ -32,12 +38,15 @@ class Harm:
 
     worse               : whether it is significantly larger
     at_known, at_others : shares of its error's variance at the lines that it is told, and at those that it is not
+    cause, share        : largest term of its error budget, and its part of the whole; empty where the budget is not known
     """
 
     observer: str
     worse: bool
     at_known: float
     at_others: float
+    cause: str = ""
+    share: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -61,10 +70,7 @@ class Verdict:
 
     def sentences(self, scale: float = 1e3, unit: str = "nm") -> list[str]:
         """Return the verdict in words; scale: from micrometres to the unit."""
-        groups: dict[tuple[bool, str], list[Harm]] = {}
-        for harm in self.harms:
-            groups.setdefault((harm.worse, told_of(harm.observer, self.lines)), []).append(harm)
-        return [_best_sentence(self, scale, unit), *(_harm_sentence(self, of, told) for (_, told), of in groups.items())]
+        return [best_sentence(self, scale, unit), *harm_sentences(self)]
 
 
 def verdict(
@@ -77,12 +83,14 @@ def verdict(
     *,
     simulation: Scenario | None = None,
     evidence: Evidence | None = None,
+    budgets: Sequence[Budget] = (),
 ) -> Verdict | None:
     """Return the verdict on one target and mode, None where nothing can be compared or there is no truth.
 
     scenario   : what the observers' priors were made from
     simulation : what the record was made from, so that the lines of the vibration are known
     evidence   : errors over several seeds, on which the verdict then rests; where the errors lie is that of the record
+    budgets    : error budgets of the record, from which it is said why an observer does harm (`explain_harm`)
     """
     of = [s for s in scores if (s.target, s.mode) == (target, mode)]
     rivals = {s.observer: s for s in of if can_be_best(s.observer, s.apart) and s.observer != NO_ESTIMATE}
@@ -94,6 +102,7 @@ def verdict(
     values = {e.observer: e.values[:, column] for e in estimates if e.target == target}
     errors = {s.observer: _keep_scored(record, values[s.observer] - truth[:, column], s) for s in ranked}
     lines = () if simulation is None else tuple(line[0] for line in vibration_lines(simulation, column))
+    causes = {b.observer: _largest_term(b) for b in budgets if (b.target, b.mode) == (target, mode) and b.terms}
     first = ranked[0]
     found = Verdict(
         first,
@@ -105,6 +114,7 @@ def verdict(
                 s.observer,
                 differs(_keep_scored(record, truth[:, column], s), errors[s.observer]),
                 *_shares(errors[s.observer], record.dt, lines, given_lines(scenario, s.observer, column, lines)),
+                *causes.get(s.observer, ("", 0.0)),
             )
             for s in reversed(ranked)
             if s.rms >= s.truth_rms
@@ -159,6 +169,26 @@ def differs(one: Array, other: Array) -> bool:
     return bool(abs(means.mean()) > student.ppf(1.0 - LEVEL / 2.0, independent - 1.0) * scatter)
 
 
+def _largest_term(budget: Budget) -> tuple[str, float]:
+    """Return the largest term of an error budget, and its part of the total."""
+    name = max(budget.terms, key=budget.terms.__getitem__)
+    return name, budget.terms[name] / budget.total
+
+
+def explain_harm(result: Result, mode: str | None = None, watch: Watch = QUIET) -> list[Budget]:
+    """Return the error budgets of the observers that do harm, of those that take a moment.
+
+    result : of a record that was simulated from its scenario; mode : by default all. Raises Cancelled.
+    """
+    seconds = {e.observer: e.seconds_per_step * e.values.size for e in result.estimates}
+    harmful = {s.observer for s in result.scores if mode in (None, s.mode) and s.rms >= s.truth_rms}
+    chosen = [name for name in seconds if name in harmful and OBSERVERS[name].linear and seconds[name] <= QUICK]
+    try:
+        return error_budget(result, observers=chosen, mode=mode, watch=watch)
+    except ValueError:
+        return []
+
+
 def _keep_scored(record: Record, error: Array, score: Score) -> Array:
     """Return a signal where it was scored, NaN elsewhere."""
     assert score.start is not None and score.stop is not None
@@ -178,71 +208,3 @@ def _shares(error: Array, dt: float, lines: Sequence[float], given_lines: Sequen
     at_given = at_lines & is_near(frequency, given_lines)
     at_others = at_lines & ~at_given
     return float(density[at_given].sum() / total), float(density[at_others].sum() / total)
-
-
-# ---------------------------------------------------------------------- in words
-
-TOLD: tuple[tuple[Part, str], ...] = (
-    (Lines, "all {n} lines"),
-    (Model, "a model with one line"),
-    (Training, "training data"),
-    (Bands, "where the bands are"),
-)
-"""What is said of an observer by the first part of its prior that is found here."""
-
-
-def told_of(observer: str, lines: int) -> str:
-    """Return what an observer is told, as a phrase."""
-    prior = OBSERVERS[observer].prior
-    words = next((words for part, words in TOLD if part in prior), "nothing")
-    return words.format(n=lines).replace("all 1 lines", "the one line").replace("all 0 lines", "a model")
-
-
-def _best_sentence(it: Verdict, scale: float, unit: str) -> str:
-    target, mode, name = it.best.target.capitalize(), it.best.mode, row_label(it.best.observer)
-    size = f"{_format_number(it.best.rms * scale)} {unit}"
-    seeds = f" over {it.seeds} seeds" if it.seeds > 1 else ""
-    if it.ties:
-        start = f"{name} has the smallest error, {size}, tied with {_join_labels(it.ties)}{seeds or ' on this record'}"
-    else:
-        start = f"{name} is best{seeds}, {size}"
-    return f"{target}, {mode}: {start}{_to_bound(it)}; it is given {told_of(it.best.observer, it.lines)}."
-
-
-def _to_bound(it: Verdict) -> str:
-    """How far the best error is from the least possible. It is a mean over records, so that one may lie below."""
-    if not it.bound:
-        return ""
-    percent = round(100.0 * (it.best.rms / it.bound - 1.0))
-    return f", {'at' if percent == 0 else f'{abs(percent)} % ' + ('above' if percent > 0 else 'below')} the bound of LGS and NGS"
-
-
-def _harm_sentence(it: Verdict, harms: Sequence[Harm], prior: str) -> str:
-    """Observers that are told the same, together; shares are the mean of theirs."""
-    names = _join_labels([harm.observer for harm in harms])
-    be, they, their = ("is", "it", "its") if len(harms) == 1 else ("are", "they", "their")
-    tell = "is" if len(harms) == 1 else "are"
-    known, others = (float(np.mean([getattr(harm, name) for harm in harms])) for name in ("at_known", "at_others"))
-    shares = {
-        f"at lines that {they} {tell} not given": others,
-        f"at lines that {they} {tell} given": known,
-        "away from the lines": 1.0 - known - others,
-    }
-    where, share = max(shares.items(), key=lambda item: item[1])
-    reason = f"; {100.0 * share:.0f} % of {their} error lies {where}" if it.lines else ""
-    return f"{names} {be} {'worse' if harms[0].worse else 'no better'} than no estimate: {they} {tell} given {prior}{reason}."
-
-
-def _join_labels(observers: Sequence[str]) -> str:
-    """Labels as a person lists them.
-
-    >>> _join_labels(["kf-lgs", "ridge", "kf-multi"])
-    'LGS KF, Ridge and Multi-peak KF'
-    """
-    names = [row_label(observer) for observer in observers]
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-
-
-def _format_number(x: float) -> str:
-    """Three digits, as a person would say them."""
-    return f"{x:.3g}" if x < 1000.0 else f"{x:.0f}"

@@ -10,6 +10,7 @@ from typing import Any
 import panel as pn
 import panel_material_ui as pmui
 
+from wfsobs.app.causes import Causes
 from wfsobs.app.controls.fields import SOON
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display
 from wfsobs.app.jobs.task import BackgroundTask
@@ -58,7 +59,8 @@ class Explore:
         self.traces = Traces(run, display)
         self.spectra = SpectraFigures(run, display, self.traces.x_range)
         self.strips = {target: Strip(target, run, display, seeds) for target in TARGETS}
-        self.verdicts = {target: VerdictLine(target, run, display, seeds) for target in TARGETS}
+        causes = Causes(seeds.store, display) if seeds else None
+        self.verdicts = {target: VerdictLine(target, run, display, seeds, causes) for target in TARGETS}
         axes = self.traces.x_range, self.spectra.x_range
         self.stretches = {target: Stretch(target, run, display, *axes) for target in TARGETS}
         self.table = Table(run, display, seeds)

@@ -6,6 +6,7 @@ from html import escape
 
 import panel as pn
 
+from wfsobs.app.causes import Causes
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.glossary import BOUND, explain_first
 from wfsobs.app.jobs.job import DONE
@@ -18,12 +19,21 @@ from wfsobs.evaluation.verdict import verdict
 class VerdictLine:
     """The verdict on one target in the mode and unit shown, once all observers are done."""
 
-    def __init__(self, target: str, run: BackgroundTask, display: Display, seeds: SeedRuns | None = None):
-        self.target, self.run, self.display, self.seeds = target, run, display, seeds
+    def __init__(
+        self,
+        target: str,
+        run: BackgroundTask,
+        display: Display,
+        seeds: SeedRuns | None = None,
+        causes: Causes | None = None,
+    ):
+        self.target, self.run, self.display, self.seeds, self.causes = target, run, display, seeds, causes
         self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
         run.param.watch(self._refresh, ["result", "state"])
         if seeds is not None:
             seeds.param.watch(self._refresh, "evidence")
+        if causes is not None:
+            causes.param.watch(self._refresh, "budgets")
         display.param.watch(self._refresh, ["mode", "unit"])
 
     def _refresh(self, *_: object) -> None:
@@ -44,6 +54,7 @@ class VerdictLine:
             self.display.mode,
             simulation=shown.simulation,
             evidence=self.seeds.evidence if self.seeds else None,
+            budgets=self.causes.budgets if self.causes else (),
         )
         if found is None:
             return ""
