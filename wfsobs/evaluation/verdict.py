@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import t as student
@@ -19,11 +20,13 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Estimate
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
-from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import welch_psd
 from wfsobs.simulation.disturbance import vibration_lines
 from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.result import Result
 
 BATCHES = 20
 """Pieces of the record whose mean squared errors are compared."""
