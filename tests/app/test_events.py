@@ -11,7 +11,6 @@ import pytest
 
 from wfsobs.app.controls.panel import Controls
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.pin import pin
 from wfsobs.app.store import Store
 from wfsobs.app.views.envelope import envelope
 from wfsobs.app.views.traces import BINS
@@ -51,7 +50,7 @@ def test_running_rms_and_marks(dashboard: Dashboard, loop: Any) -> None:
     steps = np.round(at / shown.result.record.dt).astype(int)
     np.testing.assert_allclose(trace.source.data["kf-lgs"], running_rms(shown.result.record, estimate, 1.0)[steps, 1], rtol=1e-6)
     the_marks_are_those_of_the_scenario(dashboard)
-    dashboard.display.pinned = pin(shown)  # of a pinned run, extremes are kept, of which there is no rms
+    dashboard.history.compare(dashboard.history.current)  # of a compared run, extremes are kept, of which there is no rms
     assert trace.faint.source is None
 
 

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from wfsobs.app.change_names import differences, name_of_difference
+from wfsobs.app.compared import thin_lines
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.numbers import change, number
-from wfsobs.app.pin import differences, name_of_difference, pin
 from wfsobs.app.style import observers_of
 from wfsobs.app.work import TRUTH
 from wfsobs.observers.base import TARGETS
@@ -38,13 +39,13 @@ def order(dashboard: Dashboard, target: str) -> list[str]:
 
 class TestPin:
     def test_the_table_shows_the_change(self, pinned: Dashboard) -> None:
-        kept, shown = pinned.display.pinned, pinned.store.run.result
+        (kept,), shown = pinned.display.compared_runs, pinned.store.run.result
         before = kept.score("kf-lgs", "turbulence", "tip").rms
         now = next(s for s in shown.result.scores if (s.observer, s.target, s.mode) == ("kf-lgs", "turbulence", "tip")).rms
         assert now != before
         html = pinned.explore.table.pane.object
-        assert f"<td>{number(1e3 * before)}</td><td>{change(before, now)}</td>" in html
-        assert "Pinned [nm]" in html and "Change [%]" in html
+        assert f'<td><span class="range">{change(before, now)} %</span> {number(1e3 * before)}</td>' in html
+        assert ">A [nm]<" in html and "RMS error in Preset Paper" in html
 
     def test_the_name_says_what_differs(self, pinned: Dashboard, loop: Any) -> None:
         assert "Wind speed V₀ 15 → 30 m/s" in pinned.explore.pinning.note.object and pinned.explore.pinning.note.visible
@@ -54,7 +55,7 @@ class TestPin:
 
     def test_faint_lines(self, pinned: Dashboard) -> None:
         pinned.display.param.update(show="signal", hidden={})
-        trace, kept = pinned.explore.traces.traces["turbulence"], pinned.display.pinned
+        trace, kept = pinned.explore.traces.traces["turbulence"], pinned.display.compared_runs[0].lines
         data = trace.faint.source.data
         assert len(data["xs"]) == len(data["colour"]) == 1 + len(observers_of("turbulence"))
         assert np.nanmax(data["ys"][0]) == pytest.approx(1e3 * np.nanmax(kept.signals[TRUTH, "turbulence"][:, 0]))
@@ -73,8 +74,8 @@ class TestPin:
     def test_unpin(self, pinned: Dashboard) -> None:
         assert pinned.explore.pinning.button.label == "Unpin"
         press(pinned)
-        assert pinned.display.pinned is None and pinned.explore.pinning.button.label == "Pin"
-        assert "Pinned" not in pinned.explore.table.pane.object and not pinned.explore.pinning.note.visible
+        assert pinned.display.compared_runs == [] and pinned.explore.pinning.button.label == "Pin"
+        assert ">A [nm]<" not in pinned.explore.table.pane.object and not pinned.explore.pinning.note.visible
         assert pinned.explore.traces.traces["turbulence"].faint.source.data["xs"] == []
 
     def test_nothing_is_drawn_before(self, dashboard: Dashboard) -> None:
@@ -82,7 +83,7 @@ class TestPin:
 
     def test_all_samples_of_a_short_record_are_kept(self, dashboard: Dashboard) -> None:
         shown = dashboard.store.run.result
-        kept = pin(shown)
+        kept = thin_lines(shown)
         values = shown.values("kf-lgs", "vibration")
         assert np.allclose(kept.signals["kf-lgs", "vibration"], values, atol=1e-6)
         assert np.allclose(kept.errors["kf-lgs", "vibration"], values - shown.values(TRUTH, "vibration"), atol=1e-6)

@@ -16,7 +16,6 @@ from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.limits import Limits
 from wfsobs.app.numbers import number
 from wfsobs.app.picker import LARGEST
-from wfsobs.app.pin import pin
 from wfsobs.app.service import Service
 from wfsobs.app.upload import SILENT
 from wfsobs.pipeline import observe
@@ -76,10 +75,10 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     found = {s.observer: number(1e3 * s.rms) for s in expected.scores if s.mode == "tip"}
     assert cards[0]["label"] == "Recorded loop" and notes["truth"].endswith("× z, residual") and values["truth"] == found["loop"]
     assert values["kf-lgs"] == found["kf-lgs"] and values["gpr-online"] == "–"
-    dashboard.display.pinned = pin(shown)
+    dashboard.history.compare(dashboard.history.current)
     pinned = dashboard.explore.table.html()
     rows = re.findall(r"<tr data-observer.*?</tr>", pinned)
-    assert len(rows) == len(found) and all("<td>+0.0</td>" in row for row in rows)
+    assert len(rows) == len(found) and all('"range">+0.0 %</span>' in row for row in rows)
     assert pinned.count("tag best") == 1
     assert re.fullmatch(r"\d\.\d\d × z, next z", notes["kf-lgs"]) and notes["gpr-online"] == "no truth"
     assert notes["butterworth-ol"] in ("no result", "no truth")

@@ -299,7 +299,7 @@ class TestHigherModes:
         store.change("telescope.radial_order", 3)
         loop.finish(store)
         switch.list.value = "oblique trefoil"  # the pinned run has no such mode
-        assert display.pin_compared is None and "oblique trefoil" in dashboard.explore.table.pane.object
+        assert display.compared_runs and display.runs_drawn == [] and "oblique trefoil" in dashboard.explore.table.pane.object
 
     def test_buttons_and_display_agree(self, dashboard: Dashboard) -> None:
         dashboard.modes.buttons.value = "tilt"

@@ -130,7 +130,7 @@ def test_offline_for_a_while(page: Page) -> None:
 
 def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> None:
     page.get_by_role("button", name="Pin this run to compare others with it").click()
-    expect(page.get_by_text("Pinned, faint in the figures")).to_be_visible()
+    expect(page.get_by_text("Compared with, faint in the figures")).to_be_visible()
     cable.cut()
     expect(banner(page, "connection to the server is lost")).to_be_visible()
     speed(page, "22")
@@ -143,7 +143,9 @@ def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> 
     page.wait_for_function("() => location.search.includes('turbulence.wind_speed=22')")
     page.wait_for_function("() => location.search.includes('vibration.peaks=6.5,')")
     expect(page.locator('input[data-cell$=".frequency"]')).to_have_count(peaks + 1)
-    expect(page.get_by_text("Wind speed V₀ 15 → 22 m/s")).to_be_visible()  # the same session: its pinned run is there
+    expect(page.get_by_role("status").filter(has_text="Compared with")).to_contain_text(
+        "Wind speed V₀ 15 → 22 m/s"
+    )  # the same session: its pinned run is there
     done(page)
 
 

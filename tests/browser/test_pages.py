@@ -14,7 +14,7 @@ from wfsobs.observers.base import TARGETS
 MODELS = "[...Bokeh.index.roots[0].model.document._all_models.values()]"
 VISIBLE_LINES = f"""() => {MODELS}.filter(m => m.type === "GlyphRenderer" && m.glyph.type === "Line")
     .map(m => m.data_source.get_length())"""
-PINNED = f"""() => {MODELS}.filter(m => m.type === "GlyphRenderer" && m.name === "pinned")
+PINNED = f"""() => {MODELS}.filter(m => m.type === "GlyphRenderer" && m.name === "compared")
     .map(m => m.data_source.data.xs.length)"""
 LABELS = f"""() => {MODELS}.filter(m => m.type === "LinearAxis" || m.type === "LogAxis").map(m => m.axis_label).join()"""
 ERRORS = """() => {
@@ -90,7 +90,8 @@ def test_pin_and_compare(open_page: Any) -> None:
     page = open_page()
     before = cells(page, "kf-lgs", "turbulence")[0].split()[-1]
     page.get_by_role("button", name="Pin this run to compare others with it").click()
-    expect(page.get_by_text("Pinned, faint in the figures: the same settings")).to_be_visible(timeout=SLOW)
+    legend = page.get_by_role("status").filter(has_text="Compared with, faint in the figures")
+    expect(legend).to_contain_text("Preset Paper since then: the same settings", timeout=SLOW)
     for button in page.get_by_role("button", name="Show all").all():
         button.click()
     # a trace of errors has no line of the truth, their spectra have
@@ -99,15 +100,18 @@ def test_pin_and_compare(open_page: Any) -> None:
     box = page.get_by_role("textbox", name="m/s")
     box.fill("30")
     box.press("Enter")
-    expect(page.get_by_text("Wind speed V₀ 15 → 30 m/s")).to_be_visible(timeout=SLOW)
-    expect(page.get_by_role("columnheader", name="Change [%]")).to_be_visible(timeout=SLOW)
+    expect(legend).to_contain_text("Wind speed V₀ 15 → 30 m/s", timeout=SLOW)
+    expect(page.get_by_role("columnheader", name="A [nm]")).to_be_visible(timeout=SLOW)
     row = page.locator('tr[data-observer="kf-lgs"][data-target="turbulence"] td')
-    expect(row.nth(2)).to_have_text(re.compile(r"^(?!\+0\.0).*\d$"), timeout=SLOW)  # nor a dash, of one at work
-    value, pinned, change = (text.split()[-1] for text in row.all_inner_texts()[:3])
+    expect(row.nth(1)).to_have_text(re.compile(r"^(?!\+0\.0 %)[+−]\d.* %\s+\d.*$"), timeout=SLOW)  # nor a dash, of one at work
+    value, compared = (text.split() for text in row.all_inner_texts()[:2])
+    change, _, pinned = compared
     assert pinned == before
-    assert abs(float(change) - 100 * (float(value) / float(pinned) - 1)) < 1
-    page.get_by_role("button", name="Unpin the reference run").click()
-    expect(page.get_by_role("columnheader", name="Change [%]")).to_have_count(0, timeout=SLOW)
+    assert abs(float(change.replace("−", "-")) - 100 * (float(value[-1]) / float(pinned) - 1)) < 1
+    card = page.get_by_role("button", name=re.compile("^LGS")).first.locator(".compared")
+    expect(card).to_have_text(f"A{before}{change} %")
+    page.get_by_role("button", name="Unpin: compare with no other run").click()
+    expect(page.get_by_role("columnheader", name="A [nm]")).to_have_count(0, timeout=SLOW)
     page.wait_for_function(f"({PINNED})().every(n => n === 0)")
 
 

@@ -52,13 +52,18 @@ def freeze(value: T) -> T:
 
 def size_of(value: Any) -> int:
     """Memory that the arrays in a value hold [bytes], shared ones counted once."""
+    return sum(owners_in(value).values())
+
+
+def owners_in(value: Any) -> dict[int, int]:
+    """Return the id of every array that owns memory in a value, and its size [bytes]."""
     owners: dict[int, int] = {}
     for array in arrays_in(value):
         owner: Any = array
         while isinstance(owner.base, np.ndarray):
             owner = owner.base
         owners[id(owner)] = owner.nbytes
-    return sum(owners.values())
+    return owners
 
 
 class Cache(Generic[T]):
@@ -68,6 +73,7 @@ class Cache(Generic[T]):
     """
 
     def __init__(self, most_bytes: int):
+        self.most_bytes = most_bytes
         self._kept: LRUCache[Hashable, T] = LRUCache(most_bytes, size_of)
         self._lock = threading.Lock()
 

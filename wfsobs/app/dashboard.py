@@ -17,6 +17,7 @@ from wfsobs.app.controls.panel import Controls
 from wfsobs.app.controls.status import waiting_text
 from wfsobs.app.display import Display
 from wfsobs.app.help import Help
+from wfsobs.app.history import History
 from wfsobs.app.jobs.job import FAILED
 from wfsobs.app.jobs.task import IDLE
 from wfsobs.app.pages.explore import Explore
@@ -83,7 +84,8 @@ class Dashboard:
         self.upload.open_scenario = self.actions.open_file
         self.modes, self.units = ModeSwitch(self.store.run, self.display), UnitSwitch(self.display)
         self.seeds = SeedRuns(self.store)
-        self.explore = Explore(self.store.run, self.display, self.seeds)
+        self.history = History(self.store, self.display)
+        self.explore = Explore(self.history, self.seeds)
         self.connection = Connection(self.controls.take, width=0, height=0, margin=0)
         self.frame = Frame(width=0, height=0, margin=0)
         self.keyboard = Keyboard(width=0, height=0, margin=0, styles={"position": "absolute"})
@@ -99,6 +101,8 @@ class Dashboard:
         self.controls.search.on_sweep = self.pages.sweep_over
         self.view_state = ViewState(self.display, self.pages, self.explore.lines, self.explore.traces, self.seeds)
         self.actions.follow_view(self.view_state)
+        self.history.open_view = self.view_state.open
+        self.view_state.param.watch(lambda event: self.history.follow_view(event.new), "query")
         page = pmui.Page(
             title="wfsobs",
             header=[self.controls.bar(), Help(styles={"margin-left": "auto"})],

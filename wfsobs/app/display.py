@@ -9,8 +9,8 @@ from types import MappingProxyType
 
 import param
 
+from wfsobs.app.compared import ComparedRun, DrawnLines
 from wfsobs.app.glossary import LAG, NEEDS, REAL_TIME, RELATIVE, RMS_ERROR, STATED, TERMS
-from wfsobs.app.pin import Pin
 from wfsobs.sensors.modes import HIGHEST_ORDER, TIP_TILT, Mode, modes_up_to
 from wfsobs.settings.parameters import unit_of
 
@@ -56,17 +56,17 @@ def label_of(p: param.Parameter) -> str:
     return f"{p.label} [{unit}]" if unit else str(p.label)
 
 
-def score_columns(unit: str, base: str = "truth", pin_columns: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
+def score_columns(unit: str, base: str = "truth", compared_columns: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
     """List the headings of a table of scores, and an explanation of each.
 
     base        : what an error is divided by: "truth", or "z" for a record without truth
-    pin_columns : columns that go beside the error
+    compared_columns : columns that go beside the error
     """
     of_z = "Of the prediction of z one step ahead, or residual of the recorded loop"
     return {
         "Observer": "",
         f"RMS error [{unit}]": TERMS[RMS_ERROR] if base == "truth" else of_z,
-        **pin_columns,
+        **compared_columns,
         f"RMS {base} [{unit}]": "Error of an estimate of zero",
         f"error / {base}": TERMS[RELATIVE] if base == "truth" else "Above 1: worse than an estimate of zero",
         "Needs": TERMS[NEEDS],
@@ -98,7 +98,7 @@ class Display(param.Parameterized):
     windowed = param.Boolean(False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone.")
     editing = param.Boolean(False, label="Edit on the figure", doc="Handles on the spectra, and what theory predicts.")
     best_first = param.Boolean(True, label="Best first", doc="Sort the observers of the table by their error.")
-    pinned = param.ClassSelector(class_=Pin, default=None, allow_None=True, doc="The run to compare with.")
+    compared_runs: list[ComparedRun] = param.List([], item_type=ComparedRun, doc="The runs to compare with, by their letters.")  # type: ignore
 
     @property
     def column(self) -> int:
@@ -116,9 +116,9 @@ class Display(param.Parameterized):
         return [unit for unit in UNITS if unit not in NO_ANGLE or self.mode in [m.name for m in TIP_TILT]]
 
     @property
-    def pin_compared(self) -> Pin | None:
-        """The pinned run, where it has the mode shown."""
-        return self.pinned if self.pinned is not None and self.column < len(self.pinned.scenario.modes) else None
+    def runs_drawn(self) -> list[tuple[ComparedRun, DrawnLines]]:
+        """The compared runs that have lines of the mode shown."""
+        return [(run, run.lines) for run in self.compared_runs if run.lines and self.column < len(run.scenario.modes)]
 
     @property
     def error(self) -> bool:

@@ -67,7 +67,12 @@ class Service:
 
     def is_cached(self, scenario: Scenario, source: Source | None = None) -> bool:
         """Whether the results are there already."""
-        return _key(scenario, source) in self.cache
+        return run_key(scenario, source) in self.cache
+
+    @property
+    def session_bytes(self) -> int:
+        """How much of results one session may hold on to [bytes]: a quarter of what is kept for all."""
+        return self.cache.most_bytes // 4
 
     def end_session(self) -> None:
         """Count a session that has ended."""
@@ -88,11 +93,11 @@ class Service:
             source.check(self.limits)
         work: Work = lambda watch, tell: self._work(scenario, watch, tell, source)  # noqa: E731
         cost = run_seconds(scenario) if seconds is None else seconds
-        return Job("run", work, key=_key(scenario, source), cost=cost, refusal=SettingError)
+        return Job("run", work, key=run_key(scenario, source), cost=cost, refusal=SettingError)
 
     def seed_key(self, scenario: Scenario, source: Source | None, seed: int) -> str:
         """Name the scores of a scenario's observers on the record of another seed."""
-        return f"seed {seed} of {_key(scenario, source)}"
+        return f"seed {seed} of {run_key(scenario, source)}"
 
     def close(self, timeout: float = 1.5) -> bool:
         """Stop every job; whether all have ended in time [s]. To set `queue.closing` alone does the same later."""
@@ -125,5 +130,6 @@ class Session:
             event("session-end", session=self.number, seconds=monotonic() - self._since, sessions=self.service.sessions)
 
 
-def _key(scenario: Scenario, source: Source | None) -> str:
+def run_key(scenario: Scenario, source: Source | None) -> str:
+    """Name the results of settings on what they run on."""
     return key_of(scenario, source.key if source else "")

@@ -75,6 +75,9 @@ class SimulatedRecord:
 
 Source = LoadedRecord | SimulatedRecord
 
+Step = tuple[Scenario, str, Source | None]
+"""Settings, the preset that they are compared with, and what they run on where that is not their simulation."""
+
 
 def give_same_record(one: Source | None, other: Source | None) -> bool:
     """Whether two give the same record; None is the simulation of the settings."""

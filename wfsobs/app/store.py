@@ -13,15 +13,12 @@ import param
 from wfsobs.app.jobs.job import DONE
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.service import Post, Session
-from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, give_same_record
+from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, Step, give_same_record
 from wfsobs.cost import rerun_seconds, run_seconds
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import reference_preset
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
-
-Step = tuple[Scenario, str, Source | None]
-"""Settings, the preset that they are compared with, and what they run on where that is not their simulation."""
 
 AT_ONCE = 5.0
 """A run that takes longer waits to be asked for [s]."""
@@ -80,13 +77,13 @@ class Store(param.Parameterized):
     def undo(self) -> None:
         """Take back the last change that was accepted."""
         if self._past:
-            self._future.append(self._step)
+            self._future.append(self.step)
             self._accept(self._past.pop(), {}, step=False)
 
     def redo(self) -> None:
         """Make the last change again that was taken back."""
         if self._future:
-            self._past.append(self._step)
+            self._past.append(self.step)
             self._accept(self._future.pop(), {}, step=False)
 
     def value(self, path: str) -> Any:
@@ -134,6 +131,11 @@ class Store(param.Parameterized):
         """Run on a record, or on the simulation of the settings (None), and take the settings with it. Raises SettingError."""
         self._put(scenario, self.preset, source)
 
+    def restore(self, step: Step) -> None:
+        """Return to settings, their preset and their record in one step. Raises SettingError."""
+        scenario, preset, source = step
+        self._put(scenario, preset, source)
+
     def choose(self, name: str) -> None:
         """Start again from a preset."""
         self.load(PRESETS[name](), name)
@@ -147,7 +149,8 @@ class Store(param.Parameterized):
         self.session.leave()
 
     @property
-    def _step(self) -> Step:
+    def step(self) -> Step:
+        """Settings, preset and record as they stand."""
         return self.scenario, self.preset, self.source
 
     def _put(self, scenario: Scenario, preset: str, source: Source | None) -> None:
@@ -161,7 +164,7 @@ class Store(param.Parameterized):
         scenario, preset, source = to
         unchanged, stays = scenario == self.scenario, give_same_record(source, self.source)
         if step and not (unchanged and stays and preset == self.preset):
-            self._past = _of_one_file([*self._past, self._step], source)[-STEPS_BACK:]
+            self._past = _of_one_file([*self._past, self.step], source)[-STEPS_BACK:]
             self._future = []
         self._refused = refusals
         errors = {path: reason for path, reason in self.errors.items() if path in refusals}

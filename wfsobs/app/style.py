@@ -37,6 +37,17 @@ LOOKS: Mapping[str, Look] = MappingProxyType(
 )
 """Lines that are neither observers' nor controllers'."""
 
+RUNS: Mapping[str, Look] = MappingProxyType(
+    {
+        "A": Look("A", "#0072B2", "#6CB8E6", (6, 3)),
+        "B": Look("B", "#B84A00", "#FF9A57", (2, 2)),
+        "C": Look("C", "#007A58", "#4FD1AE", (10, 3, 2, 3)),
+        "D": Look("D", "#9C3F78", "#E79AC6", (12, 4)),
+        "E": Look("E", "#6B5B00", "#D9C64A", (4, 2, 1, 2)),
+    }
+)
+"""Runs that are compared with the one shown, by their letters."""
+
 HEARD = ".MuiFormLabel-root { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); }"
 """Style of a switch whose name is heard but not seen."""
 
@@ -67,6 +78,11 @@ def look(name: str) -> Look:
     return entry.look if entry.look.label else replace(entry.look, label=entry.label)
 
 
+def run_look(letter: str) -> Look:
+    """Return the look of a compared run."""
+    return RUNS[letter]
+
+
 def labels() -> dict[str, str]:
     """Every line's name in legends."""
     return {name: look(name).label for name in (*LOOKS, *OBSERVERS, *CONTROLLERS)}
@@ -83,6 +99,11 @@ def observers_of(target: str, with_hidden: bool = False) -> list[str]:
 def asset(name: str) -> str:
     """Text of a file of the package's assets."""
     return files("wfsobs.assets").joinpath(name).read_text(encoding="utf-8")
+
+
+def run_swatch(letter: str, dark: bool) -> Markup:
+    """Draw a short line in the dashes and the colour of a compared run, with its letter."""
+    return _swatch(run_look(letter), dark, True) + Markup("<b>{}</b>").format(letter)
 
 
 def swatch(name: str, dark: bool, with_dash: bool = True) -> Markup:

@@ -59,6 +59,12 @@ export function render({model, el}) {
       unit.textContent = ` ${item.unit}`
       value.append(unit)
     }
+    for (const [letter, number, change] of item.compared ?? []) {
+      const row = part(card, "compared", "")
+      for (const [name, text] of [["b", letter], ["span", number], ["small", change]]) {
+        row.append(Object.assign(document.createElement(name), {textContent: text}))
+      }
+    }
     part(card, "note", item.note)
     // Its line is there before it comes, so that nothing moves then.
     if (item.range !== undefined) part(card, "note", item.range).title = "where the mean error over seeds lies, at 95 % confidence"

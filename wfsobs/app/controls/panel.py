@@ -197,7 +197,7 @@ class Controls:
         self.store.param.watch(self._refresh_parts, ["scenario", "source"])
         self.store.param.watch(self._refresh_run, ["errors", "waiting"])
         # Last, so that "Done" is said of what has been drawn.
-        self.store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"], precedence=1)
+        self.store.run.param.watch(self._refresh_run, ["state", "progress", "place", "message"], precedence=2)
 
     def _on_choice(self, event: param.parameterized.Event) -> None:
         if event.new != self.store.preset:

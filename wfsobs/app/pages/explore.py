@@ -13,7 +13,7 @@ import panel_material_ui as pmui
 from wfsobs.app.causes import Causes
 from wfsobs.app.controls.fields import SOON
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.history import History
 from wfsobs.app.pages.parts import WIDE, box
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
@@ -53,7 +53,8 @@ MARKS = macro("marks", PEAKS, MODEL)
 class Explore:
     """The page; its figures rest while it is hidden."""
 
-    def __init__(self, run: BackgroundTask, display: Display, seeds: SeedRuns | None = None):
+    def __init__(self, history: History, seeds: SeedRuns | None = None):
+        run, display = history.store.run, history.display
         self.display, self.seeds = display, seeds
         self.lines = MainLines(run, display)
         self.traces = Traces(run, display)
@@ -64,7 +65,7 @@ class Explore:
         axes = self.traces.x_range, self.spectra.x_range
         self.stretches = {target: Stretch(target, run, display, *axes) for target in TARGETS}
         self.table = Table(run, display, seeds)
-        self.pinning = Pinning(run, display)
+        self.pinning = Pinning(run, display, history)
         self.rooms: dict[str, pn.Column] = {}
         self.editors: dict[str, SpectrumEditor] = {}
         display.param.watch(self._edit, "editing")

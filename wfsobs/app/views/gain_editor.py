@@ -18,7 +18,7 @@ from wfsobs.app.numbers import number
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.frames import Frames
-from wfsobs.app.views.plots import PinnedLines
+from wfsobs.app.views.plots import ExtraLines
 from wfsobs.app.views.spectrum_editor import HandleLayer, positive
 from wfsobs.closed_loop.design import LawDesign, design_mode
 from wfsobs.control.curves import Curves, curves
@@ -47,7 +47,7 @@ class GainEditor:
         self.store, self.display, self.results = store, display, results
         self.frames, self.theory = Frames(store.session), Theory()
         self.layer = HandleLayer(self.hear, figure=str(fig.name), sizing_mode="stretch_width", margin=0, visible=False)
-        self.lines = PinnedLines(fig, "predicted", line_alpha=1.0, line_width=2.2, line_dash=[2, 2], level="glyph")
+        self.lines = ExtraLines(fig, "predicted", line_alpha=1.0, line_width=2.2, line_dash=[2, 2], level="glyph")
         self._number, self._note, self._was = 0, "", ""
         store.param.watch(self.follow, "scenario")
         display.param.watch(self.follow, ["editing", "mode", "unit", "dark"])

@@ -1,49 +1,56 @@
-"""The button that pins a run, and the line that says which one is pinned."""
+"""The button that pins the result shown, and the legend of the runs that it is compared with."""
 
 from __future__ import annotations
 
-from html import escape
-
 import panel as pn
 import panel_material_ui as pmui
+from markupsafe import Markup
 
+from wfsobs.app.change_names import name_of_difference
+from wfsobs.app.compared import ComparedRun
 from wfsobs.app.display import Display
+from wfsobs.app.history import History
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.pin import name_of_difference, pin
-from wfsobs.app.style import asset
+from wfsobs.app.render import macro
+from wfsobs.app.style import asset, run_swatch
+from wfsobs.scenario import Scenario
 
-PIN, UNPIN = "Pin this run to compare others with it", "Unpin the reference run"
+PIN, UNPIN = "Pin this run to compare others with it", "Unpin: compare with no other run"
 
 
 class Pinning:
-    """Pin and unpin, one button; in step with the run shown."""
+    """Pin and unpin, one button: the result shown is the first one that is compared, or none is any more."""
 
-    def __init__(self, run: BackgroundTask, display: Display):
-        self.run, self.display = run, display
+    def __init__(self, run: BackgroundTask, display: Display, history: History):
+        self.run, self.display, self.history = run, display, history
         self.button = pmui.Button(
             label="Pin", icon="push_pin", size="small", variant="outlined", margin=0, disabled=True, description=PIN
         )
         self.note = pn.pane.HTML("", margin=0, visible=False, stylesheets=[asset("style.css")])
         self.button.on_click(self._on_press)
         run.param.watch(self._refresh, "result")
-        display.param.watch(self._refresh, "pinned")
+        history.param.watch(self._refresh, "current")
+        display.param.watch(self._refresh, ["compared_runs", "dark"])
 
     def view(self) -> list[object]:
-        """Return the button and the line."""
+        """Return the button and the legend."""
         return [self.button, self.note]
 
     def _on_press(self, _event: object) -> None:
-        if self.display.pinned is not None:
-            self.display.pinned = None
-        elif self.run.result is not None:
-            self.display.pinned = pin(self.run.result)
+        if self.display.compared_runs:
+            self.history.compare_none()
+        else:
+            self.history.compare(self.history.current)
 
     def _refresh(self, *_: object) -> None:
-        kept, shown = self.display.pinned, self.run.result
-        if (self.button.label == "Unpin") != (kept is not None):
-            self.button.param.update(label="Pin" if kept is None else "Unpin", description=PIN if kept is None else UNPIN)
-            self.note.visible = kept is not None
-        self.button.disabled = shown is None
-        if kept is not None and shown is not None:
-            name = escape(name_of_difference(kept.scenario, shown.scenario))
-            self.note.object = f'<span class="pinned" role="status">Pinned, faint in the figures: {name}</span>'
+        runs, shown = self.display.compared_runs, self.run.result
+        if (self.button.label == "Unpin") != bool(runs):
+            self.button.param.update(label="Unpin" if runs else "Pin", description=UNPIN if runs else PIN)
+            self.note.visible = bool(runs)
+        self.button.disabled = not (runs or self.history.current)
+        if runs and shown is not None:
+            self.note.object = str(macro("compared", [self._item(run, shown.scenario) for run in runs]))
+
+    def _item(self, run: ComparedRun, now: Scenario) -> tuple[Markup, str, str]:
+        """Describe a run: its mark, its name, and what has changed since."""
+        return run_swatch(run.letter, self.display.dark), run.name, name_of_difference(run.scenario, now)

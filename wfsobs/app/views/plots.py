@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from bokeh.models import ColumnDataSource, GlyphRenderer
 from bokeh.plotting import figure
 from numpy.typing import ArrayLike
 
-from wfsobs.app.style import look
+from wfsobs.app.style import look, run_look
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.vibration import Peak
 from wfsobs.scenario.measured_spectra import measured_spectrum
@@ -86,23 +87,41 @@ def restyle(lines: dict[str, GlyphRenderer], dark: bool, hidden_names: list[str]
         line.visible = name not in hidden_names
 
 
-class PinnedLines:
-    """The lines of the pinned run in a figure, faint under those of the present one; nothing until there is one."""
+class ExtraLines:
+    """Lines beside those of the results in a figure; nothing until there is one."""
 
-    def __init__(self, fig: figure, name: str = "pinned", **style: Any):
-        self.figure, self.name = fig, name
-        self.style = {"line_alpha": 0.4, "line_width": 1.0, "level": "underlay", **style}
+    def __init__(self, fig: figure, name: str, **style: Any):
+        self.figure, self.name, self.style = fig, name, style
         self.source: ColumnDataSource | None = None
 
-    def draw(self, lines: dict[str, tuple[ArrayLike, ArrayLike]], dark: bool) -> None:
+    def draw(self, lines: Mapping[str, tuple[ArrayLike, ArrayLike]], dark: bool) -> None:
         """Show these lines (name -> x, y) in place of those before."""
+        self._send([(x, y, look(name).colour(dark)) for name, (x, y) in lines.items()])
+
+    def _send(self, lines: Sequence[tuple[ArrayLike, ArrayLike, str]], **columns: list[Any]) -> None:
+        """Show lines (x, y, colour). columns : for the style, an item of each line."""
+        names = ("xs", "ys", "colour")
         if self.source is None:
             if not lines:
                 return
-            self.source = ColumnDataSource({"xs": [], "ys": [], "colour": []})
+            self.source = ColumnDataSource({name: [] for name in (*names, *columns)})
             self.figure.multi_line("xs", "ys", line_color="colour", source=self.source, name=self.name, **self.style)
-        self.source.data = {
-            "xs": [x for x, _ in lines.values()],
-            "ys": [y for _, y in lines.values()],
-            "colour": [look(name).colour(dark) for name in lines],
-        }
+        data: dict[str, Any] = {name: [line[i] for line in lines] for i, name in enumerate(names)}
+        data.update(columns)
+        self.source.data = data  # type: ignore[assignment]
+
+
+class ComparedLines(ExtraLines):
+    """The lines of the compared runs, faint under those of the one shown, dashed by run."""
+
+    def __init__(self, fig: figure):
+        super().__init__(fig, "compared", line_alpha=0.6, line_width=1.2, line_dash="dash", level="underlay")
+
+    def draw_runs(self, lines: Sequence[tuple[str, str, ArrayLike, ArrayLike]], dark: bool) -> None:
+        """Show lines (letter of the run, name, x, y); they have the runs' colours where one name is shown alone."""
+        alone = len({name for _, name, _, _ in lines}) == 1
+        looks = [run_look(letter) for letter, _, _, _ in lines]
+        self._send(
+            [(x, y, (run if alone else look(name)).colour(dark)) for run, (_, name, x, y) in zip(looks, lines, strict=True)],
+            dash=[" ".join(map(str, run.dash)) for run in looks],
+        )

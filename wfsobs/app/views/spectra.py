@@ -10,7 +10,7 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d, VSpan
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.plots import MODEL, PEAKS, PinnedLines, add_line, marked_peaks, new_figure, send
+from wfsobs.app.views.plots import MODEL, PEAKS, ComparedLines, add_line, marked_peaks, new_figure, send
 from wfsobs.app.views.settle import on_settle, zoom_of
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, Array, Key, RunResults, SignalAndError
@@ -29,7 +29,7 @@ class SpectraFigures(TargetFigures):
         self.x_range = Range1d(start=0.5, end=500.0, reset_start=0.5, reset_end=500.0)
         self.times = times
         self.spectra = {target: _Spectrum(target, self.x_range) for target in TARGETS}
-        super().__init__(run, display, self.spectra, ["mode", "show", "unit", "spectrum", "pinned", "windowed"])
+        super().__init__(run, display, self.spectra, ["mode", "show", "unit", "spectrum", "compared_runs", "windowed"])
         on_settle([times], lambda: self._redraw() if display.windowed else None)
 
     def _draw(self, results: RunResults) -> None:
@@ -60,7 +60,7 @@ class _Spectrum:
             self._add_marks()
         self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in (TRUTH, *observers_of(target))}
         self.lines = {name: add_line(self.figure, name, source) for name, source in self.sources.items()}
-        self.faint = PinnedLines(self.figure)
+        self.faint = ComparedLines(self.figure)
 
     def _add_marks(self) -> None:
         """Vertical lines at the scenario's peaks and at the one that the Kalman filters model."""
@@ -83,7 +83,7 @@ class _Spectrum:
             send(source, {"x": spectrum.frequency[1:], "y": y})
             if self.lines[name].visible:
                 drawn.append(y)
-        self._fit(drawn + self.draw_pinned(display), display.cumulative)
+        self._fit(drawn + self.draw_compared(display), display.cumulative)
         of = " of error" if error else ""
         what, unit = (
             (f"cumulative rms{of}", display.unit_label) if display.cumulative else (f"PSD{of}", f"{display.unit_label}²/Hz")
@@ -92,18 +92,18 @@ class _Spectrum:
         if self.target == VIBRATION:
             self._draw_marks(results)
 
-    def draw_pinned(self, display: Display) -> list[Array]:
-        """Send the pinned run's visible lines; what was sent."""
-        kept, lines = display.pin_compared, {}
-        if kept is not None:
-            diameter = kept.scenario.telescope.diameter
+    def draw_compared(self, display: Display) -> list[Array]:
+        """Send the compared runs' visible lines; what was sent."""
+        lines: list[tuple[str, str, Array, Array]] = []
+        for run, kept in display.runs_drawn:
             for name, line in self.lines.items():
                 spectrum = kept.spectra.get((name, self.target))
                 if line.visible and spectrum is not None:
                     error = display.error and name != TRUTH and np.isfinite(spectrum.error).all()
-                    lines[name] = (spectrum.frequency[1:], _curve(spectrum, bool(error), display, diameter))
-        self.faint.draw(lines, display.dark)
-        return [y for _, y in lines.values()]
+                    y = _curve(spectrum, bool(error), display, run.scenario.telescope.diameter)
+                    lines.append((run.letter, name, spectrum.frequency[1:], y))
+        self.faint.draw_runs(lines, display.dark)
+        return [y for *_, y in lines]
 
     def _fit(self, lines: list[Array], cumulative: bool) -> None:
         """Have the axis hold every line, but for what lies too far below the highest."""

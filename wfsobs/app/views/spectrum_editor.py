@@ -19,7 +19,7 @@ from wfsobs.app.numbers import number
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.frames import Frames
-from wfsobs.app.views.plots import PinnedLines
+from wfsobs.app.views.plots import ExtraLines
 from wfsobs.evaluation.error_spectra import cumulative_rms
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.evaluation.theory import TRUTH, Prediction, Theory
@@ -59,7 +59,7 @@ class SpectrumEditor:
         self.layer = HandleLayer(
             self.hear, figure=str(fig.name), frame=self._frame(), sizing_mode="stretch_width", margin=0, visible=False
         )
-        self.lines = PinnedLines(fig, "predicted", line_alpha=1.0, line_width=1.6, line_dash=[2, 2], level="glyph")
+        self.lines = ExtraLines(fig, "predicted", line_alpha=1.0, line_width=1.6, line_dash=[2, 2], level="glyph")
         self._number = 0
         self._was: dict[str, float] = {}
         store.param.watch(self._follow, "scenario")

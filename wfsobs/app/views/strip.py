@@ -12,7 +12,7 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.glossary import RELATIVE, TERMS
 from wfsobs.app.jobs.job import RUNNING
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.numbers import NOTHING, number
+from wfsobs.app.numbers import NOTHING, change, number
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.table import find
@@ -26,7 +26,7 @@ MAIN = "Show the main ones"
 class Cards(JSComponent):
     """The cards in the browser; a click on one hides or shows its line, a double click shows it alone."""
 
-    items = param.List([], doc="{name, label, colour, dash, value, unit, note, range} of every card.")
+    items = param.List([], doc="{name, label, colour, dash, value, unit, note, range, compared} of every card.")
     hidden = param.List([], doc="Names of the cards whose lines are hidden.")
     heard = param.Integer(0, doc="Number of the last click that has arrived, and all before it.")
     terms = param.Dict({}, doc="Word that stands on the cards -> what it means.")
@@ -64,7 +64,7 @@ class Strip:
         run.param.watch(self._refresh, ["result", "state"])
         if seeds is not None:
             seeds.param.watch(self._refresh, "evidence")
-        display.param.watch(self._refresh, ["mode", "unit", "dark"])
+        display.param.watch(self._refresh, ["mode", "unit", "dark", "compared_runs"])
         display.param.watch(self._hide, "hidden")
 
     def _refresh(self, *_: object) -> None:
@@ -77,7 +77,19 @@ class Strip:
         """Describe the cards."""
         shown = self.run.result
         observers = [self._observer(name, shown) for name in observers_of(self.target)]
-        return [self._truth(shown), *observers]
+        cards = [self._truth(shown), *observers]
+        return [card | {"compared": self._compared_rows(card["name"], shown)} for card in cards]
+
+    def _compared_rows(self, name: str, results: RunResults | None) -> list[list[str]]:
+        """Write letter, value and change from there in per cent of every compared run."""
+        rows = []
+        for run in self.display.compared_runs:
+            before = run.score(name, self.target, self.display.mode)
+            now = find(results, name, self.target, self.display.mode) if results else None
+            scale = per_micrometre(self.display.unit, run.scenario.telescope.diameter)
+            value = number(before.rms * scale) if before else NOTHING
+            rows.append([run.letter, value, f"{change(before.rms, now.rms)} %" if before and now else ""])
+        return rows
 
     def _observer(self, name: str, results: RunResults | None) -> dict[str, Any]:
         score = find(results, name, self.target, self.display.mode) if results else None

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import panel as pn
 from markupsafe import Markup
 
+from wfsobs.app.compared import ComparedRun
 from wfsobs.app.display import IN_MOST, Display, per_micrometre, score_columns
 from wfsobs.app.glossary import BOUND as TERM_OF_BOUND
 from wfsobs.app.glossary import term
@@ -50,7 +51,7 @@ class Table:
         run.param.watch(self._refresh, "result")
         if seeds is not None:
             seeds.param.watch(self._refresh, "evidence")
-        display.param.watch(self._refresh, ["mode", "unit", "dark", "best_first", "pinned"])
+        display.param.watch(self._refresh, ["mode", "unit", "dark", "best_first", "compared_runs"])
 
     def _refresh(self, *_: object) -> None:
         self.pane.object = self.html()
@@ -65,8 +66,11 @@ class Table:
     def _columns(self) -> dict[str, str]:
         """Heading -> explanation."""
         unit = self.display.unit_label
-        pinned = {f"Pinned [{unit}]": "RMS error in the pinned run", "Change [%]": "from the pinned run to this one"}
-        return score_columns(unit, "z" if self._without_truth() else "truth", pinned if self.display.pinned else {})
+        compared = {
+            f"{run.letter} [{unit}]": f"RMS error in {run.name}, and the change from there to the result shown"
+            for run in self.display.compared_runs
+        }
+        return score_columns(unit, "z" if self._without_truth() else "truth", compared)
 
     def _without_truth(self) -> list[Score]:
         """Select the scores of a record without truth, of the mode shown."""
@@ -88,7 +92,7 @@ class Table:
             is_best = score.rms == best and can_be_best(score.observer, score.apart)
             cells = [
                 (BEST if is_best else "") + number(score.rms * scale),
-                *self._pinned_cells(score.observer, score.target, score),
+                *self._compared_cells(score.observer, score.target, score),
                 number(score.truth_rms * scale),
                 number(score.normalised_rms),
                 row_needs(score.observer),
@@ -131,8 +135,8 @@ class Table:
         return macro("interval", *(number(x * scale) for x in interval), f"{OVER_SEEDS}, {evidence.n_seeds} seeds")
 
     def _row(self, name: str, target: str, score: Score | None, mark: Markup) -> Row:
-        shown, pinned = self.run.result, self._pinned_cells(name, target, score)
-        cells = [NOTHING, *pinned, *[NOTHING] * 2, row_needs(name), *[NOTHING] * 4]
+        shown, compared = self.run.result, self._compared_cells(name, target, score)
+        cells = [NOTHING, *compared, *[NOTHING] * 2, row_needs(name), *[NOTHING] * 4]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             cells = [
@@ -141,7 +145,7 @@ class Table:
                 + " "
                 + mark
                 + number(score.rms * scale),
-                *pinned,
+                *compared,
                 number(score.truth_rms * scale),
                 (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
                 row_needs(name),
@@ -156,16 +160,16 @@ class Table:
         label = row_label(name)
         return swatch(name, self.display.dark) + (term(TERM_OF_BOUND, label) if name in BOUNDS else label)
 
-    def _pinned_cells(self, name: str, target: str, score: Score | None) -> list[str]:
-        """Write the pinned run's error and the change since; nothing while nothing is pinned."""
-        kept = self.display.pinned
-        if kept is None:
-            return []
-        before = kept.score(name, target, self.display.mode)
+    def _compared_cells(self, name: str, target: str, score: Score | None) -> list[str]:
+        """Write the error in every compared run, and the change from there."""
+        return [self._compared_cell(run, name, target, score) for run in self.display.compared_runs]
+
+    def _compared_cell(self, run: ComparedRun, name: str, target: str, score: Score | None) -> str:
+        before = run.score(name, target, self.display.mode)
         if before is None:
-            return [NOTHING] * 2
-        scale = per_micrometre(self.display.unit, kept.scenario.telescope.diameter)
-        return [number(before.rms * scale), change(before.rms, score.rms if score else None)]
+            return NOTHING
+        scale = per_micrometre(self.display.unit, run.scenario.telescope.diameter)
+        return macro("change", change(before.rms, score.rms if score else None)) + number(before.rms * scale)
 
 
 def _stretch(scores: list[Score]) -> str:

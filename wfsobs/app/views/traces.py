@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.envelope import band_envelope, envelope, envelope_times
 from wfsobs.app.views.event_marks import EventMarks, events_of, room
-from wfsobs.app.views.plots import PinnedLines, add_line, new_figure, send
+from wfsobs.app.views.plots import ComparedLines, add_line, new_figure, send
 from wfsobs.app.views.settle import on_settle, zoom_of
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, RunResults
@@ -46,7 +47,7 @@ class Traces(TargetFigures):
         self._wanted: tuple[float, float] | None = None
         crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
         self.traces = {target: _Trace(target, self.x_range, crosshair) for target in TARGETS}
-        super().__init__(run, display, self.traces, ["mode", "show", "unit", "pinned"])
+        super().__init__(run, display, self.traces, ["mode", "show", "unit", "compared_runs"])
         on_settle([self.x_range], self._redraw)
 
     def _draw(self, results: RunResults) -> None:
@@ -128,7 +129,7 @@ class _Trace:
         self.warm_up = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.10, line_width=0, level="underlay")
         self.figure.add_layout(self.warm_up)
         self.lines = {name: add_line(self.figure, name, self.source, name) for name in self.names}
-        self.faint = PinnedLines(self.figure)
+        self.faint = ComparedLines(self.figure)
         self.events = EventMarks(self.figure)
         self.band = _Band(self.figure)
 
@@ -143,52 +144,50 @@ class _Trace:
         warm_up = results.scenario.run.warm_up
         self.warm_up.right = warm_up
         settled = warm_up + WINDOW_S * display.running
-        extra = self._draw_pinned(display, data["x"]) | self._draw_band(results, display, first, last, data["x"])
+        extra = self._draw_compared(display, data["x"]) + self._draw_band(results, display, first, last, data["x"])
         self._fit(data, settled, extra, room(results))
         self.events.draw(results, display.dark)
         error = shows_error(results, self.target, display)
         what = f"{'running rms of ' if error and display.running else ''}{'error of ' if error else ''}{display.mode_label}"
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
 
-    def _draw_band(
-        self, results: RunResults, display: Display, first: int, last: int, times: Array
-    ) -> dict[str, tuple[Array, Array]]:
+    def _draw_band(self, results: RunResults, display: Display, first: int, last: int, times: Array) -> list[tuple[Array, Array]]:
         """Shade the 95 % band of the one observer that is shown, where it states one; its edges."""
         shown = [name for name, line in self.lines.items() if line.visible and name != TRUTH]
         sd = results.sd(shown[0], self.target) if len(shown) == 1 and not display.running else None
         if sd is None:
             self.band.hide()
-            return {}
+            return []
         scale, cut = per_micrometre(display.unit, results.scenario.telescope.diameter), slice(first, last)
         half = half_width(0.95) * sd[cut, display.column]
         values = None if shows_error(results, self.target, display) else results.values(shown[0], self.target)
         middle = 0.0 if values is None else values[cut, display.column]
         low, high = (scale * edge for edge in band_envelope(middle - half, middle + half, BINS))
         self.band.draw(times, low, high, look(shown[0]).colour(display.dark))
-        return {"low": (times, low), "high": (times, high)}
+        return [(times, low), (times, high)]
 
-    def _draw_pinned(self, display: Display, times: Array) -> dict[str, tuple[Array, Array]]:
-        """Send the pinned run's visible lines between the first and the last of the times; what was sent."""
-        kept, lines = display.pin_compared, {}
-        if kept is not None and not display.running:  # what is kept of it are extremes
+    def _draw_compared(self, display: Display, times: Array) -> list[tuple[Array, Array]]:
+        """Send the compared runs' visible lines between the first and the last of the times; what was sent."""
+        lines: list[tuple[str, str, Array, Array]] = []
+        for run, kept in display.runs_drawn if not display.running else []:  # what is kept are extremes, of which there is no rms
             first, last = np.searchsorted(kept.times, [times[0], times[-1]])
             cut = slice(first, last + 1)
             x = _times_of_envelope(kept.times[cut])
-            scale = per_micrometre(display.unit, kept.scenario.telescope.diameter)
+            scale = per_micrometre(display.unit, run.scenario.telescope.diameter)
             for name, line in self.lines.items():
                 values = (kept.errors if display.error else kept.signals).get((name, self.target))
                 if line.visible and values is not None:
-                    lines[name] = (x, scale * envelope(values[cut, display.column].astype(np.float64), BINS))
-        self.faint.draw(lines, display.dark)
-        return lines
+                    lines.append((run.letter, name, x, scale * envelope(values[cut, display.column].astype(np.float64), BINS)))
+        self.faint.draw_runs(lines, display.dark)
+        return [(x, y) for _, _, x, y in lines]
 
-    def _fit(self, data: dict[str, Any], warm_up: float, pin_lines: dict[str, tuple[Array, Array]], above: float) -> None:
+    def _fit(self, data: dict[str, Any], warm_up: float, extra: Sequence[tuple[Array, Array]], above: float) -> None:
         """Have the axis hold every visible line; what a filter does while it settles does not count."""
         counted = data["x"] >= warm_up
         if not counted.any():
             counted[:] = True
         lines = [data[name][counted] for name, line in self.lines.items() if line.visible]
-        lines += [y[x >= warm_up] for x, y in pin_lines.values()]
+        lines += [y[x >= warm_up] for x, y in extra]
         values = np.concatenate(lines) if lines else np.empty(0)
         values = values[np.isfinite(values)]
         if values.size:

@@ -1,0 +1,96 @@
+"""What a result is called: by what changed against the one before."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import param
+
+from wfsobs.app.controls.names import preset_title
+from wfsobs.app.sources import LoadedRecord, Source, Step, give_same_record
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import reference_preset
+from wfsobs.settings.group import Group
+from wfsobs.settings.parameters import unit_of
+
+NAMED = 3
+"""How many differing settings are written out."""
+
+SAME = "the same settings"
+
+
+def name_of_change(before: Step | None, now: Step) -> str:
+    """Name a result by what changed against the one before; the first by its preset."""
+    scenario, preset, source = now
+    words: list[str] = []
+    if before is None or preset != before[1]:
+        words.append(f"Preset {preset_title(preset)}")
+        base = reference_preset(preset)
+    else:
+        base = before[0]
+    if not give_same_record(source, before[2] if before else None):
+        words.append(_name_of_record(source))
+    if isinstance(source, LoadedRecord) and before is not None and words:  # it brings its rate and length with it
+        return ", ".join(words)
+    changed = differences(base, scenario)
+    return ", ".join([*words, *([join_differences(changed)] if changed else [])]) or SAME
+
+
+def _name_of_record(source: Source | None) -> str:
+    if source is None:
+        return "Simulation of the settings"
+    return f"Record {source.name}" if isinstance(source, LoadedRecord) else "Simulation kept"
+
+
+def differences(before: Scenario, now: Scenario) -> list[str]:
+    """List the differences between two scenarios, one setting each, in words.
+
+    >>> differences(Scenario(), Scenario().replace({"turbulence.wind_speed": 20}))
+    ['Wind speed V₀ 15 → 20 m/s']
+    """
+    tree = now.difference(before)
+    labels = Counter(str(p.label) for _, _, p in now.walk())
+    return _differences(before, now, tree, labels, "")
+
+
+def _differences(before: Group, now: Group, tree: Mapping[str, Any], labels: Counter[str], above: str) -> list[str]:
+    out: list[str] = []
+    for name in tree:
+        p, old, new = now.settings()[name], getattr(before, name), getattr(now, name)
+        if isinstance(new, Group):
+            out += _differences(old, new, tree[name], labels, str(p.label))
+            continue
+        label = f"{above}: {p.label}" if labels[str(p.label)] > 1 else str(p.label)
+        out.append(f"{label} {_change(p, old, new)}")
+    return out
+
+
+def _change(p: param.Parameter, old: Any, new: Any) -> str:
+    """Two values of a setting; of lists only that they differ."""
+    if isinstance(new, list):
+        return "changed"
+    if isinstance(new, bool) or not isinstance(new, (int, float)):
+        return f"{_word(old)} → {_word(new)}"
+    unit = unit_of(p).replace("um", "µm")
+    return f"{old:.6g} → {new:.6g} {unit}".rstrip()
+
+
+def _word(value: Any) -> str:
+    return {True: "on", False: "off"}[value] if isinstance(value, bool) else str(value)
+
+
+def name_of_difference(before: Scenario, now: Scenario) -> str:
+    """Name what has changed since a run by the settings in which the present one differs."""
+    return join_differences(differences(before, now)) or SAME
+
+
+def join_differences(words: Sequence[str]) -> str:
+    """Write the first few differences out and count the others.
+
+    >>> join_differences(["a", "b", "c", "d"])
+    'a, b, c and 1 more'
+    """
+    more = f" and {len(words) - NAMED} more" if len(words) > NAMED else ""
+    return ", ".join(words[:NAMED]) + more

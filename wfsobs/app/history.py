@@ -1,0 +1,230 @@
+"""The history of a session: every result that was shown, which ones are compared with the present one, and the way back to each.
+
+Settings and scores of an entry stay. Its traces stay as long as the session's share of memory allows; otherwise its settings
+and seed give the same ones again. What a session holds of loaded records is limited as well, for nothing gives these again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import param
+
+from wfsobs.app.change_names import name_of_change
+from wfsobs.app.compared import LETTERS, ComparedRun, thin_lines
+from wfsobs.app.display import Display
+from wfsobs.app.history_entry import HistoryEntry, let_go, make_entry
+from wfsobs.app.jobs.job import DONE, FAILED
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.service import run_key
+from wfsobs.app.sources import Step
+from wfsobs.app.store import Store
+from wfsobs.app.work import RunResults
+from wfsobs.settings.errors import SettingError
+
+MOST = 200
+"""Entries of a history; the oldest that have neither a star nor are compared go first."""
+
+AFTER_DRAWING = 1
+"""Precedence of a watcher that comes after the figures, whose own is 0, and before the status line, whose own is 2."""
+
+LONGEST_NAME = 200
+"""Characters of an entry's name."""
+
+
+class History(param.Parameterized):
+    """The entries, newest first, in step with the store; and the runs of the display that are compared."""
+
+    entries: list[HistoryEntry] = param.List([], doc="Every result, newest first.")  # type: ignore
+    current = param.String("", doc="Key of the entry shown.")
+    note = param.String("", doc="What was done or refused, in one line.")
+    can_undelete = param.Boolean(False, doc="Whether an entry was deleted that can come back.")
+
+    def __init__(self, store: Store, display: Display):
+        super().__init__()
+        self.store, self.display = store, display
+        self.most_bytes = store.session.service.session_bytes
+        self.open_view: Callable[[str], Any] = lambda _query: None
+        self._query = ""
+        self._view_wanted: HistoryEntry | None = None
+        self._shown: Step | None = None
+        self._deletions: list[HistoryEntry] = []
+        self.task = BackgroundTask(store.session)
+        # After the store, which says what is stale, and the figures; before "Done" is said.
+        store.run.param.watch(self._on_run, ["state", "result"], precedence=AFTER_DRAWING)
+        self.task.param.watch(self._on_lines, "state")
+
+    def find(self, key: str) -> HistoryEntry | None:
+        """Return the entry of a key, or None."""
+        return next((entry for entry in self.entries if entry.key == key), None)
+
+    # ------------------------------------------------------------------ what comes in
+
+    def _on_run(self, *_: object) -> None:
+        """Keep a result that is complete; show a restored one as it was."""
+        run, wanted = self.store.run, self._view_wanted
+        results: RunResults | None = run.result
+        if results is None or self.store.stale:
+            return
+        if wanted is not None and run_key(results.scenario, results.source) == wanted.key:
+            self._view_wanted = None
+            self.open_view(wanted.view)
+        if run.state == DONE:
+            self.keep((results.scenario, self.store.preset, results.source), results)
+
+    def keep(self, step: Step, results: RunResults | None = None) -> None:
+        """Put settings and what they gave on top; those that are there already move there."""
+        entry = make_entry(step, "", results)
+        known = self.find(entry.key)
+        if known is None:
+            entry.name, known = name_of_change(self._shown, step), entry
+        else:
+            known.time = entry.time
+            known.scores, known.source = entry.scores or known.scores, entry.source
+        known.results, known.view = results or known.results, self._query
+        self._shown = step
+        if results is not None:
+            self.current = known.key
+        self._put([known, *(e for e in self.entries if e is not known)])
+
+    def add(self, entries: list[HistoryEntry]) -> None:
+        """Add entries of another session in the order of their times; of those that are there already the star alone."""
+        for entry in entries:
+            if (known := self.find(entry.key)) is not None:
+                known.star = known.star or entry.star
+        own = {entry.key for entry in self.entries}
+        merged = [*self.entries, *(entry for entry in entries if entry.key not in own)]
+        self._put(sorted(merged, key=lambda entry: -entry.time))
+
+    def follow_view(self, query: str) -> None:
+        """Keep the view with what is shown."""
+        self._query = "&".join(part for part in query.split("&") if part.startswith("view."))
+        entry = self.find(self.current)
+        if entry is not None and self.store.run.state == DONE and not self.store.stale and self._view_wanted is None:
+            entry.view = self._query
+
+    def _put(self, entries: list[HistoryEntry]) -> None:
+        """Replace the entries, within the limits."""
+        used = {run.key for run in self.display.compared_runs} | {self.current}
+        spare = [entry.key for entry in reversed(entries) if not entry.star and entry.key not in used]
+        gone = set(spare[: max(len(entries) - MOST, 0)])
+        self.entries = [entry for entry in entries if entry.key not in gone]
+        let_go(self.entries, self.current, self.most_bytes)
+        self.param.trigger("entries")
+
+    # ------------------------------------------------------------------ what is asked for
+
+    def rename(self, key: str, name: str) -> None:
+        """Give an entry another name; an empty one changes nothing."""
+        entry, name = self.find(key), " ".join(name.split())[:LONGEST_NAME]
+        if entry is not None and name:
+            entry.name = name
+            self.display.compared_runs = [
+                replace(run, name=name) if run.key == key else run for run in self.display.compared_runs
+            ]
+        self.param.trigger("entries")
+
+    def star(self, key: str) -> None:
+        """Give an entry a star, or take it away."""
+        if (entry := self.find(key)) is not None:
+            entry.star = not entry.star
+            self.param.trigger("entries")
+
+    def delete(self, key: str) -> None:
+        """Take an entry away; `undelete` brings it back."""
+        if (entry := self.find(key)) is not None:
+            self.compare(key, False)
+            entry.results = None
+            self._deletions.append(entry)
+            self.param.update(can_undelete=True, note=f"Deleted {entry.name}.")
+            self._put([e for e in self.entries if e is not entry])
+
+    def undelete(self) -> None:
+        """Bring the entry back that was deleted last."""
+        if self._deletions:
+            entry = self._deletions.pop()
+            self.param.update(can_undelete=bool(self._deletions), note=f"{entry.name} is back.")
+            self.add([entry])
+
+    def restore(self, key: str) -> None:
+        """Return to the settings, the record and the view of an entry."""
+        entry = self.find(key)
+        if entry is None:
+            return
+        if not entry.is_restorable:
+            self.note = f"{entry.name}: {entry.record} is no longer held, load it again"
+            return
+        if self.store.stale or self.store.run.result is None:  # what has not run is not lost either
+            self.keep(self.store.step)
+        service = self.store.session.service
+        if entry.results is not None:
+            service.cache.put(entry.key, entry.results)
+        try:
+            self.store.restore(entry.step)
+        except SettingError as error:
+            self.note = f"{entry.name}: {error}"
+            return
+        self.note = f"Restored {entry.name}."
+        if entry.key == self.current and not self.store.stale:
+            self.open_view(entry.view)
+        else:
+            self._view_wanted = entry
+
+    def compare(self, key: str, on: bool = True) -> None:
+        """Compare an entry with what is shown, or no longer."""
+        entry, runs = self.find(key), [run for run in self.display.compared_runs if run.key != key]
+        if on and entry is not None:
+            if len(runs) == len(LETTERS):
+                self.note = f"{len(LETTERS)} are compared already: untick one of them first."
+                return
+            letter = next(letter for letter in LETTERS if letter not in [run.letter for run in runs])
+            shown = self.store.run.result if entry.key == self.current else None
+            results = entry.results or shown
+            run = ComparedRun(
+                entry.key, letter, entry.name, entry.scenario, entry.scores, thin_lines(results) if results else None
+            )
+            runs = sorted([*runs, run], key=lambda it: it.letter)
+        self._show_runs(runs)
+
+    def compare_none(self) -> None:
+        """Compare nothing any more."""
+        self._show_runs([])
+
+    def _show_runs(self, runs: list[ComparedRun]) -> None:
+        self.display.compared_runs = runs
+        self.param.trigger("entries")
+        self._make_lines()
+
+    # ------------------------------------------------------------------ traces made again
+
+    def _make_lines(self) -> None:
+        """Run the first compared entry whose traces are no longer there."""
+        self.task.close()
+        for run in self.display.compared_runs:
+            entry = self.find(run.key) if run.lines is None else None
+            if entry is None or not entry.is_restorable:
+                continue
+            try:
+                self.task.start(self.store.session.service.run(entry.scenario, entry.source))
+            except SettingError as error:
+                self.note = f"{entry.name}: {error}"
+            else:
+                return
+
+    def _on_lines(self, *_: object) -> None:
+        results: RunResults | None = self.task.result
+        if self.task.state == FAILED:
+            self.note = self.task.message
+        if self.task.state != DONE or results is None:
+            return
+        key = run_key(results.scenario, results.source)
+        runs, entry = self.display.compared_runs, self.find(key)
+        self.task.result = None
+        if entry is not None:
+            entry.results = results
+            lines = thin_lines(results)
+            self.display.compared_runs = [replace(run, lines=lines) if run.key == key else run for run in runs]
+            self._put(self.entries)
+        self._make_lines()

@@ -1,0 +1,86 @@
+"""An entry of the history, and how much of all entries is held."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from wfsobs.app.cache import owners_in
+from wfsobs.app.service import run_key
+from wfsobs.app.sources import LoadedRecord, Source, Step
+from wfsobs.app.work import RunResults
+from wfsobs.evaluation.scores import Score
+from wfsobs.scenario import Scenario
+
+RECORD_BYTES = 200_000_000
+"""Of all loaded records that a history holds [bytes]; the oldest go first."""
+
+
+@dataclass(eq=False)
+class HistoryEntry:
+    """A result of the session.
+
+    key     : names the settings and the record
+    time    : when it was last computed or shown [s since 1970]
+    record  : name of the loaded record; empty for a simulation
+    source  : what the observers ran on where that is not the simulation of the settings; None too for a record no longer held
+    view    : the page's view when it was last shown, as a query
+    results : with traces, as long as they are held
+    """
+
+    key: str
+    name: str
+    time: float
+    scenario: Scenario
+    preset: str
+    source: Source | None = None
+    record: str = ""
+    scores: tuple[Score, ...] = ()
+    star: bool = False
+    view: str = ""
+    results: RunResults | None = field(default=None, repr=False)
+
+    @property
+    def is_restorable(self) -> bool:
+        """Whether what it ran on is there."""
+        return not self.record or self.source is not None
+
+    @property
+    def step(self) -> Step:
+        """Settings, preset and record."""
+        return self.scenario, self.preset, self.source
+
+
+def make_entry(step: Step, name: str, results: RunResults | None = None) -> HistoryEntry:
+    """Make an entry of settings and what they gave."""
+    scenario, preset, source = step
+    record = source.name if isinstance(source, LoadedRecord) else ""
+    scores = results.result.scores if results else ()
+    return HistoryEntry(run_key(scenario, source), name, time.time(), scenario, preset, source, record, scores, results=results)
+
+
+def let_go(entries: Iterable[HistoryEntry], current: str, most_bytes: int) -> None:
+    """Let go of traces beyond some bytes, and of loaded records beyond RECORD_BYTES: those of starred entries last.
+
+    current : key of the entry whose results are shown, which holds its record
+    """
+    names, names_of_records = set[int](), set[int]()
+    left, left_of_records = most_bytes, RECORD_BYTES
+    for entry in sorted(entries, key=lambda entry: (entry.key != current, not entry.star)):
+        if entry.results is not None:
+            left -= _new_bytes(entry.results, names)
+            if left < 0:
+                entry.results = None
+        if isinstance(entry.source, LoadedRecord):
+            left_of_records -= _new_bytes(entry.source.record, names_of_records)
+            if left_of_records < 0 and entry.key != current:
+                entry.source = entry.results = None
+
+
+def _new_bytes(value: Any, names: set[int]) -> int:
+    """Return the memory of the arrays in a value beyond those named already [bytes], and name them."""
+    owners = {name: size for name, size in owners_in(value).items() if name not in names}
+    names |= owners.keys()
+    return sum(owners.values())
