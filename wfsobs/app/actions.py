@@ -17,6 +17,7 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.pages import Pages
 from wfsobs.app.pages.parts import PageActions
 from wfsobs.app.report.maker import LIMIT, ReportError, make
+from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.share import FILE, Link, from_file, from_query, to_file, to_query
 from wfsobs.app.sources import SimulatedRecord
 from wfsobs.app.store import Store
@@ -78,9 +79,9 @@ class Actions:
         store.run.param.watch(self._refresh_ready, "result")
         self._refresh()
 
-    def attach(self, pages: Pages) -> None:
-        """Watch the pages: the one that is shown says what is copied and saved."""
-        self._pages = pages
+    def attach(self, pages: Pages, seeds: SeedRuns) -> None:
+        """Watch the pages: the one that is shown says what is copied and saved; seeds : what a report says of further seeds."""
+        self._pages, self._seeds = pages, seeds
         self._watched: set[str] = set()
         pages.param.watch(self._turn, "current")
 
@@ -193,8 +194,8 @@ class Actions:
 
     def _extras(self) -> dict[str, Any]:
         """Return what the report has beside the results shown."""
-        sweep = self._pages.sweep_shown() if self._pages else None
-        return {"sweep": sweep} if sweep else {}
+        extras = {"sweep": self._pages.sweep_shown(), "evidence": self._seeds.evidence} if self._pages else {}
+        return {name: it for name, it in extras.items() if it}
 
     def _start(self, which: str, name: str, job: Job, then: Callable[[Any], None]) -> None:
         """Have a job done, one of each at a time, say under a name how it goes, and then do something with its result."""

@@ -97,7 +97,7 @@ class Dashboard:
     def page(self) -> pmui.Page:
         """Build the whole page."""
         self.pages = Pages(self.explore, self.store, self.display)
-        self.actions.attach(self.pages)
+        self.actions.attach(self.pages, self.seeds)
         self.controls.search.on_sweep = self.pages.sweep_over
         self.view_state = ViewState(self.display, self.pages, self.explore.lines, self.explore.traces, self.seeds)
         self.actions.follow_view(self.view_state)

@@ -20,6 +20,7 @@ UNITS = {"nm": "nm", "mas": "mas", "um": "µm"}
 """Unit -> how it is written."""
 
 IN_MOST = "where the error of an optimal observer lies in 95 % of records"
+OVER_SEEDS = "where the mean error over records lies, at 95 % confidence"
 
 NO_ANGLE = ("mas",)
 """Units that only tip and tilt can be in."""

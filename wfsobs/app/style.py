@@ -18,6 +18,7 @@ from markupsafe import Markup
 from wfsobs.app.render import macro
 from wfsobs.app.work import TRUTH
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import PLAIN, Look
@@ -47,6 +48,16 @@ RUNS: Mapping[str, Look] = MappingProxyType(
     }
 )
 """Runs that are compared with the one shown, by their letters."""
+
+TERM_COLOURS: Mapping[str, str] = MappingProxyType(
+    {NOISE: "#8A8F98", LAG: "#3C7FC0", LINES: "#E8912D", MISMATCH: "#B5539C", CONE: "#3F9E6B"}
+)
+"""Terms of an error budget."""
+
+BOUND_MARKS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
+    {BOUND: ("#D64533", "dashed", "bound of the LGS"), BOUND_BOTH: ("#7A4FBF", "dotted", "bound of both sensors")}
+)
+"""Bound -> its colour, its dash, and how it is called beside an error budget."""
 
 HEARD = ".MuiFormLabel-root { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); }"
 """Style of a switch whose name is heard but not seen."""

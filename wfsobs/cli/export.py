@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from wfsobs.campaign.sweep import MOST_SEEDS
 from wfsobs.cli.options import scenario_options
 from wfsobs.cli.show import progress_bar, warn
 from wfsobs.progress import Watch
@@ -21,7 +22,16 @@ from wfsobs.settings.errors import SettingError
     metavar="NAME=VALUE,VALUE,...",
     help=f"Run for each of these values as well; several make every combination, at most {MOST}.",
 )
-def export(out: str, preset: str | None, config: str | None, assignments: tuple[str, ...], vary: tuple[str, ...]) -> None:
+@click.option(
+    "--seeds",
+    type=click.IntRange(1, MOST_SEEDS),
+    default=1,
+    metavar="N",
+    help="Also run the N - 1 seeds after run.seed, and give intervals of the errors.",
+)
+def export(
+    out: str, preset: str | None, config: str | None, assignments: tuple[str, ...], vary: tuple[str, ...], seeds: int
+) -> None:
     """Write a report: one HTML file with figures and numbers that opens without a network."""
     base = configfile.scenario_from(preset, config, assignments)
     variations = [parse_variation(text) for text in vary]
@@ -34,6 +44,7 @@ def export(out: str, preset: str | None, config: str | None, assignments: tuple[
             out,
             base,
             vary=variations,
+            seeds=seeds,
             preset=configfile.preset_name(preset, config),
             watch=Watch(progress=update),
             on_result=warn,

@@ -6,7 +6,7 @@ Nothing in this package imports Panel: with it in the process Bokeh's files do n
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -20,7 +20,9 @@ from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows as controller_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.evaluation.budget import budget_row, error_budget
 from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
+from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.rows import Row, score_rows
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -105,6 +107,9 @@ class State:
     lines   : "kind/target/observer/mode" -> points; kind is signal, error [um], psd, psd-error [um^2/Hz], cumulative or
               cumulative-error [um]; frequencies [Hz] of the latter two pairs as "frequency", "frequency-cumulative"
     loop    : as `wfsobs loop --json` gives them, of the controllers without a GPR; none where the record has no truth
+    budgets : as `wfsobs run --budget --json` gives them, of the linear observers; none where the sources are not known
+    seeds   : what further seeds say: their number, intervals [um] by "observer/target/mode", and by "target/mode" the best and
+              those that do not differ significantly from it; empty for one record
     """
 
     scenario: Scenario
@@ -113,6 +118,8 @@ class State:
     grid: Grid
     lines: Mapping[str, Floats]
     loop: Sequence[Row] = ()
+    budgets: Sequence[Row] = ()
+    seeds: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -145,8 +152,11 @@ def bins_for(states: int, observers: int, modes: int) -> int:
     return int(np.clip(points / 2, FEWEST, MOST_BINS))
 
 
-def state_of(result: Result, states: int = 1) -> State:
-    """Select what a report of so many states keeps of a run."""
+def state_of(result: Result, states: int = 1, *, is_simulated: bool = True, evidence: Evidence | None = None) -> State:
+    """Select what a report of so many states keeps of a run.
+
+    is_simulated : whether the record was made from the settings; evidence : errors over several seeds
+    """
     record, scenario = result.record, result.scenario
     names = [m.name for m in scenario.modes][: record.n_modes]
     lines: dict[str, Floats] = {}
@@ -168,7 +178,32 @@ def state_of(result: Result, states: int = 1) -> State:
                 lines |= _frequencies(found[0])
                 for suffix, density in zip(("", "-error") if "error" in signals else ("",), found[1:], strict=False):
                     lines[f"psd{suffix}/{where}"], lines[f"cumulative{suffix}/{where}"] = _spectra(found[0], density[:, i])
-    return State(scenario, score_rows(result.scores, scenario.run.seed), tuple(_reasons(result)), grid, lines, loop_rows(result))
+    rows = score_rows(result.scores, scenario.run.seed)
+    budgets = budget_rows(result) if is_simulated else []
+    return State(
+        scenario, rows, tuple(_reasons(result)), grid, lines, loop_rows(result), budgets, seeds_of(evidence) if evidence else {}
+    )
+
+
+def budget_rows(result: Result) -> list[Row]:
+    """List the error budgets of the linear observers by target and mode; nothing where the sources are not known."""
+    try:
+        found = [it for it in error_budget(result) if it.terms]
+    except ValueError:
+        return []
+    found.sort(key=lambda it: (TARGETS.index(it.target), [m.name for m in result.scenario.modes].index(it.mode)))
+    return [{"observer": it.observer, "target": it.target, "mode": it.mode, **budget_row(it)} for it in found]
+
+
+def seeds_of(evidence: Evidence) -> dict[str, Any]:
+    """Write what several seeds say as plain values."""
+    intervals = {"/".join(key): evidence.interval(key) for key in evidence.errors}
+    groups = dict.fromkeys(key[1:] for key in evidence.errors)
+    return {
+        "count": evidence.n_seeds,
+        "intervals": {key: list(ends) for key, ends in intervals.items() if ends},
+        "leaders": {"/".join(key): list(evidence.leaders(*key)) for key in groups},
+    }
 
 
 def loop_rows(result: Result) -> list[Row]:

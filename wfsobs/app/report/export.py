@@ -8,6 +8,7 @@ from pathlib import Path
 
 from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.page import page
+from wfsobs.evaluation.evidence import gather_evidence
 from wfsobs.files import check_writable, write_whole
 from wfsobs.pipeline import run
 from wfsobs.progress import QUIET, Watch
@@ -22,6 +23,7 @@ def export(
     *,
     vary: Sequence[Variation] = (),
     preset: str = "paper",
+    seeds: int = 1,
     watch: Watch = QUIET,
     on_result: Callable[[Result], None] = lambda result: None,
 ) -> None:
@@ -37,6 +39,9 @@ def export(
         Settings and their values (`wfsobs.scenario.grid.parse_variation`); every combination is run.
     preset : str
         Preset that the report compares the settings with.
+    seeds : int
+        Number of seeds of every state, `run.seed` and those after it; figures and budgets are of the first, errors have
+        intervals over all.
     watch : Watch, optional
         Receives the progress, and is asked at every block of work whether to stop.
     on_result : callable, optional
@@ -55,8 +60,13 @@ def export(
     check_writable(path)
     kept = []
     for i, one in enumerate(chosen):
-        result = run(one, watch=Watch(lambda f, i=i: watch.progress((i + f) / len(chosen)), watch.is_cancelled))
-        on_result(result)
-        kept.append(state_of(result, len(chosen)))
+        of = []
+        for number in range(seeds):
+            done, scenario_of_seed = i + number / seeds, one.replace({"run.seed": one.run.seed + number}) if number else one
+            inner = Watch(lambda f, done=done: watch.progress((done + f / seeds) / len(chosen)), watch.is_cancelled)
+            of.append(run(scenario_of_seed, watch=inner))
+        on_result(of[0])
+        evidence = gather_evidence([result.scores for result in of]) if seeds > 1 else None
+        kept.append(state_of(of[0], len(chosen), evidence=evidence))
     content = page(Report(preset, scenario, tuple(vary), tuple(kept)), datetime.now().astimezone()).encode()
     write_whole(path, lambda file: file.write(content))

@@ -15,6 +15,7 @@ import wfsobs
 from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.packing import pack
 from wfsobs.app.work import RunResults
+from wfsobs.evaluation.evidence import Evidence
 from wfsobs.progress import Watch
 
 log = logging.getLogger(__name__)
@@ -37,13 +38,15 @@ def make(
     _tell: object = None,
     command: str = "",
     sweep: Mapping[str, Any] | None = None,
+    evidence: Evidence | None = None,
 ) -> bytes:
     """Make the file of the results shown; blocks, so call it in a job. Raises ReportError, Cancelled.
 
     command : what makes the estimates again, of a record that is not the simulation of the settings; sweep : what `Report` has
-    of a sweep
+    of a sweep; evidence : what further seeds say
     """
-    content = pack(Report(preset, results.scenario, (), (state_of(results.result),), results.is_recorded, command, sweep))
+    state = state_of(results.result, is_simulated=not results.is_recorded, evidence=evidence)
+    content = pack(Report(preset, results.scenario, (), (state,), results.is_recorded, command, sweep))
     root = str(Path(wfsobs.__file__).parents[1])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}
     # A file, not a pipe: what a pipe has not taken when `communicate` times out is never sent.

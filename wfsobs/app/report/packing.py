@@ -28,6 +28,8 @@ def pack(report: Report) -> bytes:
                 "reasons": s.reasons,
                 "grid": [s.grid.n, s.grid.dt, s.grid.bins],
                 "loop": list(s.loop),
+                "budgets": list(s.budgets),
+                "seeds": s.seeds,
             }
             for s in report.states
         ],
@@ -48,7 +50,7 @@ def unpack(content: bytes) -> Report:
             if slash:
                 lines[int(number)][name] = file[key]
     states = tuple(
-        State(from_toml(s["toml"]), s["rows"], tuple(s["reasons"]), Grid(*s["grid"]), of, s["loop"])
+        State(from_toml(s["toml"]), s["rows"], tuple(s["reasons"]), Grid(*s["grid"]), of, s["loop"], s["budgets"], s["seeds"])
         for s, of in zip(words["states"], lines, strict=True)
     )
     variations = tuple(Variation(path, tuple(values)) for path, values in words["variations"])

@@ -15,8 +15,9 @@ from bokeh.resources import Resources
 from markupsafe import Markup
 
 from wfsobs import __version__
-from wfsobs.app.display import IN_MOST, NO_ANGLE, UNITS, per_micrometre
+from wfsobs.app.display import NO_ANGLE, UNITS, per_micrometre
 from wfsobs.app.render import render
+from wfsobs.app.report.budget import budget_key, budget_state_table
 from wfsobs.app.report.data import Pool, Report, State, encode, window_of
 from wfsobs.app.report.figures import SHADES, all_figures
 from wfsobs.app.report.loop import loop_state_table
@@ -26,6 +27,7 @@ from wfsobs.app.style import PRIMARY, asset, look, observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, marked_peaks
 from wfsobs.app.work import TRUTH
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE
+from wfsobs.evaluation.budget import TERMS
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -58,8 +60,12 @@ def page(report: Report, date: datetime) -> str:
         units=UNITS,
         sweeps={i: setting_label(report.base, report.variations[i].path) for i in _sweeps(report)},
         errors=[state_table(state, name) for state, name in states],
-        in_most=IN_MOST,
         loops=[loop_state_table(state, name) for state, name in states] if any(state.loop for state in report.states) else [],
+        budgets=[budget_state_table(state, name) for state, name in states]
+        if any(state.budgets for state in report.states)
+        else [],
+        budget_key=budget_key(),
+        terms=TERMS,
         not_applicable=NOT_APPLICABLE,
         limited=LIMITED,
         embedded={"rows": _rows(report), "data": _data(report), "figures": _figures(report)},

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from wfsobs.app.display import score_columns
+from wfsobs.app.display import IN_MOST, OVER_SEEDS, score_columns
 from wfsobs.app.numbers import NOTHING
 from wfsobs.app.report.data import State
+from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.rows import TIME, Row, can_be_best, is_non_causal, own_interval, row_label, scored_interval
 from wfsobs.evaluation.scores import RESIDUAL
 
@@ -19,7 +20,7 @@ def state_table(state: State, name: str) -> dict[str, Any]:
     return {
         "name": name,
         "columns": score_columns("nm", "z" if any(row["target"] == RESIDUAL for row in state.rows) else "truth"),
-        "groups": [_body(rows, state.grid.dt) for rows in groups],
+        "groups": [_body(rows, state.grid.dt, state.seeds) for rows in groups],
         "reasons": state.reasons,
     }
 
@@ -34,9 +35,11 @@ def _order(rows: list[Row]):
     return lambda row: (groups.index(_group(row)), row["apart"], row["rms_um"])
 
 
-def _body(rows: list[Row], dt: float) -> dict[str, Any]:
+def _body(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> dict[str, Any]:
     target, mode = _group(rows[0])
-    best = min((row["rms_um"] for row in rows if can_be_best(row["observer"], row["apart"])), default=math.inf)
+    marks = _marks(rows, seeds.get("leaders", {}).get(f"{target}/{mode}", []))
+    intervals = seeds.get("intervals", {})
+    over_seeds = f"{OVER_SEEDS}, {seeds.get('count', 1)} seeds"
     return {
         "target": target,
         "mode": mode,
@@ -47,7 +50,9 @@ def _body(rows: list[Row], dt: float) -> dict[str, Any]:
                 "label": row_label(row["observer"]),
                 "looks_ahead": is_non_causal(row["observer"]),
                 "stretch": own_interval(row),
-                "best": row["rms_um"] == best and can_be_best(row["observer"], row["apart"]),
+                "mark": marks.get(row["observer"]),
+                "interval": row["interval_um"] or intervals.get(f"{row['observer']}/{target}/{mode}"),
+                "meaning": IN_MOST if row["interval_um"] else over_seeds,
                 "lag": NOTHING if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−"),
                 "time": row[TIME],
                 "factor": None if row[TIME] is None else 1e-6 * row[TIME] / dt,
@@ -55,3 +60,11 @@ def _body(rows: list[Row], dt: float) -> dict[str, Any]:
             for row in rows
         ],
     }
+
+
+def _marks(rows: list[Row], leaders: Sequence[str]) -> dict[str, str]:
+    """Mark the best: over several seeds only if it differs significantly from all others, which are tied with it if not."""
+    if leaders:
+        return dict.fromkeys(leaders, "tied" if len(leaders) > 1 else "best")
+    rivals = {row["observer"]: row["rms_um"] for row in rows if can_be_best(row["observer"], row["apart"])}
+    return dict.fromkeys(rank_observers(rivals)[:1], "best")

@@ -116,10 +116,17 @@ def meaning_values(report: Report) -> dict[str, Any]:
         "warm_up": f"{report.base.run.warm_up:g}",
         "truthless": any(row["target"] == RESIDUAL for row in rows),
         "bounded": any(row["observer"] == BOUND for row in rows),
+        "seeds": n_seeds(report),
+        "budgeted": any(state.budgets for state in report.states),
         "matched": [what for what, how in noises.items() if how == "matched"],
         "points": [] if all(g.whole for g in grids) else counts if len(counts) < 2 else [counts[0], counts[-1]],
         "window": window_of(report.states),
     }
+
+
+def n_seeds(report: Report) -> int:
+    """Return the number of seeds that the errors rest on."""
+    return max((int(state.seeds.get("count", 1)) for state in report.states), default=1)
 
 
 def origin_values(report: Report, date: datetime) -> dict[str, Any]:
@@ -137,7 +144,8 @@ def command_of(report: Report) -> tuple[str, bool]:
         command = report.command or f"wfsobs observe RECORD --config {FILE}"
         return command, f"--config {FILE}" in command
     changed = changed_settings(report.base, reference_preset(report.preset))
-    ends = _words("--vary", report.variations)
+    seeds = n_seeds(report)
+    ends = [*_words("--vary", report.variations), *(["--seeds", str(seeds)] if seeds > 1 else [])]
     command = _command(
         ["--preset", report.preset, *_words("--set", (f"{k}={format_value(v)}" for k, v in changed.items())), *ends]
     )

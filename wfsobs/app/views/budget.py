@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from html import escape
 from math import sqrt
-from types import MappingProxyType
 from typing import Any
 
 import panel as pn
@@ -18,21 +17,13 @@ from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.parts import WIDE, html
 from wfsobs.app.store import Store
+from wfsobs.app.style import BOUND_MARKS, TERM_COLOURS
 from wfsobs.app.views.plots import call
 from wfsobs.app.work import RunResults
 from wfsobs.cost import run_seconds
-from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE, TERMS, Budget, error_budget
+from wfsobs.evaluation.budget import TERMS, Budget, error_budget
 from wfsobs.evaluation.rows import row_label
-from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.observers.base import TARGETS
-
-COLOURS: Mapping[str, str] = MappingProxyType(
-    {NOISE: "#8A8F98", LAG: "#3C7FC0", LINES: "#E8912D", MISMATCH: "#B5539C", CONE: "#3F9E6B"}
-)
-MARKS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
-    {BOUND: ("#D64533", "dashed", "bound of the LGS"), BOUND_BOTH: ("#7A4FBF", "dotted", "bound of both sensors")}
-)
-"""Bound -> its colour, its dash, and how it is called."""
 
 COLUMNS = ("observer", "left", "right", "colour", "term", "part", "share", "rms")
 
@@ -98,7 +89,7 @@ class BudgetView:
             for target, bars in self.bars.items():
                 scale = per_micrometre(self.display.unit, results.scenario.telescope.diameter)
                 of = [s for s in results.result.scores if s.target == target and s.mode == mode]
-                bounds = {s.observer: s.rms**2 for s in of if s.observer in MARKS}
+                bounds = {s.observer: s.rms**2 for s in of if s.observer in BOUND_MARKS}
                 shown = [b for b in found if b.target == target and b.terms]
                 bars.draw(shown, bounds, mode, scale, self.display.unit_label)
 
@@ -115,11 +106,12 @@ def budget_job(results: RunResults, mode: str) -> Job:
 def term_legend() -> pn.pane.HTML:
     """Say which colour is which term."""
     marks = "".join(
-        f'<span class="mark" style="padding-left:6px; border-left:10px solid {COLOURS[name]}">{escape(label)}</span>'
+        f'<span class="mark" style="padding-left:6px; border-left:10px solid {TERM_COLOURS[name]}">{escape(label)}</span>'
         for name, label in TERMS.items()
     )
     bounds = "".join(
-        f'<span class="mark" style="border-left:2px {dash} {colour}">{label}</span>' for colour, dash, label in MARKS.values()
+        f'<span class="mark" style="border-left:2px {dash} {colour}">{label}</span>'
+        for colour, dash, label in BOUND_MARKS.values()
     )
     return html(f'<div class="caption legend">{marks}{bounds}</div>')
 
@@ -141,7 +133,7 @@ class Bars:
         self.figure.add_tools(HoverTool(tooltips=tips))
         self.bounds = {
             name: Span(dimension="height", line_color=colour, line_dash=dash, line_width=2, visible=False)
-            for name, (colour, dash, _) in MARKS.items()
+            for name, (colour, dash, _) in BOUND_MARKS.items()
         }
         for mark in self.bounds.values():
             self.figure.add_layout(mark)
@@ -178,6 +170,15 @@ def bar_data(budgets: Sequence[Budget], scale: float, unit: str) -> dict[str, li
             rms = f"rms {sqrt(part):.3g} {unit}" if part >= 0 else "less than none: the others are correlated with it"
             share = f"{100.0 * it.terms[name] / it.total:.0f} %"
             rows.append(
-                (bar_label(it, scale, unit), start, start + part, COLOURS[name], TERMS[name], f"{part:.3g} {unit}²", share, rms)
+                (
+                    bar_label(it, scale, unit),
+                    start,
+                    start + part,
+                    TERM_COLOURS[name],
+                    TERMS[name],
+                    f"{part:.3g} {unit}²",
+                    share,
+                    rms,
+                )
             )
     return {name: [row[i] for row in rows] for i, name in enumerate(COLUMNS)}

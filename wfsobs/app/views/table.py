@@ -9,7 +9,7 @@ import panel as pn
 from markupsafe import Markup
 
 from wfsobs.app.compared import ComparedRun
-from wfsobs.app.display import IN_MOST, Display, per_micrometre, score_columns
+from wfsobs.app.display import IN_MOST, OVER_SEEDS, Display, per_micrometre, score_columns
 from wfsobs.app.glossary import BOUND as TERM_OF_BOUND
 from wfsobs.app.glossary import term
 from wfsobs.app.jobs.task import BackgroundTask
@@ -33,8 +33,6 @@ from wfsobs.evaluation.scores import BOUNDS, LOOP, RESIDUAL, Score
 from wfsobs.observers.base import TARGETS
 
 BEST, TIED, ABOVE = macro("tag", "best", "best"), macro("tag", "tied", "tied"), macro("tag", "above", "above truth")
-
-OVER_SEEDS = "where the mean error over records lies, at 95 % confidence"
 
 
 def find(results: RunResults, observer: str, target: str, mode: str) -> Score | None:
