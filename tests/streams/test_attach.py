@@ -1,0 +1,214 @@
+"""An observer on streams: the numbers of its run over the record, and a safe output whatever the stream does."""
+
+import json
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import wfsobs
+from tests.streams.conftest import started
+from wfsobs.cli import main
+from wfsobs.stepping import design
+from wfsobs.streams.attach import Attached, Plan
+from wfsobs.streams.shared_image import SharedImage
+from wfsobs.streams.watchdog import Limits
+
+ENOUGH = 60.0
+"""Longest wait for another process or thread [s]; nothing is expected to take so long."""
+SINGLE = 2e-7
+"""Rounding of float32 over the size of a number, three times over: measurement, estimate, comparison."""
+
+
+def measurements(n: int) -> np.ndarray:
+    return wfsobs.simulate(wfsobs.PRESETS["paper"]().replace({"run.duration": 2.0})).z[:n]
+
+
+def stepped(z: np.ndarray, name: str, ahead: float) -> np.ndarray:
+    """What an observer gives frame by frame, (n, n_modes)."""
+    observer = design(name, wfsobs.PRESETS["paper"]())
+    out = []
+    for row in z:
+        observer.update(row)
+        out.append(np.sum([observer.predict(ahead - 1, target)[0] for target in observer.targets], axis=0))
+    return np.array(out)
+
+
+def test_a_modal_filter_in_c_gets_the_numbers_of_the_run_over_the_record(tmp_path: Path, peer: Path) -> None:
+    """Modes 3 and 1 of five are ours; nm; two frames ahead; one block per frame; the others' numbers are not touched."""
+    n = 1500
+    z = measurements(n)
+    frames = np.random.default_rng(2).normal(size=(n, 5)).astype("<f4")
+    frames[:, [3, 1]] = 1e3 * z
+    frames.tofile(tmp_path / "values")
+    given, taken = tmp_path / "aol1_modevalOL.im.shm", tmp_path / "aol1_modevalPF.im.shm"
+    command = [peer, "loop", given, taken, n, 5, tmp_path / "values", tmp_path / "result", int(ENOUGH * 1e6), 1]
+    with started(*command) as loop:
+        while not given.exists():
+            time.sleep(0.001)
+        options = ["--preset", "paper", "--set", "run.warm_up=0.5", "--observer", "kf-lgs", "--modes", "3,1", "--unit", "nm"]
+        more = ["--delay", "2", "--stuck", str(ENOUGH), "--semaphore", "9", "--json"]
+        attach = [sys.executable, "-m", "wfsobs", "attach", "--in", str(given), "--out", str(taken), *options, *more]
+        with started(*attach) as ours:
+            told, _ = loop.communicate(timeout=2 * ENOUGH)
+            ours.send_signal(signal.SIGTERM)
+            out, err = ours.communicate(timeout=ENOUGH)
+    assert ours.returncode == 0, err
+    assert loop.returncode == 0 and int(told) == 0, "frames that were not answered"
+    result = np.fromfile(tmp_path / "result", "<f4").reshape(n, 5)
+    expected = 1e3 * stepped(frames[:, [3, 1]].astype(float) * 1e-3, "kf-lgs", 2)
+    assert not result[:, [0, 2, 4]].any() and not result[:499].any()
+    np.testing.assert_allclose(result[500:, [3, 1]], expected[500:], rtol=0, atol=SINGLE * np.abs(expected).max())
+    summary = json.loads(out)
+    assert summary["frames"] == n and summary["missing"] == summary["torn"] == summary["fallbacks"] == 0
+    last = SharedImage(taken).read()
+    assert last is not None and last[0] == n + 1 and not last[1].any(), "the last thing sent is safe"
+
+
+class Streams:
+    """Two streams with an observer between them that runs in a thread, in step with the test."""
+
+    def __init__(self, folder: Path, said: list[str], name: str = "kf-lgs", **plan):
+        self.source = SharedImage.create(folder / "in.im.shm", (2,), "float64")
+        self.sink = SharedImage.create(folder / "out.im.shm", (2,), "float64")
+        settings = {"stuck": ENOUGH, **plan}
+        self.attached = Attached(
+            SharedImage(folder / "in.im.shm"),
+            SharedImage(folder / "out.im.shm"),
+            design(name, wfsobs.PRESETS["paper"]()),
+            Plan((0, 1), 1.0, 1.0, np.full(2, 0.03), **settings),
+            said.append,
+        )
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        ends: list[bool] = []
+        thread = Thread(target=self.attached.run, args=(ENOUGH,), kwargs={"stop": lambda: bool(ends)})
+        thread.start()
+        try:
+            yield
+        finally:
+            ends.append(True)
+            self.source.write(np.zeros(2))
+            thread.join(ENOUGH)
+            assert not thread.is_alive()
+
+    def answer(self, z: np.ndarray) -> np.ndarray:
+        """Send a frame and return what comes back."""
+        before = self.sink.count
+        self.source.write(z)
+        return self.next(before)
+
+    def next(self, before: int) -> np.ndarray:
+        assert self.sink.wait(before, ENOUGH)
+        found = self.sink.read()
+        assert found is not None
+        return found[1]
+
+
+def test_missing_and_unreadable_measurements_are_missing(tmp_path: Path) -> None:
+    said: list[str] = []
+    z = measurements(200)
+    gone = z.copy()
+    gone[50:53], gone[100, 0], gone[120] = np.nan, np.nan, np.nan
+    sent = gone.copy()
+    sent[120] = [np.inf, -np.inf]
+    streams = Streams(tmp_path, said)
+    got = []
+    with streams.running():
+        for k, row in enumerate(sent):
+            if 50 <= k < 53:
+                streams.source._count[0] += np.uint64(1) if k > 50 else np.uint64(0)
+                continue
+            if k == 53:
+                streams.source._count[0] += np.uint64(1)
+            got.append(streams.answer(row))
+    expected = np.delete(stepped(gone, "kf-lgs", 1), [50, 51, 52], axis=0)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    assert streams.attached.summary()["missing"] == 3 and not said
+
+
+def test_a_stream_that_stops_and_comes_back(tmp_path: Path) -> None:
+    """The output is zero as soon as it is stuck, is told once, and follows the new file that a program makes anew."""
+    said: list[str] = []
+    streams = Streams(tmp_path, said, stuck=0.05, limits=Limits(calm=20))
+    z = measurements(300)
+    with streams.running():
+        first = streams.answer(z[0])
+        assert first.any() or streams.answer(z[1]).any()
+        before = streams.sink.count
+        while streams.next(before).any():
+            before = streams.sink.count
+        assert any("no frame for" in line for line in said)
+        streams.source = SharedImage.create(tmp_path / "in.im.shm", (2,), "float64")
+        until = time.monotonic() + ENOUGH
+        while "the stream was made anew" not in said and time.monotonic() < until:
+            time.sleep(0.001)
+        streams.attached._plan = replace(streams.attached._plan, stuck=ENOUGH)
+        answers = [streams.answer(row) for row in z]
+    assert not np.any(answers[:19]) and np.any(answers[25])
+    assert not streams.next(streams.sink.count - 1).any()
+
+
+def test_garbage_gives_no_stale_and_no_wild_output(tmp_path: Path) -> None:
+    said: list[str] = []
+    streams = Streams(tmp_path, said, limits=Limits(largest=5.0, calm=50))
+    z = measurements(100)
+    with streams.running():
+        for row in z[:50]:
+            streams.answer(row)
+        wild = [streams.answer(np.array([1e12, -1e12])) for _ in range(5)]
+        assert not np.any(wild)
+        torn = streams.sink.count
+        streams.source._writing[0] = 1
+        streams.source._count[0] += np.uint64(1)
+        assert not streams.next(torn).any()
+        streams.source._writing[0] = 0
+    assert said[0] == "the estimate exceeds 5 um: output falls back to zero" and streams.attached.tally.torn == 1
+
+
+def test_shadow_writes_nothing(tmp_path: Path) -> None:
+    source = SharedImage.create(tmp_path / "in.im.shm", (2,))
+    done = CliRunner().invoke(
+        main, ["attach", "--in", source.path, "--shadow", "--observer", "kf-lgs", "--seconds", "0.3", "--stuck", "0.05", "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    assert [path.name for path in tmp_path.iterdir()] == ["in.im.shm"]
+    summary = json.loads(done.output.strip().splitlines()[-1])
+    assert summary["frames"] == 0 and summary["stuck"] == 1 and source.count == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ([], "takes --out STREAM, or --shadow"),
+        (["--out", "IN"], "is the stream that is read"),
+        (["--shadow", "--modes", "0,0"], "different whole numbers"),
+        (["--shadow", "--modes", "0,5"], "mode 5: a frame has 2 numbers, 0 to 1"),
+        (["--shadow", "--modes", "0,1,2"], "the prior has 2 modes"),
+        (["--shadow", "--observer", "kf"], "no such observer"),
+        (["--shadow", "--observer", "multirate"], "takes an NGS"),
+        (["--shadow", "--observer", "gpr-offline"], "learns from a record beforehand"),
+        (["--shadow", "--observer", "gpr-online"], "its windows hold commands"),
+        (["--shadow", "--delay", "1.5", "--observer", "ridge"], "learns from a record beforehand"),
+        (["--shadow", "--semaphore", "10"], "it has 0 to 9"),
+    ],
+)
+def test_what_cannot_be_attached_is_said_in_one_line(tmp_path: Path, options: list[str], reason: str) -> None:
+    source = SharedImage.create(tmp_path / "in.im.shm", (2,))
+    options = [source.path if option == "IN" else option for option in options]
+    done = CliRunner().invoke(main, ["attach", "--in", source.path, "--seconds", "0.1", *options])
+    assert done.exit_code == 2 and reason in done.output and done.output.count("\n") == 1, done.output
+
+
+def test_no_stream_is_said_in_one_line(tmp_path: Path) -> None:
+    done = CliRunner().invoke(main, ["attach", "--in", str(tmp_path / "none.im.shm"), "--shadow"])
+    assert done.exit_code == 2 and "no stream: No such file or directory" in done.output and done.output.count("\n") == 1

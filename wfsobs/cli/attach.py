@@ -1,0 +1,161 @@
+"""`wfsobs attach`."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import click
+import numpy as np
+
+from wfsobs.cli.options import scenario_options
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.step import StepError, StepObserver
+from wfsobs.prior import Model, Training
+from wfsobs.priors_from.identification import told_by
+from wfsobs.priors_from.scenario import observer_settings
+from wfsobs.record import Sampling
+from wfsobs.scenario import Scenario, configfile
+from wfsobs.settings.group import SettingError
+from wfsobs.stepping import design, prior_in
+from wfsobs.streams.attach import STUCK, Attached, Plan
+from wfsobs.streams.layout import StreamError
+from wfsobs.streams.shared_image import SharedImage, stream_path
+from wfsobs.streams.watchdog import Limits
+from wfsobs.units import UNITS, micrometres_per
+
+
+@click.command()
+@scenario_options
+@click.option("--in", "source", required=True, metavar="STREAM", help="Pseudo-open-loop modes: a name, or the path of a file.")
+@click.option("--out", "sink", metavar="STREAM", help="Where the estimates go; made if there is none.")
+@click.option("--shadow", is_flag=True, help="Write nothing.")
+@click.option("--prior", metavar="FOUND.toml", help="Prior of the observer: the file of `wfsobs identify --out`.")
+@click.option("--observer", "name", default="kf-multi", show_default=True, metavar="ID", help="Observer that runs.")
+@click.option(
+    "--modes",
+    default=None,
+    metavar="I,J,...",
+    help="Elements of a frame, from 0, that are its modes; the first ones unless told.",
+)
+@click.option("--unit", type=click.Choice(UNITS), default="um", show_default=True, help="Unit of the streams.")
+@click.option(
+    "--delay",
+    type=click.FloatRange(1, 100),
+    default=1.0,
+    show_default=True,
+    metavar="D",
+    help="Frames from the newest measurement to the one that the estimate is for.",
+)
+@click.option(
+    "--fallback", type=click.Choice(["zero", "hold"]), default="zero", show_default=True, help="Output in place of an estimate."
+)
+@click.option("--limit", type=click.FloatRange(0, min_open=True), metavar="X", help="Magnitude that no estimate may exceed.")
+@click.option(
+    "--stuck", type=click.FloatRange(1e-3, 60), default=STUCK, show_default=True, metavar="S", help="Time without a frame."
+)
+@click.option(
+    "--semaphore", type=click.IntRange(0), metavar="N", help="Wait for this one of the stream; else the counter is watched."
+)
+@click.option("--seconds", type=click.FloatRange(0, min_open=True), metavar="S", help="Duration; until Ctrl+C unless told.")
+@click.option("--json", "as_json", is_flag=True, help="At the end print one JSON object.")
+def attach(
+    preset: str | None,
+    config: str | None,
+    assignments: tuple[str, ...],
+    source: str,
+    sink: str | None,
+    shadow: bool,
+    prior: str | None,
+    name: str,
+    modes: str | None,
+    unit: str,
+    delay: float,
+    fallback: str,
+    limit: float | None,
+    stuck: float,
+    semaphore: int | None,
+    seconds: float | None,
+    as_json: bool,
+) -> None:
+    """Run an observer on the streams of a running loop (docs/streams.md)."""
+    if bool(sink) == shadow:
+        raise SettingError("attach: takes --out STREAM, or --shadow to write nothing")
+    scenario = configfile.scenario_from(preset, config, assignments)
+    if prior is not None:
+        scenario = told_by(configfile.load_scenario(prior), scenario)
+        for path, value in map(configfile.parse_assignment, assignments):
+            scenario.set(path, value)
+    elements = _elements(modes, len(scenario.modes))
+    per_unit = micrometres_per(unit, scenario.telescope.diameter)
+    try:
+        given = SharedImage(stream_path(source))
+        taken = None if sink is None else _open_sink(sink, given)
+        observer, noise = _design(name, scenario, len(elements), delay - 1)
+        warm_up = max(round(scenario.run.warm_up / scenario.dt), 1)
+        largest = np.inf if limit is None else limit * per_unit
+        limits = Limits(fallback, largest, calm=warm_up)  # pyright: ignore[reportArgumentType]
+        plan = Plan(elements, per_unit, delay, noise, limits, warm_up, stuck, semaphore)
+        attached = Attached(given, taken, observer, plan, _say)
+        with _interrupted() as stop:
+            attached.run(seconds or np.inf, _say, stop)
+    except (StreamError, StepError) as error:
+        raise SettingError(f"attach: {error}") from None
+    if as_json:
+        click.echo(json.dumps(attached.summary(), allow_nan=False))
+
+
+def _say(line: str) -> None:
+    click.echo(f"wfsobs: attach: {line}", err=True)
+
+
+def _elements(text: str | None, n_modes: int) -> tuple[int, ...]:
+    """Return the elements of a frame that are the modes."""
+    if text is None:
+        return tuple(range(n_modes))
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() and len(part) < 10 for part in parts) or len(set(parts)) != len(parts):
+        raise SettingError(f"--modes {text}: takes different whole numbers from 0 with commas, such as 0,1")
+    if len(parts) > n_modes:
+        raise SettingError(f"--modes {text}: the prior has {n_modes} modes")
+    return tuple(map(int, parts))
+
+
+def _open_sink(name: str, source: SharedImage) -> SharedImage:
+    path = stream_path(name)
+    if path.resolve() == stream_path(source.path).resolve():
+        raise SettingError(f"--out {name}: is the stream that is read")
+    if path.exists():
+        return SharedImage(path)
+    return SharedImage.create(path, source.header.shape, source.header.dtype.name, source.header.layout)
+
+
+def _design(name: str, scenario: Scenario, n_modes: int, horizon: float) -> tuple[StepObserver, np.ndarray]:
+    """Return the observer, and the rms noise of a measurement that its prior has, (n_modes,) [um]."""
+    if name not in OBSERVERS:
+        raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
+    declared = OBSERVERS[name]
+    if Training in (*declared.prior, *declared.asks(observer_settings(declared, scenario))):
+        raise StepError(f"{name}: learns from a record beforehand; takes an observer with a model, such as kf-multi")
+    sampling = Sampling(n_modes, scenario.dt, scenario.sensors.exposure_ratio)
+    observer = design(name, scenario, sampling=sampling, horizon=horizon)
+    if observer.estimator.needs_command:
+        raise StepError(f"{name}: its windows hold commands, which the stream has not; set its inputs to z")
+    if "y_ngs" in declared.needs:
+        raise StepError(f"{name}: takes an NGS, and the stream has one sensor")
+    model = prior_in(name, scenario, (Model,), scenario, sampling, None).model
+    return observer, np.array([mode.lgs_noise for mode in model])
+
+
+@contextmanager
+def _interrupted() -> Iterator[Callable[[], bool]]:
+    """Turn Ctrl+C and SIGTERM into a wish to stop, so that the last thing sent is the safe output."""
+    wishes: list[int] = []
+    before = {number: signal.signal(number, lambda given, _: wishes.append(given)) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(wishes)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

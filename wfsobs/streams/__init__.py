@@ -1,0 +1,1 @@
+"""Observers on the streams of a running loop: ImageStreamIO shared memory, read and written without a library."""

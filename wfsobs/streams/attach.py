@@ -1,0 +1,214 @@
+"""An observer on a stream of pseudo-open-loop modes: what it expects goes to another stream, frame by frame."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from wfsobs.observers.step import StepObserver
+from wfsobs.streams.layout import StreamError
+from wfsobs.streams.shared_image import SharedImage
+from wfsobs.streams.tally import Tally
+from wfsobs.streams.watchdog import Limits, Watchdog
+from wfsobs.typing import Array
+
+STUCK = 0.1
+"""Time without a frame after which a stream is stuck [s]."""
+TICK = 0.05
+"""Longest wait for a frame before a look at the clock and at the wish to stop [s]."""
+RATE_ERROR = 0.05
+"""Part of the rate by which a loop may be off the design."""
+LONGEST_GAP = 1000
+"""Missing frames that an observer is taken through; after more of them it starts anew."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How an observer is attached.
+
+    elements : number in a frame of the stream of each mode of the observer
+    unit     : micrometres per unit of the streams
+    ahead    : frames from the newest measurement to the one that is to be met
+    noise    : rms of the noise of a measurement, (n_modes,) [um]
+    stuck    : time without a frame after which the stream is stuck [s]
+    semaphore : number of the semaphore that is waited for; None looks at the counter
+    """
+
+    elements: tuple[int, ...]
+    unit: float
+    ahead: float
+    noise: Array
+    limits: Limits = field(default_factory=Limits)
+    warm_up: int = 0
+    stuck: float = STUCK
+    semaphore: int | None = None
+
+
+class Attached:
+    """An observer between two streams.
+
+    Parameters
+    ----------
+    source : SharedImage
+        Pseudo-open-loop modes, one frame after the other.
+    sink : SharedImage or None
+        Where the estimates go, frames as long as those of the source; None writes nothing.
+    observer : StepObserver
+        Before its first frame.
+    plan : Plan
+        Modes, unit, horizon, limits.
+    say : callable
+        Receives one line about whatever happens.
+
+    Raises
+    ------
+    StreamError
+        The streams have not the modes of the plan.
+    """
+
+    def __init__(
+        self, source: SharedImage, sink: SharedImage | None, observer: StepObserver, plan: Plan, say: Callable[[str], None]
+    ):
+        for stream in (source, sink):
+            if stream is not None and max(plan.elements) >= stream.n:
+                raise StreamError(
+                    f"{stream.path}: mode {max(plan.elements)}: a frame has {stream.n} numbers, 0 to {stream.n - 1}"
+                )
+        self._source, self._sink, self._observer, self._plan, self._say = source, sink, observer, plan, say
+        self._elements, n = np.array(plan.elements), len(plan.elements)
+        self._watchdog = Watchdog(n, plan.limits, say, plan.warm_up)
+        self._semaphore = None if plan.semaphore is None else source.semaphore(plan.semaphore)
+        self._expected, self._band = np.full(n, np.nan), np.full(n, np.nan)
+        self._missing = np.full(n, np.nan)
+        self._out = np.zeros(sink.n if sink is not None else 0)
+        self._count, self._alive = source.first, 0.0
+        self._is_stuck = self._is_off_rate = False
+        self.tally = Tally(observer.sampling.dt)
+
+    def run(
+        self, seconds: float, report: Callable[[str], None] = lambda _: None, stop: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Follow the stream for so long [s], or until `stop` says so; at the end, whatever ends it, the safe output is sent.
+
+        Parameters
+        ----------
+        seconds : float
+            Duration.
+        report : callable
+            Receives a line of statistics each second.
+        stop : callable
+            Whether to end.
+        """
+        gc.collect()
+        gc.freeze()
+        if self._semaphore is not None:
+            self._semaphore.drain()
+        self._alive = now = monotonic()
+        end, spoken = now + seconds, now + 1.0
+        try:
+            while now < end and not stop():
+                if self._source.wait(self._count, min(TICK, self._plan.stuck, end - now), self._semaphore):
+                    self._alive, self._is_stuck = monotonic(), False
+                    self._take(self._alive)
+                elif monotonic() - self._alive >= self._plan.stuck:
+                    self._stand_still()
+                now = monotonic()
+                if now >= spoken:
+                    report(self.tally.line(self._watchdog.reason))
+                    self._check_rate()
+                    spoken += 1.0
+        finally:
+            gc.unfreeze()
+            self._send(self._watchdog.safe)
+
+    def _check_rate(self) -> None:
+        """Say once that the loop runs at another rate than the observer is designed for."""
+        rate, designed = self.tally.rate, 1.0 / self._observer.sampling.dt
+        if rate is not None and not self._is_off_rate and abs(rate / designed - 1.0) > RATE_ERROR:
+            self._is_off_rate = True
+            self._say(f"{self._source.path}: {rate:.0f} frames per second, the observer is designed for {designed:g}")
+
+    def _take(self, arrived: float) -> None:
+        """Take the newest frame, and send what is expected of a later one."""
+        found = self._source.read()
+        if found is None:
+            self.tally.torn += 1
+            self._watchdog.fall_back("a frame is being written without an end")
+            self._send(self._watchdog.safe)
+            return
+        count, values = found
+        lost = count - self._count - 1
+        if lost < 0 or lost > LONGEST_GAP:
+            self._start_anew(count, f"the counter went from {self._count} to {count}")
+            lost = 0
+        self._count = count
+        for _ in range(lost):
+            self._observer.update(self._missing)
+        z = values[self._elements] * self._plan.unit
+        error = z - self._expected if not lost else self._missing
+        estimate = self._step(np.where(np.isfinite(z), z, np.nan))
+        self._send(self._watchdog.output(estimate, error, self._band, lost))
+        self.tally.add(arrived, monotonic(), lost, z, error)
+        self._observer.settle()
+        self._expect()
+
+    def _step(self, z: Array) -> Array:
+        self._observer.update(z)
+        return sum(
+            (self._observer.predict(self._plan.ahead - 1, target)[0] for target in self._observer.targets), np.zeros_like(z)
+        )
+
+    def _expect(self) -> None:
+        """Keep what the next measurement should be, and how sure that is: the deviations of the parts added up."""
+        parts = [self._observer.predict(0, target) for target in self._observer.targets] if self._predicts_next else []
+        if parts:
+            self._expected = sum((mean for mean, _ in parts), np.zeros_like(self._missing))
+            self._band = sum((sd for _, sd in parts), self._plan.noise)
+
+    @property
+    def _predicts_next(self) -> bool:
+        own = self._observer.estimator.horizon
+        return own is None or own == 0
+
+    def _stand_still(self) -> None:
+        """No frame has come: send the safe output once, and look for a new stream at the same place."""
+        if not self._is_stuck:
+            self._is_stuck = True
+            self.tally.stuck += 1
+            self._say(f"{self._source.path}: no frame for {self._plan.stuck:g} s")
+            self._watchdog.fall_back("stuck")
+            self._send(self._watchdog.safe)
+        if not self._source.is_current:
+            self._follow_new_file()
+
+    def _follow_new_file(self) -> None:
+        try:
+            new = SharedImage(self._source.path)
+        except StreamError:
+            return
+        if new.n != self._source.n:
+            raise StreamError(f"{new.path}: made anew with {new.n} numbers a frame, it had {self._source.n}")
+        self._source = new
+        self._semaphore = None if self._plan.semaphore is None else new.semaphore(self._plan.semaphore)
+        self._start_anew(new.count, "the stream was made anew")
+
+    def _start_anew(self, count: int, reason: str) -> None:
+        self._observer.reset()
+        self._expected = np.full_like(self._expected, np.nan)
+        self._count = count
+        self._say(reason)
+        self._watchdog.fall_back(reason)
+
+    def _send(self, estimate: Array) -> None:
+        if self._sink is not None:
+            self._out[self._elements] = estimate / self._plan.unit
+            self._sink.write(self._out)
+
+    def summary(self) -> dict[str, Any]:
+        """Return counts, latencies [us] and errors [nm] so far, as JSON takes them."""
+        return {**self.tally.summary(), "fallbacks": self._watchdog.trips, "output": self._watchdog.reason or "on"}
