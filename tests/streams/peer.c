@@ -3,8 +3,8 @@
  * peer loop IN OUT FRAMES N VALUES RESULT MAXWAIT_US NBBLOCK
  *     Sends FRAMES frames of N float32 from the file VALUES on the stream IN, as a modal filter does: after each it waits until
  *     the counter of the stream OUT has risen by NBBLOCK, at most MAXWAIT_US, and then writes what OUT holds to the file RESULT.
- * peer hammer PATH FRAMES N
- *     Writes frames of N equal float64 as fast as it can.
+ * peer hammer PATH N
+ *     Writes frames of N equal float64, one right after the other, until it is killed.
  */
 #include <fcntl.h>
 #include <semaphore.h>
@@ -123,22 +123,22 @@ static int loop(char **a) {
     return 0;
 }
 
-static int hammer(char **a) {
-    long frames = atol(a[1]), n = atol(a[2]);
+static void hammer(char **a) {
+    long n = atol(a[1]);
     Stream s = make(a[0], (uint32_t)n, 1, 0);
     double *data = s.data;
-    for (long k = 1; k <= frames; k++) {
+    for (long k = 1;; k++) {
         s.header->write = 1;
         __sync_synchronize();
         for (long i = 0; i < n; i++) data[i] = (double)k;
         __sync_synchronize();
         publish(s);
+        usleep(20);
     }
-    return 0;
 }
 
 int main(int count, char **a) {
     if (count == 10 && !strcmp(a[1], "loop")) return loop(a + 2);
-    if (count == 5 && !strcmp(a[1], "hammer")) return hammer(a + 2);
+    if (count == 4 && !strcmp(a[1], "hammer")) hammer(a + 2);
     return 2;
 }

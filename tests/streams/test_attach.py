@@ -18,9 +18,9 @@ import wfsobs
 from tests.streams.conftest import started
 from wfsobs.cli import main
 from wfsobs.stepping import design
-from wfsobs.streams.attach import Attached, Plan
+from wfsobs.streams.attach import Attachment, Wiring
 from wfsobs.streams.shared_image import SharedImage
-from wfsobs.streams.watchdog import Limits
+from wfsobs.streams.watchdog import Safety
 
 ENOUGH = 60.0
 """Longest wait for another process or thread [s]; nothing is expected to take so long."""
@@ -76,22 +76,22 @@ def test_a_modal_filter_in_c_gets_the_numbers_of_the_run_over_the_record(tmp_pat
 class Streams:
     """Two streams with an observer between them that runs in a thread, in step with the test."""
 
-    def __init__(self, folder: Path, said: list[str], name: str = "kf-lgs", **plan):
+    def __init__(self, folder: Path, said: list[str], name: str = "kf-lgs", **wiring):
         self.source = SharedImage.create(folder / "in.im.shm", (2,), "float64")
         self.sink = SharedImage.create(folder / "out.im.shm", (2,), "float64")
-        settings = {"stuck": ENOUGH, **plan}
-        self.attached = Attached(
+        settings = {"stuck": ENOUGH, **wiring}
+        self.attachment = Attachment(
             SharedImage(folder / "in.im.shm"),
             SharedImage(folder / "out.im.shm"),
             design(name, wfsobs.PRESETS["paper"]()),
-            Plan((0, 1), 1.0, 1.0, np.full(2, 0.03), **settings),
+            Wiring((0, 1), 1.0, 1.0, np.full(2, 0.03), **settings),
             said.append,
         )
 
     @contextmanager
     def running(self) -> Iterator[None]:
         ends: list[bool] = []
-        thread = Thread(target=self.attached.run, args=(ENOUGH,), kwargs={"stop": lambda: bool(ends)})
+        thread = Thread(target=self.attachment.run, args=(ENOUGH,), kwargs={"stop": lambda: bool(ends)})
         thread.start()
         try:
             yield
@@ -133,13 +133,13 @@ def test_missing_and_unreadable_measurements_are_missing(tmp_path: Path) -> None
             got.append(streams.answer(row))
     expected = np.delete(stepped(gone, "kf-lgs", 1), [50, 51, 52], axis=0)
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-    assert streams.attached.summary()["missing"] == 3 and not said
+    assert streams.attachment.summary()["missing"] == 3 and not said
 
 
 def test_a_stream_that_stops_and_comes_back(tmp_path: Path) -> None:
     """The output is zero as soon as it is stuck, is told once, and follows the new file that a program makes anew."""
     said: list[str] = []
-    streams = Streams(tmp_path, said, stuck=0.05, limits=Limits(calm=20))
+    streams = Streams(tmp_path, said, stuck=0.05, safety=Safety(calm=20))
     z = measurements(300)
     with streams.running():
         first = streams.answer(z[0])
@@ -152,7 +152,7 @@ def test_a_stream_that_stops_and_comes_back(tmp_path: Path) -> None:
         until = time.monotonic() + ENOUGH
         while "the stream was made anew" not in said and time.monotonic() < until:
             time.sleep(0.001)
-        streams.attached._plan = replace(streams.attached._plan, stuck=ENOUGH)
+        streams.attachment._wiring = replace(streams.attachment._wiring, stuck=ENOUGH)
         answers = [streams.answer(row) for row in z]
     assert not np.any(answers[:19]) and np.any(answers[25])
     assert not streams.next(streams.sink.count - 1).any()
@@ -160,7 +160,7 @@ def test_a_stream_that_stops_and_comes_back(tmp_path: Path) -> None:
 
 def test_garbage_gives_no_stale_and_no_wild_output(tmp_path: Path) -> None:
     said: list[str] = []
-    streams = Streams(tmp_path, said, limits=Limits(largest=5.0, calm=50))
+    streams = Streams(tmp_path, said, safety=Safety(largest=5.0, calm=50))
     z = measurements(100)
     with streams.running():
         for row in z[:50]:
@@ -172,7 +172,7 @@ def test_garbage_gives_no_stale_and_no_wild_output(tmp_path: Path) -> None:
         streams.source._count[0] += np.uint64(1)
         assert not streams.next(torn).any()
         streams.source._writing[0] = 0
-    assert said[0] == "the estimate exceeds 5 um: output falls back to zero" and streams.attached.tally.torn == 1
+    assert said[0] == "the estimate exceeds 5 um: output falls back to zero" and streams.attachment.tally.torn == 1
 
 
 def test_shadow_writes_nothing(tmp_path: Path) -> None:

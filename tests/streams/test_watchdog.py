@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from wfsobs.streams.watchdog import BEYOND, SIGMAS, Limits, Watchdog
+from wfsobs.streams.watchdog import BEYOND, SIGMAS, Safety, Watchdog
 
 NONE = np.full(2, np.nan)
 ESTIMATE = np.array([0.3, -0.2])
 
 
 def watchdog(said: list[str], warm_up: int = 0, **limits) -> Watchdog:
-    return Watchdog(2, Limits(**{"largest": 1.0, "missing": 3, "calm": 5, **limits}), said.append, warm_up)
+    return Watchdog(2, Safety(**{"largest": 1.0, "missing": 3, "calm": 5, **limits}), said.append, warm_up)
 
 
 def good(dog: Watchdog, missing: int = 0) -> np.ndarray:

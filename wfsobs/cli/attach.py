@@ -20,10 +20,10 @@ from wfsobs.record import Sampling
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import design, prior_in
-from wfsobs.streams.attach import STUCK, Attached, Plan
+from wfsobs.streams.attach import STUCK, Attachment, Wiring
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.shared_image import SharedImage, stream_path
-from wfsobs.streams.watchdog import Limits
+from wfsobs.streams.watchdog import Safety
 from wfsobs.units import UNITS, micrometres_per
 
 
@@ -96,15 +96,15 @@ def attach(
         observer, noise = _design(name, scenario, len(elements), delay - 1)
         warm_up = max(round(scenario.run.warm_up / scenario.dt), 1)
         largest = np.inf if limit is None else limit * per_unit
-        limits = Limits(fallback, largest, calm=warm_up)  # pyright: ignore[reportArgumentType]
-        plan = Plan(elements, per_unit, delay, noise, limits, warm_up, stuck, semaphore)
-        attached = Attached(given, taken, observer, plan, _say)
-        with _interrupted() as stop:
-            attached.run(seconds or np.inf, _say, stop)
+        limits = Safety(fallback, largest, calm=warm_up)  # pyright: ignore[reportArgumentType]
+        wiring = Wiring(elements, per_unit, delay, noise, limits, warm_up, stuck, semaphore)
+        attachment = Attachment(given, taken, observer, wiring, _say)
+        with _stop_signals() as stop:
+            attachment.run(seconds or np.inf, _say, stop)
     except (StreamError, StepError) as error:
         raise SettingError(f"attach: {error}") from None
     if as_json:
-        click.echo(json.dumps(attached.summary(), allow_nan=False))
+        click.echo(json.dumps(attachment.summary(), allow_nan=False))
 
 
 def _say(line: str) -> None:
@@ -150,7 +150,7 @@ def _design(name: str, scenario: Scenario, n_modes: int, horizon: float) -> tupl
 
 
 @contextmanager
-def _interrupted() -> Iterator[Callable[[], bool]]:
+def _stop_signals() -> Iterator[Callable[[], bool]]:
     """Turn Ctrl+C and SIGTERM into a wish to stop, so that the last thing sent is the safe output."""
     wishes: list[int] = []
     before = {number: signal.signal(number, lambda given, _: wishes.append(given)) for number in (signal.SIGINT, signal.SIGTERM)}

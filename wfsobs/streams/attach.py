@@ -14,7 +14,7 @@ from wfsobs.observers.step import StepObserver
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.shared_image import SharedImage
 from wfsobs.streams.tally import Tally
-from wfsobs.streams.watchdog import Limits, Watchdog
+from wfsobs.streams.watchdog import Safety, Watchdog
 from wfsobs.typing import Array
 
 STUCK = 0.1
@@ -28,8 +28,8 @@ LONGEST_GAP = 1000
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How an observer is attached.
+class Wiring:
+    """How an observer is attachment.
 
     elements : number in a frame of the stream of each mode of the observer
     unit     : micrometres per unit of the streams
@@ -43,13 +43,13 @@ class Plan:
     unit: float
     ahead: float
     noise: Array
-    limits: Limits = field(default_factory=Limits)
+    safety: Safety = field(default_factory=Safety)
     warm_up: int = 0
     stuck: float = STUCK
     semaphore: int | None = None
 
 
-class Attached:
+class Attachment:
     """An observer between two streams.
 
     Parameters
@@ -60,7 +60,7 @@ class Attached:
         Where the estimates go, frames as long as those of the source; None writes nothing.
     observer : StepObserver
         Before its first frame.
-    plan : Plan
+    wiring : Wiring
         Modes, unit, horizon, limits.
     say : callable
         Receives one line about whatever happens.
@@ -68,21 +68,21 @@ class Attached:
     Raises
     ------
     StreamError
-        The streams have not the modes of the plan.
+        The streams have not the modes of the wiring.
     """
 
     def __init__(
-        self, source: SharedImage, sink: SharedImage | None, observer: StepObserver, plan: Plan, say: Callable[[str], None]
+        self, source: SharedImage, sink: SharedImage | None, observer: StepObserver, wiring: Wiring, say: Callable[[str], None]
     ):
         for stream in (source, sink):
-            if stream is not None and max(plan.elements) >= stream.n:
+            if stream is not None and max(wiring.elements) >= stream.n:
                 raise StreamError(
-                    f"{stream.path}: mode {max(plan.elements)}: a frame has {stream.n} numbers, 0 to {stream.n - 1}"
+                    f"{stream.path}: mode {max(wiring.elements)}: a frame has {stream.n} numbers, 0 to {stream.n - 1}"
                 )
-        self._source, self._sink, self._observer, self._plan, self._say = source, sink, observer, plan, say
-        self._elements, n = np.array(plan.elements), len(plan.elements)
-        self._watchdog = Watchdog(n, plan.limits, say, plan.warm_up)
-        self._semaphore = None if plan.semaphore is None else source.semaphore(plan.semaphore)
+        self._source, self._sink, self._observer, self._wiring, self._say = source, sink, observer, wiring, say
+        self._elements, n = np.array(wiring.elements), len(wiring.elements)
+        self._watchdog = Watchdog(n, wiring.safety, say, wiring.warm_up)
+        self._semaphore = None if wiring.semaphore is None else source.semaphore(wiring.semaphore)
         self._expected, self._band = np.full(n, np.nan), np.full(n, np.nan)
         self._missing = np.full(n, np.nan)
         self._out = np.zeros(sink.n if sink is not None else 0)
@@ -112,10 +112,10 @@ class Attached:
         end, spoken = now + seconds, now + 1.0
         try:
             while now < end and not stop():
-                if self._source.wait(self._count, min(TICK, self._plan.stuck, end - now), self._semaphore):
+                if self._source.wait(self._count, min(TICK, self._wiring.stuck, end - now), self._semaphore):
                     self._alive, self._is_stuck = monotonic(), False
                     self._take(self._alive)
-                elif monotonic() - self._alive >= self._plan.stuck:
+                elif monotonic() - self._alive >= self._wiring.stuck:
                     self._stand_still()
                 now = monotonic()
                 if now >= spoken:
@@ -133,7 +133,7 @@ class Attached:
             self._is_off_rate = True
             self._say(f"{self._source.path}: {rate:.0f} frames per second, the observer is designed for {designed:g}")
 
-    def _take(self, arrived: float) -> None:
+    def _take(self, arrival: float) -> None:
         """Take the newest frame, and send what is expected of a later one."""
         found = self._source.read()
         if found is None:
@@ -149,18 +149,18 @@ class Attached:
         self._count = count
         for _ in range(lost):
             self._observer.update(self._missing)
-        z = values[self._elements] * self._plan.unit
+        z = values[self._elements] * self._wiring.unit
         error = z - self._expected if not lost else self._missing
         estimate = self._step(np.where(np.isfinite(z), z, np.nan))
         self._send(self._watchdog.output(estimate, error, self._band, lost))
-        self.tally.add(arrived, monotonic(), lost, z, error)
+        self.tally.add(arrival, monotonic(), lost, z, error)
         self._observer.settle()
         self._expect()
 
     def _step(self, z: Array) -> Array:
         self._observer.update(z)
         return sum(
-            (self._observer.predict(self._plan.ahead - 1, target)[0] for target in self._observer.targets), np.zeros_like(z)
+            (self._observer.predict(self._wiring.ahead - 1, target)[0] for target in self._observer.targets), np.zeros_like(z)
         )
 
     def _expect(self) -> None:
@@ -168,7 +168,7 @@ class Attached:
         parts = [self._observer.predict(0, target) for target in self._observer.targets] if self._predicts_next else []
         if parts:
             self._expected = sum((mean for mean, _ in parts), np.zeros_like(self._missing))
-            self._band = sum((sd for _, sd in parts), self._plan.noise)
+            self._band = sum((sd for _, sd in parts), self._wiring.noise)
 
     @property
     def _predicts_next(self) -> bool:
@@ -180,7 +180,7 @@ class Attached:
         if not self._is_stuck:
             self._is_stuck = True
             self.tally.stuck += 1
-            self._say(f"{self._source.path}: no frame for {self._plan.stuck:g} s")
+            self._say(f"{self._source.path}: no frame for {self._wiring.stuck:g} s")
             self._watchdog.fall_back("stuck")
             self._send(self._watchdog.safe)
         if not self._source.is_current:
@@ -194,7 +194,7 @@ class Attached:
         if new.n != self._source.n:
             raise StreamError(f"{new.path}: made anew with {new.n} numbers a frame, it had {self._source.n}")
         self._source = new
-        self._semaphore = None if self._plan.semaphore is None else new.semaphore(self._plan.semaphore)
+        self._semaphore = None if self._wiring.semaphore is None else new.semaphore(self._wiring.semaphore)
         self._start_anew(new.count, "the stream was made anew")
 
     def _start_anew(self, count: int, reason: str) -> None:
@@ -206,7 +206,7 @@ class Attached:
 
     def _send(self, estimate: Array) -> None:
         if self._sink is not None:
-            self._out[self._elements] = estimate / self._plan.unit
+            self._out[self._elements] = estimate / self._wiring.unit
             self._sink.write(self._out)
 
     def summary(self) -> dict[str, Any]:

@@ -41,7 +41,7 @@ class Layout:
 
     version          : the text at the start of a file
     header           : bytes of the header
-    shared, location : "in shared memory" and the device (-1: none)
+    memory, location : "in shared memory" and the device (-1: none)
     semaphores       : number of semaphores
     count, writing   : the counter of frames (cnt0; cnt1 and cnt2 follow), and "is being written"
     n_keywords       : number of keywords, of `keyword` bytes each
@@ -50,7 +50,7 @@ class Layout:
 
     version: str
     header: int
-    shared: int
+    memory: int
     location: int
     semaphores: int
     count: int
@@ -142,7 +142,7 @@ def new_file(name: str, shape: tuple[int, ...], dtype: np.dtype, layout: Layout)
     struct.pack_into("<B3x3I", made, AXES, len(shape), *axes)
     struct.pack_into("<Q", made, COUNT_OF_ELEMENTS, prod(shape))
     struct.pack_into("<B7xQ", made, DATATYPE, code, MATHEMATICAL)
-    struct.pack_into("<B", made, layout.shared, 1)
+    struct.pack_into("<B", made, layout.memory, 1)
     struct.pack_into("<b", made, layout.location, -1)
     struct.pack_into("<H", made, layout.semaphores, n)
     if layout.data_size is not None:

@@ -54,19 +54,19 @@ class Tally:
         self._second, self._all = _Span(), _Span()
         self._first: float | None = None
 
-    def add(self, arrived: float, done: float, missing: int, z: Array, error: Array) -> None:
+    def add(self, arrival: float, end: float, missing: int, z: Array, error: Array) -> None:
         """Count a frame: when it was there and when its estimate was out [s], frames missing before it, measurement and error."""
-        late = self._last is not None and arrived - self._last > SLOW * self._dt * (1 + missing)
+        late = self._last is not None and arrival - self._last > SLOW * self._dt * (1 + missing)
         known = np.isfinite(error)
         for span in (self._second, self._all):
             span.frames += 1
             span.missing += missing
             span.late += late
-            span.latencies[np.searchsorted(BINS, done - arrived)] += 1
+            span.latencies[np.searchsorted(BINS, end - arrival)] += 1
             span.scored += int(known.sum())
             span.error += float((error[known] ** 2).sum())
             span.size += float((z[known] ** 2).sum())
-        self._first, self._last = self._first or arrived, arrived
+        self._first, self._last = self._first or arrival, arrival
 
     @property
     def rate(self) -> float | None:

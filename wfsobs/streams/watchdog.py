@@ -19,7 +19,7 @@ BEYOND = 5
 
 
 @dataclass(frozen=True)
-class Limits:
+class Safety:
     """When an estimate is not sent.
 
     fallback : what is sent in its place
@@ -41,7 +41,7 @@ class Watchdog:
     ----------
     n_modes : int
         Number of modes.
-    limits : Limits
+    safety : Safety
         When an estimate is not sent.
     say : callable
         Receives one line whenever that changes.
@@ -56,9 +56,9 @@ class Watchdog:
         Times that it fell back.
     """
 
-    def __init__(self, n_modes: int, limits: Limits, say: Callable[[str], None], warm_up: int = 0):
+    def __init__(self, n_modes: int, safety: Safety, say: Callable[[str], None], warm_up: int = 0):
         self.reason, self.trips = ("the observer starts" if warm_up else ""), 0
-        self._limits, self._say = limits, say
+        self._safety, self._say = safety, say
         self._good, self._left = np.zeros(n_modes), warm_up
         self._beyond = 0
 
@@ -89,25 +89,25 @@ class Watchdog:
     @property
     def safe(self) -> Array:
         """What is sent in place of an estimate, (n_modes,) [um]."""
-        return self._good if self._limits.fallback == "hold" else np.zeros_like(self._good)
+        return self._good if self._safety.fallback == "hold" else np.zeros_like(self._good)
 
     def fall_back(self, reason: str) -> None:
         """Send no estimate until all has been well for a while."""
         if not self.reason:
             self.trips += 1
-            self._say(f"{reason}: output falls back to {self._limits.fallback}")
-        self.reason, self._left = reason, self._limits.calm
+            self._say(f"{reason}: output falls back to {self._safety.fallback}")
+        self.reason, self._left = reason, self._safety.calm
 
     def _return(self) -> None:
-        self._say(f"output on again after {self._limits.calm} good frames" if self.trips else "output on")
+        self._say(f"output on again after {self._safety.calm} good frames" if self.trips else "output on")
         self.reason = ""
 
     def _fault(self, estimate: Array, error: Array, band: Array, missing: int) -> str:
         if not np.isfinite(estimate).all():
             return "the estimate is not finite"
-        if np.abs(estimate).max() > self._limits.largest:
-            return f"the estimate exceeds {self._limits.largest:g} um"
-        if missing > self._limits.missing:
+        if np.abs(estimate).max() > self._safety.largest:
+            return f"the estimate exceeds {self._safety.largest:g} um"
+        if missing > self._safety.missing:
             return f"{missing} frames in a row are missing"
         with np.errstate(invalid="ignore"):
             self._beyond = self._beyond + 1 if (np.abs(error) > SIGMAS * band).any() else 0
