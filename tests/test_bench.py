@@ -15,8 +15,8 @@ from wfsobs.bench.measure import OURS, max_error, measure_time, row, with_ratios
 from wfsobs.bench.sizes import Sizes
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.gpr.kernels import SquaredExponential
-from wfsobs.observers.gpr.offline import train
 from wfsobs.observers.gpr.online import predict_sliding
+from wfsobs.observers.gpr.trained import train
 
 TINY = Sizes(
     settings={

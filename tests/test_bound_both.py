@@ -16,7 +16,8 @@ from wfsobs.evaluation.record_bounds import record_bounds
 from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
 from wfsobs.observers.kalman.multirate_optimal import optimal_cycle
-from wfsobs.priors_from.scenario import kalman_model, measurement_noise
+from wfsobs.priors_from.scenario import kalman_model
+from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.riccati import periodic_steady_state

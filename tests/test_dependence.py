@@ -11,9 +11,9 @@ import pytest
 
 from wfsobs.dependence import Memo, RecordMemo, digest, observers_reached, record_digest, simulate_once
 from wfsobs.evaluation.record_bounds import record_bounds
+from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import Estimate
-from wfsobs.pipeline import each_estimate
+from wfsobs.observers.estimates import Estimate
 from wfsobs.priors_from.scenario import prior_and_settings
 from wfsobs.record import Record
 from wfsobs.result import Failure

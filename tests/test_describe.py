@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wfsobs.evaluation.description import Description, describe
-from wfsobs.pipeline import run_observer
+from wfsobs.execution import run_observer
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

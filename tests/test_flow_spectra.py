@@ -8,7 +8,7 @@ from scipy.signal import csd, welch
 
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.record_bounds import record_bounds
-from wfsobs.pipeline import run_observer
+from wfsobs.execution import run_observer
 from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import circle_mean
 from wfsobs.simulation.flow_spectra import flow_spectra

@@ -13,7 +13,8 @@ from wfsobs.cli import main
 from wfsobs.cli.recovery_tables import OverTime
 from wfsobs.evaluation.recovery import PooledRms, recovery, running_rms, trailing_rms
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import VIBRATION, Estimate
+from wfsobs.observers.base import VIBRATION
+from wfsobs.observers.estimates import Estimate
 from wfsobs.pipeline import run
 from wfsobs.record import Record
 

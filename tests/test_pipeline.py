@@ -12,9 +12,11 @@ from wfsobs import PRESETS, Record, Scenario, SettingError, observe, run, simula
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.bound_both import bound_rms_of_both
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, LOOP, PREDICTION, RESIDUAL
+from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import TARGETS, Estimate
-from wfsobs.pipeline import as_stated, each_estimate
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.estimates import Estimate
+from wfsobs.pipeline import as_stated
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.result import Failure
 from wfsobs.signal.welch import rms

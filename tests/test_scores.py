@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from wfsobs.evaluation.error_spectra import cumulative_rms, scored_samples
 from wfsobs.evaluation.lag import lag
 from wfsobs.evaluation.scores import supervised_scores, unsupervised_scores
-from wfsobs.observers.base import Estimate
+from wfsobs.observers.estimates import Estimate
 from wfsobs.record import Record
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.welch import rms, welch_psd

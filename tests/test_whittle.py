@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.special import expit, logit
 
-from wfsobs.priors_from.scenario import measurement_noise, modelled_processes
+from wfsobs.priors_from.scenario import modelled_processes
+from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar3 import TOLERANCE, Ar3, fit_ar3
 from wfsobs.signal.whittle import information, whittle_fit

@@ -15,7 +15,8 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import Estimate, Observer
+from wfsobs.observers.base import Observer
+from wfsobs.observers.estimates import Estimate
 from wfsobs.prior import Lines, Part, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from time import perf_counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,18 +11,16 @@ import numpy as np
 from wfsobs.dependence import RecordMemo
 from wfsobs.evaluation.record_bounds import Bound, bound_scores, record_bounds
 from wfsobs.evaluation.scores import score
+from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import Estimate, Estimates, Observer
+from wfsobs.observers.estimates import Estimate
 from wfsobs.priors_from.identification import told_by
-from wfsobs.priors_from.scenario import arguments, as_sampled, prior_and_settings
+from wfsobs.priors_from.scenario import as_sampled
 from wfsobs.priors_from.training import trained_until, with_training
-from wfsobs.progress import QUIET, Watch, detach_watch
+from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.result import Failure, Result
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.idle import used_settings
-from wfsobs.settings.errors import SettingError
-from wfsobs.settings.tree import Plain
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
 
@@ -178,102 +175,3 @@ def collect(
         scores.sort(key=lambda s: (order[s.observer], s.target))
     scores += bound_scores(least, record, scores, warm_up)
     return Result(scenario, record, tuple(ordered), tuple(scores), tuple(sorted(failures, key=lambda f: order[f.observer])))
-
-
-def each_estimate(
-    record: Record,
-    scenario: Scenario,
-    watch: Watch = QUIET,
-    observers: Sequence[str] | None = None,
-    on_partial: Callable[[str, str, Array], None] | None = None,
-    memo: RecordMemo | None = None,
-) -> Iterator[Estimate | Failure]:
-    """Run observers, and yield the estimates of each as soon as they are done, the slow ones last.
-
-    Each receives measurements, its prior and its settings: neither record nor scenario.
-
-    on_partial : receives (observer, target, values so far) from observers that compute in blocks
-    memo       : estimates that are known by what they depend on; they come first, without a run
-    """
-    scenario = scenario.before_events  # no observer is told
-    unknown = set(observers or ()) - set(OBSERVERS)
-    if unknown:
-        raise SettingError(f"observer {sorted(unknown)[0]!r}: no such observer; there are {', '.join(OBSERVERS)}")
-    chosen = list(OBSERVERS.values()) if observers is None else [OBSERVERS[name] for name in dict.fromkeys(observers)]
-    names: dict[str, str] = {}
-    if memo is not None:
-        used = used_settings(scenario)
-        for observer in tuple(chosen):
-            watch.check()
-            name, found = _recall(observer, record, scenario, used.get(observer.group or ""), memo)
-            if found:
-                yield from found
-                chosen.remove(observer)
-            elif name:
-                names[observer.id] = name
-    weights = {o.id: o.weight for o in chosen}
-    total = sum(weights.values()) or 1.0
-    done = 0.0
-    progress = _only_forward(watch.progress)
-    for observer in sorted(chosen, key=lambda o: o.weight):
-        base, share = done / total, weights[observer.id] / total
-        inner = Watch(
-            progress=lambda f, base=base, share=share: progress(base + share * f),
-            is_cancelled=watch.is_cancelled,
-            partial=lambda target, values, o=observer: on_partial(o.id, target, values) if on_partial else None,
-        )
-        for item in _one(observer, record, scenario, inner):
-            if memo is not None and isinstance(item, Estimate):
-                memo.note(names[observer.id], item)
-            yield item
-        done += weights[observer.id]
-        watch.check()
-        progress(done / total)
-
-
-def _only_forward(tell: Callable[[float], None]) -> Callable[[float], None]:
-    """Return a progress callback that never decreases, for modes that report each their own."""
-    highest = 0.0
-
-    def told(fraction: float) -> None:
-        nonlocal highest
-        highest = max(highest, fraction)
-        tell(highest)
-
-    return told
-
-
-def run_observer(name: str, record: Record, scenario: Scenario, watch: Watch = QUIET) -> Estimates:
-    """Return {target: (n_steps, n_modes) [um]} of one observer.
-
-    Raises ValueError with the reason where there is none, Cancelled.
-    """
-    with detach_watch(watch) as alone:
-        return OBSERVERS[name].estimate(*arguments(OBSERVERS[name], record, scenario), alone)
-
-
-def _recall(
-    observer: Observer, record: Record, scenario: Scenario, own: Plain | None, memo: RecordMemo
-) -> tuple[str, list[Estimate]]:
-    """Return the name of an observer's estimates, empty where there are none, and those that are known."""
-    if observer.missing(record):
-        return "", []
-    try:
-        return memo.find(observer, prior_and_settings(observer, record, scenario)[0], own)
-    except ValueError:
-        return "", []
-
-
-def _one(observer: Observer, record: Record, scenario: Scenario, watch: Watch) -> list[Estimate | Failure]:
-    missing = observer.missing(record)
-    if missing:
-        return [Failure(observer.id, f"{observer.id} left out: the record has no {', '.join(missing)}")]
-    try:
-        given = arguments(observer, record, scenario)
-        start = perf_counter()
-        with detach_watch(watch) as alone:
-            values = observer.estimate(*given, alone)
-    except ValueError as error:
-        return [Failure(observer.id, f"{observer.id} left out: {error}")]
-    seconds = (perf_counter() - start) / max(record.n_steps * record.n_modes, 1)
-    return [Estimate(observer.id, target, values[target], seconds, values.sd.get(target)) for target in observer.targets]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from wfsobs.evaluation.rows import score_rows
 from wfsobs.evaluation.scores import Score
 from wfsobs.notebook import html_table
-from wfsobs.observers.base import Estimate
+from wfsobs.observers.estimates import Estimate
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs import PRESETS, Record, Scenario, simulate
-from wfsobs.pipeline import run_observer
+from wfsobs.execution import run_observer
 
 KNOWING, NAMES = "kf-multi", ("kf-adaptive", "kf-multi", "kf-lgs")
 CASES = (("paper", 4.0), ("strong-turbulence", 4.0), ("ut4", 4.0), ("ut4", 8.0))

@@ -19,7 +19,8 @@ import wfsobs
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.observers.kalman.spread import by_target
-from wfsobs.priors_from.scenario import measurement_noise, modelled_processes
+from wfsobs.priors_from.scenario import modelled_processes
+from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.record import Record, Training
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.bandpass import bandpass_bank, filter_causal, filter_zero_phase

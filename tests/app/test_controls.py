@@ -8,10 +8,11 @@ import numpy as np
 import param
 import pytest
 
-from wfsobs.app.controls.fields import SliderField, label_of, parse_number, unit_text
+from wfsobs.app.controls.fields import SliderField, parse_number
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.controls.panel import FIRST, Controls
 from wfsobs.app.controls.status import status_of
+from wfsobs.app.display import label_of, unit_text
 from wfsobs.app.work import RunResults
 from wfsobs.record import Record
 from wfsobs.result import Result

@@ -64,7 +64,12 @@ def board(request: Any, dashboard: Dashboard, loop: Any, short: Scenario, tmp_pa
     if request.param == LOADED:
         content = file_of(simulation)
         upload = dashboard.upload
-        for widget, value in ((upload.unit, "nm"), (upload.sign, -1), (upload.delay, "2"), (upload.rate, "1000")):
+        for widget, value in (
+            (upload.fields.unit, "nm"),
+            (upload.fields.sign, -1),
+            (upload.fields.delay, "2"),
+            (upload.fields.rate, "1000"),
+        ):
             widget.value = value
         upload.handle({"action": "part", "name": FILE, "index": 0, "count": 1, "data": base64.b64encode(content).decode()})
         loop.until(lambda: not upload.picker.said.startswith("Reading"))

@@ -17,7 +17,7 @@ from wfsobs.app.limits import Limits
 from wfsobs.app.numbers import number
 from wfsobs.app.picker import LARGEST
 from wfsobs.app.service import Service
-from wfsobs.app.upload import SILENT
+from wfsobs.app.upload_fields import SILENT
 from wfsobs.pipeline import observe
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
@@ -49,7 +49,7 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     content = file_of(short)
     before = dashboard.store.run.result
     previewed(dashboard, loop, content)
-    assert "750 steps at 500 Hz, 1.5 s, 0 missing" in dashboard.upload.text.object and dashboard.upload.room.visible
+    assert "750 steps at 500 Hz, 1.5 s, 0 missing" in dashboard.upload.content.text.object and dashboard.upload.room.visible
     assert dashboard.store.run.result is before  # nothing runs before it is confirmed
     dashboard.upload.confirm()
     loop.finish(dashboard.store)
@@ -106,24 +106,28 @@ def test_what_is_said_of_it(dashboard: Dashboard, loop: Any, short: Scenario) ->
     content = content.replace(b"# delay: 2\n", b"")
     previewed(dashboard, loop, content)
     plain = dashboard.upload._preview.rms["z"]
-    for widget, value in ((dashboard.upload.unit, "nm"), (dashboard.upload.sign, -1), (dashboard.upload.delay, "3")):
+    for widget, value in (
+        (dashboard.upload.fields.unit, "nm"),
+        (dashboard.upload.fields.sign, -1),
+        (dashboard.upload.fields.delay, "3"),
+    ):
         widget.value = value
         loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
     found = dashboard.upload._preview
     assert found.record.origin == "unit nm, command sign -1" and found.record.delay == 3
     assert found.rms["y_lgs"][0] < 1e-2 * plain[0]
-    dashboard.upload.unit.value = "mas"
+    dashboard.upload.fields.unit.value = "mas"
     loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
     on_eight = dashboard.upload._preview.rms["y_lgs"][0]
     dashboard.store.change("telescope.diameter", 10.0)
-    loop.until(lambda: "aperture 10 m" in dashboard.upload.text.object)
+    loop.until(lambda: "aperture 10 m" in dashboard.upload.content.text.object)
     assert dashboard.upload._preview.rms["y_lgs"][0] == pytest.approx(1.25 * on_eight)
-    dashboard.upload.delay.value = "soon"
+    dashboard.upload.fields.delay.value = "soon"
     assert dashboard.upload.picker.said == "Delay of commands [steps]: takes a number from 1, not 'soon'"
     assert dashboard.upload.use.disabled
-    dashboard.upload.delay.value = ""
+    dashboard.upload.fields.delay.value = ""
     loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
-    assert not dashboard.upload.use.disabled and dashboard.upload.unit.value != SILENT
+    assert not dashboard.upload.use.disabled and dashboard.upload.fields.unit.value != SILENT
 
 
 def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
@@ -131,10 +135,10 @@ def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     rows = "29.4,0,0\n29.5,10,0\n30.5,10,0\n30.6,0,0\n"
     previewed(dashboard, loop, f"frequency,tip,tilt\n{rows}".encode(), "lines.csv")
     assert dashboard.upload.picker.said.startswith("lines.csv: has no unit of tip")
-    dashboard.upload.unit.value = "nm"
+    dashboard.upload.fields.unit.value = "nm"
     loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
-    assert "4 frequencies from 29.4 to 30.6 Hz" in dashboard.upload.text.object and "3.317 nm rms of tip, 0 nm" in (
-        dashboard.upload.text.object
+    assert "4 frequencies from 29.4 to 30.6 Hz" in dashboard.upload.content.text.object and "3.317 nm rms of tip, 0 nm" in (
+        dashboard.upload.content.text.object
     )
     assert dashboard.upload.use.label == "Use this spectrum"
     dashboard.upload.confirm()
@@ -169,7 +173,7 @@ def test_columns_of_other_names(dashboard: Dashboard, loop: Any, short: Scenario
     wanted = {own.removesuffix("_um"): name for name, own in NAMES.items()}
     wanted |= {f"y_ngs/{mode}": f"y_ngs/{mode}_um" for mode in ("tip", "tilt")}  # names of a record suggest what they say
     assert form.roles == wanted
-    assert "750 steps at 500 Hz" in dashboard.upload.text.object
+    assert "750 steps at 500 Hz" in dashboard.upload.content.text.object
 
     form._handle_msg({"column": "wfs_y", "role": "y_lgs/tip"})
     loop.until(lambda: "has the modes tip, tilt; y_lgs has tip" in dashboard.upload.picker.said)
@@ -202,7 +206,7 @@ def test_the_data_propose_sign_and_delay(dashboard: Dashboard, loop: Any, short:
     file = io.BytesIO()
     np.savez(file, y_lgs=y, u=u, dt=np.array(1e-3))
     previewed(dashboard, loop, file.getvalue(), "night.npz")
-    text = dashboard.upload.text.object
+    text = dashboard.upload.content.text.object
     assert "sign -1: commands move with the measurement" in text and "delay 3: commands 3 steps earlier explain" in text
     assert "unit proposed: the numbers are plausible as um (" in text, "on 8 m an arcsec would be 10 um"
     assert dashboard.upload.take.visible and dashboard.upload._preview.record.delay == 2
@@ -212,7 +216,9 @@ def test_the_data_propose_sign_and_delay(dashboard: Dashboard, loop: Any, short:
     assert found.record.delay == 3 and found.record.origin == "command sign -1"
     # the disturbance and the noise of one sample are all that is left of z
     assert found.rms["z"][0] == pytest.approx(np.sqrt(0.5 + 0.04), rel=0.02)
-    assert "sign -1: commands move with the measurement" in dashboard.upload.text.object, "of the file, however it is read"
+    assert "sign -1: commands move with the measurement" in dashboard.upload.content.text.object, (
+        "of the file, however it is read"
+    )
 
 
 def test_template_and_sample(dashboard: Dashboard, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,7 +251,7 @@ def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
     ):
         previewed(dashboard, loop, content, name)
         assert dashboard.upload.picker.said.startswith(line)
-        assert "<b>.exe" not in dashboard.upload.text.object
+        assert "<b>.exe" not in dashboard.upload.content.text.object
         dashboard.upload.confirm()
         assert dashboard.store.source is None and dashboard.store.run.result is before
 

@@ -19,7 +19,8 @@ from wfsobs.control.residual import residual_variance
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers.baselines import online_reference
 from wfsobs.priors_from.controllers import controller_arguments, own_settings
-from wfsobs.priors_from.scenario import bands_of, kalman_model, measurement_noise, modelled_processes, spectra_of
+from wfsobs.priors_from.scenario import bands_of, kalman_model, modelled_processes, spectra_of
+from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, RecordError, Training
 from wfsobs.scenario import Scenario

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from wfsobs.execution import run_observer
 from wfsobs.observers.kalman import window_model
 from wfsobs.observers.kalman.adaptive import filter_of
 from wfsobs.observers.kalman.single import steady_filter
-from wfsobs.pipeline import run_observer
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import Record, RecordError, delay_signal
 from wfsobs.scenario import Scenario

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
-from wfsobs.pipeline import run_observer
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

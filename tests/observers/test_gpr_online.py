@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from scipy.signal import butter, lfilter, sosfilt
 
 from wfsobs.evaluation.lag import lag
+from wfsobs.execution import run_observer
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
 from wfsobs.observers.gpr.online import predict_sliding
-from wfsobs.pipeline import run_observer
 from wfsobs.progress import Cancelled, Watch
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from wfsobs.execution import run_observer
 from wfsobs.observers.gpr.inputs import scale_of
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
 from wfsobs.observers.gpr.online import predict_sliding
 from wfsobs.observers.gpr.sliding_regression import SlidingRegression
 from wfsobs.observers.gpr.stream import OnlineGprStream
-from wfsobs.pipeline import run_observer
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from wfsobs.execution import run_observer
 from wfsobs.observers.kalman.single import between_frames, steady_filter
-from wfsobs.pipeline import run_observer
-from wfsobs.priors_from.scenario import kalman_model, measurement_noise, modelled_processes
+from wfsobs.priors_from.scenario import kalman_model, modelled_processes
+from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

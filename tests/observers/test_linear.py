@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_lyapunov
 
 from wfsobs.evaluation.bound import bound_rms
+from wfsobs.execution import run_observer
 from wfsobs.observers.ridge import TAPS, fit, predict
-from wfsobs.pipeline import run_observer
-from wfsobs.priors_from.scenario import modelled_processes, modelled_turbulence, multi_model, predicted_rms
+from wfsobs.priors_from.scenario import modelled_processes, multi_model, predicted_rms
+from wfsobs.priors_from.turbulence import modelled_turbulence
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from wfsobs.control.lqg import lqg_multirate_multi
+from wfsobs.execution import run_observer
 from wfsobs.observers.base import TARGETS
-from wfsobs.pipeline import run_observer
 from wfsobs.prior import Beams, Lines, Model
 from wfsobs.priors_from.controllers import plant_of
 from wfsobs.priors_from.scenario import prior_of

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import BANDS, LINES, MODEL, TRAINING, Observer
-from wfsobs.pipeline import run_observer
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.pipeline import each_estimate
 from wfsobs.priors_from import scenario as door
 from wfsobs.progress import Watch
 from wfsobs.record import Record

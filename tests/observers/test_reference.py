@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.signal import butter, freqz_sos, lfilter
 
 from wfsobs.evaluation.lag import lag
+from wfsobs.execution import run_observer
 from wfsobs.observers.baselines import open_loop_reference
-from wfsobs.pipeline import run_observer
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS

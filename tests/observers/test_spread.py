@@ -15,8 +15,8 @@ import wfsobs
 from wfsobs.evaluation.calibration import calibration, crps, half_width
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.gpr.kernels import SquaredExponential
-from wfsobs.observers.gpr.offline import HELD, train
 from wfsobs.observers.gpr.online import predict_sliding
+from wfsobs.observers.gpr.trained import HELD, train
 from wfsobs.observers.kalman.multi import MultiPeak
 from wfsobs.prior import LgsError, Prior
 from wfsobs.priors_from.scenario import observer_settings, prior_of

@@ -20,7 +20,8 @@ from wfsobs.observers.kalman.step import matrix_power
 from wfsobs.observers.missing import fill_missing
 from wfsobs.observers.step_checks import StepError
 from wfsobs.prior import Bands, Lines, Model, Prior, Training
-from wfsobs.priors_from.scenario import arguments, kalman_model, measurement_noise, prior_of
+from wfsobs.priors_from.scenario import arguments, kalman_model, prior_of
+from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario

@@ -16,7 +16,8 @@ from wfsobs.cli import main
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import observe, run
-from wfsobs.priors_from.scenario import kalman_model, measurement_noise
+from wfsobs.priors_from.scenario import kalman_model
+from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario, configfile

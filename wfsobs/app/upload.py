@@ -7,14 +7,11 @@ is confirmed. Reading is done beside the page, in a thread.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from html import escape
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import panel as pn
 import panel_material_ui as pmui
-from bokeh.models import ColumnDataSource
 
 from wfsobs.app.column_form import ColumnForm
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING, Job, Tell
@@ -22,23 +19,16 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.picker import PartialFile, Picker, too_large
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
-from wfsobs.app.views.plots import new_figure, send
+from wfsobs.app.upload_fields import UploadFields, differs_from_proposals
+from wfsobs.app.upload_preview import PreviewView
 from wfsobs.pipeline import as_stated
 from wfsobs.progress import Watch
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.errors import SettingError
-from wfsobs.settings.parameters import hint
 from wfsobs.telemetry.examples import TEMPLATE, sample_csv
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.preview import ColumnsPreview, Preview, SpectrumPreview, preview_any, safe_name
-from wfsobs.units import UNITS
-
-SILENT = "as the file says"
-NOTHING = np.empty(0)
-COLOURS = ("#0B4F6C", "#FF6600")
-
 
 AnyPreview = Preview | SpectrumPreview | ColumnsPreview
 TEMPLATE_NAME, SAMPLE_NAME = "wfsobs-template.csv", "wfsobs-sample.csv"
@@ -51,18 +41,9 @@ class Upload:
         self.store = store
         self.picker = Picker(sizing_mode="stretch_width", margin=0)
         self.picker.on_message = self.handle
-        self.unit = self._select("Unit", [SILENT, *UNITS])
-        self.sign = self._select("Commands", {SILENT: 0, "are added to the measurement (+1)": 1, "are subtracted (-1)": -1})
-        self.delay, self.rate = self._text("Delay of commands [steps]"), self._text("Rate [Hz]")
         self.use = pmui.Button(label="Use this record", color="primary", size="small", margin=4)
         self.drop = pmui.Button(label="Discard", variant="outlined", size="small", margin=4)
-        self.text = pn.pane.HTML("", sizing_mode="stretch_width", margin=(4, 0))
-        self.figure = new_figure(x_axis_type="log", y_axis_type="log")
-        self.figure.name = "Spectrum of the record"
-        self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = "frequency [Hz]", "PSD of z [µm²/Hz]"
-        self.sources = [ColumnDataSource({"x": [], "y": []}) for _ in TIP_TILT]
-        for source, colour, mode in zip(self.sources, COLOURS, TIP_TILT, strict=True):
-            self.figure.line("x", "y", source=source, color=colour, line_width=1.4, legend_label=mode.name)
+        self.content = PreviewView()
         self.form: ColumnForm | None = None
         self.take = pmui.Button(
             label="Take the proposed sign and delay", variant="outlined", size="small", margin=4, visible=False
@@ -79,8 +60,7 @@ class Upload:
         self.reading.param.watch(self._read, ["state", "place", "message"])
         self.use.on_click(lambda _event: self.confirm())
         self.drop.on_click(lambda _event: self.discard())
-        for widget in (self.unit, self.sign, self.delay, self.rate):
-            widget.param.watch(lambda _event: self.look(), "value")
+        self.fields = UploadFields(self.look)
         self._diameter = store.scenario.telescope.diameter
         store.param.watch(self._follow, "scenario")
         store.param.watch(self._entitle, "source")
@@ -140,29 +120,12 @@ class Upload:
 
     def read_fields(self) -> DeclaredFormat:
         """Read the fields. Raises RecordError where one holds no number."""
-
-        def number(field: Any, kind: type, least: float) -> Any:
-            text = str(field.value or "").strip()
-            if not text:
-                return None
-            try:
-                value = kind(text)
-            except ValueError:
-                value = -1
-            if not least <= value < 1e6:
-                raise RecordError(f"{field.label}: takes a number from {least:g}, not {text[:40]!r}{hint(text)}")
-            return value
-
-        unit = None if self.unit.value == SILENT else self.unit.value
-        roles = self.form.roles if self.form is not None else {}
-        return DeclaredFormat(unit, self.sign.value or None, number(self.delay, int, 1), number(self.rate, float, 1e-3), roles)
+        return self.fields.read(self.form.roles if self.form is not None else {})
 
     def take_proposals(self) -> None:
         """Fill in the sign and the delay that the data propose."""
-        found = self._preview.reading.response if isinstance(self._preview, Preview) else None
-        if found is not None:
-            self.sign.value = found.sign or self.sign.value
-            self.delay.value = str(found.delay) if found.delay else self.delay.value
+        if isinstance(self._preview, Preview):
+            self.fields.take_proposals(self._preview)
 
     def look(self) -> None:
         """Read the file, beside the page, as what the fields say."""
@@ -198,20 +161,11 @@ class Upload:
             self._ask(preview)
             return
         self._preview = None if isinstance(preview, RecordError) else preview
-        spectrum = isinstance(preview, SpectrumPreview)
-        self.use.label = "Use this spectrum" if spectrum else "Use this record"
-        self.figure.yaxis.axis_label = "PSD [µm²/Hz]" if spectrum else "PSD of z [µm²/Hz]"
+        self.use.label = "Use this spectrum" if isinstance(preview, SpectrumPreview) else "Use this record"
         self.picker.said = "" if self._preview else str(preview)
         self.use.disabled = self._preview is None
-        lines = self._preview.lines() if self._preview else [str(preview)]
-        self.text.object = f"<p><b>{escape(self._name)}</b></p>{_list(lines)}"
-        if isinstance(preview, Preview):
-            self.text.object += f'<p>What the data say:</p><div class="evidence">{_list(preview.reading.lines())}</div>'
-        self.take.visible = isinstance(preview, Preview) and _differs(preview)
-        for mode, source in enumerate(self.sources):
-            there = self._preview is not None and mode < self._preview.spectrum.shape[1]
-            x, y = (self._preview.frequency, self._preview.spectrum[:, mode]) if self._preview and there else (NOTHING, NOTHING)
-            send(source, {"x": x[x > 0], "y": y[x > 0]})
+        self.content.show(self._name, preview)
+        self.take.visible = isinstance(preview, Preview) and differs_from_proposals(preview)
         self._lay_out()
 
     def _ask(self, preview: ColumnsPreview) -> None:
@@ -228,10 +182,10 @@ class Upload:
     def _lay_out(self) -> None:
         if not len(self.room):
             self.room[:] = [
-                self.text,
+                self.content.text,
                 *([self.form] if self.form is not None else []),
-                pn.FlexBox(self.unit, self.sign, self.delay, self.rate, self.take, gap="8px", align_items="center", margin=0),
-                pn.pane.Bokeh(self.figure, sizing_mode="stretch_width", margin=0),
+                pn.FlexBox(*self.fields.widgets, self.take, gap="8px", align_items="center", margin=0),
+                pn.pane.Bokeh(self.content.figure, sizing_mode="stretch_width", margin=0),
                 pn.Row(self.use, self.drop, margin=0),
             ]
         self.room.visible = True
@@ -280,26 +234,6 @@ class Upload:
 
     def _say(self, line: str) -> None:
         self.picker.said = line
-
-    def _select(self, label: str, options: Any) -> pmui.Select:
-        first = options[0] if isinstance(options, list) else next(iter(options.values()))
-        return pmui.Select(label=label, options=options, value=first, size="small", width=190, margin=(4, 0))
-
-    def _text(self, label: str) -> pmui.TextInput:
-        return pmui.TextInput(label=label, value="", placeholder=SILENT, size="small", width=190, margin=(4, 0))
-
-
-def _list(lines: Sequence[str]) -> str:
-    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
-
-
-def _differs(preview: Preview) -> bool:
-    """Whether the data propose another sign or delay than those with which the record was read."""
-    found = preview.reading.response
-    read = preview.reading.sign, preview.record.delay
-    return found is not None and any(
-        new is not None and new != old for new, old in zip((found.sign, found.delay), read, strict=True)
-    )
 
 
 def fit_to_record(record: Any, scenario: Scenario) -> Scenario:

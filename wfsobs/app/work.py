@@ -21,9 +21,11 @@ from wfsobs.app.sources import Source
 from wfsobs.dependence import Memo, RecordMemo, digest, simulate_once
 from wfsobs.evaluation.error_spectra import spectra
 from wfsobs.evaluation.record_bounds import Bound, record_bounds
+from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import TARGETS, Estimate
-from wfsobs.pipeline import as_stated, collect, each_estimate
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.estimates import Estimate
+from wfsobs.pipeline import as_stated, collect
 from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.result import Failure, Result

@@ -17,9 +17,10 @@ from wfsobs.observers.base import VIBRATION
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.gpr.inputs import window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential
-from wfsobs.observers.gpr.offline import train, training_targets
+from wfsobs.observers.gpr.offline import training_targets
 from wfsobs.observers.gpr.online import gpr_online, kernel_of
 from wfsobs.observers.gpr.stream import OnlineGprStream
+from wfsobs.observers.gpr.trained import train
 from wfsobs.prior import Bands
 from wfsobs.priors_from.scenario import bands_of, prior_of
 from wfsobs.progress import QUIET

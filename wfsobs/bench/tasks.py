@@ -14,8 +14,9 @@ from wfsobs.bench.measure import OURS, Row, measure_time, peak_memory_mb, row, w
 from wfsobs.bench.sizes import Sizes
 from wfsobs.bench.steps import steps
 from wfsobs.bench.turbulence import frozen
+from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
-from wfsobs.pipeline import run, run_observer
+from wfsobs.pipeline import run
 from wfsobs.simulation.loop import simulate
 
 

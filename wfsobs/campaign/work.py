@@ -22,8 +22,9 @@ from wfsobs.closed_loop.rows import rows as loop_rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.record_bounds import Bound, record_bounds
 from wfsobs.evaluation.rows import TIME, score_rows
-from wfsobs.observers.base import Estimate
-from wfsobs.pipeline import collect, each_estimate
+from wfsobs.execution import each_estimate
+from wfsobs.observers.estimates import Estimate
+from wfsobs.pipeline import collect
 from wfsobs.record import Record
 from wfsobs.result import Failure
 from wfsobs.scenario import Scenario

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import signal
@@ -14,18 +13,16 @@ from types import FrameType
 import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
-from wfsobs.campaign.compare import compare
 from wfsobs.campaign.plan import Campaign, load_plan
 from wfsobs.campaign.pools import DaskCluster, Processes, usable_processors
 from wfsobs.campaign.run import BATCH, run_campaign, run_cost
 from wfsobs.campaign.run import Progress as State
 from wfsobs.campaign.state import finished_runs, folder_plan
-from wfsobs.campaign.store import RESULTS, add_settings, need_pyarrow, read_results
+from wfsobs.campaign.store import add_settings, need_pyarrow, read_results
 from wfsobs.campaign.work import run_rows
+from wfsobs.cli.campaign_results import print_csv, summary_table
 from wfsobs.cli.show import show_table
-from wfsobs.evaluation.rows import NOT_OBSERVERS
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.settings.errors import SettingError
 
@@ -197,10 +194,10 @@ def print_table(folder: str, as_csv: bool, parquet: str | None) -> None:
         write_whole(parquet, lambda file: pq.write_table(add_settings(plan, rows), file))
         return
     if as_csv:
-        _print_csv(plan, rows.to_pylist())
+        print_csv(plan, rows.to_pylist())
         return
     done = int(finished_runs(plan, Path(folder)).sum())
-    show_table(_summary(plan, rows, f"{plan.name}: {done} of {plan.n_runs} runs"))
+    show_table(summary_table(plan, rows, f"{plan.name}: {done} of {plan.n_runs} runs"))
 
 
 @campaign.command()
@@ -213,46 +210,3 @@ def report(folder: str, out: str | None) -> None:
     path = Path(out) if out else Path(folder) / "report.html"
     write_report(Path(folder), path)
     click.echo(f"wfsobs: {path}: written", err=True)
-
-
-def _print_csv(plan: Campaign, rows: list[dict]) -> None:
-    """Print rows, with the settings of their scenarios; numbers with all their digits."""
-    out = csv.writer(sys.stdout, lineterminator="\n")
-    columns = list(RESULTS)
-    out.writerow([*columns, *plan.axes])
-    for row in rows:
-        changes = plan.cells[row["cell"]].changes if row["cell"] < len(plan.cells) else {}
-        out.writerow([_text(row[c]) for c in columns] + [_text(changes.get(path)) for path in plan.axes])
-
-
-def _text(value: object) -> object:
-    return "" if value is None else repr(value) if isinstance(value, float) else value
-
-
-def _summary(plan: Campaign, rows: object, title: str) -> Table:
-    """Return a table with one row per scenario, target, mode and observer."""
-    out = Table(title=title, caption="+-: interval of 95 % of the paired difference from the best; ~: not significant")
-    for name in ("Scenario", "Settings", "Target", "Mode", "Name", "rms, nm", "above the best, nm", "seeds"):
-        out.add_column(name, justify="right" if name in ("rms, nm", "above the best, nm", "seeds") else "left")
-    before = None
-    for one in compare(rows):
-        key = (one.cell, one.target, one.mode)
-        settings = ", ".join(f"{path.split('.')[-1]} = {value}" for path, value in plan.cells[one.cell].changes.items())
-        new = key != before
-        above = (
-            ""
-            if one.difference is None
-            else f"{'~' if one.is_tie else ''}{one.difference:.2f}"
-            + (f" +- {one.half_width:.2f}" if one.half_width is not None else "")
-        )
-        label = NOT_OBSERVERS.get(one.name, one.name)
-        failed = f" ({one.failures} failed)" if one.failures else ""
-        out.add_row(
-            *((one.scenario, settings, one.target, one.mode) if new else ("",) * 4),
-            label,
-            f"{one.rms:.2f}",
-            above,
-            f"{one.seeds}{failed}",
-        )
-        before = key
-    return out

@@ -15,7 +15,8 @@ from wfsobs.observers.kalman.multirate import MultiRate, multirate_filter, multi
 from wfsobs.observers.kalman.multirate_optimal import optimal_filter, optimal_model
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Model, Prior
-from wfsobs.priors_from.scenario import lgs_error_of, model_of
+from wfsobs.priors_from.scenario import model_of
+from wfsobs.priors_from.turbulence import lgs_error_of
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.riccati import steady_state

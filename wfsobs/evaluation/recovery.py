@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wfsobs.observers.base import Estimate
+from wfsobs.observers.estimates import Estimate
 from wfsobs.record import Record
 from wfsobs.typing import Array
 

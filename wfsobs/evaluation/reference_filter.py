@@ -15,7 +15,7 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.multirate_optimal import optimal_cycle, optimal_filter
 from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
 from wfsobs.prior import Line, Lines
-from wfsobs.priors_from.scenario import modelled_turbulence
+from wfsobs.priors_from.turbulence import modelled_turbulence
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3

@@ -9,7 +9,8 @@ import numpy as np
 
 from wfsobs.evaluation.calibration import Calibration, calibration
 from wfsobs.evaluation.lag import lag
-from wfsobs.observers.base import TARGETS, Estimate
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.estimates import Estimate
 from wfsobs.record import Record
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.welch import rms

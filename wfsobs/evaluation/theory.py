@@ -25,7 +25,8 @@ from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.prior import Lines, Prior, Training
-from wfsobs.priors_from.scenario import lines_of, lines_turbulence, observer_settings, prior_of
+from wfsobs.priors_from.scenario import lines_of, observer_settings, prior_of
+from wfsobs.priors_from.turbulence import lines_turbulence
 from wfsobs.progress import QUIET
 from wfsobs.record import Measurements
 from wfsobs.scenario import Scenario

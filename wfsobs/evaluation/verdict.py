@@ -17,7 +17,7 @@ from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best
 from wfsobs.evaluation.scores import BOUND_BOTH, Score
 from wfsobs.evaluation.verdict_words import best_sentence, harm_sentences
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import Estimate
+from wfsobs.observers.estimates import Estimate
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario

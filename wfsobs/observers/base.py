@@ -6,10 +6,11 @@ the prior that it asked for and its own settings: the truth is out of reach.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, NamedTuple
 
+from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
 from wfsobs.observers.step import MakeEstimator, StepObserver
 from wfsobs.observers.step_checks import StepError
@@ -72,23 +73,6 @@ class Look:
 
 PLAIN = Look(dash=(4, 2))
 """Default look."""
-
-
-class Estimates(dict[str, Array]):
-    """Estimates of an observer, target -> (n_steps, n_modes) [um], and how sure it is of them.
-
-    Parameters
-    ----------
-    values : mapping of str to Array
-        Target -> estimate, NaN where there is none.
-    sd : mapping of str to Array, optional
-        Target -> standard deviation of the estimate's error by the observer's own model in its steady state,
-        (n_steps, n_modes) [um], perhaps a read-only view of fewer numbers; no target without a model, NaN where not known.
-    """
-
-    def __init__(self, values: Mapping[str, Array], sd: Mapping[str, Array] | None = None):
-        super().__init__(values)
-        self.sd = dict(sd or {})
 
 
 def _nothing(_settings: Group | None) -> tuple[Part, ...]:
@@ -245,27 +229,3 @@ class Observer:
     def needs_text(self) -> str:
         """What it has to be told beside measurements, for people."""
         return ", ".join(self.needed_parts) or NOTHING
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Estimate of one target by one observer.
-
-    Attributes
-    ----------
-    observer, target : str
-        Of whom, and of what.
-    values : Array
-        Estimate, (n_steps, n_modes) [um]; NaN where there is none.
-    seconds_per_step : float
-        Computing time per step and mode [s].
-    sd : Array or None
-        Standard deviation of its error by the observer's own model, (n_steps, n_modes) [um]; None where it has no model, NaN
-        where there is no number.
-    """
-
-    observer: str
-    target: str
-    values: Array
-    seconds_per_step: float
-    sd: Array | None = None

@@ -12,13 +12,10 @@ from typing import Any, ClassVar, Self, cast
 
 import param
 
-from wfsobs.notebook import html_table
 from wfsobs.settings.errors import SettingError, shorten
+from wfsobs.settings.group_text import one_line, settings_html, why_idle
 from wfsobs.settings.parameters import allowed_values, hint
-from wfsobs.settings.tree import Plain, leaves, put_value, to_native
-
-SHOWN = 3
-"""Maximum number of settings in the representation of a group."""
+from wfsobs.settings.tree import Plain, put_value, to_native
 
 
 class Group(param.Parameterized):
@@ -58,7 +55,7 @@ class Group(param.Parameterized):
     def idle(self) -> dict[str, str]:
         """Return the settings without effect for the present values of the others: name -> reason in one line."""
         return {
-            name: f"Used only where {self.settings()[other].label} is {_either(values)}"
+            name: why_idle(self, other, values)
             for name, (other, values) in self.used_when.items()
             if getattr(self, other) not in values
         }
@@ -69,22 +66,12 @@ class Group(param.Parameterized):
         return {name: _effective(getattr(self, name)) for name in self.settings() if name not in idle}
 
     def __repr__(self) -> str:
-        changed = self._changed_settings()
-        shown = ", ".join(f"{path}={value}" for path, value in changed[:SHOWN])
-        return f"{type(self).__name__}({shown}{f', and {len(changed) - SHOWN} more' if len(changed) > SHOWN else ''})"
+        return one_line(self)
 
     __str__ = __repr__
 
     def _repr_html_(self) -> str:
-        return html_table((type(self).__name__, "" if (changed := self._changed_settings()) else "default settings"), changed)
-
-    def _changed_settings(self) -> list[tuple[str, str]]:
-        """Return (dotted path, value, shortened) of the settings that are not at their defaults."""
-
-        def text(value: Any) -> str:
-            return f"[{len(value)} entries]" if isinstance(value, list) and len(value) > 3 else shorten(value, 40)
-
-        return [(path, text(value)) for path, value in leaves(self.difference(type(self)()))]
+        return settings_html(self)
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and self.to_dict() == other.to_dict()  # type: ignore[attr-defined]
@@ -182,41 +169,14 @@ class Group(param.Parameterized):
             setattr(self, name, getattr(fresh, name))
 
     def lookup(self, path: str) -> Any:
-        """Return the value of a setting.
-
-        Parameters
-        ----------
-        path : str
-            Dotted path; items of lists by number.
-
-        Returns
-        -------
-        object
-            Value.
-        """
+        """Return the value of a setting by its dotted path; items of lists by number."""
         node: Any = self
         for key in path.split("."):
             node = node[int(key)] if isinstance(node, list) else getattr(node, key)
         return node
 
     def replace(self, changes: Mapping[str, Any]) -> Self:
-        """Return a copy with some settings changed.
-
-        Parameters
-        ----------
-        changes : mapping of str to object
-            Dotted path -> plain value.
-
-        Returns
-        -------
-        Group
-            The copy.
-
-        Raises
-        ------
-        SettingError
-            A setting does not exist, or takes no such value.
-        """
+        """Return a copy with some settings changed: dotted path -> plain value. Raises SettingError."""
         trial = self.to_dict()
         for path, value in changes.items():
             if put_value(trial, path.split("."), value, path):
@@ -243,11 +203,6 @@ class Group(param.Parameterized):
                 yield from value.lists(f"{prefix}{name}.")
             elif isinstance(p, param.List) and holds_groups(p):
                 yield f"{prefix}{name}", p
-
-
-def _either(values: tuple[Any, ...]) -> str:
-    """Name the values of a setting."""
-    return " or ".join({True: "on", False: "off"}[v] if isinstance(v, bool) else str(v) for v in values)
 
 
 def _effective(value: Any) -> Any:

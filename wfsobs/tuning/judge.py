@@ -8,9 +8,10 @@ from math import isfinite
 import numpy as np
 
 from wfsobs.evaluation.scores import PREDICTION, supervised_scores, unsupervised_scores
+from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import TARGETS, VIBRATION, Estimate
-from wfsobs.pipeline import each_estimate
+from wfsobs.observers.base import TARGETS, VIBRATION
+from wfsobs.observers.estimates import Estimate
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
 from wfsobs.result import Failure

@@ -14,7 +14,7 @@ import numpy as np
 import param
 
 from wfsobs.observers import OBSERVERS
-from wfsobs.priors_from.scenario import measurement_noise
+from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.simulation.disturbance import vibration_lines, vibration_variance

@@ -9,8 +9,10 @@ import panel as pn
 import param
 from panel.custom import JSComponent
 
-from wfsobs.app.controls.fields import TAG, idle_html, number_text, parse_number, unit_text
+from wfsobs.app.controls.field import TAG, idle_html
+from wfsobs.app.controls.fields import number_text, parse_number
 from wfsobs.app.controls.names import column_of, name_settings
+from wfsobs.app.display import unit_text
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset
 from wfsobs.sensors.modes import TIP_TILT

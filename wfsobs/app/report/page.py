@@ -18,7 +18,8 @@ from wfsobs import __version__
 from wfsobs.app.display import NO_ANGLE, UNITS, per_micrometre
 from wfsobs.app.render import render
 from wfsobs.app.report.budget import budget_key, budget_state_table
-from wfsobs.app.report.data import Pool, Report, State, encode, window_of
+from wfsobs.app.report.data import Report, State, window_of
+from wfsobs.app.report.encoding import Pool, encode
 from wfsobs.app.report.figures import SHADES, all_figures
 from wfsobs.app.report.loop import loop_state_table
 from wfsobs.app.report.table import state_table

@@ -6,7 +6,8 @@ background is an error of the LGS, and no part of what a frame is the mean of.
 
 from __future__ import annotations
 
-from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
+from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
+from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.gp.lgs import GP, GaussianProcess, kernels_of, measured_late, sampled_model
 from wfsobs.observers.kalman.multirate import MultiRate, run_modes
 from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_model, step_filters

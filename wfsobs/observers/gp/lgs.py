@@ -16,7 +16,8 @@ import numpy as np
 import param
 from scipy.linalg import block_diag
 
-from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
+from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
+from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.gp.kernels import Kernel, Matern, Poles, Sho, SquaredExponentialInTime, Sum
 from wfsobs.observers.kalman.single import steady_gains
 from wfsobs.observers.kalman.spread import by_target, target_sd

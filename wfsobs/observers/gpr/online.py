@@ -10,8 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wfsobs.observers.base import VIBRATION, Estimates, Look, Observer, Tunable
+from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.baselines import online_reference
+from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.gpr.inputs import Gpr, scale_of, scales_of, tunable, window_signals
 from wfsobs.observers.gpr.kernels import SquaredExponential, band, check_condition, square_from_band
 from wfsobs.observers.gpr.online_step import OnlineEstimator

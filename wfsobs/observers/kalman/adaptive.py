@@ -11,7 +11,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
+from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
+from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.adaptive_step import AdaptiveEstimator
 from wfsobs.observers.kalman.spread import target_sd
 from wfsobs.observers.kalman.window_model import NOT_YET, WindowModel, identify_window, lengths, mode_of

@@ -5,7 +5,8 @@ The filter is that of `kalman.single`, its model one AR(2) per line of the vibra
 
 from __future__ import annotations
 
-from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
+from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
+from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.single import run_steady, steady_mode
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.prior import Lines, Prior

@@ -17,7 +17,8 @@ from types import MappingProxyType
 import numpy as np
 import param
 
-from wfsobs.observers.base import TARGETS, TURBULENCE, Estimates, Look, Observer, Tunable
+from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
+from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.single import MODEL, NGS
 from wfsobs.observers.kalman.spread import by_target, target_sd
 from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter

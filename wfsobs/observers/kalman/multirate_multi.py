@@ -12,7 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
+from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
+from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.multi import PEAKS, MultiPeak
 from wfsobs.observers.kalman.multirate import MultiRate, multirate_noise, run_modes
 from wfsobs.observers.kalman.multirate_optimal import Cycle, estimated_cycle, step_filters

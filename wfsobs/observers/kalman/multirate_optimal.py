@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from wfsobs.observers.base import TARGETS, Estimates, Look, Observer
+from wfsobs.observers.base import TARGETS, Look, Observer
+from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.multirate import (
     RATES,
     TUNABLE,

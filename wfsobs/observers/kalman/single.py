@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wfsobs.observers.base import TARGETS, TURBULENCE, Estimates, Look, Observer, Tunable
+from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
+from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.spread import FrameErrors, by_target, target_sd
 from wfsobs.observers.kalman.step import FrameEstimator, KalmanEstimator, ModeFilter
 from wfsobs.prior import Model, Prior

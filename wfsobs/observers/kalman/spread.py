@@ -11,7 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import block_diag
 
-from wfsobs.observers.base import TARGETS, Estimates
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.step import matrix_power
 from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.statespace import DisturbanceModel

@@ -1,0 +1,56 @@
+"""Results of a campaign in the terminal: all rows, or errors over the seeds and paired differences from the best."""
+
+from __future__ import annotations
+
+import csv
+import sys
+
+from rich.table import Table
+
+from wfsobs.campaign.compare import compare
+from wfsobs.campaign.plan import Campaign
+from wfsobs.campaign.store import RESULTS
+from wfsobs.evaluation.rows import NOT_OBSERVERS
+
+
+def print_csv(plan: Campaign, rows: list[dict]) -> None:
+    """Print rows, with the settings of their scenarios; numbers with all their digits."""
+    out = csv.writer(sys.stdout, lineterminator="\n")
+    columns = list(RESULTS)
+    out.writerow([*columns, *plan.axes])
+    for row in rows:
+        changes = plan.cells[row["cell"]].changes if row["cell"] < len(plan.cells) else {}
+        out.writerow([_text(row[c]) for c in columns] + [_text(changes.get(path)) for path in plan.axes])
+
+
+def _text(value: object) -> object:
+    return "" if value is None else repr(value) if isinstance(value, float) else value
+
+
+def summary_table(plan: Campaign, rows: object, title: str) -> Table:
+    """Return a table with one row per scenario, target, mode and observer."""
+    out = Table(title=title, caption="+-: interval of 95 % of the paired difference from the best; ~: not significant")
+    for name in ("Scenario", "Settings", "Target", "Mode", "Name", "rms, nm", "above the best, nm", "seeds"):
+        out.add_column(name, justify="right" if name in ("rms, nm", "above the best, nm", "seeds") else "left")
+    before = None
+    for one in compare(rows):
+        key = (one.cell, one.target, one.mode)
+        settings = ", ".join(f"{path.split('.')[-1]} = {value}" for path, value in plan.cells[one.cell].changes.items())
+        new = key != before
+        above = (
+            ""
+            if one.difference is None
+            else f"{'~' if one.is_tie else ''}{one.difference:.2f}"
+            + (f" +- {one.half_width:.2f}" if one.half_width is not None else "")
+        )
+        label = NOT_OBSERVERS.get(one.name, one.name)
+        failed = f" ({one.failures} failed)" if one.failures else ""
+        out.add_row(
+            *((one.scenario, settings, one.target, one.mode) if new else ("",) * 4),
+            label,
+            f"{one.rms:.2f}",
+            above,
+            f"{one.seeds}{failed}",
+        )
+        before = key
+    return out
