@@ -1,9 +1,10 @@
-"""Check the names of functions, classes, fields and parameters: none is a bare participle, none stands for two things.
+"""Check names and lengths: no function, class, field or parameter is a bare participle or stands for two things; no module is long.
 
     python scripts/check_names.py
 
 A function is a verb with a noun (`fit_ar3`), or the noun of what it returns (`rms`); `fitted` says neither what is fitted nor
-that anything is done. A field or a parameter is the noun of what it holds (`measurements`); `measured` leaves open what.
+that anything is done. A field or a parameter is the noun of what it holds (`measurements`); `measured` leaves open what. A module of more than LONGEST lines
+holds more than one idea: each has a module of its own.
 """
 
 from __future__ import annotations
@@ -16,6 +17,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "wfsobs"
+
+LONGEST = 250
+"""Maximum number of lines of a module."""
 
 IRREGULAR = frozenset(
     "begun broken brought built caught chosen done drawn driven felt found given gone grown held hidden kept known lost made "
@@ -84,14 +88,17 @@ def fields_and_parameters(source: str) -> Iterator[str]:
 
 
 def faults(package: Path = PACKAGE) -> list[str]:
-    """Return one line for every name in a package that breaks a rule."""
+    """Return one line for every name and every module in a package that breaks a rule."""
     homes: dict[str, list[str]] = defaultdict(list)
     out = []
     for path in sorted(package.rglob("*.py")):
         where = path.relative_to(package.parent).as_posix()
+        source = path.read_text(encoding="utf-8")
+        if (length := len(source.splitlines())) > LONGEST:
+            out.append(f"{where}: {length} lines, at most {LONGEST} are allowed: give each idea a module of its own")
         out += [
             f"{where}: {name}: a bare participle; take the noun of what it holds"
-            for name in fields_and_parameters(path.read_text(encoding="utf-8"))
+            for name in fields_and_parameters(source)
             if is_participle(name.rpartition(".")[2])
         ]
         for name, is_top in names(path):

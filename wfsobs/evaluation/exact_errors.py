@@ -7,7 +7,9 @@ coefficients h_p and g_p of its estimates p steps after a frame,
 
 With their transforms H_p and G_p, and y = x + v as in `slow_sensor`, the error s - s_hat has the variance
 
-    mean(S_s + |H_p|^2 S_z + |G_p|^2 S_x + 2 Re(H_p* G_p S_xz - H_p* S_sz - G_p* S_sx)) + sum_j g_p[j]^2 E v^2.
+    mean(S_s + |H_p|^2 S_z - 2 Re(S_sz H_p*) + |G_p|^2 S_x - 2 Re((S_sx - H_p S_zx) G_p*)) + sum_j g_p[j]^2 E v^2,
+
+what the frames leave of what the LGS leave (`linear_response`).
 
 Undamped lines are in neither: each adds its variance times the square of what the observer leaves of it.
 """
@@ -20,19 +22,15 @@ import numpy as np
 
 from wfsobs.evaluation.bound import TOTAL
 from wfsobs.evaluation.bound_both import PeriodicError, exposure_response
+from wfsobs.evaluation.linear_response import estimate_and_error, impulse_responses
 from wfsobs.observers.base import Observer
 from wfsobs.prior import Prior
 from wfsobs.priors_from.scenario import observer_settings, prior_of
-from wfsobs.progress import QUIET
-from wfsobs.record import Measurements
 from wfsobs.scenario import Scenario
 from wfsobs.settings import Group
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array
-
-SETTLED = 1000
-"""Steps before the response: windows are full and gains are those that repeat."""
 
 
 def exact_errors(observer: Observer, scenario: Scenario) -> list[dict[str, PeriodicError]]:
@@ -82,34 +80,6 @@ def errors_under(
     return out
 
 
-def impulse_responses(
-    observer: Observer, prior: Prior, settings: Group | None, dt: float, n_modes: int, ratio: int, length: int
-) -> dict[str, tuple[Array, Array]]:
-    """Return target -> h_p and g_p, (ratio, length, n_modes) each; all modes respond at once, each to itself."""
-    start = -(-SETTLED // ratio) * ratio
-    n_steps = start + length + ratio
-    frames = np.full((n_steps, n_modes), np.nan)
-    frames[ratio::ratio] = 0.0
-    rest = np.zeros((n_steps, n_modes))
-
-    def respond(z: Array, ngs: Array) -> dict[str, Array]:
-        given = Measurements(z, rest, dt, y_ngs=ngs, ratio=ratio)
-        return {name: np.nan_to_num(values) for name, values in observer.estimate(given, prior, settings, QUIET).items()}
-
-    silence = respond(rest, frames)
-    out = {name: (np.zeros((ratio, length, n_modes)), np.zeros((ratio, length, n_modes))) for name in silence}
-    for at in range(start, start + ratio + 1):
-        is_frame = at == start + ratio
-        pulse = (frames if is_frame else rest).copy()
-        first = start if is_frame else at
-        pulse[first] = 1.0
-        for name, values in respond(*((rest, pulse) if is_frame else (pulse, frames))).items():
-            response = (values - silence[name])[first : first + length]
-            for late in range(ratio):  # steps after the measurement
-                out[name][int(is_frame)][(first + late) % ratio, late::ratio] = response[late::ratio]
-    return out
-
-
 def _variance(fast: Array, slow: Array, target: str, spectra: TrueSpectra) -> Array:
     """Return the variance of the error at every place in the cycle, (ratio,); fast, slow : h_p, g_p (ratio, length)."""
     known, ratio = spectra.without_lines, spectra.ngs.ratio
@@ -123,8 +93,8 @@ def _variance(fast: Array, slow: Array, target: str, spectra: TrueSpectra) -> Ar
     out = np.empty(ratio)
     for phase in range(ratio):
         H, G = np.fft.rfft(fast[phase], n), np.fft.rfft(slow[phase], n)
-        left = own + np.abs(H) ** 2 * known.measurement + np.abs(G) ** 2 * x
-        left += 2.0 * (H.conj() * (G * x_by_z - by_z) - G.conj() * by_x).real
+        _, left = estimate_and_error(H, known.measurement, own, by_z)
+        _, left = estimate_and_error(G, x, left, by_x - H * x_by_z.conj())
         of_lines = sum(
             variance * abs(_line_left(fast[phase], slow[phase], frequency, spectra.gain, ratio, target)) ** 2
             for frequency, variance in spectra.pure

@@ -1,12 +1,8 @@
 """Predicted error spectra: what the linear observers of a scenario do on average, without a simulation.
 
-With H the response of an observer from z to its estimate of s, and the true spectra of the scenario (`true_spectra`), its error
-has the spectrum
-
-    S_e = S_s + |H|^2 S_z - 2 Re(S_sz H*),
-
-whatever the model that the observer is built on. H is the transform of the estimates from a single sample of one. That is the
-expectation over records after an infinitely long start. A record is one of them, and the scores of a short one scatter around it.
+They follow from the true spectra of the scenario (`true_spectra`) and the response of an observer from z to its estimate
+(`linear_response`), the transform of the estimates from a single sample of one. That is the expectation over records after an
+infinitely long start. A record is one of them, and the scores of a short one scatter around it.
 
 Observers of the LGS that are linear have a prediction. Those that train on a record or learn during it have none, nor has one
 that looks ahead.
@@ -21,14 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from wfsobs.evaluation.linear_response import SHORTEST, estimate_and_error, impulse_response
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.prior import Lines, Prior, Training
 from wfsobs.priors_from.scenario import lines_of, observer_settings, prior_of
 from wfsobs.priors_from.turbulence import lines_turbulence
-from wfsobs.progress import QUIET
-from wfsobs.record import Measurements
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import expected_psd
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, error_spectrum, factorise
@@ -38,12 +33,6 @@ from wfsobs.typing import Array
 
 TRUTH = "truth"
 """Name of the prediction of the target itself: the error of an estimate of zero."""
-
-SETTLED = 1e-6
-"""What may be left at the end of a response, over its maximum."""
-
-SHORTEST = 2**11
-"""Steps of the first look at a response; each next one is twice as long."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +133,10 @@ class Theory:
             made_of = Identity(spectra), Identity(H), n_steps, of_error
 
             def make(name: str = name, H: Complex | None = H) -> Prediction:
-                signal, error = _own(spectra, name, target) if H is None else _through(H, spectra, cross, target)
+                if H is None:
+                    signal, error = _own(spectra, name, target)
+                else:
+                    signal, error = estimate_and_error(H, spectra.measurement, spectra.signal[target], cross)
                 frequency, density = expected_psd(error if of_error else signal, scenario.dt, n_steps, self.resolution)
                 return Prediction(name, target, sqrt(max(circle_mean(error), 0.0)), frequency, density)
 
@@ -202,50 +194,6 @@ AIR = ("telescope", "turbulence", "sensors", "run")
 
 def _groups(scenario: Scenario, *names: str) -> list[dict[str, Any]]:
     return [getattr(scenario, name).to_dict() for name in names]
-
-
-def impulse_response(
-    observer: Observer, prior: Prior, settings: Any, dt: float, most: int, first: int = SHORTEST
-) -> dict[str, Array]:
-    """Compute the estimates of a linear observer of one mode from a single sample of one.
-
-    Parameters
-    ----------
-    observer : Observer
-        The observer.
-    prior, settings : Prior, Group or None
-        What it is given, of one mode.
-    dt : float
-        Time step [s].
-    most : int
-        Maximum number of steps.
-    first : int
-        Steps of the first try, twice as many in each next, until the response has settled.
-
-    Returns
-    -------
-    dict of str to Array
-        Target -> response, (n_steps,).
-    """
-    steps = min(first, most)
-    while True:
-        impulse = np.zeros((steps, 1))
-        impulse[0] = 1.0
-        found = observer.run(Measurements(impulse, np.zeros_like(impulse), dt), prior, settings, QUIET)
-        taps = {target: np.nan_to_num(values)[:, 0] for target, values in found.items()}
-        if steps == most or all(_has_settled(h) for h in taps.values()):
-            return taps
-        steps = min(2 * steps, most)
-
-
-def _has_settled(h: Array) -> bool:
-    return float(np.abs(h[-h.size // 8 :]).max()) <= SETTLED * float(np.abs(h).max())
-
-
-def _through(H: Complex, spectra: TrueSpectra, cross: Complex, target: str) -> tuple[Array, Array]:
-    """Return the spectra of an estimate and of its error; H : the response, cross : S_sz."""
-    power = (H.real**2 + H.imag**2) * spectra.measurement
-    return power, spectra.signal[target] + power - 2.0 * (cross.real * H.real + cross.imag * H.imag)
 
 
 def _own(spectra: TrueSpectra, name: str, target: str) -> tuple[Array, Array]:
