@@ -1,10 +1,11 @@
-"""Check names and lengths: no function, class, field or parameter is a bare participle or stands for two things; no module is long.
+"""Check the names of functions, classes, fields and parameters, and the length of modules.
 
     python scripts/check_names.py
 
-A function is a verb with a noun (`fit_ar3`), or the noun of what it returns (`rms`); `fitted` says neither what is fitted nor
-that anything is done. A field or a parameter is the noun of what it holds (`measurements`); `measured` leaves open what. A module of more than LONGEST lines
-holds more than one idea: each has a module of its own.
+None is a bare participle, none stands for two things. A function is a verb with a noun (`fit_ar3`), or the noun of what it
+returns (`rms`); `fitted` says neither what is fitted nor that anything is done. A field or a parameter is the noun of what it
+holds (`measurements`); `measured` leaves open what. A module of more than LONGEST lines holds more than one idea: each has a
+module of its own.
 """
 
 from __future__ import annotations

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wfsobs.app.report.data import Grid, Report, bins_for, state_of, window_of
+from wfsobs.app.report.data import Report, bins_for, state_of, window_of
 from wfsobs.app.report.encoding import LEVELS, Pool, encode
+from wfsobs.app.report.grid import Grid
 from wfsobs.app.report.packing import pack, unpack
 from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.error_spectra import cumulative_rms

@@ -18,7 +18,8 @@ import pytest
 
 from wfsobs import __version__
 from wfsobs.app.numbers import number
-from wfsobs.app.report.data import Grid, Report, state_of
+from wfsobs.app.report.data import Report, state_of
+from wfsobs.app.report.grid import Grid
 from wfsobs.app.report.packing import pack, unpack
 from wfsobs.app.report.page import page
 from wfsobs.app.report.text import FILE, LONGEST, command_of

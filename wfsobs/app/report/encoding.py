@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from wfsobs.app.report.data import Floats
+from wfsobs.app.report.grid import Floats
 
 
 class Pool:

@@ -7,7 +7,8 @@ import json
 
 import numpy as np
 
-from wfsobs.app.report.data import Floats, Grid, Report, State
+from wfsobs.app.report.data import Report, State
+from wfsobs.app.report.grid import Floats, Grid
 from wfsobs.scenario.configfile import from_toml, to_toml
 from wfsobs.scenario.grid import Variation
 
