@@ -69,22 +69,23 @@ def test_all_is_bridged_and_the_rest_stays() -> None:
     assert np.isfinite(out.y_ngs[n::n]).all() and np.isnan(np.delete(out.y_ngs, np.arange(n, 1500, n), axis=0)).all()
 
 
-def test_the_kalman_filter_predicts_through_a_gap() -> None:
-    """Oracle: the textbook filter that leaves out its correction where there is no measurement."""
+@pytest.mark.parametrize("part", [Model, Lines])
+def test_a_gap_is_bridged_by_the_filter_of_what_is_told(part: type) -> None:
+    """Oracle: the textbook filter that leaves out its correction where there is no measurement; of one peak, or of every line."""
     s, record = scenario(), replace(gappy(), u=WHOLE.u)
-    estimates = {(e.observer, e.target): e.values for e in each_estimate(record, s, observers=["kf-lgs"])}
+    prior = prior_of(s, record, (part,))
+    filled = fill_missing(record, prior, s.multipeak.line_width).z
     for mode in range(2):
-        model = kalman_model(s, mode, record.dt)
-        L = steady_state(model.A, model.C, model.Q, np.array(measurement_noise(s, mode)[0] ** 2)).L[:, 0]
-        rows, x, want = model.output_rows(TARGETS), np.zeros(len(model.A)), []
+        if part is Model:
+            model, noise = kalman_model(s, mode, record.dt), measurement_noise(s, mode)[0]
+        else:
+            model, noise = prior.lines[mode].disturbance(s.multipeak.line_width), prior.lines[mode].noise
+        L = steady_state(model.A, model.C, model.Q, np.array(noise**2)).L[:, 0]
+        x, want = np.zeros(len(model.A)), []
         for z in record.z[:, mode]:
-            if not np.isnan(z):
-                x = x + L * (z - model.C @ x)
-            want.append(rows @ x)
-            x = model.A @ x
-        for i, target in enumerate(TARGETS):
-            got = estimates["kf-lgs", target][:, mode]
-            np.testing.assert_allclose(got, np.array(want)[:, i], atol=1e-9 * np.abs(got).max())
+            want.append(model.C @ x if np.isnan(z) else z)
+            x = model.A @ (x + L * (want[-1] - model.C @ x))
+        np.testing.assert_allclose(filled[:, mode], want, rtol=0, atol=1e-9 * np.abs(want).max())
 
 
 def test_prediction_beats_holding() -> None:
@@ -180,24 +181,6 @@ def test_what_is_told_nothing_holds_the_last_value() -> None:
     for name in ("persistence", "butterworth-cl", "kf-adaptive", "gpr-online"):
         for target, values in run_observer(name, record, scenario()).items():
             np.testing.assert_array_equal(values, run_observer(name, by_hand, scenario())[target])
-
-
-def test_what_knows_every_line_bridges_with_all_of_them() -> None:
-    """In a gap of the two-line model the filter of that model predicts; that of one peak would say something else."""
-    s, record = scenario(), replace(gappy(), u=WHOLE.u)
-    prior = prior_of(s, record, (Lines,))
-    got = run_observer("kf-multi", record, s)
-    for mode in range(2):
-        model = prior.lines[mode].disturbance(s.multipeak.line_width)
-        L = steady_state(model.A, model.C, model.Q, np.array(prior.lines[mode].noise ** 2)).L[:, 0]
-        rows, x, want = model.output_rows(TARGETS), np.zeros(len(model.A)), []
-        for z in record.z[:, mode]:
-            if not np.isnan(z):
-                x = x + L * (z - model.C @ x)
-            want.append(rows @ x)
-            x = model.A @ x
-        for i, target in enumerate(TARGETS):
-            np.testing.assert_allclose(got[target][:, mode], np.array(want)[:, i], atol=1e-9 * np.abs(got[target]).max())
 
 
 def test_a_model_of_nothing_predicts_nothing() -> None:

@@ -7,7 +7,7 @@ the prior that it asked for and its own settings: the truth is out of reach.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, NamedTuple
 
 from wfsobs.observers.estimates import Estimates
@@ -16,7 +16,7 @@ from wfsobs.observers.step import MakeEstimator, StepObserver
 from wfsobs.observers.step_checks import StepError
 from wfsobs.prior import PARTS, Part, Prior
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Measurements, Record, Sampling
+from wfsobs.record import Measurements, Record, Sampling, hold_last
 from wfsobs.settings import Group, Section
 from wfsobs.typing import Array
 
@@ -90,7 +90,8 @@ class Observer:
     targets : tuple of str
         What it estimates, of "turbulence" and "vibration".
     run : callable
-        (measurements without gaps, prior, settings, watch) -> {target: (n_steps, n_modes) [um]}, NaN without an estimate;
+        (measurements, prior, settings, watch) -> {target: (n_steps, n_modes) [um]}, NaN without an estimate; no measurement is
+        missing, unless it takes that.
         `Estimates` where it has a standard deviation.
     help : str
         One line of description.
@@ -106,6 +107,8 @@ class Observer:
         False only for a reference that uses later samples.
     linear : bool
         Whether estimates are a linear function of the measurements, with prior and settings fixed; a constant may be added.
+    takes_missing : bool
+        Whether it takes missing measurements as missing, as NaN; by default they are filled by the model of its prior.
     sensors : tuple of str
         Whose measurements it uses, of "lgs" and "ngs".
     tunable : Tunable
@@ -132,6 +135,7 @@ class Observer:
     asks: Callable[[Any], tuple[Part, ...]] = _nothing
     causal: bool = True
     linear: bool = False
+    takes_missing: bool = False
     sensors: tuple[str, ...] = ("lgs",)
     tunable: Tunable = NOT_TUNED
     weight: float = 1.0
@@ -146,7 +150,7 @@ class Observer:
     def estimate(
         self, measurements: Measurements, prior: Prior, settings: Group | None = None, watch: Watch = QUIET
     ) -> Estimates:
-        """Run the observer on measurements; missing samples are filled by the model of its prior.
+        """Run the observer on measurements; missing ones are filled by the model of its prior, unless it takes them as missing.
 
         Parameters
         ----------
@@ -171,12 +175,15 @@ class Observer:
         Cancelled
             `watch` asks to stop.
         """
-        whole = fill_missing(measurements, prior, getattr(settings, "line_width", LINE_WIDTH))
-        found = self.run(whole, prior, settings, watch)
+        if self.takes_missing:
+            given = replace(measurements, u=hold_last(measurements.u))
+        else:
+            given = fill_missing(measurements, prior, getattr(settings, "line_width", LINE_WIDTH))
+        found = self.run(given, prior, settings, watch)
         return found if isinstance(found, Estimates) else Estimates(found)
 
     def design(self, prior: Prior, settings: Group | None, sampling: Sampling, horizon: float = 0.0) -> StepObserver:
-        """Return the observer one frame at a time; missing samples are filled as in `estimate`.
+        """Return the observer one frame at a time; missing measurements are taken as in `estimate`.
 
         Parameters
         ----------
@@ -206,9 +213,9 @@ class Observer:
         if needs_ngs and sampling.ratio is None:
             raise StepError(f"{self.id}: needs NGS frames: a sampling with their ratio")
         width = getattr(settings, "line_width", LINE_WIDTH)
-        lgs, ngs = bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio, width)
+        beside = None if self.takes_missing else bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio, width)
         estimator = self.step(prior, settings, sampling, horizon)
-        return StepObserver(self.id, self.targets, estimator, sampling, lgs, ngs if needs_ngs else None)
+        return StepObserver(self.id, self.targets, estimator, sampling, needs_ngs, beside)
 
     @property
     def group(self) -> str | None:

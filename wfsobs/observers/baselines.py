@@ -63,7 +63,7 @@ def zero(measurements: Measurements, _prior: Prior, _settings: None, watch: Watc
 class BankEstimator:
     """The causal band-passes of all modes, one frame at a time. They predict nothing."""
 
-    horizon, needs_command, bridges = 0.0, False, False
+    horizon, needs_command = 0.0, False
 
     def __init__(self, bands: Bands, sampling: Sampling):
         bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
@@ -80,10 +80,6 @@ class BankEstimator:
 
     def settle(self) -> None:
         """Have nothing left to do."""
-
-    def expectation(self) -> Array:
-        """Return no number: it predicts no measurement."""
-        return np.full_like(self._mean, np.nan)
 
     def reset(self) -> None:
         """Set the state back to the start."""
@@ -109,7 +105,7 @@ class BankEstimator:
 class LastValue:
     """The last measurement times a factor, held for any number of frames."""
 
-    horizon, needs_command, bridges = None, False, False
+    horizon, needs_command = None, False
 
     def __init__(self, sampling: Sampling, factor: float):
         self._factor, self._mean, self._sd = factor, np.zeros(sampling.n_modes), np.full(sampling.n_modes, np.nan)
@@ -124,10 +120,6 @@ class LastValue:
 
     def settle(self) -> None:
         """Have nothing left to do."""
-
-    def expectation(self) -> Array:
-        """Return the value."""
-        return self._mean
 
     def reset(self) -> None:
         """Set the state back to the start."""

@@ -1,8 +1,8 @@
-"""Missing samples, bridged causally in one place, so that no observer needs to know of them.
+"""Missing samples, bridged causally in one place, for observers and controllers that do not take them as missing.
 
-A lost measurement z[k] is replaced by what the Kalman filter of the observer's own prior predicts for it. For that filter this
-is the exact answer: its correction vanishes, and it predicts through the gap. A lost NGS frame is replaced by what the NGS
-filter predicts. An observer that is told no model holds the last value. A lost command is held, as a mirror holds its position.
+A lost measurement z[k] is replaced by what the Kalman filter of the own prior predicts for it, a lost NGS frame by what the NGS
+filter predicts. Who is told no model holds the last value. A lost command is held, as a mirror holds its position. The Kalman
+filters and the Gaussian processes in time take a measurement that is missing as missing (`wfsobs.signal.gap_gains`).
 Only samples before a gap fill it, so estimates stay causal, and what has been filled in counts in no score.
 """
 

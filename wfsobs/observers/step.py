@@ -1,7 +1,8 @@
 """An observer one frame at a time, as a real loop calls it.
 
 `StepObserver` is what a loop holds. It checks what comes in, completes missing measurements as `wfsobs.observers.missing` does
-over a record, and knows when an NGS frame is due; the rest is its `Estimator`, which every observer makes in its own module.
+over a record, unless its observer takes them as missing, and knows when an NGS frame is due; the rest is its `Estimator`, which
+every observer makes in its own module.
 After frame k `predict(0)` is row k of the observer's run over the record.
 """
 
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from wfsobs.observers.missing import Bridge
 from wfsobs.observers.step_checks import StepError, check_frame, check_not_due, check_state
-from wfsobs.signal.stepping import Saved, Stateful, load_parts, save_parts
+from wfsobs.signal.stepping import Stateful, load_parts, save_parts
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
@@ -25,7 +26,9 @@ if TYPE_CHECKING:
 
 
 class Estimator(Stateful, Protocol):
-    """The part of a step observer that differs from observer to observer; measurements reach it complete.
+    """The part of a step observer that differs from observer to observer.
+
+    Measurements reach it complete, or with NaN where the observer takes missing ones.
 
     Attributes
     ----------
@@ -33,8 +36,6 @@ class Estimator(Stateful, Protocol):
         Frames ahead that it was trained for; None where it predicts any.
     needs_command : bool
         Whether `advance` needs u.
-    bridges : bool
-        Whether a missing measurement takes what it expects itself (`expectation`), not what a filter beside it does.
     """
 
     @property
@@ -42,9 +43,6 @@ class Estimator(Stateful, Protocol):
 
     @property
     def needs_command(self) -> bool: ...  # noqa: D102
-
-    @property
-    def bridges(self) -> bool: ...  # noqa: D102
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame: z (n_modes,) [um]; ngs (n_modes,) [um] where an NGS frame is due; u (n_modes,) [um]."""
@@ -58,10 +56,6 @@ class Estimator(Stateful, Protocol):
         """Do now what `advance` left for later."""
         ...
 
-    def expectation(self) -> Array:
-        """Return what the next measurement is expected to be, (n_modes,) [um]."""
-        ...
-
     def take_over(self, old: Any) -> None:
         """Go on from the state of another design of the same observer. Raises StepError."""
         ...
@@ -69,25 +63,6 @@ class Estimator(Stateful, Protocol):
 
 MakeEstimator = Callable[["Prior", Any, "Sampling", float], Estimator]
 """(prior, settings, sampling, horizon) -> estimator. Raises ValueError with the reason where there is none."""
-
-
-class _Own:
-    """Completes a measurement by what the estimator itself expects: its correction vanishes."""
-
-    def __init__(self, estimator: Estimator):
-        self._expectation = estimator.expectation
-
-    def complete(self, z: Array, is_whole: bool = False) -> Array:
-        return z if is_whole else np.where(np.isnan(z), self._expectation(), z)
-
-    def reset(self) -> None:
-        return None
-
-    def save(self) -> Saved:
-        return {}
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        return None
 
 
 class StepObserver:
@@ -106,14 +81,21 @@ class StepObserver:
     """
 
     def __init__(
-        self, id: str, targets: tuple[str, ...], estimator: Estimator, sampling: Sampling, lgs: Bridge, ngs: Bridge | None
+        self,
+        id: str,
+        targets: tuple[str, ...],
+        estimator: Estimator,
+        sampling: Sampling,
+        needs_ngs: bool,
+        bridges: tuple[Bridge, Bridge] | None,
     ):
         self.id, self.targets, self.sampling, self.estimator = id, targets, sampling, estimator
-        self.frame, self._ratio = 0, sampling.ratio or 0
-        self._lgs, self._ngs = _Own(estimator) if estimator.bridges else lgs, ngs
-        self._parts: dict[str, Stateful] = {"estimator": estimator, "lgs": self._lgs}
-        if ngs is not None:
-            self._parts["ngs"] = ngs
+        self.frame, self._ratio, self._needs_ngs = 0, sampling.ratio or 0, needs_ngs
+        self._lgs, self._ngs = bridges or (None, None)
+        if not needs_ngs:
+            self._ngs = None
+        found = {id: estimator, "lgs": self._lgs, "ngs": self._ngs}
+        self._parts: dict[str, Stateful] = {name: part for name, part in found.items() if part is not None}
         self._allowed: set[tuple[float, str]] = set()
         self._nothing = np.full(sampling.n_modes, np.nan)
 
@@ -137,18 +119,19 @@ class StepObserver:
             not taken.
         """
         z, is_whole = self._check(z, "z")
-        due = self._ngs is not None and self.frame > 0 and self.frame % self._ratio == 0
-        slow = self._check_ngs(ngs, due) if self._ngs is not None else None
+        due = self._needs_ngs and self.frame > 0 and self.frame % self._ratio == 0
+        slow = self._check_ngs(ngs, due) if self._needs_ngs else None
         if self.estimator.needs_command:
             if u is None:
                 raise StepError(f"{self.id}: its windows hold commands: update(z, u=...) takes that of the frame, too")
             u, _ = self._check(u, "u")
         else:
             u = None
-        complete = self._lgs.complete(z, is_whole)
+        if self._lgs is not None:
+            z = self._lgs.complete(z, is_whole)
         if slow is not None and self._ngs is not None:
             slow = self._ngs.complete(slow)
-        self.estimator.advance(complete, slow, u)
+        self.estimator.advance(z, slow, u)
         self.frame += 1
 
     def predict(self, frames: float = 0, target: str | None = None) -> tuple[Array, Array]:
@@ -218,7 +201,7 @@ class StepObserver:
             raise StepError(f"{self.id}: takes over from a design of the same observer and sampling, not from {old.id}")
         self.estimator.take_over(old.estimator)
         for new, was in ((self._lgs, old._lgs), (self._ngs, old._ngs)):
-            if isinstance(new, Bridge) and isinstance(was, Bridge):
+            if new is not None and was is not None:
                 new.take_over(was)
         self.frame = old.frame
 

@@ -131,8 +131,6 @@ class LinearPredictor:
         Frames ahead that it was trained for.
     """
 
-    bridges = False
-
     def __init__(self, windows: Windows, fits: Sequence[tuple[Array, float]], horizon: float):
         self.windows, self.horizon, self.needs_command = windows, horizon, windows.needs_command
         channels = fits[0][0].shape[1]
@@ -157,10 +155,6 @@ class LinearPredictor:
 
     def settle(self) -> None:
         """Have nothing left to do."""
-
-    def expectation(self) -> Array:
-        """Return no number: it predicts no measurement."""
-        return np.full_like(self._mean, np.nan)
 
     def reset(self) -> None:
         """Set the state back to the start."""

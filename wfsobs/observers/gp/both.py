@@ -10,9 +10,9 @@ from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.gp.lgs import GP, GaussianProcess, kernels_of, measured_late, sampled_model
 from wfsobs.observers.kalman.multirate import MultiRate, run_modes
-from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_model, step_filters
+from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_model
 from wfsobs.observers.kalman.single import NGS
-from wfsobs.observers.kalman.step import KalmanEstimator
+from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
 from wfsobs.prior import LgsError, Lines, Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
@@ -27,16 +27,17 @@ def cycle_of(prior: Prior, settings: GaussianProcess, mode: int, ratio: int) -> 
 
 def gp_both(measurements: Measurements, prior: Prior, settings: GaussianProcess, watch: Watch) -> Estimates:
     """Run the regression over a record."""
-    assert measurements.ratio is not None
-    ratio = measurements.ratio
-    return run_modes(measurements, watch, lambda mode: cycle_of(prior, settings, mode, ratio).filter())
+    return run_modes(measurements, _filters(prior, settings, measurements.sampling), watch)
+
+
+def _filters(prior: Prior, settings: GaussianProcess, sampling: Sampling) -> list[ModeFilter]:
+    assert sampling.ratio is not None
+    return [cycle_of(prior, settings, mode, sampling.ratio).filter() for mode in range(sampling.n_modes)]
 
 
 def step_gp_both(prior: Prior, settings: GaussianProcess, sampling: Sampling, _horizon: float) -> KalmanEstimator:
     """Return the filters of all modes, one frame at a time."""
-    assert sampling.ratio is not None
-    ratio = sampling.ratio
-    return step_filters([cycle_of(prior, settings, mode, ratio) for mode in range(sampling.n_modes)])
+    return KalmanEstimator(_filters(prior, settings, sampling))
 
 
 GP_BOTH = Observer(
@@ -49,6 +50,7 @@ GP_BOTH = Observer(
     settings=GP,
     needs=NGS,
     linear=True,
+    takes_missing=True,
     sensors=("lgs", "ngs"),
     tunable=Tunable(("gp.background_rms", "gp.background_scale"), ("kalman.lgs_noise", "kalman.ngs_noise")),
     look=Look("GP, both", "#7A3B00", "#E8B07A", (6, 2, 2, 2, 2, 2), in_figures=False),

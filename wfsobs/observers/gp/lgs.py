@@ -19,8 +19,7 @@ from scipy.linalg import block_diag
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.gp.kernels import Kernel, Matern, Poles, Sho, SquaredExponentialInTime, Sum
-from wfsobs.observers.kalman.single import steady_gains
-from wfsobs.observers.kalman.spread import by_target, target_sd
+from wfsobs.observers.kalman.single import run_steady, seen_mode
 from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
 from wfsobs.observers.missing import LINE_WIDTH
 from wfsobs.prior import Lines, Prior
@@ -115,20 +114,13 @@ def filters_of(prior: Prior, settings: GaussianProcess) -> list[ModeFilter]:
     out = []
     for lines in prior.lines:
         model = sampled_model(kernels_of(lines, settings), lines.dt)
-        gains, steady = steady_gains(measured_late(model), lines.noise)
-        out.append(ModeFilter(model, gains, (steady.posterior,)))
+        out.append(seen_mode(model, measured_late(model), lines.noise))
     return out
 
 
 def gp_lgs(measurements: Measurements, prior: Prior, settings: GaussianProcess, watch: Watch) -> Estimates:
     """Run the regression on the LGS measurement, at every fast step."""
-    z, columns, sd = measurements.z, [], []
-    for mode, one in enumerate(filters_of(prior, settings)):
-        watch.step(mode / measurements.n_modes)
-        rows = one.model.output_rows(TARGETS)
-        columns.append(one.gains.filter(np.pad(rows, ((0, 0), (0, 1)))).run(z[:, None, mode, None])[:, :, 0])
-        sd.append(target_sd(rows, one.posterior))
-    return by_target(columns, sd)
+    return run_steady(measurements, filters_of(prior, settings), watch)
 
 
 def step_gp_lgs(prior: Prior, settings: GaussianProcess, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
@@ -145,6 +137,7 @@ GP_LGS = Observer(
     prior=(Lines,),
     settings=GP,
     linear=True,
+    takes_missing=True,
     tunable=Tunable(("gp.background_rms", "gp.background_scale"), ("kalman.lgs_noise", "kalman.turbulence_rms")),
     look=Look("GP in time", "#5B4B00", "#E0C95A", (6, 2, 2, 2), in_figures=False),
     step=step_gp_lgs,

@@ -86,8 +86,6 @@ def step_gpr_offline(prior: Prior, settings: OfflineGpr, sampling: Sampling, hor
 class OfflineEstimator:
     """Trained GPR of all modes, one frame at a time; `train_mode` made them for `horizon` frames ahead."""
 
-    bridges = False
-
     def __init__(self, windows: Windows, models: Sequence[TrainedGpr], horizon: float | None):
         self.windows, self.models, self.horizon, self.needs_command = windows, tuple(models), horizon, windows.needs_command
         self._mean, self._sd = np.full(len(models), np.nan), np.full(len(models), np.nan)
@@ -105,10 +103,6 @@ class OfflineEstimator:
 
     def settle(self) -> None:
         """Have nothing left to do."""
-
-    def expectation(self) -> Array:
-        """Return no number: it predicts no measurement."""
-        return np.full_like(self._mean, np.nan)
 
     def reset(self) -> None:
         """Set the state back to the start."""

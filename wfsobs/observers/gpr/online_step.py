@@ -42,8 +42,6 @@ class OnlineEstimator:
         Of the vibration now, one frame ahead and so on in what it learns; fewer than m.
     """
 
-    bridges = False
-
     def __init__(
         self, windows: Windows, bands: Bands, sampling: Sampling, depth: int, m: int, kernel: SquaredExponential, weights: Array
     ):
@@ -82,10 +80,6 @@ class OnlineEstimator:
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
         """Return the mean of the vibration; NaN until the training set is full."""
         return self._mean, self._sd
-
-    def expectation(self) -> Array:
-        """Return no number: it predicts no measurement."""
-        return np.full_like(self._mean, np.nan)
 
     def reset(self) -> None:
         """Set the state back to the start."""

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 class AdaptiveEstimator:
     """`kf_adaptive`, one frame at a time. It identifies in `advance`, in one frame of every interval."""
 
-    horizon, needs_command, bridges = None, False, False
+    horizon, needs_command = None, False
 
     def __init__(self, settings: Adaptive, sampling: Sampling):
         self.settings, self.sampling = settings, sampling
@@ -96,10 +96,6 @@ class AdaptiveEstimator:
 
     def settle(self) -> None:
         """Have nothing left to do."""
-
-    def expectation(self) -> Array:
-        """Return no number: a missing measurement is the last one."""
-        return np.full_like(self.means, np.nan)
 
     def save(self) -> Saved:
         """Return a copy of the state: the window, what was found in it, and the states of the filters."""

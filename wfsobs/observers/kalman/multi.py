@@ -8,7 +8,7 @@ from __future__ import annotations
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.single import run_steady, steady_mode
-from wfsobs.observers.kalman.step import KalmanEstimator
+from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
 from wfsobs.prior import Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
@@ -35,13 +35,16 @@ class MultiPeak(Group):
 
 def kf_multi(measurements: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> Estimates:
     """Run the filter on the LGS measurement, at every fast step."""
-    return run_steady(measurements, [(model.disturbance(settings.line_width), model.noise) for model in prior.lines], watch)
+    return run_steady(measurements, _filters(prior, settings), watch)
+
+
+def _filters(prior: Prior, settings: MultiPeak) -> list[ModeFilter]:
+    return [steady_mode(one.disturbance(settings.line_width), one.noise) for one in prior.lines]
 
 
 def step_kf_multi(prior: Prior, settings: MultiPeak, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
     """Return the filters of all modes, one frame at a time."""
-    modes = [steady_mode(one.disturbance(settings.line_width), one.noise) for one in prior.lines]
-    return KalmanEstimator(modes, bridges=True)
+    return KalmanEstimator(_filters(prior, settings))
 
 
 PEAKS = Section("multipeak", "Multi-peak Kalman filter", MultiPeak)
@@ -55,6 +58,7 @@ KF_MULTI = Observer(
     prior=(Lines,),
     settings=PEAKS,
     linear=True,
+    takes_missing=True,
     tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
     look=Look("Multi-peak", "#00707F", "#4DD0E1", (14, 3)),
     step=step_kf_multi,

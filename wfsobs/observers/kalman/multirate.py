@@ -10,7 +10,7 @@ predicted takes the filter gain L. An NGS frame counts as a measurement of phi_d
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -22,6 +22,7 @@ from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.single import MODEL, NGS
 from wfsobs.observers.kalman.spread import by_target, target_sd
 from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
+from wfsobs.observers.kalman.with_gaps import run_frames
 from wfsobs.prior import Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
@@ -141,41 +142,45 @@ def multirate_posteriors(model: DisturbanceModel, gains: GainCycle, lgs_noise: f
     return posteriors_of_gains([(A, C, model.Q, R) for A, C, _ in gains.steps], [step.L for step in gains.steps])
 
 
-def run_modes(measurements: Measurements, watch: Watch, make: Callable[[int], tuple[MultiRateFilter, Array]]) -> Estimates:
-    """Run the filter that `make` gives for each mode, with its standard deviations at steps 1 ... n, (n, n_targets) [um]."""
-    z = np.stack([measurements.z, np.nan_to_num(measurements.z_ngs)], axis=1)
+def run_modes(measurements: Measurements, modes: Sequence[ModeFilter], watch: Watch) -> Estimates:
+    """Run the filters of all modes on both sensors."""
+    n, z_ngs = measurements.ratio, measurements.z_ngs
+    assert n is not None
+    if np.isnan(measurements.z).any() or np.isnan(z_ngs[n::n]).any():
+        return run_frames(KalmanEstimator(modes), measurements, watch)
+    z = np.stack([measurements.z, np.nan_to_num(z_ngs)], axis=1)
     columns, sd = [], []
-    for mode in range(measurements.n_modes):
+    for mode, one in enumerate(modes):
         watch.step(mode / measurements.n_modes)
-        filter_, spread = make(mode)
-        columns.append(filter_.run(z[:, :, mode]))
-        sd.append(spread)
+        rows = one.rows(TARGETS)
+        columns.append(filter_of_gains(one.gains, rows).run(z[:, :, mode]))
+        sd.append(target_sd(rows, one.posterior))
     return by_target(columns, sd, first=1)
 
 
 def multirate(measurements: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> Estimates:
     """Run the multi-rate filter over a record, for turbulence."""
     assert measurements.ratio is not None
-    ratio = measurements.ratio
-
-    def of_mode(mode: int) -> tuple[MultiRateFilter, Array]:
-        model, noises = prior.model[mode].disturbance(), multirate_noise(settings, prior.model[mode])
-        gains, rows = multirate_gains(model, ratio, *noises), model.output_rows(TARGETS)
-        return filter_of_gains(gains, rows), target_sd(rows, multirate_posteriors(model, gains, *noises))
-
-    both = run_modes(measurements, watch, of_mode)
+    both = run_modes(measurements, _filters(prior, settings, measurements.ratio), watch)
     return Estimates({TURBULENCE: both[TURBULENCE]}, {TURBULENCE: both.sd[TURBULENCE]})
+
+
+def _filters(prior: Prior, settings: MultiRate, ratio: int) -> list[ModeFilter]:
+    """Return the filters of all modes. Near gaps there are more gains than two: those of the covariance as it is there."""
+    modes = []
+    for known in prior.model:
+        model, noises = known.disturbance(), multirate_noise(settings, known)
+        gains = multirate_gains(model, ratio, *noises)
+        R, last = np.diag([noise**2 for noise in noises]), gains.steps[-1]
+        cycle = tuple((A, C if step is last else C * [[1.0], [0.0]], model.Q, R) for step in gains.steps for A, C, _ in [step])
+        modes.append(ModeFilter(model, gains, tuple(multirate_posteriors(model, gains, *noises)), cycle))
+    return modes
 
 
 def step_multirate(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:
     """Return the filters of all modes, one frame at a time."""
     assert sampling.ratio is not None
-    modes = []
-    for known in prior.model:
-        model, noises = known.disturbance(), multirate_noise(settings, known)
-        gains = multirate_gains(model, sampling.ratio, *noises)
-        modes.append(ModeFilter(model, gains, tuple(multirate_posteriors(model, gains, *noises))))
-    return KalmanEstimator(modes)
+    return KalmanEstimator(_filters(prior, settings, sampling.ratio))
 
 
 MULTIRATE = Observer(
@@ -188,6 +193,7 @@ MULTIRATE = Observer(
     settings=RATES,
     needs=NGS,
     linear=True,
+    takes_missing=True,
     sensors=("lgs", "ngs"),
     tunable=TUNABLE,
     look=Look("Multi-rate KF", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),

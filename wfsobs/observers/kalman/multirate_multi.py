@@ -16,9 +16,9 @@ from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.multi import PEAKS, MultiPeak
 from wfsobs.observers.kalman.multirate import MultiRate, multirate_noise, run_modes
-from wfsobs.observers.kalman.multirate_optimal import Cycle, estimated_cycle, step_filters
+from wfsobs.observers.kalman.multirate_optimal import Cycle, estimated_cycle
 from wfsobs.observers.kalman.single import NGS
-from wfsobs.observers.kalman.step import KalmanEstimator
+from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
 from wfsobs.prior import Beams, Lines, Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
@@ -46,16 +46,18 @@ def beam_model(beams: Beams, peaks: Sequence[Ar2]) -> DisturbanceModel:
 
 def multirate_multi(measurements: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> Estimates:
     """Run the filter over a record."""
-    assert measurements.ratio is not None
-    ratio, rates = measurements.ratio, MultiRate()
-    return run_modes(measurements, watch, lambda mode: every_peak_model(rates, settings, prior, mode, ratio).filter())
+    return run_modes(measurements, _filters(prior, settings, measurements.sampling), watch)
+
+
+def _filters(prior: Prior, settings: MultiPeak, sampling: Sampling) -> list[ModeFilter]:
+    assert sampling.ratio is not None
+    ratio, rates = sampling.ratio, MultiRate()
+    return [every_peak_model(rates, settings, prior, mode, ratio).filter() for mode in range(sampling.n_modes)]
 
 
 def step_multirate_multi(prior: Prior, settings: MultiPeak, sampling: Sampling, _horizon: float) -> KalmanEstimator:
     """Return the filters of all modes, one frame at a time."""
-    assert sampling.ratio is not None
-    ratio, rates = sampling.ratio, MultiRate()
-    return step_filters([every_peak_model(rates, settings, prior, mode, ratio) for mode in range(sampling.n_modes)])
+    return KalmanEstimator(_filters(prior, settings, sampling))
 
 
 MULTIRATE_MULTI = Observer(
@@ -68,6 +70,7 @@ MULTIRATE_MULTI = Observer(
     settings=PEAKS,
     needs=NGS,
     linear=True,
+    takes_missing=True,
     sensors=("lgs", "ngs"),
     tunable=Tunable(
         ("multipeak.line_width", "kalman.lgs_noise", "kalman.ngs_noise"),

@@ -28,7 +28,6 @@ from wfsobs.observers.kalman.multirate import (
     run_modes,
 )
 from wfsobs.observers.kalman.single import NGS
-from wfsobs.observers.kalman.spread import target_sd
 from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
 from wfsobs.prior import LgsError, Model, Prior
 from wfsobs.progress import Watch
@@ -96,10 +95,10 @@ class Cycle(NamedTuple):
     rows: Array
     model: DisturbanceModel
 
-    def filter(self) -> tuple[MultiRateFilter, Array]:
-        """Return the optimal filter, and its standard deviations at steps 1 ... n, (n, n_targets) [um]."""
-        filter_, states = optimal_filter(self.steps, self.rows)
-        return filter_, target_sd(self.rows, [state.posterior for state in states])
+    def filter(self) -> ModeFilter:
+        """Return the optimal filter."""
+        gains, states = optimal_gains(self.steps)
+        return ModeFilter(self.model, gains, tuple(state.posterior for state in states), tuple(self.steps))
 
 
 def optimal_model(settings: MultiRate, prior: Prior, mode: int, ratio: int, model: DisturbanceModel | None = None) -> Cycle:
@@ -118,27 +117,19 @@ def estimated_cycle(
     return Cycle(steps, np.hstack([rows, np.zeros((len(rows), len(steps[0][0]) - rows.shape[1]))]), model)
 
 
-def step_filters(modes: Sequence[Cycle]) -> KalmanEstimator:
-    """Return the filters of all modes, one frame at a time."""
-    filters = []
-    for one in modes:
-        gains, states = optimal_gains(one.steps)
-        filters.append(ModeFilter(one.model, gains, tuple(s.posterior for s in states)))
-    return KalmanEstimator(filters)
-
-
 def multirate_optimal(measurements: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> Estimates:
     """Run the optimal multi-rate filter over a record."""
-    assert measurements.ratio is not None
-    ratio = measurements.ratio
-    return run_modes(measurements, watch, lambda mode: optimal_model(settings, prior, mode, ratio).filter())
+    return run_modes(measurements, _filters(prior, settings, measurements.sampling), watch)
+
+
+def _filters(prior: Prior, settings: MultiRate, sampling: Sampling) -> list[ModeFilter]:
+    assert sampling.ratio is not None
+    return [optimal_model(settings, prior, mode, sampling.ratio).filter() for mode in range(sampling.n_modes)]
 
 
 def step_multirate_optimal(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:
     """Return the filters of all modes, one frame at a time."""
-    assert sampling.ratio is not None
-    ratio = sampling.ratio
-    return step_filters([optimal_model(settings, prior, mode, ratio) for mode in range(sampling.n_modes)])
+    return KalmanEstimator(_filters(prior, settings, sampling))
 
 
 MULTIRATE_OPTIMAL = Observer(
@@ -151,6 +142,7 @@ MULTIRATE_OPTIMAL = Observer(
     settings=RATES,
     needs=NGS,
     linear=True,
+    takes_missing=True,
     sensors=("lgs", "ngs"),
     tunable=TUNABLE,
     look=Look("Opt. multi-rate", "#7A1FA2", "#C9A0FF", (3, 2)),

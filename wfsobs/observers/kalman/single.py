@@ -15,8 +15,10 @@ import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
+from wfsobs.observers.kalman.frame_step import FrameEstimator
 from wfsobs.observers.kalman.spread import FrameErrors, by_target, target_sd
-from wfsobs.observers.kalman.step import FrameEstimator, KalmanEstimator, ModeFilter
+from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
+from wfsobs.observers.kalman.with_gaps import run_frames
 from wfsobs.prior import Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
@@ -57,30 +59,37 @@ def steady_filter(model: DisturbanceModel, noise: float, outputs: Array | None =
 
 def kf_lgs(measurements: Measurements, prior: Prior, _settings: None, watch: Watch) -> Estimates:
     """Run the Kalman filter on the LGS measurement, at every fast step."""
-    return run_steady(measurements, [(model.disturbance(), model.lgs_noise) for model in prior.model], watch)
+    return run_steady(measurements, [steady_mode(one.disturbance(), one.lgs_noise) for one in prior.model], watch)
 
 
-def run_steady(measurements: Measurements, models: Sequence[tuple[DisturbanceModel, float]], watch: Watch) -> Estimates:
-    """Run the steady-state filter of every mode's model and noise [um] on its z."""
+def run_steady(measurements: Measurements, modes: Sequence[ModeFilter], watch: Watch) -> Estimates:
+    """Run the filters of all modes on z."""
     z, columns, sd = measurements.z, [], []
-    for mode, (model, noise) in enumerate(models):
+    if np.isnan(z).any():
+        return run_frames(KalmanEstimator(modes), measurements, watch)
+    for mode, one in enumerate(modes):
         watch.step(mode / measurements.n_modes)
-        rows = model.output_rows(TARGETS)
-        kalman, steady = steady_filter(model, noise, rows)
-        columns.append(kalman.run(z[:, None, mode, None])[:, :, 0])
-        sd.append(target_sd(rows, [steady.posterior]))
+        rows = one.rows(TARGETS)
+        columns.append(one.gains.filter(rows).run(z[:, None, mode, None])[:, :, 0])
+        sd.append(target_sd(rows, one.posterior))
     return by_target(columns, sd)
 
 
 def step_kf_lgs(prior: Prior, _settings: None, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
     """Return the filters of all modes, one frame at a time."""
-    return KalmanEstimator([steady_mode(one.disturbance(), one.lgs_noise) for one in prior.model], bridges=True)
+    return KalmanEstimator([steady_mode(one.disturbance(), one.lgs_noise) for one in prior.model])
 
 
 def steady_mode(model: DisturbanceModel, noise: float) -> ModeFilter:
     """Return the steady-state filter of a mode; noise [um]."""
-    gains, steady = steady_gains(model, noise)
-    return ModeFilter(model, gains, (steady.posterior,))
+    return seen_mode(model, model, noise)
+
+
+def seen_mode(model: DisturbanceModel, full: DisturbanceModel, noise: float) -> ModeFilter:
+    """Return the steady-state filter of a mode with more states behind those of its disturbance; noise [um]."""
+    gains, steady = steady_gains(full, noise)
+    step = full.A, np.atleast_2d(full.C), full.Q, np.array([[noise**2]])
+    return ModeFilter(model, gains, (steady.posterior,), (step,))
 
 
 def kf_ngs(measurements: Measurements, prior: Prior, settings: Kalman, watch: Watch) -> Estimates:
@@ -89,25 +98,24 @@ def kf_ngs(measurements: Measurements, prior: Prior, settings: Kalman, watch: Wa
     A frame at k = n i measures slow step i - 1 (fast steps k - n ... k - 1); the estimate is that of slow
     step i, the fast steps k ... k + n - 1. It is held over them, or propagated by the fast model.
     """
-    assert measurements.ratio is not None
     n = measurements.ratio
-    frames = measurements.z_ngs[n::n]
+    assert n is not None
+    frames, estimator = measurements.z_ngs[n::n], step_kf_ngs(prior, settings, measurements.sampling, 0.0)
+    if np.isnan(frames).any():
+        return run_frames(estimator, measurements, watch)
     columns, sd = [], []
-    for mode, model in enumerate(prior.model):
+    for mode, (model, one) in enumerate(zip(prior.model, estimator.modes, strict=True)):
         watch.step(mode / measurements.n_modes)
-        of_frames = model.at(n * measurements.dt).disturbance()
-        gains, _ = steady_gains(of_frames, model.ngs_noise)
-        kalman, truth, spreads = gains.filter(of_frames.pairs), model.disturbance(), np.empty((n, len(TARGETS)))
-        errors = FrameErrors(truth, gains.steps[0], n, model.ngs_noise)
-        slow = kalman.run(frames[:, None, mode, None])[:, :, 0]  # of each process, slow steps i and i - 1
+        pairs, spreads = one.model.pairs, np.empty((n, len(TARGETS)))
+        slow = one.gains.filter(pairs).run(frames[:, None, mode, None])[:, :, 0]  # of each process, slow steps i and i - 1
         fast = np.full((measurements.n_steps, len(TARGETS)), np.nan)
         for target, process in enumerate((model.turbulence, model.vibration)):
             spread = between_frames(process, n, settings.ngs_between_frames)
             pair = slice(2 * target, 2 * target + 2)
             values = slow[:, pair] @ spread.T
             fast[n:, target] = values.ravel()[: measurements.n_steps - n]
-            now = truth.outputs[TARGETS[target]]
-            spreads[:, target] = [errors.sd(now, weights @ of_frames.pairs[pair], j) for j, weights in enumerate(spread)]
+            now, errors = estimator.truths[mode].outputs[TARGETS[target]], estimator.errors[mode]
+            spreads[:, target] = [errors.sd(now, weights @ pairs[pair], j) for j, weights in enumerate(spread)]
         columns.append(fast)
         sd.append(spreads)
     return by_target(columns, sd, first=n)
@@ -117,10 +125,7 @@ def step_kf_ngs(prior: Prior, settings: Kalman, sampling: Sampling, _horizon: fl
     """Return the filters of all modes, one frame at a time."""
     assert sampling.ratio is not None
     n, how = sampling.ratio, settings.ngs_between_frames
-    modes = [
-        ModeFilter(m, steady_gains(m, noise)[0])
-        for m, noise in ((m.at(n * sampling.dt).disturbance(), m.ngs_noise) for m in prior.model)
-    ]
+    modes = [steady_mode(one.at(n * sampling.dt).disturbance(), one.ngs_noise) for one in prior.model]
 
     def spread(mode: int, target: str, since: int) -> Array:
         model, at = prior.model[mode], TARGETS.index(target)
@@ -132,11 +137,7 @@ def step_kf_ngs(prior: Prior, settings: Kalman, sampling: Sampling, _horizon: fl
         FrameErrors(truth, mode.gains.steps[0], n, model.ngs_noise)
         for truth, mode, model in zip(truths, modes, prior.model, strict=True)
     ]
-
-    def sd(mode: int, target: str, since: float, row: Array) -> float:
-        return errors[mode].sd(truths[mode].outputs[target], row, since)
-
-    return FrameEstimator(modes, spread, sd, holds=how == "hold")
+    return FrameEstimator(modes, truths, errors, spread, holds=how == "hold")
 
 
 def between_frames(process: Ar2, n: int, how: str, steps: int | None = None) -> Array:
@@ -164,6 +165,7 @@ KF_LGS = Observer(
     help="steady-state Kalman filter, one vibration peak in its model",
     prior=(Model,),
     linear=True,
+    takes_missing=True,
     # The gain depends on the ratios of turbulence, vibration and noise. Turbulence tuned for vibration would be no turbulence.
     tunable=Tunable((*MODEL[:2], "kalman.vibration_rms"), ("kalman.turbulence_rms", "kalman.lgs_noise")),
     look=Look("LGS KF", "#FF6600", "#FF8533"),
@@ -180,6 +182,7 @@ KF_NGS = Observer(
     settings="kalman",
     needs=NGS,
     linear=True,
+    takes_missing=True,
     sensors=("ngs",),
     tunable=Tunable(("kalman.turbulence_rms", "kalman.vibration_rms"), (*MODEL[:2], "kalman.ngs_noise")),
     look=Look("NGS KF", "#003DE6", "#7AA2FF", (8, 2)),

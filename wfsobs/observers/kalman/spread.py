@@ -51,9 +51,14 @@ def by_target(columns: Sequence[Array], sd: Sequence[Array] = (), first: int = 0
 class FrameErrors:
     """Errors of a filter that sees NGS frames alone, where its model is true at the fast step and a frame is the mean that it is.
 
-    The pair (state xi of the fast model with the running frame, estimate x_hat) after a frame is stationary from frame to frame:
+    The pair (state xi of the fast model with the running frame, estimate x_hat) after a frame goes on from frame to frame as
 
         xi[i+1] = Phi xi[i] + w,    x_hat[i+1] = F x_hat[i] + L (c xi[i+1] + v).
+
+    Attributes
+    ----------
+    steady : Array
+        Its covariance, the same after every frame unless one is missing.
 
     Parameters
     ----------
@@ -68,20 +73,33 @@ class FrameErrors:
     """
 
     def __init__(self, model: DisturbanceModel, slow: Gain, ratio: int, noise: float):
-        n, L, c = len(model.A), slow.L, np.eye(len(model.A) + 1)[-1:]
+        n = len(model.A)
         A, Q = block_diag(model.A, [[1.0]]), block_diag(model.Q, [[0.0]])
         A[n, :n] = sum(model.outputs.values()) / ratio
         Phi, W = np.diag([*np.ones(n), 0.0]), np.zeros_like(A)  # a frame that has been read starts anew
         for _ in range(ratio):
             Phi, W = A @ Phi, A @ W @ A.T + Q
-        reduced = (np.eye(len(L)) - L @ slow.C) @ slow.A
-        seen = np.vstack([np.eye(n + 1), L @ c])
-        transition = np.hstack([seen @ Phi, np.vstack([np.zeros((n + 1, len(L))), reduced])])
-        S = lyapunov(transition, seen @ W @ seen.T + block_diag(np.zeros_like(W), noise**2 * L @ L.T))
-        self._A, self._states, self._cross, self._estimates = model.A, S[:n, :n], S[:n, n + 1 :], S[n + 1 :, n + 1 :]
+        self._A, self._Phi, self._W, self._noise = model.A, Phi, W, noise
+        self.steady = lyapunov(*self._map((np.eye(len(slow.L)) - slow.L @ slow.C) @ slow.A, slow.L))
 
-    def sd(self, now: Array, row: Array, since: float) -> float:
-        """Return the standard deviation of the estimate row x_hat of now x, that many fast steps after the frame [um]."""
+    def _map(self, F: Array, L: Array) -> tuple[Array, Array]:
+        """Return transition and drive of the pair; F (n, n), L (n, 1): x_hat[i+1] = F x_hat[i] + L z[i+1]."""
+        m, W = len(self._Phi), self._W
+        seen = np.vstack([np.eye(m), L @ np.eye(m)[-1:]])
+        transition = np.hstack([seen @ self._Phi, np.vstack([np.zeros((m, len(L))), F])])
+        return transition, seen @ W @ seen.T + block_diag(np.zeros_like(W), self._noise**2 * L @ L.T)
+
+    def after(self, S: Array, update: Array) -> Array:
+        """Return the covariance after a frame with another gain; update (n, n + 1): of x_hat and the frame."""
+        T, drive = self._map(update[:, :-1], update[:, -1:])
+        return T @ S @ T.T + drive
+
+    def sd(self, now: Array, row: Array, since: float, S: Array | None = None) -> float:
+        """Return the standard deviation of the estimate row x_hat of now x, that many fast steps after the frame [um].
+
+        S : covariance of the pair, by default the steady one
+        """
+        S, n, m = self.steady if S is None else S, len(self._A), len(self._Phi)
         ahead = now @ matrix_power(self._A, since)
-        variance = now @ self._states @ now - 2.0 * ahead @ self._cross @ row + row @ self._estimates @ row
+        variance = now @ S[:n, :n] @ now - 2.0 * ahead @ S[:n, m:] @ row + row @ S[m:, m:] @ row
         return float(np.sqrt(max(variance, 0.0)))

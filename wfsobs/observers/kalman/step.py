@@ -4,25 +4,26 @@ A process of poles exp(s_i T) with the continuous-time s_i goes on for f frames 
 the model and P that of the estimate after a measurement, the error of the prediction has the covariance
 
     A^f P A^f' + S - A^f S A^f'.
+
+A measurement that is missing is NaN. Near it the gains are those of the covariance as it is there (`wfsobs.signal.gap_gains`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import fractional_matrix_power
 
-from wfsobs.observers.missing import expected_rows
-from wfsobs.observers.step_checks import StepError, whole_frames
+from wfsobs.observers.kalman.gap_bank import GapBank
+from wfsobs.observers.step_checks import StepError
 from wfsobs.signal.filter_covariance import lyapunov
+from wfsobs.signal.gap_gains import GapGains
+from wfsobs.signal.riccati import Step
 from wfsobs.signal.statespace import DisturbanceModel
-from wfsobs.signal.stepping import FilterBank, GainCycle, Saved
+from wfsobs.signal.stepping import GainCycle, Saved
 from wfsobs.typing import Array
-
-Spread = Callable[[int, str, int], Array]
-SpreadSd = Callable[[int, str, float, Array], float]
 
 
 class ModeFilter(NamedTuple):
@@ -31,11 +32,31 @@ class ModeFilter(NamedTuple):
     model    : of the disturbance, the first states of the filter
     gains    : of the filter
     posterior : covariance after the measurement, of every step that repeats; empty where it is not known
+    cycle    : (A, C, Q, R) of every step that repeats, C zero where nothing is measured
     """
 
     model: DisturbanceModel
     gains: GainCycle
     posterior: tuple[Array, ...] = ()
+    cycle: tuple[Step, ...] = ()
+
+    def rows(self, targets: Sequence[str]) -> Array:
+        """Return rows of the whole state that give several targets, (len(targets), n)."""
+        rows = self.model.output_rows(targets)
+        return self._pad_rows(rows)
+
+    def gaps(self) -> GapGains:
+        """Return the gains near gaps; steady again is what knows every process and the measurement as well as without one."""
+        targets, (_, C, _, _) = self.rows(tuple(self.model.outputs)), self.cycle[-1]
+        scale = np.mean([np.sum((targets @ P) * targets) for P in self.posterior])
+        return GapGains(self.cycle, self.posterior, np.vstack([self._pad_rows(self.model.pairs), C]), float(scale))
+
+    def digest(self) -> bytes:
+        """Return what tells models apart."""
+        return b"".join(x.tobytes() for step in self.cycle for x in step)
+
+    def _pad_rows(self, rows: Array) -> Array:
+        return np.pad(rows, ((0, 0), (0, len(self.gains.steps[0].A) - rows.shape[1])))
 
 
 class Plan(NamedTuple):
@@ -61,20 +82,20 @@ class LinearEstimator:
 
     horizon: float | None = None
     needs_command = False
-    bridges = False
 
     def __init__(self, modes: Sequence[ModeFilter]):
         self.modes = tuple(modes)
-        self.bank = FilterBank([mode.gains.estimator() for mode in modes])
+        self.bank = GapBank([mode.gains for mode in modes], self._gaps)
         self._state = self.bank.x[:, :, None]
-        self._expected = expected_rows([mode.gains for mode in modes])
+        self._of_equal: dict[bytes, GapGains] = {}
+
+    def _gaps(self, mode: int) -> GapGains:
+        """Return the gains near gaps of a mode; modes of equal models share them."""
+        model = self.modes[mode].digest()
+        return self._of_equal.setdefault(model, self._of_equal.get(model) or self.modes[mode].gaps())
 
     def settle(self) -> None:
         """Have nothing left to do."""
-
-    def expectation(self) -> Array:
-        """Return the expected next measurement of the LGS, (n_modes,) [um]."""
-        return np.sum(self._expected * self.bank.x, axis=1)
 
     def reset(self) -> None:
         """Set the state back to rest."""
@@ -94,6 +115,7 @@ class LinearEstimator:
         for mode, (new, was) in enumerate(zip(self.modes, old.modes, strict=True)):
             x = old.bank.x[mode, : len(was.model.A)]
             self.bank.x[mode, : len(new.model.A)] = carry_state(new.model, was.model, x)
+            self.bank.set_near(mode, old.bank.near[mode] if new.digest() == was.digest() else None)
 
 
 class KalmanEstimator(LinearEstimator):
@@ -103,16 +125,19 @@ class KalmanEstimator(LinearEstimator):
     ----------
     modes : sequence of ModeFilter
         One per mode.
-    bridges : bool
-        Whether missing LGS measurements are what the filter itself expects.
     """
 
-    def __init__(self, modes: Sequence[ModeFilter], bridges: bool = False):
+    def __init__(self, modes: Sequence[ModeFilter]):
         super().__init__(modes)
-        self.bridges = bridges
         self._plans: dict[tuple[float, str], Plan] = {}
+        self._variances: dict[int, Array] = {}
         v = self.bank.v
         self._lgs, self._ngs = v[:, 0], v[:, 1] if v.shape[1] > 1 else None
+
+    @property
+    def uses_ngs(self) -> bool:
+        """Whether it takes NGS frames."""
+        return self._ngs is not None
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
@@ -125,7 +150,19 @@ class KalmanEstimator(LinearEstimator):
         """Return (mean, sd) of the target."""
         one = self._plans.get((frames, target)) or self._plan(frames, target)
         np.matmul(one.rows, self._state, out=one.product)
-        return one.mean, one.sd[self.bank.last]
+        sd = one.sd[self.bank.last]
+        return one.mean, self._near_gap(one, sd, target) if self.bank.is_near else sd
+
+    def _near_gap(self, plan: Plan, steady: Array, target: str) -> Array:
+        """Return the standard deviations where some modes are near a gap."""
+        out = steady.copy()
+        for mode, (near, row) in enumerate(zip(self.bank.near, plan.rows[:, 0], strict=True)):
+            if near is not None:
+                model = self.modes[mode].model
+                if mode not in self._variances:
+                    self._variances[mode] = lyapunov(model.A, model.Q)
+                out[mode] = prediction_sd(model.outputs[target], row[: len(model.A)], self._variances[mode], near.posterior)
+        return out
 
     def _plan(self, frames: float, target: str) -> Plan:
         powers = [matrix_power(mode.model.A, frames) for mode in self.modes]
@@ -166,9 +203,19 @@ def _sums(model: DisturbanceModel) -> Array:
 
 def _prediction_sd(mode: ModeFilter, row: Array, target: str) -> list[float]:
     """Return the standard deviation [um] of the prediction `row` of the model's state, for every step that repeats."""
-    n, now = len(mode.model.A), mode.model.outputs[target]
     S = lyapunov(mode.model.A, mode.model.Q)
-    return [float(np.sqrt(max(now @ S @ now - row @ (S - P[:n, :n]) @ row, 0.0))) for P in mode.posterior]
+    return [prediction_sd(mode.model.outputs[target], row, S, P) for P in mode.posterior]
+
+
+def prediction_sd(now: Array, row: Array, S: Array, P: Array) -> float:
+    """Return the standard deviation of row x_hat for now x.
+
+    now, row : (n,)
+    S        : covariance of the disturbance, (n, n)
+    P        : covariance after the measurement, (n, n) or of a longer state
+    """
+    n = len(S)
+    return float(np.sqrt(max(now @ S @ now - row @ (S - P[:n, :n]) @ row, 0.0)))
 
 
 def matrix_power(A: Array, frames: float) -> Array:
@@ -179,70 +226,3 @@ def matrix_power(A: Array, frames: float) -> Array:
     if np.iscomplexobj(out) and np.abs(out.imag).max() > 1e-9 * np.abs(out.real).max():
         raise StepError(f"frames = {frames:g}: the model has no continuous-time form; takes a whole number")
     return np.real(out)
-
-
-class FrameEstimator(LinearEstimator):
-    """Kalman filters on NGS frames, their estimates spread over the fast steps between them.
-
-    Parameters
-    ----------
-    modes : sequence of ModeFilter
-        The slow filters, one per mode.
-    spread : callable
-        (mode, target, fast steps since the frame) -> row of the slow filter's state.
-    sd : callable
-        (mode, target, fast steps from the frame to what is estimated, row) -> standard deviation of that estimate [um].
-    held : bool
-        Whether an estimate is held until the next frame, so that any fraction of a frame is defined.
-    """
-
-    def __init__(self, modes: Sequence[ModeFilter], spread: Spread, sd: SpreadSd, holds: bool):
-        super().__init__(modes)
-        self._spread, self._sd, self._holds = spread, sd, holds
-        self._since = -1
-        self._frame_plans: dict[tuple[int, float, str], Plan] = {}
-        self._unknown = np.full(len(self.modes), np.nan)
-
-    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
-        """Take a frame."""
-        if ngs is not None:
-            self.bank.step(ngs[:, None])
-            self._since = 0
-        elif self._since >= 0:
-            self._since += 1
-
-    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
-        """Return the mean of the target; NaN before the first NGS frame."""
-        ahead = 0 if self._holds else whole_frames(frames, "an estimate between NGS frames")
-        since = max(self._since, 0)
-        one = self._frame_plans.get((since, frames, target)) or self._plan(since, frames, ahead, target)
-        np.matmul(one.rows, self._state, out=one.product)
-        if self._since < 0:
-            one.mean[...] = np.nan
-        return one.mean, self._unknown if self._since < 0 else one.sd[0]
-
-    def _plan(self, since: int, frames: float, ahead: int, target: str) -> Plan:
-        n_modes, n = self.bank.x.shape
-        rows = [self._spread(mode, target, since + ahead) for mode in range(n_modes)]
-        sd = np.array([[self._sd(mode, target, since + frames, row) for mode, row in enumerate(rows)]])
-        self._frame_plans[since, frames, target] = out = plan(rows, n, sd)
-        return out
-
-    def reset(self) -> None:
-        """Set the state back to before the first NGS frame."""
-        super().reset()
-        self._since = -1
-
-    def save(self) -> Saved:
-        """Return a copy of the state."""
-        return {**super().save(), "since": np.array(self._since)}
-
-    def load(self, state: Mapping[str, Array]) -> None:
-        """Take over a state."""
-        super().load(state)
-        self._since = int(state["since"])
-
-    def take_over(self, old: Any) -> None:
-        """Go on from another design."""
-        super().take_over(old)
-        self._since = old._since
