@@ -21,6 +21,7 @@ RUN := $(VENV)/.run-$(PINS)
 TEST := $(VENV)/.test-$(PINS)
 BENCH := $(VENV)/.bench-$(PINS)
 DOCS := $(VENV)-docs/.docs-$(PINS)
+PYRTC := $(VENV)-pyrtc/.pyrtc-$(PINS)
 
 # $(call install,requirements): these pins and the project itself, editable; stamps of other pins go.
 define install
@@ -33,7 +34,7 @@ define install
 endef
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: help run test setup check wheel wheel-check load container-check bench docs clean test-fast
+.PHONY: help run test setup check wheel wheel-check load container-check bench docs clean test-fast test-peers
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' Makefile
@@ -50,6 +51,9 @@ test: setup  ## run all tests, then the tutorials, then those in a browser
 
 test-fast: $(TEST)  ## the quick tests alone: no dashboard, no report, none that takes long (tests/slow.txt)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" tests wfsobs --ignore=tests/app --ignore=tests/report --ignore=wfsobs/app
+
+test-peers: $(PYRTC)  ## run the tests of the predictor in pyRTC, which has an environment of its own
+	@$(VENV)-pyrtc/bin/python -m pytest tests/pyrtc
 
 setup: $(TEST)  ## install all that the tests need, the browser included
 	@scripts/need_browser.sh $(VENV)
@@ -84,7 +88,7 @@ docs: $(DOCS)  ## build this documentation in build/site, the tutorials run agai
 	$(VENV)-docs/bin/python docs/scripts/check_site.py build/site
 
 clean:  ## remove .venv and all that was built
-	rm -rf $(VENV) $(VENV)-docs build dist *.egg-info .pytest_cache .ruff_cache .hypothesis test-output
+	rm -rf $(VENV) $(VENV)-docs $(VENV)-pyrtc build dist *.egg-info .pytest_cache .ruff_cache .hypothesis test-output
 	find docs scripts tests wfsobs -name __pycache__ -prune -exec rm -rf {} +
 
 $(MADE):
@@ -99,6 +103,12 @@ $(TEST): | $(MADE)
 
 $(BENCH): | $(MADE)
 	$(call install,requirements-bench.txt)
+
+$(PYRTC):
+	@echo "Installing requirements-pyrtc.txt in $(VENV)-pyrtc ..."
+	@scripts/make_venv.sh "$(PYTHON)" $(VENV)-pyrtc
+	@$(VENV)-pyrtc/bin/python -m pip --disable-pip-version-check install --quiet -r requirements-pyrtc.txt
+	@touch $@
 
 $(DOCS):
 	@echo "Installing requirements-docs.txt in $(VENV)-docs ..."

@@ -1,0 +1,126 @@
+"""The predictor in pyRTC itself: made from its configuration, in its loop, beside its own predictors on the same disturbance."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import pyshmem
+import pytest
+import yaml
+from pyrtc import predictive
+from pyrtc.component_loading import import_symbol_from_file
+
+import wfsobs
+from wfsobs.peers import pyrtc as peer
+from wfsobs.peers.predictor import LoopPredictor
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "pyrtc" / "loop.yaml"
+NOISE = 0.03
+Step = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def disturbance() -> np.ndarray:
+    record = wfsobs.simulate(wfsobs.PRESETS["paper"]().replace({"run.duration": 24.0}))
+    assert record.turbulence is not None and record.vibration is not None
+    return record.turbulence + record.vibration
+
+
+def closed_loop(disturbance: np.ndarray, step: Step, delay: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Return residual and pseudo-open-loop modes; step(y, applied, last) gives the command that acts `delay` frames later."""
+    n = len(disturbance)
+    noise = np.random.default_rng(5).normal(0.0, NOISE, (n, 2))
+    applied, last, modes = np.zeros((n + delay, 2)), np.zeros(2), np.zeros((n, 2))
+    for t in range(n):
+        y = disturbance[t] + applied[t] + noise[t]
+        modes[t] = y - applied[t]
+        last = step(y, applied[t], last)
+        applied[t + delay] = last
+    return disturbance + applied[:n], modes
+
+
+def by(predictor: predictive.ModalPredictor) -> Step:
+    def step(y: np.ndarray, applied: np.ndarray, last: np.ndarray) -> np.ndarray:
+        predictor.update(y - applied)
+        return -predictor.predict()
+
+    return step
+
+
+def test_residual_beside_its_own_predictors(disturbance: np.ndarray) -> None:
+    """Learn on 8 s under an integrator, run on the next 16 s: below the best integrator, AR(2) filter and 30 taps."""
+    peer.register_predictor()
+    learnt, run = disturbance[:8000], disturbance[8000:]
+    _, modes = closed_loop(learnt, lambda y, applied, last: last - 0.3 * y)
+
+    def rms(step: Step) -> float:
+        return float(np.sqrt(np.mean(closed_loop(run, step)[0][1000:] ** 2)))
+
+    left = {"integrator": min(rms(lambda y, applied, last, g=g: last - g * y) for g in np.linspace(0.1, 0.7, 13))}
+    for kind, options in (
+        ("ar_kalman", {}),
+        ("least_squares", {"order": 30}),
+        ("wfsobs", {"observer": "kf-multi", "rate": 1000.0}),
+    ):
+        predictor = predictive.make_predictor({"type": kind, "horizon": 2, **options}, 2).fit(modes)
+        left[kind] = rms(by(predictor))
+    print({kind: round(1e3 * value, 2) for kind, value in left.items()})
+    assert left["wfsobs"] < min(value for kind, value in left.items() if kind != "wfsobs")
+
+
+@pytest.fixture
+def streams() -> Iterator[tuple[str, str]]:
+    names = (f"signal_{uuid4().hex[:8]}", f"wfc_{uuid4().hex[:8]}")
+    made = [pyshmem.create(name, shape=(2,), dtype="float32") for name in names]
+    yield names
+    for stream in made:
+        stream.close()
+        pyshmem.unlink(stream.name)
+
+
+def test_its_loop_runs_the_predictor_of_the_example(streams: tuple[str, str], disturbance: np.ndarray) -> None:
+    """The loop of the example on two streams, frame by frame: its commands are those of the predictor by itself."""
+    conf = yaml.safe_load(EXAMPLE.read_text())["loop"]
+    file = Path(peer.__file__)
+    loop_class = import_symbol_from_file(str(file), conf["class_name"])
+    conf |= {"input_streams": {"signal": streams[0]}, "output_streams": {"wfc": streams[1]}, "functions": [], "gain": 0.3}
+    conf["predictor"]["fit_frames"] = 4096
+    loop = loop_class(conf)
+    signal = pyshmem.open(streams[0])
+    try:
+        loop.cm = np.eye(2, dtype=np.float32)
+        applied, sent = np.zeros((5200, 2)), []
+        for t in range(5000):
+            if t == 4500:
+                loop.fit_predictor()
+            signal.write((disturbance[t] + applied[t]).astype(np.float32))
+            loop.predictive_integrator()
+            sent.append(np.array(loop.read_stream("wfc", block=False)).ravel())
+            applied[t + 2] = sent[-1]
+        modes = loop.recorded_pol()
+        alone = LoopPredictor(
+            2, **{key: value for key, value in conf["predictor"].items() if key in ("observer", "rate", "horizon")}
+        )
+        history = np.array(disturbance[:5000])
+        assert loop.predictor.name == "wfsobs" and loop.predictor_fitted and len(modes) == 4096
+        alone.fit(disturbance[404:4500].astype(np.float32))
+        for t in range(4436, 4500):
+            alone.update(history[t])
+        expected = []
+        for t in range(4500, 5000):
+            alone.update(history[t])
+            expected.append(-alone.predict())
+        # single precision in the streams, and a fit of what was so rounded
+        np.testing.assert_allclose(sent[4500:], expected, rtol=0, atol=1e-3 * np.std(history))
+    finally:
+        loop.close()
+        signal.close()
+
+
+def test_a_mistake_in_the_configuration_is_told() -> None:
+    peer.register_predictor()
+    with pytest.raises(ValueError, match="no such observer"):
+        predictive.make_predictor({"type": "wfsobs", "observer": "kf"}, 2)
+    with pytest.raises(ValueError, match="of one sensor"):
+        predictive.make_predictor({"type": "wfsobs", "observer": "multirate-multi"}, 2)

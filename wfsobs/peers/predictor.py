@@ -1,0 +1,147 @@
+"""An observer behind the interface of a modal predictor: fit on a history, then a frame in, a prediction out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from wfsobs.identification import identify
+from wfsobs.identification.result import Identification
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.step import StepObserver
+from wfsobs.prior import Training
+from wfsobs.priors_from.identification import told_by
+from wfsobs.record import Record, Sampling
+from wfsobs.scenario import Scenario
+from wfsobs.stepping import design
+from wfsobs.typing import Array
+
+SIZE = 0.5
+"""Rms that the history of the modes is scaled to before it is identified [um]: the filters' settings are in micrometres."""
+
+
+class PredictorError(ValueError):
+    """Error: a predictor that cannot be made or fitted; one line with the reason."""
+
+
+class LoopPredictor:
+    """Predicts the disturbance of modes some frames ahead; the interface that pyRTC asks of a predictor.
+
+    Parameters
+    ----------
+    num_modes : int
+        Modes of the loop.
+    horizon : int
+        Frames from the last measurement to the one that is predicted, 1 or more.
+    observer : str
+        Id; one of a single sensor that needs no training data.
+    rate : float
+        Frames per second of the loop [Hz].
+    modes : sequence of int, optional
+        Modes that the observer predicts, by default all; of the others the last measurement is the prediction.
+    prior : str, optional
+        The file of `wfsobs identify --out`; by default `fit` identifies the history that it is given.
+    scale : float
+        Micrometres per unit of the modes, for a prior from a file.
+    settings : mapping, optional
+        Settings of the observer by dotted name, such as {"gpr_online.inputs": "z"}.
+
+    Raises
+    ------
+    PredictorError
+        A number is out of range, or the observer cannot run here.
+    SettingError
+        The file or a setting is refused.
+    """
+
+    def __init__(
+        self,
+        num_modes: int,
+        horizon: int = 2,
+        *,
+        observer: str = "kf-multi",
+        rate: float = 1000.0,
+        modes: Sequence[int] | None = None,
+        prior: str | None = None,
+        scale: float = 1.0,
+        settings: Mapping[str, Any] | None = None,
+    ):
+        chosen = list(range(num_modes)) if modes is None else [int(mode) for mode in modes]
+        if num_modes < 1 or not chosen or len(set(chosen)) != len(chosen) or not 0 <= min(chosen) <= max(chosen) < num_modes:
+            raise PredictorError(f"modes = {chosen}: takes different whole numbers from 0 to {num_modes - 1}")
+        if horizon < 1 or not 0 < rate < np.inf or not 0 < scale < np.inf:
+            raise PredictorError(f"horizon = {horizon}, rate = {rate}, scale = {scale}: take 1 or more, and numbers above 0")
+        self.num_modes, self.horizon, self.fitted = num_modes, horizon, False
+        self._id, self._rate, self._modes, self._scale = observer, float(rate), np.array(chosen), float(scale)
+        self._settings = Scenario().replace({**(settings or {}), "sensors.lgs_rate": self._rate})
+        self._check_observer()
+        self._observer: StepObserver | None = None
+        self._last = np.zeros(num_modes)
+        if prior is not None:
+            from wfsobs.scenario import configfile  # needs a writer of TOML, which the core is installed without
+
+            self._observer, self.fitted = self._design(configfile.load_scenario(prior)), True
+
+    def fit(self, pol_history: ArrayLike) -> LoopPredictor:
+        """Identify a history of pseudo-open-loop modes, (n, num_modes) in units of the loop, and design the observer.
+
+        With a prior from a file the history is not used. Raises PredictorError, and RecordError where it is too short.
+        """
+        history = np.asarray(pol_history, dtype=float)
+        if history.ndim == 1:
+            history = history[:, None]
+        if history.ndim != 2 or history.shape[1] != self.num_modes:
+            raise PredictorError(f"fit: takes the shape (frames, {self.num_modes}), not {history.shape}")
+        if self._observer is None or not self._is_told:
+            z = history[:, self._modes]
+            known = z[np.isfinite(z)]
+            size = float(known.std()) if known.size else 0.0
+            if size == 0:
+                raise PredictorError("fit: the history is constant or not finite")
+            self._scale, self._is_told = SIZE / size, False
+            found = identify(Record(self._scale * z, np.zeros_like(z), 1.0 / self._rate))
+            self._observer = self._design(found)
+        for row in history:
+            self.update(row)
+        self.fitted = True
+        return self
+
+    def update(self, pol: ArrayLike) -> None:
+        """Take a pseudo-open-loop measurement of all modes, (num_modes,); NaN is missing. Raises StepError."""
+        given = np.asarray(pol, dtype=float).reshape(self.num_modes)
+        np.copyto(self._last, given, where=np.isfinite(given))
+        if self._observer is not None:
+            self._observer.update(self._scale * given[self._modes])
+
+    def predict(self) -> Array:
+        """Return the modes `horizon` frames after the last measurement, (num_modes,)."""
+        out = self._last.copy()
+        if self._observer is not None and self._observer.frame:
+            parts = [self._observer.predict(self.horizon - 1, target)[0] for target in self._observer.targets]
+            out[self._modes] = np.sum(parts, axis=0) / self._scale
+        return out
+
+    def reset(self) -> None:
+        """Go back to before the first frame, and keep the design."""
+        self._last[:] = 0.0
+        if self._observer is not None:
+            self._observer.reset()
+
+    def _check_observer(self) -> None:
+        if self._id not in OBSERVERS:
+            raise PredictorError(f"observer {self._id!r}: no such observer; there are {', '.join(OBSERVERS)}")
+        declared = OBSERVERS[self._id]
+        if "y_ngs" in declared.needs or Training in declared.prior or len(declared.targets) < 2:
+            raise PredictorError(
+                f"{self._id}: takes an observer of turbulence and vibration, of one sensor, without training data"
+            )
+
+    def _design(self, source: Scenario | Identification) -> StepObserver:
+        self._is_told = isinstance(source, Scenario)
+        scenario = told_by(source, self._settings).replace({"sensors.lgs_rate": self._rate})
+        prior = scenario if self._is_told else source
+        sampling = Sampling(len(self._modes), 1.0 / self._rate)
+        return design(self._id, prior, scenario=scenario, sampling=sampling, horizon=self.horizon - 1)
