@@ -84,6 +84,29 @@ def board(request: Any, dashboard: Dashboard, loop: Any, short: Scenario, tmp_pa
     return dashboard
 
 
+@pytest.fixture
+def columns(dashboard: Dashboard, loop: Any, short: Scenario, tmp_path: Path, monkeypatch: Any) -> Dashboard:
+    """A dashboard on a record whose columns have names that say nothing, as they are chosen in the form."""
+    monkeypatch.chdir(tmp_path)
+    record = simulate(short.replace({"run.seed": 9}))
+    names = {"y_lgs/tip": "a", "y_lgs/tilt": "b 2", "u/tip": "it's c", "u/tilt": "$d"}
+    table = np.column_stack([record.y_lgs, record.u]).tolist()
+    text = "\n".join([",".join(names.values()), *(",".join(map(repr, row)) for row in table)])
+    upload, content = dashboard.upload, text.encode()
+    upload.handle({"action": "part", "name": "odd.csv", "index": 0, "count": 1, "data": base64.b64encode(content).decode()})
+    loop.until(lambda: upload.form is not None and upload.form.visible)
+    for role, name in names.items():
+        upload.form._handle_msg({"column": name, "role": role})
+    upload.fields.rate.value = "1000"
+    loop.until(lambda: upload._preview is not None)
+    upload.confirm()
+    (tmp_path / "odd.csv").write_bytes(content)
+    loop.until(lambda: dashboard.store.run.state != RUNNING, 120)
+    source = dashboard.store.source
+    assert isinstance(source, LoadedRecord) and source.declaration.columns == names
+    return dashboard
+
+
 def shell(dashboard: Dashboard) -> Any:
     """What the command that is copied prints as JSON."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
@@ -117,6 +140,15 @@ def test_explore(board: Dashboard) -> None:
         shown = {key: value for key, value in shown.items() if key[0] not in BOUNDS}
     assert {(r["observer"], r["target"], r["mode"]): r["rms_um"] for r in shell(board)} == pytest.approx(shown, rel=CLOSE)
     made = script(board)
+    assert {(s.observer, s.target, s.mode): s.rms for s in made["result"].scores} == pytest.approx(shown, rel=CLOSE)
+
+
+def test_columns_that_were_chosen(columns: Dashboard) -> None:
+    """Without truth: the errors of predictions of the next measurement."""
+    shown = {(s.observer, s.target, s.mode): s.rms for s in of(columns).result.scores}
+    assert len(shown) > 10
+    assert {(r["observer"], r["target"], r["mode"]): r["rms_um"] for r in shell(columns)} == pytest.approx(shown, rel=CLOSE)
+    made = script(columns)
     assert {(s.observer, s.target, s.mode): s.rms for s in made["result"].scores} == pytest.approx(shown, rel=CLOSE)
 
 
