@@ -8,7 +8,7 @@ from time import perf_counter
 from wfsobs.dependence import RecordMemo
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.observers.estimates import Estimate, Estimates
+from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate, Estimates
 from wfsobs.priors_from.scenario import arguments, prior_and_settings
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record
@@ -116,4 +116,5 @@ def _one(observer: Observer, record: Record, scenario: Scenario, watch: Watch) -
     except ValueError as error:
         return [Failure(observer.id, f"{observer.id} left out: {error}")]
     seconds = (perf_counter() - start) / max(record.n_steps * record.n_modes, 1)
-    return [Estimate(observer.id, target, values[target], seconds, values.sd.get(target)) for target in observer.targets]
+    of_sum = {name: values.sd[name] for name in (TOTAL, NEXT_Z) if name in values.sd}
+    return [Estimate(observer.id, target, values[target], seconds, values.sd.get(target), of_sum) for target in observer.targets]

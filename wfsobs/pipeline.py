@@ -143,7 +143,8 @@ def _from(estimate: Estimate, first: int) -> Estimate:
     def cut(x: Array) -> Array:
         return np.vstack([np.full_like(x[:first], np.nan), x[first:]])
 
-    return replace(estimate, values=cut(estimate.values), sd=None if estimate.sd is None else cut(estimate.sd))
+    sd, of_sum = None if estimate.sd is None else cut(estimate.sd), {name: cut(x) for name, x in estimate.sd_of_sum.items()}
+    return replace(estimate, values=cut(estimate.values), sd=sd, sd_of_sum=of_sum)
 
 
 def as_stated(record: Record, scenario: Scenario) -> Scenario:

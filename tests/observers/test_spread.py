@@ -77,8 +77,14 @@ def test_bands_hold_what_they_say_where_the_model_is_true(name: str, between: st
     prior, settings = told(name, between)
     measurements, truth = own_record(name, prior, np.random.default_rng(7))
     found = OBSERVERS[name].estimate(measurements, prior, settings)
-    for target in OBSERVERS[name].targets:
-        error, sd = (found[target] - truth[target])[SETTLED:], found.sd[target][SETTLED:]
+    errors = {target: found[target] - truth[target] for target in OBSERVERS[name].targets}
+    if len(errors) == 2:
+        errors["total"] = errors["turbulence"] + errors["vibration"]
+        ahead = np.vstack([measurements.z[1:], np.full((1, RECORDS), np.nan)])
+        errors["next z"] = found["turbulence"] + found["vibration"] - ahead
+    assert set(errors) <= found.sd.keys()
+    for target, every in errors.items():
+        error, sd = every[SETTLED:-1], found.sd[target][SETTLED:-1]
         for phase in range(RATIO):
             e, s = error[phase::RATIO], sd[phase::RATIO]
             for share in (0.68, 0.95):
@@ -122,6 +128,17 @@ def test_every_observer_with_a_model_states_something(name: str) -> None:
     for score in found.scores:
         if score.observer == name:
             assert (score.calibration is not None) == with_model
+
+
+def test_without_a_truth_the_next_measurement_is_stated() -> None:
+    """By who estimates the whole disturbance; in the row, and there the rms of what is stated is that of the errors to 5 %."""
+    scenario = wfsobs.PRESETS["paper"]().replace({"run.duration": 20.0, "vibration.source": "ar2"})
+    record = replace(wfsobs.simulate(scenario), turbulence=None, vibration=None)
+    found = wfsobs.observe(record, scenario, observers=["kf-multi", "multirate", "ridge"])
+    (row,) = (s for s in found.scores if s.observer == "kf-multi" and s.mode == "tip")
+    assert row.target == "next z" and row.calibration is not None
+    assert row.calibration.sd == pytest.approx(row.rms, rel=0.05)
+    assert not [s for s in found.scores if s.observer in ("multirate", "ridge")]
 
 
 KERNEL = SquaredExponential(1.0, 2.0, 0.1)

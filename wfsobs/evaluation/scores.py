@@ -10,13 +10,13 @@ import numpy as np
 from wfsobs.evaluation.calibration import Calibration, calibration
 from wfsobs.evaluation.lag import lag
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.estimates import Estimate
+from wfsobs.observers.estimates import NEXT_Z, Estimate
 from wfsobs.record import Record
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.welch import rms
 from wfsobs.typing import Array
 
-PREDICTION, RESIDUAL = "next z", "residual y"
+PREDICTION, RESIDUAL = NEXT_Z, "residual y"
 """Targets where there is no truth: the next measurement, and the residual of the loop."""
 
 LOOP, BOUND, BOUND_BOTH = "loop", "bound", "bound-both"
@@ -190,6 +190,7 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
         scored = common_samples([measured & ~np.isnan(error) for error in errors])
         for (observer, parts), error, (samples, apart) in zip(both.items(), errors, scored, strict=True):
             if samples.any():
+                sd = parts[0].sd_of_sum.get(PREDICTION)
                 out.append(
                     Score(
                         observer,
@@ -202,6 +203,7 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
                         max(e.seconds_per_step for e in parts),
                         *_stretch(samples, record.dt),
                         apart,
+                        calibration=None if sd is None else calibration(error[samples], _later(sd[:, mode])[samples]),
                     )
                 )
         samples = next((s for s, apart in scored if not apart and s.any()), measured) & ~np.isnan(left)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from wfsobs.typing import Array
+
+TOTAL, NEXT_Z = "total", "next z"
+"""Of the standard deviations: the sum of turbulence and vibration, and the next measurement, as the sum predicts it."""
 
 
 class Estimates(dict[str, Array]):
@@ -16,8 +19,9 @@ class Estimates(dict[str, Array]):
     values : mapping of str to Array
         Target -> estimate, NaN where there is none.
     sd : mapping of str to Array, optional
-        Target -> standard deviation of the estimate's error by the observer's own model in its steady state,
-        (n_steps, n_modes) [um], perhaps a read-only view of fewer numbers; no target without a model, NaN where not known.
+        Target -> standard deviation of the estimate's error by the observer's own model, (n_steps, n_modes) [um], perhaps a
+        read-only view of fewer numbers; no target without a model, NaN where not known. TOTAL and NEXT_Z, too, where the model
+        has them: of the sum of its estimates, less the disturbance at the step and less z of the next.
     """
 
     def __init__(self, values: Mapping[str, Array], sd: Mapping[str, Array] | None = None):
@@ -40,6 +44,8 @@ class Estimate:
     sd : Array or None
         Standard deviation of its error by the observer's own model, (n_steps, n_modes) [um]; None where it has no model, NaN
         where there is no number.
+    sd_of_sum : mapping of str to Array
+        TOTAL and NEXT_Z -> that of all estimates of the observer together; empty where it has no such model.
     """
 
     observer: str
@@ -47,3 +53,4 @@ class Estimate:
     values: Array
     seconds_per_step: float
     sd: Array | None = None
+    sd_of_sum: Mapping[str, Array] = field(default_factory=dict[str, Array])

@@ -9,10 +9,11 @@ from __future__ import annotations
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.gp.lgs import GP, GaussianProcess, kernels_of, measured_late, sampled_model
+from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.kalman.multirate import MultiRate, run_modes
 from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_model
 from wfsobs.observers.kalman.single import NGS
-from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
+from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.prior import LgsError, Lines, Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling

@@ -19,8 +19,9 @@ from scipy.linalg import block_diag
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.gp.kernels import Kernel, Matern, Poles, Sho, SquaredExponentialInTime, Sum
+from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.kalman.single import run_steady, seen_mode
-from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
+from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.missing import LINE_WIDTH
 from wfsobs.prior import Lines, Prior
 from wfsobs.progress import Watch

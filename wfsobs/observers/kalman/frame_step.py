@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.kalman.spread import FrameErrors
-from wfsobs.observers.kalman.step import LinearEstimator, ModeFilter, Plan, plan
+from wfsobs.observers.kalman.step import LinearEstimator, Plan, plan
 from wfsobs.observers.step_checks import whole_frames
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.signal.stepping import Saved
@@ -71,6 +73,11 @@ class FrameEstimator(LinearEstimator):
             one.mean[...] = np.nan
             return one.mean, self._unknown
         return one.mean, self._sd(one.rows, since + frames, target, self._pairs) if self.bank.is_near else one.sd[0]
+
+    def estimate(self) -> tuple[Array, Array]:
+        """Return the estimates (2, n_modes) of the last frame, and their standard deviations, (2, n_modes)."""
+        values, sd = np.array([self.predict(0, target) for target in TARGETS]).swapaxes(0, 1)
+        return values, sd
 
     def _plan(self, since: int, frames: float, ahead: int, target: str) -> Plan:
         n_modes, n = self.bank.x.shape

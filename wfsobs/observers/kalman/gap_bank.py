@@ -28,7 +28,7 @@ class GapBank(FilterBank):
     def __init__(self, gains: Sequence[GainCycle], make_gaps: Callable[[int], GapGains]):
         super().__init__([one.estimator() for one in gains])
         self._sizes = [len(one.steps[0].A) for one in gains]
-        self._has_first, self._repeat = gains[0].first is not None, len(gains[0].steps)
+        self.has_first, self._repeat = gains[0].first is not None, len(gains[0].steps)
         self._make_gaps = make_gaps
         self._gaps: dict[int, GapGains] = {}
         self.near: list[GapStep | None] = [None] * len(gains)
@@ -44,10 +44,10 @@ class GapBank(FilterBank):
     def _advance_near(self) -> None:
         there = ~np.isnan(self.v)
         self.v[~there] = 0.0
-        is_first = self._has_first and self.phase == 0
+        is_first = self.has_first and self.phase == 0
         if is_first:
             there[:, 1:] = False  # it has no NGS frame, and is the step of the cycle before the first one
-        due, j = np.array([not (is_first and i) for i in range(there.shape[1])]), (self.phase - self._has_first) % self._repeat
+        due, j = np.array([not (is_first and i) for i in range(there.shape[1])]), (self.phase - self.has_first) % self._repeat
         before, v = self.x.copy(), self.v.copy()
         super().advance()
         for mode, (n, seen) in enumerate(zip(self._sizes, there, strict=True)):
@@ -61,6 +61,11 @@ class GapBank(FilterBank):
             step = self.near[mode] = self._gaps[mode].after(last, j, tuple(map(bool, seen)))
             self.x[mode, :n] = step.update @ np.concatenate([before[mode, :n], v[mode]])
         self.is_near = any(one is not None for one in self.near)
+
+    @property
+    def last_in_cycle(self) -> int:
+        """Which step of the cycle came last."""
+        return (self.last - self.has_first) % self._repeat
 
     def set_near(self, mode: int, step: GapStep | None) -> None:
         """Go on from a step near a gap, of the same model."""

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
+from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.kalman.single import run_steady, steady_mode
-from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
+from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.prior import Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling

@@ -19,9 +19,10 @@ import param
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
+from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.kalman.single import MODEL, NGS
-from wfsobs.observers.kalman.spread import by_target, target_sd
-from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
+from wfsobs.observers.kalman.spread import by_target
+from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.kalman.with_gaps import run_frames
 from wfsobs.prior import Model, Prior
 from wfsobs.progress import Watch
@@ -154,7 +155,7 @@ def run_modes(measurements: Measurements, modes: Sequence[ModeFilter], watch: Wa
         watch.step(mode / measurements.n_modes)
         rows = one.rows(TARGETS)
         columns.append(filter_of_gains(one.gains, rows).run(z[:, :, mode]))
-        sd.append(target_sd(rows, one.posterior))
+        sd.append(one.steady_sd())
     return by_target(columns, sd, first=1)
 
 

@@ -14,11 +14,12 @@ import numpy as np
 
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
+from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.kalman.multi import PEAKS, MultiPeak
 from wfsobs.observers.kalman.multirate import MultiRate, multirate_noise, run_modes
 from wfsobs.observers.kalman.multirate_optimal import Cycle, estimated_cycle
 from wfsobs.observers.kalman.single import NGS
-from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
+from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.prior import Beams, Lines, Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling

@@ -18,6 +18,7 @@ from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, Look, Observer
 from wfsobs.observers.estimates import Estimates
+from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.kalman.multirate import (
     RATES,
     TUNABLE,
@@ -28,7 +29,7 @@ from wfsobs.observers.kalman.multirate import (
     run_modes,
 )
 from wfsobs.observers.kalman.single import NGS
-from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
+from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.prior import LgsError, Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling

@@ -16,8 +16,9 @@ import numpy as np
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.frame_step import FrameEstimator
-from wfsobs.observers.kalman.spread import FrameErrors, by_target, target_sd
-from wfsobs.observers.kalman.step import KalmanEstimator, ModeFilter
+from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.spread import FrameErrors, by_target
+from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.kalman.with_gaps import run_frames
 from wfsobs.prior import Model, Prior
 from wfsobs.progress import Watch
@@ -71,7 +72,7 @@ def run_steady(measurements: Measurements, modes: Sequence[ModeFilter], watch: W
         watch.step(mode / measurements.n_modes)
         rows = one.rows(TARGETS)
         columns.append(one.gains.filter(rows).run(z[:, None, mode, None])[:, :, 0])
-        sd.append(target_sd(rows, one.posterior))
+        sd.append(one.steady_sd())
     return by_target(columns, sd)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.estimates import Estimates
+from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates
 from wfsobs.observers.kalman.step import matrix_power
 from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.statespace import DisturbanceModel
@@ -38,14 +38,19 @@ def over_record(sd: Array, n_steps: int, first: int = 0) -> Array:
 def by_target(columns: Sequence[Array], sd: Sequence[Array] = (), first: int = 0) -> Estimates:
     """Return results per mode (n_steps, n_targets) by target.
 
-    sd : per mode (steps that repeat, n_targets), from step `first` on
+    sd : per mode (steps that repeat, 2 or 4), as of `by_name`, from step `first` on
     """
     values, n_steps = np.stack(columns, axis=-1), len(columns[0])
     spreads = np.stack(sd, axis=-1) if len(sd) else None
     return Estimates(
-        {target: values[:, i] for i, target in enumerate(TARGETS)},
-        None if spreads is None else {target: over_record(spreads[:, i], n_steps, first) for i, target in enumerate(TARGETS)},
+        by_name(values),
+        None if spreads is None else {name: over_record(x, n_steps, first) for name, x in by_name(spreads).items()},
     )
+
+
+def by_name(x: Array) -> dict[str, Array]:
+    """Return the columns of x (n, 2 or 4, n_modes) by what they are: targets, and of standard deviations TOTAL and NEXT_Z."""
+    return {name: x[:, i] for i, name in zip(range(x.shape[1]), (*TARGETS, TOTAL, NEXT_Z), strict=False)}
 
 
 class FrameErrors:

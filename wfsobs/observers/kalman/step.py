@@ -16,47 +16,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import fractional_matrix_power
 
+from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.gap_bank import GapBank
+from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.step_checks import StepError
 from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.gap_gains import GapGains
-from wfsobs.signal.riccati import Step
 from wfsobs.signal.statespace import DisturbanceModel
-from wfsobs.signal.stepping import GainCycle, Saved
+from wfsobs.signal.stepping import Saved
 from wfsobs.typing import Array
-
-
-class ModeFilter(NamedTuple):
-    """The filter of one mode.
-
-    model    : of the disturbance, the first states of the filter
-    gains    : of the filter
-    posterior : covariance after the measurement, of every step that repeats; empty where it is not known
-    cycle    : (A, C, Q, R) of every step that repeats, C zero where nothing is measured
-    """
-
-    model: DisturbanceModel
-    gains: GainCycle
-    posterior: tuple[Array, ...] = ()
-    cycle: tuple[Step, ...] = ()
-
-    def rows(self, targets: Sequence[str]) -> Array:
-        """Return rows of the whole state that give several targets, (len(targets), n)."""
-        rows = self.model.output_rows(targets)
-        return self._pad_rows(rows)
-
-    def gaps(self) -> GapGains:
-        """Return the gains near gaps; steady again is what knows every process and the measurement as well as without one."""
-        targets, (_, C, _, _) = self.rows(tuple(self.model.outputs)), self.cycle[-1]
-        scale = np.mean([np.sum((targets @ P) * targets) for P in self.posterior])
-        return GapGains(self.cycle, self.posterior, np.vstack([self._pad_rows(self.model.pairs), C]), float(scale))
-
-    def digest(self) -> bytes:
-        """Return what tells models apart."""
-        return b"".join(x.tobytes() for step in self.cycle for x in step)
-
-    def _pad_rows(self, rows: Array) -> Array:
-        return np.pad(rows, ((0, 0), (0, len(self.gains.steps[0].A) - rows.shape[1])))
 
 
 class Plan(NamedTuple):
@@ -131,6 +99,7 @@ class KalmanEstimator(LinearEstimator):
         super().__init__(modes)
         self._plans: dict[tuple[float, str], Plan] = {}
         self._variances: dict[int, Array] = {}
+        self._record: tuple[Array, Array, list[Array]] | None = None
         v = self.bank.v
         self._lgs, self._ngs = v[:, 0], v[:, 1] if v.shape[1] > 1 else None
 
@@ -152,6 +121,21 @@ class KalmanEstimator(LinearEstimator):
         np.matmul(one.rows, self._state, out=one.product)
         sd = one.sd[self.bank.last]
         return one.mean, self._near_gap(one, sd, target) if self.bank.is_near else sd
+
+    def estimate(self) -> tuple[Array, Array]:
+        """Return the estimates of the last frame, (2, n_modes), and what `ModeFilter.sd` says of them, (4, n_modes)."""
+        if self._record is None:
+            n = self.bank.x.shape[1]
+            rows = [np.pad(one.rows(TARGETS), ((0, 0), (0, n - len(one.gains.steps[0].A)))) for one in self.modes]
+            steady = np.stack([one.steady_sd() for one in self.modes], axis=-1)
+            self._record = np.array(rows), steady, [one.variance() for one in self.modes]
+        rows, steady, variances = self._record
+        j = self.bank.last_in_cycle
+        sd = steady[j].copy() if self.bank.last or not self.bank.has_first else np.full(steady[j].shape, np.nan)
+        for mode, near in enumerate(self.bank.near):
+            if near is not None:
+                sd[:, mode] = self.modes[mode].sd(near.posterior, j, variances[mode])
+        return (rows @ self._state)[:, :, 0].T, sd
 
     def _near_gap(self, plan: Plan, steady: Array, target: str) -> Array:
         """Return the standard deviations where some modes are near a gap."""

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from wfsobs.observers.base import TARGETS
+from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.kalman.single import MIN_NOISE, steady_mode
-from wfsobs.observers.kalman.step import ModeFilter
 from wfsobs.record import RecordError
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
