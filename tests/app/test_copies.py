@@ -72,7 +72,7 @@ def board(request: Any, dashboard: Dashboard, loop: Any, short: Scenario, tmp_pa
         ):
             widget.value = value
         upload.handle({"action": "part", "name": FILE, "index": 0, "count": 1, "data": base64.b64encode(content).decode()})
-        loop.until(lambda: not upload.picker.said.startswith("Reading"))
+        loop.until(lambda: not upload.picker.said.startswith(("Reading", "Waiting")))
         upload.confirm()
         assert isinstance(dashboard.store.source, LoadedRecord), upload.picker.said
         (tmp_path / dashboard.store.source.name).write_bytes(content)

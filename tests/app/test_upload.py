@@ -42,7 +42,7 @@ def sent(dashboard: Dashboard, content: bytes, name: str = "night.csv", part: in
 
 def previewed(dashboard: Dashboard, loop: Any, content: bytes, name: str = "night.csv") -> None:
     sent(dashboard, content, name)
-    loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
+    loop.until(lambda: not dashboard.upload.picker.said.startswith(("Reading", "Waiting")))
 
 
 def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
@@ -112,12 +112,12 @@ def test_what_is_said_of_it(dashboard: Dashboard, loop: Any, short: Scenario) ->
         (dashboard.upload.fields.delay, "3"),
     ):
         widget.value = value
-        loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
+        loop.until(lambda: not dashboard.upload.picker.said.startswith(("Reading", "Waiting")))
     found = dashboard.upload._preview
     assert found.record.origin == "unit nm, command sign -1" and found.record.delay == 3
     assert found.rms["y_lgs"][0] < 1e-2 * plain[0]
     dashboard.upload.fields.unit.value = "mas"
-    loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
+    loop.until(lambda: not dashboard.upload.picker.said.startswith(("Reading", "Waiting")))
     on_eight = dashboard.upload._preview.rms["y_lgs"][0]
     dashboard.store.change("telescope.diameter", 10.0)
     loop.until(lambda: "aperture 10 m" in dashboard.upload.content.text.object)
@@ -126,7 +126,7 @@ def test_what_is_said_of_it(dashboard: Dashboard, loop: Any, short: Scenario) ->
     assert dashboard.upload.picker.said == "Delay of commands [steps]: takes a number from 1, not 'soon'"
     assert dashboard.upload.use.disabled
     dashboard.upload.fields.delay.value = ""
-    loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
+    loop.until(lambda: not dashboard.upload.picker.said.startswith(("Reading", "Waiting")))
     assert not dashboard.upload.use.disabled and dashboard.upload.fields.unit.value != SILENT
 
 
@@ -136,7 +136,7 @@ def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     previewed(dashboard, loop, f"frequency,tip,tilt\n{rows}".encode(), "lines.csv")
     assert dashboard.upload.picker.said.startswith("lines.csv: has no unit of tip")
     dashboard.upload.fields.unit.value = "nm"
-    loop.until(lambda: not dashboard.upload.picker.said.startswith("Reading"))
+    loop.until(lambda: not dashboard.upload.picker.said.startswith(("Reading", "Waiting")))
     assert "4 frequencies from 29.4 to 30.6 Hz" in dashboard.upload.content.text.object and "3.317 nm rms of tip, 0 nm" in (
         dashboard.upload.content.text.object
     )
