@@ -47,6 +47,17 @@ class TestPin:
         assert f'<td><span class="range">{change(before, now)} %</span> {number(1e3 * before)}</td>' in html
         assert ">A [nm]<" in html and "RMS error in Preset Paper" in html
 
+    def test_the_cards_have_value_beside_value(self, pinned: Dashboard) -> None:
+        (kept,), shown = pinned.display.compared_runs, pinned.store.run.result
+        cards = {card["name"]: card["compared"] for card in pinned.explore.strips["turbulence"].cards.items}
+        for name in ("kf-lgs", TRUTH):
+            before, now = (
+                next(s.truth_rms if name == TRUTH else s.rms for s in scores if (s.observer, s.target, s.mode) == of)
+                for of in [("kf-lgs", "turbulence", "tip")]
+                for scores in (kept.scores, shown.result.scores)
+            )
+            assert cards[name] == [["A", number(1e3 * before), f"{change(before, now)} %"]]
+
     def test_the_name_says_what_differs(self, pinned: Dashboard, loop: Any) -> None:
         assert "Wind speed V₀ 15 → 30 m/s" in pinned.explore.pinning.note.object and pinned.explore.pinning.note.visible
         pinned.store.change("turbulence.wind_speed", 15)

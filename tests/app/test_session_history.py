@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from wfsobs.app import history as module
-from wfsobs.app import history_entry
 from wfsobs.app.cache import size_of
 from wfsobs.app.change_names import name_of_change
 from wfsobs.app.compared import LETTERS, ComparedRun
 from wfsobs.app.display import Display
 from wfsobs.app.history import History
 from wfsobs.app.history_entry import HistoryEntry
+from wfsobs.app.limits import NONE, Limits
+from wfsobs.app.service import Service
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults
@@ -142,8 +143,8 @@ class TestLimits:
             change(history, loop, WIND, wind)
         assert len(history.entries) == 4 and oldest in history.entries and second not in history.entries
 
-    def test_records_are_limited(self, history: History, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(history_entry, "RECORD_BYTES", OF_ONE)
+    def test_records_are_limited(self, history: History, loop: Any) -> None:
+        history.most_record_bytes = OF_ONE
         for seed in (1, 2):
             history.store.run_on(loaded(seed, f"night{seed}.npz"), history.store.scenario)
             loop.finish(history.store)
@@ -152,6 +153,10 @@ class TestLimits:
         before = history.store.step
         history.restore(first.key)
         assert history.store.step == before and history.note.endswith("night1.npz is no longer held, load it again")
+
+    def test_a_server_with_many_visitors_gives_each_less(self) -> None:
+        alone, many = (Service(limits, 1, 4000, quick) for limits in (NONE, Limits(sessions=40)))
+        assert (alone.session_share(4000), many.session_share(4000)) == (1000, 100)
 
 
 class TestRestore:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -16,6 +15,7 @@ from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.pages import Pages
 from wfsobs.app.pages.parts import PageActions
+from wfsobs.app.picker import file_message
 from wfsobs.app.report.maker import LIMIT, ReportError, make
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.share import FILE, Link, from_file, from_query, to_file, to_query
@@ -61,7 +61,7 @@ class Toolbar(JSComponent):
 
     def save(self, name: str, kind: str, content: bytes) -> None:
         """Have the browser save a file."""
-        self._send_msg({"name": name, "kind": kind, "content": base64.b64encode(content).decode()})
+        self._send_msg(file_message(name, kind, content))
 
 
 class Actions:
@@ -75,6 +75,7 @@ class Actions:
         self._under_way: dict[str, tuple[str, Callable[[Any], None]]] = {}
         self._pages: Pages | None = None
         self._view: ViewState | None = None
+        self.open_history: Callable[[], None] = lambda: None
         store.param.watch(self._refresh, ["scenario", "preset", "source"])
         store.run.param.watch(self._refresh_ready, "result")
         self._refresh()
@@ -114,6 +115,7 @@ class Actions:
         does: dict[str, Callable[[], None]] = {
             "undo": self.store.undo,
             "redo": self.store.redo,
+            "history": self.open_history,
             "open": lambda: self.open_file(str(msg.get("name", "")), msg.get("text")),
             "unlinked": lambda: self._note("These settings are too long for a link: save the scenario and send the file."),
             "dismiss": self._dismiss,

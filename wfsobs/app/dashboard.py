@@ -29,6 +29,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import asset, theme
 from wfsobs.app.upload import Upload
 from wfsobs.app.view_state import ViewState
+from wfsobs.app.views.history_sheet import HistorySheet
 from wfsobs.app.views.modes import ModeSwitch, UnitSwitch
 from wfsobs.app.views.readout import Readout
 from wfsobs.scenario import Scenario
@@ -82,9 +83,12 @@ class Dashboard:
         self.controls = Controls(self.store)
         self.actions = Actions(self.store)
         self.upload.open_scenario = self.actions.open_file
+        self.history = History(self.store, self.display)
+        self.history_sheet = HistorySheet(self.history, lambda sheet: self.body.append(sheet))
+        self.actions.open_history = self.history_sheet.toggle
+        self.upload.open_session = self.history_sheet.open_file
         self.modes, self.units = ModeSwitch(self.store.run, self.display), UnitSwitch(self.display)
         self.seeds = SeedRuns(self.store)
-        self.history = History(self.store, self.display)
         self.explore = Explore(self.history, self.seeds)
         self.connection = Connection(self.controls.take, width=0, height=0, margin=0)
         self.frame = Frame(width=0, height=0, margin=0)
@@ -103,6 +107,21 @@ class Dashboard:
         self.actions.follow_view(self.view_state)
         self.history.open_view = self.view_state.open
         self.view_state.param.watch(lambda event: self.history.follow_view(event.new), "query")
+        self.body = pn.Column(
+            self._top(),
+            self._row_of_actions(),
+            self.upload.room,
+            self.alert,
+            self.stale,
+            self.keyboard,
+            self.pages.view,
+            self.frame,
+            self.connection,
+            Readout(styles={"position": "absolute"}),
+            sizing_mode="stretch_width",
+            margin=12,
+            stylesheets=[":host { gap: 10px; }"],
+        )
         page = pmui.Page(
             title="wfsobs",
             header=[self.controls.bar(), Help(styles={"margin-left": "auto"})],
@@ -113,21 +132,7 @@ class Dashboard:
             favicon=None,
             main=[
                 _title(),
-                pn.Column(
-                    self._top(),
-                    self._row_of_actions(),
-                    self.upload.room,
-                    self.alert,
-                    self.stale,
-                    self.keyboard,
-                    self.pages.view,
-                    self.frame,
-                    self.connection,
-                    Readout(styles={"position": "absolute"}),
-                    sizing_mode="stretch_width",
-                    margin=12,
-                    stylesheets=[":host { gap: 10px; }"],
-                ),
+                self.body,
             ],
         )
         self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")

@@ -16,6 +16,7 @@ SHORTCUTS: Mapping[str, str] = MappingProxyType(
     {
         "?": "This help",
         "/": "Find a setting",
+        "H": "The history: every result of the session",
         "Ctrl+Z, Ctrl+Shift+Z": "Undo and redo a change of the settings",
         "Enter or Space on a card": "Hide or show its line",
         "S on a card": "Its line alone, and all lines again",

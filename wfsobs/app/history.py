@@ -15,23 +15,18 @@ import param
 from wfsobs.app.change_names import name_of_change
 from wfsobs.app.compared import LETTERS, ComparedRun, thin_lines
 from wfsobs.app.display import Display
-from wfsobs.app.history_entry import HistoryEntry, let_go, make_entry
+from wfsobs.app.history_entry import LONGEST_NAME, MOST, RECORD_BYTES, HistoryEntry, let_go, make_entry
 from wfsobs.app.jobs.job import DONE, FAILED
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.service import run_key
+from wfsobs.app.session_file import SessionContent
 from wfsobs.app.sources import Step
 from wfsobs.app.store import Store
 from wfsobs.app.work import RunResults
 from wfsobs.settings.errors import SettingError
 
-MOST = 200
-"""Entries of a history; the oldest that have neither a star nor are compared go first."""
-
 AFTER_DRAWING = 1
 """Precedence of a watcher that comes after the figures, whose own is 0, and before the status line, whose own is 2."""
-
-LONGEST_NAME = 200
-"""Characters of an entry's name."""
 
 
 class History(param.Parameterized):
@@ -45,10 +40,11 @@ class History(param.Parameterized):
     def __init__(self, store: Store, display: Display):
         super().__init__()
         self.store, self.display = store, display
-        self.most_bytes = store.session.service.session_bytes
+        service = store.session.service
+        self.most_bytes, self.most_record_bytes = map(service.session_share, (service.cache.most_bytes, RECORD_BYTES))
         self.open_view: Callable[[str], Any] = lambda _query: None
         self._query = ""
-        self._view_wanted: HistoryEntry | None = None
+        self._view_to_open = "", ""  # key of the results to wait for, and the view
         self._shown: Step | None = None
         self._deletions: list[HistoryEntry] = []
         self.task = BackgroundTask(store.session)
@@ -64,13 +60,14 @@ class History(param.Parameterized):
 
     def _on_run(self, *_: object) -> None:
         """Keep a result that is complete; show a restored one as it was."""
-        run, wanted = self.store.run, self._view_wanted
+        run, (key, view) = self.store.run, self._view_to_open
         results: RunResults | None = run.result
         if results is None or self.store.stale:
             return
-        if wanted is not None and run_key(results.scenario, results.source) == wanted.key:
-            self._view_wanted = None
-            self.open_view(wanted.view)
+        if key:  # the first results since: of what is restored, or of what was changed in its place
+            self._view_to_open = "", ""
+            if run_key(results.scenario, results.source) == key:
+                self.open_view(view)
         if run.state == DONE:
             self.keep((results.scenario, self.store.preset, results.source), results)
 
@@ -90,10 +87,12 @@ class History(param.Parameterized):
         self._put([known, *(e for e in self.entries if e is not known)])
 
     def add(self, entries: list[HistoryEntry]) -> None:
-        """Add entries of another session in the order of their times; of those that are there already the star alone."""
+        """Add entries in the order of their times; of those that are there already a star, and a name that was given."""
         for entry in entries:
             if (known := self.find(entry.key)) is not None:
                 known.star = known.star or entry.star
+                if entry.own_name and not known.own_name:
+                    known.name, known.own_name = entry.name, True
         own = {entry.key for entry in self.entries}
         merged = [*self.entries, *(entry for entry in entries if entry.key not in own)]
         self._put(sorted(merged, key=lambda entry: -entry.time))
@@ -102,7 +101,7 @@ class History(param.Parameterized):
         """Keep the view with what is shown."""
         self._query = "&".join(part for part in query.split("&") if part.startswith("view."))
         entry = self.find(self.current)
-        if entry is not None and self.store.run.state == DONE and not self.store.stale and self._view_wanted is None:
+        if entry is not None and self.store.run.state == DONE and not self.store.stale and not self._view_to_open[0]:
             entry.view = self._query
 
     def _put(self, entries: list[HistoryEntry]) -> None:
@@ -111,7 +110,7 @@ class History(param.Parameterized):
         spare = [entry.key for entry in reversed(entries) if not entry.star and entry.key not in used]
         gone = set(spare[: max(len(entries) - MOST, 0)])
         self.entries = [entry for entry in entries if entry.key not in gone]
-        let_go(self.entries, self.current, self.most_bytes)
+        let_go(self.entries, self.current, self.most_bytes, self.most_record_bytes)
         self.param.trigger("entries")
 
     # ------------------------------------------------------------------ what is asked for
@@ -120,7 +119,7 @@ class History(param.Parameterized):
         """Give an entry another name; an empty one changes nothing."""
         entry, name = self.find(key), " ".join(name.split())[:LONGEST_NAME]
         if entry is not None and name:
-            entry.name = name
+            entry.name, entry.own_name = name, True
             self.display.compared_runs = [
                 replace(run, name=name) if run.key == key else run for run in self.display.compared_runs
             ]
@@ -156,21 +155,41 @@ class History(param.Parameterized):
         if not entry.is_restorable:
             self.note = f"{entry.name}: {entry.record} is no longer held, load it again"
             return
+        if entry.results is not None:
+            self.store.session.service.cache.put(entry.key, entry.results)
+        if self._return_to(entry.step, entry.view, entry.name):
+            self.note = f"Restored {entry.name}."
+
+    def content(self) -> SessionContent:
+        """Return what a file of the session holds."""
+        entries = [replace(entry, results=None) for entry in self.entries]
+        return SessionContent(entries, self.store.step, self._query, [run.key for run in self.display.compared_runs])
+
+    def open(self, content: SessionContent, name: str) -> None:
+        """Add the entries of a session's file, and show what it showed."""
+        self.add([*content.entries])
+        if not self.display.compared_runs:
+            for key in content.compared_keys:
+                self.compare(key)
+        if self._return_to(content.step, content.view, name):
+            count = len(content.entries)
+            self.note = f"Opened {name}: {count} result{'s' * (count != 1)}."
+
+    def _return_to(self, step: Step, view: str, name: str) -> bool:
+        """Show settings and a view again; say under a name why not where they are refused."""
         if self.store.stale or self.store.run.result is None:  # what has not run is not lost either
             self.keep(self.store.step)
-        service = self.store.session.service
-        if entry.results is not None:
-            service.cache.put(entry.key, entry.results)
         try:
-            self.store.restore(entry.step)
+            self.store.restore(step)
         except SettingError as error:
-            self.note = f"{entry.name}: {error}"
-            return
-        self.note = f"Restored {entry.name}."
-        if entry.key == self.current and not self.store.stale:
-            self.open_view(entry.view)
+            self.note = f"{name}: {error}"
+            return False
+        key = run_key(step[0], step[2])
+        if key == self.current and not self.store.stale:
+            self.open_view(view)
         else:
-            self._view_wanted = entry
+            self._view_to_open = key, view
+        return True
 
     def compare(self, key: str, on: bool = True) -> None:
         """Compare an entry with what is shown, or no longer."""

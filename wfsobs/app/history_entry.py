@@ -14,8 +14,17 @@ from wfsobs.app.work import RunResults
 from wfsobs.evaluation.scores import Score
 from wfsobs.scenario import Scenario
 
-RECORD_BYTES = 200_000_000
-"""Of all loaded records that a history holds [bytes]; the oldest go first."""
+MOST = 200
+"""Entries of a history; the oldest that have neither a star nor are compared go first."""
+
+LONGEST_NAME = 200
+"""Characters of an entry's name."""
+
+RECORD_BYTES = 800_000_000
+"""Of all loaded records that the sessions of a server hold in their histories [bytes]."""
+
+MOST_RECORD_BYTES = 200_000_000
+"""Of the records in one file of a session [bytes]."""
 
 
 @dataclass(eq=False)
@@ -27,6 +36,7 @@ class HistoryEntry:
     record  : name of the loaded record; empty for a simulation
     source  : what the observers ran on where that is not the simulation of the settings; None too for a record no longer held
     view    : the page's view when it was last shown, as a query
+    own_name : whether a visitor gave it its name
     results : with traces, as long as they are held
     """
 
@@ -40,6 +50,7 @@ class HistoryEntry:
     scores: tuple[Score, ...] = ()
     star: bool = False
     view: str = ""
+    own_name: bool = False
     results: RunResults | None = field(default=None, repr=False)
 
     @property
@@ -61,13 +72,13 @@ def make_entry(step: Step, name: str, results: RunResults | None = None) -> Hist
     return HistoryEntry(run_key(scenario, source), name, time.time(), scenario, preset, source, record, scores, results=results)
 
 
-def let_go(entries: Iterable[HistoryEntry], current: str, most_bytes: int) -> None:
-    """Let go of traces beyond some bytes, and of loaded records beyond RECORD_BYTES: those of starred entries last.
+def let_go(entries: Iterable[HistoryEntry], current: str, most_bytes: int, most_record_bytes: int) -> None:
+    """Let go of traces and of loaded records beyond some bytes: those of starred entries last.
 
     current : key of the entry whose results are shown, which holds its record
     """
     names, names_of_records = set[int](), set[int]()
-    left, left_of_records = most_bytes, RECORD_BYTES
+    left, left_of_records = most_bytes, most_record_bytes
     for entry in sorted(entries, key=lambda entry: (entry.key != current, not entry.star)):
         if entry.results is not None:
             left -= _new_bytes(entry.results, names)

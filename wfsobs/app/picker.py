@@ -27,7 +27,7 @@ class Picker(JSComponent):
     largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
     part = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
-    _esm = asset("upload.js")
+    _esm = asset("parts.js") + asset("upload.js")
     _stylesheets = [asset("actions.css")]  # noqa: RUF012
 
     def __init__(self, **params: Any):
@@ -36,11 +36,16 @@ class Picker(JSComponent):
 
     def save(self, name: str, kind: str, content: bytes) -> None:
         """Have the browser save a file."""
-        self._send_msg({"name": name, "kind": kind, "content": base64.b64encode(content).decode()})
+        self._send_msg(file_message(name, kind, content))
 
     def _handle_msg(self, data: dict[str, Any]) -> None:
         if self.on_message is not None:
             self.on_message(data)
+
+
+def file_message(name: str, kind: str, content: bytes) -> dict[str, str]:
+    """Return the message by which a browser saves a file."""
+    return {"name": name, "kind": kind, "content": base64.b64encode(content).decode()}
 
 
 class PartialFile:

@@ -8,6 +8,7 @@ import logging
 import threading
 from collections.abc import Callable
 from functools import partial
+from math import isfinite
 from time import monotonic
 
 from wfsobs.app.cache import Cache, key_of
@@ -69,10 +70,9 @@ class Service:
         """Whether the results are there already."""
         return run_key(scenario, source) in self.cache
 
-    @property
-    def session_bytes(self) -> int:
-        """How much of results one session may hold on to [bytes]: a quarter of what is kept for all."""
-        return self.cache.most_bytes // 4
+    def session_share(self, most: int) -> int:
+        """Return what one session may hold, at most a quarter, of what as many as there may be hold together [bytes]."""
+        return int(most // max(4, self.limits.sessions if isfinite(self.limits.sessions) else 0))
 
     def end_session(self) -> None:
         """Count a session that has ended."""

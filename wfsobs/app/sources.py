@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from wfsobs.app.cache import key_of
 from wfsobs.app.limits import Limits
-from wfsobs.dependence import Memo, simulate_once
+from wfsobs.dependence import Memo, digest, simulate_once
 from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -17,7 +17,7 @@ from wfsobs.telemetry.intake import DeclaredFormat
 class LoadedRecord:
     """A record that was loaded.
 
-    key  : names its content and what was said of it
+    key  : names its content
     what : one line on it;  declaration : what was said of it;  sha256 : of the file, in hexadecimal digits
     """
 
@@ -77,6 +77,11 @@ Source = LoadedRecord | SimulatedRecord
 
 Step = tuple[Scenario, str, Source | None]
 """Settings, the preset that they are compared with, and what they run on where that is not their simulation."""
+
+
+def record_key(record: Record) -> str:
+    """Name a record by its content, whatever file it came from."""
+    return digest(record)
 
 
 def give_same_record(one: Source | None, other: Source | None) -> bool:

@@ -17,7 +17,8 @@ from wfsobs.app.column_form import ColumnForm
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING, Job, Tell
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.picker import PartialFile, Picker, too_large
-from wfsobs.app.sources import LoadedRecord
+from wfsobs.app.session_file import SUFFIX
+from wfsobs.app.sources import LoadedRecord, record_key
 from wfsobs.app.store import Store
 from wfsobs.app.upload_fields import UploadFields, differs_from_proposals
 from wfsobs.app.upload_preview import PreviewView
@@ -52,6 +53,7 @@ class Upload:
         self.saving = BackgroundTask(store.session)
         self.saving.param.watch(self._save, ["state", "place"])
         self.open_scenario: Callable[[str, object], None] = lambda _name, _text: None
+        self.open_session: Callable[[str, bytes], None] = lambda _name, _content: None
         self.room = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
         self._parcel: PartialFile | None = None
         self._name, self._content = "", b""
@@ -110,8 +112,11 @@ class Upload:
             self.discard(str(error))
             return
         if content is not None:
-            self._name, self._content = self._parcel.name, content
-            self._parcel = None
+            name, self._parcel = self._parcel.name, None
+            if name.endswith(SUFFIX):
+                self.open_session(name, content)
+                return
+            self._name, self._content = name, content
             if not content:
                 self._say(f"{self._name}: is empty")
             self.look()
@@ -199,10 +204,9 @@ class Upload:
             return
         record = found.record
         stated, digest = self.read_fields(), hashlib.sha256(self._content).hexdigest()
-        key = hashlib.sha256(repr((digest, stated, self.store.scenario.telescope.diameter)).encode()).hexdigest()
         try:
             scenario = fit_to_record(record, self.store.scenario)
-            self.store.run_on(LoadedRecord(record, found.name, key, found.lines()[0], stated, digest), scenario)
+            self.store.run_on(LoadedRecord(record, found.name, record_key(record), found.lines()[0], stated, digest), scenario)
         except SettingError as error:
             self._say(f"{found.name}: {error}")
         else:

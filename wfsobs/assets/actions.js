@@ -104,7 +104,12 @@ function isText(target) {
 
 function keys(model) {
   const pressed = (event) => {
-    if (!(event.ctrlKey || event.metaKey) || event.altKey || isText(event.composedPath()[0])) return
+    const at = event.composedPath()[0]
+    if (event.altKey || isText(at)) return
+    if (!(event.ctrlKey || event.metaKey)) {
+      if (event.key.toLowerCase() === "h" && !at.matches?.("[role=option], [role=combobox], [role=menuitem]")) model.send_msg({action: "history"})
+      return
+    }
     const key = event.key.toLowerCase()
     const action = key === "z" ? (event.shiftKey ? "redo" : "undo") : key === "y" ? "redo" : ""
     if (action) {
@@ -230,6 +235,8 @@ export function render({model, view, el}) {
   ])
   reporter(bar, model)
   opener(bar, model)
+  tag("button", bar, {type: "button", textContent: "History", title: "Every result of this session, to compare, restore and save (H)"},
+      {"aria-haspopup": "dialog"}).onclick = () => model.send_msg({action: "history"})
   const say = speaker(tag("span", bar, {className: "said below"}, {role: "status"}), model)
   const copy = textBox(el, say)
   const dismiss = noteBox(el, model, say)

@@ -1,24 +1,8 @@
 // Loading a record: the button, the file sent in parts, and what there is to say about it.
 
-async function base64(blob) {
-  const bytes = new Uint8Array(await blob.arrayBuffer())
-  let text = ""
-  for (let i = 0; i < bytes.length; i += 32_768) text += String.fromCharCode(...bytes.subarray(i, i + 32_768))
-  return btoa(text)
-}
-
-async function send(model, file) {
-  if (file.size > model.largest) return model.send_msg({action: "large", name: file.name})
-  const count = Math.max(1, Math.ceil(file.size / model.part))
-  for (let index = 0; index < count; index++) {
-    const data = await base64(file.slice(index * model.part, (index + 1) * model.part))
-    model.send_msg({action: "part", name: file.name, index, count, data})
-  }
-}
-
 // A file may be dropped anywhere; while one is over the page, a cover says so.
 function takeDrops(model, root) {
-  const cover = Object.assign(document.createElement("div"), {className: "cover", hidden: true, textContent: "Drop a record, a spectrum or a scenario"})
+  const cover = Object.assign(document.createElement("div"), {className: "cover", hidden: true, textContent: "Drop a record, a spectrum, a scenario or a session"})
   root.append(cover)
   const isFile = (event) => [...(event.dataTransfer?.types ?? [])].includes("Files")
   const over = (event) => {
@@ -40,12 +24,6 @@ function takeDrops(model, root) {
   const listeners = {dragover: over, dragenter: over, dragleave: leave, drop}
   for (const [name, act] of Object.entries(listeners)) document.addEventListener(name, act)
   model.on("remove", () => { for (const [name, act] of Object.entries(listeners)) document.removeEventListener(name, act) })
-}
-
-function save(name, kind, content) {
-  const url = URL.createObjectURL(new Blob([Uint8Array.from(atob(content), (c) => c.charCodeAt(0))], {type: kind}))
-  Object.assign(document.createElement("a"), {href: url, download: name}).click()
-  setTimeout(() => URL.revokeObjectURL(url), 60_000)
 }
 
 // What a file looks like: a template to fill in, and a sample.

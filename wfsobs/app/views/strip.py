@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import param
@@ -82,14 +82,21 @@ class Strip:
 
     def _compared_rows(self, name: str, results: RunResults | None) -> list[list[str]]:
         """Write letter, value and change from there in per cent of every compared run."""
+        now = self._rms(results.result.scores, name) if results else None
         rows = []
         for run in self.display.compared_runs:
-            before = run.score(name, self.target, self.display.mode)
-            now = find(results, name, self.target, self.display.mode) if results else None
+            before = self._rms(run.scores, name)
             scale = per_micrometre(self.display.unit, run.scenario.telescope.diameter)
-            value = number(before.rms * scale) if before else NOTHING
-            rows.append([run.letter, value, f"{change(before.rms, now.rms)} %" if before and now else ""])
+            value = number(None if before is None else before * scale)
+            rows.append([run.letter, value, "" if before is None else f"{change(before, now)} %"])
         return rows
+
+    def _rms(self, scores: Sequence[Score], name: str) -> float | None:
+        """Find the error of an observer, or the rms of the truth [um]; None if there is none."""
+        of = [s for s in scores if (s.target, s.mode) == (self.target, self.display.mode)]
+        if name == TRUTH:
+            return next((s.truth_rms for s in of if not s.apart), None)
+        return next((s.rms for s in of if s.observer == name), None)
 
     def _observer(self, name: str, results: RunResults | None) -> dict[str, Any]:
         score = find(results, name, self.target, self.display.mode) if results else None

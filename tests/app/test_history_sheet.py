@@ -1,0 +1,113 @@
+"""The sheet of the history, without a browser: its rows, what it asks for, and the session's file."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import pytest
+
+from tests.app.test_session_history import WIND, change, quick
+from wfsobs.app.display import Display
+from wfsobs.app.history import History
+from wfsobs.app.picker import LARGEST
+from wfsobs.app.session_file import SUFFIX, read_session
+from wfsobs.app.views import history_sheet as module
+from wfsobs.app.views.history_sheet import HistorySheet, Sheet
+
+
+@pytest.fixture
+def sheet(make_store: Any, loop: Any) -> HistorySheet:
+    """An open sheet of two results."""
+    history = History(make_store(quick), Display())
+    history.store.start()
+    loop.finish(history.store)
+    change(history, loop, WIND, 20)
+    shown: list[Sheet] = []
+    sheet = HistorySheet(history, shown.append)
+    assert not shown and sheet.sheet is None, "made when it is first opened"
+    sheet.toggle()
+    assert shown == [sheet.sheet]
+    return sheet
+
+
+def model(sheet: HistorySheet) -> Sheet:
+    assert sheet.sheet is not None
+    return sheet.sheet
+
+
+def send(sheet: HistorySheet, name: str, content: bytes) -> None:
+    sheet.handle({"action": "part", "name": name, "index": 0, "count": 1, "data": base64.b64encode(content).decode()})
+
+
+def saved(sheet: HistorySheet, loop: Any, monkeypatch: pytest.MonkeyPatch) -> bytes:
+    files: list[dict[str, str]] = []
+    monkeypatch.setattr(model(sheet), "_send_msg", files.append)
+    sheet.handle({"action": "save"})
+    loop.until(lambda: files != [])
+    assert files[0]["name"].endswith(SUFFIX)
+    return base64.b64decode(files[0]["content"])
+
+
+def test_rows(sheet: HistorySheet) -> None:
+    newest, oldest = model(sheet).rows
+    assert newest["name"] == "Wind speed V₀ 15 → 20 m/s" and newest["current"] and not oldest["current"]
+    assert newest["scores"] == "Turbulence 20000 nm (LGS KF)" and oldest["scores"] == "Turbulence 15000 nm (LGS KF)"
+    assert (newest["note"], oldest["note"]) == ("", "Restoring runs it again"), "a server of a test keeps nothing"
+    sheet.display.mode = "tilt"
+    assert model(sheet).rows[0]["scores"] == ""
+
+
+def test_what_is_asked_for(sheet: HistorySheet, loop: Any) -> None:
+    key = model(sheet).rows[1]["key"]
+    for msg in ({"action": "star"}, {"action": "rename", "name": "mine"}, {"action": "compare", "on": True}):
+        sheet.handle({"key": key, **msg})
+    row = model(sheet).rows[1]
+    assert (row["star"], row["name"], row["letter"], row["note"]) == (True, "mine", "A", "Its lines are being made again")
+    loop.until(lambda: model(sheet).rows[1]["note"] != "Its lines are being made again")
+    sheet.handle({"action": "restore", "key": key})
+    loop.finish(sheet.history.store)
+    assert model(sheet).rows[0]["key"] == key and sheet.history.store.value(WIND) == 15.0
+    assert model(sheet).said == "Restored mine."
+    sheet.handle({"action": "delete", "key": key})
+    assert model(sheet).undo and len(model(sheet).rows) == 1
+    sheet.handle({"action": "undelete"})
+    assert not model(sheet).undo and len(model(sheet).rows) == 2
+    for nonsense in ({}, {"action": 3}, {"action": "star"}, {"action": "restore", "key": ["x"]}, {"action": "part", "index": 3}):
+        sheet.handle(nonsense)
+    sheet.handle({"action": "close"})
+    assert not model(sheet).open and model(sheet).rows == [], "no rows while it is closed"
+    sheet.history.star(key)
+    assert model(sheet).rows == []
+
+
+def test_save_and_open(sheet: HistorySheet, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    sheet.history.compare(model(sheet).rows[1]["key"])
+    content = saved(sheet, loop, monkeypatch)
+    assert [entry.name for entry in read_session(content).entries] == [row["name"] for row in model(sheet).rows]
+    sheet.history.compare_none()
+    for key in [row["key"] for row in model(sheet).rows]:
+        sheet.handle({"action": "delete", "key": key})
+    change(sheet.history, loop, WIND, 33)
+    send(sheet, f"mine{SUFFIX}", content)
+    loop.until(lambda: model(sheet).said.startswith("Opened"))
+    loop.finish(sheet.history.store)
+    assert model(sheet).said == f"Opened mine{SUFFIX}: 2 results." and sheet.history.store.value(WIND) == 20.0
+    assert sorted(entry.scores[0].rms for entry in sheet.history.entries) == [15.0, 20.0, 33.0], "what was here stays"
+    assert [run.letter for run in sheet.display.compared_runs] == ["A"]
+
+
+def test_files_that_are_none(sheet: HistorySheet, loop: Any) -> None:
+    before, step = [*sheet.history.entries], sheet.history.store.step
+    send(sheet, "night.npz", b"PK nothing")
+    loop.until(lambda: model(sheet).said.startswith("night.npz: damaged"))
+    sheet.handle({"action": "large", "name": "film.mkv"})
+    assert model(sheet).said == f"film.mkv: larger than {LARGEST // 1_000_000} MB"
+    sheet.handle({"action": "part", "name": "x", "index": 1, "count": 2, "data": "!"})
+    assert sheet.history.entries == before and sheet.history.store.step == step
+
+
+def test_a_session_too_large_to_be_opened_again(sheet: HistorySheet, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "LARGEST", 100)
+    sheet.handle({"action": "save"})
+    loop.until(lambda: "more than can be opened" in model(sheet).said)

@@ -1,0 +1,217 @@
+"""The sheet of the history: its results, and the session as a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.compared import LETTERS
+from wfsobs.app.controls.names import name_settings
+from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.downloads import TooLarge
+from wfsobs.app.history import History
+from wfsobs.app.history_entry import HistoryEntry
+from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
+from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.numbers import number
+from wfsobs.app.picker import LARGEST, PART, PartialFile, file_message, too_large
+from wfsobs.app.session_file import SUFFIX, read_session, write_session
+from wfsobs.app.session_values import SessionError
+from wfsobs.app.style import asset, look
+from wfsobs.evaluation.rows import can_be_best
+from wfsobs.evaluation.scores import PREDICTION, Score
+from wfsobs.observers.base import TARGETS
+from wfsobs.telemetry.preview import safe_name
+
+FILE = f"session{SUFFIX}"
+
+
+class Sheet(JSComponent):
+    """The sheet in the browser; it asks by messages {action, key, ...}, and has rows only while it is open."""
+
+    open = param.Boolean(False, doc="Whether it is seen.")
+    dark = param.Boolean(False, doc="Dark mode.")
+    rows = param.List([], doc="A dictionary per result, newest first.")
+    room = param.Boolean(True, doc="Whether another result can be compared.")
+    said = param.String("", doc="What was done or refused, in one line.")
+    undo = param.Boolean(False, doc="Whether a result was deleted that can come back.")
+    suffix = param.String(SUFFIX, doc="How the names of session files end.")
+    largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
+    part = param.Integer(PART, doc="How much is sent at a time [bytes].")
+
+    _esm = asset("patch.js") + asset("parts.js") + asset("history.js")
+    _stylesheets = [asset("history.css")]  # noqa: RUF012
+
+    def __init__(self, hear: Callable[[dict[str, Any]], None], **params: Any):
+        self._hear = hear
+        super().__init__(**params)
+
+    def _handle_msg(self, data: object) -> None:
+        if isinstance(data, dict):
+            self._hear(data)
+
+    def save(self, name: str, kind: str, content: bytes) -> None:
+        """Have the browser save a file."""
+        self._send_msg(file_message(name, kind, content))
+
+
+class HistorySheet:
+    """The sheet over a history, made when it is first opened."""
+
+    def __init__(self, history: History, show: Callable[[Sheet], None]):
+        """Make nothing yet. show : puts the sheet on the page, once."""
+        self.history, self.display, self._show = history, history.display, show
+        self.sheet: Sheet | None = None
+        self._parcel: PartialFile | None = None
+        self._name = ""
+        self.saving, self.reading = BackgroundTask(history.store.session), BackgroundTask(history.store.session)
+        self.saving.param.watch(self._save, ["state", "place"])
+        self.reading.param.watch(self._open, ["state", "place"])
+
+    def toggle(self) -> None:
+        """Open the sheet, or close it."""
+        if self._sheet().open:
+            self.close()
+        else:
+            self._sheet().open = True
+            self._refresh()
+
+    def close(self) -> None:
+        """Close the sheet, which needs no rows then."""
+        self._sheet().param.update(open=False, rows=[])
+
+    def handle(self, msg: dict[str, Any]) -> None:
+        """Do what a message of the sheet says."""
+        history, key = self.history, str(msg.get("key", ""))
+        does: dict[str, Callable[[], None]] = {
+            "close": self.close,
+            "star": lambda: history.star(key),
+            "rename": lambda: history.rename(key, str(msg.get("name", ""))),
+            "compare": lambda: history.compare(key, msg.get("on") is True),
+            "restore": lambda: history.restore(key),
+            "delete": lambda: history.delete(key),
+            "undelete": history.undelete,
+            "save": self.save,
+            "large": lambda: self._say(too_large(safe_name(str(msg.get("name", ""))))),
+            "part": lambda: self._take(msg),
+        }
+        if msg.get("action") in does:
+            does[msg["action"]]()
+
+    # ------------------------------------------------------------------ the session as a file
+
+    def save(self) -> None:
+        """Make the session's file beside the page, and send it."""
+        content = self.history.content()
+
+        def write(*_: object) -> bytes:
+            file = write_session(content)
+            if len(file) > LARGEST:
+                raise TooLarge(f"The session has {len(file) / 1e6:.0f} MB, more than can be opened: delete results of records")
+            return file
+
+        self.saving.start(Job("save", write, refusal=TooLarge))
+
+    def _save(self, *_: object) -> None:
+        task = self.saving
+        self._say({RUNNING: task.line("Writing the session"), FAILED: task.message}.get(task.state, ""))
+        if task.state == DONE:
+            self._sheet().save(FILE, "application/zip", task.result)
+            self._say(f"Saved {FILE}.")
+
+    def _take(self, msg: dict[str, Any]) -> None:
+        if msg.get("index") == 0:
+            self._parcel = PartialFile(safe_name(str(msg.get("name", ""))))
+        if self._parcel is None:  # more of a file that has been given up
+            return
+        try:
+            content = self._parcel.take(msg)
+        except ValueError as error:
+            self._parcel = None
+            self._say(str(error))
+            return
+        if content is not None:
+            name, self._parcel = self._parcel.name, None
+            self.open_file(name, content)
+
+    def open_file(self, name: str, content: bytes) -> None:
+        """Read a session's file beside the page, and open it; nothing changes where it cannot be read."""
+        if not self._sheet().open:
+            self.toggle()
+        self._name = name
+        self.reading.start(Job("upload", lambda _watch, _tell: read_session(content), refusal=SessionError))
+
+    def _open(self, *_: object) -> None:
+        task = self.reading
+        self._say({RUNNING: task.line(f"Reading {self._name}"), FAILED: f"{self._name}: {task.message}"}.get(task.state, ""))
+        if task.state == DONE:
+            self.history.open(task.result, self._name)
+
+    # ------------------------------------------------------------------ the sheet
+
+    def _sheet(self) -> Sheet:
+        if self.sheet is None:
+            self.sheet = Sheet(self.handle, width=0, height=0, margin=0, styles={"position": "absolute"})
+            self.history.param.watch(self._refresh, ["entries", "current", "can_undelete"])
+            self.history.param.watch(lambda event: self._say(event.new), "note", onlychanged=False)
+            self.display.param.watch(self._refresh, ["mode", "unit", "dark", "compared_runs"])
+            self._show(self.sheet)
+        return self.sheet
+
+    def _say(self, line: str) -> None:
+        self._sheet().said = name_settings(line)
+
+    def _refresh(self, *_: object) -> None:
+        sheet = self._sheet()
+        if sheet.open:
+            runs = {run.key: run for run in self.display.compared_runs}
+            sheet.param.update(
+                rows=[self._row(entry, runs[entry.key].letter if entry.key in runs else "") for entry in self.history.entries],
+                room=len(runs) < len(LETTERS),
+                undo=self.history.can_undelete,
+                dark=self.display.dark,
+            )
+
+    def _row(self, entry: HistoryEntry, letter: str) -> dict[str, Any]:
+        run = next((run for run in self.display.compared_runs if run.key == entry.key), None)
+        return {
+            "key": entry.key,
+            "name": entry.name,
+            "time": entry.time,
+            "star": entry.star,
+            "letter": letter,
+            "current": entry.key == self.history.current,
+            "restorable": entry.is_restorable,
+            "what": f"Record {entry.record}" if entry.record else "",
+            "scores": best_scores(entry, self.display),
+            "note": self._note(entry, making=run is not None and run.lines is None),
+        }
+
+    def _note(self, entry: HistoryEntry, making: bool) -> str:
+        """Say what of an entry is not there any more."""
+        if not entry.is_restorable:
+            return "Scores alone: its record is no longer held"
+        if making:
+            return "Its lines are being made again"
+        if not entry.scores:
+            return "Not run yet: restoring runs it"
+        if entry.results is None and entry.key != self.history.current:
+            return "Restoring runs it again"
+        return ""
+
+
+def best_scores(entry: HistoryEntry, display: Display) -> str:
+    """Write the smallest error of each target in the mode shown, and whose it is."""
+    scale = per_micrometre(display.unit, entry.scenario.telescope.diameter)
+    parts = []
+    for target in (*TARGETS, PREDICTION):
+        scores: list[Score] = [
+            s for s in entry.scores if (s.target, s.mode) == (target, display.mode) and can_be_best(s.observer, s.apart)
+        ]
+        if scores:
+            best = min(scores, key=lambda s: s.rms)
+            parts.append(f"{target.capitalize()} {number(best.rms * scale)} {display.unit_label} ({look(best.observer).label})")
+    return ", ".join(parts)
