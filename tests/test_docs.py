@@ -32,6 +32,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
+from wfsobs.streams.shared_image import SharedImage, stream_path
 from wfsobs.telemetry.formats.contents import Contents
 
 ROOT = Path(__file__).parents[1]
@@ -155,6 +156,8 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     """Every line of a ```sh block that starts with wfsobs, in order, in one folder, on short records."""
     monkeypatch.chdir(tmp_path)
     shutil.copy(ROOT / "examples" / "wind.toml", tmp_path)
+    monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
+    SharedImage.create(stream_path("aol1_modevalOL"), (2,))
     for line in "".join(blocks(page, "sh")).splitlines():
         words = shlex.split(line)
         if words[0] != "wfsobs":
@@ -163,6 +166,7 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         if "--seeds" in words:
             words[words.index("--seeds") + 1] = "2"
         short = SHORT if words[1] in ("run", "observe", "tune", "loop", "export", "sweep") else ()
+        short = ("--seconds", "0.1") if words[1] == "attach" else short
         result = CliRunner().invoke(main, [*words[1:], *short])
         assert result.exit_code == 0, (line, result.output)
         if out:
