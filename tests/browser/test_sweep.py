@@ -52,6 +52,14 @@ def test_a_map_comes_cell_by_cell_and_one_is_loaded(open_page: Any, server: Any)
     expect(page.get_by_role("region", name="Best observers, vibration, tip")).to_be_visible()
 
 
+def test_error_over_a_setting_by_keyboard(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK)
+    page.get_by_role("textbox", name="Peak 1: f [Hz]").press("o")  # a letter, and no page of sweeps
+    page.get_by_role("textbox", name="Exposure ratio n").press("Alt+o")
+    expect(page.get_by_role("button", name="Sweep", exact=True)).to_have_attribute("aria-pressed", "true")
+    expect(page.get_by_role("textbox", name="Values", exact=True)).to_have_value("1,6,10,15,20")
+
+
 def test_error_over_a_setting_of_the_drawer(open_page: Any, server: Any) -> None:
     page = open_page(url=server.url + QUICK)
     page.get_by_role("textbox", name="Peak 1: f [Hz]").hover()

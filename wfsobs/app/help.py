@@ -18,6 +18,7 @@ SHORTCUTS: Mapping[str, str] = MappingProxyType(
         "/": "Find a setting",
         "H": "The history: every result of the session",
         "Ctrl+Z, Ctrl+Shift+Z": "Undo and redo a change of the settings",
+        "Alt+O in a setting": "The error over this setting, on the page Sweep",
         "Enter or Space on a card": "Hide or show its line",
         "S on a card": "Its line alone, and all lines again",
         "Arrow keys": "Choose in a switch, go from line to line in a table",

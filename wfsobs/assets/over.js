@@ -1,5 +1,5 @@
 // One button for all settings: it stands beside the setting in the drawer that is pointed at or has the focus, and asks for
-// the error over it.
+// the error over it. Alt+O does the same for the setting with the focus, without another stop of the tab key for each.
 
 const TAG = "setting:"
 
@@ -18,7 +18,8 @@ function settingAt(event) {
 function offerSweep(model, el) {
   const button = document.createElement("button")
   Object.assign(button, {type: "button", className: "over", textContent: "error over this", popover: "manual"})
-  button.title = "Run the scenario over values of this setting"
+  button.title = "Run the scenario over values of this setting (Alt+O)"
+  button.setAttribute("aria-keyshortcuts", "Alt+O")
   el.append(button)
   let found = null, at = null
 
@@ -39,13 +40,21 @@ function offerSweep(model, el) {
     if (found) button.setAttribute("aria-label", `Error over ${found.name}`)
     place()
   }
-  button.onclick = () => {
+  const ask = () => {
     model.send_msg({over: found.name})
     found = null
     place()
   }
+  const press = (event) => {
+    if (!event.altKey || event.ctrlKey || event.metaKey || event.code !== "KeyO") return
+    found = settingAt(event)
+    if (!found) return
+    event.preventDefault()
+    ask()
+  }
+  button.onclick = ask
   // Not pointerover and focusin: between two parts of the page they do not leave its shadow tree.
-  const events = [["pointermove", offer], ["keyup", offer], ["scroll", place]]
+  const events = [["pointermove", offer], ["keyup", offer], ["keydown", press], ["scroll", place]]
   for (const [name, act] of events) document.addEventListener(name, act, true)
   model.on("remove", () => { for (const [name, act] of events) document.removeEventListener(name, act, true) })
 }

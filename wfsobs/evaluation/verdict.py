@@ -31,9 +31,6 @@ if TYPE_CHECKING:
 BATCHES = 20
 """Pieces of the record whose mean squared errors are compared."""
 
-QUICK = 0.5
-"""Computing time of an observer whose error budget is worth waiting for [s]; the budget takes five times as long."""
-
 
 @dataclass(frozen=True)
 class Harm:
@@ -179,13 +176,12 @@ def _largest_term(budget: Budget) -> tuple[str, float]:
 
 
 def explain_harm(result: Result, mode: str | None = None, watch: Watch = QUIET) -> list[Budget]:
-    """Return the error budgets of the observers that do harm, of those that take a moment.
+    """Return the error budgets of the observers that do harm, of those that are as fast as a Kalman filter.
 
     result : of a record that was simulated from its scenario; mode : by default all. Raises Cancelled.
     """
-    seconds = {e.observer: e.seconds_per_step * e.values.size for e in result.estimates}
     harmful = {s.observer for s in result.scores if mode in (None, s.mode) and s.rms >= s.truth_rms}
-    chosen = [name for name in seconds if name in harmful and OBSERVERS[name].linear and seconds[name] <= QUICK]
+    chosen = [o.id for o in OBSERVERS.values() if o.id in harmful and o.linear and o.seconds is None]
     try:
         return error_budget(result, observers=chosen, mode=mode, watch=watch)
     except ValueError:
