@@ -42,6 +42,9 @@ PICTURES = {
         ("Run", "Identify", "Identify the record"),
         "text=/is white|not white/",
     ),
+    "pictures/sweep": Picture(
+        "?run.duration=2&run.warm_up=0.5", ("Sweep", "Run the sweep"), "text=/Finished · 80 of 80 runs/", (1400, 900)
+    ),
     "pictures/closed-loop": Picture("", ("Closed loop",), 'tr[data-controller="integrator+gpr-online"] td', (1400, 1100)),
 }
 

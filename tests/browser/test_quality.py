@@ -122,6 +122,29 @@ def test_accessibility(open_page: Any, width: int, dark: bool) -> None:
         fits(page, width)
 
 
+BELOW = """([upper, lower]) => {
+  const found = {}
+  const walk = (root) => { for (const it of root.querySelectorAll("*")) {
+    const name = it.tagName === "H2" ? it.textContent : it.getAttribute("role") === "figure" && it.getAttribute("aria-label")
+    const box = it.getBoundingClientRect()
+    if (name && box.height) found[name] = box
+    if (it.shadowRoot) walk(it.shadowRoot)
+  } }
+  walk(document)
+  return found[upper] && found[lower] && found[upper].bottom <= found[lower].top
+}"""
+
+
+@pytest.mark.parametrize("width", [1400, 390], ids=["wide", "phone"])
+def test_boxes_that_are_higher_than_the_window_do_not_overlap(open_page: Any, server: Any, width: int) -> None:
+    page = open_page(width, 600, url=server.url + QUICK)
+    for upper, lower in (("Turbulence spectrum", "Vibration"), ("Vibration spectrum", "RMS errors")):
+        page.wait_for_function(BELOW, arg=[upper, lower])
+    page.get_by_role("button", name="Closed loop", exact=True).click()
+    for upper, lower in (("Residual, zoomed", "Controllers"), ("Rejection and noise transfer", "Controllers")):
+        page.wait_for_function(BELOW, arg=[upper, lower])
+
+
 QUICK = "?run.duration=1&run.warm_up=0.2&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.3"
 
 

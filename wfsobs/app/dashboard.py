@@ -39,6 +39,9 @@ ACTIONS = """
 @media (max-width: 700px) { :host { row-gap: 24px; } }
 :host > * { flex: 0 1 auto; width: auto !important; }
 """
+BODY = ":host { gap: 10px; max-height: none !important; }"
+"""As long as its contents: the toolkit's limit is the window, which all boxes inside take over, and longer ones overlap."""
+
 STALE = "These results are not those of the settings."
 
 NARROW = {"@media (max-width: 600px)": {"& .header a:has(.title)": {"display": "none !important"}}}
@@ -120,7 +123,7 @@ class Dashboard:
             Readout(styles={"position": "absolute"}),
             sizing_mode="stretch_width",
             margin=12,
-            stylesheets=[":host { gap: 10px; }"],
+            stylesheets=[BODY],
         )
         page = pmui.Page(
             title="wfsobs",
