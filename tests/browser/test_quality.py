@@ -165,7 +165,7 @@ def test_accessibility_of_a_sweep(open_page: Any, server: Any, dark: bool) -> No
             box = page.get_by_role("textbox", name=label, exact=True)
             box.fill(text)
             box.press("Enter")
-        expect(page.get_by_text(f"scenarios × 1 seeds = {2 * axes} runs")).to_be_visible()
+        expect(page.get_by_text(f"scenarios × 1 seed = {2 * axes} runs")).to_be_visible()
         accessible(page)
         page.get_by_role("button", name="Run the sweep").click()
         expect(page.get_by_text(f"Finished · {2 * axes} of {2 * axes} runs")).to_be_visible(timeout=240_000)

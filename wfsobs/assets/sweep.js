@@ -30,7 +30,7 @@ export function render({model, el}) {
       const line = part("tr", table)
       if (i === 0 && down) part("th", line, {className: "down", rowSpan: rows.length, scope: "rowgroup"}).append(
         Object.assign(document.createElement("span"), {textContent: down}))
-      part("th", line, {scope: "row", textContent: row})
+      part(row ? "th" : "td", line, row ? {scope: "row", textContent: row} : {})
       for (const cell of cells[i]) button(cell, part("td", line))
     }
     const foot = part("tr", table)

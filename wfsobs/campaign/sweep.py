@@ -25,8 +25,8 @@ MOST_VALUES = 50
 """Maximum number of values of a setting."""
 
 MOST_SEEDS = 100
-EACH_RUN = 0.3
-"""Time of a run that does not depend on its length: designs of the observers, bounds [s]."""
+EACH_RUN, EACH_FLOW = 0.5, 1.0
+"""Time of a run that does not depend on its length: designs of the observers, scores, bounds; that of frozen flow beside [s]."""
 
 SEED = "run.seed"
 RANGE = re.compile(r"([^:,]+):([^:,]+):([^:,]+?)(:log)?")
@@ -140,8 +140,11 @@ class Sweep:
     @cached_property
     def seconds(self) -> float:
         """Estimated time of all runs [s], from the mean of `edge`."""
-        costs = [EACH_RUN + run_seconds(self.scenario(cell), self.observers) for cell in self.edge]
-        return self.n_runs * float(np.mean(costs))
+        return self.n_runs * float(np.mean([self._seconds_of(self.scenario(cell)) for cell in self.edge]))
+
+    def _seconds_of(self, scenario: Scenario) -> float:
+        flow = EACH_FLOW if scenario.turbulence.source == "frozen-flow" else 0.0
+        return EACH_RUN + flow + run_seconds(scenario, self.observers)
 
 
 def plan_sweep(base: Scenario, axes: Sequence[Variation], seeds: int, observers: Sequence[str] | None = None) -> Sweep:
