@@ -199,7 +199,8 @@ class SweepPage(PageActions):
             said, kind = line_of(error), "failure"
         else:
             counts = " × ".join(str(len(axis.values)) for axis in sweep.axes)
-            said = f"{counts} scenarios × {sweep.seeds} seed{'s' * (sweep.seeds > 1)} = {sweep.n_runs} runs, about {max(sweep.seconds, 1.0):.0f} s"
+            seeds = f"{sweep.seeds} seed{'s' * (sweep.seeds > 1)}"
+            said = f"{counts} scenarios × {seeds} = {sweep.n_runs} runs, about {max(sweep.seconds, 1.0):.0f} s"
             kind = "text"
         self.starter.start.disabled = kind == "failure"
         self.estimate.object = f'<p class="{kind}" role="status">{escape(said)}</p>'
