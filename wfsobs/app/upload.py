@@ -115,11 +115,10 @@ class Upload:
             name, self._parcel = self._parcel.name, None
             if name.endswith(SUFFIX):
                 self.open_session(name, content)
-                return
-            self._name, self._content = name, content
-            if not content:
-                self._say(f"{self._name}: is empty")
-            self.look()
+            else:
+                self._name, self._content = name, content
+                self._say("" if content else f"{name}: is empty")
+                self.look()
 
     # ------------------------------------------------------------------ the preview
 
@@ -202,8 +201,7 @@ class Upload:
             self._vibrate(found)
         if not isinstance(found, Preview):
             return
-        record = found.record
-        stated, digest = self.read_fields(), hashlib.sha256(self._content).hexdigest()
+        record, stated, digest = found.record, self.read_fields(), hashlib.sha256(self._content).hexdigest()
         try:
             scenario = fit_to_record(record, self.store.scenario)
             self.store.run_on(LoadedRecord(record, found.name, record_key(record), found.lines()[0], stated, digest), scenario)
