@@ -118,7 +118,10 @@ def test_same_seed_same_result_and_a_subset_is_part_of_it() -> None:
 @pytest.mark.parametrize(
     ("missing", "left_out"),
     [
-        ({"y_ngs": None, "ratio": None}, ["kf-ngs", "multirate", "multirate-optimal", "multirate-multi", "gp-both"]),
+        (
+            {"y_ngs": None, "ratio": None},
+            ["kf-ngs", "multirate", "multirate-optimal", "multirate-multi", "multirate-adaptive", "gp-both"],
+        ),
         ({"open_loop_y": None}, ["butterworth-ol"]),
         ({"training": None}, ["gpr-offline", "ridge", "ridge-30"]),
     ],

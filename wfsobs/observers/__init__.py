@@ -12,6 +12,7 @@ from wfsobs.observers.gpr.online import GPR_ONLINE
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE
 from wfsobs.observers.kalman.multi import KF_MULTI
 from wfsobs.observers.kalman.multirate import MULTIRATE
+from wfsobs.observers.kalman.multirate_adaptive import MULTIRATE_ADAPTIVE
 from wfsobs.observers.kalman.multirate_multi import MULTIRATE_MULTI
 from wfsobs.observers.kalman.multirate_optimal import MULTIRATE_OPTIMAL
 from wfsobs.observers.kalman.single import KF_LGS, KF_NGS
@@ -26,6 +27,7 @@ BUILT_IN = (
     MULTIRATE,
     MULTIRATE_OPTIMAL,
     MULTIRATE_MULTI,
+    MULTIRATE_ADAPTIVE,
     GP_LGS,
     GP_BOTH,
     BUTTERWORTH_OL,

@@ -72,6 +72,8 @@ class Cells:
         Frequencies [Hz] near which cells stay narrow.
     share : Array or float
         Measured share of each bin (`missing`); by default all.
+    sizes : tuple of int
+        As FINE and NEAR.
 
     Attributes
     ----------
@@ -86,11 +88,13 @@ class Cells:
         keep: Array,
         resonances: Iterable[float] = (),
         share: Array | float = 1.0,
+        sizes: tuple[int, int] = (FINE, NEAR),
     ):
         j = np.arange(1.0, len(f) + 1.0)
-        size = np.maximum(j / FINE, 1.0)
+        fine, near = sizes
+        size = np.maximum(j / fine, 1.0)
         for centre in resonances:
-            size = np.minimum(size, np.maximum(np.abs(j - centre / f[0]) / NEAR, 1.0))
+            size = np.minimum(size, np.maximum(np.abs(j - centre / f[0]) / near, 1.0))
         cell = np.floor(np.cumsum(1.0 / size) + 1e-6).astype(int)
         count = np.bincount(cell, keep)
         used = count > 0

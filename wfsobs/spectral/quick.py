@@ -4,6 +4,9 @@ A short form of `identify`, without its tests and errors: the background of the 
 maxima of the whitened periodogram as resonances, all at once; a few Newton steps of Whittle's likelihood for all parameters; and
 the same once more for the remainder. A false weak peak costs the filter less than a missed one, so the threshold is lower than
 in `search`.
+
+For windows that grow, the resonances of the window before are a first guess too (`follow_spectrum`): they are tracked, not made
+anew.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.spectral.densities import densities
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.periodogram import Cells, periodogram, periodogram_frequencies
+from wfsobs.spectral.periodogram import FINE, NEAR, Cells, periodogram, periodogram_frequencies
 from wfsobs.spectral.search import LOWEST
 from wfsobs.spectral.whittle import first_guess
 from wfsobs.typing import Array
@@ -41,6 +44,10 @@ START = 0.5
 """Half width of a new peak, in bins."""
 NARROWEST, WIDEST = 0.3, 0.3
 """Minimum half width of a peak in bins, the resolution of a window; its maximum damping."""
+TRACKED = 0.1
+"""Minimum half width of a peak that is tracked, in bins: undamped lines become sharper as the window grows."""
+COARSE = 50, 4
+"""As FINE and NEAR of `periodogram`, for long windows: their cells hold many bins."""
 WORTH = 4.0
 """Minimum gain of log-likelihood of a peak that is kept."""
 CLIPPED = 4.0
@@ -76,39 +83,84 @@ def quick_spectrum(z: Array, dt: float, most: int, lowest: float = LOWEST, befor
     """
     if np.ptp(z) == 0:
         return Spectrum(float(np.finfo(float).tiny), dt)
-    z = z - z.mean()
-    fit = _Fit(
-        z,
-        dt,
-        first_guess(periodogram_frequencies(len(z), dt), periodogram(z, dt), dt, STARTS)
-        if before is None or before.turbulence is None
-        else before,
-    )
+    fit = _Fit(z - z.mean(), dt, _background_of(z - z.mean(), dt, before))
     fit.background()
+    _add_peaks(fit, most, lowest)
+    return fit.spectrum
+
+
+def follow_spectrum(
+    z: Array, dt: float, most: int, lowest: float, before: Spectrum | None, known: Ar2 | Ar3 | None = None
+) -> Spectrum:
+    """Fit noise, turbulence and up to `most` peaks to a window that begins as the one before it did, or thereabouts.
+
+    As `quick_spectrum`, but the first guess has the resonances of `before` too; z is not constant.
+
+    Parameters
+    ----------
+    z, dt, most, lowest : Array, float, int, float
+        As for `quick_spectrum`.
+    before : Spectrum or None
+        Spectrum of the window before.
+    known : Ar2 or Ar3, optional
+        A process that is in z as well and is known: it is not fitted.
+
+    Returns
+    -------
+    Spectrum
+        The fit, without the known process.
+    """
+    z = z - z.mean()
+    tracked = () if before is None else before.resonances
+    start = _background_of(z, dt, before)
+    fit = _Fit(z, dt, Spectrum(start.noise, dt, start.turbulence, tracked), known, TRACKED, COARSE)
+    if not tracked:
+        fit.background()
+    _add_peaks(fit, most, lowest)
+    return fit.spectrum
+
+
+def _background_of(z: Array, dt: float, before: Spectrum | None) -> Spectrum:
+    """Return a first guess of noise and turbulence, without resonances."""
+    if before is None or before.turbulence is None:
+        return first_guess(periodogram_frequencies(len(z), dt), periodogram(z, dt), dt, STARTS)
+    return Spectrum(before.noise, dt, before.turbulence)
+
+
+def _add_peaks(fit: _Fit, most: int, lowest: float) -> None:
     for again in (False, True):
         more = fit.add(fit.maxima(lowest, most - len(fit.resonances)))
         if again and not more:
             break
         fit.improve()
         fit.prune()
-    return fit.spectrum
 
 
 class _Fit:
     """A fit: periodogram I at f, a finer one, and the parameters of the spectrum.
 
-    x: log noise, then three per process, turbulence first where there is any (`densities`).
+    x: log noise, then three per process, turbulence first where there is any (`densities`). narrowest : as NARROWEST; cells : as
+    FINE and NEAR.
     """
 
-    def __init__(self, z: Array, dt: float, start: Spectrum):
+    def __init__(
+        self,
+        z: Array,
+        dt: float,
+        start: Spectrum,
+        known: Ar2 | Ar3 | None = None,
+        narrowest: float = NARROWEST,
+        cells: tuple[int, int] = (FINE, NEAR),
+    ):
         n = len(z)
+        self.known, self.narrowest, self.sizes = known, narrowest, cells
         self.dt, self.f, self.I = dt, periodogram_frequencies(n, dt), periodogram(z, dt)
         self.fine_f, self.fine = periodogram_frequencies(n, dt, PAD), periodogram(z, dt, PAD)
         self.df = self.f[0]
         processes = [] if start.turbulence is None else [start.turbulence]
         self.first = 1 + 3 * len(processes)
-        self.x = np.concatenate([[log(start.noise)], *map(_numbers, processes)])
-        self.cells = Cells(self.f, self.I, np.ones(len(self.f)))
+        self.x = np.concatenate([[log(start.noise)], *map(_numbers, [*processes, *start.resonances])])
+        self.add(())
 
     @property
     def resonances(self) -> Array:
@@ -130,6 +182,8 @@ class _Fit:
         noise = np.full_like(f, 2.0 * self.dt * np.exp(2.0 * x[0]))
         S, slopes = densities(x[1:].reshape(-1, 3), self.dt, f)
         total = noise + S.sum(axis=0)
+        if self.known is not None:
+            total += self.known.psd(f)
         return total, np.vstack([2.0 * noise, (S[:, None] * slopes).reshape(-1, len(f))]) / total
 
     def background(self) -> None:
@@ -142,8 +196,11 @@ class _Fit:
 
     def maxima(self, lowest: float, most: int) -> list[tuple[float, float]]:
         """Return frequency and density of up to `most` unexplained maxima of the whitened periodogram, the highest first."""
+        if most <= 0:
+            return []
         f = self.fine_f
-        S = np.interp(f, self.f, self.density(self.x, self.f)[0])
+        at = self.f if self.sizes == (FINE, NEAR) else self.cells.frequency
+        S = np.interp(f, at, self.density(self.x, at)[0])
         ratio = self.fine / S
         inner = ratio[1:-1]
         noise = 2.0 * self.dt * np.exp(2.0 * self.x[0])
@@ -164,7 +221,8 @@ class _Fit:
             half = START * self.df
             new = Ar2(2.0 * pi * frequency, min(half / frequency, WIDEST), float(np.sqrt(0.5 * pi * half * density)), self.dt)
             self.x = np.concatenate([self.x, _numbers(new)])
-        self.cells = Cells(self.f, self.I, np.ones(len(self.f)), np.exp(self.resonances[:, 0]) / (2.0 * pi))
+        centres = np.exp(self.resonances[:, 0]) / (2.0 * pi)
+        self.cells = Cells(self.f, self.I, np.ones(len(self.f)), centres, sizes=self.sizes)
         return len(peaks) > 0
 
     def improve(self) -> None:
@@ -196,7 +254,7 @@ class _Fit:
             x[1] = np.clip(x[1], log(pi * self.df), log(0.5 / self.dt))
             x[2] = np.clip(x[2], logit(0.1), logit(0.99))
         x[self.first :: 3] = np.clip(x[self.first :: 3], log(4.0 * pi * self.df), log(0.95 * pi / self.dt))
-        least = np.minimum(2.0 * pi * NARROWEST * self.df / np.exp(x[self.first :: 3]), WIDEST)
+        least = np.minimum(2.0 * pi * self.narrowest * self.df / np.exp(x[self.first :: 3]), WIDEST)
         x[self.first + 1 :: 3] = np.clip(x[self.first + 1 :: 3], logit(least), logit(WIDEST))
         return x
 

@@ -37,6 +37,14 @@ class Adaptive(Group):
         doc="Length of the identification window [s]. Peaks closer than two over it are one; a peak that moves is "
         "followed after this time.",
     )
+    longest = Real(
+        30.0,
+        bounds=(0.1, 1000.0),
+        softbounds=(4.0, 60.0),
+        step=1.0,
+        label="Longest window",
+        doc="Length to which the window of the multi-rate filter grows while the record is still [s].",
+    )
     interval = Real(
         0.5,
         bounds=(0.01, 100.0),
@@ -46,7 +54,10 @@ class Adaptive(Group):
         doc="Time from one identification to the next [s].",
     )
     peak_count = Whole(
-        20, bounds=(0, 60), label="Maximum peaks", doc="Maximum number of vibration peaks in the model of one mode."
+        20,
+        bounds=(0, 60),
+        label="Maximum peaks",
+        doc="Maximum number of vibration peaks in the model of one mode; twice as many where the window has grown to twice.",
     )
     lowest = Real(
         5.0,
@@ -117,13 +128,15 @@ def seconds(settings: Adaptive, n_steps: int, n_modes: int, dt: float) -> float:
     return n_modes * windows * (3.5e-3 + 0.9e-6 * settings.window / dt)
 
 
+ADAPTIVE = Section("adaptive", "Adaptive Kalman filter", Adaptive)
+
 KF_ADAPTIVE = Observer(
     "kf-adaptive",
     "Adaptive KF",
     TARGETS,
     kf_adaptive,
     help="noise, turbulence and peaks identified anew from the last 4 s, twice a second; not in the paper",
-    settings=Section("adaptive", "Adaptive Kalman filter", Adaptive),
+    settings=ADAPTIVE,
     tunable=Tunable(("adaptive.window",), ("adaptive.interval",)),  # a shorter interval costs time, which no error shows
     weight=50.0,
     seconds=seconds,

@@ -1,0 +1,93 @@
+"""The model of a window of both sensors, for the adaptive multi-rate filter.
+
+With x the mean of phi over a frame, the NGS gives x + v and the mean of z over the same steps x + e + w / sqrt(n). Their
+difference holds what the LGS alone see, e, and both noises: its spectrum tells them. The spectrum of z, with e in it, tells the
+rest. e is taken for independent of phi.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from wfsobs.observers.kalman.multirate_multi import beam_model
+from wfsobs.observers.kalman.multirate_optimal import Cycle, estimated_cycle
+from wfsobs.observers.kalman.single import MIN_NOISE
+from wfsobs.prior import Beams
+from wfsobs.record import RecordError
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.quick import SHORTEST, follow_spectrum, quick_spectrum
+from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.observers.kalman.adaptive import Adaptive
+
+GROWS = 0.3
+"""Growth of a window to the next identification, over its length."""
+STILL = 0.7, 1.4
+"""Mean square of the innovations over what the model says, within which a record is still."""
+FEWEST = 20
+"""Minimum NGS frames of a window."""
+LEAST = 0.1
+"""Minimum share of the NGS in the noise of the difference."""
+
+
+class Lengths(NamedTuple):
+    """Numbers of fast steps, whole frames: shortest and longest window, from check to check, and the first step of a window."""
+
+    window: int
+    longest: int
+    interval: int
+    first: int
+    ratio: int
+
+
+def both_lengths(settings: Adaptive, dt: float, ratio: int, delay: int) -> Lengths:
+    """Return the lengths of windows. Raises RecordError for a window of too few samples."""
+    window, least = round(settings.window / dt / ratio), max(-(-SHORTEST // ratio), FEWEST)
+    if window < least:
+        raise RecordError(f"adaptive.window = {settings.window:g}: takes {least * ratio * dt:g} s or more, {least} NGS frames")
+    longest, interval = (round(seconds / dt / ratio) for seconds in (settings.longest, settings.interval))
+    first = 1 + ratio * -(-max(delay - 1, 0) // ratio)  # after a frame; what the mirror did before the record is not known
+    return Lengths(window * ratio, max(longest, window) * ratio, max(interval, 1) * ratio, first, ratio)
+
+
+class BothModel(NamedTuple):
+    """What has been identified last.
+
+    spectrum : of z without the error; error : spectrum of the difference of the sensors, per frame
+    ngs      : rms of the noise of a frame [um]
+    cycle    : the filter in charge; None before the first, and where nothing moves
+    """
+
+    spectrum: Spectrum | None = None
+    error: Spectrum | None = None
+    ngs: float = 0.0
+    cycle: Cycle | None = None
+
+
+def identify_both(z: Array, frames: Array, dt: float, settings: Adaptive, last: BothModel) -> BothModel:
+    """Identify the model of a window; where it or its filter cannot be found, the last one stays.
+
+    z, frames : LGS measurements (n,) and NGS frames (n / ratio,) [um]
+    """
+    ratio = len(z) // len(frames)
+    try:
+        with np.errstate(divide="raise", over="raise", invalid="raise"):
+            error = quick_spectrum(z.reshape(-1, ratio).mean(axis=1) - frames, dt * ratio, 0, settings.lowest, last.error)
+            e = (error.turbulence.at(dt),) if isinstance(error.turbulence, Ar2) else ()
+            most = settings.peak_count * (2 if len(z) * dt >= 2.0 * settings.window else 1)
+            before = last.spectrum
+            if before is None and e:  # of about the same corner: a guess that needs no search
+                before = Spectrum(error.noise, dt, replace(e[0], rms=float(z.std())))
+            spectrum = follow_spectrum(z, dt, most, settings.lowest, before, *e)
+            ngs = max(error.noise * np.sqrt(max(1.0 - spectrum.noise**2 / ratio / error.noise**2, LEAST)), MIN_NOISE)
+            turbulence = () if spectrum.turbulence is None else (spectrum.turbulence,)
+            model = beam_model(Beams(turbulence), spectrum.resonances)
+            cycle = estimated_cycle(model, ratio, max(spectrum.noise, MIN_NOISE), ngs, e)
+            return BothModel(spectrum, error, ngs, cycle)
+    except (ValueError, ArithmeticError):
+        return last

@@ -1,0 +1,130 @@
+"""Adaptive multi-rate filter: `multirate_multi` with a model that is identified from both sensors, again and again.
+
+It needs no prior. While the record is still, the window grows from `adaptive.window` to `adaptive.longest`, so that close lines
+part and every number becomes more certain; the peaks of the window before are tracked. Where the innovations are not as large as
+the model says, something has changed, and the window is the shortest one again. A new filter starts at rest at the beginning of
+its window. The mean of a window is taken off either sensor; that of the NGS counts as turbulence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
+from wfsobs.observers.kalman.adaptive import ADAPTIVE, Adaptive
+from wfsobs.observers.kalman.both_window import GROWS, STILL, BothModel, Lengths, both_lengths, identify_both
+from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_filter
+from wfsobs.observers.kalman.single import NGS
+from wfsobs.observers.kalman.spread import target_sd
+from wfsobs.prior import Prior
+from wfsobs.progress import Watch
+from wfsobs.record import Measurements, RecordError
+from wfsobs.typing import Array
+
+
+def multirate_adaptive(measurements: Measurements, _prior: Prior, settings: Adaptive, watch: Watch) -> Estimates:
+    """Run the filter over a record; NaN until the first window is full.
+
+    Raises RecordError for a record shorter than a window, or a window of too few samples.
+    """
+    assert measurements.ratio is not None
+    lengths = both_lengths(settings, measurements.dt, measurements.ratio, measurements.delay)
+    needed = lengths.first + lengths.window
+    if measurements.n_steps < needed:
+        raise RecordError(f"the record has {measurements.n_steps} steps; adaptive.window = {settings.window:g} s needs {needed}")
+    v = np.stack([measurements.z, np.nan_to_num(measurements.z_ngs)], axis=1)
+    columns = []
+    for mode in range(measurements.n_modes):
+
+        def tell(fraction: float, mode: int = mode) -> None:
+            watch.step((mode + fraction) / measurements.n_modes)
+
+        columns.append(_adapt(v[:, :, mode], measurements.dt, lengths, settings, tell))
+    values, sd = np.stack(columns, axis=-1)
+    return Estimates(*({target: x[:, i] for i, target in enumerate(TARGETS)} for x in (values, sd)))
+
+
+def _adapt(v: Array, dt: float, lengths: Lengths, settings: Adaptive, tell: Callable[[float], None]) -> Array:
+    """Turbulence and vibration of one mode's v (n, 2), and their standard deviations, (2, n, 2) [um]."""
+    n, ratio = len(v), lengths.ratio
+    out = np.full((2, n, len(TARGETS)), np.nan)
+    start, end, changed, found = lengths.first, lengths.first + lengths.window, 0, BothModel()
+    while end <= n:
+        tell(end / n)
+        found = identify_both(v[start:end, 0], v[start + ratio - 1 : end : ratio, 1], dt, settings, found)
+        due = end + next_length(end - start, lengths)
+        if found.cycle is not None:
+            run = run_window(found.cycle, v[start : min(due, n)], end - start)
+            for stop in range(end + lengths.interval, min(due, n) + 1, lengths.interval):
+                if not is_still(run.surprise[stop - lengths.interval - start : stop - start]):
+                    changed, due = stop - lengths.interval, stop
+                    break
+            out[:, end - 1 : due] = run.estimates[:, end - 1 - start : due - start]
+        end = due
+        start = window_start(end, changed, lengths)
+    return out
+
+
+def next_length(window: int, lengths: Lengths) -> int:
+    """Return the steps from an identification to the next one, if the record is still."""
+    return max(int(GROWS * window) // lengths.interval, 1) * lengths.interval
+
+
+def window_start(end: int, changed: int, lengths: Lengths) -> int:
+    """Return where the window begins that ends before step `end`; changed : when the record was last not still."""
+    return max(min(max(changed, end - lengths.longest), end - lengths.window), lengths.first)
+
+
+def is_still(surprise: Array) -> bool:
+    """Return whether squared innovations over their variances (n,) are as large as they should be."""
+    return bool(STILL[0] < surprise.mean() < STILL[1])
+
+
+class WindowRun(NamedTuple):
+    """A filter over a window: estimates and standard deviations (2, n, 2) [um]; squared innovations over their variances (n,)."""
+
+    estimates: Array
+    surprise: Array
+
+
+def run_window(cycle: Cycle, v: Array, learned: int) -> WindowRun:
+    """Run the filter of a cycle over v (n, 2) from its first step on; learned : steps of which it is the model."""
+    frames = len(cycle.steps)
+    means = np.array([v[:learned, 0].mean(), v[frames - 1 : learned : frames, 1].mean()])
+    A, C, _, R = cycle.steps[0]
+    filter_, states = optimal_filter(cycle.steps, np.vstack([cycle.rows, C[0] @ A]))
+    found = filter_.cycle.run((v - means)[:, :, None])[:, :, 0]
+    innovations = v[:, 0] - means[0] - np.append(0.0, found[:-1, 2])
+    variance = np.resize([C[0] @ s.P @ C[0] + R[0, 0] for s in states], len(v))
+    sd = np.resize(target_sd(cycle.rows, [s.posterior for s in states]), (len(v), len(TARGETS)))
+    return WindowRun(np.array([found[:, :2] + [means[1], 0.0], sd]), innovations**2 / variance)
+
+
+def seconds(settings: Adaptive, n_steps: int, n_modes: int, dt: float) -> float:
+    """9 ms + 1 us per sample for every window, one mode after the other; windows grow [s]."""
+    lengths, out = both_lengths(settings, dt, 1, 0), 0.0
+    end = lengths.window
+    while end <= n_steps:
+        window = min(end, lengths.longest)
+        out += 9e-3 + 1e-6 * window
+        end += next_length(window, lengths)
+    return n_modes * out
+
+
+MULTIRATE_ADAPTIVE = Observer(
+    "multirate-adaptive",
+    "Adaptive multi-rate KF",
+    TARGETS,
+    multirate_adaptive,
+    help="both sensors; noises, turbulence, peaks and the error of the LGS identified from windows that grow; not in the paper",
+    settings=ADAPTIVE,
+    needs=NGS,
+    sensors=("lgs", "ngs"),
+    tunable=Tunable(("adaptive.window",), ("adaptive.longest", "adaptive.interval")),
+    weight=50.0,
+    seconds=seconds,
+    look=Look("Adaptive multi-rate", "#9A0048", "#FF9FC4", (20, 2, 3, 2), width=1.8),
+)
