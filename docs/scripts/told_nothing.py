@@ -10,7 +10,7 @@ import numpy as np
 
 from wfsobs import PRESETS, simulate
 from wfsobs.evaluation.bound_both import bound_rms_of_both
-from wfsobs.pipeline import run_observer
+from wfsobs.execution import run_observer
 
 NAMES = ("kf-adaptive", "multirate-adaptive", "multirate-multi")
 """The last one is told."""

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from wfsobs import PRESETS, simulate
+from wfsobs.execution import run_observer
 from wfsobs.observers.kalman import multirate_adaptive
 from wfsobs.observers.kalman.adaptive import Adaptive
 from wfsobs.observers.kalman.both_window import BothModel, Lengths, both_lengths, identify_both
 from wfsobs.observers.kalman.multirate_adaptive import next_length, window_start
-from wfsobs.pipeline import run_observer
 from wfsobs.record import RecordError
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.spectral.quick import follow_spectrum

@@ -73,9 +73,9 @@ def next_length(window: int, lengths: Lengths) -> int:
     return max(int(GROWS * window) // lengths.interval, 1) * lengths.interval
 
 
-def window_start(end: int, changed: int, lengths: Lengths) -> int:
-    """Return where the window begins that ends before step `end`; changed : when the record was last not still."""
-    return max(min(max(changed, end - lengths.longest), end - lengths.window), lengths.first)
+def window_start(end: int, change: int, lengths: Lengths) -> int:
+    """Return where the window begins that ends before step `end`; change : when the record was last not still."""
+    return max(min(max(change, end - lengths.longest), end - lengths.window), lengths.first)
 
 
 def is_still(surprise: Array) -> bool:
@@ -90,10 +90,10 @@ class WindowRun(NamedTuple):
     surprise: Array
 
 
-def run_window(cycle: Cycle, v: Array, learned: int) -> WindowRun:
-    """Run the filter of a cycle over v (n, 2) from its first step on; learned : steps of which it is the model."""
+def run_window(cycle: Cycle, v: Array, size: int) -> WindowRun:
+    """Run the filter of a cycle over v (n, 2) from its first step on; size : steps of which it is the model."""
     frames = len(cycle.steps)
-    means = np.array([v[:learned, 0].mean(), v[frames - 1 : learned : frames, 1].mean()])
+    means = np.array([v[:size, 0].mean(), v[frames - 1 : size : frames, 1].mean()])
     A, C, _, R = cycle.steps[0]
     filter_, states = optimal_filter(cycle.steps, np.vstack([cycle.rows, C[0] @ A]))
     found = filter_.cycle.run((v - means)[:, :, None])[:, :, 0]

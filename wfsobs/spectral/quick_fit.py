@@ -1,0 +1,177 @@
+"""The fit of one window, for `quick`: Newton steps of Whittle's likelihood for noise, turbulence and resonances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import log, pi
+
+import numpy as np
+from scipy.special import logit
+
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.spectral.densities import densities
+from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.periodogram import FINE, NEAR, Cells, periodogram, periodogram_frequencies
+from wfsobs.typing import Array
+
+FEWEST = 15.0
+"""Minimum periods of a peak in a window: with fewer, turbulence hides its maximum."""
+PAD = 2
+"""Frequencies per bin in the search for maxima."""
+HEIGHT, AT, DEEPER = 6.0, 10.0, 0.35
+"""Minimum I / S over noise of a maximum at AT [Hz] that counts as a peak.
+
+It grows as log f, since the number of false maxima does, and by DEEPER log(S / noise), since a false peak takes more where
+there is more turbulence.
+"""
+APART = 2.0
+"""Minimum distance of two peaks, in bins."""
+START = 0.5
+"""Half width of a new peak, in bins."""
+NARROWEST, WIDEST = 0.3, 0.3
+"""Minimum half width of a peak in bins, the resolution of a window; its maximum damping."""
+WORTH = 4.0
+"""Minimum gain of log-likelihood of a peak that is kept."""
+CLIPPED = 4.0
+"""I / S above which a bin belongs to a peak, not to the background."""
+STEPS, ENOUGH = 6, 0.2
+"""Maximum number of Newton steps in a row; gain of log-likelihood below which they end."""
+REACH = 1.0
+"""Maximum change of a logarithmic parameter in one step; a frequency moves by half a bin."""
+
+
+class WindowFit:
+    """A fit: periodogram I at f, a finer one, and the parameters of the spectrum.
+
+    x: log noise, then three per process, turbulence first where there is any (`densities`). narrowest : as NARROWEST; cells : as
+    FINE and NEAR.
+    """
+
+    def __init__(
+        self,
+        z: Array,
+        dt: float,
+        start: Spectrum,
+        extra: Ar2 | Ar3 | None = None,
+        narrowest: float = NARROWEST,
+        cells: tuple[int, int] = (FINE, NEAR),
+    ):
+        n = len(z)
+        self.extra, self.narrowest, self.sizes = extra, narrowest, cells
+        self.dt, self.f, self.I = dt, periodogram_frequencies(n, dt), periodogram(z, dt)
+        self.fine_f, self.fine = periodogram_frequencies(n, dt, PAD), periodogram(z, dt, PAD)
+        self.df = self.f[0]
+        processes = [] if start.turbulence is None else [start.turbulence]
+        self.first = 1 + 3 * len(processes)
+        self.x = np.concatenate([[log(start.noise)], *map(_numbers, [*processes, *start.resonances])])
+        self.add(())
+
+    @property
+    def resonances(self) -> Array:
+        """Parameters of the resonances, a row each."""
+        return self.x[self.first :].reshape(-1, 3)
+
+    @property
+    def spectrum(self) -> Spectrum:
+        """The fit as processes."""
+        found = [
+            Ar2(float(np.exp(w)), float(1.0 / (1.0 + np.exp(-d))), float(np.exp(rms)), self.dt)
+            for w, d, rms in self.x[1:].reshape(-1, 3)
+        ]
+        turbulence = found.pop(0) if self.first > 1 else None
+        return Spectrum(float(np.exp(self.x[0])), self.dt, turbulence, tuple(found))
+
+    def density(self, x: Array, f: Array) -> tuple[Array, Array]:
+        """Return S (len(f),) and the derivatives of its logarithm by x, (len(x), len(f))."""
+        noise = np.full_like(f, 2.0 * self.dt * np.exp(2.0 * x[0]))
+        S, slopes = densities(x[1:].reshape(-1, 3), self.dt, f)
+        total = noise + S.sum(axis=0)
+        if self.extra is not None:
+            total += self.extra.psd(f)
+        return total, np.vstack([2.0 * noise, (S[:, None] * slopes).reshape(-1, len(f))]) / total
+
+    def background(self) -> None:
+        """Adapt noise and turbulence to this window, whatever its peaks."""
+        whole = self.cells.mean
+        for _ in range(2):
+            self.cells.mean = np.minimum(whole, CLIPPED * self.density(self.x, self.cells.frequency)[0])
+            self.improve()
+        self.cells.mean = whole
+
+    def maxima(self, lowest: float, most: int) -> list[tuple[float, float]]:
+        """Return frequency and density of up to `most` unexplained maxima of the whitened periodogram, the highest first."""
+        if most <= 0:
+            return []
+        f = self.fine_f
+        at = self.f if self.sizes == (FINE, NEAR) else self.cells.frequency
+        S = np.interp(f, at, self.density(self.x, at)[0])
+        ratio = self.fine / S
+        inner = ratio[1:-1]
+        noise = 2.0 * self.dt * np.exp(2.0 * self.x[0])
+        height = HEIGHT + np.log(f / AT) + DEEPER * np.log(S / noise)
+        high = ((ratio > height) & (f >= max(lowest, FEWEST * self.df)))[1:-1]
+        top = 1 + np.flatnonzero((inner >= ratio[:-2]) & (inner > ratio[2:]) & high)
+        taken = list(np.exp(self.resonances[:, 0]) / (2.0 * pi))
+        found: list[tuple[float, float]] = []
+        for i in top[np.argsort(-ratio[top])]:
+            if len(found) < most and all(abs(f[i] - other) > APART * self.df for other in taken):
+                taken.append(f[i])
+                found.append((float(f[i]), float(self.fine[i])))
+        return found
+
+    def add(self, peaks: Sequence[tuple[float, float]]) -> bool:
+        """Add resonances of width START at these frequencies and densities; return whether there are any."""
+        for frequency, density in peaks:
+            half = START * self.df
+            new = Ar2(2.0 * pi * frequency, min(half / frequency, WIDEST), float(np.sqrt(0.5 * pi * half * density)), self.dt)
+            self.x = np.concatenate([self.x, _numbers(new)])
+        centres = np.exp(self.resonances[:, 0]) / (2.0 * pi)
+        self.cells = Cells(self.f, self.I, np.ones(len(self.f)), centres, sizes=self.sizes)
+        return len(peaks) > 0
+
+    def improve(self) -> None:
+        """Take Newton steps with the expected second derivatives, damped (Levenberg, Marquardt) where they lead uphill."""
+        f, count, mean = self.cells.frequency, self.cells.count, self.cells.mean
+        reach = np.full(len(self.x), REACH)
+        reach[self.first :: 3] = np.minimum(0.5 * self.df / np.exp(self.resonances[:, 0]) * (2.0 * pi), REACH)
+        x = self._clip_to_bounds(self.x)
+        S, slopes = self.density(x, f)
+        value, held = count @ (np.log(S) + mean / S), 0.3
+        for _ in range(STEPS):
+            gradient, F = slopes @ (count * (1.0 - mean / S)), (slopes * count) @ slopes.T
+            step = np.linalg.solve(F + np.diag(held * np.diag(F) + 1e-2), -gradient)
+            trial = self._clip_to_bounds(x + np.clip(step, -reach, reach))
+            S_there, slopes_there = self.density(trial, f)
+            there = count @ (np.log(S_there) + mean / S_there)
+            if there >= value:
+                held *= 10.0
+                continue
+            gain, x, S, slopes, value, held = value - there, trial, S_there, slopes_there, there, 0.3 * held
+            if gain < ENOUGH:
+                break
+        self.x = x
+
+    def _clip_to_bounds(self, x: Array) -> Array:
+        """Return x with every parameter clipped to its bounds."""
+        x = x.copy()
+        if self.first > 1:
+            x[1] = np.clip(x[1], log(pi * self.df), log(0.5 / self.dt))
+            x[2] = np.clip(x[2], logit(0.1), logit(0.99))
+        x[self.first :: 3] = np.clip(x[self.first :: 3], log(4.0 * pi * self.df), log(0.95 * pi / self.dt))
+        least = np.minimum(2.0 * pi * self.narrowest * self.df / np.exp(x[self.first :: 3]), WIDEST)
+        x[self.first + 1 :: 3] = np.clip(x[self.first + 1 :: 3], logit(least), logit(WIDEST))
+        return x
+
+    def prune(self) -> None:
+        """Remove resonances that gain too little likelihood."""
+        count, mean = self.cells.count, self.cells.mean
+        S, slopes = self.density(self.x, self.cells.frequency)
+        share = 0.5 * slopes[self.first + 2 :: 3]  # of each in S
+        without = S * np.maximum(1.0 - share, 1e-6)
+        gain = (np.log(without) + mean / without - np.log(S) - mean / S) @ count
+        self.x = np.concatenate([self.x[: self.first], self.resonances[gain > WORTH].ravel()])
+
+
+def _numbers(p: Ar2 | Ar3) -> Array:
+    return np.array([log(p.omega), logit(min(p.damping, 0.99)), log(max(p.rms, 1e-12))])
