@@ -1,4 +1,4 @@
-"""Check the names of functions, classes, fields and parameters, and the length of modules.
+"""Check the names of functions, classes, fields, attributes and parameters, and the length of modules.
 
     python scripts/check_names.py
 
@@ -88,6 +88,19 @@ def fields_and_parameters(source: str) -> Iterator[str]:
             yield from (f"{node.name}.{parameter.arg}" for parameter in every)
 
 
+def attributes(source: str) -> Iterator[str]:
+    r"""Yield the attributes that the methods of classes in a source set on their objects, each once, after its class.
+
+    >>> list(attributes("class A:\n  def f(self):\n    self.x, self._made = 1, 2\n    self.x: int = self.y"))
+    ['A.x', 'A._made']
+    """
+    for owner in ast.walk(ast.parse(source)):
+        if isinstance(owner, ast.ClassDef):
+            stored = (n for n in ast.walk(owner) if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store))
+            names = (n.attr for n in stored if isinstance(n.value, ast.Name) and n.value.id == "self")
+            yield from (f"{owner.name}.{name}" for name in dict.fromkeys(names))
+
+
 def faults(package: Path = PACKAGE) -> list[str]:
     """Return one line for every name and every module in a package that breaks a rule."""
     homes: dict[str, list[str]] = defaultdict(list)
@@ -99,7 +112,7 @@ def faults(package: Path = PACKAGE) -> list[str]:
             out.append(f"{where}: {length} lines, at most {LONGEST} are allowed: give each idea a module of its own")
         out += [
             f"{where}: {name}: a bare participle; take the noun of what it holds"
-            for name in fields_and_parameters(source)
+            for name in (*fields_and_parameters(source), *attributes(source))
             if is_participle(name.rpartition(".")[2])
         ]
         for name, is_top in names(path):

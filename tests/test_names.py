@@ -24,6 +24,9 @@ class Spectra:
     measured: float
     noise: float
 
+    def draw(self):
+        self._drawn, self.lines = 1, self.shown
+
 def estimate(record, told, /, *made, seen=None, speed=1.0, **hidden): ...
 def fitted(): ...
 """
@@ -32,7 +35,8 @@ def fitted(): ...
 def test_participles_are_found_wherever_a_name_is_given(check: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "bad.py").write_text(SOURCE, encoding="utf-8")
     found = [line.split(": ")[1] for line in check.faults(tmp_path)]
-    assert found == ["Spectra.measured", "estimate.told", "estimate.seen", "estimate.made", "estimate.hidden", "fitted"]
+    parameters = ["estimate.told", "estimate.seen", "estimate.made", "estimate.hidden"]
+    assert found == ["Spectra.measured", *parameters, "Spectra._drawn", "fitted"]
 
 
 def test_long_modules_are_found(check: ModuleType, tmp_path: Path) -> None:

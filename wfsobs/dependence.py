@@ -37,19 +37,19 @@ class Memo:
     """Values by name, as long as somebody else holds them: it takes no memory of its own. For any thread."""
 
     def __init__(self) -> None:
-        self._known: WeakValueDictionary[str, Any] = WeakValueDictionary()
+        self._values: WeakValueDictionary[str, Any] = WeakValueDictionary()
 
     def get(self, name: str) -> Any:
         """Return the value of a name, or None."""
-        return self._known.get(name)
+        return self._values.get(name)
 
     def put(self, name: str, value: T) -> T:
         """Note a value under a name, and return it."""
-        self._known[name] = value
+        self._values[name] = value
         return value
 
     def __len__(self) -> int:
-        return len(self._known)
+        return len(self._values)
 
 
 def digest(*values: Any) -> str:
@@ -130,12 +130,12 @@ def observers_reached(before: Scenario, now: Scenario) -> set[str] | None:
 class RecordMemo:
     """The estimates that are known of a record: looked for in a memo, and noted there.
 
-    record : digest of the record;  reused : observers whose estimates were known
+    record : digest of the record;  known_observers : observers whose estimates were known
     """
 
     def __init__(self, memo: Memo, record: Record):
         self.memo, self.record = memo, record_digest(record)
-        self.reused: set[str] = set()
+        self.known_observers: set[str] = set()
 
     def find(self, observer: Observer, prior: Prior, own: Plain | None) -> tuple[str, list[Estimate]]:
         """Return the name of an observer's estimates, and the estimates, one per target; none unless all are known.
@@ -146,7 +146,7 @@ class RecordMemo:
         found = [self.memo.get(f"{name} {target}") for target in observer.targets]
         if any(e is None for e in found):
             return name, []
-        self.reused.add(observer.id)
+        self.known_observers.add(observer.id)
         return name, found
 
     def note(self, name: str, estimate: Estimate) -> None:

@@ -73,7 +73,7 @@ class Registry(MutableMapping[str, E]):
     """
 
     def __init__(self, kind: type[E], group: str, built_in: Iterable[E], reserved_ids: Iterable[str] = ()):
-        self.kind, self.group, self.reserved = kind, group, frozenset(reserved_ids)
+        self.kind, self.group, self.reserved_ids = kind, group, frozenset(reserved_ids)
         self._entries: dict[str, E] = {}
         self._complete, self._reading = False, False
         for entry in built_in:
@@ -123,7 +123,7 @@ class Registry(MutableMapping[str, E]):
             raise RegistrationError(f"{where}: an id takes lower-case letters, digits and hyphens between them")
         if entry.id in self._entries:
             raise RegistrationError(f"{where}: the id is taken, by {self._entries[entry.id].label}")
-        if entry.id in self.reserved:
+        if entry.id in self.reserved_ids:
             raise RegistrationError(f"{where}: the id is taken, by a row of the tables")
         if entry.label in (other.label for other in self._entries.values()):
             raise RegistrationError(f"{where}: the label {entry.label!r} is taken")

@@ -24,7 +24,7 @@ from wfsobs.evaluation.scores import BOUNDS
 
 def opened(dashboard: Dashboard) -> ClosedLoopPage:
     dashboard.pages.current = LOOP
-    page = dashboard.pages.made[LOOP]
+    page = dashboard.pages.by_name[LOOP]
     assert isinstance(page, ClosedLoopPage)
     return page
 
@@ -148,4 +148,4 @@ def test_what_would_take_minutes_is_left_out(dashboard: Dashboard, loop: Any, mo
     (card,) = [c for c in page.cards.items if c["name"] == "integrator+gpr-online"]
     assert card["note"].startswith("left out") and "integrator+gpr-online" not in page.table.object
     dashboard.close()
-    assert page.run.session.closed, "a session that ends takes its loop with it"
+    assert page.run.session.is_closed, "a session that ends takes its loop with it"

@@ -154,7 +154,7 @@ def test_columns_that_were_chosen(columns: Dashboard) -> None:
 
 def test_closed_loop(board: Dashboard, loop: Any) -> None:
     board.pages.current = "loop"
-    page = board.pages.made["loop"]
+    page = board.pages.by_name["loop"]
     assert isinstance(page, ClosedLoopPage)
     loop.until(lambda: page.results is not None and page.results.complete, 120)
     assert page.results is not None
@@ -170,7 +170,7 @@ def test_closed_loop(board: Dashboard, loop: Any) -> None:
 
 def test_identify(board: Dashboard, loop: Any) -> None:
     board.pages.current = "identify"
-    page = board.pages.made["identify"]
+    page = board.pages.by_name["identify"]
     assert isinstance(page, IdentifyPage)
     page.level.value, page.lowest.value = "0.02", "8"
     page.start()
@@ -185,7 +185,7 @@ def test_identify(board: Dashboard, loop: Any) -> None:
 
 def test_tune(board: Dashboard, loop: Any) -> None:
     board.pages.current = "tune"
-    page = board.pages.made["tune"]
+    page = board.pages.by_name["tune"]
     assert isinstance(page, TunePage)
     page.observer.value, page.evaluations.value = "kf-lgs", "4"
     page.start()
@@ -253,7 +253,7 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
     dashboard.pages.current = "identify"
     dashboard.actions.handle({"action": "page", "name": "Model as TOML"})
     assert dashboard.actions.toolbar.notes == ["Model as TOML: there is none yet."]
-    page: Any = dashboard.pages.made["identify"]
+    page: Any = dashboard.pages.by_name["identify"]
     page.start()
     loop.until(lambda: page.work.state != RUNNING, 120)
     files = saved(dashboard, loop, sent)
@@ -263,7 +263,7 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
     )
 
     dashboard.pages.current = "tune"
-    page = dashboard.pages.made["tune"]
+    page = dashboard.pages.by_name["tune"]
     page.observer.value, page.evaluations.value = "kf-lgs", "3"
     page.start()
     loop.until(lambda: page.work.state != RUNNING, 120)
@@ -274,7 +274,7 @@ def test_what_pages_have_found_is_saved(dashboard: Dashboard, loop: Any, sent: l
     assert tomllib.loads(files["wfsobs-tuned.toml"].decode()) == page.work.result.scenario.to_dict()
 
     dashboard.pages.current = "loop"
-    page = dashboard.pages.made["loop"]
+    page = dashboard.pages.by_name["loop"]
     loop.until(lambda: page.results is not None and page.results.complete, 120)
     files = saved(dashboard, loop, sent)
     table = [*csv.DictReader(io.StringIO(files["wfsobs-controllers.csv"].decode()))]

@@ -200,7 +200,7 @@ class TestGain:
     @pytest.fixture
     def gain(self, dashboard: Dashboard, loop: Any) -> GainEditor:
         dashboard.pages.current = LOOP
-        page = dashboard.pages.made[LOOP]
+        page = dashboard.pages.by_name[LOOP]
         loop.until(lambda: page.results is not None and page.results.complete)
         assert page.editor is None, "made when first wanted"
         dashboard.display.editing = True

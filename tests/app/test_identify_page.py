@@ -44,7 +44,7 @@ def short(short: Scenario) -> Scenario:
 def page(dashboard: Dashboard, loop: Any) -> IdentifyPage:
     """The page, the record measured."""
     dashboard.pages.current = IDENTIFY
-    page = dashboard.pages.made[IDENTIFY]
+    page = dashboard.pages.by_name[IDENTIFY]
     assert isinstance(page, IdentifyPage)
     loop.until(lambda: page.of is not None)
     return page
@@ -85,7 +85,7 @@ def test_it_shows_what_the_core_finds(page: IdentifyPage, dashboard: Dashboard, 
 
 def the_line_stands_as_high_as_the_measured_spectrum(page: IdentifyPage) -> None:
     """Up to what falls between two bins (0.9 dB of a taper that is nearly a rectangle: at most a factor 2.5) and noise."""
-    spikes, known = page.figure.spikes.data, page.figure.measured.data
+    spikes, known = page.figure.spikes.data, page.figure.measurement.data
     (at,) = np.asarray(spikes["x"])
     near = np.abs(np.asarray(known["x"]) - at) < 1.0
     ratio = np.asarray(known["highest"])[near].max() / np.asarray(spikes["high"])[0]

@@ -23,7 +23,7 @@ from wfsobs.scenario import Scenario
 
 def opened(dashboard: Dashboard, name: str) -> Any:
     dashboard.pages.current = name
-    return dashboard.pages.made[name]
+    return dashboard.pages.by_name[name]
 
 
 class Checker(HTMLParser):
@@ -60,7 +60,7 @@ def seen(dashboard: Dashboard) -> list[str]:
 
 class TestPages:
     def test_nothing_is_made_before_it_is_opened(self, dashboard: Dashboard) -> None:
-        assert list(dashboard.pages.made) == [EXPLORE]
+        assert list(dashboard.pages.by_name) == [EXPLORE]
         assert seen(dashboard) == [EXPLORE]
 
     def test_turning(self, dashboard: Dashboard) -> None:

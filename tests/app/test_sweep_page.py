@@ -39,7 +39,7 @@ WIND, RATIO = "turbulence.wind_speed", "sensors.exposure_ratio"
 @pytest.fixture
 def page(dashboard: Dashboard) -> SweepPage:
     dashboard.pages.current = SWEEP
-    page = dashboard.pages.made[SWEEP]
+    page = dashboard.pages.by_name[SWEEP]
     assert isinstance(page, SweepPage)
     return page
 

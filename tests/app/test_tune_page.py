@@ -30,7 +30,7 @@ from wfsobs.tuning.judge import Errors
 @pytest.fixture
 def page(dashboard: Dashboard) -> TunePage:
     dashboard.pages.current = TUNE
-    page = dashboard.pages.made[TUNE]
+    page = dashboard.pages.by_name[TUNE]
     assert isinstance(page, TunePage)
     page.observer.value, page.evaluations.value = "kf-lgs", "8"
     return page
@@ -91,7 +91,7 @@ def using_it_leaves_the_other_settings(page: TunePage, dashboard: Dashboard, fou
 
 def test_a_gpr_and_its_likelihood(page: TunePage, dashboard: Dashboard, loop: Any) -> None:
     page.observer.value, page.evaluations.value = "gpr-offline", "3"
-    assert page.target.options == ["vibration"] and "gpr_offline.noise_std" in page.searched.object
+    assert page.target.options == ["vibration"] and "gpr_offline.noise_std" in page.search_space.object
     found = tuned(page, loop)
     assert found.before.likelihood and found.after.likelihood
     cells = row(page.table.object, "likelihood", "tilt")

@@ -83,7 +83,7 @@ class Actions:
     def attach(self, pages: Pages, seeds: SeedRuns) -> None:
         """Watch the pages: the one that is shown says what is copied and saved; seeds : what a report says of further seeds."""
         self._pages, self._seeds = pages, seeds
-        self._watched: set[str] = set()
+        self._watched_pages: set[str] = set()
         pages.param.watch(self._turn, "current")
 
     def follow_view(self, state: ViewState) -> None:
@@ -98,13 +98,13 @@ class Actions:
 
     @property
     def _offers(self) -> PageActions | None:
-        page = self._pages and self._pages.made.get(self._pages.current)
+        page = self._pages and self._pages.by_name.get(self._pages.current)
         return page if isinstance(page, PageActions) else None
 
     def _turn(self, _event: object) -> None:
         page = self._offers
-        if page is not None and self._pages is not None and self._pages.current not in self._watched:
-            self._watched.add(self._pages.current)
+        if page is not None and self._pages is not None and self._pages.current not in self._watched_pages:
+            self._watched_pages.add(self._pages.current)
             for field in page.inputs:
                 field.param.watch(self._refresh, "value")
         self.toolbar.saves = [*page.saves()] if page else []

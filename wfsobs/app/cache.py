@@ -74,32 +74,32 @@ class Cache(Generic[T]):
 
     def __init__(self, most_bytes: int):
         self.most_bytes = most_bytes
-        self._kept: LRUCache[Hashable, T] = LRUCache(most_bytes, size_of)
+        self._entries: LRUCache[Hashable, T] = LRUCache(most_bytes, size_of)
         self._lock = threading.Lock()
 
     def get(self, key: Hashable) -> T | None:
         """Return the value under a key, or None."""
         with self._lock:
-            return self._kept.get(key)
+            return self._entries.get(key)
 
     def put(self, key: Hashable, value: T) -> T:
         """Keep a value, in place of the least wanted ones; gives it back, its arrays read-only."""
         freeze(value)
         with self._lock, suppress(ValueError):  # larger than all that is kept
-            self._kept.pop(key, None)
-            self._kept[key] = value
+            self._entries.pop(key, None)
+            self._entries[key] = value
         return value
 
     def __contains__(self, key: Hashable) -> bool:
         with self._lock:
-            return key in self._kept
+            return key in self._entries
 
     def __len__(self) -> int:
         with self._lock:
-            return len(self._kept)
+            return len(self._entries)
 
     @property
     def bytes(self) -> int:
         """Of arrays that are kept."""
         with self._lock:
-            return int(self._kept.currsize)
+            return int(self._entries.currsize)

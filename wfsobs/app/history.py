@@ -45,7 +45,7 @@ class History(param.Parameterized):
         self.open_view: Callable[[str], Any] = lambda _query: None
         self._query = ""
         self._view_to_open = "", ""  # key of the results to wait for, and the view
-        self._shown: Step | None = None
+        self._shown_step: Step | None = None
         self._deletions: list[HistoryEntry] = []
         self.task = BackgroundTask(store.session)
         # After the store, which says what is stale, and the figures; before "Done" is said.
@@ -76,12 +76,12 @@ class History(param.Parameterized):
         entry = make_entry(step, "", results)
         known = self.find(entry.key)
         if known is None:
-            entry.name, known = name_of_change(self._shown, step), entry
+            entry.name, known = name_of_change(self._shown_step, step), entry
         else:
             known.time = entry.time
             known.scores, known.source = entry.scores or known.scores, entry.source
         known.results, known.view = results or known.results, self._query
-        self._shown = step
+        self._shown_step = step
         if results is not None:
             self.current = known.key
         self._put([known, *(e for e in self.entries if e is not known)])

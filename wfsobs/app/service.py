@@ -111,19 +111,19 @@ class Session:
         self.service, self.number = service, number
         self.post: Post = lambda function: function()
         self.tasks: list[BackgroundTask] = []
-        self.closed = False
+        self.is_closed = False
         self._since = monotonic()
 
     def submit(self, job: Job, listener: Listener, before: Callable[[], None] = lambda: None) -> Callable[[], None]:
         """Have a job done when its turn comes, in place of the one before; how to take it back."""
-        if self.closed:
+        if self.is_closed:
             return lambda: None
         return self.service.queue.submit(job, self.number, listener, before)
 
     def leave(self) -> None:
         """Close the session, and cancel its jobs."""
-        if not self.closed:
-            self.closed = True
+        if not self.is_closed:
+            self.is_closed = True
             for task in self.tasks:
                 task.close()
             self.service.end_session()

@@ -43,7 +43,7 @@ class Store(param.Parameterized):
         super().__init__(scenario=scenario or PRESETS[next(iter(PRESETS))]())
         self.session, self.limits = session, session.service.limits
         session.post = post
-        self._refused: dict[str, Any] = {}
+        self._refusals: dict[str, Any] = {}
         self._past: list[Step] = []
         self._future: list[Step] = []
         self.run = BackgroundTask(session)
@@ -96,7 +96,7 @@ class Store(param.Parameterized):
         Values refused before are tried again with it, so that settings that only go together can be given
         one by one. Returns whether the value was accepted.
         """
-        waiting = {p: v for p, v in self._refused.items() if not _covers(path, p)}
+        waiting = {p: v for p, v in self._refusals.items() if not _covers(path, p)}
         reason = ""
         for changes in ({**waiting, path: value}, {path: value}) if waiting else ({path: value},):
             try:
@@ -107,7 +107,7 @@ class Store(param.Parameterized):
             else:
                 self._accept((fresh, self.preset, self.source), {p: v for p, v in waiting.items() if p not in changes})
                 return True
-        self._refused = {**waiting, path: value}
+        self._refusals = {**waiting, path: value}
         self.errors = {p: e for p, e in self.errors.items() if p in waiting} | {path: reason}
         return False
 
@@ -166,7 +166,7 @@ class Store(param.Parameterized):
         if step and not (unchanged and stays and preset == self.preset):
             self._past = _of_one_file([*self._past, self.step], source)[-STEPS_BACK:]
             self._future = []
-        self._refused = refusals
+        self._refusals = refusals
         errors = {path: reason for path, reason in self.errors.items() if path in refusals}
         self.param.update(
             scenario=self.scenario if unchanged else scenario,

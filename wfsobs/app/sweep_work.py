@@ -34,13 +34,13 @@ class SweepTask(BackgroundTask):
     def __init__(self, session: Session):
         super().__init__(session)
         self._one = BackgroundTask(session)
-        self._cell, self._base_key, self._begun = 0, "", 0.0
+        self._cell, self._base_key, self._start = 0, "", 0.0
         self._one.param.watch(self._take, ["state", "place"])
 
     def begin(self, sweep: Sweep) -> None:
         """Run a sweep, in place of the one before."""
         self.close()
-        self._base_key, self._begun = key_of(sweep.base), monotonic()
+        self._base_key, self._start = key_of(sweep.base), monotonic()
         self.param.update(state=RUNNING, progress=0.0, place=0, message="", result=SweepResults(sweep))
         self._go_on()
 
@@ -52,7 +52,7 @@ class SweepTask(BackgroundTask):
     @property
     def seconds_left(self) -> float:
         """Time that the rest takes at the rate so far [s]; 0 where nothing is known of it."""
-        return (monotonic() - self._begun) * (1.0 / self.progress - 1.0) if self.progress else 0.0
+        return (monotonic() - self._start) * (1.0 / self.progress - 1.0) if self.progress else 0.0
 
     def _go_on(self) -> None:
         results: SweepResults = self.result

@@ -131,7 +131,7 @@ class _Work:
         self.bounds: _Bounds | None = None
         self.growing: dict[Key, Array] = {}  # written to by the observers' threads
         self.spectra: dict[Key, SignalAndError] = {}
-        self.started = self.told = self.delivered = perf_counter()
+        self.start_time = self.report_time = self.delivery_time = perf_counter()
         self.news = False  # since the last delivery
         self.fraction = 0.0
         self.lock, self.telling = threading.Lock(), threading.Lock()
@@ -146,11 +146,11 @@ class _Work:
             record = self.source.make(self.watch, self.memo)
             stated = as_stated(record, stated)
             stated.validate()
-        self.record, self.known = record, RecordMemo(self.memo, record)
+        self.record, self.known_estimates = record, RecordMemo(self.memo, record)
         self.bounds = self.memo.get(self._name_of_bounds(record)) if self.simulation is not None else _Bounds()
         self._add_truth(record)
         handed_over = False  # the quick ones
-        for item in each_estimate(record, stated, self.watch, on_partial=self._grow, memo=self.known):
+        for item in each_estimate(record, stated, self.watch, on_partial=self._grow, memo=self.known_estimates):
             with self.lock:
                 if isinstance(item, Failure):
                     self.failures.append(item)
@@ -190,27 +190,27 @@ class _Work:
             sleep(0.01)
 
     def _deliver(self, record: Record) -> RunResults:
-        self.delivered, self.news = perf_counter(), False
+        self.delivery_time, self.news = perf_counter(), False
         return self._so_far(record)
 
     def _so_far(self, record: Record) -> RunResults:
         least = self.bounds or ()
         result = collect(self.scenario, record, self.estimates, self.failures, least=least)
         partial = {key: values.copy() for key, values in self.growing.items()}
-        ran = tuple(name for name in OBSERVERS if name not in self.known.reused)
-        return RunResults(result, partial, dict(self.spectra), perf_counter() - self.started, self.source, least, ran)
+        ran = tuple(name for name in OBSERVERS if name not in self.known_estimates.known_observers)
+        return RunResults(result, partial, dict(self.spectra), perf_counter() - self.start_time, self.source, least, ran)
 
     def _progress(self, fraction: float) -> None:
         """Take the progress of the observers; called from any of their threads."""
         with self.telling:  # one after the other, or a report could arrive before one that it was made after
             with self.lock:
                 now = perf_counter()
-                if now - self.told < INTERVAL or self.record is None:
+                if now - self.report_time < INTERVAL or self.record is None:
                     return
-                self.told = now
+                self.report_time = now
                 self.fraction = fraction = max(self.fraction, fraction)  # modes at work in parallel overtake each other
                 shown = None
-                if self.news and now - self.delivered >= DELIVERY_INTERVAL:
+                if self.news and now - self.delivery_time >= DELIVERY_INTERVAL:
                     shown = self._deliver(self.record)
             self.report(fraction)
             if shown is not None:
@@ -240,7 +240,7 @@ class _Work:
     def _spectrum(self, record: Record, target: str, values: Array) -> SignalAndError | None:
         """Over the samples that count for the scores; None where there are too few."""
         warm_up = self.scenario.run.warm_up
-        name = digest("spectra", self.known.record, target, values, warm_up)
+        name = digest("spectra", self.known_estimates.record, target, values, warm_up)
         known = self.memo.get(name)
         if known is None:
             found = spectra(record, target, values, warm_up)

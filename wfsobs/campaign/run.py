@@ -130,7 +130,7 @@ class _Batches:
         self.plan, self.todo, self.folder = plan, todo, folder
         self.position = 0
         self.again: list[Batch] = []
-        self.spent, self.expected = 0.0, 0.0
+        self.actual_seconds, self.expected_seconds = 0.0, 0.0
         self._cost: dict[int, float] = {}
 
     def __iter__(self) -> Iterator[Batch]:
@@ -143,7 +143,7 @@ class _Batches:
         if self.position >= len(self.todo):
             raise StopIteration
         runs: list[tuple[Cell, int]] = []
-        seconds, speed = 0.0, self.spent / self.expected if self.expected else 1.0
+        seconds, speed = 0.0, self.actual_seconds / self.expected_seconds if self.expected_seconds else 1.0
         while self.position < len(self.todo) and len(runs) < MOST_RUNS and (not runs or seconds < BATCH):
             cell, seed = divmod(int(self.todo[self.position]), len(self.plan.seeds))
             seconds += speed * self.cost(cell)
@@ -153,8 +153,8 @@ class _Batches:
 
     def learn(self, batch: Batch, summary: Summary) -> None:
         """Correct the expected times by that of a batch."""
-        self.spent += summary.seconds
-        self.expected += sum(self.cost(cell.index) for cell, _ in batch.runs)
+        self.actual_seconds += summary.seconds
+        self.expected_seconds += sum(self.cost(cell.index) for cell, _ in batch.runs)
 
     def cost(self, cell: int) -> float:
         """Return the expected time of a run [s]."""

@@ -33,14 +33,14 @@ class OverTime:
             )
         self.scenario, self.window = scenario, window
         self.rows: list[Row] = []
-        self._pooled: dict[tuple[str, str], PooledRms] = {}
+        self._pools: dict[tuple[str, str], PooledRms] = {}
 
     def add(self, result: Result, seed: int) -> None:
         """One more run."""
         every = max(round(self.window / result.record.dt), 1)
         for e in result.estimates:
             running = running_rms(result.record, e, self.window)
-            self._pooled.setdefault((e.observer, e.target), PooledRms()).add(running)
+            self._pools.setdefault((e.observer, e.target), PooledRms()).add(running)
             for mode, column in zip(self.scenario.modes, running[every - 1 :: every].T, strict=False):
                 self.rows += [
                     {
@@ -62,7 +62,7 @@ class OverTime:
         """(target, mode, observer, pooled running rms (n_steps,)) in the order of targets and modes."""
         found = [
             (target, i, observer, pool.rms[:, i])
-            for (observer, target), pool in self._pooled.items()
+            for (observer, target), pool in self._pools.items()
             for i in range(pool.rms.shape[1])
         ]
         modes = self.scenario.modes

@@ -107,14 +107,14 @@ class VibrationPredictor:
         self._taps = plant.mirror.taps
         self._bank = StreamingBank(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, plant.dt))
         self._regression = LateRegression(g.depth, g.training_size, 1, kernel_of(g), late=self._taps.size - 2)
-        self._filtered = np.zeros(self._taps.size - 1)  # newest first; of step k it tells phi_vib[k-1]
+        self._band_signal = np.zeros(self._taps.size - 1)  # newest first; of step k it tells phi_vib[k-1]
 
     def step(self, z: float) -> float:
         """Prediction [um] of the vibration while the command of this step acts; NaN until the training set is full."""
-        self._filtered = np.roll(self._filtered, 1)
-        self._filtered[0] = self._bank.push(z)
+        self._band_signal = np.roll(self._band_signal, 1)
+        self._band_signal[0] = self._bank.push(z)
         # of the window that ended as many steps ago as there are taps after the first
-        target = self._taps[1:] @ self._filtered[::-1]
+        target = self._taps[1:] @ self._band_signal[::-1]
         value = self._regression.predict(self._inputs.step(np.array([z])), float(target))
         self._regression.update()
         self._bank.settle()

@@ -52,7 +52,7 @@ class StepController:
         n = sampling.n_modes
         self._lgs, self._ngs, self._ratio = lgs, ngs, sampling.ratio or 0
         self._taps = plant.mirror.taps[1:]
-        self._sent = np.zeros((len(self._taps), n))  # commands, newest first
+        self._commands = np.zeros((len(self._taps), n))  # commands, newest first
         self._mirror = np.zeros((max(self._ratio, 1), n))  # the mirror in the last measurements, newest first
         self._nothing, self._none = np.full(n, np.nan), np.zeros(n)
         self.bridges = lgs, ngs
@@ -85,7 +85,7 @@ class StepController:
         y, is_whole = check_frame(self.id, y, "y", self.sampling.n_modes, self.frame)
         due = self._ngs is not None and self.frame > 0 and self.frame % self._ratio == 0
         slow = None if self._ngs is None else self._check_ngs(ngs, due)
-        seen = self._taps @ self._sent
+        seen = self._taps @ self._commands
         z = self._lgs.complete(y - seen, is_whole)
         if self._ngs is not None:
             push_row(self._mirror, seen)
@@ -98,7 +98,7 @@ class StepController:
         if self.law is not None:
             u = self._clip(self.law.command(z, slow, forward))
             self.law.tell(u, forward)
-        push_row(self._sent, u)
+        push_row(self._commands, u)
         self.frame += 1
         return u
 
@@ -110,20 +110,20 @@ class StepController:
     def reset(self) -> None:
         """Go back to before the first frame, the mirror at rest."""
         self.frame = 0
-        self._sent[...] = self._mirror[...] = 0.0
+        self._commands[...] = self._mirror[...] = 0.0
         for part in self._parts.values():
             part.reset()
 
     def state_dict(self) -> dict[str, Array]:
         """Return a copy of the state: name -> array, plain numbers that `numpy.savez` can keep."""
-        own = {"frame": np.array(self.frame), "sent": self._sent.copy(), "mirror": self._mirror.copy()}
+        own = {"frame": np.array(self.frame), "sent": self._commands.copy(), "mirror": self._mirror.copy()}
         return own | save_parts(self._parts)
 
     def load_state_dict(self, state: Mapping[str, ArrayLike]) -> None:
         """Go on from a state of `state_dict`. Raises StepError where it is that of another design."""
         given = check_state(self.id, state, self.state_dict())
         self.frame = int(given["frame"])
-        self._sent[...], self._mirror[...] = given["sent"], given["mirror"]
+        self._commands[...], self._mirror[...] = given["sent"], given["mirror"]
         load_parts(self._parts, given)
 
     def take_over(self, old: StepController) -> None:
@@ -139,7 +139,7 @@ class StepController:
         StepError
             Another controller, sampling or delay, or a state that cannot be carried over.
         """
-        if old.id != self.id or old.sampling != self.sampling or old._sent.shape != self._sent.shape:
+        if old.id != self.id or old.sampling != self.sampling or old._commands.shape != self._commands.shape:
             raise StepError(f"{self.id}: takes over from a design of the same controller, sampling and delay, not from {old.id}")
         if self.law is not None:
             self.law.take_over(old.law)
@@ -150,14 +150,14 @@ class StepController:
         self._lgs.take_over(old._lgs)
         if self._ngs is not None and old._ngs is not None:
             self._ngs.take_over(old._ngs)
-        self._sent[...], self._mirror[...], self.frame = old._sent, old._mirror, old.frame
+        self._commands[...], self._mirror[...], self.frame = old._commands, old._mirror, old.frame
 
     def _clip(self, command: Array) -> Array:
         """Return the commands nearest to these within the limits of the mirror."""
         mirror = self.plant.mirror
         if not mirror.has_limits:
             return command
-        last = self._sent[0]
+        last = self._commands[0]
         return np.clip(np.clip(command, last - mirror.slew, last + mirror.slew), -mirror.stroke, mirror.stroke)
 
     def _check_ngs(self, ngs: ArrayLike | None, due: bool) -> Array | None:

@@ -96,7 +96,7 @@ class StepObserver:
             self._ngs = None
         found = {id: estimator, "lgs": self._lgs, "ngs": self._ngs}
         self._parts: dict[str, Stateful] = {name: part for name, part in found.items() if part is not None}
-        self._allowed: set[tuple[float, str]] = set()
+        self._allowed_requests: set[tuple[float, str]] = set()
         self._nothing = np.full(sampling.n_modes, np.nan)
 
     def update(self, z: ArrayLike, ngs: ArrayLike | None = None, u: ArrayLike | None = None) -> None:
@@ -157,7 +157,7 @@ class StepObserver:
         """
         if target is None:
             target = self._only_target()
-        if (frames, target) not in self._allowed:
+        if (frames, target) not in self._allowed_requests:
             self._check_request(frames, target)
         return self.estimator.predict(frames, target) if self.frame else (self._nothing, self._nothing)
 
@@ -224,7 +224,7 @@ class StepObserver:
             raise StepError(
                 f"{self.id}: designed for {own:g} frames ahead; design it with horizon = {frames:g} for predict({frames:g})"
             )
-        self._allowed.add((frames, target))
+        self._allowed_requests.add((frames, target))
 
     def _only_target(self) -> str:
         if len(self.targets) != 1:

@@ -43,7 +43,7 @@ class Windows:
         self._samples = np.zeros((n, 4 * depth))  # newest last; moved to the front at the end
         self._end = depth
         self._past = np.zeros((sampling.delay, sampling.n_modes))  # commands, newest first
-        self._held = np.zeros(sampling.n_modes)
+        self._held_value = np.zeros(sampling.n_modes)
         self._sample = np.zeros(n)
 
     @property
@@ -56,7 +56,7 @@ class Windows:
         sample = self._sample
         if self.needs_command:
             assert u is not None
-            held, past = self._held, self._past
+            held, past = self._held_value, self._past
             np.copyto(held, u, where=~np.isnan(u))
             sample[::2] = held
             sample[1::2] = z + past[-1]
@@ -80,7 +80,7 @@ class Windows:
 
     def reset(self) -> None:
         """Set the state back to the start."""
-        for x in (self._samples, self._past, self._held):
+        for x in (self._samples, self._past, self._held_value):
             x[...] = 0.0
         self.count, self._end = 0, self.depth
         if self._inputs is not None:
@@ -92,7 +92,7 @@ class Windows:
         return {
             "window": self.window.copy(),
             "past": self._past.copy(),
-            "held": self._held.copy(),
+            "held": self._held_value.copy(),
             "count": np.array(self.count),
             **more,
         }
@@ -101,7 +101,7 @@ class Windows:
         """Take over a state."""
         self._end, self.count = self.depth, int(state["count"])
         self._samples[:, : self.depth] = state["window"]
-        self._past[...], self._held[...] = state["past"], state["held"]
+        self._past[...], self._held_value[...] = state["past"], state["held"]
         if self._inputs is not None:
             self._inputs.load(state)
 
@@ -113,7 +113,7 @@ class Windows:
         self._end = self.depth
         self._samples[:, self.depth - n : self.depth] = old.window[:, old.depth - n :]
         self.count = min(old.count, n) if self.depth > old.depth else old.count
-        self._past[...], self._held[...] = old._past, old._held
+        self._past[...], self._held_value[...] = old._past, old._held_value
         if self._inputs is not None and old._inputs is not None:
             self._inputs.load(old._inputs.save(len(self._sample)))
 

@@ -60,7 +60,7 @@ class ShackHartmann:
         self.reconstructor = reconstructor(lenslets, self.order)[[j - 2 for j in self.nolls]]
         weights = lenslets.spread(np.concatenate(np.split(self.reconstructor, 2, axis=1)))
         self._sums = TrigonometricSum(weights)
-        self._known: tuple[Wave, float, Array] | None = None
+        self._memory: tuple[Wave, float, Array] | None = None
 
     @property
     def n_outputs(self) -> int:
@@ -114,10 +114,10 @@ class ShackHartmann:
 
         The last one is cached: guide stars at one height differ in their shifts alone.
         """
-        known = self._known  # another thread may replace it
+        known = self._memory  # another thread may replace it
         if known is None or known[0] is not wave or known[1] != scale:
             x, y = replace(wave, kx=kx).in_pupil()
             made = self.transform(scale * x, scale * y)
             known = wave, scale, np.moveaxis(made, 2, 0).astype(np.complex64, order="C")
-            self._known = known
+            self._memory = known
         return known[2]

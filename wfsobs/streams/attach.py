@@ -83,7 +83,7 @@ class Attachment:
         self._elements, n = np.array(wiring.elements), len(wiring.elements)
         self._watchdog = Watchdog(n, wiring.safety, say, wiring.warm_up)
         self._semaphore = None if wiring.semaphore is None else source.semaphore(wiring.semaphore)
-        self._expected, self._band = np.full(n, np.nan), np.full(n, np.nan)
+        self._expectation, self._band = np.full(n, np.nan), np.full(n, np.nan)
         self._missing = np.full(n, np.nan)
         self._out = np.zeros(sink.n if sink is not None else 0)
         self._count, self._alive = source.first, 0.0
@@ -150,7 +150,7 @@ class Attachment:
         for _ in range(lost):
             self._observer.update(self._missing)
         z = values[self._elements] * self._wiring.unit
-        error = z - self._expected if not lost else self._missing
+        error = z - self._expectation if not lost else self._missing
         estimate = self._step(np.where(np.isfinite(z), z, np.nan))
         self._send(self._watchdog.output(estimate, error, self._band, lost))
         self.tally.add(arrival, monotonic(), lost, z, error)
@@ -167,7 +167,7 @@ class Attachment:
         """Keep what the next measurement should be, and how sure that is: the deviations of the parts added up."""
         parts = [self._observer.predict(0, target) for target in self._observer.targets] if self._predicts_next else []
         if parts:
-            self._expected = sum((mean for mean, _ in parts), np.zeros_like(self._missing))
+            self._expectation = sum((mean for mean, _ in parts), np.zeros_like(self._missing))
             self._band = sum((sd for _, sd in parts), self._wiring.noise)
 
     @property
@@ -199,7 +199,7 @@ class Attachment:
 
     def _start_anew(self, count: int, reason: str) -> None:
         self._observer.reset()
-        self._expected = np.full_like(self._expected, np.nan)
+        self._expectation = np.full_like(self._expectation, np.nan)
         self._count = count
         self._say(reason)
         self._watchdog.fall_back(reason)

@@ -18,7 +18,7 @@ class _Span:
     """What is counted over a stretch of time."""
 
     def __init__(self) -> None:
-        self.frames = self.missing = self.late = self.scored = 0
+        self.frames = self.missing = self.late = self.n_scored = 0
         self.latencies = np.zeros(len(BINS) + 1, dtype=np.int64)
         self.error = self.size = 0.0
 
@@ -31,7 +31,7 @@ class _Span:
 
     def rms(self, squares: float) -> float | None:
         """Return the rms of a sum of squares [nm]."""
-        return round(1e3 * float(np.sqrt(squares / self.scored)), 3) if self.scored else None
+        return round(1e3 * float(np.sqrt(squares / self.n_scored)), 3) if self.n_scored else None
 
 
 class Tally:
@@ -63,7 +63,7 @@ class Tally:
             span.missing += missing
             span.late += late
             span.latencies[np.searchsorted(BINS, end - arrival)] += 1
-            span.scored += int(known.sum())
+            span.n_scored += int(known.sum())
             span.error += float((error[known] ** 2).sum())
             span.size += float((z[known] ** 2).sum())
         self._first, self._last = self._first or arrival, arrival

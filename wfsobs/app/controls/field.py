@@ -24,12 +24,12 @@ TAG = "setting:"
 class Field:
     """The widgets of one setting; `view` is what the page shows."""
 
-    helped = False
+    has_help = False
     """Whether its box has a line of help, which says why it has no effect; else a line below does."""
 
     def __init__(self, store: Store, path: str, p: param.Parameter):
         self.store, self.path, self.parameter = store, path, p
-        self.idle = self._noted = ""
+        self.idle = self._note_html = ""
         self.widgets = self._widgets()
         self.view = pn.Column(self._row(), sizing_mode="stretch_width", margin=0)
         self.refresh()
@@ -40,7 +40,7 @@ class Field:
         reason = self.store.errors.get(self.path, "")
         if not reason:
             self.show(self.store.value(self.path))
-        self._note(error_html(name_settings(reason)) or ("" if self.helped else idle_html(self.idle)))
+        self._note(error_html(name_settings(reason)) or ("" if self.has_help else idle_html(self.idle)))
         for widget in self.widgets:
             if "error_state" in widget.param:
                 widget.error_state = bool(reason)
@@ -51,14 +51,14 @@ class Field:
             self.idle = why
             for widget in self.widgets:
                 widget.disabled = bool(why)
-            if self.helped:
+            if self.has_help:
                 self.widgets[-1].helper_text = why
             self.refresh()
 
     def _note(self, html: str) -> None:
         """Show a line below the widgets; none where it is empty."""
-        if html != self._noted:
-            self._noted = html
+        if html != self._note_html:
+            self._note_html = html
             self.view[1:] = [pn.pane.HTML(html, margin=(0, 0, 6, 0))] if html else []
 
     def show(self, value: Any) -> None:

@@ -51,7 +51,7 @@ def parse_number(text: str) -> float | str:
 class ChoiceField(Field):
     """One of several words."""
 
-    helped = True
+    has_help = True
 
     def _widgets(self) -> list[Any]:
         select = pmui.Select(options=list(self.parameter.objects), size="small", sx=HELP, **self._names(), **ROOM)
@@ -79,7 +79,7 @@ class SwitchField(Field):
 class TextField(Field):
     """A number, typed."""
 
-    helped = True
+    has_help = True
 
     def _widgets(self) -> list[Any]:
         return [self._text(sx=HELP, **self._names(), **ROOM)]
@@ -127,7 +127,7 @@ class NumbersField(TextField):
 class SliderField(TextField):
     """A number with a usual range: a slider over that range, and the number itself to type."""
 
-    helped = False
+    has_help = False
     _value: Any = None
     """What the slider stands at, as far as it has said or was told."""
 

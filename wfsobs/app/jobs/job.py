@@ -73,8 +73,8 @@ class Job:
         self._level = logging.DEBUG if quiet else logging.INFO
         self._lock = threading.RLock()  # where a session has no thread of its own, a listener may leave
         self._listeners: dict[Listener, Hashable] = {}
-        self._unwanted = False
-        self._known: dict[str, Any] = {}
+        self._is_unwanted = False
+        self._state: dict[str, Any] = {}
 
     @property
     def owner(self) -> Hashable:
@@ -85,30 +85,30 @@ class Job:
     def join(self, owner: Hashable, listener: Listener) -> bool:
         """One more who wants the result, told at once what is known; false where the job has been given up."""
         with self._lock:
-            if self._unwanted:
+            if self._is_unwanted:
                 return False
             self._listeners[listener] = owner
-            if self._known:
-                listener(dict(self._known))
+            if self._state:
+                listener(dict(self._state))
             return True
 
     def leave(self, listener: Listener) -> bool:
         """One less; whether nobody is left, and the job told to stop."""
         with self._lock:
             self._listeners.pop(listener, None)
-            self._unwanted = not self._listeners
-            return self._unwanted
+            self._is_unwanted = not self._listeners
+            return self._is_unwanted
 
     def tell(self, **news: Any) -> None:
         """Tell all who listen."""
         with self._lock:
-            self._known |= news
+            self._state |= news
             for listener in [*self._listeners]:
                 listener(news)
 
     def tell_place(self, place: int) -> None:
         """Its place in the line may have changed."""
-        if self._known.get("place", 0) != place:
+        if self._state.get("place", 0) != place:
             self.tell(place=place)
 
     def run(self, closing: Callable[[], bool], keep: Callable[[str, Any], Any], busy: Callable[[], bool] = lambda: False) -> bool:
@@ -133,7 +133,7 @@ class Job:
                 self.tell(progress=min(max(fraction, 0.0), 1.0))
 
         def stopped() -> bool:
-            return self._unwanted or closing()
+            return self._is_unwanted or closing()
 
         gave_way = False
 

@@ -37,9 +37,9 @@ class JobQueue:
         self.closing = False
         self._waiting: list[Job] = []
         self._running: list[Job] = []
-        self._shared: dict[str, Job] = {}
+        self._shared_jobs: dict[str, Job] = {}
         self._turn = 0  # the latest that has begun
-        self._changed = threading.Condition()
+        self._change = threading.Condition()
         self._timers: dict[Job, threading.Timer] = {}
         self._threads = [threading.Thread(target=self._work, name=f"wfsobs-work-{i}", daemon=True) for i in range(workers)]
         for thread in self._threads:
@@ -52,9 +52,9 @@ class JobQueue:
 
         before : takes back what this replaces; that would end the same job if it were done any sooner
         """
-        with self._changed:
+        with self._change:
             found = self.cache.get(job.key) if job.key else None
-            shared = self._shared.get(job.key) if found is None else None
+            shared = self._shared_jobs.get(job.key) if found is None else None
             joined = shared is not None and shared.join(owner, listener)
             if job.key:
                 how = "hit" if found is not None else "joined" if joined else "miss"
@@ -75,7 +75,7 @@ class JobQueue:
             job.tell(state=CANCELLED)
             return
         if job.key:
-            self._shared[job.key] = job
+            self._shared_jobs[job.key] = job
         if job.wait_limit < math.inf:
             self._timers[job] = threading.Timer(job.wait_limit, self._overdue, (job,))
             self._timers[job].daemon = True
@@ -83,23 +83,23 @@ class JobQueue:
         owner = job.owner
         job.turn = max([self._turn, *(other.turn + 1 for other in self._requests if other.owner == owner)])
         self._waiting.append(job)
-        self._changed.notify_all()
+        self._change.notify_all()
         self._tell_places()
 
     def _leave(self, job: Job, listener: Listener) -> None:
         if job.leave(listener):
-            with self._changed:
+            with self._change:
                 self._take_out(job)
 
     def _overdue(self, job: Job) -> None:
-        with self._changed:
+        with self._change:
             if self._take_out(job):
                 job.tell(state=FAILED, message=f"the server is busy: no turn within {job.wait_limit:g} s, try again")
 
     def _take_out(self, job: Job) -> bool:
         """Out of the line and of what is shared; whether it was in the line."""
-        if self._shared.get(job.key) is job:
-            del self._shared[job.key]
+        if self._shared_jobs.get(job.key) is job:
+            del self._shared_jobs[job.key]
         if job not in self._waiting:
             return False
         self._waiting.remove(job)
@@ -116,23 +116,23 @@ class JobQueue:
     @property
     def length(self) -> int:
         """How many wait."""
-        with self._changed:
+        with self._change:
             return len(self._waiting)
 
     @property
     def running(self) -> int:
         """How many are being done."""
-        with self._changed:
+        with self._change:
             return len(self._running)
 
     def close(self, timeout: float) -> bool:
         """Start nothing any more, and wait [s] for what is being done; whether all of that has ended."""
-        with self._changed:
+        with self._change:
             self.closing = True
             for job in [*self._waiting]:
                 self._take_out(job)
                 job.tell(state=CANCELLED)
-            self._changed.notify_all()
+            self._change.notify_all()
         end = monotonic() + timeout
         for thread in self._threads:
             thread.join(max(end - monotonic(), 0.0))
@@ -147,19 +147,19 @@ class JobQueue:
             except Exception:  # a bug, but the thread is for all
                 log.exception("a job failed")
             finally:
-                with self._changed:
+                with self._change:
                     self._running.remove(job)
                     if again:
                         self._waiting.append(job)
                     else:
                         self._take_out(job)
-                    self._changed.notify_all()
+                    self._change.notify_all()
                 del job
                 release_memory()
 
     def _next(self) -> Job | None:
         """Take the first job of the line; None when there will be no more."""
-        with self._changed:
+        with self._change:
             while not self.closing:
                 job = self._line()[0] if self._waiting else None
                 if job is not None and not (job.priority == IDLE_TIME and self._is_busy()):
@@ -171,7 +171,7 @@ class JobQueue:
                     job.tell_place(0)
                     self._tell_places()
                     return job
-                self._changed.wait()
+                self._change.wait()
             return None
 
     def _line(self) -> list[Job]:

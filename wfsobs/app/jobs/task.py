@@ -38,7 +38,7 @@ class BackgroundTask(param.Parameterized):
         self._lock = threading.Lock()
         self._generation = 0
         self._news: dict[str, Any] = {}
-        self._posted = False
+        self._is_posted = False
         self._leave: Callable[[], None] = _nothing
 
     def start(self, job: Job) -> None:
@@ -80,14 +80,14 @@ class BackgroundTask(param.Parameterized):
             if generation != self._generation:
                 return
             self._news |= news
-            if self._posted:
+            if self._is_posted:
                 return
-            self._posted = True
+            self._is_posted = True
         self.session.post(self._land)
 
     def _land(self) -> None:
         with self._lock:
-            news, self._news, self._posted = self._news, {}, False
+            news, self._news, self._is_posted = self._news, {}, False
         if news:
             self.param.update(**news)
 

@@ -55,13 +55,13 @@ class ClosedLoopPage(PageActions):
         self.visible, self._of = False, object()
         self.note, self.table, self.margins = html(), html(), html()
         self.cards = Cards(items=[], hidden=[], terms={STREHL: TERMS[STREHL]}, sizing_mode="stretch_width", margin=0)
-        self.whole, self.zoomed = Trace("whole record"), Trace("zoomed")
+        self.whole, self.zoom = Trace("whole record"), Trace("zoomed")
         self.spectrum, self.response, self.nyquist = LoopSpectrum(), Response(), Nyquist()
         self.room = figure_with_caption("Rejection and noise transfer", self.response.figure)
         self.editor: GainEditor | None = None
         display.param.watch(self._edit, "editing")
         self._edit()
-        self._drawn = (self.whole, self.zoomed, self.spectrum, self.response, self.nyquist)
+        self._figures = (self.whole, self.zoom, self.spectrum, self.response, self.nyquist)
         self.work.param.watch(self._say, ["state", "place", "message"])
         self.work.param.watch(self._redraw, "result")
         run.param.watch(self._follow, ["result", "state"])
@@ -77,7 +77,7 @@ class ClosedLoopPage(PageActions):
                 for title, drawn in (
                     ("Residual, whole record", self.whole),
                     ("Spectrum of the residual", self.spectrum),
-                    ("Residual, zoomed", self.zoomed),
+                    ("Residual, zoomed", self.zoom),
                 )
             ),
             self.room,
@@ -163,7 +163,7 @@ class ClosedLoopPage(PageActions):
             begin = min(round(shown.result.scenario.run.warm_up / dt), n - 2)
             middle = (begin + n) // 2
             self.whole.draw(shown, self.display, begin, n)
-            self.zoomed.draw(shown, self.display, max(middle - half, begin), min(middle + half, n))
+            self.zoom.draw(shown, self.display, max(middle - half, begin), min(middle + half, n))
             for drawn in (self.spectrum, self.response, self.nyquist):
                 drawn.draw(shown, self.display)
             self._restyle()
@@ -172,9 +172,9 @@ class ClosedLoopPage(PageActions):
 
     def _restyle(self, *_: object) -> None:
         with pn.io.hold():
-            for drawn in self._drawn:
+            for drawn in self._figures:
                 drawn.restyle(self.display.dark, self.cards.hidden)
-            for trace in (self.whole, self.zoomed):
+            for trace in (self.whole, self.zoom):
                 trace.fit(self.cards.hidden)
             if self.results is not None:
                 self.table.object = loop_html(self.results, self.display)

@@ -72,8 +72,8 @@ class IdentifyPage(PageActions):
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
         self.of: RecordSpectrum | None = None
         self.measuring = BackgroundTask(store.session)
-        self._made: Scenario | None = None
-        self.visible, self._measured = False, object()
+        self._scenario: Scenario | None = None
+        self.visible, self._spectrum = False, object()
         self.starter.start.on_click(lambda _event: self.start())
         filters, simulation = self.starter.uses
         filters.on_click(lambda _event: self.tell_filters())
@@ -147,15 +147,15 @@ class IdentifyPage(PageActions):
             except SettingError as error:
                 self.work.refuse(str(error))
             else:
-                self._made = self.store.scenario if source is None else None
+                self._scenario = self.store.scenario if source is None else None
                 self._redraw()
 
     def _follow(self, *_: object) -> None:
         """Measure the record shown, once its run is over."""
         of = self.run.result
-        if not self.visible or of is None or self.run.state == RUNNING or of is self._measured:
+        if not self.visible or of is None or self.run.state == RUNNING or of is self._spectrum:
             return
-        self._measured = of
+        self._spectrum = of
         self.measuring.start(Job("identify", partial(estimate_record_spectrum, of), refusal=RecordError))
 
     def _land(self, *_: object) -> None:
@@ -186,7 +186,7 @@ class IdentifyPage(PageActions):
             if result and record:
                 self.verdict.object = verdict_html(result)
                 self.table.object = identification_html(mode, self.display, diameter) if mode else ""
-                replaced = self.store.source is None and self._made == self.store.scenario
+                replaced = self.store.source is None and self._scenario == self.store.scenario
                 self.stale.param.update(
                     object=REPLACED if replaced else EARLIER, visible=not same_measurements(record, of.record)
                 )

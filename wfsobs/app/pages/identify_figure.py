@@ -32,28 +32,28 @@ class SpectrumFigure:
         self.figure.height = HEIGHT
         call(self.figure, "Spectrum of z and its model")
         self.figure.xaxis.axis_label = "frequency [Hz]"
-        self.measured = ColumnDataSource({"x": [], "mean": [], "highest": []})
+        self.measurement = ColumnDataSource({"x": [], "mean": [], "highest": []})
         self.total = ColumnDataSource({"x": [], "y": []})
         self.parts = ColumnDataSource({"xs": [], "ys": []})
         self.spikes = ColumnDataSource({"x": [], "low": [], "high": []})
         self.peaks = ColumnDataSource({"x": [], "y": [], "text": []})
         fig = self.figure
-        self._coloured = {
-            "highest": [fig.line("x", "highest", source=self.measured, line_alpha=0.45, line_width=1.0)],
-            "measured": [fig.line("x", "mean", source=self.measured, line_width=1.0)],
+        self._renderers = {
+            "highest": [fig.line("x", "highest", source=self.measurement, line_alpha=0.45, line_width=1.0)],
+            "measured": [fig.line("x", "mean", source=self.measurement, line_width=1.0)],
             "parts": [fig.multi_line("xs", "ys", source=self.parts, line_width=1.2, line_dash=list(look("parts").dash))],
             "fitted": [fig.line("x", "y", source=self.total, line_width=2.2)],
         }
         marks = fig.scatter("x", "y", source=self.peaks, marker="inverted_triangle", size=8)
         spikes = fig.segment("x", "low", "x", "high", source=self.spikes, line_width=2.2)
-        self._coloured["found"] = [marks, spikes]
+        self._renderers["found"] = [marks, spikes]
         fig.add_tools(HoverTool(renderers=[marks], tooltips="@text"))
 
     def draw_measured(self, of: RecordSpectrum, display: Display, diameter: float) -> None:
         """Send what was measured, and have the axes hold it."""
         scale, column = per_micrometre(display.unit, diameter) ** 2, display.column
         mean, highest = scale * of.mean[:, column], scale * of.highest[:, column]
-        self.measured.data = {"x": of.frequency, "mean": mean, "highest": highest}
+        self.measurement.data = {"x": of.frequency, "mean": mean, "highest": highest}
         positive = mean[mean > 0]
         if positive.size:
             low, high = float(np.quantile(positive, 0.01)) / 5.0, float(highest.max()) * 6.0
@@ -87,7 +87,7 @@ class SpectrumFigure:
 
     def restyle(self, dark: bool) -> None:
         """Set the colours of light or dark mode."""
-        for name, renderers in self._coloured.items():
+        for name, renderers in self._renderers.items():
             for renderer in renderers:
                 renderer.glyph.line_color = look(name).colour(dark)
                 if "fill_color" in renderer.glyph.properties():

@@ -65,7 +65,7 @@ class Pages(param.Parameterized):
             FIGURES: lambda: Figures(store.run, display),
             MODEL: lambda: ModelPage(store, display),
         }
-        self.made: dict[str, Page] = {EXPLORE: explore}
+        self.by_name: dict[str, Page] = {EXPLORE: explore}
         self.rooms = {
             EXPLORE: explore.view(),
             **{name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers},
@@ -79,23 +79,23 @@ class Pages(param.Parameterized):
     def sweep_over(self, path: str) -> None:
         """Turn to the error over one setting."""
         self.current = SWEEP
-        page = self.made[SWEEP]
+        page = self.by_name[SWEEP]
         assert isinstance(page, SweepPage)
         page.choose(path)
 
     def sweep_shown(self) -> dict[str, Any] | None:
         """Return what a report has of the last sweep; None where there is none."""
-        page = self.made.get(SWEEP)
+        page = self.by_name.get(SWEEP)
         return report_part(page.results) if isinstance(page, SweepPage) and page.results else None
 
     def _turn(self, _event: object) -> None:
         name = self.current
         with pn.io.hold():
-            if name in self._makers and name not in self.made:
-                page = self.made[name] = self._makers[name]()
+            if name in self._makers and name not in self.by_name:
+                page = self.by_name[name] = self._makers[name]()
                 page.show(True)
                 self.rooms[name][:] = [page.view()]
             for other, room in self.rooms.items():
-                if other in self.made:
-                    self.made[other].show(other == name)
+                if other in self.by_name:
+                    self.by_name[other].show(other == name)
                 room.visible = other == name

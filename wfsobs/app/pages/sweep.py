@@ -73,7 +73,7 @@ class SweepPage(PageActions):
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
         self.boxes = [box(target.capitalize(), self.legends[target], self.panes[target], self.maps[target]) for target in TARGETS]
         self.shades = text(f"{legend_of_shades()} Click a cell to load its scenario in Explore.")
-        self.visible, self._drawn = False, 0.0
+        self.visible, self._draw_time = False, 0.0
         for part in (*self.boxes, self.shades):
             part.visible = False
         self._watch()
@@ -215,14 +215,14 @@ class SweepPage(PageActions):
 
     def _take(self, *_: object) -> None:
         """Draw what has come, not too often."""
-        if self.work.state != RUNNING or monotonic() - self._drawn >= REDRAW:
+        if self.work.state != RUNNING or monotonic() - self._draw_time >= REDRAW:
             self._redraw()
 
     def _redraw(self, *_: object) -> None:
         results = self.results
         if not self.visible or results is None:
             return
-        self._drawn = monotonic()
+        self._draw_time = monotonic()
         single = len(results.sweep.axes) == 1
         with pn.io.hold():
             for target in TARGETS:

@@ -55,7 +55,7 @@ class TunePage(PageActions):
         self.inputs = (self.observer, self.target, self.evaluations)
         self.figure = HistoryFigure()
         self.measure = MEASURES[TRUTH]
-        self.searched, self.legend, self.table = html(), html(), html()
+        self.search_space, self.legend, self.table = html(), html(), html()
         self.history = box("History", self.legend, pn.pane.Bokeh(self.figure.figure, **WIDE))
         self.outcome = box("Before and after", self.table)
         self.history.visible = self.outcome.visible = False
@@ -73,7 +73,7 @@ class TunePage(PageActions):
         """Return the contents of the page."""
         row = line(self.observer, self.target, self.evaluations, *self.starter.view())
         return pn.Column(
-            box("Tuning", text(INTRO), row, self.searched, self.starter.status, self.stale),
+            box("Tuning", text(INTRO), row, self.search_space, self.starter.status, self.stale),
             self.history,
             self.outcome,
             **WIDE,
@@ -132,7 +132,7 @@ class TunePage(PageActions):
         name = self.observer.value
         targets = list(OBSERVERS[name].targets)
         self.target.param.update(options=targets, value=VIBRATION if VIBRATION in targets else targets[0])
-        self.searched.object = f'<p class="text">Searched: {", ".join(OBSERVERS[name].tunable.usual)}.</p>'
+        self.search_space.object = f'<p class="text">Searched: {", ".join(OBSERVERS[name].tunable.usual)}.</p>'
 
     def _tuning_result(self) -> TuningResult | None:
         return self.work.result

@@ -41,7 +41,7 @@ class HistoryFigure:
         call(self.figure, "History of the tuning")
         self.figure.xaxis.axis_label = "evaluation"
         self.source = ColumnDataSource({"x": [], "tried": [], "best": []})
-        self._tried = self.figure.scatter("x", "tried", source=self.source, size=6, fill_alpha=0.7)
+        self._trials = self.figure.scatter("x", "tried", source=self.source, size=6, fill_alpha=0.7)
         self._best = self.figure.step("x", "best", source=self.source, mode="after", line_width=2.0)
 
     def draw(self, history: Sequence[Evaluation], measure: str, unit: str, diameter: float) -> None:
@@ -58,7 +58,7 @@ class HistoryFigure:
     def restyle(self, dark: bool) -> None:
         """Set the colours of light or dark mode."""
         colour = look("tried").colour(dark)
-        self._tried.glyph.update(line_color=colour, fill_color=colour)
+        self._trials.glyph.update(line_color=colour, fill_color=colour)
         self._best.glyph.update(line_color=look("fitted").colour(dark))
 
 

@@ -41,22 +41,22 @@ class MainLines:
 
     def __init__(self, run: BackgroundTask, display: Display):
         self.run, self.display = run, display
-        self._chosen: set[str] = set()
+        self._chosen_targets: set[str] = set()
         run.param.watch(self._on_results, "result")
         display.param.watch(self._follow, "mode")
 
     def choose(self, target: str, hidden_names: list[str]) -> None:
         """Hide these lines and no others from now on."""
-        self._chosen.add(target)
+        self._chosen_targets.add(target)
         self.display.hidden = {**self.display.hidden, target: list(hidden_names)}
 
     def choices(self) -> dict[str, list[str]]:
         """Return the hidden lines of the targets where the visitor has chosen."""
-        return {target: self.display.hidden.get(target, []) for target in TARGETS if target in self._chosen}
+        return {target: self.display.hidden.get(target, []) for target in TARGETS if target in self._chosen_targets}
 
     def reset(self, target: str) -> None:
         """Show those that matter again."""
-        self._chosen.discard(target)
+        self._chosen_targets.discard(target)
         self._follow()
 
     def _on_results(self, *_: object) -> None:
@@ -69,7 +69,7 @@ class MainLines:
             return
         hidden = dict(self.display.hidden)
         for target in TARGETS:
-            if target not in self._chosen:
+            if target not in self._chosen_targets:
                 main = main_observers(results.result.scores, target, self.display.mode)
                 hidden[target] = [name for name in observers_of(target) if name not in main]
         if hidden != self.display.hidden:

@@ -44,7 +44,7 @@ class Traces(TargetFigures):
     def __init__(self, run: BackgroundTask, display: Display):
         self.x_range = Range1d(start=0.0, end=10.0, reset_start=0.0, reset_end=10.0)
         self.length = 0.0
-        self._wanted: tuple[float, float] | None = None
+        self._wanted_window: tuple[float, float] | None = None
         crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
         self.traces = {target: _Trace(target, self.x_range, crosshair) for target in TARGETS}
         super().__init__(run, display, self.traces, ["mode", "show", "unit", "compared_runs"])
@@ -56,8 +56,8 @@ class Traces(TargetFigures):
         if length != self.length:
             whole = self.length > 0 and zoom_of(self.x_range) is None  # stays so
             self.length = length
-            start, end = self._wanted or ((0.0, length) if whole else first_window(results))
-            self._wanted = None
+            start, end = self._wanted_window or ((0.0, length) if whole else first_window(results))
+            self._wanted_window = None
             self.x_range.update(start=start, end=min(end, length), reset_start=0.0, reset_end=length)
         first, last = self._window(record.n_steps, record.dt)
         for trace in self.traces.values():
@@ -73,7 +73,7 @@ class Traces(TargetFigures):
     def open_window(self, window: tuple[float, float] | None) -> None:
         """Show a stretch of the record [s], that of a fresh page if None; with the first results where there are none yet."""
         if self.run.result is None:
-            self._wanted = window
+            self._wanted_window = window
         else:
             start, end = window or first_window(self.run.result)
             self.x_range.update(start=start, end=min(end, self.length))
@@ -81,7 +81,7 @@ class Traces(TargetFigures):
     def chosen_window(self) -> tuple[float, float] | None:
         """Return the stretch in view [s]; None where it is that of a fresh page."""
         if self.run.result is None:
-            return self._wanted
+            return self._wanted_window
         start, end = float(self.x_range.start), float(self.x_range.end)  # type: ignore[arg-type]
         first = first_window(self.run.result)
         return None if abs(start - first[0]) + abs(end - first[1]) < 1e-9 else (start, end)

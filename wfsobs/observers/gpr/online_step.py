@@ -47,7 +47,7 @@ class OnlineEstimator:
     ):
         self.windows, self.weights, self.needs_command = windows, weights, windows.needs_command
         self.horizon = float(len(weights) - 1)
-        self._filtered = np.zeros((len(weights), sampling.n_modes))  # oldest first
+        self._band_signals = np.zeros((len(weights), sampling.n_modes))  # oldest first
         self._size = depth, m, 2 if windows.needs_command else 1, kernel
         bank = bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, sampling.dt)
         self.bank = FilterBank([bank_recursion(bank)] * sampling.n_modes)
@@ -62,9 +62,9 @@ class OnlineEstimator:
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
         self.settle()
-        self._filtered[:-1] = self._filtered[1:].copy()
-        self._filtered[-1] = self.bank.step(z[:, None])[:, 0]
-        targets = self.weights @ self._filtered
+        self._band_signals[:-1] = self._band_signals[1:].copy()
+        self._band_signals[-1] = self.bank.step(z[:, None])[:, 0]
+        targets = self.weights @ self._band_signals
         samples = self.windows.push(z, u).reshape(len(z), -1)
         for mode, regression in enumerate(self.regressions):
             self._mean[mode] = regression.predict(samples[mode], float(targets[mode]))
@@ -86,20 +86,20 @@ class OnlineEstimator:
         self.windows.reset()
         self.bank.reset()
         self.regressions, self._pending = self._start(), False
-        self._mean[...], self._filtered[...] = np.nan, 0.0
+        self._mean[...], self._band_signals[...] = np.nan, 0.0
 
     def save(self) -> Saved:
         """Return a copy of the state."""
         self.settle()
         parts = {"windows": self.windows, "bank": self.bank}
-        own = {"mean": self._mean.copy(), "filtered": self._filtered.copy()}
+        own = {"mean": self._mean.copy(), "filtered": self._band_signals.copy()}
         found = [regression.save() for regression in self.regressions]
         return save_parts(parts) | own | {name: np.array([one[name] for one in found]) for name in found[0]}
 
     def load(self, state: Mapping[str, Array]) -> None:
         """Take over a state."""
         load_parts({"windows": self.windows, "bank": self.bank}, state)
-        self._mean[...], self._filtered[...], self._pending = state["mean"], state["filtered"], False
+        self._mean[...], self._band_signals[...], self._pending = state["mean"], state["filtered"], False
         for mode, regression in enumerate(self.regressions):
             regression.load({name: x[mode] for name, x in state.items() if "." not in name and name not in ("mean", "filtered")})
 

@@ -26,7 +26,7 @@ class OnlineGprStream:
     def __init__(self, settings: OnlineGpr, bands: Bands, dt: float, scale: Scale | None = None):
         """dt: step [s]; scale: of standardised inputs, from `inputs.scale_of`."""
         g = settings
-        self._inputs, self._prepared = g.inputs, StreamingInputs(g, dt, scale)
+        self._inputs, self._streaming_inputs = g.inputs, StreamingInputs(g, dt, scale)
         self._bank = StreamingBank(bandpass_bank(bands.frequencies, bands.bandwidth_online, bands.order, dt))
         self._regression = SlidingRegression(g.depth, g.training_size, 1 if g.inputs == "z" else 2, kernel_of(g))
         self._u = (0.0, 0.0)  # u[k-1], u[k-2]
@@ -48,7 +48,7 @@ class OnlineGprStream:
         else:
             sample = np.array([u, y])
         self._now, self._pending = u, True
-        return self._regression.predict(self._prepared.step(sample), self._bank.push(z))
+        return self._regression.predict(self._streaming_inputs.step(sample), self._bank.push(z))
 
     def update(self, u: float | None = None) -> None:
         """Learn from the last sample. u: its command [um], where `estimate` was not told."""

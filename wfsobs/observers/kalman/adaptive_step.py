@@ -43,7 +43,7 @@ class AdaptiveEstimator:
         """Set the state back to the start."""
         n = self.sampling.n_modes
         self._end = self.count = 0
-        self.found = [NOT_YET] * n
+        self.models = [NOT_YET] * n
         self.means = np.full(n, np.nan)
         self.filters: list[KalmanEstimator | None] = [None] * n
 
@@ -68,8 +68,8 @@ class AdaptiveEstimator:
 
     def _identify(self, mode: int) -> None:
         z = self._samples[mode, self._end - self.window : self._end]
-        self.found[mode] = identify_window(z, self.sampling.dt, self.settings, self.found[mode])
-        if self.found[mode].spectrum is None:
+        self.models[mode] = identify_window(z, self.sampling.dt, self.settings, self.models[mode])
+        if self.models[mode].spectrum is None:
             return
         self.means[mode] = z.mean()
         self._start(mode)
@@ -81,7 +81,7 @@ class AdaptiveEstimator:
 
     def _start(self, mode: int) -> None:
         """Put the filter that has been found in charge, at rest."""
-        one = self.found[mode].mode
+        one = self.models[mode].mode
         self.filters[mode] = None if one is None else KalmanEstimator([one])
 
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
@@ -100,7 +100,7 @@ class AdaptiveEstimator:
     def save(self) -> Saved:
         """Return a copy of the state: the window, what was found in it, and the states of the filters."""
         rows = self.settings.peak_count + 2
-        spectra = [[pack_spectrum(one, rows) for one in (found.fit, found.spectrum)] for found in self.found]
+        spectra = [[pack_spectrum(one, rows) for one in (found.fit, found.spectrum)] for found in self.models]
         window, states = np.zeros((len(self.means), self.window)), np.zeros((len(self.means), 3 * rows))
         size = min(self._end, self.window)
         window[:, self.window - size :] = self._samples[:, self._end - size : self._end]
@@ -121,7 +121,7 @@ class AdaptiveEstimator:
         self.means[...] = state["means"]
         for mode, (packed, x) in enumerate(zip(state["spectra"], state["states"], strict=True)):
             fit, spectrum = (unpack_spectrum(one, self.sampling.dt) for one in packed)
-            self.found[mode] = WindowModel(fit, spectrum, None if spectrum is None else mode_of(spectrum))
+            self.models[mode] = WindowModel(fit, spectrum, None if spectrum is None else mode_of(spectrum))
             self._start(mode)
             kalman = self.filters[mode]
             if kalman is not None:
