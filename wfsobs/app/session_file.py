@@ -156,20 +156,20 @@ class _Records:
     def __init__(self, archive: zipfile.ZipFile, members: Mapping[str, zipfile.ZipInfo]):
         self._archive, self._members = archive, members
         self._left = MOST_RECORD_BYTES
-        self._known: dict[int, tuple[Record, str]] = {}
+        self._records: dict[int, tuple[Record, str]] = {}
         self._largest = Scenario().replace({"telescope.radial_order": 6})  # as many modes as there may be
 
     def find(self, number: int) -> tuple[Record, str]:
         """Return a record and its key."""
-        if number not in self._known:
+        if number not in self._records:
             info = self._members.get(_member(number))
             if info is None:
                 raise SessionError("one of its records is missing")
             contents = npz.read(io.BytesIO(_unpack(self._archive, info, self._left)), self._left)
             self._left -= sum(array.nbytes for array in contents.arrays.values())
             record = to_record(contents, self._largest, DeclaredFormat())
-            self._known[number] = record, record_key(record)
-        return self._known[number]
+            self._records[number] = record, record_key(record)
+        return self._records[number]
 
 
 def _content(values: Mapping[str, Any], records: _Records) -> SessionContent:
