@@ -148,31 +148,6 @@ def test_boxes_that_are_higher_than_the_window_do_not_overlap(open_page: Any, se
 QUICK = "?run.duration=1&run.warm_up=0.2&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.3"
 
 
-@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-def test_accessibility_of_a_sweep(open_page: Any, server: Any, dark: bool) -> None:
-    """Before it, with a map over two settings, and with lines over one."""
-    page = open_page(1400, 900, url=server.url + QUICK)
-    if dark:
-        theme(page)
-    page.evaluate(files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8"))
-    page.get_by_role("button", name="Sweep", exact=True).click()
-    for axes in (2, 1):
-        if axes == 1:
-            page.get_by_role("textbox", name="Wind speed V₀ [m/s]").press("Alt+o")
-            expect(page.get_by_role("textbox", name="Values of the second", exact=True)).to_be_disabled()
-        fields = {"Values": "5,20", **({"Values of the second": "5,10"} if axes == 2 else {}), "Seeds of each": "1"}
-        for label, text in fields.items():
-            box = page.get_by_role("textbox", name=label, exact=True)
-            box.fill(text)
-            box.press("Enter")
-        expect(page.get_by_text(f"scenarios × 1 seed = {2 * axes} runs")).to_be_visible()
-        accessible(page)
-        page.get_by_role("button", name="Run the sweep").click()
-        expect(page.get_by_text(f"Finished · {2 * axes} of {2 * axes} runs")).to_be_visible(timeout=240_000)
-        accessible(page)
-        fits(page, 1400)
-
-
 def accessible(page: Page) -> None:
     """Nothing wrong but what is allowed."""
     end = time.monotonic() + 20
