@@ -189,11 +189,11 @@ class TestModel:
 def test_the_first_page_rests_while_another_shows(dashboard: Dashboard, loop: Any) -> None:
     line = dashboard.explore.traces.traces["turbulence"].source
     spectrum = dashboard.explore.spectra.spectra["turbulence"].sources["kf-lgs"]
-    before = line.data, spectrum.data
+    before = dict(line.data), dict(spectrum.data)
     opened(dashboard, MODEL)
     dashboard.store.change("turbulence.wind_speed", 30)
     loop.finish(dashboard.store)
-    assert line.data is before[0] and spectrum.data is before[1]
+    assert line.data["truth"] is before[0]["truth"] and spectrum.data["y"] is before[1]["y"]
     dashboard.pages.current = EXPLORE
     assert not np.array_equal(np.asarray(line.data["truth"]), np.asarray(before[0]["truth"]))
     assert not np.array_equal(np.asarray(spectrum.data["y"]), np.asarray(before[1]["y"]))

@@ -262,7 +262,7 @@ class TestLooks:
     def test_dark_mode(self, dashboard: Dashboard) -> None:
         dashboard.display.dark = True
         line = dashboard.explore.traces.traces["vibration"].lines["gpr-online"]
-        assert line.glyph.line_color == look("gpr-online").dark
+        assert line.renderer.glyph.line_color == look("gpr-online").dark
         assert look("gpr-online").dark in dashboard.explore.table.pane.object
 
 

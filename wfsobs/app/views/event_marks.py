@@ -61,23 +61,23 @@ def levels(results: RunResults) -> list[int]:
 
 
 class EventMarks:
-    """The marks in one figure; words hang from the top of its axis."""
+    """The marks in one figure, none until there is an event; words hang from the top of its axis."""
 
     def __init__(self, fig: figure):
-        self.figure = fig
+        self.figure, self._made = fig, False
         self.jumps = ColumnDataSource({"x": []})
         self.spans = ColumnDataSource({"start": [], "end": []})
         self.words = ColumnDataSource({"x": [], "y": [], "text": [], "below": []})
         self._line = VSpan(x="x", line_width=1.5, line_dash=[6, 3])
         self._strip = VStrip(x0="start", x1="end", fill_alpha=0.13, line_width=0)
         self._text = Text(x="x", y="y", text="text", x_offset=4, y_offset="below", text_baseline="top", text_font_size="11px")
-        fig.add_glyph(self.spans, self._strip, level="underlay")
-        fig.add_glyph(self.jumps, self._line)
-        fig.add_glyph(self.words, self._text, level="overlay")
 
     def draw(self, results: RunResults, dark: bool) -> None:
         """Show those of the results."""
         events = events_of(results)
+        if not events and not self._made:
+            return
+        self._make()
         lasting = [e for e in events if e.duration > 0]
         send(self.jumps, {"x": [e.start for e in events if not e.duration > 0]})
         send(self.spans, {"start": [e.start for e in lasting], "end": [e.start + e.duration for e in lasting]})
@@ -92,6 +92,13 @@ class EventMarks:
             },
         )
         self.restyle(dark)
+
+    def _make(self) -> None:
+        if not self._made:
+            self._made = True
+            self.figure.add_glyph(self.spans, self._strip, level="underlay")
+            self.figure.add_glyph(self.jumps, self._line)
+            self.figure.add_glyph(self.words, self._text, level="overlay")
 
     def restyle(self, dark: bool) -> None:
         """Set the colour of light or dark mode."""

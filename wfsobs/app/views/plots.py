@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColumnDataSource, GlyphRenderer
+from bokeh.models import ColumnDataSource, GlyphRenderer, Line
 from bokeh.plotting import figure
 from numpy.typing import ArrayLike
 
@@ -48,10 +48,17 @@ def call(fig: figure, name: str) -> None:
     fig.update(name=name, html_attributes={"role": "figure", "aria-label": name})
 
 
+def make_line(name: str, source: ColumnDataSource, y: str = "y", **options: Any) -> GlyphRenderer:
+    """Make a line in the look of an observer or of the truth, without the glyphs of what is selected or muted: nothing is."""
+    it = look(name)
+    glyph = Line(x="x", y=y, line_color=it.light, line_width=it.width, line_dash=list(it.dash))
+    return GlyphRenderer(data_source=source, glyph=glyph, name=name, **options)
+
+
 def add_line(fig: figure, name: str, source: ColumnDataSource, y: str = "y") -> GlyphRenderer:
     """Draw a line in the look of an observer or of the truth."""
-    it = look(name)
-    renderer = fig.line("x", y, source=source, color=it.light, line_width=it.width, line_dash=list(it.dash), name=name)
+    renderer = make_line(name, source, y)
+    fig.renderers.append(renderer)
     return renderer
 
 
@@ -68,10 +75,12 @@ def marked_peaks(scenario: Scenario) -> list[Peak]:
 
 
 def send(source: ColumnDataSource, data: dict[str, Any]) -> None:
-    """Give a source its data, unless it has them already: each one sent has its figure drawn anew."""
-    old = source.data
-    if data.keys() != old.keys() or not all(_same(old[name], data[name]) for name in data):  # type: ignore[arg-type]
+    """Give a source the columns that it does not have already: each time that one is sent its figure is drawn anew."""
+    old: Any = source.data
+    if data.keys() != old.keys() or any(len(old[name]) != len(column) for name, column in data.items()):
         source.data = data
+    elif changed := {name: column for name, column in data.items() if not _same(old[name], column)}:
+        old.update(changed)
 
 
 def _same(a: Any, b: Any) -> bool:

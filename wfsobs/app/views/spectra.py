@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from bokeh.models import ColumnDataSource, HoverTool, Range1d, VSpan
+from bokeh.models import ColumnDataSource, HoverTool, Range1d, UnionRenderers, VSpan
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.plots import MODEL, PEAKS, ComparedLines, add_line, marked_peaks, new_figure, send
+from wfsobs.app.views.lines import Lines
+from wfsobs.app.views.plots import MODEL, PEAKS, ComparedLines, marked_peaks, new_figure, send
 from wfsobs.app.views.settle import on_settle, zoom_of
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, Array, Key, RunResults, SignalAndError
@@ -58,8 +59,11 @@ class _Spectrum:
         self.figure.xaxis.axis_label = "frequency [Hz]"
         if target == VIBRATION:
             self._add_marks()
-        self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in (TRUTH, *observers_of(target))}
-        self.lines = {name: add_line(self.figure, name, source) for name, source in self.sources.items()}
+        policy = UnionRenderers()
+        self.sources = {
+            name: ColumnDataSource({"x": [], "y": []}, selection_policy=policy) for name in (TRUTH, *observers_of(target))
+        }
+        self.lines = Lines(self.figure, {name: (source, "y") for name, source in self.sources.items()})
         self.faint = ComparedLines(self.figure)
 
     def _add_marks(self) -> None:

@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import panel as pn
-from bokeh.models import GlyphRenderer
 from bokeh.plotting import figure
 
 from wfsobs.app.display import Display
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.views.plots import restyle
+from wfsobs.app.views.lines import Lines
 from wfsobs.app.work import TRUTH, RunResults
 
 
@@ -19,7 +18,7 @@ class Drawing(Protocol):
     """One figure and its lines, by observer."""
 
     figure: figure
-    lines: dict[str, GlyphRenderer]
+    lines: Lines
 
 
 class TargetFigures:
@@ -30,8 +29,7 @@ class TargetFigures:
         self.run, self.display, self._drawings = run, display, drawings
         self.visible, self._behind = True, False
         run.param.watch(self._redraw, "result")
-        display.param.watch(self._redraw, [*switches])
-        display.param.watch(self._restyle, ["dark", "hidden"])
+        display.param.watch(self._redraw, [*switches, "dark", "hidden"])
 
     def pane(self, target: str) -> pn.pane.Bokeh:
         """Return the figure of one target."""
@@ -49,18 +47,13 @@ class TargetFigures:
         self._behind = not self.visible
         if results is not None and self.visible:
             with pn.io.hold():
+                for target, drawing in self._drawings.items():
+                    drawing.lines.restyle(self.display.dark, self.display.hidden.get(target, []))
                 self._draw(results)
 
     def _draw(self, results: RunResults) -> None:
-        """Send the data of every figure."""
+        """Send the data of every figure, whose lines are shown or hidden by now."""
         raise NotImplementedError
-
-    def _restyle(self, *_: object) -> None:
-        """Set the colours of light or dark mode, hide lines, and fit the axes to the others."""
-        with pn.io.hold():
-            for target, drawing in self._drawings.items():
-                restyle(drawing.lines, self.display.dark, self.display.hidden.get(target, []))
-            self._redraw()
 
 
 def shows_error(results: RunResults, target: str, display: Display) -> bool:
