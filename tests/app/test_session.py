@@ -34,7 +34,7 @@ def test_only_its_own_thread_touches_the_document(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(session, "pn", SimpleNamespace(state=state, io=session.pn.io))
 
     async def main() -> None:
-        post = session.post_to_session()
+        post = session.Poster()
 
         def many(i: int) -> None:
             for k in range(100):
@@ -49,3 +49,17 @@ def test_only_its_own_thread_touches_the_document(monkeypatch: pytest.MonkeyPatc
     for callback in page.callbacks:
         callback()
     assert sorted(done) == [(i, k) for i in range(8) for k in range(100)]
+
+
+def test_what_is_known_goes_with_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is posted while a page is built runs before anybody is told of it; what comes of that waits until it is drawn."""
+    page, done, loaded = Page(), [], []
+    state = SimpleNamespace(curdoc=page, onload=loaded.append)
+    monkeypatch.setattr(session, "pn", SimpleNamespace(state=state, io=session.pn.io))
+    post = session.Poster()
+    post(lambda: (done.append("result"), post(partial(done.append, "next"))))
+    assert done == []
+    post.deliver()
+    assert done == ["result"]
+    loaded[0]()
+    assert done == ["result", "next"] and page.callbacks == []

@@ -172,7 +172,13 @@ DRAWN = """() => {
 """Whether the table stands on the page as its model has it: on a busy machine that takes a while."""
 
 
+SETTINGS = """() => [...(window.Bokeh?.index?.roots?.[0]?.model.document._all_models.values() ?? [])]
+    .some((m) => m.type === "panel.models.esm.ReactComponent" && m.data?.label === "Preset")"""
+"""Whether the drawer has its settings: they come after the first picture."""
+
+
 def finished(page: Page) -> None:
-    """Wait until the run is over and its results are drawn."""
+    """Wait until the settings are there, the run is over and its results are drawn."""
+    page.wait_for_function(SETTINGS, polling=100)
     page.wait_for_function(DONE, polling=100)
     page.wait_for_function(DRAWN, polling=100)

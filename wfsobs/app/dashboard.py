@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
@@ -52,7 +54,7 @@ PHONE_PX = 600
 
 
 class Frame(JSComponent):
-    """Tells the width of the window and the theme that is wanted, and fades the results above it while they are stale."""
+    """Tells the width, the theme that is wanted and when the first picture stands, and fades the results while they are stale."""
 
     width_px = param.Integer(0, doc="Width when the page opened [px].")
     wants_dark = param.Boolean(False, doc="Whether the visitor's system has a dark theme, unless one was chosen here.")
@@ -60,6 +62,14 @@ class Frame(JSComponent):
     stale = param.Boolean(False, doc="Whether to fade the results.")
 
     _esm = asset("patch.js") + asset("frame.js")
+
+    def __init__(self, **params: Any):
+        self.on_drawn: Callable[[], None] = lambda: None
+        super().__init__(**params)
+
+    def _handle_msg(self, data: object) -> None:
+        if isinstance(data, dict) and data.get("drawn"):
+            self.on_drawn()
 
 
 class Keyboard(JSComponent):
@@ -94,6 +104,7 @@ class Dashboard:
         self.seeds = SeedRuns(self.store)
         self.explore = Explore(self.history, self.seeds)
         self.connection = Connection(self.controls.take, width=0, height=0, margin=0)
+        self.drawer = pn.Column(sizing_mode="stretch_width", margin=0)
         self.frame = Frame(width=0, height=0, margin=0)
         self.keyboard = Keyboard(width=0, height=0, margin=0, styles={"position": "absolute"})
         self.alert = pmui.Alert(object="", severity="error", visible=False, **WIDE)
@@ -128,7 +139,7 @@ class Dashboard:
         page = pmui.Page(
             title="wfsobs",
             header=[self.controls.bar(), Help(styles={"margin-left": "auto"})],
-            sidebar=[self.controls.view()],
+            sidebar=[self.drawer],
             sidebar_width=340,
             theme_config=theme(),
             sx=NARROW,
@@ -138,6 +149,9 @@ class Dashboard:
                 self.body,
             ],
         )
+        self.frame.on_drawn = lambda: self._post(self.complete)
+        if pn.state.curdoc is None:  # nobody will say that it has been drawn
+            self.complete()
         self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")
         with edit_readonly(page):
             # Tied to what all sessions do, each change walks all models of the page, and the page outlives its session.
@@ -145,6 +159,14 @@ class Dashboard:
         page.param.watch(self._on_theme, "dark_theme")
         self.frame.param.watch(lambda event: self._post(partial(setattr, page, "dark_theme", event.new)), "wants_dark")
         return page
+
+    def complete(self) -> None:
+        """Make what the first picture does not need: the settings, whose drawer has its width, and figures further down."""
+        if len(self.drawer):
+            return
+        with pn.io.hold():
+            self.explore.complete()
+            self.drawer[:] = [self.controls.view()]
 
     def start(self) -> None:
         """Start the first run, unless settings from a link have brought one or would take long."""

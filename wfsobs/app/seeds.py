@@ -113,7 +113,8 @@ class SeedRuns(param.Parameterized):
             self._go_on()
 
     def _go_on(self, *_: object) -> None:
-        """Say what is known, and have the next seed run."""
+        """Say what is known, and have the next seed run; what is there already does not wait for a turn each."""
+        self._take_known()
         self.evidence = gather_evidence(self._scores[: self.count]) if self.n_known > 1 else None
         if not self.possible or len(self._scores) >= self.count:
             self.task.close()
@@ -121,10 +122,21 @@ class SeedRuns(param.Parameterized):
             assert self._of is not None
             self.task.start(self._job(self._of, len(self._scores)))
 
+    def _take_known(self) -> None:
+        service = self.task.session.service
+        while self._of is not None and self.possible and len(self._scores) < self.count:
+            of = self._of
+            found = service.cache.get(service.seed_key(of.scenario, of.source, self._seed(of, len(self._scores))))
+            if not isinstance(found, SeedScores):
+                return
+            self._scores.append(found.scores)
+
+    def _seed(self, of: RunResults, number: int) -> int:
+        simulated = of.source.simulation if isinstance(of.source, SimulatedRecord) else of.scenario
+        return simulated.run.seed + number
+
     def _job(self, of: RunResults, number: int) -> Job:
-        source = of.source
-        simulated = source.simulation if isinstance(source, SimulatedRecord) else of.scenario
-        seed = simulated.run.seed + number
+        source, seed = of.source, self._seed(of, number)
         return Job(
             "seed",
             lambda watch, tell: run_seed(of.scenario, source, seed, watch, tell, self.task.session.service.memo),

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from math import isfinite
 from time import monotonic
+from typing import Any
 
 from wfsobs.app.cache import Cache, key_of
 from wfsobs.app.jobs.job import Job, Listener, Tell, Work
@@ -43,7 +44,7 @@ class Service:
 
     def __init__(self, limits: Limits, workers: int, most_bytes: int, work: Compute | None = None):
         self.limits, self.memo = limits, Memo()
-        self.cache: Cache[RunResults] = Cache(most_bytes)
+        self.cache: Cache[Any] = Cache(most_bytes)
         self.queue = JobQueue(workers, self.cache)
         self.sessions = 0
         self._work = work or partial(compute, memo=self.memo)

@@ -24,13 +24,15 @@ log = logging.getLogger(__name__)
 def session_page(build: Callable[[Post], Dashboard]) -> Any:
     """Build the page of a new session; one with the error where it cannot be built."""
     try:
-        dashboard = build(post_to_session())
+        post = Poster()
+        dashboard = build(post)
         if query := page_query():
             dashboard.actions.open_link(query)
         session_page = dashboard.page()
         if query:
             dashboard.actions.open_view(query)
         dashboard.start()
+        post.deliver()
         pn.state.on_session_destroyed(lambda _context: dashboard.close())
         return session_page
     except Exception as error:
@@ -49,49 +51,64 @@ def page_query() -> str:
     return urlencode(texts, quote_via=quote)
 
 
-def post_to_session() -> Post:
-    """Return a function by which other threads run something on this session's thread, once its page has been drawn.
+class Poster:
+    """Has other threads run something on this session's thread.
 
-    What is changed before does not reach a browser that is just being told of the page, so it waits.
+    What is changed while a browser is being told of the page does not reach it. So what is posted before it has been drawn waits,
+    but for what `deliver` lets go with the page.
     """
-    doc = pn.state.curdoc
-    if doc is None:
-        return lambda function: function()
-    try:
-        loop = asyncio.get_running_loop()
-    except RuntimeError:
-        loop = None
-    waiting: list[Callable[[], None]] | None = []
-    lock = threading.Lock()
 
-    def loaded() -> None:
-        nonlocal waiting
-        with lock:
-            functions, waiting = waiting or [], None
-        for function in functions:
-            held(function)
+    def __init__(self) -> None:
+        """Post to the present session; at once where there is none."""
+        self._doc = pn.state.curdoc
+        try:
+            self._loop: asyncio.AbstractEventLoop | None = asyncio.get_running_loop()
+        except RuntimeError:
+            self._loop = None
+        self._waiting: list[Callable[[], None]] | None = []
+        self._lock = threading.Lock()
+        if self._doc is not None:
+            pn.state.onload(self._on_load)
 
-    def held(function: Callable[[], None]) -> None:
-        with pn.io.hold():
+    def __call__(self, function: Callable[[], None]) -> None:
+        """Have a function run; from any thread."""
+        if self._doc is None:
             function()
-
-    def post(function: Callable[[], None]) -> None:
-        with lock:
-            if waiting is not None:
-                waiting.append(function)
+            return
+        with self._lock:
+            if self._waiting is not None:
+                self._waiting.append(function)
                 return
-        if loop is None:
-            schedule(function)
+        if self._loop is None:
+            self._schedule(function)
         else:  # several threads post, and a document is not made for that: one of two callbacks may be lost
             with contextlib.suppress(RuntimeError):  # the server has stopped
-                loop.call_soon_threadsafe(schedule, function)
+                self._loop.call_soon_threadsafe(self._schedule, function)
 
-    def schedule(function: Callable[[], None]) -> None:
+    def deliver(self) -> None:
+        """Run what has been posted so far, before anybody is told of the page: results that are known go with it."""
+        with self._lock:
+            if not self._waiting:
+                return
+            functions, self._waiting = self._waiting, []
+        for function in functions:
+            _held(function)
+
+    def _on_load(self) -> None:
+        with self._lock:
+            functions, self._waiting = self._waiting or [], None
+        for function in functions:
+            _held(function)
+
+    def _schedule(self, function: Callable[[], None]) -> None:
+        doc = self._doc
         if doc.session_context is not None and not doc.session_context.destroyed:
-            doc.add_next_tick_callback(partial(held, function))
+            doc.add_next_tick_callback(partial(_held, function))
 
-    pn.state.onload(loaded)
-    return post
+
+def _held(function: Callable[[], None]) -> None:
+    with pn.io.hold():
+        function()
 
 
 def error_page(error: Exception) -> pn.Column:

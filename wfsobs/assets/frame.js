@@ -1,4 +1,4 @@
-// Stands below the results: tells how wide the window is when the page opens, and fades the results while they are
+// Stands below the results: tells how wide the window is when the page opens and when its first picture stands, and fades the results while they are
 // stale. Fading them from here costs nothing; a change of their own style has the browser lay them all out anew.
 // The theme is the system's, until another is chosen: that one is remembered.
 
@@ -43,10 +43,25 @@ function patchTexts(doc) {
   }
 }
 
+// What the first picture does not need is made when it stands: when its figures have been painted, or a page has none.
+const PATIENCE = 1500, STEP = 30
+function tellDrawn(model) {
+  const end = performance.now() + PATIENCE
+  const idle = window.requestIdleCallback ?? ((act) => setTimeout(act, STEP))
+  const look = () => {
+    const figures = [...Bokeh.index.query((it) => it.model.type === "Figure")]
+    const drawn = figures.length > 0 && figures.every((it) => it.has_finished())
+    if (drawn || performance.now() > end) idle(() => model.send_msg({drawn: true}), {timeout: PATIENCE})
+    else setTimeout(look, STEP)
+  }
+  look()
+}
+
 export function render({model, view, el}) {
   patchTexts(view.model.document)
   model.width_px = window.innerWidth
   themes(model)
+  tellDrawn(model)
   const fade = () => {
     const results = el.getRootNode().host?.previousElementSibling
     if (results) {

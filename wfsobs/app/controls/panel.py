@@ -90,13 +90,13 @@ class Controls:
             margin=(8, 0),
         )
         self._watch()
-        self.accordion.active = [0]
         self._refresh_run()
         self._refresh_preset()
 
     def view(self) -> pn.Column:
-        """Return the contents of the drawer."""
+        """Make the contents of the drawer."""
         first = [self._field(path) for path in FIRST]
+        self.accordion.active = self.accordion.active or [0]
         return pn.Column(
             self.preset,
             pn.Row(self.gallery, self.undo, self.redo, self.reset, sizing_mode="stretch_width", margin=0),
@@ -140,8 +140,8 @@ class Controls:
                 self.preset.value = value
             elif isinstance(path, str) and path.split(".")[0] in self.rooms:
                 self.open_topic(path.split(".")[0])
-                if path in self.fields:
-                    self.fields[path].enter(value)
+                if path in FIRST or path in self.fields:
+                    self._field(path).enter(value)
                 elif path in self.lists and isinstance(message, dict):
                     self.lists[path].handle(message)
 

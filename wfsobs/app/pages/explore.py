@@ -67,6 +67,7 @@ class Explore:
         self.table = Table(run, display, seeds)
         self.pinning = Pinning(run, display, history)
         self.rooms: dict[str, pn.Column] = {}
+        self._later: list[tuple[pn.Column, pn.pane.Bokeh]] = []
         self.editors: dict[str, SpectrumEditor] = {}
         display.param.watch(self._edit, "editing")
         self.budget = BudgetView(seeds.store, display) if seeds else None
@@ -126,19 +127,34 @@ class Explore:
         cards.param.watch(lambda event: self._hide(target, event.new), "hidden")
         cards.on_main = lambda: self.lines.reset(target)
         marks = MARKS if target == VIBRATION else ""
-        self.rooms[target] = pn.Column(_caption("Spectrum", marks), self.spectra.pane(target), **TALL)
-        figures = pn.Column(
-            pn.Column(_caption("Time trace"), self.traces.pane(target), **TALL),
-            self.rooms[target],
-            **WIDE,
-            stylesheets=[GRID],
+        traces, self.rooms[target] = (
+            self._room(target, *parts)
+            for parts in (
+                (_caption("Time trace"), self.traces.pane(target)),
+                (_caption("Spectrum", marks), self.spectra.pane(target)),
+            )
         )
+        figures = pn.Column(traces, self.rooms[target], **WIDE, stylesheets=[GRID])
         return box(target.capitalize(), self.verdicts[target].pane, cards, figures, self.stretches[target].pane)
+
+    def _room(self, target: str, caption: pn.pane.HTML, pane: pn.pane.Bokeh) -> pn.Column:
+        """Lay out a figure; those of the first target stand there at once, the others have their room."""
+        if target == TARGETS[0]:
+            return pn.Column(caption, pane, **TALL)
+        self._later.append((room := pn.Column(caption, **TALL), pane))
+        return room
+
+    def complete(self) -> None:
+        """Put the figures further down into their rooms."""
+        for room, pane in self._later:
+            room.insert(1, pane)
+        self._later = []
 
     def _edit(self, *_: object) -> None:
         """Make the handles when they are first wanted."""
         if self.editors or self.seeds is None:
             return
+        self.complete()
         frames, theory = Frames(self.seeds.store.session), Theory()
         with pn.io.hold():
             for target, room in self.rooms.items():
