@@ -313,3 +313,19 @@ class TestHigherModes:
         shown = dashboard.store.run.result
         head = next(line for line in data_csv(shown).decode().splitlines() if line.startswith("time_s"))
         assert all(f"truth/turbulence/{mode.name}_um" in head for mode in dashboard.store.scenario.modes)
+
+
+def test_the_verdict_stays_dimmed_until_the_next_one(dashboard: Dashboard, loop: Any) -> None:
+    """What is below it does not move: its place is never empty, and what it says is marked as that of the run before."""
+    line = dashboard.explore.verdicts["vibration"]
+    said = line.pane.object
+    assert said.startswith('<p class="verdict"><strong>Vibration, tip: ')
+    dashboard.store.change("turbulence.wind_speed", 30)
+    assert line.pane.object == said.replace('"verdict"', '"verdict before"', 1)
+    loop.finish(dashboard.store)
+    assert line.pane.object.startswith('<p class="verdict"><strong>Vibration, tip: ') and line.pane.object != said
+    dashboard.store.change("turbulence.wind_speed", 20)
+    dashboard.display.mode = "tilt"
+    assert line.pane.object == '<p class="verdict before"></p>', "nothing is known of another mode yet"
+    loop.finish(dashboard.store)
+    assert "Vibration, tilt: " in line.pane.object

@@ -101,7 +101,7 @@ class Poster:
             _held(function)
 
     def _schedule(self, function: Callable[[], None]) -> None:
-        doc = self._doc
+        doc: Any = self._doc
         if doc.session_context is not None and not doc.session_context.destroyed:
             doc.add_next_tick_callback(partial(_held, function))
 

@@ -9,8 +9,8 @@ import panel as pn
 from wfsobs.app.causes import Causes
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.glossary import BOUND, explain_first
-from wfsobs.app.jobs.job import DONE
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs.job import DONE, RUNNING
+from wfsobs.app.jobs.task import IDLE, BackgroundTask
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
 from wfsobs.evaluation.verdict import verdict
@@ -28,6 +28,7 @@ class VerdictLine:
         causes: Causes | None = None,
     ):
         self.target, self.run, self.display, self.seeds, self.causes = target, run, display, seeds, causes
+        self._said: tuple[tuple[str, str], str] = ("", ""), ""
         self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
         run.param.watch(self._refresh, ["result", "state"])
         if seeds is not None:
@@ -40,8 +41,11 @@ class VerdictLine:
         self.pane.object = self.html()
 
     def html(self) -> str:
-        """Return the sentences; empty while observers are at work or where there is no truth."""
-        shown = self.run.result
+        """Return the sentences; while observers are at work those before, dimmed; empty where there is no truth."""
+        shown, of = self.run.result, (self.display.mode, self.display.unit)
+        if self.run.state in (IDLE, RUNNING):
+            before, text = self._said
+            return _paragraph(text if before == of else "", "verdict before")
         if shown is None or self.run.state != DONE:
             return ""
         it = shown.result
@@ -61,4 +65,11 @@ class VerdictLine:
         scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
         first, *others = found.sentences(scale, self.display.unit_label)
         more = "".join(f"<br>{escape(sentence)}" for sentence in others)
-        return f'<p class="verdict"><strong>{explain_first(first, "bound", BOUND)}</strong>{more}</p>'
+        text = f"<strong>{explain_first(first, 'bound', BOUND)}</strong>{more}"
+        self._said = of, text
+        return _paragraph(text, "verdict")
+
+
+def _paragraph(text: str, kind: str) -> str:
+    """Write what has its room before it comes, so that the figures below do not move."""
+    return f'<p class="{kind}">{text}</p>'
