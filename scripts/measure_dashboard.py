@@ -66,9 +66,10 @@ CLOCK = """() => {
   const last = (values) => values?.length > 0 && Number.isFinite(values[values.length - 1])
   let sources = {}
   const clock = window.wfsobsClock = {start: null, done: {}}
+  const fresh = () => sources.own.data["gpr-offline"] !== clock.before
   const said = {
-    most: () => sources.own.data.truth !== clock.before && last(sources.own.data["gpr-offline"]) && cell("gpr-offline") !== "–",
-    all: () => sources.own.data.truth !== clock.before && cell("gpr-online") !== "–" && status().startsWith("Done"),
+    most: () => fresh() && last(sources.own.data["gpr-offline"]) && cell("gpr-offline") !== "–",
+    all: () => fresh() && cell("gpr-online") !== "–" && status().startsWith("Done"),
     filter: () => sources.filter.data["kf-ngs"] !== clock.filter,
   }
   const look = () => {
@@ -84,7 +85,7 @@ CLOCK = """() => {
     window.addEventListener("pointerup", () => {
       Object.assign(clock, {
         start: performance.now(), done: {}, waiting: names,
-        before: sources.own.data.truth, filter: sources.filter.data["kf-ngs"]})
+        before: sources.own.data["gpr-offline"], filter: sources.filter.data["kf-ngs"]})
       look()
     }, {capture: true, once: true})
   }

@@ -28,6 +28,7 @@ from wfsobs.app.logs import event, to_stream
 from wfsobs.app.service import Full, Service
 from wfsobs.app.session import session_page
 from wfsobs.app.share import LONGEST
+from wfsobs.app.warm import warm_up
 from wfsobs.app.work import one_blas_thread
 
 CACHE_MB = 256
@@ -90,6 +91,7 @@ def serve(options: Options) -> None:
     to_stream(options.log_level, options.log_requests)
     prepare()
     service = make_service(options.limits, options.runs, options.cache_mb)
+    warm_up(service)
     server = make_server(options, service)
     loop = server.io_loop
     for number in (signal.SIGINT, signal.SIGTERM):

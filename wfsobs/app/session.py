@@ -92,21 +92,21 @@ class Poster:
                 return
             functions, self._waiting = self._waiting, []
         for function in functions:
-            _held(function)
+            _run_held(function)
 
     def _on_load(self) -> None:
         with self._lock:
             functions, self._waiting = self._waiting or [], None
         for function in functions:
-            _held(function)
+            _run_held(function)
 
     def _schedule(self, function: Callable[[], None]) -> None:
         doc: Any = self._doc
         if doc.session_context is not None and not doc.session_context.destroyed:
-            doc.add_next_tick_callback(partial(_held, function))
+            doc.add_next_tick_callback(partial(_run_held, function))
 
 
-def _held(function: Callable[[], None]) -> None:
+def _run_held(function: Callable[[], None]) -> None:
     with pn.io.hold():
         function()
 

@@ -32,7 +32,7 @@ class LazyLine:
             self.renderer.visible = visible
 
 
-class Lines(Mapping[str, LazyLine]):
+class FigureLines(Mapping[str, LazyLine]):
     """The lines of a figure by name; those that come first lie below."""
 
     def __init__(self, fig: figure, columns: Mapping[str, tuple[ColumnDataSource, str]]):

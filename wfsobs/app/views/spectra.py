@@ -10,7 +10,7 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d, UnionRenderers, V
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.lines import Lines
+from wfsobs.app.views.lines import FigureLines
 from wfsobs.app.views.plots import MODEL, PEAKS, ComparedLines, marked_peaks, new_figure, send
 from wfsobs.app.views.settle import on_settle, zoom_of
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
@@ -63,7 +63,7 @@ class _Spectrum:
         self.sources = {
             name: ColumnDataSource({"x": [], "y": []}, selection_policy=policy) for name in (TRUTH, *observers_of(target))
         }
-        self.lines = Lines(self.figure, {name: (source, "y") for name, source in self.sources.items()})
+        self.lines = FigureLines(self.figure, {name: (source, "y") for name, source in self.sources.items()})
         self.faint = ComparedLines(self.figure)
 
     def _add_marks(self) -> None:

@@ -10,7 +10,7 @@ from bokeh.plotting import figure
 
 from wfsobs.app.display import Display
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.views.lines import Lines
+from wfsobs.app.views.lines import FigureLines
 from wfsobs.app.work import TRUTH, RunResults
 
 
@@ -18,7 +18,7 @@ class Drawing(Protocol):
     """One figure and its lines, by observer."""
 
     figure: figure
-    lines: Lines
+    lines: FigureLines
 
 
 class TargetFigures:

@@ -15,7 +15,7 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.envelope import band_envelope, envelope, envelope_times
 from wfsobs.app.views.event_marks import EventMarks, events_of, room
-from wfsobs.app.views.lines import Lines
+from wfsobs.app.views.lines import FigureLines
 from wfsobs.app.views.plots import ComparedLines, new_figure, send
 from wfsobs.app.views.settle import on_settle, zoom_of
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
@@ -129,7 +129,7 @@ class _Trace:
         self.figure.add_tools(crosshair)
         self.warm_up = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.10, line_width=0, level="underlay")
         self.figure.add_layout(self.warm_up)
-        self.lines = Lines(self.figure, {name: (self.source, name) for name in self.names})
+        self.lines = FigureLines(self.figure, {name: (self.source, name) for name in self.names})
         self.faint = ComparedLines(self.figure)
         self.events = EventMarks(self.figure)
         self.band = _Band(self.figure)
