@@ -64,7 +64,7 @@ class EventMarks:
     """The marks in one figure, none until there is an event; words hang from the top of its axis."""
 
     def __init__(self, fig: figure):
-        self.figure, self._made = fig, False
+        self.figure, self._marks_exist = fig, False
         self.jumps = ColumnDataSource({"x": []})
         self.spans = ColumnDataSource({"start": [], "end": []})
         self.words = ColumnDataSource({"x": [], "y": [], "text": [], "below": []})
@@ -75,7 +75,7 @@ class EventMarks:
     def draw(self, results: RunResults, dark: bool) -> None:
         """Show those of the results."""
         events = events_of(results)
-        if not events and not self._made:
+        if not events and not self._marks_exist:
             return
         self._make()
         lasting = [e for e in events if e.duration > 0]
@@ -94,8 +94,8 @@ class EventMarks:
         self.restyle(dark)
 
     def _make(self) -> None:
-        if not self._made:
-            self._made = True
+        if not self._marks_exist:
+            self._marks_exist = True
             self.figure.add_glyph(self.spans, self._strip, level="underlay")
             self.figure.add_glyph(self.jumps, self._line)
             self.figure.add_glyph(self.words, self._text, level="overlay")

@@ -28,7 +28,7 @@ class VerdictLine:
         causes: Causes | None = None,
     ):
         self.target, self.run, self.display, self.seeds, self.causes = target, run, display, seeds, causes
-        self._said: tuple[tuple[str, str], str] = ("", ""), ""
+        self._sentence: tuple[tuple[str, str], str] = ("", ""), ""
         self.pane = pn.pane.HTML(self.html(), sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
         run.param.watch(self._refresh, ["result", "state"])
         if seeds is not None:
@@ -44,7 +44,7 @@ class VerdictLine:
         """Return the sentences; while observers are at work those before, dimmed; empty where there is no truth."""
         shown, of = self.run.result, (self.display.mode, self.display.unit)
         if self.run.state in (IDLE, RUNNING):
-            before, text = self._said
+            before, text = self._sentence
             return _paragraph(text if before == of else "", "verdict before")
         if shown is None or self.run.state != DONE:
             return ""
@@ -66,7 +66,7 @@ class VerdictLine:
         first, *others = found.sentences(scale, self.display.unit_label)
         more = "".join(f"<br>{escape(sentence)}" for sentence in others)
         text = f"<strong>{explain_first(first, 'bound', BOUND)}</strong>{more}"
-        self._said = of, text
+        self._sentence = of, text
         return _paragraph(text, "verdict")
 
 
