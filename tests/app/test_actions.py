@@ -246,4 +246,4 @@ def test_the_page_tells_of_a_long_run(loop: Any, short: Scenario, enter: Any) ->
     dashboard.page()
     dashboard.start()
     assert dashboard.store.run.state == "idle" and dashboard.stale.visible
-    assert dashboard.stale.object.startswith("About 20 s") and "press Run" in dashboard.stale.object
+    assert dashboard.stale.object.startswith("About 23 s") and "press Run" in dashboard.stale.object

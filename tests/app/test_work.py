@@ -63,7 +63,9 @@ def test_deliveries_are_held_back(short: Scenario, monkeypatch: pytest.MonkeyPat
     (shown,) = told
     assert shown is not None
     here = {name for name, _ in keys(shown)}
-    assert here == set(OBSERVERS) - {"gpr-online", "kf-adaptive"}, "all but those that learn during the run, at once"
+    assert here == set(OBSERVERS) - {"gpr-online", "kf-adaptive", "multirate-adaptive"}, (
+        "all but those that learn during the run, at once"
+    )
 
 
 def test_only_what_depends_runs(short: Scenario) -> None:

@@ -236,6 +236,7 @@ def test_every_tunable_setting_is_read() -> None:
             "vibration.peaks.0.damping": 0.0,
             "kalman.process_noise": "manual",
             "adaptive.window": 2.5,  # and the record holds two of them, half a second apart
+            "adaptive.longest": 2.6,  # the second is cut
             "kalman.measurement_noise": "manual",
             "multirate.measurement_noise": "manual",
             "gp.background_rms": 0.02,

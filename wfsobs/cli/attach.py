@@ -80,7 +80,7 @@ def attach(
     seconds: float | None,
     as_json: bool,
 ) -> None:
-    """Run an observer on the streams of a running loop (docs/streams.md)."""
+    """Run an observer on the shared-memory streams of a running loop (docs/streams.md)."""
     if bool(sink) == shadow:
         raise SettingError("attach: takes --out STREAM, or --shadow to write nothing")
     scenario = configfile.scenario_from(preset, config, assignments)

@@ -19,7 +19,7 @@ class Place(NamedTuple):
 
 
 COMMANDS = {
-    "attach": Place("attach", "Run an observer on the streams of a running loop (ImageStreamIO shared memory)."),
+    "attach": Place("attach", "Run an observer on the shared-memory streams of a running loop."),
     "bench": Place("bench", "Time the observers beside textbook versions, and other libraries if installed."),
     "campaign": Place("campaign", "Run many scenarios and seeds, on many processes or machines."),
     "design": Place("design", "Write a controller for a program elsewhere: C99 with a test, arrays, python-control."),

@@ -46,13 +46,19 @@ class Lengths(NamedTuple):
 
 
 def both_lengths(settings: Adaptive, dt: float, ratio: int, delay: int) -> Lengths:
-    """Return the lengths of windows. Raises RecordError for a window of too few samples."""
-    window, least = round(settings.window / dt / ratio), max(-(-SHORTEST // ratio), FEWEST)
-    if window < least:
-        raise RecordError(f"adaptive.window = {settings.window:g}: takes {least * ratio * dt:g} s or more, {least} NGS frames")
+    """Return the lengths of windows."""
+    window = round(settings.window / dt / ratio)
     longest, interval = (round(seconds / dt / ratio) for seconds in (settings.longest, settings.interval))
     first = 1 + ratio * -(-max(delay - 1, 0) // ratio)  # after a frame; what the mirror did before the record is not known
     return Lengths(window * ratio, max(longest, window) * ratio, max(interval, 1) * ratio, first, ratio)
+
+
+def check_window(settings: Adaptive, lengths: Lengths, dt: float) -> None:
+    """Raise RecordError for a window of too few samples."""
+    least = max(-(-SHORTEST // lengths.ratio), FEWEST)
+    if lengths.window < least * lengths.ratio:
+        needed = least * lengths.ratio * dt
+        raise RecordError(f"adaptive.window = {settings.window:g}: takes {needed:g} s or more, {least} NGS frames")
 
 
 class BothModel(NamedTuple):

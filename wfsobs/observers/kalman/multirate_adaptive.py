@@ -15,7 +15,7 @@ import numpy as np
 
 from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
 from wfsobs.observers.kalman.adaptive import ADAPTIVE, Adaptive
-from wfsobs.observers.kalman.both_window import GROWS, STILL, BothModel, Lengths, both_lengths, identify_both
+from wfsobs.observers.kalman.both_window import GROWS, STILL, BothModel, Lengths, both_lengths, check_window, identify_both
 from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_filter
 from wfsobs.observers.kalman.single import NGS
 from wfsobs.observers.kalman.spread import target_sd
@@ -32,6 +32,7 @@ def multirate_adaptive(measurements: Measurements, _prior: Prior, settings: Adap
     """
     assert measurements.ratio is not None
     lengths = both_lengths(settings, measurements.dt, measurements.ratio, measurements.delay)
+    check_window(settings, lengths, measurements.dt)
     needed = lengths.first + lengths.window
     if measurements.n_steps < needed:
         raise RecordError(f"the record has {measurements.n_steps} steps; adaptive.window = {settings.window:g} s needs {needed}")
