@@ -15,6 +15,14 @@ HERE = Path(__file__).parent
 SLOW = tuple(line for line in (HERE / "slow.txt").read_text().splitlines() if line and not line.startswith("#"))
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not even read the files of tests/slow.txt where what is slow is left out."""
+    if config.option.markexpr != "not slow" or HERE not in collection_path.parents:
+        return None
+    file = collection_path.relative_to(HERE).as_posix()
+    return file in SLOW or f"{file}/" in SLOW or None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what tests/slow.txt names: whole files, or single tests with all their parameters."""
     for item in items:
