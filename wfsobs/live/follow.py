@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from wfsobs.latencies import Latencies
 from wfsobs.live.blocks import check_live
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.source import SimulatedSource
@@ -25,8 +26,6 @@ LATE = 1e-3
 """From which delay a frame counts as late [s]."""
 LONG_STEPS = ("kf-adaptive", "gpr-offline")
 """Observers that are run if named alone."""
-BINS = np.geomspace(1e-7, 10.0, 1601)
-"""Edges of the histogram of latencies [s]: each 1.2 % above the one before, which is how exact a quantile is."""
 
 
 class Follower:
@@ -45,7 +44,7 @@ class Follower:
     def __init__(self, observer: StepObserver, scored_from: int, budget: float):
         self.observer, self.scored_from, self.budget = observer, scored_from, budget
         n_modes = observer.sampling.n_modes
-        self.late, self._counts = 0, np.zeros(len(BINS) + 1, dtype=np.int64)
+        self.late, self.latencies = 0, Latencies()
         self._squares = {target: np.zeros(n_modes) for target in observer.targets}
         self._samples = {target: np.zeros(n_modes, dtype=np.int64) for target in observer.targets}
 
@@ -57,7 +56,7 @@ class Follower:
         self.observer.update(frame.z, ngs, frame.u if needs_command else None)
         means = {target: self.observer.predict(0, target)[0] for target in self.observer.targets}
         spent = monotonic() - start
-        self._counts[np.searchsorted(BINS, spent)] += 1
+        self.latencies.add(spent)
         self.late += spent > self.budget
         if number >= self.scored_from:
             for target, mean in means.items():
@@ -66,13 +65,6 @@ class Follower:
                 self._squares[target] += np.where(known, error, 0.0) ** 2
                 self._samples[target] += known
         self.observer.settle()
-
-    def quantile(self, share: float) -> float:
-        """Return a quantile of the latencies [s]; NaN without a frame."""
-        if not (total := self._counts.sum()):
-            return float("nan")
-        bin_ = int(np.searchsorted(np.cumsum(self._counts), share * total))
-        return float(BINS[min(bin_, len(BINS) - 1)])
 
     def errors(self, modes: Sequence[str]) -> dict[str, dict[str, float | None]]:
         """Return target -> mode -> rms error after the warm-up [nm], None without a sample."""
@@ -157,8 +149,8 @@ def follow(
         "late_share": late / max(frames, 1),
         "observers": {
             name: {
-                "p50_us": f.quantile(0.5) * 1e6,
-                "p99_9_us": f.quantile(0.999) * 1e6,
+                "p50_us": f.latencies.quantile(0.5) * 1e6,
+                "p99_9_us": f.latencies.quantile(0.999) * 1e6,
                 "late": int(f.late),
                 "rms_nm": f.error(),
                 "errors_nm": f.errors(modes),

@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from wfsobs.latencies import Latencies
 from wfsobs.typing import Array
 
-BINS = np.geomspace(1e-7, 10.0, 1601)
-"""Edges of the histogram of latencies [s], each 1.2 % above the one before."""
 SLOW = 1.5
 """A frame is late if it comes more than so many frame times after the one before."""
 
@@ -19,15 +18,12 @@ class _Span:
 
     def __init__(self) -> None:
         self.frames = self.missing = self.late = self.n_scored = 0
-        self.latencies = np.zeros(len(BINS) + 1, dtype=np.int64)
+        self.latencies = Latencies()
         self.error = self.size = 0.0
 
     def quantile(self, share: float) -> float | None:
         """Return a quantile of the latencies [us]."""
-        if not self.frames:
-            return None
-        at = int(np.searchsorted(np.cumsum(self.latencies), share * self.frames))
-        return round(float(BINS[min(at, len(BINS) - 1)]) * 1e6, 1)
+        return round(self.latencies.quantile(share) * 1e6, 1) if self.frames else None
 
     def rms(self, squares: float) -> float | None:
         """Return the rms of a sum of squares [nm]."""
@@ -62,7 +58,7 @@ class Tally:
             span.frames += 1
             span.missing += missing
             span.late += late
-            span.latencies[np.searchsorted(BINS, end - arrival)] += 1
+            span.latencies.add(end - arrival)
             span.n_scored += int(known.sum())
             span.error += float((error[known] ** 2).sum())
             span.size += float((z[known] ** 2).sum())
