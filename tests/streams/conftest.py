@@ -1,11 +1,15 @@
 """The C program on the other side of a stream."""
 
 import subprocess
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+
+ENOUGH = 60.0
+"""Longest wait for another process or thread [s]; nothing is expected to take so long."""
 
 
 @pytest.fixture(scope="session")
@@ -26,3 +30,11 @@ def started(*command: object) -> Iterator[subprocess.Popen[str]]:
     finally:
         process.kill()
         process.communicate()
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    """Look every millisecond: a file of another program and a line of another thread do not announce themselves."""
+    until = time.monotonic() + ENOUGH
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.001)

@@ -3,7 +3,6 @@
 import json
 import signal
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,15 +14,13 @@ import pytest
 from click.testing import CliRunner
 
 import wfsobs
-from tests.streams.conftest import started
+from tests.streams.conftest import ENOUGH, started, wait_until
 from wfsobs.cli import main
 from wfsobs.stepping import design
 from wfsobs.streams.attach import Attachment, Wiring
 from wfsobs.streams.shared_image import SharedImage
 from wfsobs.streams.watchdog import Safety
 
-ENOUGH = 60.0
-"""Longest wait for another process or thread [s]; nothing is expected to take so long."""
 SINGLE = 2e-7
 """Rounding of float32 over the size of a number, three times over: measurement, estimate, comparison."""
 
@@ -52,8 +49,7 @@ def test_a_modal_filter_in_c_gets_the_numbers_of_the_run_over_the_record(tmp_pat
     given, taken = tmp_path / "aol1_modevalOL.im.shm", tmp_path / "aol1_modevalPF.im.shm"
     command = [peer, "loop", given, taken, n, 5, tmp_path / "values", tmp_path / "result", int(ENOUGH * 1e6), 1]
     with started(*command) as loop:
-        while not given.exists():
-            time.sleep(0.001)
+        wait_until(given.exists)
         options = ["--preset", "paper", "--set", "run.warm_up=0.5", "--observer", "kf-lgs", "--modes", "3,1", "--unit", "nm"]
         more = ["--delay", "2", "--stuck", str(ENOUGH), "--semaphore", "9", "--json"]
         attach = [sys.executable, "-m", "wfsobs", "attach", "--in", str(given), "--out", str(taken), *options, *more]
@@ -77,8 +73,8 @@ class Streams:
     """Two streams with an observer between them that runs in a thread, in step with the test."""
 
     def __init__(self, folder: Path, said: list[str], name: str = "kf-lgs", **wiring):
-        self.source = SharedImage.create(folder / "in.im.shm", (2,), "float64")
-        self.sink = SharedImage.create(folder / "out.im.shm", (2,), "float64")
+        self.source = SharedImage.create(folder / "in.im.shm", (2,), dtype="float64")
+        self.sink = SharedImage.create(folder / "out.im.shm", (2,), dtype="float64")
         settings = {"stuck": ENOUGH, **wiring}
         self.attachment = Attachment(
             SharedImage(folder / "in.im.shm"),
@@ -148,10 +144,8 @@ def test_a_stream_that_stops_and_comes_back(tmp_path: Path) -> None:
         while streams.next(before).any():
             before = streams.sink.count
         assert any("no frame for" in line for line in said)
-        streams.source = SharedImage.create(tmp_path / "in.im.shm", (2,), "float64")
-        until = time.monotonic() + ENOUGH
-        while "the stream was made anew" not in said and time.monotonic() < until:
-            time.sleep(0.001)
+        streams.source = SharedImage.create(tmp_path / "in.im.shm", (2,), dtype="float64")
+        wait_until(lambda: "the stream was made anew" in said)
         streams.attachment._wiring = replace(streams.attachment._wiring, stuck=ENOUGH)
         answers = [streams.answer(row) for row in z]
     assert not np.any(answers[:19]) and np.any(answers[25])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.streams.conftest import started
+from tests.streams.conftest import ENOUGH, started, wait_until
 from wfsobs.streams.layout import CURRENT, OLDER, StreamError
 from wfsobs.streams.semaphores import Semaphore
 from wfsobs.streams.shared_image import SharedImage, stream_path
@@ -26,7 +26,7 @@ def offset(fields: int) -> int:
 @pytest.mark.parametrize("shape", [(7,), (3, 5), (2, 3, 4)])
 def test_what_is_written_is_read(tmp_path: Path, layout, dtype: str, shape: tuple[int, ...]) -> None:
     path = tmp_path / "aol1_modevalOL.im.shm"
-    writer = SharedImage.create(path, shape, dtype, layout)
+    writer = SharedImage.create(path, shape, dtype=dtype, layout=layout)
     reader = SharedImage(path)
     assert reader.header.shape == shape and reader.header.name == "aol1_modevalOL" and reader.count == 0
     values = np.random.default_rng(1).normal(size=writer.n).astype(dtype)
@@ -39,7 +39,7 @@ def test_what_is_written_is_read(tmp_path: Path, layout, dtype: str, shape: tupl
 
 def test_the_older_layout_is_that_of_its_description(tmp_path: Path) -> None:
     path = tmp_path / "old.im.shm"
-    stream = SharedImage.create(path, (3, 5), "float64", OLDER)
+    stream = SharedImage.create(path, (3, 5), dtype="float64", layout=OLDER)
     stream.write(np.arange(15.0))
     raw = path.read_bytes()
     header = struct.unpack_from(OLD_FORMAT, raw)
@@ -52,7 +52,7 @@ def test_the_older_layout_is_that_of_its_description(tmp_path: Path) -> None:
 def test_one_axis_of_which_the_size_is_left_out(tmp_path: Path) -> None:
     """As xaosim writes it."""
     path = tmp_path / "one.im.shm"
-    SharedImage.create(path, (6,), "float64", OLDER)
+    SharedImage.create(path, (6,), dtype="float64", layout=OLDER)
     raw = bytearray(path.read_bytes())
     raw[:32] = b"xaosim".ljust(32)
     struct.pack_into("<3I", raw, 116, 0, 0, 0)
@@ -63,10 +63,9 @@ def test_one_axis_of_which_the_size_is_left_out(tmp_path: Path) -> None:
 def test_no_frame_is_half_of_one_and_half_of_another(tmp_path: Path, peer: Path) -> None:
     """A C program writes frames of equal numbers, one right after the other: what is read is one number all over."""
     path, seen = tmp_path / "fast.im.shm", set()
-    until = time.monotonic() + 60
+    until = time.monotonic() + ENOUGH
     with started(peer, "hammer", path, 20_000):
-        while not path.exists() and time.monotonic() < until:
-            time.sleep(0.001)
+        wait_until(path.exists)
         stream = SharedImage(path)
         while len(seen) < 1000 and time.monotonic() < until:
             found = stream.read()
@@ -108,7 +107,7 @@ def test_a_semaphore_that_nobody_waits_for_stays_low(tmp_path: Path) -> None:
 @pytest.mark.parametrize("layout", [CURRENT, OLDER])
 def test_a_file_cut_anywhere_is_refused_or_whole(tmp_path: Path, layout) -> None:
     path = tmp_path / "a.im.shm"
-    SharedImage.create(path, (5,), "float32", layout)
+    SharedImage.create(path, (5,), layout=layout)
     whole = path.read_bytes()
     needed = layout.header + 20 if layout is OLDER else layout.header + 24 + 32 * 10
     for size in [*range(0, needed, 7), needed - 1]:

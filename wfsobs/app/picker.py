@@ -11,6 +11,7 @@ import param
 from panel.custom import JSComponent
 
 from wfsobs.app.style import asset
+from wfsobs.telemetry.preview import safe_name
 
 LARGEST = 20_000_000
 """Of a file [bytes]."""
@@ -49,25 +50,43 @@ def file_message(name: str, kind: str, content: bytes) -> dict[str, str]:
 
 
 class PartialFile:
-    """A file on its way, in parts that come one after the other."""
+    """A file on its way, in parts that come one after the other; the first part of a file ends the one before."""
 
-    def __init__(self, name: str):
-        self.name = name
-        self._parts: list[bytes] = []
+    def __init__(self) -> None:
+        self.name = ""
+        self._parts: list[bytes] | None = None
 
     def take(self, msg: dict[str, Any]) -> bytes | None:
-        """Add a part {index, count, data}; the whole file with the last one. Raises ValueError, one line."""
+        """Add a part {name, index, count, data}; the whole file with the last one. Raises ValueError, one line."""
+        if msg.get("index") == 0:
+            self.name, self._parts = safe_name(str(msg.get("name", ""))), []
+        if self._parts is None:  # more of a file that has been given up
+            return None
+        try:
+            return self._add(self._parts, msg)
+        except ValueError:
+            self.drop()
+            raise
+
+    def drop(self) -> None:
+        """Give the file up: parts that still come are passed over."""
+        self._parts = None
+
+    def _add(self, parts: list[bytes], msg: dict[str, Any]) -> bytes | None:
         try:
             index, count = int(msg["index"]), int(msg["count"])
             part = base64.b64decode(msg["data"], validate=True)
         except (KeyError, TypeError, ValueError, binascii.Error):
             index, count, part = 0, 0, b""
-        if index != len(self._parts) or not index < count:
+        if index != len(parts) or not index < count:
             raise ValueError("The upload is incomplete: choose the file again.")
-        self._parts.append(part)
-        if sum(map(len, self._parts)) > LARGEST:
+        parts.append(part)
+        if sum(map(len, parts)) > LARGEST:
             raise ValueError(too_large(self.name))
-        return b"".join(self._parts) if index == count - 1 else None
+        if index < count - 1:
+            return None
+        self.drop()
+        return b"".join(parts)
 
 
 def too_large(name: str) -> str:

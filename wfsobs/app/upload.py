@@ -55,7 +55,7 @@ class Upload:
         self.open_scenario: Callable[[str, object], None] = lambda _name, _text: None
         self.open_session: Callable[[str, bytes], None] = lambda _name, _content: None
         self.room = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
-        self._parcel: PartialFile | None = None
+        self._parcel = PartialFile()
         self._name, self._content = "", b""
         self._preview: AnyPreview | None = None
         self.reading = BackgroundTask(store.session)
@@ -103,16 +103,13 @@ class Upload:
     def _take(self, msg: dict[str, Any]) -> None:
         if msg.get("index") == 0:
             self.discard()
-            self._parcel = PartialFile(safe_name(str(msg.get("name", ""))))
-        if self._parcel is None:  # more of a file that has been given up
-            return
         try:
             content = self._parcel.take(msg)
         except ValueError as error:
             self.discard(str(error))
             return
         if content is not None:
-            name, self._parcel = self._parcel.name, None
+            name = self._parcel.name
             if name.endswith(SUFFIX):
                 self.open_session(name, content)
             else:
@@ -226,7 +223,8 @@ class Upload:
 
     def discard(self, why: str = "") -> None:
         """Forget the file that is being looked at."""
-        self._content, self._parcel, self._preview = b"", None, None
+        self._content, self._preview = b"", None
+        self._parcel.drop()
         if self.form is not None:
             self.form.visible = False
             self.form.show({}, {})

@@ -23,7 +23,7 @@ from wfsobs.stepping import design, prior_in
 from wfsobs.streams.attach import STUCK, Attachment, Wiring
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.shared_image import SharedImage, stream_path
-from wfsobs.streams.watchdog import Safety
+from wfsobs.streams.watchdog import Fallback, Safety
 from wfsobs.units import UNITS, micrometres_per
 
 
@@ -73,7 +73,7 @@ def attach(
     modes: str | None,
     unit: str,
     delay: float,
-    fallback: str,
+    fallback: Fallback,
     limit: float | None,
     stuck: float,
     semaphore: int | None,
@@ -96,11 +96,11 @@ def attach(
         observer, noise = _design(name, scenario, len(elements), delay - 1)
         warm_up = max(round(scenario.run.warm_up / scenario.dt), 1)
         largest = np.inf if limit is None else limit * per_unit
-        limits = Safety(fallback, largest, calm=warm_up)  # pyright: ignore[reportArgumentType]
+        limits = Safety(fallback, largest, calm=warm_up)
         wiring = Wiring(elements, per_unit, delay, noise, limits, warm_up, stuck, semaphore)
         attachment = Attachment(given, taken, observer, wiring, _say)
         with _stop_signals() as stop:
-            attachment.run(seconds or np.inf, _say, stop)
+            attachment.run(seconds or np.inf, report=_say, stop=stop)
     except (StreamError, StepError) as error:
         raise SettingError(f"attach: {error}") from None
     if as_json:
@@ -129,7 +129,7 @@ def _open_sink(name: str, source: SharedImage) -> SharedImage:
         raise SettingError(f"--out {name}: is the stream that is read")
     if path.exists():
         return SharedImage(path)
-    return SharedImage.create(path, source.header.shape, source.header.dtype.name, source.header.layout)
+    return SharedImage.create(path, source.header.shape, dtype=source.header.dtype.name, layout=source.header.layout)
 
 
 def _design(name: str, scenario: Scenario, n_modes: int, horizon: float) -> tuple[StepObserver, np.ndarray]:

@@ -29,7 +29,7 @@ LONGEST_GAP = 1000
 
 @dataclass(frozen=True)
 class Wiring:
-    """How an observer is attachment.
+    """How an observer is attached.
 
     elements : number in a frame of the stream of each mode of the observer
     unit     : micrometres per unit of the streams
@@ -91,7 +91,7 @@ class Attachment:
         self.tally = Tally(observer.sampling.dt)
 
     def run(
-        self, seconds: float, report: Callable[[str], None] = lambda _: None, stop: Callable[[], bool] = lambda: False
+        self, seconds: float, *, report: Callable[[str], None] = lambda _: None, stop: Callable[[], bool] = lambda: False
     ) -> None:
         """Follow the stream for so long [s], or until `stop` says so; at the end, whatever ends it, the safe output is sent.
 

@@ -76,7 +76,7 @@ class SharedImage:
         self.first = self.count
 
     @classmethod
-    def create(cls, path: str | Path, shape: Sequence[int], dtype: str = "float32", layout: Layout = CURRENT) -> SharedImage:
+    def create(cls, path: str | Path, shape: Sequence[int], *, dtype: str = "float32", layout: Layout = CURRENT) -> SharedImage:
         """Make a stream of zeros, in place of one that is there.
 
         Parameters

@@ -65,7 +65,7 @@ class HistorySheet:
         """Make nothing yet. show : puts the sheet on the page, once."""
         self.history, self.display, self._show = history, history.display, show
         self.sheet: Sheet | None = None
-        self._parcel: PartialFile | None = None
+        self._parcel = PartialFile()
         self._name = ""
         self.saving, self.reading = BackgroundTask(history.store.session), BackgroundTask(history.store.session)
         self.saving.param.watch(self._save, ["state", "place"])
@@ -123,19 +123,13 @@ class HistorySheet:
             self._say(f"Saved {FILE}.")
 
     def _take(self, msg: dict[str, Any]) -> None:
-        if msg.get("index") == 0:
-            self._parcel = PartialFile(safe_name(str(msg.get("name", ""))))
-        if self._parcel is None:  # more of a file that has been given up
-            return
         try:
             content = self._parcel.take(msg)
         except ValueError as error:
-            self._parcel = None
             self._say(str(error))
             return
         if content is not None:
-            name, self._parcel = self._parcel.name, None
-            self.open_file(name, content)
+            self.open_file(self._parcel.name, content)
 
     def open_file(self, name: str, content: bytes) -> None:
         """Read a session's file beside the page, and open it; nothing changes where it cannot be read."""

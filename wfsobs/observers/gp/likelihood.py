@@ -9,12 +9,12 @@ e is its derivative, to rounding, as nothing is subtracted (Squire and Trapp, SI
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from wfsobs.observers.gp.kernels import Kernel
+from wfsobs.observers.gp.kernels import Kernel, Number
 from wfsobs.typing import Array
 
 TINY = 1e-30
@@ -55,14 +55,12 @@ def regress(kernel: Kernel, noise: float, dt: float, z: Array) -> Regression:
     Regression
         Means, variances and likelihood.
     """
-    space = kernel.state_space()
-    A, Q = space.discretise(dt)
-    found = _filter(A[None], Q[None], space.h[None], space.P[None], np.array([noise**2]), z)
+    found = _regressions([(kernel, noise)], dt, z)
     mean, variance, ahead, innovation = (x[:, 0] for x in found[:4])
     return Regression(mean, variance, ahead, innovation, float(found[4][0]))
 
 
-def log_likelihood(make: Callable[[Array], tuple[Kernel, float]], parameters: Array, dt: float, z: Array) -> tuple[float, Array]:
+def log_likelihood(make: Callable[[Array], tuple[Kernel, Number]], parameters: Array, dt: float, z: Array) -> tuple[float, Array]:
     """Return the log-likelihood of samples, and its gradient by the parameters.
 
     Parameters
@@ -81,19 +79,21 @@ def log_likelihood(make: Callable[[Array], tuple[Kernel, float]], parameters: Ar
     float, Array
         Log-likelihood and its gradient (p,).
     """
-    p = len(parameters)
-    found = []
-    for moved in np.asarray(parameters) + 1j * TINY * np.eye(p):
-        kernel, noise = make(moved)
-        space = kernel.state_space()
-        found.append((*space.discretise(dt), space.h, space.P, noise**2))
-    A, Q, h, P, r = (np.array(parts) for parts in zip(*found, strict=True))
-    total = _filter(A, Q, h, P, r, z)[4]
+    moved = np.asarray(parameters) + 1j * TINY * np.eye(len(parameters))
+    total = _regressions([make(one) for one in moved], dt, z)[4]
     return float(np.real(total[0])), np.imag(total) / TINY
 
 
+def _regressions(models: Sequence[tuple[Kernel, Number]], dt: float, z: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Run m regressions (kernel, noise) side by side; results (steps, m), and the log-likelihoods (m,)."""
+    spaces = [kernel.state_space() for kernel, _ in models]
+    A, Q = (np.array(parts) for parts in zip(*(space.discretise(dt) for space in spaces), strict=True))
+    h, P = np.array([space.h for space in spaces]), np.array([space.P for space in spaces])
+    return _filter(A, Q, h, P, np.array([noise**2 for _, noise in models]), z)
+
+
 def _filter(A: Array, Q: Array, h: Array, P: Array, r: Array, z: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Run several filters side by side: A, Q, P (m, n, n), h (m, n), r (m,); results (steps, m), and the log-likelihoods (m,)."""
+    """Run the filters: A, Q, P (m, n, n), h (m, n), r (m,)."""
     kind = np.result_type(A, Q, h, P, r)
     mean, variance, ahead, innovation = np.empty((4, len(z), len(r)), dtype=kind)
     x, total, turned = np.zeros(h.shape, dtype=kind), np.zeros(len(r), dtype=kind), A.swapaxes(1, 2)

@@ -9,20 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
-from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.observers.kalman.multi import PEAKS, MultiPeak
-from wfsobs.observers.kalman.multirate import MultiRate, multirate_noise, run_modes
-from wfsobs.observers.kalman.multirate_optimal import Cycle, estimated_cycle
+from wfsobs.observers.kalman.multirate import MultiRate, multirate_noise
+from wfsobs.observers.kalman.multirate_optimal import Cycle, OptimalFilters, estimated_cycle
 from wfsobs.observers.kalman.single import NGS
-from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.prior import Beams, Lines, Model, Prior
-from wfsobs.progress import Watch
-from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
@@ -45,27 +41,13 @@ def beam_model(beams: Beams, peaks: Sequence[Ar2]) -> DisturbanceModel:
     return replace(model, C=model.C * np.repeat(gains, poles))
 
 
-def multirate_multi(measurements: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> Estimates:
-    """Run the filter over a record."""
-    return run_modes(measurements, _filters(prior, settings, measurements.sampling), watch)
-
-
-def _filters(prior: Prior, settings: MultiPeak, sampling: Sampling) -> list[ModeFilter]:
-    assert sampling.ratio is not None
-    ratio, rates = sampling.ratio, MultiRate()
-    return [every_peak_model(rates, settings, prior, mode, ratio).filter() for mode in range(sampling.n_modes)]
-
-
-def step_multirate_multi(prior: Prior, settings: MultiPeak, sampling: Sampling, _horizon: float) -> KalmanEstimator:
-    """Return the filters of all modes, one frame at a time."""
-    return KalmanEstimator(_filters(prior, settings, sampling))
-
+_FILTERS = OptimalFilters(partial(every_peak_model, MultiRate()))
 
 MULTIRATE_MULTI = Observer(
     "multirate-multi",
     "Multi-rate multi-peak KF",
     TARGETS,
-    multirate_multi,
+    _FILTERS.run,
     help="both sensors, every line of the scenario in the model; not in the paper",
     prior=(Model, Lines, Beams),
     settings=PEAKS,
@@ -78,5 +60,5 @@ MULTIRATE_MULTI = Observer(
         ("multipeak.turbulence_order", "kalman.turbulence_rms"),
     ),
     look=Look("Multi-rate, all peaks", "#8C1D00", "#FFB59A", (16, 3, 3, 3)),
-    step=step_multirate_multi,
+    step=_FILTERS.step,
 )

@@ -10,8 +10,8 @@ the periodic Riccati equation of the n steps. Optimal for its model only; the pa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -118,26 +118,31 @@ def estimated_cycle(
     return Cycle(steps, np.hstack([rows, np.zeros((len(rows), len(steps[0][0]) - rows.shape[1]))]), model)
 
 
-def multirate_optimal(measurements: Measurements, prior: Prior, settings: MultiRate, watch: Watch) -> Estimates:
-    """Run the optimal multi-rate filter over a record."""
-    return run_modes(measurements, _filters(prior, settings, measurements.sampling), watch)
+class OptimalFilters(NamedTuple):
+    """The optimal filters of all modes. cycle_of : (settings, prior, mode, ratio) -> what is estimated in that mode."""
+
+    cycle_of: Callable[[Any, Prior, int, int], Cycle]
+
+    def run(self, measurements: Measurements, prior: Prior, settings: Any, watch: Watch) -> Estimates:
+        """Run them over a record."""
+        return run_modes(measurements, self._filters(prior, settings, measurements.sampling), watch)
+
+    def step(self, prior: Prior, settings: Any, sampling: Sampling, _horizon: float) -> KalmanEstimator:
+        """Return them one frame at a time."""
+        return KalmanEstimator(self._filters(prior, settings, sampling))
+
+    def _filters(self, prior: Prior, settings: Any, sampling: Sampling) -> list[ModeFilter]:
+        assert sampling.ratio is not None
+        return [self.cycle_of(settings, prior, mode, sampling.ratio).filter() for mode in range(sampling.n_modes)]
 
 
-def _filters(prior: Prior, settings: MultiRate, sampling: Sampling) -> list[ModeFilter]:
-    assert sampling.ratio is not None
-    return [optimal_model(settings, prior, mode, sampling.ratio).filter() for mode in range(sampling.n_modes)]
-
-
-def step_multirate_optimal(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:
-    """Return the filters of all modes, one frame at a time."""
-    return KalmanEstimator(_filters(prior, settings, sampling))
-
+_FILTERS = OptimalFilters(optimal_model)
 
 MULTIRATE_OPTIMAL = Observer(
     "multirate-optimal",
     "Optimal multi-rate KF",
     TARGETS,
-    multirate_optimal,
+    _FILTERS.run,
     help="periodic gains, frames as the means that they are; not in the paper",
     prior=(Model, LgsError),
     settings=RATES,
@@ -147,5 +152,5 @@ MULTIRATE_OPTIMAL = Observer(
     sensors=("lgs", "ngs"),
     tunable=TUNABLE,
     look=Look("Opt. multi-rate", "#7A1FA2", "#C9A0FF", (3, 2)),
-    step=step_multirate_optimal,
+    step=_FILTERS.step,
 )
