@@ -38,12 +38,15 @@ class GapStep:
         Gives x_hat[k] from (x_hat[k-1], v[k]), (n, n + m).
     is_last : bool
         Whether the filter is steady after it.
+    sd : Array or None
+        What its owner states of the errors after it, once asked for; kept with it.
     """
 
-    __slots__ = ("following", "is_last", "posterior", "update")
+    __slots__ = ("following", "is_last", "posterior", "sd", "update")
 
     def __init__(self, posterior: Array, update: Array, is_last: bool):
         self.posterior, self.update, self.is_last = posterior, update, is_last
+        self.sd: Array | None = None
         self.following: dict[Pattern, GapStep] = {}
 
 

@@ -39,29 +39,14 @@ class ModeFilter(NamedTuple):
         """Return the covariance of the state, (n, n), but for a running NGS frame."""
         return lyapunov(self.cycle[-1][0], self.cycle[-1][2])
 
+    def stated(self) -> StatedErrors:
+        """Return the standard deviations of its errors by its own model."""
+        return StatedErrors(self)
+
     def steady_sd(self) -> Array:
-        """Return `sd` of every step that repeats, (steps, 4) [um]."""
-        S = self.variance()
-        return np.array([self.sd(P, j, S) for j, P in enumerate(self.posterior)])
-
-    def sd(self, P: Array, j: int, S: Array) -> Array:
-        """Return the standard deviations after step j of the cycle of turbulence, vibration, their sum and the next z, (4,) [um].
-
-        The next z is c A x + noise. From the estimate s x_hat of the sum it differs by c A (x - x_hat) + (c A - s) x_hat + noise,
-        of which x_hat is independent of x - x_hat.
-
-        P : covariance after the measurement, (n, n)
-        S : `variance`
-        """
-        A, _, Q, R = self.cycle[j]
-        targets, C = self.rows(TARGETS), self.cycle[(j + 1) % len(self.cycle)][1]
-        rows = np.vstack([targets, targets.sum(axis=0), C[0] @ A])
-        variances = np.sum((rows @ P) * rows, axis=1)
-        other = rows[3] - rows[2]
-        if np.abs(other).max() > 1e-9 * np.abs(rows[2]).max():
-            variances[3] += other @ (S - P) @ other
-        variances[3] += C[0] @ Q @ C[0] + R[0, 0]
-        return np.sqrt(np.maximum(variances, 0.0))
+        """Return `StatedErrors.sd` of every step that repeats, (steps, 4) [um]."""
+        stated = self.stated()
+        return np.array([stated.sd(P, j) for j, P in enumerate(self.posterior)])
 
     def gaps(self) -> GapGains:
         """Return the gains near gaps; steady again is what knows every process and the measurement as well as without one."""
@@ -71,7 +56,41 @@ class ModeFilter(NamedTuple):
 
     def digest(self) -> bytes:
         """Return what tells models apart."""
-        return b"".join(x.tobytes() for step in self.cycle for x in step)
+        return b"".join(x.tobytes() for step in (*self.cycle, (self.rows(TARGETS),)) for x in step)
 
     def _pad_rows(self, rows: Array) -> Array:
         return np.pad(rows, ((0, 0), (0, len(self.gains.steps[0].A) - rows.shape[1])))
+
+
+class StatedErrors:
+    """Standard deviations [um] that a filter states after a step: of turbulence, vibration, their sum and the next z.
+
+    The next z is c A x + noise. From the estimate s x_hat of the sum it differs by c A (x - x_hat) + (c A - s) x_hat + noise,
+    of which x_hat is independent of x - x_hat.
+
+    Parameters
+    ----------
+    mode : ModeFilter
+        The filter.
+    """
+
+    def __init__(self, mode: ModeFilter):
+        targets, S, repeat = mode.rows(TARGETS), mode.variance(), len(mode.cycle)
+        total = targets.sum(axis=0)
+        self._rows, self._least = [], []
+        for j, (A, _, Q, R) in enumerate(mode.cycle):
+            c = mode.cycle[(j + 1) % repeat][1][0]
+            ahead = c @ A
+            other = ahead - total
+            if np.abs(other).max() <= 1e-9 * np.abs(total).max():
+                other = np.zeros_like(other)
+            rows = np.vstack([targets, total, ahead, other])
+            self._rows.append(rows)
+            self._least.append(np.array([0.0, 0.0, 0.0, other @ S @ other + c @ Q @ c + R[0, 0]]))
+
+    def sd(self, P: Array, j: int) -> Array:
+        """Return them after step j of the cycle, (4,); P : covariance after the measurement, (n, n)."""
+        rows = self._rows[j]
+        variances = np.einsum("ij,ij->i", rows @ P, rows)
+        variances[3] -= variances[4]
+        return np.sqrt(np.maximum(variances[:4] + self._least[j], 0.0))

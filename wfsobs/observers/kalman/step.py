@@ -18,7 +18,7 @@ from scipy.linalg import fractional_matrix_power
 
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.gap_bank import GapBank
-from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.mode_filter import ModeFilter, StatedErrors
 from wfsobs.observers.step_checks import StepError
 from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.gap_gains import GapGains
@@ -99,7 +99,7 @@ class KalmanEstimator(LinearEstimator):
         super().__init__(modes)
         self._plans: dict[tuple[float, str], Plan] = {}
         self._variances: dict[int, Array] = {}
-        self._record: tuple[Array, Array, list[Array]] | None = None
+        self._record: tuple[Array, Array, list[StatedErrors]] | None = None
         v = self.bank.v
         self._lgs, self._ngs = v[:, 0], v[:, 1] if v.shape[1] > 1 else None
 
@@ -123,18 +123,20 @@ class KalmanEstimator(LinearEstimator):
         return one.mean, self._near_gap(one, sd, target) if self.bank.is_near else sd
 
     def estimate(self) -> tuple[Array, Array]:
-        """Return the estimates of the last frame, (2, n_modes), and what `ModeFilter.sd` says of them, (4, n_modes)."""
+        """Return the estimates of the last frame, (2, n_modes), and what `StatedErrors` says of them, (4, n_modes)."""
         if self._record is None:
             n = self.bank.x.shape[1]
             rows = [np.pad(one.rows(TARGETS), ((0, 0), (0, n - len(one.gains.steps[0].A)))) for one in self.modes]
             steady = np.stack([one.steady_sd() for one in self.modes], axis=-1)
-            self._record = np.array(rows), steady, [one.variance() for one in self.modes]
-        rows, steady, variances = self._record
+            self._record = np.array(rows), steady, [one.stated() for one in self.modes]
+        rows, steady, stated = self._record
         j = self.bank.last_in_cycle
         sd = steady[j].copy() if self.bank.last or not self.bank.has_first else np.full(steady[j].shape, np.nan)
         for mode, near in enumerate(self.bank.near):
             if near is not None:
-                sd[:, mode] = self.modes[mode].sd(near.posterior, j, variances[mode])
+                if near.sd is None:
+                    near.sd = stated[mode].sd(near.posterior, j)
+                sd[:, mode] = near.sd
         return (rows @ self._state)[:, :, 0].T, sd
 
     def _near_gap(self, plan: Plan, steady: Array, target: str) -> Array:
