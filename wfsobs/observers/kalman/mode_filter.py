@@ -39,13 +39,13 @@ class ModeFilter(NamedTuple):
         """Return the covariance of the state, (n, n), but for a running NGS frame."""
         return lyapunov(self.cycle[-1][0], self.cycle[-1][2])
 
-    def stated(self) -> StatedErrors:
+    def stated_errors(self) -> StatedErrors:
         """Return the standard deviations of its errors by its own model."""
         return StatedErrors(self)
 
     def steady_sd(self) -> Array:
         """Return `StatedErrors.sd` of every step that repeats, (steps, 4) [um]."""
-        stated = self.stated()
+        stated = self.stated_errors()
         return np.array([stated.sd(P, j) for j, P in enumerate(self.posterior)])
 
     def gaps(self) -> GapGains:

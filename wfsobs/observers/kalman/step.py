@@ -128,7 +128,7 @@ class KalmanEstimator(LinearEstimator):
             n = self.bank.x.shape[1]
             rows = [np.pad(one.rows(TARGETS), ((0, 0), (0, n - len(one.gains.steps[0].A)))) for one in self.modes]
             steady = np.stack([one.steady_sd() for one in self.modes], axis=-1)
-            self._record = np.array(rows), steady, [one.stated() for one in self.modes]
+            self._record = np.array(rows), steady, [one.stated_errors() for one in self.modes]
         rows, steady, stated = self._record
         j = self.bank.last_in_cycle
         sd = steady[j].copy() if self.bank.last or not self.bank.has_first else np.full(steady[j].shape, np.nan)
