@@ -19,6 +19,7 @@ class Place(NamedTuple):
 
 
 COMMANDS = {
+    "arena": Place("arena", "Rank observers and controllers under the same rules on the same records."),
     "attach": Place("attach", "Run an observer on the shared-memory streams of a running loop."),
     "bench": Place("bench", "Time the observers beside textbook versions, and other libraries if installed."),
     "campaign": Place("campaign", "Run many scenarios and seeds, on many processes or machines."),

@@ -1,0 +1,123 @@
+"""A run: entries by registry and by folder, results written once, failures as an estimate of zero, one page."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.arena import trials
+from wfsobs.arena.cases import SimulatedCase, mean_square
+from wfsobs.arena.definition import Arena, load_arena
+from wfsobs.arena.entries import ArenaEntry, admits, find_entries
+from wfsobs.arena.process import Answer, EntryProcess
+from wfsobs.arena.reference import taps_error
+from wfsobs.arena.results import tables, write_results
+from wfsobs.arena.run import run_arena
+from wfsobs.arena.tracks import TRACKS
+from wfsobs.arena.trials import try_record
+from wfsobs.settings.errors import SettingError
+
+
+@pytest.fixture(scope="module")
+def arena() -> Arena:
+    quick = load_arena(quick=True)
+    return Arena(quick.version, tuple(case for case in quick.cases if case.track == "turbulence"), quick.rules)
+
+
+def test_an_entry_runs_once_and_stands_on_the_page(arena: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    entries = find_entries(["persistence"])
+    (first,) = run_arena(arena, entries, tmp_path)
+    case = arena.cases[0]
+    assert isinstance(case, SimulatedCase)
+    record = case.record(case.seeds[0])
+    after = slice(round(case.scenario.run.warm_up / record.dt), None)
+    expected = mean_square((record.z - case.truth(record))[after])
+    got = first.trials["turbulence", "paper"][0]
+    assert got.squares == pytest.approx([expected], rel=1e-9)  # the process adds in another order at most
+    assert got.reference[0] < expected and got.record == case.record_id(case.seeds[0])
+
+    def never(*_: Any) -> None:
+        raise AssertionError("runs again")
+
+    monkeypatch.setattr(EntryProcess, "_ask", never)
+    (again,) = run_arena(arena, entries, tmp_path)
+    assert again.trials == first.trials
+    values = tables(arena, [again])
+    write_results(values, tmp_path)
+    row = json.loads((tmp_path / "results.json").read_text())["tracks"][0]["rows"][0]
+    assert row["rank"] == 1 and row["told"] == "nothing" and row["failures"] == 0
+    page = (tmp_path / "index.html").read_text()
+    assert "Persistence" in page and f"{row['score']:.3f}" in page
+    assert "http" not in page  # self-contained
+
+
+def folder_of(place: Path) -> ArenaEntry:
+    (entry,) = find_entries([str(place)])
+    return entry
+
+
+def test_a_folder_of_estimates(arena: Arena, tmp_path: Path) -> None:
+    case = arena.cases[0]
+    record, path = case.record(case.seeds[0]), tmp_path / f"{case.record_id(case.seeds[0])}.npz"
+    truth = case.truth(record)
+
+    def trial() -> trials.Trial:
+        return try_record(folder_of(tmp_path), case, case.seeds[0], record, None, arena.rules)
+
+    zero = [mean_square(truth[part]) for part in case.stretches(record)]
+    assert trial().failure == f"{path.name}: there is no such file" and trial().squares == zero
+    np.savez(path, estimate=np.full(truth.shape, np.nan))
+    assert trial().failure == "no number in 2000 of 2000 steps that are scored" and trial().squares == zero
+    np.savez(path, estimate=truth[:5])
+    assert trial().failure.startswith(f"estimate takes numbers of shape {truth.shape}") and trial().squares == zero
+    np.savez(path, estimate=np.array([{"a": 1}], dtype=object))
+    assert "there is no" not in trial().failure and trial().failure and trial().squares == zero
+    path.write_bytes(pickle.dumps(truth))
+    assert "takes an .npz with estimate" in trial().failure
+    np.savez(path, estimate=truth + 0.01, sd=np.full(truth.shape, 0.01))
+    good = trial()
+    assert not good.failure and good.squares == pytest.approx([2 * 0.01**2], rel=1e-9)
+    assert good.calibration["within_95"] == 1.0 and good.microseconds is None
+
+
+def test_who_enters_where() -> None:
+    def tracks(name: str) -> list[str]:
+        return [t.id for t in TRACKS.values() if admits(t, find_entries([name])[0])]
+
+    assert tracks("kf-lgs") == ["vibration", "turbulence", "disturbance", "next", "two-sensors", "events"]
+    assert tracks("multirate") == ["two-sensors"]
+    assert tracks("integrator") == ["closed-loop"]
+    assert tracks("rls") == ["disturbance", "next", "events"]
+
+
+@pytest.mark.parametrize("name", ["nobody", "nowhere:ME", "wfsobs.record:DELAY"])
+def test_an_entry_that_is_none(name: str) -> None:
+    with pytest.raises(SettingError, match="--entry"):
+        find_entries([name])
+
+
+def test_the_reference_of_thirty_taps_is_least_squares() -> None:
+    rng = np.random.default_rng(3)
+    z = rng.standard_normal((3000, 1)).cumsum(axis=0) * 0.01
+    truth = 0.5 * z + 0.25 * np.vstack([z[:1] * 0, z[:-1]])
+    error = taps_error(z, truth, z, truth)
+    # a filter of two taps is within reach: what is left is the penalty of 1e-6
+    assert np.std(error[100:]) < 1e-3 * np.std(truth)
+
+
+def test_controllers_answer_with_commands(arena: Arena) -> None:
+    case = next(c for c in load_arena(quick=True).cases if c.track == "closed-loop")
+    record = case.record(case.seeds[0])
+
+    class Still:
+        def run(self, _seconds: float, *_: Any) -> Answer:
+            return Answer({"u": np.zeros_like(record.y_lgs)}, 0.0)
+
+    (entry,) = find_entries(["integrator"])
+    found = try_record(entry, case, case.seeds[0], record, Still(), arena.rules)  # type: ignore[arg-type]
+    assert found.squares == pytest.approx([mean_square(case.truth(record)[part]) for part in case.stretches(record)], rel=1e-12)

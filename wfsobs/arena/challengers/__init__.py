@@ -1,0 +1,9 @@
+"""Predictors from the literature that enter the arena beside the observers, each in a module of its own."""
+
+from __future__ import annotations
+
+from wfsobs.arena.challengers.base import Challenger
+from wfsobs.arena.challengers.rls import RLS
+
+CHALLENGERS: dict[str, Challenger] = {one.observer.id: one for one in (RLS,)}
+"""By id, in the order of tables."""

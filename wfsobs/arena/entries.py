@@ -1,0 +1,132 @@
+"""What enters the arena: registered observers and controllers, challengers, objects of a module, folders of estimates."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from wfsobs import __version__
+from wfsobs.arena.challengers import CHALLENGERS
+from wfsobs.arena.tracks import Track
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Observer
+from wfsobs.settings.errors import SettingError
+
+REGISTERED, CHALLENGER, MODULE, FOLDER = "registered", "challenger", "module", "folder"
+
+
+@dataclass(frozen=True)
+class ArenaEntry:
+    """An entry.
+
+    Attributes
+    ----------
+    id, label : str
+        For files, and for people.
+    kind : str
+        "registered", "challenger", "module" or "folder".
+    place : str
+        Id, MODULE:NAME, or path of the folder.
+    version : str
+        Of its code or files: results of another version are not its own.
+    """
+
+    id: str
+    label: str
+    kind: str
+    place: str
+    version: str
+
+
+def find_entries(names: Sequence[str] = ()) -> list[ArenaEntry]:
+    """Return entries.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Ids of observers, controllers and challengers, MODULE:NAME of an object of a module, or folders; by default all that are
+        registered and all challengers.
+
+    Returns
+    -------
+    list of ArenaEntry
+        In the order of the names.
+
+    Raises
+    ------
+    SettingError
+        There is no such entry, or two have one id.
+    """
+    chosen = names or [*OBSERVERS, *CHALLENGERS, *CONTROLLERS]
+    entries = [_find(name) for name in dict.fromkeys(chosen)]
+    ids = [entry.id for entry in entries]
+    for id_ in ids:
+        if ids.count(id_) > 1:
+            raise SettingError(f"--entry: two entries have the id {id_!r}")
+    return entries
+
+
+def _find(name: str) -> ArenaEntry:
+    if name in OBSERVERS or name in CONTROLLERS:
+        return _of_object(OBSERVERS.get(name) or CONTROLLERS[name], REGISTERED, name)
+    if name in CHALLENGERS:
+        return _of_object(CHALLENGERS[name].observer, CHALLENGER, name)
+    if Path(name).is_dir():
+        files = sorted(Path(name).glob("*.npz"))
+        digest = hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files))
+        return ArenaEntry(Path(name).resolve().name, Path(name).resolve().name, FOLDER, name, digest.hexdigest()[:16])
+    if ":" in name:
+        return _of_object(_from_module(name), MODULE, name)
+    known = ", ".join([*OBSERVERS, *CHALLENGERS, *CONTROLLERS])
+    raise SettingError(f"--entry {name}: takes {known}, MODULE:NAME or a folder of estimates")
+
+
+def _of_object(algorithm: Any, kind: str, place: str) -> ArenaEntry:
+    return ArenaEntry(algorithm.id, algorithm.label, kind, place, _code_version(algorithm))
+
+
+def load_object(entry: ArenaEntry) -> Any:
+    """Return the observer or controller of an entry. Raises SettingError."""
+    if entry.kind == CHALLENGER:
+        return CHALLENGERS[entry.place].observer
+    if entry.kind == MODULE:
+        return _from_module(entry.place)
+    return OBSERVERS.get(entry.place) or CONTROLLERS[entry.place]
+
+
+def _from_module(name: str) -> Any:
+    module, _, attribute = name.partition(":")
+    try:
+        algorithm = getattr(import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise SettingError(f"--entry {name}: cannot be imported: {error}") from None
+    kinds = (OBSERVERS.kind, CONTROLLERS.kind)
+    if not isinstance(algorithm, kinds):
+        raise SettingError(f"--entry {name}: takes an Observer or a Controller, not a {type(algorithm).__name__}")
+    return algorithm
+
+
+def _code_version(algorithm: Any) -> str:
+    """Return the version of wfsobs with a digest of the module that an object's function is in."""
+    function = algorithm.run if isinstance(algorithm, Observer) else algorithm.predict or algorithm.law
+    try:
+        source = inspect.getsource(inspect.getmodule(function) or function).encode()
+    except (OSError, TypeError):
+        source = repr(algorithm).encode()
+    return f"{__version__} {hashlib.sha256(source).hexdigest()[:16]}"
+
+
+def admits(track: Track, entry: ArenaEntry) -> bool:
+    """Return whether an entry takes part in a track; a folder does where it has files of it."""
+    if entry.kind == FOLDER:
+        return not track.is_loop
+    if entry.kind == CHALLENGER and track.id not in CHALLENGERS[entry.place].tracks:
+        return False
+    algorithm = load_object(entry)
+    return track.admits(algorithm) if isinstance(algorithm, Observer) else track.is_loop

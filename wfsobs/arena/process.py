@@ -1,0 +1,200 @@
+"""An entry in a process of its own, which knows what it is sent and has limits of time and memory.
+
+It is sent measurements, a prior and settings; answers come back as arrays of numbers. The truth stays here.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from collections.abc import Mapping
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from time import perf_counter
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from wfsobs.arena.entries import ArenaEntry, load_object
+from wfsobs.observers.base import Observer
+from wfsobs.observers.estimates import NEXT_Z, TOTAL
+from wfsobs.typing import Array
+
+READY_TIME = 120.0
+"""Time to start a process and import what the entry needs [s]."""
+
+END_TIME = 1.0
+"""Time to end once nothing is asked any more [s]."""
+
+CHECK = "check"
+
+
+class EntryError(ValueError):
+    """Error: an entry without an answer; one line with the reason."""
+
+
+class Answer(NamedTuple):
+    """Answer of an entry for one record.
+
+    arrays  : target, "u" or "sd of ..." -> (n_steps, n_modes) [um]
+    seconds : computing time [s]
+    """
+
+    arrays: dict[str, Array]
+    seconds: float
+
+
+class EntryProcess:
+    """Process of an entry; used in a `with`, it ends with it.
+
+    Parameters
+    ----------
+    entry : ArenaEntry
+        What runs.
+    memory : float
+        Address space [GB].
+    """
+
+    def __init__(self, entry: ArenaEntry, memory: float):
+        self.entry, self.memory = entry, memory
+        self._process: Any = None
+        self._connection: Any = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._end()
+
+    def check(self, seconds: float) -> None:
+        """Check the rules for all entries in the process. Raises EntryError."""
+        self._ask(CHECK, seconds)
+
+    def run(self, seconds: float, *arguments: Any) -> Answer:
+        """Return the answer for one record. Raises EntryError after this time [s], or with the entry's own reason."""
+        return self._ask(arguments, seconds)
+
+    def _ask(self, message: Any, seconds: float) -> Answer:
+        if self._process is None:
+            self._start()
+        try:
+            self._connection.send(message)
+            return _read(self._receive(seconds))
+        except EOFError:
+            raise EntryError(f"its process ended, with exit status {self._end()}") from None
+        except BrokenPipeError:
+            raise EntryError(f"its process ended, with exit status {self._end()}") from None
+
+    def _receive(self, seconds: float) -> bytes:
+        if not self._connection.poll(seconds):
+            self._end()
+            raise EntryError(f"too slow: no answer after {seconds:g} s")
+        return self._connection.recv_bytes()
+
+    def _start(self) -> None:
+        os.environ["OPENBLAS_NUM_THREADS"] = "1"  # inherited, and read when it imports numpy
+        context = get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        process = context.Process(target=serve, args=(theirs, self.entry, self.memory, os.getcwd()))
+        process.start()
+        self._process = process
+        theirs.close()
+        _read(self._receive(READY_TIME))
+
+    def _end(self) -> int | None:
+        """End the process; return its exit status, None where there was none."""
+        process, self._process = self._process, None
+        if process is None:
+            return None
+        self._connection.close()
+        process.join(END_TIME)
+        process.kill()
+        process.join()
+        return process.exitcode
+
+
+def serve(connection: Connection, entry: ArenaEntry, memory: float, folder: str) -> None:
+    """Answer what is asked until the connection ends; the main function of the process."""
+    import wfsobs.testing  # noqa: F401  the limit is for what comes after
+
+    sys.path.insert(0, folder)
+    _limit_memory(memory)
+    algorithm: Any = None
+    message: Any = None
+    while True:
+        try:
+            if algorithm is None:
+                algorithm = load_object(entry)
+                answer = {}
+            elif message == CHECK:
+                check(algorithm)
+                answer = {}
+            else:
+                start = perf_counter()
+                answer = solve(algorithm, *message)
+                answer["seconds"] = np.array(perf_counter() - start)
+        except MemoryError:
+            answer = {"reason": np.array(f"too large: needs more than {memory:g} GB of memory")}
+        except Exception as error:
+            answer = {"reason": np.array(reason(error))}
+        file = io.BytesIO()
+        np.savez(file, **answer)  # pyright: ignore[reportArgumentType]
+        connection.send_bytes(file.getvalue())
+        try:
+            message = connection.recv()
+        except EOFError:
+            return
+
+
+def reason(error: Exception) -> str:
+    """Return the reason of an error in one line; an error of the code has its type."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, (ValueError, AssertionError)) and text else f"{type(error).__name__}: {text}"
+
+
+def check(algorithm: Any) -> None:
+    """Check the rules for observers or controllers. Raises CheckError, ValueError."""
+    from wfsobs.testing import QUICK, CheckError, check_controller, check_observer
+
+    if not isinstance(algorithm, Observer):
+        check_controller(algorithm)
+        return
+    if not algorithm.causal:
+        raise CheckError(f"{algorithm.id}: looks ahead, as it says itself")
+    from wfsobs.scenario.presets import PRESETS
+
+    check_observer(algorithm, PRESETS["paper"]().replace({**QUICK, "vibration.synthesis": "gaussian"}))
+
+
+def solve(algorithm: Any, *arguments: Any) -> dict[str, Array]:
+    """Return the estimates of an observer and its standard deviations, or the commands of a controller. Raises ValueError."""
+    if isinstance(algorithm, Observer):
+        found = algorithm.estimate(*arguments)
+        known = (*algorithm.targets, TOTAL, NEXT_Z)
+        return dict(found) | {f"sd of {name}": np.asarray(sd) for name, sd in found.sd.items() if name in known}
+    measured, prior, plant, settings = arguments
+    laws = algorithm.laws(prior, plant, settings, measured.n_modes)
+    if not all(law.stable for law in laws):
+        raise EntryError("a pole of the closed loop is not within the unit circle")
+    return {"u": algorithm.commands(laws, measured, prior, plant, settings)[0]}
+
+
+def _read(data: bytes) -> Answer:
+    """Return the arrays of an answer; nothing is unpickled. Raises EntryError."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        values: Mapping[str, Array] = {name: file[name] for name in file.files}
+    if "reason" in values:
+        raise EntryError(str(values["reason"]))
+    return Answer({k: v for k, v in values.items() if k != "seconds"}, float(values.get("seconds", 0.0)))
+
+
+def _limit_memory(gigabytes: float) -> None:
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return
+    size = round(gigabytes * 1e9)
+    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (size if hard == resource.RLIM_INFINITY else min(size, hard), hard))
