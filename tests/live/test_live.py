@@ -12,7 +12,7 @@ import wfsobs
 from wfsobs.latencies import EDGES, Latencies
 from wfsobs.live.blocks import endless_blocks
 from wfsobs.live.ring import CAPACITY, Ring
-from wfsobs.live.source import _Loop
+from wfsobs.live.simulated import Integrator
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario.presets import paper
 
@@ -60,11 +60,11 @@ def test_frames_of_the_natural_guide_star_come_when_they_are_due():
     assert not np.isnan(made["z"]).any()
 
 
-def test_the_integrator_goes_on_from_block_to_block():
+def test_the_integrator_frame_by_frame():
     z = np.random.default_rng(1).normal(size=(300, 2))
     scenario = paper()
-    loop = _Loop(scenario)
-    parts = np.vstack([loop.commands(part) for part in np.split(z, [1, 100, 101])])
+    loop = Integrator(scenario)
+    parts = np.vstack([loop.command(one) for one in z])
     g, leak = scenario.loop.gain, scenario.loop.leak
     assert parts == pytest.approx(lfilter([-g], [1, -leak, g], z, axis=0), rel=0, abs=1e-13)
 

@@ -12,12 +12,10 @@ from wfsobs.cli.options import scenario_options
 from wfsobs.cli.show import progress_bar, show_table
 from wfsobs.files import check_writable
 from wfsobs.live.follow import follow
+from wfsobs.live.recording import record_of
 from wfsobs.live.ring import LiveFrame
-from wfsobs.record import Record
 from wfsobs.scenario import configfile
 from wfsobs.settings.group import SettingError
-from wfsobs.simulation.loop import measure_closed_loop
-from wfsobs.simulation.sensing import OpenLoop
 from wfsobs.telemetry.records import save_record
 
 
@@ -57,11 +55,8 @@ def live(
             report=update,
         )
     if record_file:
-        z, ngs, _, turbulence, vibration = (np.array(x) for x in list(zip(*kept, strict=True))[1:])
-        ngs[0] = np.nan  # a record begins before its first NGS frame
-        measured = measure_closed_loop(scenario, OpenLoop(z, ngs))
-        record = Record(**vars(measured), turbulence=turbulence, vibration=vibration)
-        save_record(record_file, record, configfile.to_toml(scenario))
+        frames = LiveFrame(*(np.array(part) for part in zip(*kept, strict=True)))
+        save_record(record_file, record_of(frames, scenario), configfile.to_toml(scenario))
     if as_json:
         click.echo(json.dumps(result, allow_nan=False))
         return

@@ -41,6 +41,10 @@ class Block:
     turbulence: Array
     vibration: Array
 
+    def rows(self) -> Array:
+        """Return a row per frame: z, ngs, turbulence, vibration, (n, 4 n_modes) [um]."""
+        return np.hstack([self.z, self.ngs, self.turbulence, self.vibration])
+
 
 def endless_blocks(scenario: Scenario, rng: np.random.Generator, length: float = LENGTH) -> Iterator[Block]:
     """Yield blocks of frames of a scenario for ever.
@@ -50,7 +54,7 @@ def endless_blocks(scenario: Scenario, rng: np.random.Generator, length: float =
     scenario : Scenario
         Settings, without events.
     rng : numpy.random.Generator
-        Source of all random numbers.
+        LiveSource of all random numbers.
     length : float
         Length of the records [s].
 

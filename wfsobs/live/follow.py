@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Sequence
+from math import inf, isnan
 from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
 
-from wfsobs.latencies import Latencies
 from wfsobs.live.blocks import check_live
+from wfsobs.live.board import Counts
 from wfsobs.live.ring import LiveFrame
-from wfsobs.live.source import SimulatedSource
+from wfsobs.live.simulated import SimulatedLoop
+from wfsobs.live.source import SourceProcess
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepObserver
 from wfsobs.observers.step_checks import StepError
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import design
+from wfsobs.typing import Array
 
 POLL = 1e-4
 """Pause between two looks at the ring [s]."""
@@ -36,50 +40,66 @@ class Follower:
     observer : StepObserver
         Before its first frame.
     scored_from : int
-        First frame that counts in the error.
+        First frame of the observer that counts in the error.
     budget : float
         Time in which the estimate should be there [s].
+    counts : Counts, optional
+        Where errors and latencies are counted.
     """
 
-    def __init__(self, observer: StepObserver, scored_from: int, budget: float):
+    def __init__(self, observer: StepObserver, scored_from: int, budget: float, counts: Counts | None = None):
         self.observer, self.scored_from, self.budget = observer, scored_from, budget
         n_modes = observer.sampling.n_modes
-        self.late, self.latencies = 0, Latencies()
-        self._squares = {target: np.zeros(n_modes) for target in observer.targets}
-        self._samples = {target: np.zeros(n_modes, dtype=np.int64) for target in observer.targets}
+        self.counts = Counts.empty(n_modes) if counts is None else counts
+        self._places = [TARGETS.index(target) for target in observer.targets]
+        self._expects = len(self._places) == len(TARGETS)
+        self._next = np.full(n_modes, np.nan)
 
-    def take(self, frame: LiveFrame, number: int) -> None:
-        """Update, estimate and score on one frame."""
-        start = monotonic()
-        needs_command = self.observer.estimator.needs_command
-        ngs = None if np.isnan(frame.ngs[0]) or number == 0 else frame.ngs
-        self.observer.update(frame.z, ngs, frame.u if needs_command else None)
-        means = {target: self.observer.predict(0, target)[0] for target in self.observer.targets}
+    def take(self, frame: LiveFrame) -> tuple[float, list[Array]]:
+        """Update, estimate and score on one frame; return the time that it took [s], and the estimate of every target."""
+        observer, start = self.observer, monotonic()
+        number = observer.frame
+        ngs = None if number == 0 or np.isnan(frame.ngs[0]) else frame.ngs
+        observer.update(frame.z, ngs, frame.u if observer.estimator.needs_command else None)
+        means = [observer.predict(0, target)[0] for target in observer.targets]
         spent = monotonic() - start
-        self.latencies.add(spent)
-        self.late += spent > self.budget
+        self.counts.latencies.add(spent)
+        self.counts.late[0] += spent > self.budget
+        self.counts.frames[0] += 1
         if number >= self.scored_from:
-            for target, mean in means.items():
-                error = mean - getattr(frame, target)
-                known = ~np.isnan(error)
-                self._squares[target] += np.where(known, error, 0.0) ** 2
-                self._samples[target] += known
-        self.observer.settle()
+            for place, mean in zip(self._places, means, strict=True):
+                self._score(place, mean - (frame.vibration if place else frame.turbulence))
+            if self._expects:
+                self._score(len(TARGETS), self._next - frame.z)
+        if self._expects:
+            self._next = means[0] + means[1]
+        observer.settle()
+        return spent, means
+
+    def _score(self, place: int, error: Array) -> None:
+        if is_known(error):
+            self.counts.squares[place] += error * error
+            self.counts.samples[place] += 1
+        elif (known := ~np.isnan(error)).any():
+            self.counts.squares[place, known] += error[known] ** 2
+            self.counts.samples[place] += known
 
     def errors(self, modes: Sequence[str]) -> dict[str, dict[str, float | None]]:
         """Return target -> mode -> rms error after the warm-up [nm], None without a sample."""
         return {
-            target: {name: _rms(float(s), int(n)) for name, s, n in zip(modes, squares, self._samples[target], strict=True)}
-            for target, squares in self._squares.items()
+            target: {name: None if isnan(x) else float(x) * 1e3 for name, x in zip(modes, self.counts.rms(target), strict=True)}
+            for target in self.observer.targets
         }
 
     def error(self) -> float | None:
         """Return the rms error over all targets and modes [nm]."""
-        return _rms(sum(float(s.sum()) for s in self._squares.values()), sum(int(n.sum()) for n in self._samples.values()))
+        n = int(self.counts.samples[self._places].sum())
+        return float(np.sqrt(self.counts.squares[self._places].sum() / n)) * 1e3 if n else None
 
 
-def _rms(squares: float, samples: int) -> float | None:
-    return float(np.sqrt(squares / samples)) * 1e3 if samples else None
+def is_known(x: Array) -> bool:
+    """Return whether no number is NaN."""
+    return bool(x.dot(x) < inf)
 
 
 def default_observers() -> list[str]:
@@ -136,7 +156,7 @@ def follow(
         followers = {name: Follower(design(name, scenario), first, pace) for name in dict.fromkeys(chosen)}
     except StepError as error:
         raise SettingError(str(error)) from None
-    source = SimulatedSource(scenario, speed, n_frames)
+    source = SourceProcess(SimulatedLoop(scenario), speed, n_frames)
     try:
         source.start()
         frames, lost, late = _drain(source, followers, n_frames, keep, report)
@@ -149,9 +169,9 @@ def follow(
         "late_share": late / max(frames, 1),
         "observers": {
             name: {
-                "p50_us": f.latencies.quantile(0.5) * 1e6,
-                "p99_9_us": f.latencies.quantile(0.999) * 1e6,
-                "late": int(f.late),
+                "p50_us": f.counts.latencies.quantile(0.5) * 1e6,
+                "p99_9_us": f.counts.latencies.quantile(0.999) * 1e6,
+                "late": int(f.counts.late[0]),
                 "rms_nm": f.error(),
                 "errors_nm": f.errors(modes),
             }
@@ -161,7 +181,7 @@ def follow(
 
 
 def _drain(
-    source: SimulatedSource,
+    source: SourceProcess,
     followers: dict[str, Follower],
     n_frames: int,
     keep: Callable[[LiveFrame], None] | None,
@@ -181,9 +201,9 @@ def _drain(
         if frame is None:
             lost += 1
         else:
-            late += monotonic() - frame.due > LATE
+            late += monotonic() - float(frame.due) > LATE
             for follower in followers.values():
-                follower.take(frame, number)
+                follower.take(frame)
             if keep is not None:
                 keep(frame)
         number += 1

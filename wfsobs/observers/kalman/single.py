@@ -9,6 +9,7 @@ y up to k - 1. Here phi_hat[k] uses y[k] too, like the GPR. The mirror's part is
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -128,17 +129,20 @@ def step_kf_ngs(prior: Prior, settings: Kalman, sampling: Sampling, _horizon: fl
     n, how = sampling.ratio, settings.ngs_between_frames
     modes = [steady_mode(one.at(n * sampling.dt).disturbance(), one.ngs_noise) for one in prior.model]
 
-    def spread(mode: int, target: str, since: int) -> Array:
-        model, at = prior.model[mode], TARGETS.index(target)
-        weights = between_frames((model.turbulence, model.vibration)[at], n, how, max(since + 1, n))[since]
-        return weights @ modes[mode].model.pairs[2 * at : 2 * at + 2]
-
+    spread = partial(_spread, prior.model, modes, n, how)
     truths = [model.disturbance() for model in prior.model]
     errors = [
         FrameErrors(truth, mode.gains.steps[0], n, model.ngs_noise)
         for truth, mode, model in zip(truths, modes, prior.model, strict=True)
     ]
     return FrameEstimator(modes, truths, errors, spread, holds=how == "hold")
+
+
+def _spread(models: Sequence[Model], modes: Sequence[ModeFilter], n: int, how: str, mode: int, target: str, since: int) -> Array:
+    """Return the row of the slow filter's state that gives a target, some fast steps since the frame."""
+    model, at = models[mode], TARGETS.index(target)
+    weights = between_frames((model.turbulence, model.vibration)[at], n, how, max(since + 1, n))[since]
+    return weights @ modes[mode].model.pairs[2 * at : 2 * at + 2]
 
 
 def between_frames(process: Ar2, n: int, how: str, steps: int | None = None) -> Array:

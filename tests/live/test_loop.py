@@ -1,0 +1,260 @@
+"""A live loop: changes while it runs, observers that come and go, and what is left when its owner goes."""
+
+import os
+import queue
+import signal
+import subprocess
+import sys
+import time
+from multiprocessing.shared_memory import SharedMemory
+
+import numpy as np
+import pytest
+
+import wfsobs
+from wfsobs.live.blocks import Block
+from wfsobs.live.board import Board
+from wfsobs.live.loop import LiveLoop
+from wfsobs.live.observing import Crew, Order, trace_width
+from wfsobs.live.paced import Pace
+from wfsobs.live.ring import LiveFrame, Ring
+from wfsobs.live.rows import Rows
+from wfsobs.live.simulated import FADE, SimulatedFrames, SimulatedLoop
+from wfsobs.live.view import read_view
+from wfsobs.scenario.presets import paper
+from wfsobs.settings.group import SettingError
+
+
+def blocks(value, n, count, first=False):
+    """Make blocks of n frames of one number each, with an NGS measurement in every fifth."""
+    ngs = np.full((n, 2), np.nan)
+    ngs[::5] = value
+    out = [Block(np.full((n, 2), value), ngs.copy(), np.full((n, 2), value), np.full((n, 2), value)) for _ in range(count)]
+    if first:
+        out[0].ngs[0] = np.nan
+    return out
+
+
+def test_new_settings_fade_in_without_a_seam():
+    """Weights of old and new have squares that add up to one, whatever was still in the queue; NGS frames come when due."""
+    ready = queue.Queue()
+    for block in blocks(1.0, 2000, 3):
+        ready.put((0, block))
+    frames = SimulatedFrames(paper(), ready)
+    rows = [frames.next_row(k) for k in range(503)]
+    assert "peak" in frames.take({"settings": paper().to_dict(), "is_new": 1, "line": "a peak"}, 503)
+    rows += [frames.next_row(k) for k in range(503, 603)]
+    for block in blocks(100.0, 2000, 2, first=True):
+        ready.put((1, block))
+    rows = np.array([*rows, *(frames.next_row(k) for k in range(603, 2500))])
+    z, ngs = rows[:, 0], rows[:, 2]
+    start, steps = 605, round(FADE * 1000)  # looked for in frames with an NGS measurement, so that those stay in step
+    phase = 0.5 * np.pi * np.arange(steps) / steps
+    assert np.all(z[:start] == 1.0) and np.all(z[start + steps :] == 100.0)
+    assert z[start : start + steps] == pytest.approx(np.cos(phase) + 100.0 * np.sin(phase), rel=1e-12)
+    assert np.array_equal(~np.isnan(ngs), np.arange(2500) % 5 == 0)
+    assert np.array_equal(ngs[::5], z[::5]) and np.array_equal(rows[:, 6], z)
+
+
+def test_lost_frames_hold_the_command():
+    ready = queue.Queue()
+    for block in blocks(1.0, 2000, 2):
+        ready.put((0, block))
+    frames = SimulatedFrames(paper(), ready)
+    before = [frames.next_row(k) for k in range(50)][-1]
+    frames.take({"losses": {"lgs": False, "ngs": True, "loss": 0.0}}, 50)
+    out = np.array([frames.next_row(k) for k in range(50, 60)])
+    assert np.isnan(out[:, :2]).all() and np.all(out[:, 4] == before[4]) and not np.isnan(out[:, 6:]).any()
+    frames.take({"losses": {"lgs": True, "ngs": True, "loss": 0.3}}, 60)
+    lost = np.isnan([frames.next_row(k)[0] for k in range(60, 1560)]).mean()
+    assert lost == pytest.approx(0.3, abs=5 * np.sqrt(0.3 * 0.7 / 1500))  # 5 standard deviations of 1500 draws
+
+
+def test_play_pause_steps_and_speed(monkeypatch):
+    now = 100.0
+    monkeypatch.setattr("wfsobs.live.paced.monotonic", lambda: now)
+    pace = Pace(0.001, 2.0)
+    assert not pace.runs
+    pace.take({"step": 2})
+    for _ in range(2):
+        assert pace.runs
+        pace.advance()
+    assert not pace.runs
+    now = 200.0
+    pace.take({"play": True})
+    due = []
+    for _ in range(4):
+        due.append(pace.due())
+        pace.advance()
+    pace.take({"speed": 0.1})
+    pace.advance()
+    due.append(pace.due())
+    assert np.diff(due) == pytest.approx([0.0005, 0.0005, 0.0005, 0.0105], abs=1e-9)
+    now = 300.0  # a machine that slept: what was due meanwhile is not sent in a rush
+    assert pace.due() == 300.0
+    pace.take({"play": False})
+    assert not pace.runs
+
+
+class Stage:
+    """The observers of a live loop in this process, on the frames of a record."""
+
+    def __init__(self, scenario, names):
+        record = wfsobs.simulate(scenario)
+        self.record, self.said = record, queue.Queue()
+        self.ring, self.board = Ring(2), Board(2)
+        self.traces = Rows(trace_width(2), 4096)
+        settings = scenario.to_dict()
+        order = Order(settings, names, 2, self.ring.name, self.traces.name, self.board.name, None, self.said)
+        self.crew, self.number = Crew(order), 0
+
+    def run(self, n):
+        r = self.record
+        for k in range(self.number, self.number + n):
+            parts = (r.z[k], r.z_ngs[k], r.u[k], r.turbulence[k], r.vibration[k])
+            self.ring.write(np.concatenate(([time.monotonic()], *parts)))
+            self.traces.write(self.crew.take(LiveFrame(time.monotonic(), *parts), k))
+        self.number += n
+
+    def view(self, seconds=1.0):
+        return read_view(self.ring, self.traces, self.record.dt, seconds)
+
+    def close(self):
+        for part in (self.ring, self.traces, self.board):
+            part.release()
+
+
+@pytest.fixture
+def stage():
+    made = []
+
+    def make(names, **changes):
+        made.append(Stage(paper().replace({"run.duration": 2.0, "run.warm_up": 0.5, **changes}), names))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def test_counts_and_traces_are_those_of_the_batch_run(stage):
+    live = stage(("kf-multi", "multirate-optimal", "kf-ngs"))
+    live.run(2000)
+    scenario = paper().replace({"run.duration": 2.0, "run.warm_up": 0.5})
+    result = wfsobs.observe(live.record, scenario, observers=["kf-multi", "multirate-optimal", "kf-ngs"])
+    view = live.view(1.5)
+    for score in result.scores:
+        if score.observer not in live.board.active():
+            continue
+        column = ["tip", "tilt"].index(score.mode)
+        # frame by frame and at once are one algorithm; the window begins where the warm-up ends
+        assert live.board[score.observer].rms(score.target)[column] == pytest.approx(score.rms, rel=1e-9)
+        assert view.rms(score.observer, score.target)[column] == pytest.approx(score.rms, rel=1e-9)
+    both = view.estimate("kf-multi", "turbulence")[:-1] + view.estimate("kf-multi", "vibration")[:-1]
+    expected = np.sqrt(np.mean((both - view.frames.z[1:]) ** 2, axis=0))
+    assert view.rms("kf-multi", "next") == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_new_design_goes_on_without_a_bump(stage):
+    names = ("kf-multi", "gpr-online")
+    live, other = stage(names), stage(names)
+    for one in (live, other):
+        one.run(1003)
+    for name in names:
+        live.crew.follow({"observer": name, "design": wfsobs.design(name, paper())}, 1003)
+    for one in (live, other):
+        one.run(500)
+    for name in names:
+        # the same design and the state carried over: the same estimates
+        assert live.view(0.4).estimate(name, "vibration") == pytest.approx(
+            other.view(0.4).estimate(name, "vibration"), rel=1e-9, abs=1e-12
+        )
+    assert live.board["kf-multi"].frames[0] == 1503
+
+
+def test_observers_come_and_go(stage):
+    live = stage(("kf-lgs",))
+    live.run(1003)
+    live.crew.follow({"observer": "multirate", "design": wfsobs.design("multirate", paper())}, 1003)
+    live.crew.follow({"observer": "kf-lgs", "design": None}, 1003)
+    live.run(900)
+    assert live.board.active() == ["multirate"] and live.board["multirate"].since[0] == 1005
+    view = live.view(2.0)
+    assert np.isnan(view.estimate("kf-lgs", "turbulence")[1003:]).all()
+    assert np.isnan(view.estimate("multirate", "turbulence")[:1005]).all()
+    # as a run that begins there: NGS frames are due in its own fifth frames
+    alone = wfsobs.design("multirate", paper())
+    for k in range(1005, 1903):
+        alone.update(live.record.z[k], live.record.z_ngs[k] if k > 1005 and k % 5 == 0 else None)
+    assert view.estimate("multirate", "turbulence")[-1] == pytest.approx(alone.predict(0)[0], rel=1e-12)
+    assert [line for _, line in list(live.said.queue)] == ["kf-lgs off", "multirate on"]
+
+
+def test_a_live_loop_from_start_to_stop():
+    scenario = paper().replace({"run.warm_up": 0.2})
+    loop = LiveLoop(SimulatedLoop(scenario), scenario, ["kf-multi", "gp-both"], speed=0.5)
+    try:
+        names = [loop._processes.feed.ring.name, loop._processes.traces.name, loop.board.name]
+        with pytest.raises(SettingError, match="modes and rates cannot change"):
+            loop.change({"sensors.exposure_ratio": 10})
+        with pytest.raises(SettingError, match="does not run frame by frame"):
+            loop.switch("butterworth-ol", True)
+        with pytest.raises(SettingError, match="takes a number from"):
+            loop.set_speed(50)
+        loop.start_recording()
+        loop.step(7)
+        wait(lambda: loop.count == 7)
+        loop.play()
+        wait(lambda: loop.count > 600)
+        loop.change({"turbulence.wind_speed": 20.0})
+        loop.pause()
+        wait(lambda: loop.count == loop.newest and "turbulence.wind_speed = 20.0" in [e.line for e in loop.events])
+        sent = loop.newest
+        record, pids = loop.stop_recording(), loop.pids
+        assert record.n_steps == sent == loop.newest
+        for score in wfsobs.observe(record, scenario, observers=["kf-multi", "gp-both"]).scores:
+            if score.observer in ("kf-multi", "gp-both"):
+                live = loop.board[score.observer].rms(score.target)[["tip", "tilt"].index(score.mode)]
+                # measurements of the record are sums in another order
+                assert live == pytest.approx(score.rms, rel=1e-6), score
+    finally:
+        loop.stop()
+    assert np.isnan(loop.view(0.1).frames.z).all() and loop.board["gp-both"].frames[0] == sent
+    wait(lambda: not any(map(is_running, pids)))
+    for name in names:
+        with pytest.raises(FileNotFoundError):
+            SharedMemory(name=name)
+
+
+def test_nothing_is_left_of_a_loop_whose_owner_is_killed():
+    code = (
+        "import time\n"
+        "from wfsobs import PRESETS\n"
+        "from wfsobs.live.loop import LiveLoop\n"
+        "from wfsobs.live.simulated import SimulatedLoop\n"
+        "s = PRESETS['paper']()\n"
+        "loop = LiveLoop(SimulatedLoop(s), s, ['zero'])\n"
+        "print(*loop.pids, loop._processes.feed.ring.name, loop._processes.traces.name, loop.board.name, flush=True)\n"
+        "time.sleep(100)\n"
+    )
+    owner = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    *pids, ring, traces, board = owner.stdout.readline().split()
+    owner.send_signal(signal.SIGKILL)
+    owner.communicate(timeout=60)
+    wait(lambda: not any(is_running(int(pid)) for pid in pids))
+    wait(lambda: not any(os.path.exists(f"/dev/shm/{name}") for name in (ring, traces, board)))
+
+
+def wait(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def is_running(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,163 @@
+"""Frames that are sent by the clock: play, pause, single steps and speed."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+from collections.abc import Mapping
+from dataclasses import dataclass
+from multiprocessing import parent_process
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from multiprocessing.queues import Queue
+from threading import Thread
+from time import monotonic, sleep
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from wfsobs.live.ring import Ring
+from wfsobs.typing import Array
+
+IDLE = 0.05
+"""Pause between two looks at the commands while nothing is sent [s]."""
+STALL = 1.0
+"""Delay beyond which the frames in between are given up, and the clock starts anew [s]."""
+
+Command = Mapping[str, Any]
+"""What a process of a live loop is told: one word and what belongs to it."""
+
+
+@dataclass(frozen=True)
+class Desk:
+    """Where a process of a source finds its work, and says what happens.
+
+    ring_name, n_modes : of the ring that it writes
+    inbox : commands
+    news  : (number of the frame, one line)
+    speed : at the start, 1 is real time
+    n_frames : after which it ends; None for no end
+    """
+
+    ring_name: str
+    n_modes: int
+    inbox: Connection
+    news: Queue[tuple[int, str]]
+    speed: float
+    n_frames: int | None
+
+    def say(self, number: int, line: str) -> None:
+        """Tell what happens from a frame on."""
+        self.news.put((number, line))
+
+
+class Staff(NamedTuple):
+    """The processes of a source.
+
+    sender   : writes the ring
+    others   : work for it
+    outboxes : by which the others are told of new settings
+    queue    : between them; its locks live as long as it is kept
+    """
+
+    sender: BaseProcess
+    others: list[BaseProcess]
+    outboxes: list[Connection]
+    queue: object = None
+
+
+class PacedFrames(Protocol):
+    """Frames of a source that has no clock of its own."""
+
+    def next_row(self, number: int) -> Array | None:
+        """Return z, ngs, u, turbulence and vibration of the next frame, (5 n_modes,) [um]; None after the last one."""
+        ...
+
+    def take(self, command: Command, number: int) -> str:
+        """Follow a command about the frames, from this number on; return a line for the list of events, or ""."""
+        ...
+
+
+class Pace:
+    """The clock of a source.
+
+    Parameters
+    ----------
+    dt : float
+        Time between two frames at the speed 1 [s].
+    speed : float
+        1 is real time.
+    """
+
+    def __init__(self, dt: float, speed: float):
+        self._dt, self._speed, self._steps, self._due = dt, speed, 0, 0.0
+        self.is_playing = False
+
+    @property
+    def runs(self) -> bool:
+        """Whether a frame is to be sent."""
+        return self.is_playing or self._steps > 0
+
+    def take(self, command: Command) -> None:
+        """Follow a command about the clock: "play", "step", "speed"."""
+        was_running = self.runs
+        self.is_playing = command.get("play", self.is_playing)
+        self._steps += command.get("step", 0)
+        self._speed = command.get("speed", self._speed)
+        if self.runs and not was_running:
+            self._due = monotonic() + self._dt / self._speed
+
+    def due(self) -> float:
+        """Return when the next frame is due, on the monotonic clock [s]."""
+        now = monotonic()
+        if now - self._due > STALL:
+            self._due = now
+        return self._due
+
+    def advance(self) -> None:
+        """Count a frame."""
+        self._due += self._dt / self._speed
+        self._steps = max(0, self._steps - 1)
+
+
+def send_frames(desk: Desk, frames: PacedFrames, dt: float) -> None:
+    """Write frames to the ring when they are due, until there are no more."""
+    ring, pace, number = Ring(desk.n_modes, desk.ring_name), Pace(dt, desk.speed), 0
+    row, rest = np.empty(1 + 5 * desk.n_modes), frames.next_row(0)
+    gc.collect()
+    gc.freeze()
+    while number != desk.n_frames and rest is not None:
+        while desk.inbox.poll(0 if pace.runs else IDLE):
+            command = desk.inbox.recv()
+            pace.take(command)
+            if line := frames.take(command, number):
+                desk.say(number, line)
+        if not pace.runs:
+            continue
+        row[0] = due = pace.due()
+        row[1:] = rest
+        if (wait := due - monotonic()) > 0:
+            sleep(wait)
+        ring.write(row)
+        number += 1
+        pace.advance()
+        rest = frames.next_row(number)
+    if rest is None:
+        desk.say(number, "the record has ended")
+    ring.close_writer()
+
+
+def enter_process(niceness: int = 0) -> None:
+    """Set up a process of a live loop: it ends with the one that started it, to which alone Ctrl+C goes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if niceness:
+        os.nice(niceness)
+    parent = parent_process()
+    assert parent is not None
+
+    def end() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=end, daemon=True).start()

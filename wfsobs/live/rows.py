@@ -1,0 +1,85 @@
+"""Rows of numbers in shared memory: one writer, any number of readers, none of which can hold the writer up."""
+
+from __future__ import annotations
+
+from multiprocessing.shared_memory import SharedMemory
+
+import numpy as np
+
+from wfsobs.typing import Array
+
+HEAD = 16
+"""Bytes before the rows: the count, and whether the writer has ended."""
+
+
+class Rows:
+    """A ring of rows.
+
+    Parameters
+    ----------
+    width : int
+        Numbers in a row.
+    capacity : int
+        Rows that it holds.
+    name : str, optional
+        That of a ring that exists.
+
+    Raises
+    ------
+    OSError
+        There is no ring of this name.
+    """
+
+    def __init__(self, width: int, capacity: int, name: str | None = None):
+        self._memory = SharedMemory(name=name, create=name is None, size=HEAD + 8 * capacity * width if name is None else 0)
+        self._head = np.ndarray(2, dtype=np.int64, buffer=self._memory.buf)
+        self._rows = np.ndarray((capacity, width), buffer=self._memory.buf, offset=HEAD)
+        self.capacity, self._owner = capacity, name is None
+
+    @property
+    def name(self) -> str:
+        """Name by which another process finds it."""
+        return self._memory.name
+
+    @property
+    def count(self) -> int:
+        """Number of rows written so far."""
+        return int(self._head[0])
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the writer has ended."""
+        return bool(self._head[1])
+
+    def write(self, row: Array) -> None:
+        """Append a row: the numbers first, then the count."""
+        self._rows[self._head[0] % self.capacity] = row
+        self._head[0] += 1
+
+    def skip_to(self, index: int) -> None:
+        """Go on with the row of this number; those between are not written, and hold what was there."""
+        self._head[0] = index
+
+    def read_row(self, index: int) -> Array | None:
+        """Return a copy of a row, (width,); None where it has been overwritten."""
+        row = self._rows[index % self.capacity].copy()
+        return None if self._head[0] - index > self.capacity - 1 else row
+
+    def read_rows(self, first: int, stop: int) -> Array:
+        """Return copies of the rows first ... stop - 1, (n, width); NaN where they have been overwritten or are yet to come."""
+        first, at = max(first, 0), np.arange(max(first, 0), max(stop, first, 0))
+        rows = self._rows[at % self.capacity]
+        head = int(self._head[0])
+        rows[(head - at > self.capacity - 1) | (at >= head)] = np.nan
+        return rows
+
+    def close_writer(self) -> None:
+        """Say that no row follows."""
+        self._head[1] = 1
+
+    def release(self) -> None:
+        """Give the memory back; what is read from then on is NaN."""
+        self._head, self._rows = self._head.copy(), np.broadcast_to(np.nan, self._rows.shape)
+        self._memory.close()
+        if self._owner:
+            self._memory.unlink()

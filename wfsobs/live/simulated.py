@@ -1,0 +1,196 @@
+"""The simulated loop as a source: one process makes blocks ahead of time, another sends their frames by the clock."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext
+from multiprocessing.queues import Queue
+from queue import Empty, Full
+from typing import Any
+
+import numpy as np
+
+from wfsobs.live.blocks import Block, endless_blocks
+from wfsobs.live.paced import Command, Desk, Staff, enter_process, send_frames
+from wfsobs.record import Sampling
+from wfsobs.scenario import Scenario
+from wfsobs.stepping import sampling_of
+from wfsobs.typing import Array
+
+AHEAD = 2
+"""Blocks that are ready beside the one that is sent."""
+FADE = 0.5
+"""Time in which frames of changed settings fade in [s]."""
+
+
+@dataclass(frozen=True)
+class SimulatedLoop:
+    """A scenario as a source.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        Settings; the seed is `run.seed`.
+    """
+
+    scenario: Scenario
+    name = "simulation"
+    has_truth = True
+
+    @property
+    def sampling(self) -> Sampling:
+        """Modes, step and NGS ratio."""
+        return sampling_of(self.scenario)
+
+    def staff(self, context: SpawnContext, desk: Desk) -> Staff:
+        """Return its processes."""
+        ready = context.Queue(AHEAD)
+        inbox, outbox = context.Pipe(duplex=False)
+        settings = self.scenario.to_dict()
+        maker = context.Process(target=_make, args=(settings, inbox, ready), daemon=True)
+        sender = context.Process(target=_send, args=(settings, ready, desk), daemon=True)
+        return Staff(sender, [maker], [outbox], ready)
+
+
+def _make(settings: dict[str, Any], inbox: Connection, ready: Queue[tuple[int, Block]]) -> None:
+    """Make blocks ahead of time, at low priority; when the settings change, those of the new ones."""
+    enter_process(niceness=10)
+    scenario, generation = Scenario.from_dict(settings), 0
+    rng = np.random.default_rng(scenario.run.seed)
+    blocks = endless_blocks(scenario, rng)
+    while True:
+        block, is_put = next(blocks), False
+        while not is_put:
+            if inbox.poll():
+                changed = inbox.recv()["settings"]
+                generation, blocks = generation + 1, endless_blocks(Scenario.from_dict(changed), rng)
+                break
+            try:
+                ready.put((generation, block), timeout=0.1)
+                is_put = True
+            except Full:
+                pass
+
+
+def _send(settings: dict[str, Any], ready: Queue[tuple[int, Block]], desk: Desk) -> None:
+    enter_process()
+    scenario = Scenario.from_dict(settings)
+    send_frames(desk, SimulatedFrames(scenario, ready), scenario.dt)
+
+
+class SimulatedFrames:
+    """Frames of a simulation whose settings may change.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings at the start.
+    ready : queue
+        (generation, block): blocks of the same settings are of one generation, the first is 0.
+    """
+
+    def __init__(self, scenario: Scenario, ready: Queue[tuple[int, Block]]):
+        self._ready, self._ratio, self._dt = ready, scenario.sensors.exposure_ratio, scenario.dt
+        self._loop, self._losses = Integrator(scenario), Losses(len(scenario.modes))
+        self._generation = self._target = 0
+        self._stock: deque[Array] = deque()
+        self._old, self._new = self._take_block(), None
+        self._at = self._new_at = 0
+        self._weight = np.empty(0)
+
+    def next_row(self, number: int) -> Array:
+        """Return the next frame: of the present settings, or fading into those of changed ones."""
+        if self._target > self._generation and self._new is None and number % self._ratio == 0:
+            self._look_for_new()
+        if self._new is not None and self._new_at == len(self._weight):
+            self._old, self._at, self._new = self._new, self._new_at, None
+        if self._at == len(self._old):
+            self._old, self._at = self._take_block(), 0
+        row = self._old[self._at]
+        self._at += 1
+        if self._new is not None:
+            row = self._mix(row, self._new[self._new_at])
+            self._new_at += 1
+        measured, truth = np.split(row, 2)
+        z, ngs = self._losses.apply(*np.split(measured, 2))
+        return np.concatenate((z, ngs, self._loop.command(z), truth))
+
+    def take(self, command: Command, number: int) -> str:
+        """Follow "settings", for which frames of another generation are to be expected, and "losses"."""
+        if "losses" in command:
+            self._losses.take(**command["losses"])
+        if "settings" in command:
+            self._loop.take(Scenario.from_dict(command["settings"]))
+            self._target += command["is_new"]
+        return command.get("line", "")
+
+    def _mix(self, row: Array, new: Array) -> Array:
+        """Fade; the first frame is an old one alone, as a first block has no NGS measurement there."""
+        weight = self._weight[self._new_at]
+        return np.sqrt(1.0 - weight**2) * row + weight * new if self._new_at else row
+
+    def _look_for_new(self) -> None:
+        """Begin to fade once a block of the newest settings has come; those before it may still be needed."""
+        try:
+            generation, block = self._ready.get_nowait()
+        except Empty:
+            return
+        if generation < self._target:
+            self._stock.append(block.rows())
+            return
+        left = len(self._old) - self._at + sum(map(len, self._stock))
+        steps = min(round(FADE / self._dt), left) // self._ratio * self._ratio
+        self._weight = np.sin(0.5 * np.pi * np.arange(steps) / max(steps, 1))
+        self._new, self._new_at, self._generation = block.rows(), 0, generation
+
+    def _take_block(self) -> Array:
+        if self._stock:
+            return self._stock.popleft()
+        self._generation, block = self._ready.get()
+        return block.rows()
+
+
+class Losses:
+    """What of the frames does not arrive.
+
+    Attributes
+    ----------
+    lgs, ngs : bool
+        Whether lasers and NGS sensor are on.
+    loss : float
+        Part of the frames that is lost.
+    """
+
+    def __init__(self, n_modes: int):
+        self.lgs, self.ngs, self.loss = True, True, 0.0
+        self._missing, self._rng = np.full(n_modes, np.nan), np.random.default_rng(0)
+
+    def take(self, lgs: bool, ngs: bool, loss: float) -> None:
+        """Change what arrives."""
+        self.lgs, self.ngs, self.loss = lgs, ngs, loss
+
+    def apply(self, z: Array, ngs: Array) -> tuple[Array, Array]:
+        """Return the measurements of a frame that arrive; NaN in place of others."""
+        is_lost = self.loss > 0 and self._rng.random() < self.loss
+        return z if self.lgs and not is_lost else self._missing, ngs if self.ngs and not is_lost else self._missing
+
+
+class Integrator:
+    """The integrator of the scenario."""
+
+    def __init__(self, scenario: Scenario):
+        self._before = self._last = np.zeros(len(scenario.modes))
+        self.take(scenario)
+
+    def take(self, scenario: Scenario) -> None:
+        """Go on with the gain and the leak of a scenario."""
+        loop = scenario.loop
+        self._gain, self._leak = (loop.gain, loop.leak) if loop.closed else (0.0, 0.0)
+
+    def command(self, z: Array) -> Array:
+        """Return u[k] = leak u[k-1] - g y[k], y[k] = z[k] + u[k-2], (n_modes,) [um]; a missing measurement holds the command."""
+        u = self._leak * self._last - self._gain * (z + self._before)
+        self._before, self._last = self._last, np.where(np.isnan(z), self._last, u)
+        return self._last

@@ -1,0 +1,103 @@
+"""The last seconds of a live loop: frames, estimates, errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from wfsobs.live.board import NEXT, SLOTS
+from wfsobs.live.observing import slot_width
+from wfsobs.live.ring import LiveFrame, Ring
+from wfsobs.live.rows import Rows
+from wfsobs.observers.base import TARGETS
+from wfsobs.typing import Array
+
+
+@dataclass(frozen=True)
+class LiveView:
+    """Consecutive frames, with what every observer makes of them.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first one.
+    dt : float
+        Time between two [s].
+    frames : LiveFrame
+        Each part (n, n_modes) [um].
+    """
+
+    first: int
+    dt: float
+    frames: LiveFrame
+    _traces: Array
+
+    @property
+    def n(self) -> int:
+        """Number of frames."""
+        return len(self._traces)
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes."""
+        return self.frames.z.shape[1]
+
+    @property
+    def delays(self) -> Array:
+        """Time from when a frame was due to when the observers had it, (n,) [s]."""
+        return self._traces[:, 1]
+
+    def truth(self, target: str) -> Array:
+        """Return the truth of a target, (n, n_modes) [um]; of the next measurement, the measurements."""
+        return self.frames.z if target == NEXT else getattr(self.frames, target)
+
+    def steps(self, observer: str) -> Array:
+        """Return the times of an observer's steps, (n,) [s]; NaN while it is off."""
+        return self._of(observer)[:, 0]
+
+    def estimate(self, observer: str, target: str) -> Array:
+        """Return what an observer has estimated of a target, (n, n_modes) [um]; NaN where nothing."""
+        own, m = self._of(observer), self.n_modes
+        if target != NEXT:
+            at = 1 + TARGETS.index(target) * m
+            return own[:, at : at + m]
+        out = np.full((self.n, m), np.nan)
+        out[1:] = own[:-1, 1 : 1 + m] + own[:-1, 1 + m : 1 + 2 * m]
+        return out
+
+    def error(self, observer: str, target: str) -> Array:
+        """Return the error of an estimate, (n, n_modes) [um]."""
+        return self.estimate(observer, target) - self.truth(target)
+
+    def rms(self, observer: str, target: str) -> Array:
+        """Return the rms error, (n_modes,) [um]; NaN where there is none."""
+        return rms_of_known(self.error(observer, target))
+
+    @cached_property
+    def _known_traces(self) -> Array:
+        """The rows that are those of their frames: others have been overwritten, or skipped."""
+        traces = self._traces.copy()
+        traces[traces[:, 0] != self.first + np.arange(self.n), 1:] = np.nan
+        return traces
+
+    def _of(self, observer: str) -> Array:
+        width = slot_width(self.n_modes)
+        at = 2 + SLOTS.index(observer) * width
+        return self._known_traces[:, at : at + width]
+
+
+def read_view(ring: Ring, traces: Rows, dt: float, seconds: float) -> LiveView:
+    """Return the last so many seconds that all observers have taken."""
+    stop = traces.count
+    first = max(0, stop - max(1, round(seconds / dt)))
+    return LiveView(first, dt, ring.read_frames(first, stop), traces.read_rows(first, stop))
+
+
+def rms_of_known(x: Array) -> Array:
+    """Return the rms over rows, (n_modes,), NaN left out; NaN where there is nothing else."""
+    known = ~np.isnan(x)
+    n = known.sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.sqrt((np.where(known, x, 0.0) ** 2).sum(axis=0) / n)
