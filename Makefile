@@ -21,7 +21,7 @@ RUN := $(VENV)/.run-$(PINS)
 TEST := $(VENV)/.test-$(PINS)
 BENCH := $(VENV)/.bench-$(PINS)
 DOCS := $(VENV)-docs/.docs-$(PINS)
-PYRTC := $(VENV)-pyrtc/.pyrtc-$(PINS)
+PEERS := pyrtc hcipy
 
 # $(call install,requirements): these pins and the project itself, editable; stamps of other pins go.
 define install
@@ -52,8 +52,10 @@ test: setup  ## run all tests, then the tutorials, then those in a browser
 test-fast: $(TEST)  ## the quick tests alone: no dashboard, no report, none that takes long (tests/slow.txt)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" tests wfsobs --ignore=tests/app --ignore=tests/report --ignore=wfsobs/app
 
-test-peers: $(PYRTC)  ## run the tests of the predictor in pyRTC, which has an environment of its own
-	@$(VENV)-pyrtc/bin/python -m pytest tests/pyrtc
+test-peers: $(PEERS:%=test-peer-%)  ## run the tests in pyRTC and HCIPy, each in an environment of its own (make test-peer-oopao, test-peer-soapy: in those)
+
+test-peer-%: $(VENV)-%/.made-$(PINS)
+	@$(VENV)-$*/bin/python -m pytest tests/peers/test_$*.py
 
 setup: $(TEST)  ## install all that the tests need, the browser included
 	@scripts/need_browser.sh $(VENV)
@@ -88,7 +90,7 @@ docs: $(DOCS)  ## build this documentation in build/site, the tutorials run agai
 	$(VENV)-docs/bin/python docs/scripts/check_site.py build/site
 
 clean:  ## remove .venv and all that was built
-	rm -rf $(VENV) $(VENV)-docs $(VENV)-pyrtc build dist *.egg-info .pytest_cache .ruff_cache .hypothesis test-output
+	rm -rf $(VENV) $(VENV)-* build dist *.egg-info .pytest_cache .ruff_cache .hypothesis test-output
 	find docs scripts tests wfsobs -name __pycache__ -prune -exec rm -rf {} +
 
 $(MADE):
@@ -104,10 +106,11 @@ $(TEST): | $(MADE)
 $(BENCH): | $(MADE)
 	$(call install,requirements-bench.txt)
 
-$(PYRTC):
-	@echo "Installing requirements-pyrtc.txt in $(VENV)-pyrtc ..."
-	@scripts/make_venv.sh "$(PYTHON)" $(VENV)-pyrtc
-	@$(VENV)-pyrtc/bin/python -m pip --disable-pip-version-check install --quiet -r requirements-pyrtc.txt
+.PRECIOUS: $(VENV)-%/.made-$(PINS)
+$(VENV)-%/.made-$(PINS):
+	@echo "Installing requirements-$*.txt in $(VENV)-$* ..."
+	@scripts/make_venv.sh "$(PYTHON)" $(VENV)-$*
+	@$(VENV)-$*/bin/python -m pip --disable-pip-version-check install --quiet -r requirements-$*.txt
 	@touch $@
 
 $(DOCS):
