@@ -23,12 +23,13 @@ LONGEST = 250
 """Maximum number of lines of a module."""
 
 IRREGULAR = frozenset(
-    "begun broken brought built caught chosen done drawn driven felt found given gone grown held hidden kept known lost made "
-    "meant met said seen sent shown sold spent spoken taken taught thought thrown told worn written".split()
+    "begun broken brought built caught chosen done drawn driven felt found given gone grown heard held hidden kept known lost "
+    "made meant met said seen sent shown sold spent spoken taken taught thought thrown told worn written".split()
 )
 """Participles that do not end in -ed."""
 
 PARTICIPLES = {
+    "Loop.closed": "a setting, `loop.closed`, in the files of users; closed loop is the term of the field",
     "Cancelled": "an exception; the word of concurrent code",
     "LoopPredictor.fitted": "read by the loop that calls the predictor: the interface of pyRTC",
 }
@@ -76,17 +77,28 @@ def names(path: Path) -> Iterator[tuple[str, bool]]:
 def fields_and_parameters(source: str) -> Iterator[str]:
     r"""Yield the fields of classes and the parameters of functions in a source, each after its owner.
 
-    >>> list(fields_and_parameters("class A:\n  seen: int\n  def f(self, told, *made, kept=1): pass"))
-    ['A.seen', 'f.self', 'f.told', 'f.kept', 'f.made']
+    >>> list(fields_and_parameters("class A:\n  seen: int\n  said = String()\n  def f(self, told, *made, kept=1): pass"))
+    ['A.seen', 'A.said', 'f.self', 'f.told', 'f.kept', 'f.made']
     """
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.ClassDef):
-            fields = [n.target for n in node.body if isinstance(n, ast.AnnAssign)]
+            fields = [t for n in node.body for t in _targets(n)]
             yield from (f"{node.name}.{field.id}" for field in fields if isinstance(field, ast.Name))
         elif isinstance(node, ast.FunctionDef):
             a = node.args
             every = [*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg))]
             yield from (f"{node.name}.{parameter.arg}" for parameter in every)
+
+
+def _targets(statement: ast.stmt) -> list[ast.expr]:
+    """Return what a statement assigns to: a field with an annotation, or a parameter of `param` without one."""
+    return (
+        statement.targets
+        if isinstance(statement, ast.Assign)
+        else [statement.target]
+        if isinstance(statement, ast.AnnAssign)
+        else []
+    )
 
 
 def attributes(source: str) -> Iterator[str]:

@@ -23,6 +23,7 @@ SOURCE = """
 class Spectra:
     measured: float
     noise: float
+    hidden = param.List([])
 
     def draw(self):
         self._drawn, self.lines = 1, self.shown
@@ -36,7 +37,7 @@ def test_participles_are_found_wherever_a_name_is_given(check: ModuleType, tmp_p
     (tmp_path / "bad.py").write_text(SOURCE, encoding="utf-8")
     found = [line.split(": ")[1] for line in check.faults(tmp_path)]
     parameters = ["estimate.told", "estimate.seen", "estimate.made", "estimate.hidden"]
-    assert found == ["Spectra.measured", *parameters, "Spectra._drawn", "fitted"]
+    assert found == ["Spectra.measured", "Spectra.hidden", *parameters, "Spectra._drawn", "fitted"]
 
 
 def test_long_modules_are_found(check: ModuleType, tmp_path: Path) -> None:

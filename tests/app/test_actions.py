@@ -87,9 +87,9 @@ def test_a_file_is_one_step(actions: Actions, loop: Any) -> None:
     before = actions.store.scenario
     actions.handle({"action": "open", "name": "mine.toml", "text": 'preset = "ut4"\nloop.gain = 0.2'})
     store = actions.store
-    loop.until(lambda: actions.toolbar.said.startswith("Opened"))  # on a busy machine it waits in the line first
+    loop.until(lambda: actions.toolbar.message.startswith("Opened"))  # on a busy machine it waits in the line first
     assert store.scenario == PRESETS["ut4"]().replace({"loop.gain": 0.2}) and store.preset == "ut4"
-    assert actions.toolbar.said == "Opened mine.toml."
+    assert actions.toolbar.message == "Opened mine.toml."
     store.undo()
     assert store.scenario == before
 
@@ -172,11 +172,11 @@ def test_too_much_data_is_refused_with_a_line(actions: Actions, loop: Any, monke
 
 def test_what_was_read_is_taken_back_and_nothing_that_came_meanwhile(actions: Actions) -> None:
     toolbar = actions.toolbar
-    toolbar.param.update(said="Opened b.toml.", notes=["a.toml: no"])
+    toolbar.param.update(message="Opened b.toml.", notes=["a.toml: no"])
     actions.handle({"action": "read", "text": "Opened a.toml."})
-    assert toolbar.said == "Opened b.toml."
+    assert toolbar.message == "Opened b.toml."
     actions.handle({"action": "read", "text": "Opened b.toml."})
-    assert toolbar.said == "" and toolbar.notes == ["a.toml: no"]
+    assert toolbar.message == "" and toolbar.notes == ["a.toml: no"]
     actions.handle({"action": "dismiss"})
     assert toolbar.notes == []
 
@@ -184,7 +184,7 @@ def test_what_was_read_is_taken_back_and_nothing_that_came_meanwhile(actions: Ac
 def test_settings_too_long_for_a_link(actions: Actions) -> None:
     many = [1.0 + i / 100 for i in range(3000)]
     actions.store.change("vibration.psd.frequency", many)
-    assert not actions.toolbar.linked and actions.toolbar.query == ""
+    assert not actions.toolbar.has_link and actions.toolbar.query == ""
     actions.handle({"action": "unlinked"})
     assert "save the scenario" in actions.toolbar.notes[0]
 

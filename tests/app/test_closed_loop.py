@@ -87,7 +87,7 @@ def the_lines_are_the_results(page: ClosedLoopPage, dashboard: Dashboard) -> Non
 def test_marks_hiding_colours_and_reasons(page: ClosedLoopPage, dashboard: Dashboard) -> None:
     the_marks_lie_on_the_curves_where_the_margins_are(page)
     before = top(page)
-    page.cards.hidden = [name for name in CONTROLLERS if name != "lqg-multirate-multi"]
+    page.cards.hidden_lines = [name for name in CONTROLLERS if name != "lqg-multirate-multi"]
     assert not page.whole.lines["integrator"].visible and page.whole.lines["lqg-multirate-multi"].visible
     assert top(page) < before and not len(page.nyquist.marks.data["x"])
     dashboard.display.dark = True

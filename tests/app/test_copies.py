@@ -72,9 +72,9 @@ def board(request: Any, dashboard: Dashboard, loop: Any, short: Scenario, tmp_pa
         ):
             widget.value = value
         upload.handle({"action": "part", "name": FILE, "index": 0, "count": 1, "data": base64.b64encode(content).decode()})
-        loop.until(lambda: not upload.picker.said.startswith(("Reading", "Waiting")))
+        loop.until(lambda: not upload.picker.message.startswith(("Reading", "Waiting")))
         upload.confirm()
-        assert isinstance(dashboard.store.source, LoadedRecord), upload.picker.said
+        assert isinstance(dashboard.store.source, LoadedRecord), upload.picker.message
         (tmp_path / dashboard.store.source.name).write_bytes(content)
         loop.until(lambda: dashboard.store.run.state != RUNNING, 120)
     if request.param == KEPT:

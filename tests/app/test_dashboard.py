@@ -117,9 +117,9 @@ def test_the_theme_that_the_system_wants(dashboard: Dashboard, loop: Any) -> Non
     frame.wants_dark = True
     assert not page.dark_theme, "not before the page has been drawn"
     loop.until(lambda: page.dark_theme)
-    assert dashboard.display.dark and not frame.chosen, "the system's"
+    assert dashboard.display.dark and not frame.preferred_theme, "the system's"
     page.dark_theme = False  # as the button does
-    assert not dashboard.display.dark and frame.chosen == "light" and frame.wants_dark
+    assert not dashboard.display.dark and frame.preferred_theme == "light" and frame.wants_dark
 
 
 def test_importing_the_package_imports_no_panel() -> None:

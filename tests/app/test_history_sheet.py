@@ -68,7 +68,7 @@ def test_what_is_asked_for(sheet: HistorySheet, loop: Any) -> None:
     sheet.handle({"action": "restore", "key": key})
     loop.finish(sheet.history.store)
     assert model(sheet).rows[0]["key"] == key and sheet.history.store.value(WIND) == 15.0
-    assert model(sheet).said == "Restored mine."
+    assert model(sheet).message == "Restored mine."
     sheet.handle({"action": "delete", "key": key})
     assert model(sheet).undo and len(model(sheet).rows) == 1
     sheet.handle({"action": "undelete"})
@@ -90,9 +90,9 @@ def test_save_and_open(sheet: HistorySheet, loop: Any, monkeypatch: pytest.Monke
         sheet.handle({"action": "delete", "key": key})
     change(sheet.history, loop, WIND, 33)
     send(sheet, f"mine{SUFFIX}", content)
-    loop.until(lambda: model(sheet).said.startswith("Opened"))
+    loop.until(lambda: model(sheet).message.startswith("Opened"))
     loop.finish(sheet.history.store)
-    assert model(sheet).said == f"Opened mine{SUFFIX}: 2 results." and sheet.history.store.value(WIND) == 20.0
+    assert model(sheet).message == f"Opened mine{SUFFIX}: 2 results." and sheet.history.store.value(WIND) == 20.0
     assert sorted(entry.scores[0].rms for entry in sheet.history.entries) == [15.0, 20.0, 33.0], "what was here stays"
     assert [run.letter for run in sheet.display.compared_runs] == ["A"]
 
@@ -100,9 +100,9 @@ def test_save_and_open(sheet: HistorySheet, loop: Any, monkeypatch: pytest.Monke
 def test_files_that_are_none(sheet: HistorySheet, loop: Any) -> None:
     before, step = [*sheet.history.entries], sheet.history.store.step
     send(sheet, "night.npz", b"PK nothing")
-    loop.until(lambda: model(sheet).said.startswith("night.npz: damaged"))
+    loop.until(lambda: model(sheet).message.startswith("night.npz: damaged"))
     sheet.handle({"action": "large", "name": "film.mkv"})
-    assert model(sheet).said == f"film.mkv: larger than {LARGEST // 1_000_000} MB"
+    assert model(sheet).message == f"film.mkv: larger than {LARGEST // 1_000_000} MB"
     sheet.handle({"action": "part", "name": "x", "index": 1, "count": 2, "data": "!"})
     assert sheet.history.entries == before and sheet.history.store.step == step
 
@@ -110,4 +110,4 @@ def test_files_that_are_none(sheet: HistorySheet, loop: Any) -> None:
 def test_a_session_too_large_to_be_opened_again(sheet: HistorySheet, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "LARGEST", 100)
     sheet.handle({"action": "save"})
-    loop.until(lambda: "more than can be opened" in model(sheet).said)
+    loop.until(lambda: "more than can be opened" in model(sheet).message)

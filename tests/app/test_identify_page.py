@@ -115,7 +115,7 @@ def test_filters_only(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> No
     told = identified(page, loop).scenario(store.scenario)
     page.starter.uses[0].param.trigger("clicks")
     assert store.scenario == told != before.scenario
-    assert dashboard.upload.picker.loaded.startswith("The simulation with 1 peak is kept")
+    assert dashboard.upload.picker.source_title.startswith("The simulation with 1 peak is kept")
     loop.finish(store)
     shown = store.run.result
     assert shown is not None and shown.is_recorded and not store.stale and not page.stale.visible
@@ -130,7 +130,7 @@ def test_filters_only(page: IdentifyPage, dashboard: Dashboard, loop: Any) -> No
     np.testing.assert_array_equal(store.run.result.result.record.y_lgs, before.result.record.y_lgs)
     store.undo()
     store.undo()
-    assert (store.scenario, store.source) == (before.scenario, None) and dashboard.upload.picker.loaded == ""
+    assert (store.scenario, store.source) == (before.scenario, None) and dashboard.upload.picker.source_title == ""
     store.redo()
     assert store.scenario == told and isinstance(store.source, SimulatedRecord), "and not the simulation of the model"
     dashboard.upload.handle({"action": "simulate"})

@@ -26,8 +26,10 @@ def scores(dashboard: Dashboard) -> tuple[Score, ...]:
 
 def hidden(dashboard: Dashboard, target: str) -> list[str]:
     lines = dashboard.explore.traces.traces[target].lines
-    assert dashboard.explore.strips[target].cards.hidden == [name for name in observers_of(target) if not lines[name].visible]
-    return dashboard.explore.strips[target].cards.hidden
+    assert dashboard.explore.strips[target].cards.hidden_lines == [
+        name for name in observers_of(target) if not lines[name].visible
+    ]
+    return dashboard.explore.strips[target].cards.hidden_lines
 
 
 class TestRule:
@@ -61,11 +63,11 @@ class TestChoice:
 
     def test_a_choice_stays_until_the_main_ones_are_asked_for(self, dashboard: Dashboard, loop: Any) -> None:
         at_first = hidden(dashboard, "vibration")
-        dashboard.explore.strips["vibration"].cards.hidden = ["truth", "kf-lgs"]
+        dashboard.explore.strips["vibration"].cards.hidden_lines = ["truth", "kf-lgs"]
         dashboard.store.change("turbulence.wind_speed", 30)
         loop.finish(dashboard.store)
         dashboard.display.mode = "tilt"
-        assert dashboard.display.hidden["vibration"] == ["truth", "kf-lgs"]
+        assert dashboard.display.hidden_lines["vibration"] == ["truth", "kf-lgs"]
         dashboard.display.mode = "tip"
         dashboard.explore.strips["vibration"].cards._handle_msg({"main": True})
         scores = dashboard.store.run.result.result.scores
@@ -76,17 +78,19 @@ class TestChoice:
         """The browser asks; what the page sends meanwhile does not undo it, and it hears what became of it."""
         cards = dashboard.explore.strips["vibration"].cards
         told: list[list[str]] = []
-        cards.param.watch(lambda event: told.append(event.new), "hidden")
+        cards.param.watch(lambda event: told.append(event.new), "hidden_lines")
         cards._handle_msg({"hidden": ["truth", "kf-lgs"], "number": 7})
-        assert cards.heard == 7
-        assert told == [["truth", "kf-lgs"]] and dashboard.display.hidden["vibration"] == ["truth", "kf-lgs"]
+        assert cards.last_arrival == 7
+        assert told == [["truth", "kf-lgs"]] and dashboard.display.hidden_lines["vibration"] == ["truth", "kf-lgs"]
         for wrong in ("main", {"hidden": "truth"}, None):
             cards._handle_msg(wrong)
         assert told == [["truth", "kf-lgs"]]
 
     def test_the_axis_fits_the_lines_that_are_shown(self, dashboard: Dashboard) -> None:
         view = dashboard.explore.traces.traces["vibration"]
-        dashboard.explore.strips["vibration"].cards.hidden = [n for n in ("truth", *observers_of("vibration")) if n != "kf-multi"]
+        dashboard.explore.strips["vibration"].cards.hidden_lines = [
+            n for n in ("truth", *observers_of("vibration")) if n != "kf-multi"
+        ]
         counted = np.asarray(view.source.data["kf-multi"])[np.asarray(view.source.data["x"]) >= 0.5]
         low, high = counted.min(), counted.max()
         # 5 % of its height are left on either side of a line

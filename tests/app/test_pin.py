@@ -65,7 +65,7 @@ class TestPin:
         assert "the same settings" in pinned.explore.pinning.note.object
 
     def test_faint_lines(self, pinned: Dashboard) -> None:
-        pinned.display.param.update(show="signal", hidden={})
+        pinned.display.param.update(show="signal", hidden_lines={})
         trace, kept = pinned.explore.traces.traces["turbulence"], pinned.display.compared_runs[0].lines
         data = trace.faint.source.data
         assert len(data["xs"]) == len(data["colour"]) == 1 + len(observers_of("turbulence"))
@@ -74,7 +74,7 @@ class TestPin:
         assert np.allclose(spectrum["ys"][0], 1e6 * kept.spectra[TRUTH, "vibration"].signal[1:, 0])
         pinned.display.show = "error"
         assert len(trace.faint.source.data["xs"]) == len(observers_of("turbulence")), "the truth has no error"
-        pinned.display.hidden = {"turbulence": ["kf-lgs"]}
+        pinned.display.hidden_lines = {"turbulence": ["kf-lgs"]}
         assert len(trace.faint.source.data["xs"]) == len(observers_of("turbulence")) - 1
 
     def test_a_zoom_cuts_the_pinned_lines(self, pinned: Dashboard) -> None:

@@ -39,7 +39,9 @@ class TestStretch:
         results = dashboard.store.run.result
         (line,) = lines(dashboard)
         assert line.startswith("RMS error, 1.00 – 1.50 s:")
-        shown = [n for n in ("kf-lgs", "gpr-online", "kf-multi", "kf-adaptive") if n not in dashboard.display.hidden["vibration"]]
+        shown = [
+            n for n in ("kf-lgs", "gpr-online", "kf-multi", "kf-adaptive") if n not in dashboard.display.hidden_lines["vibration"]
+        ]
         errors = {n: (results.values(n, "vibration") - results.values(TRUTH, "vibration"))[1000:1501, 0] for n in shown}
         common = np.isfinite(np.column_stack([*errors.values()])).all(axis=1)
         assert common.any() and "kf-lgs" in errors
@@ -61,7 +63,7 @@ class TestStretch:
 
     def test_hidden_lines_are_left_out(self, dashboard: Dashboard) -> None:
         dashboard.explore.traces.x_range.update(start=1.0, end=1.5)
-        dashboard.explore.strips["vibration"].cards.hidden = ["kf-lgs"]
+        dashboard.explore.strips["vibration"].cards.hidden_lines = ["kf-lgs"]
         assert "LGS KF" not in lines(dashboard)[0] and "Offline GPR" in lines(dashboard)[0]
 
 
@@ -69,7 +71,7 @@ def test_the_spectra_of_the_time_in_view(dashboard: Dashboard) -> None:
     dashboard.explore.traces.x_range.update(start=1.0, end=1.6)
     source = dashboard.explore.spectra.spectra["vibration"].sources["kf-lgs"]
     whole = np.asarray(source.data["y"])
-    dashboard.display.windowed = True
+    dashboard.display.window_spectra = True
     results = dashboard.store.run.result
     error = (results.values("kf-lgs", "vibration") - results.values(TRUTH, "vibration"))[1000:1601, :1]
     frequency, density = welch_psd(error, 1e-3)
@@ -77,5 +79,5 @@ def test_the_spectra_of_the_time_in_view(dashboard: Dashboard) -> None:
     np.testing.assert_allclose(source.data["y"], 1e6 * density[1:, 0], rtol=1e-9)
     dashboard.explore.traces.x_range.update(start=1.2, end=1.6)
     assert len(source.data["x"]) < len(frequency) - 1, "it follows"
-    dashboard.display.windowed = False
+    dashboard.display.window_spectra = False
     np.testing.assert_array_equal(source.data["y"], whole)

@@ -42,7 +42,7 @@ def sent(dashboard: Dashboard, content: bytes, name: str = "night.csv", part: in
 
 def previewed(dashboard: Dashboard, loop: Any, content: bytes, name: str = "night.csv") -> None:
     sent(dashboard, content, name)
-    loop.until(lambda: not dashboard.upload.picker.said.startswith(("Reading", "Waiting")))
+    loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
 
 
 def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
@@ -86,7 +86,7 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
 
     dashboard.upload.handle({"action": "simulate"})
     loop.finish(dashboard.store)
-    assert dashboard.store.run.result.result.record.turbulence is not None and dashboard.upload.picker.loaded == ""
+    assert dashboard.store.run.result.result.record.turbulence is not None and dashboard.upload.picker.source_title == ""
 
 
 def test_settings_change_what_runs_on_the_record(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
@@ -112,21 +112,21 @@ def test_what_is_said_of_it(dashboard: Dashboard, loop: Any, short: Scenario) ->
         (dashboard.upload.fields.delay, "3"),
     ):
         widget.value = value
-        loop.until(lambda: not dashboard.upload.picker.said.startswith(("Reading", "Waiting")))
+        loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
     found = dashboard.upload._preview
     assert found.record.origin == "unit nm, command sign -1" and found.record.delay == 3
     assert found.rms["y_lgs"][0] < 1e-2 * plain[0]
     dashboard.upload.fields.unit.value = "mas"
-    loop.until(lambda: not dashboard.upload.picker.said.startswith(("Reading", "Waiting")))
+    loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
     on_eight = dashboard.upload._preview.rms["y_lgs"][0]
     dashboard.store.change("telescope.diameter", 10.0)
     loop.until(lambda: "aperture 10 m" in dashboard.upload.content.text.object)
     assert dashboard.upload._preview.rms["y_lgs"][0] == pytest.approx(1.25 * on_eight)
     dashboard.upload.fields.delay.value = "soon"
-    assert dashboard.upload.picker.said == "Delay of commands [steps]: takes a number from 1, not 'soon'"
+    assert dashboard.upload.picker.message == "Delay of commands [steps]: takes a number from 1, not 'soon'"
     assert dashboard.upload.use.disabled
     dashboard.upload.fields.delay.value = ""
-    loop.until(lambda: not dashboard.upload.picker.said.startswith(("Reading", "Waiting")))
+    loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
     assert not dashboard.upload.use.disabled and dashboard.upload.fields.unit.value != SILENT
 
 
@@ -134,9 +134,9 @@ def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     """10 um^2/Hz over 1 Hz about 30 Hz on tip, nothing on tilt; without a unit it is asked for."""
     rows = "29.4,0,0\n29.5,10,0\n30.5,10,0\n30.6,0,0\n"
     previewed(dashboard, loop, f"frequency,tip,tilt\n{rows}".encode(), "lines.csv")
-    assert dashboard.upload.picker.said.startswith("lines.csv: has no unit of tip")
+    assert dashboard.upload.picker.message.startswith("lines.csv: has no unit of tip")
     dashboard.upload.fields.unit.value = "nm"
-    loop.until(lambda: not dashboard.upload.picker.said.startswith(("Reading", "Waiting")))
+    loop.until(lambda: not dashboard.upload.picker.message.startswith(("Reading", "Waiting")))
     assert "4 frequencies from 29.4 to 30.6 Hz" in dashboard.upload.content.text.object and "3.317 nm rms of tip, 0 nm" in (
         dashboard.upload.content.text.object
     )
@@ -148,7 +148,7 @@ def test_a_vibration_spectrum(dashboard: Dashboard, loop: Any) -> None:
     assert vibration.psd.tip == pytest.approx([0.0, 1e-5, 1e-5, 0.0], rel=1e-12)
     assert dashboard.store.run.result.result.record.vibration.std(axis=0) == pytest.approx([np.sqrt(1.1e-5), 0.0], rel=0.02)
     previewed(dashboard, loop, b"seeing,airmass\n1,2\n", "log.csv")
-    assert dashboard.upload.picker.said.startswith("log.csv: has no y_lgs")
+    assert dashboard.upload.picker.message.startswith("log.csv: has no y_lgs")
 
 
 NAMES = {"wfs_x": "y_lgs/tip_um", "wfs_y": "y_lgs/tilt_um", "dm_x": "u/tip_um", "dm_y": "u/tilt_um"}
@@ -167,7 +167,7 @@ def test_columns_of_other_names(dashboard: Dashboard, loop: Any, short: Scenario
     """Names that say enough are read at once; a choice moves a role; the copy names the columns."""
     content = renamed(file_of(short))
     previewed(dashboard, loop, content)
-    loop.until(lambda: not dashboard.upload.picker.said)
+    loop.until(lambda: not dashboard.upload.picker.message)
     form = dashboard.upload.form
     assert form is not None and form.visible and form in dashboard.upload.room.objects
     wanted = {own.removesuffix("_um"): name for name, own in NAMES.items()}
@@ -176,10 +176,10 @@ def test_columns_of_other_names(dashboard: Dashboard, loop: Any, short: Scenario
     assert "750 steps at 500 Hz" in dashboard.upload.content.text.object
 
     form._handle_msg({"column": "wfs_y", "role": "y_lgs/tip"})
-    loop.until(lambda: "has the modes tip, tilt; y_lgs has tip" in dashboard.upload.picker.said)
+    loop.until(lambda: "has the modes tip, tilt; y_lgs has tip" in dashboard.upload.picker.message)
     assert form.roles["y_lgs/tip"] == "wfs_y" and "y_lgs/tilt" not in form.roles and dashboard.upload.use.disabled
     form._handle_msg({"column": "wfs_x", "role": "y_lgs/tilt"})
-    loop.until(lambda: not dashboard.upload.picker.said)
+    loop.until(lambda: not dashboard.upload.picker.message)
     form._handle_msg({"column": "nothing", "role": "time"})
     form._handle_msg({"column": "wfs_x", "role": "nothing"})
     assert form.roles == wanted | {"y_lgs/tip": "wfs_y", "y_lgs/tilt": "wfs_x"}
@@ -250,7 +250,7 @@ def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
         (b"x", "<b>.exe", "_b_.exe: its name ends in none of"),
     ):
         previewed(dashboard, loop, content, name)
-        assert dashboard.upload.picker.said.startswith(line)
+        assert dashboard.upload.picker.message.startswith(line)
         assert "<b>.exe" not in dashboard.upload.content.text.object
         dashboard.upload.confirm()
         assert dashboard.store.source is None and dashboard.store.run.result is before
@@ -266,12 +266,12 @@ def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.Monk
         {"index": 0},
     ):
         upload.handle({"action": "part", "name": "a.csv", **msg})
-        assert upload.picker.said == "The upload is incomplete: choose the file again." and upload._content == b""
+        assert upload.picker.message == "The upload is incomplete: choose the file again." and upload._content == b""
     upload.handle({"action": "large", "name": "../x.csv"})
-    assert upload.picker.said == f"x.csv: larger than {LARGEST // 1_000_000} MB"
+    assert upload.picker.message == f"x.csv: larger than {LARGEST // 1_000_000} MB"
     monkeypatch.setattr(module, "LARGEST", 1000)
     sent(dashboard, bytes(3000), part=400)
-    assert upload._content == b"" and upload.picker.said == "night.csv: larger than 0 MB"
+    assert upload._content == b"" and upload.picker.message == "night.csv: larger than 0 MB"
 
 
 def test_on_a_server_with_limits(loop: Any, short: Scenario) -> None:
@@ -292,7 +292,7 @@ def test_on_a_server_with_limits(loop: Any, short: Scenario) -> None:
         long = simulate(short.replace({"run.duration": 2.5}))
         previewed(board, loop, file_of(short, **{k: getattr(long, k) for k in ("y_lgs", "u", "y_ngs", "open_loop_y")}))
         board.upload.confirm()
-        assert "run.duration = 5: at most 2 s on this server" in board.upload.picker.said
+        assert "run.duration = 5: at most 2 s on this server" in board.upload.picker.message
         np.testing.assert_array_equal(board.store.run.result.result.record.y_lgs, boards[1].record.y_lgs)
     finally:
         service.close()

@@ -18,7 +18,7 @@ class TestViewState:
 
     def test_there_and_back(self, dashboard: Dashboard) -> None:
         dashboard.display.param.update(mode="tilt", unit="mas", show="signal", spectrum="cumulative")
-        dashboard.explore.strips["vibration"].cards.hidden = ["truth", "kf-lgs"]
+        dashboard.explore.strips["vibration"].cards.hidden_lines = ["truth", "kf-lgs"]
         dashboard.explore.traces.x_range.update(start=0.75, end=1.25)
         dashboard.pages.current = "model"
         dashboard.seeds.count = 3
@@ -33,7 +33,7 @@ class TestViewState:
         assert dashboard.seeds.count == SEEDS
         assert other(dashboard, f"?run.seed=3&{query}") == []
         assert dashboard.view_state.query == query
-        assert dashboard.explore.strips["vibration"].cards.hidden == ["truth", "kf-lgs"]
+        assert dashboard.explore.strips["vibration"].cards.hidden_lines == ["truth", "kf-lgs"]
         assert dashboard.seeds.count == 3
 
     @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ class TestTraces:
         shown = dashboard.store.run.result.result.estimate("multirate-optimal", "turbulence")
         assert drawn.band.renderer is None, "nothing is made for it at first"
         others = [name for name in drawn.lines if name not in (TRUTH, "multirate-optimal")]
-        dashboard.display.hidden = {"turbulence": others}
+        dashboard.display.hidden_lines = {"turbulence": others}
         assert drawn.band.renderer is not None and drawn.band.renderer.visible
         band, half = drawn.band.source.data, 1.959964e3 * shown.sd[:, 0]
         start = round(band["x"][100] / 1e-3)  # bins of 4 steps hold nearly every phase of 5
@@ -89,9 +89,9 @@ class TestTraces:
         middle = 0.5 * (band := drawn.band.source.data)["high"] + 0.5 * band["low"]
         line = np.array(trace(dashboard, "turbulence")["multirate-optimal"])
         assert np.nanmax(np.abs(middle - line)[10:]) < 0.1 * np.nanstd(line)
-        dashboard.display.hidden = {"turbulence": others[1:]}
+        dashboard.display.hidden_lines = {"turbulence": others[1:]}
         assert not drawn.band.renderer.visible
-        dashboard.display.hidden = {"turbulence": [name for name in drawn.lines if name not in (TRUTH, "persistence")]}
+        dashboard.display.hidden_lines = {"turbulence": [name for name in drawn.lines if name not in (TRUTH, "persistence")]}
         assert not drawn.band.renderer.visible
 
     def test_mode_and_unit(self, dashboard: Dashboard) -> None:
@@ -139,11 +139,11 @@ class TestTraces:
         assert dashboard.explore.traces.x_range.reset_end == 3.0
 
     def test_hidden_lines(self, dashboard: Dashboard) -> None:
-        dashboard.explore.strips["vibration"].cards.hidden = ["kf-lgs"]
+        dashboard.explore.strips["vibration"].cards.hidden_lines = ["kf-lgs"]
         assert not dashboard.explore.traces.traces["vibration"].lines["kf-lgs"].visible
         assert not dashboard.explore.spectra.spectra["vibration"].lines["kf-lgs"].visible
         assert dashboard.explore.traces.traces["turbulence"].lines["kf-lgs"].visible
-        dashboard.explore.strips["vibration"].cards.hidden = []
+        dashboard.explore.strips["vibration"].cards.hidden_lines = []
         assert dashboard.explore.traces.traces["vibration"].lines["kf-lgs"].visible
 
     def test_the_axis_leaves_out_the_warm_up(self, dashboard: Dashboard) -> None:

@@ -37,12 +37,12 @@ class Toolbar(JSComponent):
 
     query = param.String("", doc="What a link to the settings has after its ?.")
     view = param.String("", doc="What the address has beside the settings, of the view.")
-    linked = param.Boolean(True, doc="Whether the settings are short enough for a link.")
+    has_link = param.Boolean(True, doc="Whether the settings are short enough for a link.")
     command = param.String("", doc="The settings as a command line.")
     python = param.String("", doc="The settings as Python.")
     ready = param.Boolean(False, doc="Whether there are results to save.")
     reporting = param.Boolean(False, doc="Whether a report is being made.")
-    said = param.String("", doc="What was done, in one line.")
+    message = param.String("", doc="What was done, in one line.")
     notes = param.List([], doc="What was refused, a line each.")
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called, for the legends of figures that are saved.")
     saves = param.List([], doc="What the page can save beside the data, as it is called in the menu.")
@@ -151,7 +151,7 @@ class Actions:
         except SettingError as error:
             self._note(f"{name[:80]}: {_reason(str(error))}")
         else:
-            self.toolbar.param.update(notes=[], said=f"Opened {name[:80]}.")
+            self.toolbar.param.update(notes=[], message=f"Opened {name[:80]}.")
 
     def save_scenario(self) -> None:
         """Send the settings as TOML."""
@@ -214,27 +214,27 @@ class Actions:
         if task.state == FAILED:
             self._note(f"{name}: {_reason(task.message)}")
         else:
-            self.toolbar.param.update(notes=[], said=f"{name}: {task.line()}" if task.place else "")
+            self.toolbar.param.update(notes=[], message=f"{name}: {task.line()}" if task.place else "")
         if task.state == DONE:
             then(task.result)
 
     def _note(self, line: str) -> None:
-        self.toolbar.param.update(notes=[line], said="")
+        self.toolbar.param.update(notes=[line], message="")
 
     def _dismiss(self) -> None:
         self.toolbar.notes = []
 
     def _take_back(self, text: object) -> None:
         """Unsay what has been read, unless something else has been said meanwhile."""
-        if self.toolbar.said == text:
-            self.toolbar.said = ""
+        if self.toolbar.message == text:
+            self.toolbar.message = ""
 
     def _refresh(self, *_: object) -> None:
         scenario, preset, source = self.store.scenario, self.store.preset, self.store.source
         query = to_query(scenario, preset, source.simulation if source else None)
         task = self._offers.task if self._offers else EXPLORED
         self.toolbar.param.update(
-            linked=query is not None,
+            has_link=query is not None,
             query=query or "",
             command=to_command(scenario, preset, source, task),
             python=to_python(scenario, preset, source, task),

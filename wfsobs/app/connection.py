@@ -16,10 +16,10 @@ MOST = 1000
 
 
 class Connection(JSComponent):
-    """The banner in the browser: questions {ask} and unsent changes {changes} up, the last question heard down."""
+    """The banner in the browser: questions {ask} and unsent changes {changes} up, the last question that has arrived down."""
 
     session = param.String("", doc="A name of the session, to tell it from one made anew.")
-    heard = param.Integer(0, doc="Number of the last question that has arrived, and all before it.")
+    last_arrival = param.Integer(0, doc="Number of the last question that has arrived, and all before it.")
 
     _esm = asset("connection.js")
     _stylesheets = [asset("connection.css")]  # noqa: RUF012
@@ -33,7 +33,7 @@ class Connection(JSComponent):
         if not isinstance(data, dict):
             return
         if isinstance(data.get("ask"), int):
-            self.heard = data["ask"]
+            self.last_arrival = data["ask"]
         changes = data.get("changes")
         for change in changes[:MOST] if isinstance(changes, list) else []:
             if isinstance(change, dict):

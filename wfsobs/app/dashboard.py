@@ -58,7 +58,9 @@ class Frame(JSComponent):
 
     width_px = param.Integer(0, doc="Width when the page opened [px].")
     wants_dark = param.Boolean(False, doc="Whether the visitor's system has a dark theme, unless one was chosen here.")
-    chosen = param.Selector(default="", objects=["", "dark", "light"], doc="The theme that was chosen, for the browser to keep.")
+    preferred_theme = param.Selector(
+        default="", objects=["", "dark", "light"], doc="The theme that was chosen, for the browser to keep."
+    )
     stale = param.Boolean(False, doc="Whether to fade the results.")
 
     _esm = asset("patch.js") + asset("frame.js")
@@ -182,7 +184,7 @@ class Dashboard:
         if event.new != self.frame.wants_dark:
             self._theme_chosen = True
         if self._theme_chosen:
-            self.frame.chosen = "dark" if event.new else "light"
+            self.frame.preferred_theme = "dark" if event.new else "light"
             self.view_state.choose_theme(event.new)
 
     def _top(self) -> pn.FlexBox:

@@ -93,10 +93,10 @@ class Display(param.Parameterized):
     mode = param.Selector(default=MODES[0], objects=MODES, label="Mode")
     show = param.Selector(default=ERROR, objects=[SIGNAL, ERROR, RUNNING_RMS], label="Show")
     unit = param.Selector(default="nm", objects=list(UNITS), label="Unit")
-    hidden = param.Dict({}, doc="Target -> names of its hidden lines.")
+    hidden_lines = param.Dict({}, doc="Target -> names of its hidden lines.")
     dark = param.Boolean(False, doc="Dark mode.")
     spectrum = param.Selector(default=PSD, objects=[PSD, CUMULATIVE], label="Spectrum")
-    windowed = param.Boolean(False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone.")
+    window_spectra = param.Boolean(False, label="Spectra of the window", doc="Spectra of the stretch of time in view alone.")
     editing = param.Boolean(False, label="Edit on the figure", doc="Handles on the spectra, and what theory predicts.")
     best_first = param.Boolean(True, label="Best first", doc="Sort the observers of the table by their error.")
     compared_runs: list[ComparedRun] = param.List([], item_type=ComparedRun, doc="The runs to compare with, by their letters.")  # type: ignore

@@ -23,8 +23,8 @@ PART = 1_000_000
 class Picker(JSComponent):
     """The button and what is said beside it; files up in parts."""
 
-    said = param.String("", doc="What there is to say, in one line.")
-    loaded = param.String("", doc="What takes the place of the simulation.")
+    message = param.String("", doc="What there is to say, in one line.")
+    source_title = param.String("", doc="What takes the place of the simulation.")
     largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
     part = param.Integer(PART, doc="How much is sent at a time [bytes].")
 

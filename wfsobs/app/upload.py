@@ -74,7 +74,7 @@ class Upload:
             self.look()
 
     def _entitle(self, _event: object) -> None:
-        self.picker.loaded = self.store.source.title if self.store.source else ""
+        self.picker.source_title = self.store.source.title if self.store.source else ""
 
     # ------------------------------------------------------------------ the file
 
@@ -163,7 +163,7 @@ class Upload:
             return
         self._preview = None if isinstance(preview, RecordError) else preview
         self.use.label = "Use this spectrum" if isinstance(preview, SpectrumPreview) else "Use this record"
-        self.picker.said = "" if self._preview else str(preview)
+        self.picker.message = "" if self._preview else str(preview)
         self.use.disabled = self._preview is None
         self.content.show(self._name, preview)
         self.take.visible = isinstance(preview, Preview) and differs_from_proposals(preview)
@@ -233,7 +233,7 @@ class Upload:
         self._say(why)
 
     def _say(self, line: str) -> None:
-        self.picker.said = line
+        self.picker.message = line
 
 
 def fit_to_record(record: Any, scenario: Scenario) -> Scenario:

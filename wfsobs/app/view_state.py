@@ -40,7 +40,7 @@ class ViewState(param.Parameterized):
         self.display, self.pages, self.lines, self.traces, self.seeds = display, pages, lines, traces, seeds
         self._fresh = {name: getattr(display, name) for name in SWITCHES}
         self._theme = ""
-        display.param.watch(self._refresh, [*SWITCHES, "hidden"])
+        display.param.watch(self._refresh, [*SWITCHES, "hidden_lines"])
         pages.param.watch(self._refresh, "current")
         seeds.param.watch(self._refresh, "count")
         on_settle([traces.x_range], self._refresh)

@@ -88,11 +88,11 @@ function speaker(line, model) {
     clearTimeout(over)
     if (text && !text.endsWith("…")) over = setTimeout(() => {
       line.textContent = ""
-      if (text === model.said) model.send_msg({action: "read", text})
+      if (text === model.message) model.send_msg({action: "read", text})
     }, SAID_MS)
   }
-  model.on("said", () => say(model.said))
-  say(model.said)
+  model.on("message", () => say(model.message))
+  say(model.message)
   return say
 }
 
@@ -180,7 +180,7 @@ function noteBox(el, model, say) {
     lines.replaceChildren()
     model.notes.forEach((note) => tag("p", lines, {textContent: note}))
     box.hidden = model.notes.length === 0
-    if (!box.hidden) say(model.said)
+    if (!box.hidden) say(model.message)
   }
   model.on("notes", draw)
   draw()
@@ -215,7 +215,7 @@ export function render({model, view, el}) {
     const query = [model.query, model.view].filter(Boolean).join("&")
     return location.origin + location.pathname + (query ? `?${query}` : "")
   }
-  const copyLink = () => model.linked ? copy(here(), "link") : model.send_msg({action: "unlinked"})
+  const copyLink = () => model.has_link ? copy(here(), "link") : model.send_msg({action: "unlinked"})
   const ask = (message) => () => {
     dismiss()
     say("Preparing the file …")

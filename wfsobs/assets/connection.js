@@ -69,7 +69,7 @@ class Link {
   attach(model, draw) {
     const again = this.model !== undefined
     Object.assign(this, {model, draw, session: model.session})
-    model.on("heard", () => this.answered(model.heard))
+    model.on("last_arrival", () => this.answered(model.last_arrival))
     if (!again) this.restore()
     this.connection = null
     this.wait = this.refused = 0
@@ -88,7 +88,7 @@ class Link {
 
   ask() {
     if (this.connection || !this.ready) return
-    if (this.asked === this.model.heard) this.ticks = 0
+    if (this.asked === this.model.last_arrival) this.ticks = 0
     this.asked += 1
     this.socket = socketOf(() => this.model.send_msg({ask: this.asked}))
   }
@@ -98,7 +98,7 @@ class Link {
     if (this.connection || document.hidden) return
     this.deliver()
     this.ticks += 1
-    const waiting = this.asked > this.model.heard
+    const waiting = this.asked > this.model.last_arrival
     if (!waiting && (this.unsent.length || this.ticks >= PERIOD)) this.ask()
     if (waiting && this.ticks === PATIENCE) this.turn(navigator.onLine ? "silent" : "offline")
     if (waiting && this.ticks % GIVEN_UP === 0) this.another()
@@ -114,7 +114,7 @@ class Link {
   // Where the server is there but this way to it is not.
   async another() {
     const {asked, socket} = this
-    if (await reachable() && this.model.heard < asked && socket === this.socket) socket?.close()
+    if (await reachable() && this.model.last_arrival < asked && socket === this.socket) socket?.close()
   }
 
   // ---------------------------------------------------------------- lost, and found again
@@ -195,7 +195,7 @@ class Link {
     this.ready ||= this.doc.is_idle
     if (!this.ready || !this.due) return
     this.due = false
-    this.send(this.unsent.filter((it) => it.number > this.model.heard))
+    this.send(this.unsent.filter((it) => it.number > this.model.last_arrival))
   }
 
   send(changes) {

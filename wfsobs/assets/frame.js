@@ -21,9 +21,9 @@ function themes(model) {
   }
   system.addEventListener("change", follow)
   model.on("remove", () => system.removeEventListener("change", follow))
-  model.on("chosen", () => {
+  model.on("preferred_theme", () => {
     try {
-      localStorage.setItem(THEME, model.chosen)
+      localStorage.setItem(THEME, model.preferred_theme)
     } catch { /* a browser that keeps nothing */ }
   })
   follow()

@@ -99,14 +99,14 @@ export function render({model, el}) {
   }
   const paint = () => sheet.classList.toggle("dark", model.dark)
   const say = () => {
-    line.textContent = model.said
+    line.textContent = model.message
     undo.hidden = !model.undo
   }
   model.on("open", follow)
   model.on("rows", draw)
   model.on("room", draw)
   model.on("dark", paint)
-  model.on("said", say)
+  model.on("message", say)
   model.on("undo", say)
   model.on("msg:custom", (event) => {
     const {name, kind, content} = event.data ?? event

@@ -211,13 +211,13 @@ function zoom(figure, state) {
 // ------------------------------------------------------------------ cards and table
 
 function cards(target) {
-  const watchers = {items: [], hidden: [], heard: []}
+  const watchers = {items: [], hidden_lines: [], last_arrival: []}
   const model = {
     items: [], terms: {},  // the report has a section of them
-    hidden: hidden[target], heard: 0,
+    hidden_lines: hidden[target], last_arrival: 0,
     send_msg({hidden: names, number: asked}) {
       hidden[target] = names
-      Object.assign(model, {hidden: names, heard: asked})
+      Object.assign(model, {hidden_lines: names, last_arrival: asked})
       toggled(target)
     },
     on(name, f) { watchers[name].push(f) },

@@ -22,9 +22,9 @@ export function render({model, el}) {
     return div
   }
 
-  let hidden = model.hidden
+  let hidden = model.hidden_lines
   let before = hidden  // the click: a double click is about what stood there before its first one
-  let asked = model.heard
+  let asked = model.last_arrival
 
   const hide = (names) => {
     hidden = names
@@ -128,11 +128,11 @@ export function render({model, el}) {
 
   model.on("items", draw)
   const follow = () => {
-    if (asked !== model.heard) return  // another click is on its way
-    hidden = model.hidden
+    if (asked !== model.last_arrival) return  // another click is on its way
+    hidden = model.hidden_lines
     mark()
   }
-  model.on("hidden", follow)
-  model.on("heard", follow)
+  model.on("hidden_lines", follow)
+  model.on("last_arrival", follow)
   draw()
 }

@@ -68,11 +68,11 @@ export function render({model, el}) {
     save(name, kind, content)
   })
   const draw = () => {
-    loaded.textContent = model.loaded
-    back.hidden = !model.loaded
-    said.textContent = model.said
+    loaded.textContent = model.source_title
+    back.hidden = !model.source_title
+    said.textContent = model.message
   }
-  model.on("loaded", draw)
-  model.on("said", draw)
+  model.on("source_title", draw)
+  model.on("message", draw)
   draw()
 }

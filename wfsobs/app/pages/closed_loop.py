@@ -54,7 +54,7 @@ class ClosedLoopPage(PageActions):
         self.work = BackgroundTask(store.session)
         self.visible, self._of = False, object()
         self.note, self.table, self.margins = html(), html(), html()
-        self.cards = Cards(items=[], hidden=[], terms={STREHL: TERMS[STREHL]}, sizing_mode="stretch_width", margin=0)
+        self.cards = Cards(items=[], hidden_lines=[], terms={STREHL: TERMS[STREHL]}, sizing_mode="stretch_width", margin=0)
         self.whole, self.zoom = Trace("whole record"), Trace("zoomed")
         self.spectrum, self.response, self.nyquist = LoopSpectrum(), Response(), Nyquist()
         self.room = figure_with_caption("Rejection and noise transfer", self.response.figure)
@@ -67,7 +67,7 @@ class ClosedLoopPage(PageActions):
         run.param.watch(self._follow, ["result", "state"])
         display.param.watch(self._redraw, ["mode", "unit"])
         display.param.watch(self._restyle, "dark")
-        self.cards.param.watch(self._restyle, "hidden")
+        self.cards.param.watch(self._restyle, "hidden_lines")
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
@@ -173,9 +173,9 @@ class ClosedLoopPage(PageActions):
     def _restyle(self, *_: object) -> None:
         with pn.io.hold():
             for drawn in self._figures:
-                drawn.restyle(self.display.dark, self.cards.hidden)
+                drawn.restyle(self.display.dark, self.cards.hidden_lines)
             for trace in (self.whole, self.zoom):
-                trace.fit(self.cards.hidden)
+                trace.fit(self.cards.hidden_lines)
             if self.results is not None:
                 self.table.object = loop_html(self.results, self.display)
                 self.margins.object = margins_html(self.results, self.display)

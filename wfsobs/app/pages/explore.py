@@ -93,7 +93,7 @@ class Explore:
             group(self.display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS}),
             group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
             self._zoom_buttons(),
-            self._tick("windowed"),
+            self._tick("window_spectra"),
             *([self._tick("editing")] if self.seeds else []),
             *self.pinning.view(),
             gap="12px",
@@ -124,7 +124,7 @@ class Explore:
         call(self.traces.traces[target].figure, f"{target.capitalize()} time trace")
         call(self.spectra.spectra[target].figure, f"{target.capitalize()} spectrum")
         cards = self.strips[target].cards
-        cards.param.watch(lambda event: self._hide(target, event.new), "hidden")
+        cards.param.watch(lambda event: self._hide(target, event.new), "hidden_lines")
         cards.on_main = lambda: self.lines.reset(target)
         marks = MARKS if target == VIBRATION else ""
         traces, self.rooms[target] = (
@@ -163,7 +163,7 @@ class Explore:
                 room.append(self.editors[target].layer)
 
     def _hide(self, target: str, names: list[str]) -> None:
-        if names != self.display.hidden.get(target, []):
+        if names != self.display.hidden_lines.get(target, []):
             self.lines.choose(target, names)
 
 

@@ -36,7 +36,7 @@ class Sheet(JSComponent):
     dark = param.Boolean(False, doc="Dark mode.")
     rows = param.List([], doc="A dictionary per result, newest first.")
     room = param.Boolean(True, doc="Whether another result can be compared.")
-    said = param.String("", doc="What was done or refused, in one line.")
+    message = param.String("", doc="What was done or refused, in one line.")
     undo = param.Boolean(False, doc="Whether a result was deleted that can come back.")
     suffix = param.String(SUFFIX, doc="How the names of session files end.")
     largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
@@ -156,7 +156,7 @@ class HistorySheet:
         return self.sheet
 
     def _say(self, line: str) -> None:
-        self._sheet().said = name_settings(line)
+        self._sheet().message = name_settings(line)
 
     def _refresh(self, *_: object) -> None:
         sheet = self._sheet()

@@ -48,11 +48,11 @@ class MainLines:
     def choose(self, target: str, hidden_names: list[str]) -> None:
         """Hide these lines and no others from now on."""
         self._chosen_targets.add(target)
-        self.display.hidden = {**self.display.hidden, target: list(hidden_names)}
+        self.display.hidden_lines = {**self.display.hidden_lines, target: list(hidden_names)}
 
     def choices(self) -> dict[str, list[str]]:
         """Return the hidden lines of the targets where the visitor has chosen."""
-        return {target: self.display.hidden.get(target, []) for target in TARGETS if target in self._chosen_targets}
+        return {target: self.display.hidden_lines.get(target, []) for target in TARGETS if target in self._chosen_targets}
 
     def reset(self, target: str) -> None:
         """Show those that matter again."""
@@ -60,17 +60,17 @@ class MainLines:
         self._follow()
 
     def _on_results(self, *_: object) -> None:
-        if self.run.state != RUNNING or not self.display.hidden:
+        if self.run.state != RUNNING or not self.display.hidden_lines:
             self._follow()
 
     def _follow(self, *_: object) -> None:
         results = self.run.result
         if results is None:
             return
-        hidden = dict(self.display.hidden)
+        hidden = dict(self.display.hidden_lines)
         for target in TARGETS:
             if target not in self._chosen_targets:
                 main = main_observers(results.result.scores, target, self.display.mode)
                 hidden[target] = [name for name in observers_of(target) if name not in main]
-        if hidden != self.display.hidden:
-            self.display.hidden = hidden
+        if hidden != self.display.hidden_lines:
+            self.display.hidden_lines = hidden

@@ -30,11 +30,11 @@ class SpectraFigures(TargetFigures):
         self.x_range = Range1d(start=0.5, end=500.0, reset_start=0.5, reset_end=500.0)
         self.times = times
         self.spectra = {target: _Spectrum(target, self.x_range) for target in TARGETS}
-        super().__init__(run, display, self.spectra, ["mode", "show", "unit", "spectrum", "compared_runs", "windowed"])
-        on_settle([times], lambda: self._redraw() if display.windowed else None)
+        super().__init__(run, display, self.spectra, ["mode", "show", "unit", "spectrum", "compared_runs", "window_spectra"])
+        on_settle([times], lambda: self._redraw() if display.window_spectra else None)
 
     def _draw(self, results: RunResults) -> None:
-        window = zoom_of(self.times) if self.display.windowed else None
+        window = zoom_of(self.times) if self.display.window_spectra else None
         spectra = results.spectra if window is None else window_spectra(results, *window)
         for spectrum in self.spectra.values():
             spectrum.draw(results, spectra, self.display)

@@ -63,7 +63,7 @@ class SpectrumEditor:
         self._number = 0
         self._was: dict[str, float] = {}
         store.param.watch(self._follow, "scenario")
-        display.param.watch(self._ask, ["mode", "unit", "spectrum", "show", "hidden", "dark"])
+        display.param.watch(self._ask, ["mode", "unit", "spectrum", "show", "hidden_lines", "dark"])
         display.param.watch(self._turn, "editing")
         self._turn()
 
@@ -129,7 +129,7 @@ class SpectrumEditor:
         if note:
             self._show(note)
             return
-        hidden = self.display.hidden.get(self.target, [])
+        hidden = self.display.hidden_lines.get(self.target, [])
         names = (*(name for name in observers_of(self.target) if name not in hidden), BOUND)
         trial, mode, of_error = self.trial, self.display.column, self.display.error
         self.frames.ask(

@@ -25,7 +25,7 @@ class Stretch:
         self.times, self.frequencies = times, frequencies
         self.pane = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, stylesheets=[asset("style.css")])
         run.param.watch(self._refresh, "result")
-        display.param.watch(self._refresh, ["mode", "unit", "hidden", "dark"])
+        display.param.watch(self._refresh, ["mode", "unit", "hidden_lines", "dark"])
         on_settle([times, frequencies], self._refresh)
 
     def _refresh(self, *_: object) -> None:
@@ -36,7 +36,7 @@ class Stretch:
         results = self.run.result
         if results is None or results.values(TRUTH, self.target) is None:
             return ""
-        hidden = self.display.hidden.get(self.target, [])
+        hidden = self.display.hidden_lines.get(self.target, [])
         names = [name for name in observers_of(self.target) if name not in hidden]
         lines = []
         if (ends := zoom_of(self.times)) is not None:

@@ -27,8 +27,8 @@ class Cards(JSComponent):
     """The cards in the browser; a click on one hides or shows its line, a double click shows it alone."""
 
     items = param.List([], doc="{name, label, colour, dash, value, unit, note, range, compared} of every card.")
-    hidden = param.List([], doc="Names of the cards whose lines are hidden.")
-    heard = param.Integer(0, doc="Number of the last click that has arrived, and all before it.")
+    hidden_lines = param.List([], doc="Names of the cards whose lines are hidden.")
+    last_arrival = param.Integer(0, doc="Number of the last click that has arrived, and all before it.")
     terms = param.Dict({}, doc="Word that stands on the cards -> what it means.")
     main = param.String("", doc="What the button is called that shows the lines that matter; none if empty.")
 
@@ -48,8 +48,8 @@ class Cards(JSComponent):
         elif isinstance(names := data.get("hidden"), list):
             number = data.get("number")
             self.param.update(
-                hidden=[name for name in names if isinstance(name, str)],
-                heard=number if isinstance(number, int) else self.heard,
+                hidden_lines=[name for name in names if isinstance(name, str)],
+                last_arrival=number if isinstance(number, int) else self.last_arrival,
             )
 
 
@@ -65,13 +65,13 @@ class Strip:
         if seeds is not None:
             seeds.param.watch(self._refresh, "evidence")
         display.param.watch(self._refresh, ["mode", "unit", "dark", "compared_runs"])
-        display.param.watch(self._hide, "hidden")
+        display.param.watch(self._hide, "hidden_lines")
 
     def _refresh(self, *_: object) -> None:
         self.cards.items = self.items()
 
     def _hide(self, *_: object) -> None:
-        self.cards.hidden = self.display.hidden.get(self.target, [])
+        self.cards.hidden_lines = self.display.hidden_lines.get(self.target, [])
 
     def items(self) -> list[dict[str, Any]]:
         """Describe the cards."""

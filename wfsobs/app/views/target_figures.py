@@ -29,7 +29,7 @@ class TargetFigures:
         self.run, self.display, self._drawings = run, display, drawings
         self.visible, self._behind = True, False
         run.param.watch(self._redraw, "result")
-        display.param.watch(self._redraw, [*switches, "dark", "hidden"])
+        display.param.watch(self._redraw, [*switches, "dark", "hidden_lines"])
 
     def pane(self, target: str) -> pn.pane.Bokeh:
         """Return the figure of one target."""
@@ -48,7 +48,7 @@ class TargetFigures:
         if results is not None and self.visible:
             with pn.io.hold():
                 for target, drawing in self._drawings.items():
-                    drawing.lines.restyle(self.display.dark, self.display.hidden.get(target, []))
+                    drawing.lines.restyle(self.display.dark, self.display.hidden_lines.get(target, []))
                 self._draw(results)
 
     def _draw(self, results: RunResults) -> None:
