@@ -115,3 +115,12 @@ def solve_rows(S: Array, n: int) -> Array:
         lead,
     )
     return S[n:, :n]
+
+
+def solve_lower(L: Array, X: Array) -> Array:
+    """Return L^-1 X for the lower triangle L (n, n) and X (n, k); in place of X."""
+    n, k = X.shape
+    here, lead, there, step = L.ctypes.data, _int(L.strides[1] // L.itemsize), X.ctypes.data, _int(X.strides[1] // X.itemsize)
+    left, lower, plain = _char(b"L"), _char(b"L"), _char(b"N")
+    _trsm(left, lower, plain, plain, _int(n), _int(k), _real(1.0), here, lead, there, step)
+    return X

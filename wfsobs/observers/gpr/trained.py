@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
-from scipy.linalg import solve_triangular
 
 from wfsobs.observers.gpr.kernels import (
     Points,
@@ -29,7 +28,7 @@ from wfsobs.observers.gpr.kernels import (
 )
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import RecordError
-from wfsobs.signal.linalg import eliminate, solve_rows
+from wfsobs.signal.linalg import eliminate, solve_lower, solve_rows
 from wfsobs.typing import Array
 
 ROWS = 256
@@ -65,6 +64,7 @@ class TrainedGpr:
         out = np.full(n, np.nan)
         signals = signals / self.kernel.length_scale
         tests = self.kernel.points(squared_norms(signals, d))
+        since, held = d - 1, []  # windows whose standard deviation is still to come
         for start in range(d - 1, n, ROWS):
             watch.step(start / n)
             rows = min(ROWS, n - start)
@@ -72,19 +72,23 @@ class TrainedGpr:
             products = sliding_products(signals, self.signals, d, start, d - rows, rows, m + rows - 1)
             row, item = products.strides
             G = as_strided(products[:, rows - 1 :], (rows, m), (row - item, item))
-            here = tests.select(lambda p, start=start, rows=rows: p[start : start + rows])
+            end = start + rows
+            here = tests.select(lambda p, start=start, end=end: p[start:end])
             if sd is not None:
-                held = np.repeat(self._sd(G[::HELD].copy(), here.select(lambda p: p[::HELD])), HELD)
-                sd[start : start + rows] = held[:rows]
+                held.append(G[::HELD].copy())
+                if len(held) == HELD or end == n:  # many at a time, for the whole factor is read each time
+                    windows = tests.select(lambda p, since=since, end=end: p[since:end:HELD])
+                    sd[since:end] = np.repeat(self._sd(np.concatenate(held), windows), HELD)[: end - since]
+                    since, held = end, []
             known = self.kernel.split_times(G, here, self.points, self.weights)
-            out[start : start + rows] = known + here.delta * self.constant
+            out[start:end] = known + here.delta * self.constant
         return out
 
     def _sd(self, G: Array, tests: Points) -> Array:
         """Return the standard deviations (n,) of windows with these inner products G (n, m) [l^2]; uses up G."""
         self.kernel.split(G, tests.select(lambda p: p[:, None]), self.points)
-        whitened = solve_triangular(self.factor, G.T, lower=True, check_finite=False)
         border = tests.delta - G @ self.b
+        whitened = solve_lower(self.factor, G.T)
         variance = self.kernel.own(tests) - np.sum(whitened**2, axis=0) + border**2 / self.pivot
         return np.sqrt(np.maximum(variance, 0.0))
 
