@@ -67,7 +67,7 @@ def test_a_folder_of_estimates(arena: Arena, tmp_path: Path) -> None:
     truth = case.truth(record)
 
     def trial() -> trials.Trial:
-        return try_record(folder_of(tmp_path), case, case.seeds[0], record, None, arena.rules)
+        return try_record(folder_of(tmp_path), case, case.seeds[0], record, [1.0], None, arena.rules)
 
     zero = [mean_square(truth[part]) for part in case.stretches(record)]
     assert trial().failure == f"{path.name}: there is no such file" and trial().squares == zero
@@ -119,5 +119,5 @@ def test_controllers_answer_with_commands(arena: Arena) -> None:
             return Answer({"u": np.zeros_like(record.y_lgs)}, 0.0)
 
     (entry,) = find_entries(["integrator"])
-    found = try_record(entry, case, case.seeds[0], record, Still(), arena.rules)  # type: ignore[arg-type]
+    found = try_record(entry, case, case.seeds[0], record, [1.0], Still(), arena.rules)  # type: ignore[arg-type]
     assert found.squares == pytest.approx([mean_square(case.truth(record)[part]) for part in case.stretches(record)], rel=1e-12)

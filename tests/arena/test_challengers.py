@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from wfsobs.arena.challengers import CHALLENGERS
+from wfsobs.arena.challengers.avc import lock_lines
+from wfsobs.arena.challengers.coupled_ar import NormalEquations
+from wfsobs.arena.challengers.imm import run_mixture, to_pairs
 from wfsobs.arena.challengers.rls import histories, predict_rls
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.kalman.single import steady_filter
+from wfsobs.prior import Model
+from wfsobs.signal.ar2 import Ar2
 from wfsobs.testing import check_observer
 
 
@@ -31,3 +38,66 @@ def test_forgetting_weighs_the_past_exponentially() -> None:
     w = 0.98 ** np.arange(n - 2, -1, -1)
     batch = np.linalg.solve((H[:-1].T * w) @ H[:-1] + 0.1 * 0.98 ** (n - 1) * np.eye(2), (H[:-1].T * w) @ z[1:])
     np.testing.assert_allclose(weights, batch, rtol=0, atol=1e-8)  # rounding of 300 updates
+
+
+def test_coupled_autoregression_is_least_squares_of_all_blocks_and_finds_the_order() -> None:
+    rng, n = np.random.default_rng(4), 6000
+    A1, A2 = np.array([[0.9, 0.3], [-0.2, 0.8]]), np.array([[-0.5, 0.0], [0.1, -0.4]])
+    z = np.zeros((n, 2))
+    for k in range(2, n):
+        z[k] = A1 @ z[k - 1] + A2 @ z[k - 2] + rng.standard_normal(2)
+    H, sums = histories(z, 10), NormalEquations(2, 10)
+    for start in range(0, n - 1, 1000):
+        stop = min(start + 1000, n - 1)
+        sums.add(H[start:stop], z[start + 1 : stop + 1])
+    batch = np.linalg.lstsq(H[:-1, :6], z[1:], rcond=None)[0]
+    np.testing.assert_allclose(sums.fit(3).weights, batch, rtol=0, atol=1e-6)  # the penalty of 1e-7 over n = 6000
+    found = sums.best((1, 2, 5, 10))
+    assert found.order == 2
+    truth = np.vstack([A1.T, A2.T])
+    np.testing.assert_allclose(found.weights, truth, rtol=0, atol=0.06)  # five standard errors of 1 / sqrt(n)
+    np.testing.assert_allclose(found.covariance, np.eye(2), rtol=0, atol=0.1)  # five of sqrt(2 / n)
+
+
+def peak(frequency: float) -> Model:
+    return Model(Ar2(6.6, 0.9, 0.5, 1e-3), Ar2(2 * np.pi * frequency, 0.01, 0.03, 1e-3), 0.014, 0.01)
+
+
+def test_one_hypothesis_is_the_kalman_filter_and_so_are_equal_ones() -> None:
+    model, rng = peak(47.0), np.random.default_rng(6)
+    z = rng.standard_normal(4000).cumsum() * 0.005
+    own = model.disturbance()
+    steady, states = steady_filter(own, model.lgs_noise)
+    expected = steady.run(z[:, None, None])[:, :, 0]
+    one = to_pairs(own)
+    rows = one.output_rows(TARGETS)
+    single = run_mixture(z, [one], model.lgs_noise, 1.0, rows)
+    # it starts from the stationary covariance; after 3 s the slowest part of the start has died out by exp(-0.01 * 295 * 3)
+    np.testing.assert_allclose(single.values[3000:], expected[3000:], rtol=0, atol=1e-3 * np.std(expected))
+    sd = np.sqrt(np.einsum("ra,ab,rb->r", own.output_rows(TARGETS), states.posterior, own.output_rows(TARGETS)))
+    np.testing.assert_allclose(np.sqrt(single.variances[-1]), sd, rtol=1e-3)
+    twice = run_mixture(z, [one, one], model.lgs_noise, 0.99, rows)
+    np.testing.assert_allclose(twice.values, single.values, rtol=0, atol=1e-9)  # rounding
+    np.testing.assert_allclose(twice.probabilities, 0.5, rtol=0, atol=1e-9)
+
+
+def test_the_hypothesis_that_made_the_record_gets_probable() -> None:
+    rng, models = np.random.default_rng(7), [to_pairs(peak(f).disturbance()) for f in (44.0, 50.0)]
+    made = peak(50.0)
+    disturbance = made.turbulence.sample(6000, rng) + made.vibration.sample(6000, rng)
+    z = np.concatenate([[0.0], disturbance[:-1]]) + 0.014 * rng.standard_normal(6000)
+    found = run_mixture(z, models, 0.014, 0.9995, models[0].output_rows(TARGETS))
+    assert found.probabilities[2000:, 1].mean() > 0.9
+
+
+def test_phase_locked_loops_lock_on_pure_lines() -> None:
+    t = np.arange(20_001) * 1e-3
+    clean = np.column_stack([0.03 * np.cos(2 * np.pi * 47.9 * t + 1.0), 0.01 * np.cos(2 * np.pi * 48.2 * t)])
+    found = lock_lines(clean[:-1], [30.0, 48.0], 1.0, 1e-3, level=0.0)
+    # after 20 s of loops of 0.5 Hz only the ripple of demodulation is left, of the order of bandwidth over frequency
+    np.testing.assert_allclose(found.frequencies[:, 1], [47.9, 48.2], rtol=0, atol=0.02)
+    np.testing.assert_allclose(found.magnitudes[:, 1], [0.03, 0.01], rtol=0.05)
+    error = (found.values - clean[1:])[-5000:]
+    assert (np.sqrt(np.mean(error**2, axis=0)) < 0.05 * np.sqrt(np.mean(clean**2, axis=0))).all()
+    far = lock_lines(clean[:-1], [40.0], 1.0, 1e-3, level=0.0)
+    assert (np.abs(far.frequencies - 40.0) <= 1.0 + 1e-9).all()  # no line leaves its band

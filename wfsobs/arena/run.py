@@ -43,16 +43,17 @@ class EntryOutcome:
 
 
 class RecordCache:
-    """Records of the scenarios, each made once."""
+    """Records of the scenarios and the mean squares of their references, each made once."""
 
     def __init__(self) -> None:
-        self._records: dict[tuple[str, str, int], Record] = {}
+        self._records: dict[str, tuple[Record, list[float]]] = {}
 
-    def get(self, case: Case, seed: int) -> Record:
-        """Return a record."""
-        key = case.track, case.name, seed
+    def get(self, case: Case, seed: int) -> tuple[Record, list[float]]:
+        """Return a record, and the mean squares [um^2] of the reference."""
+        key = f"{case.digest} {seed}"
         if key not in self._records:
-            self._records[key] = case.record(seed)
+            record = case.record(seed)
+            self._records[key] = record, case.reference_squares(record, seed)
         return self._records[key]
 
 
@@ -112,7 +113,7 @@ def _try_records(
     arena: Arena, entry: ArenaEntry, case: Case, seeds: Sequence[int], records: RecordCache, process: EntryProcess | None
 ) -> Iterator[Trial]:
     for seed in seeds:
-        yield try_record(entry, case, seed, records.get(case, seed), process, arena.rules)
+        yield try_record(entry, case, seed, *records.get(case, seed), process, arena.rules)
 
 
 def _refusal(arena: Arena, entry: ArenaEntry, folder: Path, process: EntryProcess) -> str:

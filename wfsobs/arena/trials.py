@@ -55,14 +55,23 @@ class Trial:
     calibration: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
-def try_record(entry: ArenaEntry, case: Case, seed: int, record: Record, process: EntryProcess | None, rules: Rules) -> Trial:
+def try_record(
+    entry: ArenaEntry,
+    case: Case,
+    seed: int,
+    record: Record,
+    references: list[float],
+    process: EntryProcess | None,
+    rules: Rules,
+) -> Trial:
     """Return the result of an entry on one record.
 
-    process : in which it runs; None for a folder of estimates
+    references : mean squares of the reference [um^2], one per sample
+    process    : in which it runs; None for a folder of estimates
     """
     track, truth = TRACKS[case.track], case.truth(record)
     same = seed, case.record_id(seed)
-    references, stretches = case.reference_squares(record, seed), case.stretches(record)
+    stretches = case.stretches(record)
     try:
         if process is None:
             answer = _read_estimate(Path(entry.place), case.record_id(seed), record)

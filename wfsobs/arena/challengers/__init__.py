@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from wfsobs.arena.challengers.avc import AVC
 from wfsobs.arena.challengers.base import Challenger
+from wfsobs.arena.challengers.coupled_ar import COUPLED_AR
+from wfsobs.arena.challengers.imm import IMM
 from wfsobs.arena.challengers.rls import RLS
 
-CHALLENGERS: dict[str, Challenger] = {one.observer.id: one for one in (RLS,)}
+CHALLENGERS: dict[str, Challenger] = {one.observer.id: one for one in (RLS, COUPLED_AR, IMM, AVC)}
 """By id, in the order of tables."""
