@@ -4,7 +4,7 @@
 
 by least squares on all that has been measured, anew every REFIT seconds. Off-diagonal elements of A couple the modes. The order
 is that of ORDERS with the least |S| ((n + m p) / (n - m p))^m, S the covariance of the residuals, m the modes, n the measurements
-(Akaike 1971, Ann. Inst. Statist. Math. 23, 163). Hafeez et al. (2022, JATIS 8, 029003) find some thirty coefficients enough for tip
+(Akaike 1971, Ann. Inst. Statist. Math. 23, 163). Hafeez et al. (2022, JATIS 8, 029003) find thirty coefficients enough for tip
 and tilt, and nothing that networks add. It is told nothing.
 """
 

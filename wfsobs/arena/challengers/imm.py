@@ -1,7 +1,7 @@
 """Interacting multiple models: Kalman filters of several hypotheses, mixed by how well each predicts.
 
 Before every step the filters start from a mixture of the states of all, weighed by the probability that the disturbance passes
-from one hypothesis to another; afterwards each hypothesis has the probability that its innovation gives it, and the estimate is the
+from one hypothesis to another; afterwards each hypothesis has the probability that its innovation gives it, the estimate is the
 mean over them (Blom and Bar-Shalom 1988, IEEE Trans. Autom. Control 33, 780). The hypotheses are the model that it is told,
 turbulence that is twice as fast, and a vibration peak that is lower or higher by SHIFT. With one it is the Kalman filter.
 """
