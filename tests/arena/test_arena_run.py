@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import pickle
 from pathlib import Path
@@ -12,15 +13,19 @@ import pytest
 
 from wfsobs.arena import trials
 from wfsobs.arena.cases import SimulatedCase, mean_square
-from wfsobs.arena.definition import Arena, load_arena
-from wfsobs.arena.entries import ArenaEntry, admits, find_entries
-from wfsobs.arena.process import Answer, EntryProcess
+from wfsobs.arena.challengers import CHALLENGERS
+from wfsobs.arena.definition import Arena, add_records, load_arena
+from wfsobs.arena.entries import ArenaEntry, admits, find_entries, load_object
+from wfsobs.arena.process import Answer, EntryProcess, solve
 from wfsobs.arena.reference import taps_error
 from wfsobs.arena.results import tables, write_results
 from wfsobs.arena.run import run_arena
 from wfsobs.arena.tracks import TRACKS
 from wfsobs.arena.trials import try_record
+from wfsobs.prior import Prior
+from wfsobs.record import Record
 from wfsobs.settings.errors import SettingError
+from wfsobs.telemetry.records import save_record
 
 
 @pytest.fixture(scope="module")
@@ -121,3 +126,48 @@ def test_controllers_answer_with_commands(arena: Arena) -> None:
     (entry,) = find_entries(["integrator"])
     found = try_record(entry, case, case.seeds[0], record, [1.0], Still(), arena.rules)  # type: ignore[arg-type]
     assert found.squares == pytest.approx([mean_square(case.truth(record)[part]) for part in case.stretches(record)], rel=1e-12)
+
+
+class Here:
+    """The same without a process of its own."""
+
+    def __init__(self, entry: ArenaEntry):
+        self.algorithm = load_object(entry)
+
+    def run(self, _seconds: float, *arguments: Any) -> Answer:
+        return Answer(solve(self.algorithm, *arguments), 0.0)
+
+
+def test_telemetry_is_known_by_its_bytes_and_scored_in_parts(arena: Arena, tmp_path: Path) -> None:
+    record = arena.cases[0].record(1)
+    path = tmp_path / "night.npz"
+    save_record(path, Record(record.y_lgs, record.u, record.dt, delay=record.delay))
+    case = add_records(arena, [path]).cases[-1]
+    assert case.record_id(0) == hashlib.sha256(path.read_bytes()).hexdigest() and (case.track, case.name) == ("next", "night")
+    z, n = record.z, record.n_steps
+    given = case.record(0)
+    references = case.reference_squares(given, 0)
+    (rls,) = find_entries(["rls"])
+    found = try_record(rls, case, 0, given, references, Here(rls), arena.rules)  # type: ignore[arg-type]
+    predicted = CHALLENGERS["rls"].observer.estimate(given.measurements(), Prior())["turbulence"]
+    squares = np.sum((predicted[:-1] - z[1:]) ** 2, axis=1)[n // 2 : n - 1]
+    counts = [part.stop - part.start for part in case.stretches(given)]
+    assert len(found.squares) == 8 and sum(counts) == n - 1 - n // 2
+    # parts together are all of the second half
+    assert np.average(found.squares, weights=counts) == pytest.approx(squares.mean(), rel=1e-9)
+    # what is told was identified: a filter of it does not do much worse than thirty taps that were trained on 1.5 s, nor RLS
+    (kf,) = find_entries(["kf-lgs"])
+    filtered = try_record(kf, case, 0, given, references, Here(kf), arena.rules)  # type: ignore[arg-type]
+    assert not filtered.failure and filtered.calibration["within_95"] > 0.8
+    for one in (found, filtered):
+        assert np.mean(one.squares) < 1.5**2 * np.mean(references)
+
+
+def test_two_records_of_one_name_are_refused(arena: Arena, tmp_path: Path) -> None:
+    record = arena.cases[0].record(1)
+    paths = [tmp_path / "a" / "night.npz", tmp_path / "b" / "night.npz"]
+    for path in paths:
+        path.parent.mkdir()
+        save_record(path, Record(record.y_lgs, record.u, record.dt))
+    with pytest.raises(SettingError, match="two records have the name night"):
+        add_records(arena, paths)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from wfsobs.arena.cases import Case, SimulatedCase
+from wfsobs.arena.telemetry import TelemetryCase
 from wfsobs.arena.tracks import TRACKS
 from wfsobs.scenario.configfile import parse_toml, preset
 from wfsobs.settings.errors import SettingError
@@ -112,6 +113,16 @@ def load_arena(path: Path = FILE, *, seeds: int | None = None, quick: bool = Fal
         raise SettingError("arena: two scenarios of a track have one name")
     cases.sort(key=lambda case: list(TRACKS).index(case.track))
     return Arena(values["version"], tuple(cases), Rules(values["time_limit"], values["memory"]))
+
+
+def add_records(arena: Arena, files: Sequence[Path]) -> Arena:
+    """Return the arena with records of telemetry. Raises RecordError where one cannot be used, SettingError for equal names."""
+    given = [TelemetryCase(path) for path in files]
+    for case in given:
+        case.whole  # noqa: B018  read now: a file that cannot be used ends nothing that has run long
+        if [other.name for other in given].count(case.name) > 1:
+            raise SettingError(f"--record {case.path}: two records have the name {case.name}")
+    return Arena(arena.version, (*arena.cases, *given), arena.rules)
 
 
 def _case(entry: Mapping[str, Any], common: Mapping[str, Any], seeds: range, reach: float, quick: bool) -> SimulatedCase:

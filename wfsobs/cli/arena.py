@@ -8,7 +8,7 @@ import click
 import numpy as np
 from rich.table import Table
 
-from wfsobs.arena.definition import Arena, load_arena
+from wfsobs.arena.definition import Arena, add_records, load_arena
 from wfsobs.arena.entries import find_entries
 from wfsobs.arena.results import tables, write_results
 from wfsobs.arena.run import run_arena
@@ -57,12 +57,16 @@ def print_list(quick: bool, seeds: int | None) -> None:
     metavar="ENTRY",
     help="Only this: an id, MODULE:NAME or a folder of estimates; repeat it.",
 )
+@click.option("--record", "files", multiple=True, metavar="FILE", help="Telemetry for the track next; repeat it.")
 @TRACK
 @SEEDS
 @QUICK
-def run(out: str, entries: tuple[str, ...], tracks: tuple[str, ...], seeds: int | None, quick: bool) -> None:
+def run(
+    out: str, entries: tuple[str, ...], files: tuple[str, ...], tracks: tuple[str, ...], seeds: int | None, quick: bool
+) -> None:
     """Run what is missing, and write results.json and index.html."""
-    found = _select_tracks(load_arena(seeds=seeds, quick=quick), tracks)
+    found = add_records(load_arena(seeds=seeds, quick=quick), [Path(file) for file in files])
+    found = _select_tracks(found, tracks)
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     outcomes = run_arena(found, find_entries(entries), folder, lambda line: click.echo(f"wfsobs: {line}", err=True))
