@@ -4,9 +4,9 @@ Each line is an oscillator m cos(alpha) with magnitude, phase and frequency of i
 
     e[k] = z[k] - level[k] - sum of m cos(alpha),
 
-which demodulated by the oscillator gives the errors of magnitude, 2 e cos(alpha), and phase, -2 e sin(alpha) / m (Wu and Bodson
-2003, IEEE Trans. Autom. Control 48, 612). A level with a slope takes the turbulence. It is told bands of the vibration: no line leaves
-its own.
+which demodulated by the oscillator gives the errors of magnitude, 2 e cos(alpha), and of phase, -2 e sin(alpha) / m
+(Wu and Bodson 2003, IEEE Trans. Autom. Control 48, 612). A level with a slope takes the turbulence. It is told the bands of
+the vibration: no line leaves its own.
 """
 
 from __future__ import annotations
