@@ -10,10 +10,13 @@ from wfsobs.arena.challengers.avc import lock_lines
 from wfsobs.arena.challengers.coupled_ar import NormalEquations
 from wfsobs.arena.challengers.imm import run_mixture, to_pairs
 from wfsobs.arena.challengers.rls import histories, predict_rls
+from wfsobs.arena.challengers.subspace import fit_subspace, joint_moments
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Model
 from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.statespace import disturbance_model
 from wfsobs.testing import check_observer
 
 
@@ -101,3 +104,21 @@ def test_phase_locked_loops_lock_on_pure_lines() -> None:
     assert (np.sqrt(np.mean(error**2, axis=0)) < 0.05 * np.sqrt(np.mean(clean**2, axis=0))).all()
     far = lock_lines(clean[:-1], [40.0], 1.0, 1e-3, level=0.0)
     assert (np.abs(far.frequencies - 40.0) <= 1.0 + 1e-9).all()  # no line leaves its band
+
+
+def test_the_subspace_predictor_finds_the_states_and_predicts_like_the_kalman_filter() -> None:
+    rng, n = np.random.default_rng(8), 20_000
+    # the sum of two processes of two states each, and noise
+    one, two = Ar2(2 * np.pi * 20.0, 0.3, 1.0, 1e-3), Ar2(2 * np.pi * 150.0, 0.05, 1.0, 1e-3)
+    z = (one.sample(n, rng) + two.sample(n, rng) + 0.3 * rng.standard_normal(n))[:, None]
+    past, future = 40, 10
+    H = histories(z, past)
+    found = fit_subspace(joint_moments(H, z, 0, n - future, future), n - future, 1, past)
+    assert found.order == 4
+    model = disturbance_model([one], [two])
+    steady = steady_state(model.A, model.C, model.Q, np.array(0.3**2))
+    optimal = float(model.C @ steady.P @ model.C + 0.3**2)
+    error = np.var((H[:-1] @ found.weights - z[1:])[past:])
+    # five standard errors of a variance over n = 20,000, sqrt(2 / n) each; what the fit of 4 states costs is less
+    assert error == pytest.approx(optimal, rel=0.05)
+    assert found.covariance[0, 0] == pytest.approx(error, rel=0.01)  # the start of the record is in one of them

@@ -7,6 +7,7 @@ from wfsobs.arena.challengers.base import Challenger
 from wfsobs.arena.challengers.coupled_ar import COUPLED_AR
 from wfsobs.arena.challengers.imm import IMM
 from wfsobs.arena.challengers.rls import RLS
+from wfsobs.arena.challengers.subspace import SUBSPACE
 
-CHALLENGERS: dict[str, Challenger] = {one.observer.id: one for one in (RLS, COUPLED_AR, IMM, AVC)}
+CHALLENGERS: dict[str, Challenger] = {one.observer.id: one for one in (RLS, COUPLED_AR, SUBSPACE, IMM, AVC)}
 """By id, in the order of tables."""
