@@ -1,6 +1,6 @@
 """Subspace predictor: the few combinations of the past that predict the future.
 
-The last PAST measurements of all modes, Z, and the next FUTURE ones, F, have canonical correlations r_i. A disturbance of n states
+The last PAST measurements of all modes, Z, and the next FUTURE ones, F, have canonical correlations r_i. One of n states
 has n that are not zero; the state is the n combinations of Z that belong to them, and the next measurement is regressed on it
 (canonical variate analysis, Larimore 1990, Proc. 29th CDC, 596). Data-driven subspace predictive control (Haffert et al. 2021,
 JATIS 7, 029001) rests on the same regression of the future on the past. The order is that of the least Akaike criterion of a
