@@ -52,7 +52,7 @@ test: setup  ## run all tests, then the tutorials, then those in a browser
 test-fast: $(TEST)  ## the quick tests alone: no dashboard, no report, none that takes long (tests/slow.txt)
 	@$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" tests wfsobs --ignore=tests/app --ignore=tests/report --ignore=wfsobs/app
 
-test-peers: $(PEERS:%=test-peer-%)  ## run the tests in pyRTC and HCIPy, each in an environment of its own (make test-peer-oopao, test-peer-soapy: in those)
+test-peers: $(PEERS:%=test-peer-%)  ## run the tests in pyRTC and HCIPy, each in an environment of its own (make test-peer-specula, test-peer-oopao, test-peer-soapy: in those)
 
 test-peer-%: $(VENV)-%/.made-$(PINS)
 	@$(VENV)-$*/bin/python -m pytest tests/peers/test_$*.py
