@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.handlers import full_html
 from wfsobs.app.limits import NONE, PUBLIC, Limits
-from wfsobs.app.serve import Options, full_html, options, origins
+from wfsobs.app.serve import Options, options, origins
 from wfsobs.app.service import Full, Service
 from wfsobs.app.share import from_query, to_file
 from wfsobs.app.store import Store

@@ -10,7 +10,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from html import escape
 from ipaddress import ip_address
 from typing import Any
 
@@ -20,14 +19,14 @@ from bokeh.server.views.autoload_js_handler import AutoloadJsHandler
 from bokeh.server.views.metadata_handler import MetadataHandler
 from bokeh.util.token import generate_secret_key
 from panel.io.server import DocHandler, get_server
-from tornado.web import RequestHandler
 
 from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.handlers import Liveness, PageHandler, full_html
 from wfsobs.app.limits import NONE, PUBLIC, Limits
 from wfsobs.app.logs import event, to_stream
+from wfsobs.app.ready import NEXT, NextPage
 from wfsobs.app.service import Full, Service
 from wfsobs.app.session import session_page
-from wfsobs.app.share import LONGEST
 from wfsobs.app.warm import warm_up
 from wfsobs.app.work import one_blas_thread
 
@@ -148,7 +147,7 @@ def _end(service: Service, then: Any, number: int, frame: Any) -> None:
 def new_page(service: Service) -> Any:
     """Build the page of a new session."""
     try:
-        session = service.enter()
+        session = NEXT.get() or service.enter()
     except Full as error:
         return pn.pane.HTML(full_html(str(error)), margin=40)
     pn.state.on_session_destroyed(lambda _context: session.leave())
@@ -181,7 +180,10 @@ def make_server(options: Options, service: Service) -> Server:
     router.rules = [rule for rule in router.rules if not issubclass(rule.target, UNUSED)]
     for rule in router.rules:
         if rule.target is DocHandler:
-            rule.target = type("Door", (PageHandler,), {"service": service})
+            context = rule.target_kwargs["application_context"]
+            ready = NextPage(service, server._tornado, context, options.lifetime)
+            ready.start()
+            rule.target = type("Door", (PageHandler,), {"service": service, "next_page": ready})
     return server
 
 
@@ -201,42 +203,3 @@ def is_local(address: str) -> bool:
         return ip_address(address.strip("[]")).is_loopback
     except ValueError:
         return address.lower() == "localhost"
-
-
-class PageHandler(DocHandler):
-    """The page: turns visitors away who are too many, and takes no session's name and no endless query from an address."""
-
-    service: Service
-
-    async def prepare(self) -> None:
-        """Turn the visitor away if the server is full."""
-        await super().prepare()
-        if self.service.full:
-            self.set_status(503)
-            self.set_header("Retry-After", "60")
-            self.finish(full_html("There are as many visitors as this server takes. Please try again later."))
-            return
-        arguments = self.request.arguments
-        for name in ("bokeh-token", "bokeh-session-id"):
-            arguments.pop(name, None)
-        self.request.headers.pop("Bokeh-Session-Id", None)
-        if len(self.request.query) > LONGEST:  # the page says that it was not used; here it would be sent to and fro
-            arguments.clear()
-
-
-class Liveness(RequestHandler):
-    """Whether the server answers, and how busy it is."""
-
-    def initialize(self, service: Service) -> None:
-        """Take what was given beside the pattern; called by Tornado."""
-        self.service = service
-
-    def get(self) -> None:
-        """Answer in JSON."""
-        queue = self.service.queue
-        self.write({"ok": True, "sessions": self.service.sessions, "running": queue.running, "waiting": queue.length})
-
-
-def full_html(line: str) -> str:
-    """Write the page for a visitor for whom there is no room."""
-    return f"<!doctype html><title>wfsobs</title><h1>wfsobs is full</h1><p>{escape(line)}</p>"

@@ -13,7 +13,7 @@ from time import monotonic
 from typing import Any
 
 from wfsobs.app.cache import Cache, key_of
-from wfsobs.app.jobs.job import Job, Listener, Tell, Work
+from wfsobs.app.jobs.job import IDLE_TIME, Job, Listener, Tell, Work
 from wfsobs.app.jobs.queue import JobQueue, release_memory
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.limits import Limits
@@ -47,12 +47,23 @@ class Service:
         self.cache: Cache[Any] = Cache(most_bytes)
         self.queue = JobQueue(workers, self.cache)
         self.sessions = 0
+        self._last_wish = monotonic()
         self._work = work or partial(compute, memo=self.memo)
         self._lock = threading.Lock()
         self._numbers = itertools.count(1)
 
     def enter(self) -> Session:
         """Open a new session. Raises Full."""
+        session = self.new_session()
+        session.enter()
+        return session
+
+    def new_session(self) -> Session:
+        """Make a session whose visitor has not come."""
+        return Session(self)
+
+    def count_session(self) -> int:
+        """Count a session that begins, and return its number. Raises Full."""
         with self._lock:
             if self.full:
                 event("refused", logging.WARNING, what="session", sessions=self.sessions)
@@ -60,7 +71,16 @@ class Service:
             self.sessions += 1
             number = next(self._numbers)
         event("session-start", session=number, sessions=self.sessions)
-        return Session(self, number)
+        return number
+
+    def note_wish(self) -> None:
+        """Note that somebody wants something now."""
+        self._last_wish = monotonic()
+
+    @property
+    def quiet_seconds(self) -> float:
+        """For how long nobody has wanted anything [s]."""
+        return 0.0 if self.queue.is_busy() else monotonic() - self._last_wish
 
     @property
     def full(self) -> bool:
@@ -106,19 +126,38 @@ class Service:
 
 
 class Session:
-    """One visitor: their number, their tasks, and how another thread has something done on theirs."""
+    """One visitor: their number, their tasks, and how another thread has something done on theirs.
 
-    def __init__(self, service: Service, number: int):
-        self.service, self.number = service, number
+    Before the visitor has come, what is not known already waits for them.
+    """
+
+    def __init__(self, service: Service):
+        self.service, self.number = service, 0
         self.post: Post = lambda function: function()
         self.tasks: list[BackgroundTask] = []
         self.is_closed = False
+        self._jobs: list[tuple[Job, Listener]] | None = []
+        self._leave: dict[Listener, Callable[[], None]] = {}
         self._since = monotonic()
+
+    def enter(self) -> None:
+        """Have the visitor come, and what waited for them done. Raises Full."""
+        self.number = self.service.count_session()
+        self._since = monotonic()
+        jobs, self._jobs = self._jobs or [], None
+        for job, listener in jobs:
+            self._leave[listener] = self.submit(job, listener)
 
     def submit(self, job: Job, listener: Listener, before: Callable[[], None] = lambda: None) -> Callable[[], None]:
         """Have a job done when its turn comes, in place of the one before; how to take it back."""
         if self.is_closed:
             return lambda: None
+        if self._jobs is not None and job.key not in self.service.cache:
+            before()
+            self._jobs.append((job, listener))
+            return partial(self._take_back, listener)
+        if job.priority != IDLE_TIME:
+            self.service.note_wish()
         return self.service.queue.submit(job, self.number, listener, before)
 
     def leave(self) -> None:
@@ -127,8 +166,16 @@ class Session:
             self.is_closed = True
             for task in self.tasks:
                 task.close()
-            self.service.end_session()
-            event("session-end", session=self.number, seconds=monotonic() - self._since, sessions=self.service.sessions)
+            if self._jobs is None:
+                self.service.end_session()
+                event("session-end", session=self.number, seconds=monotonic() - self._since, sessions=self.service.sessions)
+
+    def _take_back(self, listener: Listener) -> None:
+        """Take back what waited, or what has become of it."""
+        if self._jobs is not None:
+            self._jobs = [it for it in self._jobs if it[1] is not listener]
+        elif (leave := self._leave.pop(listener, None)) is not None:
+            leave()
 
 
 def run_key(scenario: Scenario, source: Source | None) -> str:

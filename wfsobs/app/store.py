@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import param
+from param.parameterized import batch_call_watchers
 
 from wfsobs.app.jobs.job import DONE
 from wfsobs.app.jobs.task import BackgroundTask
@@ -168,18 +169,19 @@ class Store(param.Parameterized):
             self._future = []
         self._refusals = refusals
         errors = {path: reason for path, reason in self.errors.items() if path in refusals}
-        self.param.update(
-            scenario=self.scenario if unchanged else scenario,
-            source=self.source if stays else source,
-            errors=errors,
-            preset=preset,
-            can_undo=bool(self._past),
-            can_redo=bool(self._future),
-        )
-        if unchanged and stays:
-            return
-        self.follow()  # first, so that a warning of stale results does not come and go
-        self._compare()
+        with batch_call_watchers(self):
+            self.param.update(
+                scenario=self.scenario if unchanged else scenario,
+                source=self.source if stays else source,
+                errors=errors,
+                preset=preset,
+                can_undo=bool(self._past),
+                can_redo=bool(self._future),
+            )
+            if not (unchanged and stays):
+                # First: it goes on while the page is told, and a warning of stale results does not come and go.
+                self.follow()
+                self._compare()
 
     def _compare(self, *_: object) -> None:
         shown = self.run.result

@@ -9,7 +9,7 @@ from panel.io.document import _cleanup_doc
 from panel.io.state import set_curdoc
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.service import Service, Session
+from wfsobs.app.service import Service
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
 
@@ -20,7 +20,7 @@ def warm_up(service: Service) -> None:
         service.queue.submit(service.run(PRESETS[next(iter(PRESETS))]()), "server", lambda _news: None)
     doc = Document()
     with set_curdoc(doc):
-        dashboard = Dashboard(lambda function: function(), Session(service, 0))
+        dashboard = Dashboard(lambda function: function(), service.new_session())
         dashboard.page().server_doc(doc)
         dashboard.complete()
         doc.to_json()

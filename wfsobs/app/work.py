@@ -1,42 +1,35 @@
 """The work of one run, done in a thread: what it delivers, and how often.
 
-Nothing here knows of Panel. `compute` runs the core and hands over what is done so far: the quick observers where the
-others keep one waiting, all but those that learn during the run as soon as they are done, then those, in parts where they
-come in parts.
+Nothing here knows of Panel. `compute` runs the core and hands over what is done so far: the quick observers as soon as they are
+done, then all but those that learn during the run, then those, in parts where they come in parts.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from bisect import bisect
+from dataclasses import replace
 from time import perf_counter, sleep
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from wfsobs.app.jobs.job import INTERVAL, Tell
+from wfsobs.app.run_results import TRUTH, Array, Key, RunResults, SignalAndError
 from wfsobs.app.sources import Source
 from wfsobs.dependence import Memo, RecordMemo, digest, simulate_once
 from wfsobs.evaluation.error_spectra import spectra
 from wfsobs.evaluation.record_bounds import Bound, record_bounds
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import TARGETS
+from wfsobs.observers.base import SLOW, TARGETS
 from wfsobs.observers.estimates import Estimate
 from wfsobs.pipeline import as_stated, collect
 from wfsobs.progress import Watch
 from wfsobs.record import Record
-from wfsobs.result import Failure, Result
+from wfsobs.result import Failure
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import record_settings
-
-Array = NDArray[np.float64]
-Key = tuple[str, str]
-"""(observer or TRUTH, target)."""
-
-TRUTH = "truth"
 
 DELIVERY_INTERVAL = 0.4
 """Least time between two deliveries [s], each of which has the page drawn anew."""
@@ -45,60 +38,8 @@ DRAWING = 0.15
 """What the page takes to draw a delivery [s]."""
 
 
-@dataclass(frozen=True)
-class SignalAndError:
-    """Power spectral densities [um^2/Hz], one column per mode, of a signal and of its error; frequency in [Hz]."""
-
-    frequency: Array
-    signal: Array
-    error: Array
-
-
-@dataclass(frozen=True)
-class RunResults:
-    """What a run has given so far.
-
-    partial : values so far, NaN where there are none yet, of observers still at work
-    spectra : of the truth and of every finished estimate
-    source : what they are of where that is not the simulation of the settings
-    bounds : of the record
-    ran    : observers that ran for it, None for all; nothing changed that the others depend on, so their estimates were known
-    """
-
-    result: Result
-    partial: Mapping[Key, Array] = field(default_factory=dict)
-    spectra: Mapping[Key, SignalAndError] = field(default_factory=dict)
-    seconds: float = 0.0
-    source: Source | None = None
-    bounds: Sequence[Bound] = ()
-    ran: tuple[str, ...] | None = None
-
-    @property
-    def is_recorded(self) -> bool:
-        """Whether the record stays whatever the settings."""
-        return self.source is not None
-
-    @property
-    def simulation(self) -> Scenario | None:
-        """What the record was simulated from; None where it was loaded."""
-        return self.scenario if self.source is None else self.source.simulation
-
-    @property
-    def scenario(self) -> Scenario:
-        """The settings this was computed from."""
-        return self.result.scenario
-
-    def values(self, observer: str, target: str) -> Array | None:
-        """(n_steps, n_modes) [um] of the truth, a finished or a growing estimate, or None."""
-        if observer == TRUTH:
-            return self.result.record.truth(target)
-        estimate = self.result.estimate(observer, target)
-        return estimate.values if estimate else self.partial.get((observer, target))
-
-    def sd(self, observer: str, target: str) -> Array | None:
-        """(n_steps, n_modes) [um], the standard deviation that a finished estimate states, or None."""
-        estimate = self.result.estimate(observer, target)
-        return estimate.sd if estimate else None
+WEIGHTS = (10.0, SLOW)
+"""As soon as no observer is at work that is lighter than one of these, what is there is delivered."""
 
 
 def one_blas_thread() -> None:
@@ -134,6 +75,7 @@ class _Work:
         self.start_time = self.report_time = self.delivery_time = perf_counter()
         self.news = False  # since the last delivery
         self.fraction = 0.0
+        self.stage = 0
         self.lock, self.telling = threading.Lock(), threading.Lock()
         self.record: Record | None = None
 
@@ -149,8 +91,8 @@ class _Work:
         self.record, self.known_estimates = record, RecordMemo(self.memo, record)
         self.bounds = self.memo.get(self._name_of_bounds(record)) if self.simulation is not None else _Bounds()
         self._add_truth(record)
-        handed_over = False  # the quick ones
-        for item in each_estimate(record, stated, self.watch, on_partial=self._grow, memo=self.known_estimates):
+        known = self.known_estimates
+        for item in each_estimate(record, stated, self.watch, on_partial=self._grow, memo=known):
             with self.lock:
                 if isinstance(item, Failure):
                     self.failures.append(item)
@@ -158,14 +100,14 @@ class _Work:
                     self._add(record, item)
                 self.news = True
                 left = self._left()
-                quick = not handed_over and all(OBSERVERS[name].slow for name in left) and (left or self.bounds is None)
-                shown = self._deliver(record) if quick else None
+                due = (stage := _stage(left)) > self.stage and (left or self.bounds is None)
+                self.stage = stage
+                shown = self._deliver(record) if due else None
             if shown is not None:
-                handed_over = True
                 self.report(self.fraction)
                 self.tell(result=shown)
                 self._let_draw()
-                if self.bounds is None and self.simulation is not None:
+                if stage == len(WEIGHTS) and self.bounds is None and self.simulation is not None:
                     self.bounds = self.memo.put(self._name_of_bounds(record), _Bounds(record_bounds(self.simulation, record)))
         return self._so_far(record)
 
@@ -246,3 +188,8 @@ class _Work:
             found = spectra(record, target, values, warm_up)
             known = self.memo.put(name, SignalAndError(*found)) if found else None
         return known
+
+
+def _stage(left: set[str]) -> int:
+    """Count the weights that nothing lighter is left of."""
+    return bisect(WEIGHTS, min((OBSERVERS[name].weight for name in left), default=SLOW))

@@ -43,6 +43,26 @@ function patchTexts(doc) {
   }
 }
 
+// Each part that is put into the page or changes its size has all of it laid out anew, some thirty times until the first picture
+// stands. Once a frame is enough.
+function layOutOnceAFrame() {
+  const kind = Bokeh.Models.get("panel.models.esm.ReactiveESM").prototype.default_view.prototype
+  if (kind.laidOutOnceAFrame) return
+  const compute = kind.compute_layout
+  kind.laidOutOnceAFrame = true
+  kind.compute_layout = function () {
+    if (this.is_managed) compute.call(this)
+    else if (!this.layoutIsDue) {
+      this.layoutIsDue = true
+      requestAnimationFrame(() => {
+        this.layoutIsDue = false
+        if (!this.is_destroyed) compute.call(this)
+      })
+    }
+  }
+}
+layOutOnceAFrame()
+
 // What the first picture does not need is made when it stands: when its figures have been painted, or a page has none.
 const PATIENCE = 1500, STEP = 30
 function tellDrawn(model) {

@@ -143,7 +143,7 @@ class JobQueue:
         while (job := self._next()) is not None:
             again = False
             try:
-                again = job.run(lambda: self.closing, self.cache.put, self._is_busy)
+                again = job.run(lambda: self.closing, self.cache.put, self.is_busy)
             except Exception:  # a bug, but the thread is for all
                 log.exception("a job failed")
             finally:
@@ -162,7 +162,7 @@ class JobQueue:
         with self._change:
             while not self.closing:
                 job = self._line()[0] if self._waiting else None
-                if job is not None and not (job.priority == IDLE_TIME and self._is_busy()):
+                if job is not None and not (job.priority == IDLE_TIME and self.is_busy()):
                     self._waiting.remove(job)
                     if job in self._timers:
                         self._timers.pop(job).cancel()
@@ -188,7 +188,7 @@ class JobQueue:
         """Jobs that somebody has asked for, waiting or being done."""
         return [job for job in (*self._running, *self._waiting) if job.priority != IDLE_TIME]
 
-    def _is_busy(self) -> bool:
+    def is_busy(self) -> bool:
         """Whether somebody waits for a job."""
         return bool(self._requests)
 
