@@ -54,6 +54,16 @@ class TestRms:
         assert found[BOUND].rms == pytest.approx(expected, rel=1e-4)
         assert found["kf-lgs"].rms > 1.02 * expected, "a wrong model costs something"
 
+    @pytest.mark.parametrize("target", TARGETS)
+    def test_with_fewer_frequencies_it_is_nearly_the_same(self, target: str) -> None:
+        scenario, shown = PRESETS["ut4"](), ("kf-lgs", "kf-multi", BOUND)
+        coarse = Theory(most=65_536)
+        found, whole = (predictions(scenario, target, theory, observers=shown) for theory in (coarse, Theory()))
+        assert coarse.spectra(scenario, 0).n == 65_536
+        # three digits are shown; what is left of narrow lines, the bound, moves most
+        assert {n: p.rms for n, p in found.items()} == pytest.approx({n: p.rms for n, p in whole.items()}, rel=0.01)
+        assert found["kf-multi"].rms != whole["kf-multi"].rms
+
     def test_of_the_target_and_of_the_bound(self) -> None:
         found = predictions(RIGHT, "vibration")
         assert found[TRUTH].rms == pytest.approx(np.hypot(0.05, 0.02), rel=1e-6)

@@ -12,7 +12,7 @@ from wfsobs.app.handles import changes_of, handles_of, with_new_peak, without_pe
 from wfsobs.app.pages.pages import LOOP
 from wfsobs.app.views.frames import Frames
 from wfsobs.app.views.gain_editor import GainEditor
-from wfsobs.app.views.spectrum_editor import SpectrumEditor
+from wfsobs.app.views.spectrum_editor import DRAGGED, SpectrumEditor
 from wfsobs.closed_loop.design import design
 from wfsobs.evaluation.theory import Theory
 from wfsobs.priors_from.controllers import plant_of
@@ -102,6 +102,7 @@ class TestMessages:
         editor.layer._handle_msg(drag(1, frequency=60.0, strength=3.0))
         loop.until(lambda: editor.layer.frame["answered"] == 1)
         assert store.scenario is scenario and not store.can_undo
+        assert editor.theory.most == DRAGGED, "a coarse grid while it moves"
         assert numbers(editor)["kf-multi"] != before["kf-multi"]
         assert not np.array_equal(editor.lines.source.data["ys"][0], line)
         (handle,) = [h for h in editor.layer.frame["handles"] if h["id"] == "peak-14"]
@@ -127,7 +128,7 @@ class TestMessages:
         editor.layer._handle_msg(drag(1, frequency=60.0))
         editor.layer._handle_msg({"action": "cancel", "number": 2})
         loop.until(lambda: editor.layer.frame["answered"] == 2)
-        assert numbers(editor) == before
+        assert numbers(editor) == before and editor.theory.most is None
         assert not editor.store.can_undo
 
     @pytest.mark.parametrize(

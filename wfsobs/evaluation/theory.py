@@ -27,7 +27,7 @@ from wfsobs.priors_from.turbulence import lines_turbulence
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import expected_psd
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, error_spectrum, factorise
-from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, n_frequencies, true_spectra
+from wfsobs.simulation.true_spectra import MOST, TrueSpectra, has_known_spectra, n_frequencies, true_spectra
 from wfsobs.simulation.turbulence_spectra import TurbulenceSpectra, turbulence_spectra
 from wfsobs.typing import Array
 
@@ -85,9 +85,13 @@ class Theory:
     ----------
     resolution : float
         Resolution of the Welch estimates [Hz].
+    most : int or None
+        The most frequencies to compute with, a power of two; None for as many as the scenario needs. With fewer, lines that are
+        narrower than their spacing are coarse.
     """
 
     resolution: float = 0.5
+    most: int | None = None
     _memory: dict[str, tuple[Any, Any]] = field(default_factory=dict, repr=False)
     _lengths: dict[str, int] = field(default_factory=dict, repr=False)
 
@@ -154,11 +158,11 @@ class Theory:
 
     def spectra(self, scenario: Scenario, mode: int) -> TrueSpectra:
         """Return the true spectra of a mode."""
-        key = mode, _groups(scenario, *AIR, "vibration")
+        key = mode, self.most, _groups(scenario, *AIR, "vibration")
         return self._keep("spectra", key, lambda: true_spectra(scenario, mode, self._air(scenario, mode)))
 
     def _air(self, scenario: Scenario, mode: int) -> TurbulenceSpectra:
-        n = n_frequencies(scenario)
+        n = min(n_frequencies(scenario), self.most or MOST)
         return self._keep("air", (mode, n, _groups(scenario, *AIR)), lambda: turbulence_spectra(scenario, mode, n))
 
     def _response(self, observer: Observer, scenario: Scenario, mode: int, target: str, n: int) -> Complex:

@@ -135,15 +135,15 @@ def true_spectra(scenario: Scenario, mode: int, air: TurbulenceSpectra | None = 
     mode : int
         Index of the mode.
     air : TurbulenceSpectra, optional
-        Its turbulence, where already computed.
+        Its turbulence, where already computed, which has as many frequencies as the spectra are to have.
 
     Returns
     -------
     TrueSpectra
         Spectra.
     """
-    n = n_frequencies(scenario)
-    air = air or turbulence_spectra(scenario, mode, n)
+    air = air or turbulence_spectra(scenario, mode, n_frequencies(scenario))
+    n = 2 * (air.own.size - 1)
     vibration, gain = _vibration(scenario, mode, n), lgs_weights(scenario)[mode, :, mode].sum()
     lines = _pure_lines(scenario, mode, n)
     if lines is not None:
