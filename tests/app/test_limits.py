@@ -187,7 +187,7 @@ def test_limits_are_on_unless_only_this_machine_reaches_the_page(given: dict[str
 
 
 def test_every_limit_has_a_flag() -> None:
-    names = ["duration", "training_size", "depth", "seconds", "sweep_seconds", "megabytes", "sessions"]
+    names = ["duration", "training_size", "depth", "seconds", "sweep_seconds", "live_seconds", "megabytes", "sessions"]
     flags = {"max_memory" if name == "megabytes" else f"max_{name}": i for i, name in enumerate(names, start=1)}
     limits = options(**flags).limits
     assert [getattr(limits, name) for name in names] == list(flags.values())

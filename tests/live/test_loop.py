@@ -201,7 +201,7 @@ def test_a_live_loop_from_start_to_stop():
             loop.switch("butterworth-ol", True)
         with pytest.raises(SettingError, match="takes a number from"):
             loop.set_speed(50)
-        loop.start_recording()
+        loop.recorder.start()
         loop.step(7)
         wait(lambda: loop.count == 7)
         loop.play()
@@ -210,7 +210,7 @@ def test_a_live_loop_from_start_to_stop():
         loop.pause()
         wait(lambda: loop.count == loop.newest and "turbulence.wind_speed = 20.0" in [e.line for e in loop.events])
         sent = loop.newest
-        record, pids = loop.stop_recording(), loop.pids
+        record, pids = loop.recorder.stop(scenario), loop.pids
         assert record.n_steps == sent == loop.newest
         for score in wfsobs.observe(record, scenario, observers=["kf-multi", "gp-both"]).scores:
             if score.observer in ("kf-multi", "gp-both"):

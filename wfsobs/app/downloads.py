@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from wfsobs.app.loop_work import LoopResults
 from wfsobs.app.work import RunResults
 from wfsobs.observers.base import TARGETS
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import to_toml
 from wfsobs.telemetry.records import record_arrays
 
@@ -54,6 +56,11 @@ def data_csv(results: RunResults) -> bytes:
     head = [f"# # dt: {record.dt!r}", *([f"# # ratio: {record.ratio}"] if record.ratio else [])]
     head += [f"# {line}".rstrip() for line in to_toml(results.scenario).splitlines()]
     return _csv(head, dict(_columns(results)))
+
+
+def record_npz(record: Record, scenario: Scenario) -> bytes:
+    """Write a record as `wfsobs observe` reads it, with the scenario."""
+    return _npz(record_arrays(record, to_toml(scenario)))
 
 
 def residuals_npz(results: LoopResults) -> bytes:

@@ -25,6 +25,7 @@ class Limits:
     megabytes     : memory of a run, likewise [MB]
     sessions      : open pages
     sweep_seconds : how long all runs of a sweep take, as estimated [s]
+    live_seconds  : how long a live loop goes on [s]
     """
 
     duration: float = math.inf
@@ -36,6 +37,7 @@ class Limits:
     megabytes: float = math.inf
     sessions: float = math.inf
     sweep_seconds: float = math.inf
+    live_seconds: float = math.inf
 
     def check(self, scenario: Scenario) -> None:
         """Raise SettingError, one line, where a run of this scenario is more than the server allows."""
@@ -89,6 +91,7 @@ PUBLIC = Limits(
     megabytes=600.0,
     sessions=100,
     sweep_seconds=300.0,
+    live_seconds=60.0,
 )
 """For a server that strangers reach."""
 

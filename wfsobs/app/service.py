@@ -7,10 +7,11 @@ import itertools
 import logging
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from math import isfinite
 from time import monotonic
-from typing import Any
+from typing import Any, TypeVar
 
 from wfsobs.app.cache import Cache, key_of
 from wfsobs.app.jobs.job import IDLE_TIME, Job, Listener, Tell, Work
@@ -31,6 +32,9 @@ Post = Callable[[Callable[[], None]], None]
 """Has a function called soon on the thread that owns the session; may itself be called from any thread."""
 
 
+Made = TypeVar("Made")
+
+
 class Full(Exception):
     """No more sessions on this server: one line saying so."""
 
@@ -48,6 +52,9 @@ class Service:
         self.queue = JobQueue(workers, self.cache)
         self.sessions = 0
         self._last_wish = monotonic()
+        # Its thread is not one of low priority, as those of the jobs are: processes that it starts inherit that.
+        self._starter = ThreadPoolExecutor(1, "wfsobs-start")
+        self._starter.submit(bool)
         self._work = work or partial(compute, memo=self.memo)
         self._lock = threading.Lock()
         self._numbers = itertools.count(1)
@@ -119,6 +126,10 @@ class Service:
     def seed_key(self, scenario: Scenario, source: Source | None, seed: int) -> str:
         """Name the scores of a scenario's observers on the record of another seed."""
         return f"seed {seed} of {run_key(scenario, source)}"
+
+    def start(self, make: Callable[[], Made]) -> Made:
+        """Make something that starts processes which keep to a clock."""
+        return self._starter.submit(make).result()
 
     def close(self, timeout: float = 1.5) -> bool:
         """Stop every job; whether all have ended in time [s]. To set `queue.closing` alone does the same later."""

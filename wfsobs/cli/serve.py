@@ -35,6 +35,7 @@ from wfsobs.settings.errors import SettingError
 @click.option(
     "--max-sweep-seconds", type=click.FloatRange(0, min_open=True), metavar="S", help="Maximum estimated time of a sweep."
 )
+@click.option("--max-live-seconds", type=click.FloatRange(0, min_open=True), metavar="S", help="Maximum time of a live loop.")
 @click.option("--max-memory", type=click.FloatRange(0, min_open=True), metavar="MB", help="Maximum estimated memory of a run.")
 @click.option("--max-sessions", type=click.IntRange(1), metavar="N", help="Maximum number of open pages.")
 @click.option(

@@ -4,35 +4,28 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
-from functools import partial
 from threading import Event, Thread
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import ReferenceType, finalize, ref
 
 from wfsobs.live.blocks import check_live
-from wfsobs.live.checks import check_slot, check_speed, make_design
+from wfsobs.live.checks import check_slot, check_speed, loss_line, needs_new_frames
 from wfsobs.live.processes import LiveProcesses
-from wfsobs.live.recording import Recording, loop_record
-from wfsobs.live.source import LiveSource
-from wfsobs.live.view import LiveView, read_view
-from wfsobs.observers.step import StepObserver
-from wfsobs.record import Record
+from wfsobs.live.recording import Recorder
+from wfsobs.live.source import SIMULATION, LiveSource
+from wfsobs.live.view import LiveEvent, LiveView, read_view
+from wfsobs.live.workshop import Workshop
+from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import sampling_of
 
 TICK = 0.2
 """Pause between two looks at the processes [s]."""
+MINUTE = 60.0
+"""What is identified [s]."""
 MOST_EVENTS = 200
 """Events that are kept."""
-
-
-class LiveEvent(NamedTuple):
-    """What has happened: number of the first frame of it, and one line."""
-
-    frame: int
-    line: str
 
 
 class LiveLoop:
@@ -66,9 +59,10 @@ class LiveLoop:
         self._speed, self._is_wanted, self._has_begun = check_speed(speed), False, False
         self.events: deque[LiveEvent] = deque(maxlen=MOST_EVENTS)
         self.watchers: list[Callable[[], None]] = []
-        self._recording: Recording | None = None
         self._processes = LiveProcesses(source, scenario, tuple(dict.fromkeys(observers)), self._speed)
         self.board = self._processes.board
+        self.recorder = Recorder(self._processes.feed.ring, self.sampling, self.say)
+        self.workshop = Workshop(self._processes, self.say)
         self._release = finalize(self, self._processes.release)
         Thread(target=_keep, args=(ref(self), self._processes.is_over), daemon=True, name="wfsobs-live").start()
 
@@ -83,9 +77,9 @@ class LiveLoop:
         return bool(self.board.totals[3])
 
     @property
-    def is_alive(self) -> bool:
-        """Whether frames may follow, and the observers take them."""
-        return self._processes.are_alive
+    def observers_are_alive(self) -> bool:
+        """Whether the observers take what comes."""
+        return self._processes.observers_are_alive
 
     @property
     def speed(self) -> float:
@@ -128,42 +122,38 @@ class LiveLoop:
         self._speed = check_speed(speed)
         self._processes.feed.tell({"speed": self._speed})
 
-    def change(self, settings: Mapping[str, Any], line: str = "") -> None:
-        """Change settings of the simulation: it fades into that of the new ones; the observers keep their designs.
+    def change(self, settings: Mapping[str, Any]) -> None:
+        """Change settings, path -> value, of the simulation. Raises SettingError as `become` does."""
+        self.become(self.scenario.replace(settings), ", ".join(f"{path} = {value}" for path, value in settings.items()))
+
+    def become(self, scenario: Scenario, line: str) -> None:
+        """Change the settings of the simulation: it fades into that of the new ones; the observers keep their designs.
 
         Parameters
         ----------
-        settings : mapping
-            Path -> value.
+        scenario : Scenario
+            New settings.
         line : str
-            For the list of events; by default the settings themselves.
+            For the list of events.
 
         Raises
         ------
         SettingError
-            A setting is wrong, or would change modes or rates; or the source is no simulation.
+            Modes or rates would change, or the scenario has events; or the source is no simulation.
         """
-        if not self.source.has_truth or self.source.name != "simulation":
+        if self.source.name != SIMULATION:
             raise SettingError(f"a {self.source.name} has no settings to change")
-        scenario = self.scenario.replace(settings)
         check_live(scenario)
-        if sampling_of(scenario) != sampling_of(self.scenario):
+        if sampling_of(scenario) != self.sampling:
             raise SettingError("modes and rates cannot change while the loop runs: start another")
-        line = line or ", ".join(f"{path} = {value}" for path, value in settings.items())
-        is_new = any(not path.startswith("loop.") for path in settings)
+        is_new = needs_new_frames(self.scenario, scenario)
         self.scenario = scenario
         self._processes.feed.tell({"settings": scenario.to_dict(), "is_new": is_new, "line": line})
 
     def lose(self, lgs: bool = True, ngs: bool = True, loss: float = 0.0) -> None:
         """Switch lasers and NGS sensor on and off, and lose a part of the frames."""
-        parts = (
-            ([] if lgs else ["lasers out"])
-            + ([] if ngs else ["no NGS frames"])
-            + ([f"{loss:.0%} of frames lost"] if loss else [])
-        )
-        self._processes.feed.tell(
-            {"losses": {"lgs": lgs, "ngs": ngs, "loss": loss}, "line": ", ".join(parts) or "all frames arrive"}
-        )
+        losses = {"lgs": lgs, "ngs": ngs, "loss": loss}
+        self._processes.feed.tell({"losses": losses, "line": loss_line(lgs, ngs, loss)})
 
     def switch(self, observer: str, on: bool) -> None:
         """Switch an observer off, or on with a design for the present settings. Raises SettingError."""
@@ -183,22 +173,15 @@ class LiveLoop:
         scenario : Scenario, optional
             What they are told; by default the present settings.
         """
-        settings = (scenario or self.scenario).to_dict()
-        for name in observers or self.board.active():
-            future = self._processes.workshop.submit(make_design, name, settings)
-            future.add_done_callback(partial(self._deliver, name))
+        self.workshop.redesign(self.board.active() if observers is None else observers, scenario or self.scenario)
 
-    def do_beside(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Have something computed beside the loop, in the process that makes designs."""
-        return self._processes.workshop.submit(function, *arguments)
+    def identify(self, seconds: float = MINUTE) -> None:
+        """Identify the last so many seconds beside the loop, and design the observers for it. Raises SettingError."""
+        self.workshop.identify(self.recorder.look_back(seconds, self.scenario), self.scenario, self.board.active())
 
-    def _deliver(self, name: str, future: Future[StepObserver]) -> None:
-        if future.cancelled() or self._processes.is_over.is_set():
-            return
-        if (error := future.exception()) is not None:
-            self.say(f"{name}: {error}")
-        else:
-            self._processes.tell_observers({"observer": name, "design": future.result()})
+    def targets(self, observer: str) -> tuple[str, ...]:
+        """Return what an observer estimates."""
+        return OBSERVERS[observer].targets
 
     def say(self, line: str, frame: int | None = None) -> None:
         """Add a line to the list of events."""
@@ -208,28 +191,6 @@ class LiveLoop:
         """Return the last so many seconds of frames and estimates."""
         return read_view(self._processes.feed.ring, self._processes.traces, self.sampling.dt, seconds)
 
-    def look_back(self, seconds: float) -> Record:
-        """Return the last so many seconds as a record, as far back as there are frames. Raises SettingError."""
-        return loop_record(self._processes.feed.ring, self.scenario, self.sampling, seconds)
-
-    def start_recording(self, look_back: float = 0.0) -> None:
-        """Keep every frame from now on, and those of the last so many seconds."""
-        self._recording = Recording(self._processes.feed.ring, self.sampling, look_back)
-        self.say("recording on")
-
-    def stop_recording(self) -> Record | None:
-        """Return what has been recorded, None where there is nothing."""
-        recording, self._recording = self._recording, None
-        if recording is None:
-            return None
-        self.say("recording off")
-        return recording.record(self.scenario)
-
-    @property
-    def is_recording(self) -> bool:
-        """Whether every frame is kept."""
-        return self._recording is not None
-
     def tend(self) -> None:
         """Look after the processes; called a few times a second."""
         if self._is_wanted and self.is_ready and not self._has_begun:
@@ -237,8 +198,7 @@ class LiveLoop:
             self._processes.feed.tell({"play": True})
         for number, line in self._processes.news():
             self.say(line, number)
-        if self._recording is not None and not self._recording.collect():
-            self.say("recording is full")
+        self.recorder.collect()
         for watch in self.watchers:
             watch()
 

@@ -55,9 +55,9 @@ class LiveProcesses:
         self.workshop = ProcessPoolExecutor(1, context, initializer=enter_process, initargs=(10,))
 
     @property
-    def are_alive(self) -> bool:
-        """Whether frames may follow, and the observers take them."""
-        return not self.is_over.is_set() and self._observing.is_alive() and self.feed.is_alive
+    def observers_are_alive(self) -> bool:
+        """Whether the observers take what comes."""
+        return not self.is_over.is_set() and self._observing.is_alive()
 
     @property
     def pids(self) -> list[int]:

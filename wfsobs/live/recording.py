@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from threading import Lock
+
 import numpy as np
 
 from wfsobs.live.ring import CAPACITY, LiveFrame, Ring
@@ -32,6 +35,7 @@ class Recording:
         self._ring, self._sampling = ring, sampling
         self._next = self._first = first_frame(ring, sampling, look_back)
         self._parts: list[LiveFrame] = []
+        self.is_full = False
 
     def collect(self) -> bool:
         """Keep what has come; return whether there is room for more."""
@@ -49,20 +53,71 @@ class Recording:
         return record_of(LiveFrame(*(np.concatenate(parts) for parts in zip(*self._parts, strict=True))), scenario)
 
 
+class Recorder:
+    """Recording on and off, and a look back.
+
+    Parameters
+    ----------
+    ring : Ring
+        Where the frames come.
+    sampling : Sampling
+        NGS ratio, and time step.
+    say : callable
+        Receives one line about what happens.
+
+    Attributes
+    ----------
+    record : Record or None
+        The last recording that has ended.
+    """
+
+    def __init__(self, ring: Ring, sampling: Sampling, say: Callable[[str], None]):
+        self._ring, self._sampling, self._say = ring, sampling, say
+        self._recording: Recording | None = None
+        self._lock = Lock()
+        self.record: Record | None = None
+
+    @property
+    def is_on(self) -> bool:
+        """Whether every frame is kept."""
+        return self._recording is not None
+
+    def start(self, look_back: float = 0.0) -> None:
+        """Keep every frame from now on, and those of the last so many seconds."""
+        with self._lock:
+            self._recording = Recording(self._ring, self._sampling, look_back)
+        self._say("recording on")
+
+    def stop(self, scenario: Scenario) -> Record | None:
+        """Return what has been recorded as a record of the scenario's loop, None where there is nothing."""
+        with self._lock:
+            recording, self._recording = self._recording, None
+            self.record = None if recording is None else recording.record(scenario)
+        self._say("recording off")
+        return self.record
+
+    def collect(self) -> None:
+        """Keep what has come; called a few times a second."""
+        with self._lock:
+            is_full = self._recording is not None and not self._recording.collect() and not self._recording.is_full
+            if is_full and self._recording is not None:
+                self._recording.is_full = True
+        if is_full:
+            self._say(f"recording is full: {LONGEST} frames")
+
+    def look_back(self, seconds: float, scenario: Scenario) -> Record:
+        """Return the last so many seconds as a record, as far back as there are frames. Raises SettingError without a frame."""
+        record = Recording(self._ring, self._sampling, seconds).record(scenario)
+        if record is None:
+            raise SettingError("no frame has come yet")
+        return record
+
+
 def first_frame(ring: Ring, sampling: Sampling, seconds: float) -> int:
     """Return the first frame of the last so many seconds that is there still, and has an NGS measurement."""
     ratio = sampling.ratio or 1
     there = min(round(seconds / sampling.dt), CAPACITY - ratio - 2)
     return -(-max(0, ring.count - there) // ratio) * ratio
-
-
-def loop_record(ring: Ring, scenario: Scenario, sampling: Sampling, seconds: float) -> Record:
-    """Return the last so many seconds as a record. Raises SettingError where there is no frame."""
-    recording = Recording(ring, sampling, seconds)
-    record = recording.record(scenario)
-    if record is None:
-        raise SettingError("no frame has come yet")
-    return record
 
 
 def record_of(frames: LiveFrame, scenario: Scenario) -> Record:

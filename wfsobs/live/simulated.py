@@ -14,6 +14,7 @@ import numpy as np
 
 from wfsobs.live.blocks import Block, endless_blocks
 from wfsobs.live.paced import Command, Desk, Staff, enter_process, send_frames
+from wfsobs.live.source import SIMULATION
 from wfsobs.record import Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.stepping import sampling_of
@@ -36,7 +37,7 @@ class SimulatedLoop:
     """
 
     scenario: Scenario
-    name = "simulation"
+    name = SIMULATION
     has_truth = True
 
     @property

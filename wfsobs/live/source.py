@@ -14,6 +14,9 @@ from wfsobs.live.paced import Command, Desk, Staff
 from wfsobs.live.ring import Ring
 from wfsobs.record import Sampling
 
+SIMULATION, RECORD, STREAM = "simulation", "record", "stream"
+"""Names of sources."""
+
 
 class LiveSource(Protocol):
     """A source before it runs: what its processes are told, and nothing that lives."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,13 @@ from wfsobs.live.ring import LiveFrame, Ring
 from wfsobs.live.rows import Rows
 from wfsobs.observers.base import TARGETS
 from wfsobs.typing import Array
+
+
+class LiveEvent(NamedTuple):
+    """What has happened: number of the first frame of it, and one line."""
+
+    frame: int
+    line: str
 
 
 @dataclass(frozen=True)

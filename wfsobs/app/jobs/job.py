@@ -47,6 +47,7 @@ class Job:
     time_limit : of the work, after which it is told to stop [s]
     wait_limit : of the time in the line, after which it is given up [s]
     refusal    : exceptions of the work that are a reason in one line; others are bugs, and logged
+    endless    : goes on until it is stopped; one place among the jobs is kept free of such
     quiet      : one of many in a second, of which the log says nothing unless it is asked for everything
     """
 
@@ -63,11 +64,12 @@ class Job:
         time_limit: float = math.inf,
         wait_limit: float = math.inf,
         refusal: type[Exception] = ValueError,
+        endless: bool = False,
         quiet: bool = False,
     ):
         self.kind, self.key, self.cost = kind, key, cost
         self.priority = (CLICK if cost <= LONG else SWEEP) if priority is None else priority
-        self.time_limit, self.wait_limit = time_limit, wait_limit
+        self.time_limit, self.wait_limit, self.endless = time_limit, wait_limit, endless
         self.number, self.since, self.turn = next(Job.numbers), monotonic(), 0
         self._work, self._refusal = work, refusal
         self._level = logging.DEBUG if quiet else logging.INFO

@@ -161,7 +161,7 @@ class JobQueue:
         """Take the first job of the line; None when there will be no more."""
         with self._change:
             while not self.closing:
-                job = self._line()[0] if self._waiting else None
+                job = next(filter(self._has_room, self._line()), None)
                 if job is not None and not (job.priority == IDLE_TIME and self.is_busy()):
                     self._waiting.remove(job)
                     if job in self._timers:
@@ -182,6 +182,10 @@ class JobQueue:
             return CLICK if job.since < late and job.priority != IDLE_TIME else job.priority, job.turn
 
         return sorted(self._waiting, key=place)
+
+    def _has_room(self, job: Job) -> bool:
+        """Whether a job may begin: one place is kept for those that come to an end."""
+        return not job.endless or sum(other.endless for other in self._running) < len(self._threads) - 1
 
     @property
     def _requests(self) -> list[Job]:

@@ -15,6 +15,7 @@ from wfsobs.app.display import Display
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.figures import Figures
 from wfsobs.app.pages.identify import IdentifyPage
+from wfsobs.app.pages.live import LivePage
 from wfsobs.app.pages.model import ModelPage
 from wfsobs.app.pages.sweep import SweepPage
 from wfsobs.app.pages.sweep_views import report_part
@@ -22,7 +23,7 @@ from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.store import Store
 from wfsobs.app.style import HEARD
 
-EXPLORE, IDENTIFY, TUNE, SWEEP, LOOP = "explore", "identify", "tune", "sweep", "loop"
+EXPLORE, IDENTIFY, TUNE, SWEEP, LOOP, LIVE = "explore", "identify", "tune", "sweep", "loop", "live"
 FIGURES, MODEL = "figures", "model"
 TITLES: Mapping[str, str] = MappingProxyType(
     {
@@ -31,6 +32,7 @@ TITLES: Mapping[str, str] = MappingProxyType(
         "Tune": TUNE,
         "Sweep": SWEEP,
         "Closed loop": LOOP,
+        "Live": LIVE,
         "Paper figures": FIGURES,
         "Model": MODEL,
     }
@@ -62,6 +64,7 @@ class Pages(param.Parameterized):
             TUNE: lambda: TunePage(store, display),
             SWEEP: lambda: SweepPage(store, display, partial(setattr, self, "current", EXPLORE)),
             LOOP: lambda: ClosedLoopPage(store, display),
+            LIVE: lambda: LivePage(store, display),
             FIGURES: lambda: Figures(store.run, display),
             MODEL: lambda: ModelPage(store, display),
         }

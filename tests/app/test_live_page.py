@@ -1,0 +1,128 @@
+"""The page of the live loop: a job that goes on until it is stopped, true to the loop, at rest while hidden."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.jobs.job import FAILED, RUNNING, Job
+from wfsobs.app.limits import NONE
+from wfsobs.app.numbers import number
+from wfsobs.app.pages.live import LivePage
+from wfsobs.app.pages.live_controls import Pulse
+from wfsobs.app.pages.live_table import ranking
+from wfsobs.app.pages.pages import LIVE
+from wfsobs.app.service import Service
+from wfsobs.live.loop import LiveLoop
+
+
+@pytest.fixture
+def page(dashboard: Dashboard) -> LivePage:
+    dashboard.pages.current = LIVE
+    page = dashboard.pages.by_name[LIVE]
+    assert isinstance(page, LivePage)
+    page.controls.running.value = ["kf-multi", "gp-both"]
+    return page
+
+
+def is_running(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def wait(condition: Any, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def begin(page: LivePage, loop: Any) -> LiveLoop:
+    page.buttons["Start"].param.trigger("clicks")
+    loop.until(lambda: page.loop is not None)
+    live = page.loop
+    assert live is not None
+    wait(lambda: live.count > 400)
+    return live
+
+
+def test_a_loop_from_start_to_the_end_of_the_session(page: LivePage, dashboard: Dashboard, loop: Any) -> None:
+    assert page._figures is None and page.loop is None and not page.draw(), "nothing before it is asked for"
+    live = begin(page, loop)
+    assert page.draw() and page._figures is not None
+    assert set(live.board.active()) == {"kf-multi", "gp-both"}
+    page.buttons["Pause"].param.trigger("clicks")
+    wait(lambda: not live.is_playing and live.count == live.newest)
+    assert page.buttons["Pause"].label == "Play"
+    page.draw()
+    view = live.view(page.window.value)
+    best, rms = ranking(view, live.board.active(), "turbulence", 0)[0]
+    assert rms == pytest.approx(np.sqrt(np.mean(view.error(best, "turbulence")[:, 0] ** 2)), rel=1e-12)
+    rows = re.findall(r'data-name="([^"]+)".*?</tr>', page.table.object, re.S)
+    assert rows[0] == best and number(1e3 * rms) in page.table.object
+    assert f"{live.count} frames · 0 lost" in page.status.object
+    assert f"{live.count * 0.001:.1f} s" in page.status.object
+    # a change in the drawer is one in the loop; what it cannot take is said
+    dashboard.store.change("turbulence.wind_speed", 20.0)
+    dashboard.store.change("sensors.exposure_ratio", 10)
+    wait(lambda: any("Wind speed" in event.line for event in live.events))
+    assert live.scenario.turbulence.wind_speed == 20.0 and live.scenario.sensors.exposure_ratio == 5
+    page.draw()
+    assert "modes and rates cannot change" in page.news.object and "Wind speed" in page.news.object
+    # the page is left, the loop goes on; the session ends, nothing is left
+    page.show(False)
+    assert not page.draw() and page.work.state == RUNNING
+    pids = live.pids
+    assert len(pids) == 3 and all(map(is_running, pids))
+    dashboard.store.session.leave()
+    wait(lambda: not any(map(is_running, pids)))
+
+
+def test_pictures_wait_for_the_browser(page: LivePage, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[int] = []
+    monkeypatch.setattr(page, "draw", lambda: drawn.append(1) is None)
+    page.tick()
+    page.tick()
+    page.tick()
+    assert len(drawn) == 1 and page.pulse.picture == 1, "a page that sleeps is sent nothing more"
+    page.pulse._handle_msg({"painted": 1})
+    page.tick()
+    assert len(drawn) == 2
+    page.pulse._handle_msg({"painted": "x"})
+    assert not page.pulse.is_free and Pulse().is_free
+
+
+def test_one_place_is_kept_for_jobs_that_end() -> None:
+    service = Service(NONE, 2, 1000)
+    running, end = threading.Semaphore(0), threading.Event()
+
+    def work(watch: Any, _tell: Any) -> None:
+        running.release()
+        while not end.wait(0.01):
+            watch.check()
+
+    done = threading.Event()
+    leave = [service.queue.submit(Job("live", work, endless=True), owner, lambda _: None) for owner in (1, 2)]
+    assert running.acquire(timeout=20)
+    service.queue.submit(Job("run", lambda *_: done.set()), 3, lambda _: None)
+    assert done.wait(20), "a run is done beside"
+    assert service.queue.running == 1 and service.queue.length == 1
+    leave[0]()
+    assert running.acquire(timeout=20), "the second loop takes the place of the first"
+    leave[1]()
+    assert service.close(20)
+
+
+def test_one_job_at_once_is_too_few(page: LivePage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page.store.session.service.queue, "_threads", [])
+    page.start()
+    assert page.work.state == FAILED and "--runs 2" in page.status.object

@@ -1,0 +1,89 @@
+"""The buttons and fields of the live loop, and what tells that a picture has been painted."""
+
+from __future__ import annotations
+
+from time import monotonic
+from typing import Any
+
+import panel_material_ui as pmui
+import param
+from panel.custom import JSComponent
+
+from wfsobs.app.pages.live_table import QUANTITIES
+from wfsobs.app.pages.parts import WIDE, line
+from wfsobs.app.style import asset, look
+from wfsobs.live.follow import default_observers
+from wfsobs.observers.base import TARGETS
+
+PATIENCE = 10.0
+"""Time after which a picture that the browser has not answered is given up [s]."""
+SPEEDS = {f"{speed:g} ×": speed for speed in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)}
+WINDOWS = {f"{seconds:g} s": seconds for seconds in (2.0, 5.0, 10.0)}
+LOSSES = {"no frame": 0.0, "1 % of frames": 0.01, "5 % of frames": 0.05, "20 % of frames": 0.2}
+MAIN = ("kf-multi", "multirate-multi", "gpr-online")
+"""Observers whose lines are shown first."""
+BUTTONS = {
+    "Start": "play_arrow",
+    "Pause": "pause",
+    "Step": "skip_next",
+    "Stop": "stop",
+    "Design anew": "build",
+    "Identify": "search",
+    "Record": "fiber_manual_record",
+}
+"""Button -> its icon."""
+
+
+class Pulse(JSComponent):
+    """Tells when a picture has been painted."""
+
+    picture = param.Integer(0, doc="Number of the last one.")
+    _esm = asset("pulse.js")
+
+    def __init__(self, **params: Any):
+        self.answer, self._time = 0, 0.0
+        super().__init__(**params)
+
+    def _handle_msg(self, data: object) -> None:
+        if isinstance(data, dict) and isinstance(number := data.get("painted"), int):
+            self.answer = number
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the browser is ready for another."""
+        return self.answer >= self.picture or monotonic() - self._time > PATIENCE
+
+    def beat(self) -> None:
+        """Ask for an answer to the picture that has been sent."""
+        self._time = monotonic()
+        self.picture += 1
+
+
+class LiveControls:
+    """Buttons and fields."""
+
+    def __init__(self) -> None:
+        self.buttons = {
+            name: pmui.Button(label=name, icon=icon, color="primary" if name == "Start" else "default", size="small", margin=0)
+            for name, icon in BUTTONS.items()
+        }
+        select = {"size": "small", "margin": 0}
+        self.speed = pmui.Select(label="Speed", options=SPEEDS, value=1.0, width=100, **select)
+        self.window = pmui.Select(label="Window", options=WINDOWS, value=5.0, width=100, **select)
+        self.target = pmui.Select(label="Errors of", options=QUANTITIES, value=TARGETS[0], width=180, **select)
+        self.lasers = pmui.Checkbox(label="Lasers", value=True, **select)
+        self.ngs = pmui.Checkbox(label="NGS", value=True, **select)
+        self.losses = pmui.Select(label="Lost", options=LOSSES, value=0.0, width=150, **select)
+        self.running = pmui.MultiChoice(
+            label="Observers", options={look(name).label: name for name in default_observers()}, value=default_observers(), **WIDE
+        )
+        self.lines = pmui.MultiChoice(label="Lines", options=self.running.options, value=list(MAIN), **WIDE)
+
+    def view(self) -> list[Any]:
+        """Return the rows of controls; window, target and lines stand by the figures."""
+        b = self.buttons
+        return [
+            line(b["Start"], b["Pause"], b["Step"], self.speed, b["Stop"]),
+            line(self.lasers, self.ngs, self.losses, b["Design anew"], b["Identify"], b["Record"]),
+            self.running,
+        ]

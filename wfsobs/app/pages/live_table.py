@@ -1,0 +1,90 @@
+"""What is known of every observer of a live loop, best first, and what has happened."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from html import escape
+from math import inf, isnan
+
+from wfsobs.app.display import Display
+from wfsobs.app.numbers import NOTHING, number
+from wfsobs.app.render import Row, table
+from wfsobs.app.style import look, swatch
+from wfsobs.evaluation.rows import row_label
+from wfsobs.live.board import NEXT, SCORED
+from wfsobs.live.loop import LiveLoop
+from wfsobs.live.view import LiveEvent, LiveView
+
+SHOWN_EVENTS = 8
+QUANTITIES = {"Turbulence": "turbulence", "Vibration": "vibration", "Next measurement": NEXT}
+
+Bounds = Mapping[str, Mapping[str, list[float]]]
+
+
+def ranking(view: LiveView, names: Iterable[str], target: str, column: int) -> list[tuple[str, float]]:
+    """Return the observers with their rms errors over the view [um], best first; those without one last."""
+    errors = [(name, float(view.rms(name, target)[column])) for name in names]
+    return sorted(errors, key=lambda one: inf if isnan(one[1]) else one[1])
+
+
+def live_html(loop: LiveLoop, view: LiveView, target: str, display: Display, scale: float, bounds: Bounds) -> str:
+    """Write the table of all observers that run."""
+    unit, seconds = display.unit_label, view.n * view.dt
+    columns = {
+        "Observer": "",
+        f"RMS error [{unit}]": f"over the last {seconds:.1f} s",
+        f"Since its start [{unit}]": "after its warm-up",
+        "error / bound": "the smallest bound of the two",
+        "Step, median [µs]": "update and estimate of all modes",
+        "99.9 % [µs]": "",
+        "Longer than a frame": "steps",
+    }
+    of = {name: by_target[target][display.column] for name, by_target in bounds.items() if target in by_target}
+    least = min(of.values(), default=float("nan"))
+    rows = [
+        _row(loop, name, rms, target, display, scale, least)
+        for name, rms in ranking(view, loop.board.active(), target, display.column)
+    ]
+    rows += [Row(row_label(name), [number(scale * rms), *[NOTHING] * 5], {"name": name}) for name, rms in of.items()]
+    return str(table("Live", columns, [("", rows)]))
+
+
+def _row(loop: LiveLoop, name: str, rms: float, target: str, display: Display, scale: float, least: float) -> Row:
+    counts = loop.board[name]
+    whole = float(counts.rms(target)[display.column]) if target in SCORED else float("nan")
+    cells = [
+        _number(scale * rms),
+        _number(scale * whole),
+        _number(rms / least),
+        *(_number(1e6 * counts.latencies.quantile(share)) for share in (0.5, 0.999)),
+        str(int(counts.late[0])),
+    ]
+    return Row(swatch(name, display.dark) + look(name).label, cells, {"name": name})
+
+
+def _number(x: float) -> str:
+    return NOTHING if isnan(x) else number(x)
+
+
+def status_line(loop: LiveLoop, view: LiveView) -> str:
+    """Say how the loop goes, in one line."""
+    taken, lost, late, _ = (int(x) for x in loop.board.totals)
+    if not loop.is_ready:
+        return "The observers are being designed"
+    state = "Running" if loop.is_playing else "Paused"
+    behind = (loop.newest - loop.count) * loop.sampling.dt / loop.speed
+    parts = [
+        f"{state} at {loop.speed:g} × real time",
+        f"{view.dt * (view.first + view.n):.1f} s",
+        f"{taken} frames",
+        f"{lost} lost",
+        f"{100.0 * late / max(1, taken):.2f} % later than 1 ms",
+        f"observers {behind:.2f} s behind",
+    ]
+    return " · ".join([*parts, "recording"] if loop.recorder.is_on else parts)
+
+
+def events_html(events: Iterable[LiveEvent], dt: float) -> str:
+    """List the latest events, the newest first."""
+    lines = [f"<li>{event.frame * dt:.2f} s: {escape(event.line)}</li>" for event in list(events)[-SHOWN_EVENTS:][::-1]]
+    return f'<ul class="text" aria-label="Events">{"".join(lines)}</ul>' if lines else ""

@@ -1,0 +1,70 @@
+"""What is made beside a live loop, in a process at low priority: designs, identifications, bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from typing import Any
+
+from wfsobs.live.checks import check_slot, make_design
+from wfsobs.live.finding import Finding, identify_frames
+from wfsobs.live.processes import LiveProcesses
+from wfsobs.record import Record
+from wfsobs.scenario import Scenario
+
+
+class Workshop:
+    """Makes what a loop takes once it is ready.
+
+    Parameters
+    ----------
+    processes : LiveProcesses
+        Of the loop.
+    say : callable
+        Receives one line about what happens.
+
+    Attributes
+    ----------
+    finding : Finding or None
+        The last identification.
+    """
+
+    def __init__(self, processes: LiveProcesses, say: Callable[[str], None]):
+        self._processes, self._say = processes, say
+        self.finding: Finding | None = None
+
+    def do(self, function: Callable[..., Any], *arguments: Any, then: Callable[[Any], None]) -> None:
+        """Have something computed, and then do something with the result; an error becomes a line."""
+
+        def end(future: Future[Any]) -> None:
+            if future.cancelled() or self._processes.is_over.is_set():
+                return
+            if (error := future.exception()) is not None:
+                self._say(str(error) or type(error).__name__)
+            else:
+                then(future.result())
+
+        self._processes.workshop.submit(function, *arguments).add_done_callback(end)
+
+    def redesign(self, observers: Sequence[str], scenario: Scenario) -> None:
+        """Design observers; each goes on where the one before is, or begins. Raises SettingError."""
+        for name in observers:
+            check_slot(name)
+        settings = scenario.to_dict()
+        for name in observers:
+            self.do(make_design, name, settings, then=self._deliver)
+
+    def identify(self, record: Record, scenario: Scenario, observers: Sequence[str]) -> None:
+        """Identify a record, and design observers for what is found."""
+
+        def take(finding: Finding) -> None:
+            self.finding = finding
+            peaks = ", ".join(f"{p.frequency:.1f} Hz" for p in finding.peaks)
+            self._say(f"identified: {len(finding.peaks)} peaks" + (f" at {peaks}" if peaks else ""))
+            if observers:
+                self.redesign(observers, Scenario.from_dict(finding.settings))
+
+        self.do(identify_frames, record, scenario.to_dict(), then=take)
+
+    def _deliver(self, observer: Any) -> None:
+        self._processes.tell_observers({"observer": observer.id, "design": observer})
