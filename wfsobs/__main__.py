@@ -2,4 +2,5 @@
 
 from wfsobs.cli import main
 
-main(prog_name="wfsobs")
+if __name__ == "__main__":
+    main(prog_name="wfsobs")

@@ -14,11 +14,11 @@ class LowPass(Group):
     corner = Real(150.0, bounds=(0.1, 10_000.0), softbounds=(10.0, 400.0), label="Corner", doc="Cut-off frequency [Hz].")
 
 
-def low_pass(measured, prior, settings, watch):
+def low_pass(measurements, prior, settings, watch):
     """Take the slow part of z for the turbulence: a first-order low-pass."""
     watch.check()
-    share = 1.0 - exp(-2.0 * pi * settings.corner * measured.dt)
-    return {TURBULENCE: lfilter([share], [1.0, share - 1.0], measured.z, axis=0)}
+    share = 1.0 - exp(-2.0 * pi * settings.corner * measurements.dt)
+    return {TURBULENCE: lfilter([share], [1.0, share - 1.0], measurements.z, axis=0)}
 
 
 LOW_PASS = Observer(

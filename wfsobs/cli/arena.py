@@ -30,7 +30,7 @@ QUICK = click.option(
 
 @click.group()
 def arena() -> None:
-    """Rank observers and controllers under the same rules (docs/arena.md)."""
+    """Rank observers and controllers under the same rules on the same records (docs/arena.md)."""
 
 
 @arena.command("list")

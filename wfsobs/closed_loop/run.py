@@ -52,6 +52,9 @@ class ClosedLoop:
     record: Record
     outcomes: tuple[Outcome, ...] = field(default=())
 
+    def __repr__(self) -> str:
+        return f"ClosedLoop({len(self.outcomes)} controllers, {self.record!r})"
+
     @property
     def scenario(self) -> Scenario:
         """The settings."""

@@ -87,6 +87,10 @@ class Identification:
     n_steps: int
     level: float
 
+    def __repr__(self) -> str:
+        peaks = ", ".join(f"{mode.name} {len(mode.peaks)} peaks" for mode in self.modes)
+        return f"Identification({peaks}, length {self.duration:g} s, rate {1.0 / self.dt:g} Hz)"
+
     @property
     def duration(self) -> float:
         """Length of the part of the record that was used [s]."""

@@ -54,3 +54,9 @@ class Estimate:
     seconds_per_step: float
     sd: Array | None = None
     sd_of_sum: Mapping[str, Array] = field(default_factory=dict[str, Array])
+
+    def __repr__(self) -> str:
+        n_steps, n_modes = self.values.shape
+        return (
+            f"Estimate({self.observer}, {self.target}, steps {n_steps}, modes {n_modes}, {self.seconds_per_step:.3g} s per step)"
+        )
