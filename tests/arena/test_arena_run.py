@@ -90,6 +90,16 @@ def test_a_folder_of_estimates(arena: Arena, tmp_path: Path) -> None:
     assert good.calibration["within_95"] == 1.0 and good.microseconds is None
 
 
+def test_a_folder_enters_the_tracks_that_it_has_files_of(arena: Arena, tmp_path: Path) -> None:
+    whole, case = load_arena(quick=True, seeds=1), arena.cases[0]
+    (tmp_path / "mine").mkdir()
+    np.savez(tmp_path / "mine" / f"{case.record_id(case.seeds[0])}.npz", estimate=case.truth(case.record(case.seeds[0])))
+    (outcome,) = run_arena(whole, [folder_of(tmp_path / "mine")], tmp_path / "out")
+    assert list(outcome.trials) == [("turbulence", "paper")]
+    assert outcome.trials["turbulence", "paper"][0].squares == [0.0]
+    assert tables(whole, [outcome])["tracks"][0]["rows"][0]["score"] == 0.0
+
+
 def test_who_enters_where() -> None:
     def tracks(name: str) -> list[str]:
         return [t.id for t in TRACKS.values() if admits(t, find_entries([name])[0])]

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import importlib.util
+import math
+from pathlib import Path
+from types import ModuleType
+
 import numpy as np
 import pytest
 
 from wfsobs.arena.challengers import CHALLENGERS
 from wfsobs.arena.challengers.avc import lock_lines
 from wfsobs.arena.challengers.coupled_ar import NormalEquations
+from wfsobs.arena.challengers.gru import FILE, predict_gru, stored_weights
 from wfsobs.arena.challengers.imm import run_mixture, to_pairs
 from wfsobs.arena.challengers.rls import histories, predict_rls
 from wfsobs.arena.challengers.subspace import fit_subspace, joint_moments
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Model
+from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import disturbance_model
+from wfsobs.simulation.loop import simulate
 from wfsobs.testing import check_observer
 
 
@@ -122,3 +130,61 @@ def test_the_subspace_predictor_finds_the_states_and_predicts_like_the_kalman_fi
     # five standard errors of a variance over n = 20,000, sqrt(2 / n) each; what the fit of 4 states costs is less
     assert error == pytest.approx(optimal, rel=0.05)
     assert found.covariance[0, 0] == pytest.approx(error, rel=0.01)  # the start of the record is in one of them
+
+
+@pytest.fixture(scope="module")
+def training() -> ModuleType:
+    """The script that trains the network."""
+    path = Path(__file__).parents[2] / "scripts" / "train_gru.py"
+    spec = importlib.util.spec_from_file_location("train_gru", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def small_weights(rng: np.random.Generator) -> dict[str, np.ndarray]:
+    shapes = {"W": (4, 9), "U": (3, 9), "b": (9,), "v": (4,), "w": (3,)}
+    return {name: 0.5 * rng.standard_normal(shape) for name, shape in shapes.items()}
+
+
+def test_the_network_is_a_gated_recurrent_unit() -> None:
+    rng = np.random.default_rng(9)
+    p, z = small_weights(rng), rng.standard_normal((40, 1)).cumsum(axis=0)
+
+    def logistic(x: float) -> float:
+        return 1.0 / (1.0 + math.exp(-x))
+
+    h, square, weight = [0.0] * 3, 0.0, 0.0
+    for k in range(40):
+        step = [z[k - j, 0] - z[k - j - 1, 0] if k - j > 0 else 0.0 for j in range(4)]
+        square, weight = math.exp(-1e-3) * square + step[0] ** 2, math.exp(-1e-3) * weight + 1.0
+        s = math.sqrt(square / weight) + 1e-12
+        x = [d / s for d in step]
+        drive = [sum(x[i] * p["W"][i, j] for i in range(4)) + p["b"][j] for j in range(9)]
+        r, g = ([logistic(drive[o + j] + sum(h[i] * p["U"][i, o + j] for i in range(3))) for j in range(3)] for o in (0, 3))
+        c = [math.tanh(drive[6 + j] + sum(r[i] * h[i] * p["U"][i, 6 + j] for i in range(3))) for j in range(3)]
+        h = [(1 - g[j]) * h[j] + g[j] * c[j] for j in range(3)]
+        expected = z[k, 0] + s * (sum(x[i] * p["v"][i] for i in range(4)) + sum(h[j] * p["w"][j] for j in range(3)))
+        assert predict_gru(p, z[: k + 1])[k, 0] == pytest.approx(expected, rel=1e-10, abs=1e-10)
+
+
+def test_the_network_is_trained_along_its_gradient(training: ModuleType) -> None:
+    rng = np.random.default_rng(10)
+    p, x, target = small_weights(rng), rng.standard_normal((6, 2, 4)), rng.standard_normal((6, 2))
+    h = rng.standard_normal((2, 3))
+    _, gradient, _ = training.loss_gradient(p, x, target, h)
+    for name, value in p.items():
+        along = rng.standard_normal(value.shape)
+        two = [training.loss_gradient({**p, name: value + e * along}, x, target, h)[0] for e in (1e-5, -1e-5)]
+        # central differences: an error of the order of 1e-10
+        assert float(np.sum(gradient[name] * along)) == pytest.approx((two[0] - two[1]) / 2e-5, abs=1e-8)
+
+
+def test_the_stored_network_is_small_and_predicts_better_than_the_last_measurement() -> None:
+    assert FILE.stat().st_size < 100_000
+    scenario = PRESETS["ut4"]().replace({"run.duration": 3.0, "run.seed": 99})
+    z = simulate(scenario).z
+    after = slice(500, -1)
+    error = predict_gru(stored_weights(), z)[after] - z[501:]
+    assert np.std(error) < 0.9 * np.std(z[after] - z[501:])

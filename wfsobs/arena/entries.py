@@ -123,7 +123,7 @@ def _code_version(algorithm: Any) -> str:
 
 
 def admits(track: Track, entry: ArenaEntry) -> bool:
-    """Return whether an entry takes part in a track; a folder does where it has files of it."""
+    """Return whether an entry can take part in a track; a folder can wherever estimates are asked."""
     if entry.kind == FOLDER:
         return not track.is_loop
     if entry.kind == CHALLENGER and track.id not in CHALLENGERS[entry.place].tracks:

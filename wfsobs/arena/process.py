@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from time import perf_counter
@@ -110,6 +112,7 @@ class EntryProcess:
             return None
         self._connection.close()
         process.join(END_TIME)
+        _kill_group(process.pid)
         process.kill()
         process.join()
         return process.exitcode
@@ -119,6 +122,8 @@ def serve(connection: Connection, entry: ArenaEntry, memory: float, folder: str)
     """Answer what is asked until the connection ends; the main function of the process."""
     import wfsobs.testing  # noqa: F401  the limit is for what comes after
 
+    if hasattr(os, "setpgid"):
+        os.setpgid(0, 0)
     sys.path.insert(0, folder)
     _limit_memory(memory)
     algorithm: Any = None
@@ -188,6 +193,13 @@ def _read(data: bytes) -> Answer:
     if "reason" in values:
         raise EntryError(str(values["reason"]))
     return Answer({k: v for k, v in values.items() if k != "seconds"}, float(values.get("seconds", 0.0)))
+
+
+def _kill_group(leader: int) -> None:
+    """Kill what the process has started; the group bears its number."""
+    if hasattr(os, "killpg"):
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(leader, signal.SIGKILL)
 
 
 def _limit_memory(gigabytes: float) -> None:

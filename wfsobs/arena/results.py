@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
+from importlib.util import find_spec
 from math import pi, sqrt
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from wfsobs.files import write_whole
 from wfsobs.observers.base import Observer
 from wfsobs.priors_from.controllers import own_settings
 from wfsobs.scenario import Scenario
+from wfsobs.settings.errors import SettingError
 
 Table = dict[str, Any]
 
@@ -123,6 +125,12 @@ def needs_of(entry: ArenaEntry) -> str:
 def source_of(entry_id: str) -> str:
     """Return the publication of a challenger, empty for others."""
     return CHALLENGERS[entry_id].source if entry_id in CHALLENGERS else ""
+
+
+def need_jinja() -> None:
+    """Raise SettingError where Jinja2 is not installed."""
+    if find_spec("jinja2") is None:
+        raise SettingError('the page of the arena needs Jinja2: pip install "wfsobs[campaign]"')
 
 
 def write_results(values: Table, folder: Path) -> None:

@@ -87,7 +87,7 @@ def run_arena(arena: Arena, entries: Sequence[ArenaEntry], folder: Path, tell: T
 
 def _run_entry(arena: Arena, entry: ArenaEntry, folder: Path, records: RecordCache, tell: Tell) -> EntryOutcome:
     folder.mkdir(parents=True, exist_ok=True)
-    cases = [case for case in arena.cases if admits(TRACKS[case.track], entry)]
+    cases = _cases_of(arena, entry)
     trials: dict[tuple[str, str], list[Trial]] = {}
     with EntryProcess(entry, arena.rules.memory) as process:
         refusal = "" if entry.kind == FOLDER or not cases else _refusal(arena, entry, folder, process)
@@ -107,6 +107,16 @@ def _run_entry(arena: Arena, entry: ArenaEntry, folder: Path, records: RecordCac
             failures = [trial.failure for trial in trials[case.track, case.name] if trial.failure]
             tell(f"{entry.id}: {case.track} {case.name}{f': no answer: {failures[0]}' if failures else ''}")
     return EntryOutcome(entry, "", trials)
+
+
+def _cases_of(arena: Arena, entry: ArenaEntry) -> list[Case]:
+    """Return the scenarios of the tracks that an entry takes part in; a folder does where it has a file of one of the records."""
+    cases = [case for case in arena.cases if admits(TRACKS[case.track], entry)]
+    if entry.kind != FOLDER:
+        return cases
+    files = {path.stem for path in Path(entry.place).glob("*.npz")}
+    tracks = {case.track for case in cases if any(case.record_id(seed) in files for seed in case.seeds)}
+    return [case for case in cases if case.track in tracks]
 
 
 def _try_records(

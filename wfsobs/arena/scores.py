@@ -97,7 +97,7 @@ def rank_entries(squares: Mapping[str, Sequence[Array]], reference: Sequence[Arr
     Parameters
     ----------
     squares : mapping of str to sequence of Array
-        ArenaEntry -> mean squares of its errors, one array (n_samples,) per scenario, on the same samples.
+        Entry -> mean squares of its errors, one array (n_samples,) per scenario, on the same samples.
     reference : sequence of Array
         Those of the reference.
 

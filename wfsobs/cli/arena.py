@@ -10,7 +10,7 @@ from rich.table import Table
 
 from wfsobs.arena.definition import Arena, add_records, load_arena
 from wfsobs.arena.entries import find_entries
-from wfsobs.arena.results import tables, write_results
+from wfsobs.arena.results import need_jinja, tables, write_results
 from wfsobs.arena.run import run_arena
 from wfsobs.arena.tracks import TRACKS
 from wfsobs.cli.show import show_table
@@ -65,6 +65,7 @@ def run(
     out: str, entries: tuple[str, ...], files: tuple[str, ...], tracks: tuple[str, ...], seeds: int | None, quick: bool
 ) -> None:
     """Run what is missing, and write results.json and index.html."""
+    need_jinja()
     found = add_records(load_arena(seeds=seeds, quick=quick), [Path(file) for file in files])
     found = _select_tracks(found, tracks)
     folder = Path(out)
@@ -109,8 +110,8 @@ def _select_tracks(whole: Arena, tracks: tuple[str, ...]) -> Arena:
 def _table(track: dict) -> Table:
     """Return the rows of a track for the terminal."""
     table = Table(title=f"{track['label']}: {track['help']}", caption="~: tied; scenarios: error over the reference")
-    for name in ("Rank", "ArenaEntry", "Score", "95 %", *(one["name"] for one in track["scenarios"]), "us", "Told"):
-        table.add_column(name, justify="left" if name in ("ArenaEntry", "Told") else "right")
+    for name in ("Rank", "Entry", "Score", "95 %", *(one["name"] for one in track["scenarios"]), "us", "Told"):
+        table.add_column(name, justify="left" if name in ("Entry", "Told") else "right")
     for row in track["rows"]:
         between = "" if row["interval"] is None else f"{row['interval'][0]:.3f} to {row['interval'][1]:.3f}"
         time = "" if row["microseconds"] is None else f"{row['microseconds']:.3g}"

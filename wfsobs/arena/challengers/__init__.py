@@ -5,9 +5,10 @@ from __future__ import annotations
 from wfsobs.arena.challengers.avc import AVC
 from wfsobs.arena.challengers.base import Challenger
 from wfsobs.arena.challengers.coupled_ar import COUPLED_AR
+from wfsobs.arena.challengers.gru import GRU
 from wfsobs.arena.challengers.imm import IMM
 from wfsobs.arena.challengers.rls import RLS
 from wfsobs.arena.challengers.subspace import SUBSPACE
 
-CHALLENGERS: dict[str, Challenger] = {one.observer.id: one for one in (RLS, COUPLED_AR, SUBSPACE, IMM, AVC)}
+CHALLENGERS: dict[str, Challenger] = {one.observer.id: one for one in (RLS, COUPLED_AR, SUBSPACE, IMM, AVC, GRU)}
 """By id, in the order of tables."""

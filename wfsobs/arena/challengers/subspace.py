@@ -1,8 +1,8 @@
 """Subspace predictor: the few combinations of the past that predict the future.
 
-The last PAST measurements of all modes, Z, and the next FUTURE ones, F, have canonical correlations r_i. One of n states
-has n that are not zero; the state is the n combinations of Z that belong to them, and the next measurement is regressed on it
-(canonical variate analysis, Larimore 1990, Proc. 29th CDC, 596). Data-driven subspace predictive control (Haffert et al. 2021,
+The last PAST measurements of all modes, Z, and the next FUTURE ones, F, have canonical correlations. For a disturbance of n
+states n of them are not zero; the state is the n combinations of Z that belong to them, and the next measurement is regressed on
+it (canonical variate analysis, Larimore 1990, Proc. 29th CDC, 596). Data-driven subspace predictive control (Haffert et al. 2021,
 JATIS 7, 029001) rests on the same regression of the future on the past. The order is that of the least Akaike criterion of a
 regression of rank n. It is told nothing and learns anew every REFIT seconds.
 """
