@@ -135,6 +135,15 @@ class TestLimits:
         assert size_of([entry.results for entry in held]) <= 2 * OF_ONE
         assert all(entry.scores for entry in history.entries), "the scores of all are there"
 
+    def test_lines_of_compared_runs_count(self, history: History) -> None:
+        history.most_bytes = 3 * OF_ONE
+        oldest = history.entries[2]
+        history.compare(oldest.key)
+        (run,) = history.display.compared_runs
+        assert 0 < size_of(run.lines) < OF_ONE
+        assert [entry.results is None for entry in history.entries] == [False, False, True], "its lines take the place of one"
+        assert run.lines is not None, "and stay"
+
     def test_the_oldest_entries_go(self, history: History, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "MOST", 4)
         oldest, second, _ = reversed(history.entries)

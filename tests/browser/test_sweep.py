@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+from importlib.resources import files
 from typing import Any
 
 from playwright.sync_api import Locator, Page, expect
+
+from tests.browser.test_quality import accessible, fits, focused, theme
 
 QUICK = "?run.duration=1&run.warm_up=0.2&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.3"
 
@@ -14,6 +17,21 @@ def enter(page: Page, label: str, text: str) -> None:
     box = page.get_by_role("textbox", name=label, exact=True)
     box.fill(text)
     box.press("Enter")
+
+
+def tab_to(page: Page, name: str, most: int = 40) -> None:
+    """Go on with the Tab key until the focus is on what is called so."""
+    for _ in range(most):
+        if name in focused(page)["name"]:
+            return
+    raise AssertionError(f"no {name!r} in {most} stops")
+
+
+def look_for_faults(page: Page) -> None:
+    """Have axe look at the page."""
+    page.evaluate(files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8"))
+    accessible(page)
+    fits(page, 1400)
 
 
 def known(page: Page) -> Locator:
@@ -37,6 +55,8 @@ def test_a_map_comes_cell_by_cell_and_one_is_loaded(open_page: Any, server: Any)
     page.get_by_role("button", name="Stop").click()
     expect(page.get_by_text(re.compile(r"Stopped · \d+ of 160 runs"))).to_be_visible()
     expect(known(page)).to_have_count(4)
+    theme(page)
+    look_for_faults(page)
     wind = page.get_by_role("textbox", name="Wind speed V₀ [m/s]")
     expect(wind).to_have_value("15")
     page.get_by_role("region", name="Best observers, vibration, tip").get_by_role(
@@ -57,7 +77,24 @@ def test_error_over_a_setting_by_keyboard(open_page: Any, server: Any) -> None:
     page.get_by_role("textbox", name="Peak 1: f [Hz]").press("o")  # a letter, and no page of sweeps
     page.get_by_role("textbox", name="Exposure ratio n").press("Alt+o")
     expect(page.get_by_role("button", name="Sweep", exact=True)).to_have_attribute("aria-pressed", "true")
-    expect(page.get_by_role("textbox", name="Values", exact=True)).to_have_value("1,6,10,15,20")
+    values = page.get_by_role("textbox", name="Values", exact=True)
+    expect(values).to_have_value("1,6,10,15,20")
+    expect(page.get_by_text(re.compile("5 scenarios × 4 seeds = 20 runs"))).to_be_visible()
+    values.focus()
+    page.keyboard.press("ControlOrMeta+a")
+    page.keyboard.type("5,10")
+    tab_to(page, "Seeds of each")
+    page.keyboard.press("ControlOrMeta+a")
+    page.keyboard.type("1")
+    tab_to(page, "Observers")
+    expect(page.get_by_text("2 scenarios × 1 seed = 2 runs")).to_be_visible()
+    tab_to(page, "Run the sweep")
+    page.keyboard.press("Enter")
+    expect(page.get_by_text("Finished · 2 of 2 runs")).to_be_visible(timeout=90_000)
+    tab_to(page, "Exposure ratio n 5:")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("button", name="Explore", exact=True)).to_have_attribute("aria-pressed", "true")
+    expect(page.get_by_role("textbox", name="Exposure ratio n")).to_have_value("5")
 
 
 def test_error_over_a_setting_of_the_drawer(open_page: Any, server: Any) -> None:
@@ -74,3 +111,4 @@ def test_error_over_a_setting_of_the_drawer(open_page: Any, server: Any) -> None
     expect(page.get_by_text("Finished · 6 of 6 runs")).to_be_visible(timeout=90_000)
     expect(page.get_by_role("figure", name="Error over Exposure ratio n, turbulence")).to_be_visible()
     expect(page.get_by_role("button", name=re.compile(r"^Exposure ratio n 10: .*3 seeds$"))).to_have_count(2)
+    look_for_faults(page)

@@ -12,7 +12,7 @@ from scipy.stats import t as student
 from scipy.stats import ttest_rel
 
 import wfsobs
-from wfsobs.campaign.sweep import EACH_RUN, MOST_CELLS, parse_axis, plan_sweep
+from wfsobs.campaign.sweep import EACH_RUN, EACH_STEP, MOST_CELLS, parse_axis, plan_sweep
 from wfsobs.campaign.sweep_results import SweepResults, run_sweep
 from wfsobs.cli import main
 from wfsobs.evaluation.scores import BOUND, Score
@@ -142,7 +142,8 @@ def test_time_is_that_of_the_observers_chosen(base: Scenario) -> None:
     axis = [parse_axis("run.duration=10,20")]
     few, every = (plan_sweep(base, axis, 2, names) for names in (FEW, None))
     # Two seeds of each duration; no straight line over it, for the windows of the adaptive filters come one at a time.
-    one_seed = sum(EACH_RUN + wfsobs.cost.run_seconds(base.replace({"run.duration": d})) for d in (10.0, 20.0))
+    runs = [base.replace({"run.duration": d}) for d in (10.0, 20.0)]
+    one_seed = sum(EACH_RUN + EACH_STEP * s.n_steps * len(s.modes) + wfsobs.cost.run_seconds(s) for s in runs)
     assert every.seconds == pytest.approx(2 * one_seed, rel=1e-12)
     assert 4 * EACH_RUN < few.seconds < every.seconds / 1.5
 

@@ -196,8 +196,10 @@ class Actions:
 
     def _extras(self) -> dict[str, Any]:
         """Return what the report has beside the results shown."""
-        extras = {"sweep": self._pages.sweep_shown(), "evidence": self._seeds.evidence} if self._pages else {}
-        return {name: it for name, it in extras.items() if it}
+        shown = self.store.run.result
+        if self._pages is None or shown is None:
+            return {}
+        return {**self._pages.shown_beside(shown.result), "evidence": self._seeds.evidence}
 
     def _start(self, which: str, name: str, job: Job, then: Callable[[Any], None]) -> None:
         """Have a job done, one of each at a time, say under a name how it goes, and then do something with its result."""

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wfsobs.app.numbers import NOTHING, change, number
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError
+from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import Score
 from wfsobs.observers.base import TARGETS
+from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -73,3 +77,20 @@ def thin_lines(results: RunResults) -> DrawnLines:
 
 def _thin(values: Array) -> NDArray[np.float32]:
     return np.column_stack([envelope(column, KEPT) for column in values.T]).astype(np.float32)
+
+
+def comparison_of(runs: Sequence[ComparedRun], result: Result) -> dict[str, Any] | None:
+    """Return what a report has of compared runs: their names, and a table per target and mode [nm]; None where there are none."""
+    if not runs:
+        return None
+    groups: dict[tuple[str, str], list[list[str]]] = {}
+    for now in result.scores:
+        before = [run.score(now.observer, now.target, now.mode) for run in runs]
+        if any(before):
+            cells = [NOTHING if s is None else f"{number(1e3 * s.rms)} ({change(s.rms, now.rms)} %)" for s in before]
+            groups.setdefault((now.target, now.mode), []).append([row_label(now.observer), number(1e3 * now.rms), *cells])
+    return {
+        "runs": [[run.letter, run.name] for run in runs],
+        "columns": ["Observer", "shown [nm]", *(f"{run.letter} [nm]" for run in runs)],
+        "groups": [[f"{target.capitalize()}, {mode}", rows] for (target, mode), rows in groups.items()],
+    }

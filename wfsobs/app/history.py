@@ -110,7 +110,8 @@ class History(param.Parameterized):
         spare = [entry.key for entry in reversed(entries) if not entry.star and entry.key not in used]
         gone = set(spare[: max(len(entries) - MOST, 0)])
         self.entries = [entry for entry in entries if entry.key not in gone]
-        let_go(self.entries, self.current, self.most_bytes, self.most_record_bytes)
+        lines = [run.lines for run in self.display.compared_runs]
+        let_go(self.entries, self.current, self.most_bytes, self.most_record_bytes, lines)
         self.param.trigger("entries")
 
     # ------------------------------------------------------------------ what is asked for
@@ -213,7 +214,7 @@ class History(param.Parameterized):
 
     def _show_runs(self, runs: list[ComparedRun]) -> None:
         self.display.compared_runs = runs
-        self.param.trigger("entries")
+        self._put(self.entries)
         self._make_lines()
 
     # ------------------------------------------------------------------ traces made again

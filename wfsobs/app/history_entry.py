@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from wfsobs.app.cache import owners_in
+from wfsobs.app.compared import DrawnLines
 from wfsobs.app.service import run_key
 from wfsobs.app.sources import LoadedRecord, Source, Step
 from wfsobs.app.work import RunResults
@@ -72,13 +73,19 @@ def make_entry(step: Step, name: str, results: RunResults | None = None) -> Hist
     return HistoryEntry(run_key(scenario, source), name, time.time(), scenario, preset, source, record, scores, results=results)
 
 
-def let_go(entries: Iterable[HistoryEntry], current: str, most_bytes: int, most_record_bytes: int) -> None:
+def let_go(
+    entries: Iterable[HistoryEntry],
+    current: str,
+    most_bytes: int,
+    most_record_bytes: int,
+    lines: Iterable[DrawnLines | None] = (),
+) -> None:
     """Let go of traces and of loaded records beyond some bytes: those of starred entries last.
 
-    current : key of the entry whose results are shown, which holds its record
+    current : key of the entry whose results are shown, which holds its record; lines : of compared runs, which stay
     """
     names, names_of_records = set[int](), set[int]()
-    left, left_of_records = most_bytes, most_record_bytes
+    left, left_of_records = most_bytes - sum(_new_bytes(drawn, names) for drawn in lines), most_record_bytes
     for entry in sorted(entries, key=lambda entry: (entry.key != current, not entry.star)):
         if entry.results is not None:
             left -= _new_bytes(entry.results, names)

@@ -14,9 +14,6 @@ from wfsobs.app.store import Store
 
 ROOM = {"sizing_mode": "stretch_width", "margin": (4, 0)}
 
-HELP = {"& .MuiFormHelperText-root.Mui-disabled": {"color": "text.secondary"}}
-"""Why a setting is grey can be read all the same."""
-
 TAG = "setting:"
 """Stands before the path of its setting in the tag of a widget: the browser knows by it what was changed."""
 

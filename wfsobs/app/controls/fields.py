@@ -14,7 +14,7 @@ import panel as pn
 import panel_material_ui as pmui
 import param
 
-from wfsobs.app.controls.field import HELP, ROOM, TAG, Field
+from wfsobs.app.controls.field import ROOM, TAG, Field
 from wfsobs.app.store import Store
 from wfsobs.settings.parameters import Reals
 
@@ -54,7 +54,7 @@ class ChoiceField(Field):
     has_help = True
 
     def _widgets(self) -> list[Any]:
-        select = pmui.Select(options=list(self.parameter.objects), size="small", sx=HELP, **self._names(), **ROOM)
+        select = pmui.Select(options=list(self.parameter.objects), size="small", **self._names(), **ROOM)
         select.param.watch(self._change, "value")
         return [select]
 
@@ -82,7 +82,7 @@ class TextField(Field):
     has_help = True
 
     def _widgets(self) -> list[Any]:
-        return [self._text(sx=HELP, **self._names(), **ROOM)]
+        return [self._text(**self._names(), **ROOM)]
 
     def _text(self, **options: Any) -> pmui.TextInput:
         text = pmui.TextInput(size="small", **options)

@@ -11,6 +11,7 @@ import panel as pn
 import panel_material_ui as pmui
 import param
 
+from wfsobs.app.compared import comparison_of
 from wfsobs.app.display import Display
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.figures import Figures
@@ -22,6 +23,7 @@ from wfsobs.app.pages.sweep_views import report_part
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.store import Store
 from wfsobs.app.style import HEARD
+from wfsobs.result import Result
 
 EXPLORE, IDENTIFY, TUNE, SWEEP, LOOP, LIVE = "explore", "identify", "tune", "sweep", "loop", "live"
 FIGURES, MODEL = "figures", "model"
@@ -59,6 +61,7 @@ class Pages(param.Parameterized):
 
     def __init__(self, explore: Page, store: Store, display: Display):
         super().__init__()
+        self.display = display
         self._makers: dict[str, Callable[[], Page]] = {
             IDENTIFY: lambda: IdentifyPage(store, display),
             TUNE: lambda: TunePage(store, display),
@@ -86,10 +89,11 @@ class Pages(param.Parameterized):
         assert isinstance(page, SweepPage)
         page.choose(path)
 
-    def sweep_shown(self) -> dict[str, Any] | None:
-        """Return what a report has of the last sweep; None where there is none."""
+    def shown_beside(self, result: Result) -> dict[str, Any]:
+        """Return what a report has of the last sweep, and of the runs that a result is compared with; None for nothing."""
         page = self.by_name.get(SWEEP)
-        return report_part(page.results) if isinstance(page, SweepPage) and page.results else None
+        sweep = report_part(page.results) if isinstance(page, SweepPage) and page.results else None
+        return {"sweep": sweep, "comparison": comparison_of(self.display.compared_runs, result)}
 
     def _turn(self, _event: object) -> None:
         name = self.current

@@ -113,10 +113,11 @@ class SweepPage(PageActions):
             if not any(path == known for known, _, _ in self.store.scenario.walk()):
                 return
             first.options = {**first.options, axis_title(self.store.scenario, path): path}
-        self.settings[1].value = NONE
-        if first.value == path:
-            self.values[0].value = usual_values(self.store.scenario, path)
-        first.value = path
+        with pn.io.hold():  # what is typed then is typed after it
+            self.settings[1].value = NONE
+            if first.value == path:
+                self.values[0].value = usual_values(self.store.scenario, path)
+            first.value = path
 
     def plan(self) -> Sweep:
         """Return the sweep that the fields describe. Raises SettingError."""

@@ -76,7 +76,8 @@ class Report:
 
     preset : what the settings are compared with; base : the settings that were varied; is_recorded : whether on a record
     that was loaded or kept, not simulated from the settings; command : what makes the estimates of such a record again;
-    sweep : maps of the last sweep, a title, axes, and cells row by row, and its rows
+    sweep : maps of the last sweep, a title, axes, and cells row by row, and its rows; comparison : the runs that the one shown is
+    compared with, and a table per target and mode
     """
 
     preset: str
@@ -86,6 +87,7 @@ class Report:
     is_recorded: bool = False
     command: str = ""
     sweep: Mapping[str, Any] | None = None
+    comparison: Mapping[str, Any] | None = None
 
     @property
     def start(self) -> int:

@@ -39,14 +39,15 @@ def make(
     command: str = "",
     sweep: Mapping[str, Any] | None = None,
     evidence: Evidence | None = None,
+    comparison: Mapping[str, Any] | None = None,
 ) -> bytes:
     """Make the file of the results shown; blocks, so call it in a job. Raises ReportError, Cancelled.
 
-    command : what makes the estimates again, of a record that is not the simulation of the settings; sweep : what `Report` has
-    of a sweep; evidence : what further seeds say
+    command : what makes the estimates again, of a record that is not the simulation of the settings; sweep, comparison : what
+    `Report` has of a sweep and of compared runs; evidence : what further seeds say
     """
     state = state_of(results.result, is_simulated=not results.is_recorded, evidence=evidence)
-    content = pack(Report(preset, results.scenario, (), (state,), results.is_recorded, command, sweep))
+    content = pack(Report(preset, results.scenario, (), (state,), results.is_recorded, command, sweep, comparison))
     root = str(Path(wfsobs.__file__).parents[1])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}
     # A file, not a pipe: what a pipe has not taken when `communicate` times out is never sent.

@@ -21,6 +21,7 @@ def pack(report: Report) -> bytes:
         "recorded": report.is_recorded,
         "command": report.command,
         "sweep": report.sweep,
+        "comparison": report.comparison,
         "variations": [[v.path, v.values] for v in report.variations],
         "states": [
             {
@@ -55,6 +56,5 @@ def unpack(content: bytes) -> Report:
         for s, of in zip(words["states"], lines, strict=True)
     )
     variations = tuple(Variation(path, tuple(values)) for path, values in words["variations"])
-    return Report(
-        words["preset"], from_toml(words["base"]), variations, states, words["recorded"], words["command"], words["sweep"]
-    )
+    rest = (words[name] for name in ("recorded", "command", "sweep", "comparison"))
+    return Report(words["preset"], from_toml(words["base"]), variations, states, *rest)
