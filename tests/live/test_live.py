@@ -141,7 +141,7 @@ def test_live_numbers_are_those_of_the_recording(session):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ([], "live: there is no page yet, take --headless"),
+        (["--replay", "a.npz", "--in", "b"], "live: --replay and --in are two sources, take one"),
         (["--headless", "--observer", "butterworth-ol"], "looks ahead: it cannot run frame by frame"),
         (["--headless", "--observer", "kf"], "observer 'kf': no such observer; there are"),
         (["--headless", "--preset", "peak-jump"], "events: a live loop takes none"),

@@ -105,7 +105,7 @@ class Stage:
         self.ring, self.board = Ring(2), Board(2)
         self.traces = Rows(trace_width(2), 4096)
         settings = scenario.to_dict()
-        order = Order(settings, names, 2, self.ring.name, self.traces.name, self.board.name, None, self.said)
+        order = Order(settings, names, record.sampling, self.ring.name, self.traces.name, self.board.name, None, self.said)
         self.crew, self.number = Crew(order), 0
 
     def run(self, n):

@@ -23,7 +23,7 @@ from wfsobs.app.history import History
 from wfsobs.app.jobs.job import FAILED
 from wfsobs.app.jobs.task import IDLE
 from wfsobs.app.pages.explore import Explore
-from wfsobs.app.pages.pages import Pages
+from wfsobs.app.pages.pages import LIVE, Pages
 from wfsobs.app.pages.parts import WIDE
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.service import Post, Session
@@ -118,6 +118,8 @@ class Dashboard:
         """Build the whole page."""
         self.pages = Pages(self.explore, self.store, self.display)
         self.actions.attach(self.pages, self.seeds)
+        if self.store.session.service.live is not None:
+            self.pages.current = LIVE
         self.controls.search.on_sweep = self.pages.sweep_over
         self.view_state = ViewState(self.display, self.pages, self.explore.lines, self.explore.traces, self.seeds)
         self.actions.follow_view(self.view_state)

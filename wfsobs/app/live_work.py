@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import logging
 from time import sleep
 from typing import Any
 
 from wfsobs.app.jobs.job import CLICK, Job, Tell
 from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.live_order import LiveOrder
+from wfsobs.app.logs import event
 from wfsobs.app.service import Service
 from wfsobs.live.loop import LiveLoop
-from wfsobs.live.source import LiveSource
 from wfsobs.progress import Watch
-from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 
 LOOK = 0.2
@@ -21,28 +20,11 @@ LOOK = 0.2
 ENDED = "the processes of the loop have ended"
 
 
-@dataclass(frozen=True)
-class LiveOrder:
-    """A loop that is to run.
-
-    source    : of the frames
-    scenario  : what the observers are told
-    observers : ids of those that run from the start
-    speed     : 1 is real time
-    key       : names the loop, where all pages watch the same
-    """
-
-    source: LiveSource
-    scenario: Scenario
-    observers: Sequence[str]
-    speed: float = 1.0
-    key: str = ""
-
-
 def compute(order: LiveOrder, service: Service, watch: Watch, tell: Tell) -> None:
     """Run a loop until the job is stopped. Raises SettingError, Cancelled."""
     loop = service.start(lambda: LiveLoop(order.source, order.scenario, order.observers, order.speed))
     try:
+        order.begin(loop)
         loop.play()
         tell(latest=loop)
         while True:
@@ -52,7 +34,19 @@ def compute(order: LiveOrder, service: Service, watch: Watch, tell: Tell) -> Non
                 raise SettingError(loop.events[-1].line if loop.events else ENDED)
             sleep(LOOK)
     finally:
+        order.end(loop)
         loop.stop()
+
+
+def share_loop(order: LiveOrder, service: Service) -> None:
+    """Run a loop that all sessions watch, until the server ends."""
+    service.live = order
+    service.queue.submit(live_job(order, service), "server", lambda news: _log_end(news.get("message", "")))
+
+
+def _log_end(message: str) -> None:
+    if message:
+        event("live-ended", logging.ERROR, reason=message)
 
 
 class LiveTask(BackgroundTask):

@@ -23,6 +23,8 @@ from panel.io.server import DocHandler, get_server
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.handlers import Liveness, PageHandler, full_html
 from wfsobs.app.limits import NONE, PUBLIC, Limits
+from wfsobs.app.live_order import LiveOrder
+from wfsobs.app.live_work import share_loop
 from wfsobs.app.logs import event, to_stream
 from wfsobs.app.ready import NEXT, NextPage
 from wfsobs.app.service import Full, Service
@@ -39,6 +41,9 @@ TOKEN = 30 * 86_400
 
 TURN = 0.001
 """How long the interpreter stays with one thread while another waits [s]: the page's own has short things to do."""
+
+SAVE_TIME = 60.0
+"""Longest wait at the end for the record of a loop to be written [s]."""
 
 UNUSED = (AutoloadJsHandler, MetadataHandler)
 """Ways into a session that this page does not need."""
@@ -85,12 +90,17 @@ def options(*, public: bool | None = None, runs: int | None = None, **values: An
     return Options(limits=limits, runs=runs or 0, **values)
 
 
-def serve(options: Options) -> None:
-    """Serve the dashboard at http://address:port/prefix until told to stop by SIGINT or SIGTERM. Raises OSError."""
+def serve(options: Options, live: LiveOrder | None = None) -> None:
+    """Serve the dashboard at http://address:port/prefix until told to stop by SIGINT or SIGTERM. Raises OSError.
+
+    live : a loop that runs until then, and that every page opens with
+    """
     to_stream(options.log_level, options.log_requests)
     prepare()
     service = make_service(options.limits, options.runs, options.cache_mb)
     warm_up(service)
+    if live is not None:
+        share_loop(live, service)
     server = make_server(options, service)
     loop = server.io_loop
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -105,7 +115,7 @@ def serve(options: Options) -> None:
     server.start()
     loop.start()
     server.stop(wait=False)
-    ended = service.close()
+    ended = service.close(SAVE_TIME if live is not None and live.record_file else 1.5)
     event("stopped", sessions=service.sessions)
     gc.freeze()  # what is left need not be looked through once more
     if not ended:  # a computation that does not listen must not keep the process

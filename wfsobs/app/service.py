@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from math import isfinite
 from time import monotonic
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from wfsobs.app.cache import Cache, key_of
 from wfsobs.app.jobs.job import IDLE_TIME, Job, Listener, Tell, Work
@@ -26,6 +26,9 @@ from wfsobs.dependence import Memo
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
+
+if TYPE_CHECKING:
+    from wfsobs.app.live_order import LiveOrder
 
 Compute = Callable[[Scenario, Watch, Tell, Source | None], RunResults]
 Post = Callable[[Callable[[], None]], None]
@@ -52,6 +55,7 @@ class Service:
         self.queue = JobQueue(workers, self.cache)
         self.sessions = 0
         self._last_wish = monotonic()
+        self.live: LiveOrder | None = None  # the loop that all sessions watch
         # Its thread is not one of low priority, as those of the jobs are: processes that it starts inherit that.
         self._starter = ThreadPoolExecutor(1, "wfsobs-start")
         self._starter.submit(bool)

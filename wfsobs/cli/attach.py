@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import click
 import numpy as np
 
-from wfsobs.cli.options import scenario_options
+from wfsobs.cli.options import scenario_options, stream_elements
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import StepError, StepObserver
 from wfsobs.prior import Model, Training
@@ -88,7 +88,7 @@ def attach(
         scenario = told_by(configfile.load_scenario(prior), scenario)
         for path, value in map(configfile.parse_assignment, assignments):
             scenario.set(path, value)
-    elements = _elements(modes, len(scenario.modes))
+    elements = stream_elements(modes, len(scenario.modes))
     per_unit = micrometres_per(unit, scenario.telescope.diameter)
     try:
         given = SharedImage(stream_path(source))
@@ -109,18 +109,6 @@ def attach(
 
 def _say(line: str) -> None:
     click.echo(f"wfsobs: attach: {line}", err=True)
-
-
-def _elements(text: str | None, n_modes: int) -> tuple[int, ...]:
-    """Return the elements of a frame that are the modes."""
-    if text is None:
-        return tuple(range(n_modes))
-    parts = [part.strip() for part in text.split(",")]
-    if not all(part.isdecimal() and len(part) < 10 for part in parts) or len(set(parts)) != len(parts):
-        raise SettingError(f"--modes {text}: takes different whole numbers from 0 with commas, such as 0,1")
-    if len(parts) > n_modes:
-        raise SettingError(f"--modes {text}: the prior has {n_modes} modes")
-    return tuple(map(int, parts))
 
 
 def _open_sink(name: str, source: SharedImage) -> SharedImage:

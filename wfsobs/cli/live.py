@@ -3,60 +3,129 @@
 from __future__ import annotations
 
 import json
+from os import cpu_count
 
 import click
 import numpy as np
 from rich.table import Table
 
-from wfsobs.cli.options import scenario_options
+from wfsobs.cli.options import scenario_options, stream_elements
 from wfsobs.cli.show import progress_bar, show_table
 from wfsobs.files import check_writable
+from wfsobs.live.attached import StreamSource
+from wfsobs.live.blocks import check_live
+from wfsobs.live.checks import check_slot, observers_on
 from wfsobs.live.follow import follow
-from wfsobs.live.recording import record_of
+from wfsobs.live.recording import open_loop_record, record_of
+from wfsobs.live.replay import Replay
 from wfsobs.live.ring import LiveFrame
-from wfsobs.scenario import configfile
+from wfsobs.live.simulated import SimulatedLoop
+from wfsobs.live.source import LiveSource
+from wfsobs.scenario import Scenario, configfile
 from wfsobs.settings.group import SettingError
-from wfsobs.telemetry.records import save_record
+from wfsobs.streams.shared_image import stream_path
+from wfsobs.telemetry.records import load_record, save_record
+from wfsobs.units import UNITS, micrometres_per
 
 
 @click.command()
 @scenario_options
-@click.option("--headless", is_flag=True, help="Run without a page; needed, there is no page yet.")
-@click.option("--seconds", type=click.FloatRange(0.01, 86_400), default=10.0, metavar="N", help="How long; 10 unless told.")
+@click.option("--replay", "replay_file", metavar="RECORD", help="Frames of a record, once: .npz, .csv, .fits or AOT.")
+@click.option("--in", "stream", metavar="STREAM", help="Frames of a running loop, in shadow (docs/streams.md).")
+@click.option("--modes", metavar="I,J,...", help="Elements of a frame of the stream, from 0, that are its modes.")
+@click.option("--unit", type=click.Choice(UNITS), default="um", show_default=True, help="Unit of the stream.")
 @click.option("--observer", "observers", multiple=True, metavar="NAME", help="Run this observer alone; can be given many times.")
 @click.option("--speed", type=click.FloatRange(0.1, 20), default=1.0, metavar="X", help="1 is real time, the default.")
 @click.option("--record", "record_file", metavar="RECORD", help="Also save what was sent: .npz, .csv, .fits or .aot.fits.")
+@click.option("--log", "log_file", metavar="FILE", help="Append what happens and alarms, a line each.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=5006, show_default=True, help="Port of the page; 0 for a free one."
+)
+@click.option("--open", "open_browser", is_flag=True, help="Open a browser.")
+@click.option("--headless", is_flag=True, help="Run without a page, for --seconds, and print a table.")
+@click.option("--seconds", type=click.FloatRange(0.01, 86_400), default=10.0, metavar="N", help="How long; 10 unless told.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of a table.")
 def live(
     preset: str | None,
     config: str | None,
     assignments: tuple[str, ...],
-    headless: bool,
-    seconds: float,
+    replay_file: str | None,
+    stream: str | None,
+    modes: str | None,
+    unit: str,
     observers: tuple[str, ...],
     speed: float,
     record_file: str | None,
+    log_file: str | None,
+    port: int,
+    open_browser: bool,
+    headless: bool,
+    seconds: float,
     as_json: bool,
 ) -> None:
-    """Run the simulated loop by the clock, every observer beside it, frame by frame (docs/live.md)."""
-    if not headless:
-        raise SettingError("live: there is no page yet, take --headless")
-    if record_file:
-        check_writable(record_file)
+    """Run a loop by the clock, every observer beside it, frame by frame, and show it on a page (docs/live.md)."""
+    if replay_file and stream:
+        raise SettingError("live: --replay and --in are two sources, take one")
+    for file in (record_file, log_file):
+        if file:
+            check_writable(file)
     scenario = configfile.scenario_from(preset, config, assignments)
+    check_live(scenario)
+    source = _source(scenario, replay_file, stream, modes, unit)
+    names = tuple(observers or observers_on(source, scenario))
+    if headless:
+        _run_headless(source, scenario, names, speed, seconds, record_file, as_json)
+        return
+    for name in names:
+        check_slot(name)
+    try:
+        from wfsobs.app import serve as server
+        from wfsobs.app.live_order import LiveOrder
+    except ModuleNotFoundError as error:
+        raise SettingError(f"live: the page needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
+    order = LiveOrder(source, scenario, names, speed, "live", record_file or "", log_file or "")
+    server.serve(server.Options(port=port, open_browser=open_browser, runs=max(2, cpu_count() or 1)), order)
+
+
+def _source(scenario: Scenario, replay_file: str | None, stream: str | None, modes: str | None, unit: str) -> LiveSource:
+    """Return the source that the options name. Raises SettingError, RecordError."""
+    if replay_file:
+        return Replay(load_record(replay_file, scenario))
+    if not stream:
+        return SimulatedLoop(scenario)
+    elements = stream_elements(modes, len(scenario.modes))
+    path = str(stream_path(stream))
+    return StreamSource(path, elements, micrometres_per(unit, scenario.telescope.diameter), scenario.dt)
+
+
+def _run_headless(
+    source: LiveSource,
+    scenario: Scenario,
+    observers: tuple[str, ...],
+    speed: float,
+    seconds: float,
+    record_file: str | None,
+    as_json: bool,
+) -> None:
     kept: list[LiveFrame] = []
+    n_frames = max(1, round(seconds / source.sampling.dt * speed))
+    if isinstance(source, Replay):
+        n_frames = min(n_frames, source.record.n_steps)
     with progress_bar("frames") as update:
         result = follow(
             scenario,
-            max(1, round(seconds * scenario.sensors.lgs_rate * speed)),
-            observers or None,
+            n_frames,
+            observers,
+            source=source,
             speed=speed,
             keep=kept.append if record_file else None,
             report=update,
         )
-    if record_file:
+    if record_file and kept:
         frames = LiveFrame(*(np.array(part) for part in zip(*kept, strict=True)))
-        save_record(record_file, record_of(frames, scenario), configfile.to_toml(scenario))
+        is_simulated = isinstance(source, SimulatedLoop)
+        record = record_of(frames, scenario) if is_simulated else open_loop_record(frames, source.sampling)
+        save_record(record_file, record, configfile.to_toml(scenario))
     if as_json:
         click.echo(json.dumps(result, allow_nan=False))
         return

@@ -117,3 +117,15 @@ def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFor
             err=True,
         )
     return record
+
+
+def stream_elements(text: str | None, n_modes: int) -> tuple[int, ...]:
+    """Return the elements of a frame that are the modes."""
+    if text is None:
+        return tuple(range(n_modes))
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() and len(part) < 10 for part in parts) or len(set(parts)) != len(parts):
+        raise SettingError(f"--modes {text}: takes different whole numbers from 0 with commas, such as 0,1")
+    if len(parts) > n_modes:
+        raise SettingError(f"--modes {text}: the prior has {n_modes} modes")
+    return tuple(map(int, parts))

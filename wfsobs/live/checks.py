@@ -5,7 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from wfsobs.live.board import SLOTS
+from wfsobs.live.follow import default_observers
+from wfsobs.live.source import STREAM, LiveSource
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import Observer
 from wfsobs.observers.step import StepObserver
+from wfsobs.prior import Training
+from wfsobs.priors_from.scenario import observer_settings
+from wfsobs.record import Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.simulation.loop import record_settings
@@ -15,15 +22,33 @@ SLOWEST, FASTEST = 0.1, 20.0
 """Limits of the speed."""
 
 
-def make_design(name: str, settings: dict[str, Any]) -> StepObserver:
+def make_design(name: str, settings: dict[str, Any], sampling: Sampling) -> StepObserver:
     """Design an observer for a scenario; in another process. Raises ValueError."""
-    return design(name, Scenario.from_dict(settings))
+    return design(name, Scenario.from_dict(settings), sampling=sampling)
 
 
 def check_slot(name: str) -> None:
     """Raise SettingError for an observer that is unknown or does not run frame by frame."""
     if name not in SLOTS:
         raise SettingError(f"observer {name!r}: does not run frame by frame; there are {', '.join(SLOTS)}")
+
+
+def observers_on(source: LiveSource, scenario: Scenario) -> list[str]:
+    """Return the ids of the observers that run frame by frame on a source, but for those whose step may be longer than a frame.
+
+    Without NGS frames those that take them are left out; on a stream also those that learn beforehand: there is no record of it.
+    """
+    names = default_observers()
+    if source.sampling.ratio is None:
+        names = [name for name in names if "y_ngs" not in OBSERVERS[name].needs]
+    if source.name == STREAM:
+        names = [name for name in names if not learns_beforehand(OBSERVERS[name], scenario)]
+    return names
+
+
+def learns_beforehand(observer: Observer, scenario: Scenario) -> bool:
+    """Return whether an observer is made from a training record."""
+    return Training in (*observer.prior, *observer.asks(observer_settings(observer, scenario)))
 
 
 def check_speed(speed: float) -> float:

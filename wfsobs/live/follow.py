@@ -14,11 +14,12 @@ from wfsobs.live.blocks import check_live
 from wfsobs.live.board import Counts
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.simulated import SimulatedLoop
-from wfsobs.live.source import SourceProcess
+from wfsobs.live.source import LiveSource, SourceProcess
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepObserver
 from wfsobs.observers.step_checks import StepError
+from wfsobs.priors_from.scenario import as_sampled
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import design
@@ -112,11 +113,12 @@ def follow(
     n_frames: int,
     observers: Sequence[str] | None = None,
     *,
+    source: LiveSource | None = None,
     speed: float = 1.0,
     keep: Callable[[LiveFrame], None] | None = None,
     report: Callable[[float], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Let observers follow the simulated loop in real time.
+    """Let observers follow a source in real time.
 
     Parameters
     ----------
@@ -126,6 +128,8 @@ def follow(
         Frames to follow.
     observers : sequence of str, optional
         Ids; by default those of `default_observers`.
+    source : LiveSource, optional
+        Of the frames; by default the simulation of the scenario.
     speed : float
         1 is real time.
     keep : callable, optional
@@ -150,19 +154,21 @@ def follow(
         if name not in OBSERVERS:
             raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
     chosen = list(observers) if observers else default_observers()
-    pace = scenario.dt / speed
+    source = source or SimulatedLoop(scenario)
+    sampling = source.sampling
+    scenario, pace = as_sampled(scenario, sampling), sampling.dt / speed
     first = round(scenario.run.warm_up / scenario.dt)
     try:
-        followers = {name: Follower(design(name, scenario), first, pace) for name in dict.fromkeys(chosen)}
+        followers = {name: Follower(design(name, scenario, sampling=sampling), first, pace) for name in dict.fromkeys(chosen)}
     except StepError as error:
         raise SettingError(str(error)) from None
-    source = SourceProcess(SimulatedLoop(scenario), speed, n_frames)
+    feed = SourceProcess(source, speed, n_frames)
     try:
-        source.start()
-        frames, lost, late = _drain(source, followers, n_frames, keep, report)
+        feed.start()
+        frames, lost, late = _drain(feed, followers, n_frames, keep, report)
     finally:
-        source.stop()
-    modes = [mode.name for mode in scenario.modes]
+        feed.stop()
+    modes = [mode.name for mode in scenario.modes][: sampling.n_modes]
     return {
         "frames": frames,
         "lost": lost,
@@ -181,19 +187,19 @@ def follow(
 
 
 def _drain(
-    source: SourceProcess,
+    feed: SourceProcess,
     followers: dict[str, Follower],
     n_frames: int,
     keep: Callable[[LiveFrame], None] | None,
     report: Callable[[float], None],
 ) -> tuple[int, int, int]:
     """Take every frame of a source; return how many were taken, lost and late."""
-    ring, number, lost, late = source.ring, 0, 0, 0
+    ring, number, lost, late = feed.ring, 0, 0, 0
     gc.collect()
     gc.freeze()
     while number < n_frames:
         if ring.count <= number:
-            if not source.is_alive and ring.count <= number:
+            if not feed.is_alive and ring.count <= number:
                 break
             sleep(POLL)
             continue

@@ -16,6 +16,7 @@ from wfsobs.live.source import SIMULATION, LiveSource
 from wfsobs.live.view import LiveEvent, LiveView, read_view
 from wfsobs.live.workshop import Workshop
 from wfsobs.observers import OBSERVERS
+from wfsobs.priors_from.scenario import as_sampled
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import sampling_of
@@ -55,14 +56,14 @@ class LiveLoop:
         check_live(scenario)
         for name in observers:
             check_slot(name)
-        self.source, self.scenario, self.sampling = source, scenario, source.sampling
+        self.source, self.scenario, self.sampling = source, as_sampled(scenario, source.sampling), source.sampling
         self._speed, self._is_wanted, self._has_begun = check_speed(speed), False, False
         self.events: deque[LiveEvent] = deque(maxlen=MOST_EVENTS)
         self.watchers: list[Callable[[], None]] = []
-        self._processes = LiveProcesses(source, scenario, tuple(dict.fromkeys(observers)), self._speed)
+        self._processes = LiveProcesses(source, self.scenario, tuple(dict.fromkeys(observers)), self._speed)
         self.board = self._processes.board
-        self.recorder = Recorder(self._processes.feed.ring, self.sampling, self.say)
-        self.workshop = Workshop(self._processes, self.say)
+        self.recorder = Recorder(self._processes.feed.ring, self.sampling, self.say, source.name == SIMULATION)
+        self.workshop = Workshop(self._processes, self.sampling, self.say)
         self._release = finalize(self, self._processes.release)
         Thread(target=_keep, args=(ref(self), self._processes.is_over), daemon=True, name="wfsobs-live").start()
 

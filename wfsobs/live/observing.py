@@ -20,6 +20,7 @@ from wfsobs.live.rows import Rows
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.step import StepObserver
 from wfsobs.observers.step_checks import StepError
+from wfsobs.record import Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.stepping import design
 from wfsobs.typing import Array
@@ -36,14 +37,15 @@ class Order:
 
     settings  : of the scenario that the observers are told of
     observers : ids of those that run from the start
-    n_modes, ring_name, traces_name, board_name : shared memory
+    sampling  : modes, step and NGS ratio of the source
+    ring_name, traces_name, board_name : shared memory
     inbox     : commands
     news      : (number of the frame, one line)
     """
 
     settings: Mapping[str, Any]
     observers: tuple[str, ...]
-    n_modes: int
+    sampling: Sampling
     ring_name: str
     traces_name: str
     board_name: str
@@ -72,14 +74,15 @@ class Crew:
 
     def __init__(self, order: Order):
         scenario = Scenario.from_dict(dict(order.settings))
-        self._dt, self._ratio, self._n = scenario.dt, scenario.sensors.exposure_ratio, order.n_modes
-        self._warm_up = round(scenario.run.warm_up / scenario.dt)
-        self._board, self._say = Board(order.n_modes, order.board_name), order.news.put
-        self._row, self._width = np.full(trace_width(order.n_modes), np.nan), slot_width(order.n_modes)
+        sampling = order.sampling
+        self._dt, self._ratio, self._n = sampling.dt, sampling.ratio or 1, sampling.n_modes
+        self._warm_up = round(scenario.run.warm_up / sampling.dt)
+        self._board, self._say = Board(order.sampling.n_modes, order.board_name), order.news.put
+        self._row, self._width = np.full(trace_width(order.sampling.n_modes), np.nan), slot_width(order.sampling.n_modes)
         self._active: dict[str, Follower] = {}
         self._waiting: dict[str, StepObserver] = {}
         for name in order.observers:
-            self._start(name, design(name, scenario), 0)
+            self._start(name, design(name, scenario, sampling=sampling), 0)
 
     def take(self, frame: LiveFrame, number: int) -> Array:
         """Have every observer take a frame; return the row of their estimates."""
@@ -153,8 +156,8 @@ class Crew:
 def observe_frames(order: Order) -> None:
     """Follow a ring until the process is ended."""
     enter_process()
-    ring = Ring(order.n_modes, order.ring_name)
-    traces = Rows(trace_width(order.n_modes), TRACE_CAPACITY, order.traces_name)
+    ring = Ring(order.sampling.n_modes, order.ring_name)
+    traces = Rows(trace_width(order.sampling.n_modes), TRACE_CAPACITY, order.traces_name)
     try:
         crew = Crew(order)
     except ValueError as error:

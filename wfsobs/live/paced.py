@@ -74,7 +74,7 @@ class PacedFrames(Protocol):
         """Return z, ngs, u, turbulence and vibration of the next frame, (5 n_modes,) [um]; None after the last one."""
         ...
 
-    def take(self, command: Command, number: int) -> str:
+    def take(self, command: Command, number: int, /) -> str:
         """Follow a command about the frames, from this number on; return a line for the list of events, or ""."""
         ...
 

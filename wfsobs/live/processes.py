@@ -49,7 +49,7 @@ class LiveProcesses:
         inbox, self._outbox = context.Pipe(duplex=False)
         self._news = context.Queue()
         names = self.feed.ring.name, self.traces.name, self.board.name
-        order = Order(scenario.to_dict(), observers, n, *names, inbox, self._news)
+        order = Order(scenario.to_dict(), observers, source.sampling, *names, inbox, self._news)
         self._observing = context.Process(target=observe_frames, args=(order,), daemon=True)
         self._observing.start()
         self.workshop = ProcessPoolExecutor(1, context, initializer=enter_process, initargs=(10,))

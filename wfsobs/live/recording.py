@@ -45,12 +45,12 @@ class Recording:
             self._next = stop
         return stop < self._first + LONGEST
 
-    def record(self, scenario: Scenario) -> Record | None:
-        """Return the record so far, None where there is no frame."""
+    def frames(self) -> LiveFrame | None:
+        """Return the frames so far, None where there is none."""
         self.collect()
         if not self._parts:
             return None
-        return record_of(LiveFrame(*(np.concatenate(parts) for parts in zip(*self._parts, strict=True))), scenario)
+        return LiveFrame(*(np.concatenate(parts) for parts in zip(*self._parts, strict=True)))
 
 
 class Recorder:
@@ -64,6 +64,8 @@ class Recorder:
         NGS ratio, and time step.
     say : callable
         Receives one line about what happens.
+    is_simulated : bool
+        Whether the commands are those of the scenario's loop; else the mirror is at rest in the record.
 
     Attributes
     ----------
@@ -71,8 +73,8 @@ class Recorder:
         The last recording that has ended.
     """
 
-    def __init__(self, ring: Ring, sampling: Sampling, say: Callable[[str], None]):
-        self._ring, self._sampling, self._say = ring, sampling, say
+    def __init__(self, ring: Ring, sampling: Sampling, say: Callable[[str], None], is_simulated: bool):
+        self._ring, self._sampling, self._say, self._is_simulated = ring, sampling, say, is_simulated
         self._recording: Recording | None = None
         self._lock = Lock()
         self.record: Record | None = None
@@ -92,7 +94,7 @@ class Recorder:
         """Return what has been recorded as a record of the scenario's loop, None where there is nothing."""
         with self._lock:
             recording, self._recording = self._recording, None
-            self.record = None if recording is None else recording.record(scenario)
+            self.record = None if recording is None else self._record(recording, scenario)
         self._say("recording off")
         return self.record
 
@@ -105,9 +107,15 @@ class Recorder:
         if is_full:
             self._say(f"recording is full: {LONGEST} frames")
 
+    def _record(self, recording: Recording, scenario: Scenario) -> Record | None:
+        frames = recording.frames()
+        if frames is None:
+            return None
+        return record_of(frames, scenario) if self._is_simulated else open_loop_record(frames, self._sampling)
+
     def look_back(self, seconds: float, scenario: Scenario) -> Record:
         """Return the last so many seconds as a record, as far back as there are frames. Raises SettingError without a frame."""
-        record = Recording(self._ring, self._sampling, seconds).record(scenario)
+        record = self._record(Recording(self._ring, self._sampling, seconds), scenario)
         if record is None:
             raise SettingError("no frame has come yet")
         return record
@@ -118,6 +126,22 @@ def first_frame(ring: Ring, sampling: Sampling, seconds: float) -> int:
     ratio = sampling.ratio or 1
     there = min(round(seconds / sampling.dt), CAPACITY - ratio - 2)
     return -(-max(0, ring.count - there) // ratio) * ratio
+
+
+def open_loop_record(frames: LiveFrame, sampling: Sampling) -> Record:
+    """Return frames of which only the pseudo-open-loop measurement is known as a record with the mirror at rest."""
+    ngs = frames.ngs.copy()
+    ngs[0] = np.nan
+    has_ngs, has_truth = sampling.ratio is not None, not np.isnan(frames.turbulence).all()
+    return Record(
+        y_lgs=frames.z,
+        u=np.zeros_like(frames.z),
+        dt=sampling.dt,
+        y_ngs=ngs if has_ngs else None,
+        ratio=sampling.ratio,
+        turbulence=frames.turbulence if has_truth else None,
+        vibration=frames.vibration if has_truth else None,
+    )
 
 
 def record_of(frames: LiveFrame, scenario: Scenario) -> Record:

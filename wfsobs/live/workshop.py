@@ -9,7 +9,7 @@ from typing import Any
 from wfsobs.live.checks import check_slot, make_design
 from wfsobs.live.finding import Finding, identify_frames
 from wfsobs.live.processes import LiveProcesses
-from wfsobs.record import Record
+from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
 
 
@@ -20,6 +20,8 @@ class Workshop:
     ----------
     processes : LiveProcesses
         Of the loop.
+    sampling : Sampling
+        Of the loop.
     say : callable
         Receives one line about what happens.
 
@@ -29,8 +31,8 @@ class Workshop:
         The last identification.
     """
 
-    def __init__(self, processes: LiveProcesses, say: Callable[[str], None]):
-        self._processes, self._say = processes, say
+    def __init__(self, processes: LiveProcesses, sampling: Sampling, say: Callable[[str], None]):
+        self._processes, self._sampling, self._say = processes, sampling, say
         self.finding: Finding | None = None
 
     def do(self, function: Callable[..., Any], *arguments: Any, then: Callable[[Any], None]) -> None:
@@ -52,7 +54,7 @@ class Workshop:
             check_slot(name)
         settings = scenario.to_dict()
         for name in observers:
-            self.do(make_design, name, settings, then=self._deliver)
+            self.do(make_design, name, settings, self._sampling, then=self._deliver)
 
     def identify(self, record: Record, scenario: Scenario, observers: Sequence[str]) -> None:
         """Identify a record, and design observers for what is found."""

@@ -14,7 +14,9 @@ from wfsobs.app.change_names import name_of_difference
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.downloads import Save, record_npz
 from wfsobs.app.jobs.job import FAILED, RUNNING
-from wfsobs.app.live_work import LiveOrder, LiveTask
+from wfsobs.app.jobs.task import IDLE
+from wfsobs.app.live_order import LiveOrder
+from wfsobs.app.live_work import LiveTask
 from wfsobs.app.pages.live_controls import LiveControls, Pulse
 from wfsobs.app.pages.live_figures import Detector, LatencyHistogram, RollingSpectra, RollingTraces
 from wfsobs.app.pages.live_table import Bounds, events_html, live_html, ranking, status_line
@@ -105,6 +107,9 @@ class LivePage(PageActions):
     def show(self, visible: bool) -> None:
         """Draw while visible; the loop goes on when the page is left."""
         self.visible = visible
+        shared = self.store.session.service.live
+        if visible and shared is not None and self.work.state == IDLE:
+            self.work.begin(shared)
         self._say()
         self.draw()
 
@@ -231,8 +236,10 @@ class LivePage(PageActions):
         if not runs:
             self.status.object = f'<p class="{"failure" if work.state == FAILED else "text"}" role="status">{escape(said)}</p>'
         if self._callback is not None:
-            wanted = self.visible and runs
-            if wanted and not self._callback.running:
-                self._callback.start()
-            elif not wanted and self._callback.running:
-                self._callback.stop()
+            self.store.session.post(self._pace)  # once the page stands: what comes before that does not reach it
+
+    def _pace(self) -> None:
+        """Draw again and again while there is something to see."""
+        wanted = self.visible and self.loop is not None
+        if self._callback is not None and wanted != self._callback.running:
+            (self._callback.start if wanted else self._callback.stop)()

@@ -1,0 +1,106 @@
+"""Sources of a live loop beside the simulation: a record, and a stream of another program."""
+
+import queue
+
+import numpy as np
+import pytest
+
+import wfsobs
+from wfsobs.live.attached import StreamFrames, StreamSource
+from wfsobs.live.checks import observers_on
+from wfsobs.live.paced import Desk
+from wfsobs.live.recording import open_loop_record
+from wfsobs.live.replay import RecordFrames, Replay, frame_rows
+from wfsobs.live.ring import LiveFrame, Ring
+from wfsobs.scenario.presets import paper
+from wfsobs.streams.shared_image import SharedImage
+
+
+class Inbox:
+    """Commands that are there."""
+
+    def __init__(self):
+        self.waiting = []
+
+    def poll(self, *_):
+        return bool(self.waiting)
+
+    def recv(self):
+        return self.waiting.pop(0)
+
+
+def test_frames_of_a_record_are_those_of_the_record():
+    record = wfsobs.simulate(paper().replace({"run.duration": 1.5}))
+    frames = RecordFrames(frame_rows(record))
+    rows = np.array([frames.next_row(k) for k in range(record.n_steps)])
+    assert frames.next_row(record.n_steps) is None
+    parts = np.split(rows, 5, axis=1)
+    for part, expected in zip(parts, (record.z, record.z_ngs, record.u, record.turbulence, record.vibration), strict=True):
+        np.testing.assert_array_equal(part, expected)
+    source = Replay(record)
+    assert source.has_truth and source.sampling == record.sampling
+    again = open_loop_record(LiveFrame(np.zeros(len(rows)), *parts), record.sampling)
+    np.testing.assert_array_equal(again.z, record.z)
+    np.testing.assert_array_equal(again.z_ngs[1:], record.z_ngs[1:])
+
+
+@pytest.fixture
+def stream(tmp_path):
+    path = tmp_path / "modes.im.shm"
+    image = SharedImage.create(path, (4,), dtype="float64")
+    ring, inbox, news = Ring(2), Inbox(), queue.Queue()
+    source = StreamSource(str(path), (2, 0), 1e-3, 1e-3)
+    frames = StreamFrames(source, Desk(ring.name, 2, inbox, news, 1.0, None))
+    frames._look()
+    yield path, image, ring, inbox, news, frames
+    frames._ring.release()
+    ring.release()
+
+
+def test_a_stream_is_followed_through_whatever_happens_to_it(stream):
+    path, image, ring, inbox, news, frames = stream
+
+    def send(*values):
+        image.write(np.array(values, dtype=float))
+        frames.take()
+
+    def lines():
+        out = [(k, line.removeprefix(f"{path}: ")) for k, line in list(news.queue)]
+        news.queue.clear()
+        return out
+
+    send(1, 2, 3, 4)
+    assert ring.count == 0, "nothing before it plays"
+    inbox.waiting.append({"play": True})
+    frames._follow_commands()
+    send(1, 2, 3, 4)
+    frame = ring.read(0)
+    assert frame.z == pytest.approx([3e-3, 1e-3]) and np.all(frame.u == 0) and np.isnan(frame.ngs).all()
+    assert np.isnan(frame.turbulence).all()
+    image.write(np.zeros(4))  # two frames that nobody has seen
+    image.write(np.zeros(4))
+    send(5, 0, 7, 0)
+    assert ring.count == 4 and np.isnan(ring.read_frames(1, 3).z).all() and ring.read(3).z[0] == pytest.approx(7e-3)
+    send(np.nan, 0, np.inf, 0)
+    send(np.nan, 0, 1, 0)
+    assert np.isnan(ring.read(4).z).all() and lines() == [(4, "numbers that are not finite")]
+    frames._stand_still()
+    frames._stand_still()
+    assert lines() == [(6, "no frame for 0.1 s")]
+    path.unlink()
+    frames._stand_still()
+    frames._look()
+    frames._look()
+    assert frames._stream is None and lines() == []
+    image = SharedImage.create(path, (4,), dtype="float64")
+    frames._look()
+    image.write(np.arange(4.0))
+    frames.take()
+    assert ring.count == 7 and lines() == [(6, "frames again")]
+    np.testing.assert_array_equal(image._values, np.arange(4.0))  # nothing is written to it
+
+
+def test_observers_that_a_stream_can_have():
+    names = observers_on(StreamSource("nowhere", (0, 1), 1.0, 1e-3), paper())
+    assert {"kf-multi", "gp-lgs", "persistence"} <= set(names)
+    assert not {"multirate", "kf-ngs", "multirate-multi", "ridge", "ridge-30"} & set(names)

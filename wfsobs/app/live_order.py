@@ -1,0 +1,45 @@
+"""A live loop as it is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from wfsobs.live.loop import LiveLoop
+from wfsobs.live.source import LiveSource
+from wfsobs.scenario import Scenario
+from wfsobs.scenario.configfile import to_toml
+from wfsobs.telemetry.records import save_record
+
+
+@dataclass(frozen=True)
+class LiveOrder:
+    """A loop that is to run.
+
+    source    : of the frames
+    scenario  : what the observers are told
+    observers : ids of those that run from the start
+    speed     : 1 is real time
+    key       : names the loop, where all pages watch the same
+    record_file : where all its frames go when it ends; none if empty
+    log_file  : to which events and alarms are appended; none if empty
+    """
+
+    source: LiveSource
+    scenario: Scenario
+    observers: Sequence[str]
+    speed: float = 1.0
+    key: str = ""
+    record_file: str = ""
+    log_file: str = ""
+
+    def begin(self, loop: LiveLoop) -> None:
+        """Begin to record, if that is wanted."""
+        if self.record_file:
+            loop.recorder.start()
+
+    def end(self, loop: LiveLoop) -> None:
+        """Write what has been recorded. Raises OSError."""
+        record = loop.recorder.stop(loop.scenario) if self.record_file else None
+        if record is not None:
+            save_record(self.record_file, record, to_toml(loop.scenario))

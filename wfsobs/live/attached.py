@@ -1,0 +1,162 @@
+"""A stream of a running loop as a source: its frames when they come; nothing is written to it."""
+
+from __future__ import annotations
+
+import gc
+from dataclasses import dataclass
+from multiprocessing.context import SpawnContext
+from time import monotonic, sleep
+
+import numpy as np
+
+from wfsobs.live.paced import Desk, Staff, enter_process
+from wfsobs.live.ring import Ring
+from wfsobs.live.source import STREAM
+from wfsobs.record import Sampling
+from wfsobs.streams.attach import LONGEST_GAP, STUCK
+from wfsobs.streams.layout import StreamError
+from wfsobs.streams.shared_image import SharedImage
+
+TICK = 0.05
+"""Longest wait for a frame before a look at the commands [s]."""
+RETRY = 0.5
+"""Pause before a stream that cannot be read is looked for again [s]."""
+
+
+@dataclass(frozen=True)
+class StreamSource:
+    """A stream as a source: pseudo-open-loop modes of one sensor.
+
+    Attributes
+    ----------
+    path : str
+        File of the stream.
+    elements : tuple of int
+        Number in a frame of each mode.
+    unit : float
+        Micrometres per unit of the stream.
+    dt : float
+        Time between two frames by the design of the observers [s].
+    """
+
+    path: str
+    elements: tuple[int, ...]
+    unit: float
+    dt: float
+    name = STREAM
+    has_truth = False
+
+    @property
+    def sampling(self) -> Sampling:
+        """Modes and step; no NGS."""
+        return Sampling(len(self.elements), self.dt)
+
+    def staff(self, context: SpawnContext, desk: Desk) -> Staff:
+        """Return its process."""
+        return Staff(context.Process(target=_send, args=(self, desk), daemon=True), [], [])
+
+
+def _send(source: StreamSource, desk: Desk) -> None:
+    enter_process()
+    gc.freeze()
+    StreamFrames(source, desk).run()
+
+
+class StreamFrames:
+    """Writes what a stream brings to a ring; a stream that dies, stalls or sends garbage is told in one line, and followed again.
+
+    Parameters
+    ----------
+    source : StreamSource
+        The stream.
+    desk : Desk
+        Where the ring is, and the commands.
+    """
+
+    def __init__(self, source: StreamSource, desk: Desk):
+        self._source, self._desk, self._elements = source, desk, np.array(source.elements)
+        self._ring = Ring(desk.n_modes, desk.ring_name)
+        self._row = np.full(1 + 5 * desk.n_modes, np.nan)
+        self._row[1 + 2 * desk.n_modes : 1 + 3 * desk.n_modes] = 0.0  # of commands nothing is known: z is all there is
+        self._stream: SharedImage | None = None
+        self._count, self._alive, self._steps = 0, monotonic(), 0
+        self._is_playing = self._is_stuck = self._is_garbage = False
+
+    def run(self) -> None:
+        """Follow the stream until the process is ended, or all frames have been sent."""
+        while self._ring.count != self._desk.n_frames:
+            self._follow_commands()
+            if self._stream is None:
+                self._look()
+            elif self._stream.wait(self._count, TICK):
+                self.take()
+            elif monotonic() - self._alive > STUCK:
+                self._stand_still()
+        self._ring.close_writer()
+
+    def take(self) -> None:
+        """Write the newest frame of the stream, and NaN for those missing before it."""
+        assert self._stream is not None
+        found = self._stream.read()
+        if found is None:
+            self._say("a frame is being written without an end")
+            sleep(TICK)
+            return
+        count, values = found
+        missing = count - self._count - 1
+        if self._is_stuck:
+            self._say("frames again")
+        self._count, self._alive, self._is_stuck = count, monotonic(), False
+        if not self._is_playing and not self._steps:
+            return
+        self._steps = max(0, self._steps - 1)
+        if missing < 0 or missing > LONGEST_GAP:
+            self._say("the counter has jumped")
+        else:
+            for _ in range(missing):
+                self._write(np.nan)
+        z = values[self._elements] * self._source.unit
+        is_garbage = not np.isfinite(z).all()
+        if is_garbage and not self._is_garbage:
+            self._say("numbers that are not finite")
+        self._is_garbage = is_garbage
+        self._write(np.where(np.isfinite(z), z, np.nan))
+
+    def _write(self, z: object) -> None:
+        self._row[0] = self._alive
+        self._row[1 : 1 + self._desk.n_modes] = z
+        self._ring.write(self._row)
+
+    def _follow_commands(self) -> None:
+        while self._desk.inbox.poll():
+            command = self._desk.inbox.recv()
+            was_playing = self._is_playing
+            self._is_playing = command.get("play", self._is_playing)
+            self._steps += command.get("step", 0)
+            if self._is_playing and not was_playing and self._stream is not None:
+                self._count = self._stream.count  # what came meanwhile is not missing
+
+    def _look(self) -> None:
+        """Open the stream; say once why it cannot be opened."""
+        try:
+            stream = SharedImage(self._source.path)
+            if max(self._source.elements) >= stream.n:
+                raise StreamError(f"a frame has {stream.n} numbers, mode {max(self._source.elements)} is not among them")
+        except StreamError as error:
+            if not self._is_stuck:
+                self._is_stuck = True
+                self._say(str(error))
+            sleep(RETRY)
+            return
+        self._stream, self._count = stream, stream.count
+
+    def _stand_still(self) -> None:
+        assert self._stream is not None
+        if not self._is_stuck:
+            self._is_stuck = True
+            self._say(f"no frame for {STUCK:g} s")
+        if not self._stream.is_current:
+            self._stream = None
+
+    def _say(self, line: str) -> None:
+        self._desk.say(self._ring.count, f"{self._source.path}: {line}")
