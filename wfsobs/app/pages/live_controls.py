@@ -41,7 +41,7 @@ class Pulse(JSComponent):
     _esm = asset("pulse.js")
 
     def __init__(self, **params: Any):
-        self.answer, self._time = 0, 0.0
+        self.answer, self._time = -1, 0.0
         super().__init__(**params)
 
     def _handle_msg(self, data: object) -> None:
@@ -50,8 +50,8 @@ class Pulse(JSComponent):
 
     @property
     def is_free(self) -> bool:
-        """Whether the browser is ready for another."""
-        return self.answer >= self.picture or monotonic() - self._time > PATIENCE
+        """Whether the browser is ready for another; for the first once it has drawn the page."""
+        return self.answer >= self.picture or (self.answer >= 0 and monotonic() - self._time > PATIENCE)
 
     def beat(self) -> None:
         """Ask for an answer to the picture that has been sent."""
