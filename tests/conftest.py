@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,20 @@ import pytest
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
+FOLDER = "WFSOBS_TEST_RECORDS"
+"""Environment variable: the folder of this session's records, for `tests.records`."""
+
 HERE = Path(__file__).parent
 SLOW = tuple(line for line in (HERE / "slow.txt").read_text().splitlines() if line and not line.startswith("#"))
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Make the folder of records that tests share; workers find the one of the session."""
+    if FOLDER not in os.environ:
+        folder = tempfile.TemporaryDirectory(prefix="wfsobs-records-")
+        os.environ[FOLDER] = folder.name
+        config.add_cleanup(folder.cleanup)
+        config.add_cleanup(lambda: os.environ.pop(FOLDER))
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import wfsobs
-from wfsobs import PRESETS, simulate
+from tests.records import short
+from wfsobs import PRESETS
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers.step_checks import StepError
 from wfsobs.prior import Lines
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
-from wfsobs.testing import QUICK
 from wfsobs.testing.steps import run_loop
 
 ROUNDING, GPR = 1e-12, 1e-9
@@ -26,10 +26,7 @@ ROUNDING, GPR = 1e-12, 1e-9
 @cache
 def with_gaps(preset: str) -> tuple[Record, Scenario]:
     """A record of 0.8 s with missing measurements and NGS frames; events come at the same share of it."""
-    s = PRESETS[preset]()
-    events = [e.to_dict() | {k: getattr(e, k) * 0.8 / s.run.duration for k in ("start", "duration")} for e in s.events]
-    scenario = s.replace({**QUICK, "run.duration": 0.8, "events": events})
-    record = simulate(scenario)
+    record, scenario = short(preset)
     y, ngs, n = record.y_lgs.copy(), record.y_ngs.copy(), record.ratio
     y[np.r_[0, 1, 400:412, 500, 510]], y[600, 0] = np.nan, np.nan
     ngs[[n, 90 * n, 91 * n]] = ngs[100 * n, 0] = np.nan

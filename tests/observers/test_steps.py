@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import wfsobs
-from wfsobs import PRESETS, simulate
+from tests.records import short
+from wfsobs import PRESETS
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
 from wfsobs.observers import OBSERVERS
@@ -26,7 +27,6 @@ from wfsobs.progress import QUIET
 from wfsobs.record import Record, hold_last, pseudo_open_loop
 from wfsobs.scenario import Scenario
 from wfsobs.signal.riccati import steady_state
-from wfsobs.testing import QUICK
 from wfsobs.testing.steps import run_steps, step_difference
 
 STEPS = [name for name, observer in OBSERVERS.items() if observer.step is not None]
@@ -35,18 +35,10 @@ ROUNDING, GPR = 1e-12, 1e-9
 """Differences over the std of an estimate: sums in another order; the kernel's condition number makes more of them in a GPR."""
 
 
-def short(preset: str) -> Scenario:
-    """The preset with a record of 0.8 s; events come at the same share of it."""
-    s = PRESETS[preset]()
-    events = [e.to_dict() | {k: getattr(e, k) * 0.8 / s.run.duration for k in ("start", "duration")} for e in s.events]
-    return s.replace({**QUICK, "run.duration": 0.8, "events": events})
-
-
 @cache
 def with_gaps(preset: str) -> tuple[Record, Scenario]:
     """A record with missing measurements of all and of single modes, commands and NGS frames, some at the start."""
-    scenario = short(preset)
-    record = simulate(scenario)
+    record, scenario = short(preset)
     y, u, ngs = record.y_lgs.copy(), record.u.copy(), record.y_ngs.copy()
     n = record.ratio
     lost = np.unique(np.concatenate([[0, 1], np.arange(400, 412), np.random.default_rng(5).integers(500, 800, 30)]))
@@ -83,8 +75,7 @@ def test_the_public_door_gives_the_same() -> None:
 @pytest.mark.parametrize("frames", [1, 3, 0.5, 2.25])
 def test_predictions_and_their_sd(frames: float) -> None:
     """Oracle: the textbook filter, its state moved on by the exponential of its poles."""
-    scenario = short("paper")
-    record = simulate(scenario)
+    record, scenario = short("paper")
     observer = wfsobs.design("kf-lgs", scenario)
     run_steps(observer, record.measurements())
     model, noise = kalman_model(scenario, 0, record.dt), measurement_noise(scenario, 0)[0]

@@ -11,6 +11,7 @@ times sinc^2(f T) for the mean over a step. Layers are independent and add. The 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -67,9 +68,7 @@ def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra
     FlowSpectra
         Six densities, (n,) each [um^2/Hz].
     """
-    found = atmosphere.layers(scenario)
-    f = _frequencies(scenario, min(layer.speed for layer in found), float(frequency[-1]))
-    total = np.sum([_layer(scenario, mode, layer, f) for layer in found], axis=0)
+    f, total = _at_nodes(scenario, mode, float(frequency[-1]))
     exposure = np.sinc(f * scenario.dt) ** 2
     at, nodes = np.log(np.maximum(frequency, f[0])), np.log(f)
     density = [np.exp(np.interp(at, nodes, np.log(np.maximum((row[i] * exposure).real, 1e-300)))) for i, row in enumerate(total)]
@@ -83,6 +82,16 @@ def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra
     if len(total) == 2:  # the NGS is on the axis
         return FlowSpectra(density[0], density[1], shared, density[0], density[0] + 0j, shared)
     return FlowSpectra(density[0], density[1], shared, density[2], between(0, 2), between(2, 1))
+
+
+@lru_cache(maxsize=32)
+def _at_nodes(scenario: Scenario, mode: int, highest: float) -> tuple[Array, NDArray[np.complex128]]:
+    """Return the nodes in frequency, and the spectra of all layers there, which take a second where there are many."""
+    found = atmosphere.layers(scenario)
+    f = _frequencies(scenario, min(layer.speed for layer in found), highest)
+    total = np.sum([_layer(scenario, mode, layer, f) for layer in found], axis=0)
+    f.flags.writeable = total.flags.writeable = False
+    return f, total
 
 
 def _frequencies(scenario: Scenario, speed: float, highest: float) -> Array:

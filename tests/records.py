@@ -1,0 +1,45 @@
+"""Records that several tests share: simulated once per session, by whichever process comes first."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wfsobs import PRESETS, simulate
+from wfsobs.record import Record, Training
+from wfsobs.scenario import Scenario
+from wfsobs.testing import QUICK
+
+
+def recorded(scenario: Scenario) -> Record:
+    """Return the record of a scenario, kept in a file of the session (conftest.py)."""
+    path = Path(os.environ["WFSOBS_TEST_RECORDS"]) / f"{sha256(repr(scenario.to_dict()).encode()).hexdigest()}.npz"
+    with path.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            record = simulate(scenario)
+            np.savez(path, **arrays(record), **{f"training.{name}": x for name, x in arrays(record.training).items()})
+        with np.load(path) as file:
+            found = dict(file)
+    training = Training(**{name.removeprefix("training."): found.pop(name) for name in sorted(found) if "." in name})
+    return Record(**{name: x if x.ndim else x[()].item() for name, x in found.items()}, training=training)
+
+
+def arrays(data: Record | Training) -> dict[str, Any]:
+    """Return what there is of a record, by name."""
+    return {name: value for name, value in vars(data).items() if value is not None and name != "training"}
+
+
+@cache
+def short(preset: str) -> tuple[Record, Scenario]:
+    """Return a record of 0.8 s of a preset, and its scenario; events come at the same share of it."""
+    s = PRESETS[preset]()
+    events = [e.to_dict() | {k: getattr(e, k) * 0.8 / s.run.duration for k in ("start", "duration")} for e in s.events]
+    scenario = s.replace({**QUICK, "run.duration": 0.8, "events": events})
+    return recorded(scenario), scenario
