@@ -117,3 +117,16 @@ def test_what_cannot_be_made_is_said(options: dict, reason: str) -> None:
 def test_what_cannot_be_learnt_from_is_said(history: np.ndarray, reason: str) -> None:
     with pytest.raises(PredictorError, match=reason):
         LoopPredictor(2).fit(history)
+
+
+def test_a_controller_predicts_what_it_commands(record: wfsobs.Record, found: str) -> None:
+    """In a loop of its own, delay 3: minus the prediction is the command."""
+    scenario = load_scenario(found).replace({"control.delay": float(HORIZON)})
+    controller = design("lqg-kf-multi", scenario, sampling=record.sampling)
+    z, u = record.z[:300], np.zeros((300 + HORIZON, 2))
+    for k, row in enumerate(z):
+        u[k] = controller.update(row + u[k - HORIZON])
+    predictor = LoopPredictor(2, HORIZON, observer="lqg-kf-multi", prior=found)
+    np.testing.assert_array_equal(-predictions(predictor, z), u[:300])
+    predictor.reset()
+    np.testing.assert_array_equal(-predictions(predictor, z[:20]), u[:20])

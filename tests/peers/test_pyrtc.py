@@ -122,5 +122,5 @@ def test_a_mistake_in_the_configuration_is_told() -> None:
     peer.register_predictor()
     with pytest.raises(ValueError, match="no such observer"):
         predictive.make_predictor({"type": "wfsobs", "observer": "kf"}, 2)
-    with pytest.raises(ValueError, match="of one sensor"):
+    with pytest.raises(ValueError, match="or a controller"):
         predictive.make_predictor({"type": "wfsobs", "observer": "multirate-multi"}, 2)

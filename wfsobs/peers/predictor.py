@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.identification import identify
 from wfsobs.identification.result import Identification
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import StepObserver
+from wfsobs.peers.command import CommandAhead
 from wfsobs.prior import Training
 from wfsobs.priors_from.identification import told_by
 from wfsobs.record import Record, Sampling
@@ -37,7 +39,7 @@ class LoopPredictor:
     horizon : int
         Frames from the last measurement to the one that is predicted, 1 or more.
     observer : str
-        Id; one of a single sensor that needs no training data.
+        Id of an observer of a single sensor that needs no training data, or of a controller without NGS.
     rate : float
         Frames per second of the loop [Hz].
     modes : sequence of int, optional
@@ -78,7 +80,7 @@ class LoopPredictor:
         self._id, self._rate, self._modes, self._scale = observer, float(rate), np.array(chosen), float(scale)
         self._settings = Scenario().replace({**(settings or {}), "sensors.lgs_rate": self._rate})
         self._check_observer()
-        self._observer: StepObserver | None = None
+        self._observer: StepObserver | CommandAhead | None = None
         self._last = np.zeros(num_modes)
         if prior is not None:
             from wfsobs.scenario import configfile  # needs a writer of TOML, which the core is installed without
@@ -102,8 +104,8 @@ class LoopPredictor:
             if size == 0:
                 raise PredictorError("fit: the history is constant or not finite")
             self._scale, self._is_told = SIZE / size, False
-            found = identify(Record(self._scale * z, np.zeros_like(z), 1.0 / self._rate))
-            self._observer = self._design(found)
+            record = Record(self._scale * z, np.zeros_like(z), 1.0 / self._rate)
+            self._observer = self._design(identify(record), record)
         for row in history:
             self.update(row)
         self.fitted = True
@@ -131,17 +133,23 @@ class LoopPredictor:
             self._observer.reset()
 
     def _check_observer(self) -> None:
+        if self._id in CONTROLLERS and not CONTROLLERS[self._id].ngs:
+            return
         if self._id not in OBSERVERS:
             raise PredictorError(f"observer {self._id!r}: no such observer; there are {', '.join(OBSERVERS)}")
         declared = OBSERVERS[self._id]
         if "y_ngs" in declared.needs or Training in declared.prior or len(declared.targets) < 2:
             raise PredictorError(
-                f"{self._id}: takes an observer of turbulence and vibration, of one sensor, without training data"
+                f"{self._id}: takes an observer of turbulence and vibration of one sensor without training data, or a controller"
             )
 
-    def _design(self, source: Scenario | Identification) -> StepObserver:
+    def _design(self, source: Scenario | Identification, history: Record | None = None) -> StepObserver | CommandAhead:
         self._is_told = isinstance(source, Scenario)
-        scenario = told_by(source, self._settings).replace({"sensors.lgs_rate": self._rate})
+        own = {"sensors.lgs_rate": self._rate, "control.delay": float(self.horizon)}
+        scenario = told_by(source, self._settings).replace(own)
         prior = scenario if self._is_told else source
         sampling = Sampling(len(self._modes), 1.0 / self._rate)
-        return design(self._id, prior, scenario=scenario, sampling=sampling, horizon=self.horizon - 1)
+        if self._id in OBSERVERS:
+            return design(self._id, prior, scenario=scenario, sampling=sampling, horizon=self.horizon - 1)
+        controller = design(self._id, prior, scenario=scenario, sampling=sampling, train=history)
+        return CommandAhead(controller, sampling.n_modes, self.horizon)
