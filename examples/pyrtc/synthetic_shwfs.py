@@ -3,8 +3,8 @@
     python synthetic_shwfs.py [SECONDS]
 
 pyRTC's sensor renders spots with read noise, its `SlopesProcess` measures them, its `Loop` predicts and commands. In the place of
-the sensor's few sines, tip and tilt follow the preset paper, one command acts a frame later than the sensor reads it, two frames in
-all, and nothing waits for a clock. Each predictor is fitted on 8 s under an integrator and runs on what follows.
+the few sines of the sensor, tip and tilt follow the preset paper. One command acts a frame later than the sensor reads it, two
+frames in all, and nothing waits for a clock. Each predictor is fitted on 8 s under an integrator and runs on what follows.
 """
 
 import sys

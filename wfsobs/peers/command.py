@@ -24,7 +24,7 @@ class CommandAhead:
     targets = ("disturbance",)
 
     def __init__(self, controller: StepController, n_modes: int, delay: int):
-        self._controller, self._sent = controller, np.zeros((delay, n_modes))
+        self._controller, self._commands = controller, np.zeros((delay, n_modes))
 
     @property
     def frame(self) -> int:
@@ -33,15 +33,15 @@ class CommandAhead:
 
     def update(self, z: Array) -> None:
         """Take a pseudo-open-loop measurement, (n_modes,) [um]: of its own loop it would be the residual. Raises StepError."""
-        u = self._controller.update(z + self._sent[-1])
-        self._sent[1:] = self._sent[:-1].copy()
-        self._sent[0] = u
+        u = self._controller.update(z + self._commands[-1])
+        self._commands[1:] = self._commands[:-1].copy()
+        self._commands[0] = u
 
     def predict(self, frames: float = 0.0, target: str = "disturbance") -> tuple[Array, Array]:
         """Return mean and standard deviation, which it does not know, (n_modes,) [um] each."""
-        return -self._sent[0], np.full(self._sent.shape[1], np.nan)
+        return -self._commands[0], np.full(self._commands.shape[1], np.nan)
 
     def reset(self) -> None:
         """Go back to before the first frame."""
         self._controller.reset()
-        self._sent[:] = 0.0
+        self._commands[:] = 0.0
