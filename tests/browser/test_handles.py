@@ -20,6 +20,14 @@ HOLD = """settle => {
 """Has a move by keys be over when the test says so, however long it takes to press them."""
 
 
+HOLD_BACK = """() => {
+  const send = WebSocket.prototype.send, kept = []
+  WebSocket.prototype.send = function (...args) { kept.push(() => send.apply(this, args)) }
+  window.goOn = () => { WebSocket.prototype.send = send; kept.forEach((it) => it()) }
+}"""
+"""Has what the browser says wait until the test lets it go."""
+
+
 @pytest.fixture
 def page(open_page: Any) -> Page:
     page = open_page()
@@ -93,6 +101,16 @@ def test_by_keyboard(page: Page) -> None:
     expect(peak).to_have_attribute("aria-valuetext", "49.81 Hz, 9.97 nm rms, damping 0.00448")
     page.get_by_role("button", name="Undo").click()
     expect(peak).to_have_attribute("aria-valuetext", STANDS)
+    expect(predicted(page, "kf-multi")).to_have_text("10.9")
+    page.evaluate(HOLD_BACK)  # an answer that takes its time
+    peak.press("Shift+ArrowUp")
+    expect(page.locator(".pending .numbers")).to_be_visible()
+    expect(predicted(page, "kf-multi")).to_have_text("10.9")  # the last frame stays
+    page.evaluate("() => window.goOn()")
+    expect(page.locator(".pending")).to_have_count(0)
+    expect(predicted(page, "kf-multi")).not_to_have_text("10.9")
+    peak.press("Escape")
+    expect(predicted(page, "kf-multi")).to_have_text("10.9")
 
 
 def test_one_more_and_one_less(page: Page) -> None:
