@@ -8,6 +8,7 @@ from bokeh.server.session import ServerSession
 from panel.io.server import DocHandler
 from tornado.web import RequestHandler
 
+from wfsobs.app.live_work import live_counts
 from wfsobs.app.ready import NextPage
 from wfsobs.app.service import Service
 from wfsobs.app.share import LONGEST
@@ -54,7 +55,8 @@ class Liveness(RequestHandler):
     def get(self) -> None:
         """Answer in JSON."""
         queue = self.service.queue
-        self.write({"ok": True, "sessions": self.service.sessions, "running": queue.running, "waiting": queue.length})
+        counts = {"ok": True, "sessions": self.service.sessions, "running": queue.running, "waiting": queue.length}
+        self.write(counts | live_counts(self.service.live_loop))
 
 
 def full_html(line: str) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from wfsobs.live.loop import LiveLoop
-from wfsobs.live.source import LiveSource
+from wfsobs.live.source import STREAM, LiveSource
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import to_toml
 from wfsobs.telemetry.records import save_record
@@ -34,7 +34,9 @@ class LiveOrder:
     log_file: str = ""
 
     def begin(self, loop: LiveLoop) -> None:
-        """Begin to record, if that is wanted."""
+        """Begin to record and to raise alarms, if that is wanted; of a stream there are always alarms."""
+        if self.log_file or self.source.name == STREAM:
+            loop.watch(self.log_file)
         if self.record_file:
             loop.recorder.start()
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Mapping
 from time import sleep
 from typing import Any
 
+from wfsobs.app.downloads import Save, record_npz
 from wfsobs.app.jobs.job import CLICK, Job, Tell
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.live_order import LiveOrder
@@ -13,6 +15,7 @@ from wfsobs.app.logs import event
 from wfsobs.app.service import Service
 from wfsobs.live.loop import LiveLoop
 from wfsobs.progress import Watch
+from wfsobs.record import Record
 from wfsobs.settings.errors import SettingError
 
 LOOK = 0.2
@@ -40,13 +43,23 @@ def compute(order: LiveOrder, service: Service, watch: Watch, tell: Tell) -> Non
 
 def share_loop(order: LiveOrder, service: Service) -> None:
     """Run a loop that all sessions watch, until the server ends."""
+
+    def hear(news: Mapping[str, Any]) -> None:
+        service.live_loop = news.get("latest", service.live_loop)
+        if message := news.get("message"):
+            event("live-failed", logging.ERROR, reason=message)
+
     service.live = order
-    service.queue.submit(live_job(order, service), "server", lambda news: _log_end(news.get("message", "")))
+    service.queue.submit(live_job(order, service), "server", hear)
 
 
-def _log_end(message: str) -> None:
-    if message:
-        event("live-ended", logging.ERROR, reason=message)
+def live_counts(loop: LiveLoop | None) -> dict[str, Any]:
+    """Return what is counted of a loop, as JSON takes it; nothing without one."""
+    if loop is None:
+        return {}
+    frames, lost, late, _ = (int(x) for x in loop.board.totals)
+    behind = (loop.newest - loop.count) * loop.sampling.dt
+    return {"live": {"frames": frames, "lost": lost, "late_share": late / max(frames, 1), "behind_s": round(behind, 3)}}
 
 
 class LiveTask(BackgroundTask):
@@ -70,3 +83,19 @@ def live_job(order: LiveOrder, service: Service) -> Job:
     work: Any = lambda watch, tell: compute(order, service, watch, tell)  # noqa: E731
     limits = service.limits
     return Job("live", work, key=order.key, priority=CLICK, time_limit=limits.live_seconds, endless=True, refusal=SettingError)
+
+
+def record_saves(loop: LiveLoop | None, look_back: float) -> dict[str, Save | None]:
+    """Offer the last recording of a loop, and its last so many seconds."""
+
+    def save(name: str, make: Callable[[LiveLoop], Record]) -> Save | None:
+        live = loop
+        if live is None or not live.newest:
+            return None
+        return Save(name, "application/octet-stream", lambda: record_npz(make(live), live.scenario))
+
+    record = None if loop is None else loop.recorder.record
+    return {
+        "Recording as NPZ": None if record is None else save("wfsobs-live.npz", lambda _: record),
+        "Last two minutes as NPZ": save("wfsobs-live-last.npz", lambda live: live.recorder.look_back(look_back, live.scenario)),
+    }

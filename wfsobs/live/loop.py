@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from threading import Event, Thread
 from typing import Any
 from weakref import ReferenceType, finalize, ref
@@ -12,6 +12,7 @@ from wfsobs.live.blocks import check_live
 from wfsobs.live.checks import check_slot, check_speed, loss_line, needs_new_frames
 from wfsobs.live.processes import LiveProcesses
 from wfsobs.live.recording import Recorder
+from wfsobs.live.shadow import Shadow, append_line
 from wfsobs.live.source import SIMULATION, LiveSource
 from wfsobs.live.view import LiveEvent, LiveView, read_view
 from wfsobs.live.workshop import Workshop
@@ -59,7 +60,8 @@ class LiveLoop:
         self.source, self.scenario, self.sampling = source, as_sampled(scenario, source.sampling), source.sampling
         self._speed, self._is_wanted, self._has_begun = check_speed(speed), False, False
         self.events: deque[LiveEvent] = deque(maxlen=MOST_EVENTS)
-        self.watchers: list[Callable[[], None]] = []
+        self._shadow: Shadow | None = None
+        self._log_file = ""
         self._processes = LiveProcesses(source, self.scenario, tuple(dict.fromkeys(observers)), self._speed)
         self.board = self._processes.board
         self.recorder = Recorder(self._processes.feed.ring, self.sampling, self.say, source.name == SIMULATION)
@@ -186,7 +188,14 @@ class LiveLoop:
 
     def say(self, line: str, frame: int | None = None) -> None:
         """Add a line to the list of events."""
-        self.events.append(LiveEvent(self.newest if frame is None else frame, line))
+        event = LiveEvent(self.newest if frame is None else frame, line)
+        self.events.append(event)
+        if self._log_file:
+            append_line(self._log_file, event.frame * self.sampling.dt, line)
+
+    def watch(self, log_file: str = "") -> None:
+        """Raise alarms from now on; append them, and all events, to a file."""
+        self._log_file, self._shadow = log_file, Shadow(self)
 
     def view(self, seconds: float) -> LiveView:
         """Return the last so many seconds of frames and estimates."""
@@ -200,8 +209,8 @@ class LiveLoop:
         for number, line in self._processes.news():
             self.say(line, number)
         self.recorder.collect()
-        for watch in self.watchers:
-            watch()
+        if self._shadow is not None:
+            self._shadow(self)
 
     def stop(self) -> None:
         """End the processes and give the memory back."""

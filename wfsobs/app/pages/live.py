@@ -12,21 +12,21 @@ import param
 
 from wfsobs.app.change_names import name_of_difference
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.downloads import Save, record_npz
+from wfsobs.app.downloads import Save
 from wfsobs.app.jobs.job import FAILED, RUNNING
 from wfsobs.app.jobs.task import IDLE
 from wfsobs.app.live_order import LiveOrder
-from wfsobs.app.live_work import LiveTask
+from wfsobs.app.live_work import LiveTask, record_saves
 from wfsobs.app.pages.live_controls import LiveControls, Pulse
 from wfsobs.app.pages.live_figures import Detector, LatencyHistogram, RollingSpectra, RollingTraces
-from wfsobs.app.pages.live_table import Bounds, events_html, live_html, ranking, status_line
+from wfsobs.app.pages.live_table import Bounds, events_html, live_html, peaks_html, ranking, status_line
 from wfsobs.app.pages.parts import WIDE, PageActions, box, figure_with_caption, html, line, text
 from wfsobs.app.store import Store
+from wfsobs.live.board import NEXT
 from wfsobs.live.finding import bounds_of
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.view import LiveView
-from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 
@@ -55,7 +55,7 @@ class LivePage(PageActions):
         self.work = LiveTask(store.session)
         self.controls = c = LiveControls()
         self.buttons, self.lines, self.target, self.window = c.buttons, c.lines, c.target, c.window
-        self.status, self.table, self.news = html(), html(), html()
+        self.status, self.table, self.news, self.peaks = html(), html(), html(), html()
         self.room = pn.Column(**WIDE, visible=False)
         self.pulse = Pulse(width=0, height=0, margin=0)
         self.visible, self._table_time = False, 0.0
@@ -158,8 +158,8 @@ class LivePage(PageActions):
         scale = per_micrometre(self.display.unit, diameter)
         active = loop.board.active()
         names = [name for name in active if name in self.lines.value]
-        traces.draw(view, self.target.value, names, self.display, scale, list(loop.events))
-        spectra.draw(view, self.target.value, names, self.display, scale)
+        traces.draw(view, self._target(loop), names, self.display, scale, list(loop.events))
+        spectra.draw(view, self._target(loop), names, self.display, scale)
         latencies.draw(loop.board, names, loop.sampling.dt, self.display.dark)
         both = [name for name in active if len(loop.targets(name)) > 1]
         if both:
@@ -171,9 +171,14 @@ class LivePage(PageActions):
         titles = "The last seconds", "Spectra", "Latencies", "Star, as it comes (grey) and corrected by the best of both targets"
         figures = [figure_with_caption(title, drawn.figure) for title, drawn in zip(titles, made, strict=True)]
         grid = pn.Column(*figures, **WIDE, stylesheets=[GRID])
-        self.room[:] = [box("Now", line(self.window, self.target), self.lines, grid), box("Observers", self.table, self.news)]
+        known = box("Observers", self.table, self.news, self.peaks)
+        self.room[:] = [box("Now", line(self.window, self.target), self.lines, grid), known]
         self.room.visible = True
         return made
+
+    def _target(self, loop: LiveLoop) -> str:
+        """Return what errors are shown of: without truth, of the next measurement."""
+        return self.target.value if loop.source.has_truth else NEXT
 
     def _draw_table(self, loop: LiveLoop, view: LiveView) -> None:
         self._table_time = monotonic()
@@ -181,8 +186,9 @@ class LivePage(PageActions):
             self._bounds_of, self._bounds = loop.scenario, {}
             loop.workshop.do(bounds_of, loop.scenario.to_dict(), then=partial(setattr, self, "_bounds"))
         scale = per_micrometre(self.display.unit, loop.scenario.telescope.diameter)
-        self.table.object = live_html(loop, view, self.target.value, self.display, scale, self._bounds)
+        self.table.object = live_html(loop, view, self._target(loop), self.display, scale, self._bounds)
         self.news.object = events_html(loop.events, loop.sampling.dt)
+        self.peaks.object = peaks_html(loop.workshop.finding, scale, self.display.unit_label)
 
     def _toggle_recording(self, loop: LiveLoop) -> None:
         """Keep every frame, and the last two minutes; or end that."""
@@ -194,18 +200,7 @@ class LivePage(PageActions):
 
     def saves(self) -> Mapping[str, Save | None]:
         """Offer the recording, and the last two minutes."""
-        loop = self.loop
-        recording = loop.recorder.record if loop is not None else None
-        return {
-            "Recording as NPZ": self._save("wfsobs-live.npz", lambda: recording) if recording is not None else None,
-            "Last two minutes as NPZ": None
-            if loop is None or not loop.newest
-            else self._save("wfsobs-live-last.npz", lambda: loop.recorder.look_back(LOOK_BACK, loop.scenario)),
-        }
-
-    def _save(self, name: str, make: Callable[[], Record]) -> Save:
-        scenario = self.store.scenario
-        return Save(name, "application/octet-stream", lambda: record_npz(make(), scenario))
+        return record_saves(self.loop, LOOK_BACK)
 
     def _do(self, act: Callable[[LiveLoop], None]) -> None:
         """Do something with the loop, or say in one line why not."""

@@ -12,6 +12,7 @@ from wfsobs.app.render import Row, table
 from wfsobs.app.style import look, swatch
 from wfsobs.evaluation.rows import row_label
 from wfsobs.live.board import NEXT, SCORED
+from wfsobs.live.finding import Finding
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.view import LiveEvent, LiveView
 
@@ -60,6 +61,17 @@ def _row(loop: LiveLoop, name: str, rms: float, target: str, display: Display, s
         str(int(counts.late[0])),
     ]
     return Row(swatch(name, display.dark) + look(name).label, cells, {"name": name})
+
+
+def peaks_html(finding: Finding | None, scale: float, unit: str) -> str:
+    """Write the peaks of the last identification."""
+    if finding is None:
+        return ""
+    columns = {"Peak [Hz]": "", "± [Hz]": "standard deviation", "Damping": "", f"RMS [{unit}]": "of the mode that has most of it"}
+    rows = [
+        Row(number(p.frequency, 4), [_number(p.frequency_std), _number(p.damping), number(scale * p.rms)]) for p in finding.peaks
+    ]
+    return str(table("Peaks of the last minute", columns, [("", rows)]))
 
 
 def _number(x: float) -> str:

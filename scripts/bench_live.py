@@ -1,0 +1,149 @@
+"""Measure a live loop and its server beside an empty paced loop.
+
+    python scripts/bench_live.py [--seconds 60] [--pages 5] [--port 5930]
+
+Starts `wfsobs live` on the preset paper with the linear observers and the online GPR, opens pages by websocket without a browser,
+and runs an empty loop of the same pace in a process of its own. Prints one JSON object: frames and lost frames; the shares of
+frames that came more than 1 ms late, of the loop and of the empty one; how far the observers were behind, sampled every second
+[s]; processor time of the server and all its processes over time [cores]; memory, proportional set size after the first minute
+(or the first tenth) and at the end [MB].
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from multiprocessing import Process, Value
+from pathlib import Path
+from urllib.request import urlopen
+
+from bokeh.client import pull_session
+
+LINEAR = ("kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi", "butterworth-cl", "persistence")
+OBSERVERS = (*LINEAR, "gpr-online")
+DT, LATE = 1e-3, 1e-3
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+def run_empty(late, frames, end) -> None:
+    """Wake every millisecond and do nothing."""
+    due = time.monotonic() + DT
+    while not end.value:
+        if (wait := due - time.monotonic()) > 0:
+            time.sleep(wait)
+        late.value += time.monotonic() - due > LATE
+        frames.value += 1
+        due += DT
+
+
+def family(pid: int) -> list[int]:
+    """Return a process and its descendants."""
+    children: dict[int, list[int]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = int(stat.read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+        children.setdefault(parent, []).append(int(stat.parent.name))
+    out = [pid]
+    for one in out:
+        out += children.get(one, [])
+    return out
+
+
+def cpu_seconds(pids: list[int]) -> float:
+    """Return the processor time of processes [s]."""
+    total = 0
+    for pid in pids:
+        try:
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        total += int(fields[11]) + int(fields[12])
+    return total / TICKS
+
+
+def memory_mb(pids: list[int]) -> float:
+    """Return the proportional set size of processes [MB]."""
+    total = 0
+    for pid in pids:
+        try:
+            lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+        except OSError:
+            continue
+        total += sum(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+    return total / 1024
+
+
+def counts(url: str) -> dict:
+    """Return what the server counts of the loop."""
+    with urlopen(f"{url}/liveness", timeout=30) as answer:
+        return json.load(answer).get("live", {})
+
+
+def main() -> None:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--pages", type=int, default=5)
+    parser.add_argument("--port", type=int, default=5930)
+    a = parser.parse_args()
+    url = f"http://localhost:{a.port}"
+    chosen = [word for name in OBSERVERS for word in ("--observer", name)]
+    server = subprocess.Popen([sys.executable, "-m", "wfsobs", "live", "--port", str(a.port), *chosen], stderr=subprocess.DEVNULL)
+    late, frames, end = Value("q", 0), Value("q", 0), Value("b", 0)
+    empty = Process(target=run_empty, args=(late, frames, end), daemon=True)
+    try:
+        ready = time.monotonic() + 120.0
+        while time.monotonic() < ready:
+            try:
+                if counts(url).get("frames", 0) > 1000:
+                    break
+            except OSError:
+                pass
+            time.sleep(0.5)
+        pages = [pull_session(url=f"{url}/") for _ in range(a.pages)]
+        time.sleep(10.0)  # the first run of the pages is over
+        empty.start()
+        first, start, cpu = counts(url), time.monotonic(), cpu_seconds(family(server.pid))
+        behind, memory = [], []
+        while (elapsed := time.monotonic() - start) < a.seconds:
+            time.sleep(1.0)
+            behind.append(counts(url)["behind_s"])
+            memory.append((elapsed, memory_mb(family(server.pid))))
+        last, seconds = counts(url), time.monotonic() - start
+        used = cpu_seconds(family(server.pid)) - cpu
+        end.value = 1
+        empty.join(5)
+        taken = last["frames"] - first["frames"]
+        was_late = last["late_share"] * last["frames"] - first["late_share"] * first["frames"]
+        settled = min(60.0, 0.1 * a.seconds)
+        before = next(mb for at, mb in memory if at >= settled)
+        print(
+            json.dumps(
+                {
+                    "seconds": round(seconds, 1),
+                    "frames": taken,
+                    "lost": last["lost"] - first["lost"],
+                    "late_share": round(was_late / max(taken, 1), 5),
+                    "late_share_empty": round(late.value / max(frames.value, 1), 5),
+                    "behind_s": {"median": sorted(behind)[len(behind) // 2], "max": max(behind)},
+                    "cores": round(used / seconds, 3),
+                    "memory_mb": {"settled": round(before, 1), "end": round(memory[-1][1], 1)},
+                    "pages": len(pages),
+                    "load": os.getloadavg()[0],
+                }
+            )
+        )
+    finally:
+        end.value = 1
+        server.terminate()
+        server.wait(60)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,51 @@
+"""Looks after a loop of which no truth is known: alarms every second, an identification every minute."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from wfsobs.live.alarms import Alarms
+from wfsobs.live.finding import Finding, identify_frames
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS
+from wfsobs.settings.group import SettingError
+
+if TYPE_CHECKING:
+    from wfsobs.live.loop import LiveLoop
+
+SECOND, MINUTE = 1.0, 60.0
+
+
+class Shadow:
+    """Called by its loop a few times a second."""
+
+    def __init__(self, loop: LiveLoop):
+        self._alarms = Alarms(loop.say)
+        self._next_second, self._next_minute = SECOND, MINUTE
+
+    def __call__(self, loop: LiveLoop) -> None:
+        """Judge what has come since the last call."""
+        now = loop.count * loop.sampling.dt
+        if now >= self._next_second:
+            self._next_second = now + SECOND
+            both = [name for name in loop.board.active() if len(OBSERVERS[name].targets) == len(TARGETS)]
+            self._alarms.look_at(loop.view(SECOND), both)
+        if now >= self._next_minute:
+            self._next_minute = now + MINUTE
+            try:
+                record = loop.recorder.look_back(MINUTE, loop.scenario)
+            except SettingError:  # nothing has come
+                return
+
+            def take(finding: Finding) -> None:
+                loop.workshop.finding = finding
+                self._alarms.compare(finding)
+
+            loop.workshop.do(identify_frames, record, loop.scenario.to_dict(), then=take)
+
+
+def append_line(path: str, seconds: float, line: str) -> None:
+    """Append a line to a log: the time in UTC, that of the loop, what has happened. Raises OSError."""
+    with open(path, "a", encoding="utf-8") as file:
+        file.write(f"{datetime.now(UTC).isoformat(timespec='milliseconds')} {seconds:.3f} {line}\n")
