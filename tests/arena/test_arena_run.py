@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,14 @@ from wfsobs.arena import trials
 from wfsobs.arena.cases import SimulatedCase, mean_square
 from wfsobs.arena.challengers import CHALLENGERS
 from wfsobs.arena.definition import Arena, add_records, load_arena
-from wfsobs.arena.entries import ArenaEntry, admits, find_entries, load_object
+from wfsobs.arena.entries import ArenaEntry, admits, code_version, find_entries, load_object
 from wfsobs.arena.process import Answer, EntryProcess, solve
 from wfsobs.arena.reference import taps_error
 from wfsobs.arena.results import tables, write_results
 from wfsobs.arena.run import run_arena
 from wfsobs.arena.tracks import TRACKS
 from wfsobs.arena.trials import try_record
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.prior import Prior
 from wfsobs.record import Record
 from wfsobs.settings.errors import SettingError
@@ -108,6 +110,12 @@ def test_who_enters_where() -> None:
     assert tracks("multirate") == ["two-sensors"]
     assert tracks("integrator") == ["closed-loop"]
     assert tracks("rls") == ["disturbance", "next", "events"]
+
+
+def test_the_version_of_an_entry_is_that_of_its_code() -> None:
+    nothing = CONTROLLERS["none"]  # without a function of its own
+    assert code_version(nothing) == code_version(replace(nothing, asks=lambda _: ()))
+    assert code_version(CHALLENGERS["rls"].observer) != code_version(CHALLENGERS["imm"].observer)
 
 
 @pytest.mark.parametrize("name", ["nobody", "nowhere:ME", "wfsobs.record:DELAY"])

@@ -88,7 +88,7 @@ def _find(name: str) -> ArenaEntry:
 
 
 def _of_object(algorithm: Any, kind: str, place: str) -> ArenaEntry:
-    return ArenaEntry(algorithm.id, algorithm.label, kind, place, _code_version(algorithm))
+    return ArenaEntry(algorithm.id, algorithm.label, kind, place, code_version(algorithm))
 
 
 def load_object(entry: ArenaEntry) -> Any:
@@ -112,13 +112,13 @@ def _from_module(name: str) -> Any:
     return algorithm
 
 
-def _code_version(algorithm: Any) -> str:
+def code_version(algorithm: Any) -> str:
     """Return the version of wfsobs with a digest of the module that an object's function is in."""
     function = algorithm.run if isinstance(algorithm, Observer) else algorithm.predict or algorithm.law
     try:
         source = inspect.getsource(inspect.getmodule(function) or function).encode()
-    except (OSError, TypeError):
-        source = repr(algorithm).encode()
+    except (OSError, TypeError):  # no function, or none with a source
+        source = algorithm.id.encode()
     return f"{__version__} {hashlib.sha256(source).hexdigest()[:16]}"
 
 
