@@ -61,7 +61,7 @@ def test_steps_are_the_run_over_the_record(name: str, preset: str) -> None:
 
 
 def test_every_causal_observer_has_steps() -> None:
-    assert [name for name, observer in OBSERVERS.items() if observer.step is None] == ["multirate-adaptive", "butterworth-ol"]
+    assert [name for name, observer in OBSERVERS.items() if observer.step is None] == ["butterworth-ol"]
 
 
 def test_the_public_door_gives_the_same() -> None:
@@ -203,7 +203,9 @@ def test_a_horizon_that_cannot_be_is_refused() -> None:
         wfsobs.design("butterworth-cl", scenario, horizon=1)
 
 
-@pytest.mark.parametrize("name", ["ridge-30", "gpr-online", "kf-ngs", "butterworth-cl", "kf-adaptive", "persistence"])
+@pytest.mark.parametrize(
+    "name", ["ridge-30", "gpr-online", "kf-ngs", "butterworth-cl", "kf-adaptive", "multirate-adaptive", "persistence"]
+)
 def test_every_kind_takes_over_its_own_state(name: str) -> None:
     """A design with the same numbers goes on as if it were the old one."""
     record, scenario = with_gaps("paper")

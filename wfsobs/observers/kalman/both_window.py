@@ -33,6 +33,8 @@ FEWEST = 20
 """Minimum NGS frames of a window."""
 LEAST = 0.1
 """Minimum share of the NGS in the noise of the difference."""
+DECIMALS = 12
+"""Of a sample [um] in a fit: it is then the same to the last bit, in whichever order sums were taken that filled a gap."""
 
 
 class Lengths(NamedTuple):
@@ -61,6 +63,21 @@ def check_window(settings: Adaptive, lengths: Lengths, dt: float) -> None:
         raise RecordError(f"adaptive.window = {settings.window:g}: takes {needed:g} s or more, {least} NGS frames")
 
 
+def next_length(window: int, lengths: Lengths) -> int:
+    """Return the steps from an identification to the next one, if the record is still."""
+    return max(int(GROWS * window) // lengths.interval, 1) * lengths.interval
+
+
+def window_start(end: int, change: int, lengths: Lengths) -> int:
+    """Return where the window begins that ends before step `end`; change : when the record was last not still."""
+    return max(min(max(change, end - lengths.longest), end - lengths.window), lengths.first)
+
+
+def is_still(surprise: Array) -> bool:
+    """Return whether squared innovations over their variances (n,) are as large as they should be."""
+    return bool(STILL[0] < surprise.mean() < STILL[1])
+
+
 class BothModel(NamedTuple):
     """What has been identified last.
 
@@ -81,6 +98,7 @@ def identify_both(z: Array, frames: Array, dt: float, settings: Adaptive, last: 
     z, frames : LGS measurements (n,) and NGS frames (n / ratio,) [um]
     """
     ratio = len(z) // len(frames)
+    z, frames = np.round(z, DECIMALS), np.round(frames, DECIMALS)
     try:
         with np.errstate(divide="raise", over="raise", invalid="raise"):
             error = quick_spectrum(z.reshape(-1, ratio).mean(axis=1) - frames, dt * ratio, 0, settings.lowest, last.error)
@@ -91,9 +109,14 @@ def identify_both(z: Array, frames: Array, dt: float, settings: Adaptive, last: 
                 before = Spectrum(error.noise, dt, replace(e[0], rms=float(z.std())))
             spectrum = follow_spectrum(z, dt, most, settings.lowest, before, *e)
             ngs = max(error.noise * np.sqrt(max(1.0 - spectrum.noise**2 / ratio / error.noise**2, LEAST)), MIN_NOISE)
-            turbulence = () if spectrum.turbulence is None else (spectrum.turbulence,)
-            model = beam_model(Beams(turbulence), spectrum.resonances)
-            cycle = estimated_cycle(model, ratio, max(spectrum.noise, MIN_NOISE), ngs, e)
-            return BothModel(spectrum, error, ngs, cycle)
+            return BothModel(spectrum, error, ngs, model_cycle(spectrum, error, ngs, ratio))
     except (ValueError, ArithmeticError):
         return last
+
+
+def model_cycle(spectrum: Spectrum, error: Spectrum, ngs: float, ratio: int) -> Cycle:
+    """Return what is estimated by a model. Raises ValueError and ArithmeticError where it has no filter."""
+    e = (error.turbulence.at(spectrum.dt),) if isinstance(error.turbulence, Ar2) else ()
+    turbulence = () if spectrum.turbulence is None else (spectrum.turbulence,)
+    model = beam_model(Beams(turbulence), spectrum.resonances)
+    return estimated_cycle(model, ratio, max(spectrum.noise, MIN_NOISE), ngs, e)

@@ -15,13 +15,23 @@ import numpy as np
 
 from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
 from wfsobs.observers.kalman.adaptive import ADAPTIVE, Adaptive
-from wfsobs.observers.kalman.both_window import GROWS, STILL, BothModel, Lengths, both_lengths, check_window, identify_both
+from wfsobs.observers.kalman.both_window import (
+    BothModel,
+    Lengths,
+    both_lengths,
+    check_window,
+    identify_both,
+    is_still,
+    next_length,
+    window_start,
+)
+from wfsobs.observers.kalman.multirate_adaptive_step import BothEstimator
 from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_filter
 from wfsobs.observers.kalman.single import NGS
 from wfsobs.observers.kalman.spread import target_sd
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
-from wfsobs.record import Measurements, RecordError
+from wfsobs.record import Measurements, RecordError, Sampling
 from wfsobs.typing import Array
 
 
@@ -69,21 +79,6 @@ def _adapt(v: Array, dt: float, lengths: Lengths, settings: Adaptive, tell: Call
     return out
 
 
-def next_length(window: int, lengths: Lengths) -> int:
-    """Return the steps from an identification to the next one, if the record is still."""
-    return max(int(GROWS * window) // lengths.interval, 1) * lengths.interval
-
-
-def window_start(end: int, change: int, lengths: Lengths) -> int:
-    """Return where the window begins that ends before step `end`; change : when the record was last not still."""
-    return max(min(max(change, end - lengths.longest), end - lengths.window), lengths.first)
-
-
-def is_still(surprise: Array) -> bool:
-    """Return whether squared innovations over their variances (n,) are as large as they should be."""
-    return bool(STILL[0] < surprise.mean() < STILL[1])
-
-
 class WindowRun(NamedTuple):
     """A filter over a window: estimates and standard deviations (2, n, 2) [um]; squared innovations over their variances (n,)."""
 
@@ -102,6 +97,11 @@ def run_window(cycle: Cycle, v: Array, size: int) -> WindowRun:
     variance = np.resize([C[0] @ s.P @ C[0] + R[0, 0] for s in states], len(v))
     sd = np.resize(target_sd(cycle.rows, [s.posterior for s in states]), (len(v), len(TARGETS)))
     return WindowRun(np.array([found[:, :2] + [means[1], 0.0], sd]), innovations**2 / variance)
+
+
+def step_multirate_adaptive(_prior: Prior, settings: Adaptive, sampling: Sampling, _horizon: float) -> BothEstimator:
+    """Return `multirate_adaptive`, one frame at a time."""
+    return BothEstimator(settings, sampling)
 
 
 def seconds(settings: Adaptive, n_steps: int, n_modes: int, dt: float) -> float:
@@ -128,4 +128,5 @@ MULTIRATE_ADAPTIVE = Observer(
     weight=50.0,
     seconds=seconds,
     look=Look("Adaptive multi-rate", "#9A0048", "#FF9FC4", (20, 2, 3, 2), width=1.8),
+    step=step_multirate_adaptive,
 )
