@@ -29,7 +29,7 @@ POLL = 1e-4
 """Pause between two looks at the ring [s]."""
 LATE = 1e-3
 """From which delay a frame counts as late [s]."""
-LONG_STEPS = ("kf-adaptive", "gpr-offline")
+LONG_STEPS = ("kf-adaptive", "multirate-adaptive", "gpr-offline")
 """Observers that are run if named alone."""
 
 
