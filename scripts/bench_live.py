@@ -12,6 +12,7 @@ frames that came more than 1 ms late, of the loop and of the empty one; how far 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import json
 import os
 import subprocess
@@ -21,7 +22,7 @@ from multiprocessing import Process, Value
 from pathlib import Path
 from urllib.request import urlopen
 
-from bokeh.client import pull_session
+from visitor import Visitor
 
 LINEAR = ("kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi", "butterworth-cl", "persistence")
 OBSERVERS = (*LINEAR, "gpr-online")
@@ -38,6 +39,16 @@ def run_empty(late, frames, end) -> None:
         late.value += time.monotonic() - due > LATE
         frames.value += 1
         due += DT
+
+
+def visit(base: str, pages: int) -> None:
+    """Open pages, and keep them open."""
+
+    async def stay() -> None:
+        kept = [await Visitor(base).open() for _ in range(pages)]
+        await asyncio.sleep(86_400 + len(kept))
+
+    asyncio.run(stay())
 
 
 def family(pid: int) -> list[int]:
@@ -96,6 +107,7 @@ def main() -> None:
     chosen = [word for name in OBSERVERS for word in ("--observer", name)]
     server = subprocess.Popen([sys.executable, "-m", "wfsobs", "live", "--port", str(a.port), *chosen], stderr=subprocess.DEVNULL)
     late, frames, end = Value("q", 0), Value("q", 0), Value("b", 0)
+    visitors = Process(target=visit, args=(f"localhost:{a.port}", a.pages), daemon=True)
     empty = Process(target=run_empty, args=(late, frames, end), daemon=True)
     try:
         ready = time.monotonic() + 120.0
@@ -106,8 +118,8 @@ def main() -> None:
             except OSError:
                 pass
             time.sleep(0.5)
-        pages = [pull_session(url=f"{url}/") for _ in range(a.pages)]
-        time.sleep(10.0)  # the first run of the pages is over
+        visitors.start()
+        time.sleep(15.0)  # the pages are open, and their first run is over
         empty.start()
         first, start, cpu = counts(url), time.monotonic(), cpu_seconds(family(server.pid))
         behind, memory = [], []
@@ -116,6 +128,8 @@ def main() -> None:
             behind.append(counts(url)["behind_s"])
             memory.append((elapsed, memory_mb(family(server.pid))))
         last, seconds = counts(url), time.monotonic() - start
+        with urlopen(f"{url}/liveness", timeout=30) as answer:
+            pages = json.load(answer)["sessions"]
         used = cpu_seconds(family(server.pid)) - cpu
         end.value = 1
         empty.join(5)
@@ -134,13 +148,15 @@ def main() -> None:
                     "behind_s": {"median": sorted(behind)[len(behind) // 2], "max": max(behind)},
                     "cores": round(used / seconds, 3),
                     "memory_mb": {"settled": round(before, 1), "end": round(memory[-1][1], 1)},
-                    "pages": len(pages),
+                    "pages": pages,
                     "load": os.getloadavg()[0],
                 }
             )
         )
     finally:
         end.value = 1
+        if visitors.pid:
+            visitors.kill()
         server.terminate()
         server.wait(60)
 
