@@ -19,7 +19,7 @@ from wfsobs.arena.definition import Arena, add_records, load_arena
 from wfsobs.arena.entries import ArenaEntry, admits, code_version, find_entries, load_object
 from wfsobs.arena.process import Answer, EntryProcess, solve
 from wfsobs.arena.reference import taps_error
-from wfsobs.arena.results import tables, write_results
+from wfsobs.arena.results import needs_of, tables, write_results
 from wfsobs.arena.run import run_arena
 from wfsobs.arena.tracks import TRACKS
 from wfsobs.arena.trials import try_record
@@ -110,6 +110,13 @@ def test_who_enters_where() -> None:
     assert tracks("multirate") == ["two-sensors"]
     assert tracks("integrator") == ["closed-loop"]
     assert tracks("rls") == ["disturbance", "next", "events"]
+
+
+def test_what_an_entry_is_told() -> None:
+    multi, rls = find_entries(["kf-multi", "rls"])
+    assert needs_of(multi, TRACKS["vibration"]) == "model, true lines"
+    assert needs_of(multi, TRACKS["next"]) == "model, lines, identified"
+    assert needs_of(rls, TRACKS["next"]) == "nothing"
 
 
 def test_the_version_of_an_entry_is_that_of_its_code() -> None:

@@ -19,7 +19,7 @@ from wfsobs.arena.definition import Arena
 from wfsobs.arena.entries import FOLDER, ArenaEntry, load_object
 from wfsobs.arena.run import EntryOutcome
 from wfsobs.arena.scores import geometric_mean, rank_entries
-from wfsobs.arena.tracks import TRACKS, Track
+from wfsobs.arena.tracks import NEXT, TRACKS, Track
 from wfsobs.arena.trials import Trial
 from wfsobs.campaign.keys import PHYSICS_VERSION
 from wfsobs.files import write_whole
@@ -75,7 +75,8 @@ def _table(track: Track, cases: Sequence[Case], outcomes: Sequence[EntryOutcome]
         **{key: value for key, value in asdict(track).items() if key != "target"},
         "scenarios": [_scenario(case) for case in cases],
         "rows": [
-            {**asdict(one), "label": entries[one.entry].label, "told": needs_of(entries[one.entry])} | _beside(of[one.entry])
+            {**asdict(one), "label": entries[one.entry].label, "told": needs_of(entries[one.entry], track)}
+            | _beside(of[one.entry])
             for one in standings
         ],
     }
@@ -114,12 +115,15 @@ def _beside(trials: Sequence[Sequence[Trial]]) -> Table:
     }
 
 
-def needs_of(entry: ArenaEntry) -> str:
-    """Return what an entry is told beside measurements, for people."""
+def needs_of(entry: ArenaEntry, track: Track) -> str:
+    """Return what an entry is told beside measurements in a track, for people."""
     if entry.kind == FOLDER:
         return "not known"
-    made = load_object(entry)
-    return made.needs_text if isinstance(made, Observer) else made.needs_text(own_settings(made, Scenario()))
+    algorithm = load_object(entry)
+    if not isinstance(algorithm, Observer):
+        return algorithm.needs_text(own_settings(algorithm, Scenario()))
+    identified = algorithm.needed_parts and track.target == NEXT
+    return f"{algorithm.needs_text}, identified".replace("true ", "") if identified else algorithm.needs_text
 
 
 def source_of(entry_id: str) -> str:
