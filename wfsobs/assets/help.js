@@ -9,6 +9,12 @@ const STOPS = [ // where, what is said of it
   [["[aria-label='Share']"], "The address of the page has what you have changed: share it, save data and figures, or make a report of everything."],
 ]
 
+// Dark where the page is.
+function paint(it) {
+  const [red, green, blue] = getComputedStyle(document.body).backgroundColor.match(/\d+/g).map(Number)
+  it.classList.toggle("dark", red + green + blue < 384)
+}
+
 export function render({model, el}) {
   const make = (name, parent, properties = {}, attributes = {}) => {
     const it = Object.assign(document.createElement(name), properties)
@@ -36,7 +42,7 @@ export function render({model, el}) {
       }
     }
   }
-  sheet.addEventListener("beforetoggle", fill)
+  sheet.addEventListener("beforetoggle", () => { fill(); paint(sheet) })
   sheet.addEventListener("toggle", (event) => { if (event.newState === "open") sheet.querySelector("button").focus() })
 
   const stop = new AbortController()
@@ -93,7 +99,7 @@ function tour(el) {
     const buttons = [...at > 0 ? [button("Back", () => { at -= 1; show() })] : [], ...last ? [] : [button("Skip", end)], next]
     note.replaceChildren(line, count, ...buttons)
     target?.scrollIntoView({block: "center"})
-    if (!note.matches(":popover-open")) { ring.showPopover(); note.showPopover() }
+    if (!note.matches(":popover-open")) { ring.showPopover(); note.showPopover(); paint(note) }
     if (target) requestAnimationFrame(() => place(target))
     next.focus()
   }
