@@ -37,7 +37,7 @@ for i in range(2):
     star * telescope * mirror * sensor
     pushed.append(sensor.signal / 0.05)
 reconstructor = np.linalg.pinv(np.transpose(pushed))
-sensor.cam.photonNoise = True
+sensor.cam.photonNoise, sensor.cam.random_state_photon_noise = True, np.random.RandomState(1)
 y, u = np.zeros((frames, 2)), np.zeros((frames, 2))
 
 
