@@ -20,6 +20,8 @@ PATIENCE = 10.0
 SPEEDS = {f"{speed:g} ×": speed for speed in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)}
 WINDOWS = {f"{seconds:g} s": seconds for seconds in (2.0, 5.0, 10.0)}
 LOSSES = {"no frame": 0.0, "1 % of frames": 0.01, "5 % of frames": 0.05, "20 % of frames": 0.2}
+FIRST = ("kf-lgs", "kf-multi", "multirate", "multirate-multi", "gpr-online")
+"""Observers that run first: as many as two cores keep up with beside the page."""
 MAIN = ("kf-multi", "multirate-multi", "gpr-online")
 """Observers whose lines are shown first."""
 BUTTONS = {
@@ -75,7 +77,7 @@ class LiveControls:
         self.ngs = pmui.Checkbox(label="NGS", value=True, **select)
         self.losses = pmui.Select(label="Lost", options=LOSSES, value=0.0, width=150, **select)
         self.running = pmui.MultiChoice(
-            label="Observers", options={look(name).label: name for name in default_observers()}, value=default_observers(), **WIDE
+            label="Observers", options={look(name).label: name for name in default_observers()}, value=list(FIRST), **WIDE
         )
         self.lines = pmui.MultiChoice(label="Lines", options=self.running.options, value=list(MAIN), **WIDE)
 
