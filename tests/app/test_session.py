@@ -109,7 +109,10 @@ def test_an_event_after_a_change_on_its_way_may_change_figures(caplog: pytest.Lo
         await page.with_document_locked(build)
         pn_state._change_callbacks[page.document] = {"one": change}
         await page.with_document_locked(lambda: setter._server_event(page.document, DataEvent(None, 3.0)))
-        await asyncio.sleep(0.05)
+        for _ in range(1000):  # as many turns of the loop as the answer takes
+            if where.start == 3.0:
+                break
+            await asyncio.sleep(0.005)
 
     asyncio.run(main())
     assert (where.start, answered) == (3.0, ["change"])

@@ -25,7 +25,7 @@ ENDED = "the processes of the loop have ended"
 
 def compute(order: LiveOrder, service: Service, watch: Watch, tell: Tell) -> None:
     """Run a loop until the job is stopped. Raises SettingError, Cancelled."""
-    loop = service.start(lambda: LiveLoop(order.source, order.scenario, order.observers, order.speed))
+    loop = service.start(lambda: LiveLoop(order.source, order.scenario, order.observers, speed=order.speed))
     try:
         order.begin(loop)
         loop.play()

@@ -57,7 +57,9 @@ class RecordCache:
         return self._records[key]
 
 
-def run_arena(arena: Arena, entries: Sequence[ArenaEntry], folder: Path, tell: Tell = lambda _line: None) -> list[EntryOutcome]:
+def run_arena(
+    arena: Arena, entries: Sequence[ArenaEntry], folder: Path, *, tell: Tell = lambda _line: None
+) -> list[EntryOutcome]:
     """Run what is missing, and return all outcomes.
 
     Parameters

@@ -17,10 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
+from wfsobs.campaign.compare import LEVEL
 from wfsobs.typing import Array
-
-LEVEL = 0.95
-"""Level of intervals and comparisons."""
 
 
 @dataclass(frozen=True)

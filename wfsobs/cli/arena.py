@@ -70,7 +70,7 @@ def run(
     found = _select_tracks(found, tracks)
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    outcomes = run_arena(found, find_entries(entries), folder, lambda line: click.echo(f"wfsobs: {line}", err=True))
+    outcomes = run_arena(found, find_entries(entries), folder, tell=lambda line: click.echo(f"wfsobs: {line}", err=True))
     values = tables(found, outcomes)
     write_results(values, folder)
     for track in values["tracks"]:

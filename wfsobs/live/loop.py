@@ -53,7 +53,7 @@ class LiveLoop:
         An observer is unknown or does not run frame by frame, or the scenario has events.
     """
 
-    def __init__(self, source: LiveSource, scenario: Scenario, observers: Sequence[str], speed: float = 1.0):
+    def __init__(self, source: LiveSource, scenario: Scenario, observers: Sequence[str], *, speed: float = 1.0):
         check_live(scenario)
         for name in observers:
             check_slot(name)
@@ -153,7 +153,7 @@ class LiveLoop:
         self.scenario = scenario
         self._processes.feed.tell({"settings": scenario.to_dict(), "is_new": is_new, "line": line})
 
-    def lose(self, lgs: bool = True, ngs: bool = True, loss: float = 0.0) -> None:
+    def lose(self, *, lgs: bool = True, ngs: bool = True, loss: float = 0.0) -> None:
         """Switch lasers and NGS sensor on and off, and lose a part of the frames."""
         losses = {"lgs": lgs, "ngs": ngs, "loss": loss}
         self._processes.feed.tell({"losses": losses, "line": loss_line(lgs, ngs, loss)})
@@ -166,7 +166,7 @@ class LiveLoop:
         else:
             self._processes.tell_observers({"observer": observer, "design": None})
 
-    def redesign(self, observers: Sequence[str] | None = None, scenario: Scenario | None = None) -> None:
+    def redesign(self, observers: Sequence[str] | None = None, *, scenario: Scenario | None = None) -> None:
         """Design observers anew beside the loop; each goes on where the one before is.
 
         Parameters

@@ -52,6 +52,7 @@ class LoopController:
         controller: str,
         prior: str,
         dt: float,
+        *,
         delay: float = 2.0,
         scale: float = 1.0,
         settings: Mapping[str, Any] | None = None,

@@ -60,7 +60,7 @@ def make_filter() -> type:
             precision: Any = None,
         ):
             super().__init__(n_modes, delay=delay, target_device_idx=target_device_idx, precision=precision)
-            self._law = LoopController(n_modes, controller, prior, float(simul_params.time_step), delay + 1.0, scale)
+            self._law = LoopController(n_modes, controller, prior, float(simul_params.time_step), delay=delay + 1.0, scale=scale)
             self._sensor_gain = gain
 
         def trigger_code(self) -> None:

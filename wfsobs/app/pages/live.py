@@ -81,7 +81,9 @@ class LivePage(PageActions):
             self.buttons[name].on_click(lambda _event, act=act: self._do(act))
         self.controls.speed.param.watch(lambda event: self._do(lambda loop: loop.set_speed(event.new)), "value")
         for field in (c.lasers, c.ngs, c.losses):
-            field.param.watch(lambda _: self._do(lambda loop: loop.lose(c.lasers.value, c.ngs.value, c.losses.value)), "value")
+            field.param.watch(
+                lambda _: self._do(lambda loop: loop.lose(lgs=c.lasers.value, ngs=c.ngs.value, loss=c.losses.value)), "value"
+            )
         self.controls.running.param.watch(self._switch, "value")
         self.work.param.watch(self._say, ["state", "place", "message", "latest"])
         self.store.param.watch(self._follow, "scenario")
