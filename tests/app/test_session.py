@@ -10,14 +10,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from bokeh.application import Application
-from bokeh.models import Range1d
-from bokeh.server.contexts import ApplicationContext
-from bokeh.util.token import generate_jwt_token, generate_session_id
-from panel.custom import DataEvent, JSComponent
-from panel.io.state import set_curdoc
-from panel.io.state import state as pn_state
-from tornado.ioloop import IOLoop
 
 from wfsobs.app import session
 
@@ -71,49 +63,3 @@ def test_what_is_known_goes_with_the_page(monkeypatch: pytest.MonkeyPatch) -> No
     assert done == ["result"]
     loaded[0]()
     assert done == ["result", "next"] and page.callbacks == []
-
-
-class Setter(JSComponent):
-    """Sets the start of a range to what the page says."""
-
-    _esm = "export function render() {}"
-
-    def __init__(self, where: Range1d):
-        super().__init__()
-        self._where = where
-
-    def _handle_msg(self, data: float) -> None:
-        self._where.update(start=data)
-
-
-def test_an_event_after_a_change_on_its_way_may_change_figures(caplog: pytest.LogCaptureFixture) -> None:
-    """A field waits a while for further keys; Panel would answer the event before without the lock of the document."""
-    session.lock_events()
-    session.lock_events()  # by every session
-    where, answered = Range1d(), []
-
-    async def change() -> None:
-        answered.append("change")
-
-    async def main() -> None:
-        name = generate_session_id()
-        server = ApplicationContext(Application(), io_loop=IOLoop.current())
-        page = await server.create_session_if_needed(name, token=generate_jwt_token(name))
-        setter = Setter(where)
-
-        def build() -> None:
-            with set_curdoc(page.document):
-                page.document.add_root(setter.get_root(page.document))
-                page.document.add_root(where)
-
-        await page.with_document_locked(build)
-        pn_state._change_callbacks[page.document] = {"one": change}
-        await page.with_document_locked(lambda: setter._server_event(page.document, DataEvent(None, 3.0)))
-        for _ in range(1000):  # as many turns of the loop as the answer takes
-            if where.start == 3.0:
-                break
-            await asyncio.sleep(0.005)
-
-    asyncio.run(main())
-    assert (where.start, answered) == (3.0, ["change"])
-    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []

@@ -50,6 +50,29 @@ def test_nothing_moves_under_the_pointer(open_page: Any, server: Any) -> None:
     expect(page.get_by_text("Copied the link.")).to_have_count(0)
 
 
+TOLD_TWICE = """async () => {
+  const doc = Bokeh.index.roots[0].model.document
+  const {data} = [...doc._all_models.values()].find((m) => m.type.endsWith("ReactComponent") && m.data?.label === "Preset")
+  const tell = (text) => doc.apply_json_patch(
+    {events: [{kind: "ModelChanged", model: {id: data.id}, attr: "helper_text", new: text}]})
+  tell("the older")
+  tell("the newer")
+  data.setv({helper_text: "the older"})
+  const late = data.helper_text
+  await new Promise((done) => setTimeout(done, 500))
+  const settled = data.helper_text
+  data.setv({helper_text: "a third"})
+  return [late, settled, data.helper_text]
+}"""
+"""A text that the server changes twice, and what Panel's React components do on a busy page: they give back the first after the
+second has come. What a component itself sets is another matter."""
+
+
+def test_what_is_told_twice_stays_at_the_second(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK)
+    assert page.evaluate(TOLD_TWICE) == ["the newer", "the newer", "a third"]
+
+
 def test_a_comma_gets_a_hint(open_page: Any, server: Any) -> None:
     page = open_page(url=server.url + QUICK)
     box = page.get_by_role("textbox", name="m/s")

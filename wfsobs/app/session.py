@@ -14,27 +14,17 @@ from typing import Any
 from urllib.parse import quote, urlencode
 
 import panel as pn
-from panel.io.document import with_lock
-from panel.reactive import Syncable
 
 from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.mends import mend_panel
 from wfsobs.app.service import Post
 
 log = logging.getLogger(__name__)
 
 
-def lock_events() -> None:
-    """Have every event of a page answered under its document's lock.
-
-    While a changed property is on its way, Panel answers an event without it, and a figure that is changed then raises.
-    """
-    if not getattr(Syncable._event_coroutine, "lock", False):
-        Syncable._event_coroutine = with_lock(Syncable._event_coroutine)
-
-
 def session_page(build: Callable[[Post], Dashboard]) -> Any:
     """Build the page of a new session; one with the error where it cannot be built."""
-    lock_events()
+    mend_panel()
     try:
         post = Poster()
         dashboard = build(post)

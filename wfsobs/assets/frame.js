@@ -63,6 +63,40 @@ function layOutOnceAFrame() {
 }
 layOutOnceAFrame()
 
+// A React component gives what the server sets back to its model a moment later. By then the server may have set something newer,
+// which the older would undo, on the page and in the server. What comes back is left out; it is what the model had been given.
+const ECHO_MS = 2000
+function ignoreEchoes(view) {
+  const data = view.model.data
+  if (!data || Object.hasOwn(data, "setv")) return
+  const set = data.setv, given = new Map()
+  const due = (name) => (given.get(name) ?? []).filter((it) => performance.now() - it.at < ECHO_MS)
+  data.setv = function (changes, options = {}) {
+    const names = Object.keys(changes)
+    if (options.sync === false) {
+      set.call(this, changes, options)
+      for (const name of names) given.set(name, [...due(name), {value: this.attributes[name], at: performance.now()}])
+      return
+    }
+    const echoes = names.length === 1 ? due(names[0]) : []
+    const which = echoes.findIndex((it) => it.value === changes[names[0]])
+    for (const name of names) given.set(name, which < 0 ? [] : echoes.slice(which + 1))
+    if (which < 0) set.call(this, changes, options)
+  }
+}
+function ignoreAllEchoes() {
+  const kind = Bokeh.Models.get("panel.models.esm.ReactComponent").prototype.default_view.prototype
+  if (kind.ignoresEchoes) return
+  const initialize = kind.initialize
+  kind.ignoresEchoes = true
+  kind.initialize = function () {
+    initialize.call(this)
+    ignoreEchoes(this)
+  }
+  for (const view of Bokeh.index.query((it) => it.model.type === "panel.models.esm.ReactComponent")) ignoreEchoes(view)
+}
+ignoreAllEchoes()
+
 // What the first picture does not need is made when it stands: when its figures have been painted, or a page has none.
 const PATIENCE = 1500, STEP = 30
 function tellDrawn(model) {
