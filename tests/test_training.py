@@ -147,6 +147,7 @@ def test_what_cannot_be_trained_on_is_refused_with_a_line(
     monkeypatch.chdir(files)
     done = call(*command, "night.npz", *options, *SET)
     assert done.exit_code == 2 and reason in done.stderr.splitlines()[-1]
+    assert "wfsobs: training data:" not in done.stderr
 
 
 def test_observe_says_what_it_was_trained_on(night: Record, files: Path) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import click
 
+from wfsobs.priors_from.training import training_part
 from wfsobs.record import DELAY, Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
@@ -92,14 +93,15 @@ def training_options(command: Callable) -> Callable:
 def training(
     train: str | None, train_until: float | None, record: Record, scenario: Scenario, declaration: DeclaredFormat
 ) -> Record | float | None:
-    """Read what --train and --train-until name, and say it on standard error. Raises SettingError, RecordError."""
+    """Read and check what --train and --train-until name, and say it on standard error. Raises SettingError, RecordError."""
     if train is not None and train_until is not None:
         raise SettingError("--train and --train-until: give one of them")
     if train is not None:
-        other = load_declared(train, scenario, declaration)
+        other = training_part(record, load_declared(train, scenario, declaration), scenario)
         click.echo(f"wfsobs: training data: {train}, {other.n_steps * other.dt:g} s; no score is of it", err=True)
         return other
     if train_until is not None:
+        training_part(record, train_until, scenario)
         what = f"the first {train_until:g} s of {record.n_steps * record.dt:g} s"
         click.echo(f"wfsobs: training data: {what}; estimates and scores begin after", err=True)
     return train_until

@@ -38,12 +38,17 @@ def with_training(record: Record, train: Record | float, scenario: Scenario) -> 
         The other record has another rate, number of modes or delay, is the record itself, or either has too few samples or an
         impossible duration.
     """
+    whole = fill_missing(training_part(record, train, scenario), Prior())
+    return replace(record, training=Training(whole.y_lgs, whole.u, whole.open_loop_y).copy())
+
+
+def training_part(record: Record, train: Record | float, scenario: Scenario) -> Record:
+    """Return the training data of `with_training` as a record. Raises RecordError as that does."""
     other = _other(record, train) if isinstance(train, Record) else _first(record, train)
     g = scenario.gpr_offline
     if other.n_steps < (needed := g.depth + g.training_size):
         raise RecordError(f"the training data has {other.n_steps} steps; gpr_offline.depth + training_size need {needed}")
-    whole = fill_missing(other, Prior())
-    return replace(record, training=Training(whole.y_lgs, whole.u, whole.open_loop_y).copy())
+    return other
 
 
 def trained_until(train: Record | float | None) -> float:
