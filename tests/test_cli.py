@@ -81,8 +81,12 @@ def test_a_saved_record_gives_the_same_numbers(tmp_path):
     first = call("run", *QUICK, "--json", "--save", str(record))
     second = call("observe", str(record), *QUICK, "--json", "--out", str(estimates))
     assert second.exit_code == 0
-    without_seed = [[{k: v for k, v in row.items() if k != "seed"} for row in observed(r)] for r in (first, second)]
-    assert without_seed[0] == without_seed[1]
+    same = [[{k: v for k, v in row.items() if k not in ("seed", "needs")} for row in observed(r)] for r in (first, second)]
+    assert same[0] == same[1]
+    # Who observes a file is not told by what it was simulated from.
+    needs = [{row["observer"]: row["needs"] for row in observed(r)} for r in (first, second)]
+    assert needs[0]["kf-multi"] == "model, true lines" and needs[1]["kf-multi"] == "model, given lines"
+    assert needs[1] == {observer: text.replace("true", "given") for observer, text in needs[0].items()}
     with np.load(estimates, allow_pickle=False) as file:
         keys = {f"{o.id}/{t}" for o in OBSERVERS.values() for t in o.targets}
         assert set(file.files) == keys
@@ -201,5 +205,7 @@ def test_the_file_of_an_identification_is_all_that_telemetry_needs(tmp_path):
 
     as_prior, without = errors("--prior", found, *light), errors(*light)
     assert as_prior == errors("--config", found, *light) and as_prior.keys() == without.keys()
+    table = call("observe", record, "--prior", found, *light).stdout
+    assert "model, identified lines" in table and "true" not in table.replace("truth", "")
     moved = {key[0] for key, value in as_prior.items() if value != without[key]}
     assert moved == {"kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi", "gp-lgs", "gp-both"}

@@ -163,7 +163,9 @@ def test_loop_counts_what_follows_the_training_data(night: Record, files: Path) 
     chosen = [word for name in names for word in ("--controller", name)]
     done = call("loop", "--record", files / "night.npz", "--train-until", "0.8", "--json", *chosen, *SET)
     assert done.exit_code == 0 and "training data: the first 0.8 s" in done.stderr
-    got = {(r["controller"], r["mode"]): r["residual_rms_nm"] for r in json.loads(done.stdout)}
+    rows = json.loads(done.stdout)
+    assert {r["needs"] for r in rows if r["controller"] == "integrator"} == {"given spectra"}
+    got = {(r["controller"], r["mode"]): r["residual_rms_nm"] for r in rows}
     brought = replace(night, training=Training(night.y_lgs[:800], night.u[:800], night.open_loop_y[:800]))  # type: ignore[index]
     for outcome in closed_loop(brought, design(S, names)).outcomes:
         assert outcome.residual is not None

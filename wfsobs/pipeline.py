@@ -14,6 +14,7 @@ from wfsobs.evaluation.scores import score
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.estimates import Estimate
+from wfsobs.prior import GIVEN, IDENTIFIED, TRUE, PriorSource
 from wfsobs.priors_from.identification import told_by
 from wfsobs.priors_from.scenario import as_sampled
 from wfsobs.priors_from.training import trained_until, with_training
@@ -132,7 +133,8 @@ def observe(
         else:
             estimates.append(_from(item, round(start / record.dt)))
     least = record_bounds(scenario, record) if is_simulated else []
-    return collect(scenario, record, estimates, failures, watch, least, start)
+    source = IDENTIFIED if prior is not None else TRUE if is_simulated else GIVEN
+    return collect(scenario, record, estimates, failures, watch, least, start, source)
 
 
 def _from(estimate: Estimate, first: int) -> Estimate:
@@ -160,10 +162,12 @@ def collect(
     watch: Watch = QUIET,
     least: Sequence[Bound] = (),
     start: float = 0.0,
+    source: PriorSource = TRUE,
 ) -> Result:
     """Score estimates, and return a Result in the order of the registry, the bounds last. Raises Cancelled.
 
-    start : from which samples count [s], or from the end of the warm-up
+    start  : from which samples count [s], or from the end of the warm-up
+    source : where the prior of the observers comes from
     """
     warm_up = max(scenario.run.warm_up, start)
     order = {name: i for i, name in enumerate(OBSERVERS)}
@@ -175,4 +179,5 @@ def collect(
     if known:
         scores.sort(key=lambda s: (order[s.observer], s.target))
     scores += bound_scores(least, record, scores, warm_up)
-    return Result(scenario, record, tuple(ordered), tuple(scores), tuple(sorted(failures, key=lambda f: order[f.observer])))
+    failed = tuple(sorted(failures, key=lambda f: order[f.observer]))
+    return Result(scenario, record, tuple(ordered), tuple(scores), failed, source)

@@ -9,6 +9,7 @@ from wfsobs.evaluation.rows import score_rows
 from wfsobs.evaluation.scores import Score
 from wfsobs.notebook import html_table
 from wfsobs.observers.estimates import Estimate
+from wfsobs.prior import TRUE, PriorSource
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 
@@ -40,6 +41,8 @@ class Result:
         One per observer, target and mode; the bounds last.
     failures : tuple of Failure
         Observers without an estimate.
+    prior_source : {"true", "identified", "given"}
+        Where the prior of the observers comes from: the settings of the simulation, an identification, or settings alone.
     """
 
     scenario: Scenario
@@ -47,6 +50,7 @@ class Result:
     estimates: tuple[Estimate, ...]
     scores: tuple[Score, ...]
     failures: tuple[Failure, ...] = ()
+    prior_source: PriorSource = TRUE
 
     def __repr__(self) -> str:
         left_out = f", {len(self.failures)} left out" if self.failures else ""
@@ -72,7 +76,7 @@ class Result:
         """
         import pandas
 
-        return pandas.DataFrame(score_rows(self.scores, self.scenario.run.seed))
+        return pandas.DataFrame(score_rows(self.scores, self.scenario.run.seed, self.prior_source))
 
     def estimate(self, observer: str, target: str) -> Estimate | None:
         """Return the estimate of one observer and target.

@@ -121,7 +121,7 @@ def observers() -> str:
     for o in OBSERVERS.values():
         rows = (
             ("Estimates", ", ".join(o.targets)),
-            ("Needs beside measurements", o.needs_text),
+            ("Needs beside measurements", o.needs_text()),
             ("Needs of a record", listed(("y_lgs", "u", *o.needs) if o.id != "zero" else ())),
             ("Causal", "yes" if o.causal else "no: a reference that looks ahead"),
             ("Computing time, Kalman filter = 1", f"{o.weight:g}"),

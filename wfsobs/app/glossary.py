@@ -33,7 +33,9 @@ TERMS: Mapping[str, str] = MappingProxyType(
             "Smallest RMS error that a causal linear observer of the mean LGS measurement, or of both sensors, can have, from "
             "the true spectra (Wiener). It is a mean over records: on one record an observer may come out a little below."
         ),
-        NEEDS: ("What an observer must be given beside measurements: a model, the true lines, frequency bands or training data."),
+        NEEDS: (
+            "What an observer must be given beside measurements: a model, vibration lines, frequency bands or training data."
+        ),
         LAG: "Delay of the estimate: where its cross-correlation with the truth has its maximum. Negative if the estimate leads.",
         REAL_TIME: "Computing time per step over the period of the loop. Below 1 the observer is fast enough for it.",
         STATED: (

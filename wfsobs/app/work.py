@@ -25,6 +25,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import SLOW, TARGETS
 from wfsobs.observers.estimates import Estimate
 from wfsobs.pipeline import as_stated, collect
+from wfsobs.prior import GIVEN, TRUE
 from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.result import Failure
@@ -137,7 +138,8 @@ class _Work:
 
     def _so_far(self, record: Record) -> RunResults:
         least = self.bounds or ()
-        result = collect(self.scenario, record, self.estimates, self.failures, least=least)
+        told = TRUE if self.source is None else GIVEN
+        result = collect(self.scenario, record, self.estimates, self.failures, least=least, source=told)
         partial = {key: values.copy() for key, values in self.growing.items()}
         ran = tuple(name for name in OBSERVERS if name not in self.known_estimates.known_observers)
         return RunResults(result, partial, dict(self.spectra), perf_counter() - self.start_time, self.source, least, ran)

@@ -123,7 +123,8 @@ def needs_of(entry: ArenaEntry, track: Track) -> str:
     if not isinstance(algorithm, Observer):
         return algorithm.needs_text(own_settings(algorithm, Scenario()))
     identified = algorithm.needed_parts and track.target == NEXT
-    return f"{algorithm.needs_text}, identified".replace("true ", "") if identified else algorithm.needs_text
+    text = algorithm.needs_text()
+    return f"{text}, identified".replace("true ", "") if identified else text
 
 
 def source_of(entry_id: str) -> str:

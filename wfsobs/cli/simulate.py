@@ -27,6 +27,7 @@ from wfsobs.evaluation.rows import Row, score_rows
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import as_stated
 from wfsobs.pipeline import observe as observe_record
+from wfsobs.prior import GIVEN
 from wfsobs.priors_from.training import trained_until, with_training
 from wfsobs.progress import Watch
 from wfsobs.scenario import configfile
@@ -151,7 +152,7 @@ def loop(
             one = scenario.replace({"run.seed": scenario.run.seed + i})
             given = simulate(one) if record is None else record
             result = closed_loop(given, plan, Watch(progress=lambda f, i=i: update((i + f) / seeds)))
-            all_rows += loop_rows(result, one.run.seed if record is None else None)
+            all_rows += loop_rows(result, one.run.seed) if record is None else loop_rows(result, None, GIVEN)
     if as_json:
         click.echo(json.dumps(all_rows, allow_nan=False))
     else:

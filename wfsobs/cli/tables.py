@@ -7,7 +7,7 @@ from statistics import median
 
 from rich.table import Table
 
-from wfsobs.evaluation.rows import TIME, Row, interval_text, is_non_causal, own_interval, row_label, row_needs, scored_interval
+from wfsobs.evaluation.rows import TIME, Row, interval_text, is_non_causal, own_interval, row_label, scored_interval
 from wfsobs.evaluation.scores import RESIDUAL
 
 
@@ -40,7 +40,7 @@ def score_table(rows: Sequence[Row]) -> Table:
             target,
             mode,
             row_label(observer) + (" (looks ahead)" if is_non_causal(observer) else "") + _own(same),
-            row_needs(observer),
+            same[0]["needs"],
             f"{median(errors):.2f}",
             *((f"{min(errors):.2f} - {max(errors):.2f}",) if several else ()),
             *((interval_text(same[0]["interval_um"], 1e3),) if bounded else ()),

@@ -58,14 +58,16 @@ def observe(
     record = load_declared(record_file, scenario, stated, sha256)
     learnt = training(train, train_until, record, scenario, stated)
     with progress_bar() as update:
-        result = observe_record(record, scenario, train=learnt, watch=Watch(progress=update))
+        result = observe_record(
+            record, scenario, prior=None if prior is None else scenario, train=learnt, watch=Watch(progress=update)
+        )
     warn(result)
     if out:
         save_arrays(out, {f"{e.observer}/{e.target}": e.values for e in result.estimates})
     if not result.scores and not as_json:
         click.echo(f"wfsobs: {record_file}: {len(result.estimates)} estimates, no scores: nothing after the warm-up", err=True)
         return
-    show(score_rows(result.scores, None), as_json)
+    show(score_rows(result.scores, None, result.prior_source), as_json)
 
 
 @click.command()

@@ -11,7 +11,7 @@ from wfsobs.closed_loop.run import ClosedLoop, residual_rms, strehl
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import NOT_OBSERVERS, Row
 from wfsobs.evaluation.scores import BOUNDS
-from wfsobs.observers.base import SPECTRA
+from wfsobs.prior import TRUE, PriorSource, Spectra, words_for
 from wfsobs.priors_from.controllers import own_settings
 from wfsobs.scenario import Scenario
 from wfsobs.units import micrometres_per
@@ -22,7 +22,7 @@ LIMITED = "theory and margins are not applicable: a limit of the mirror acts, an
 NOT_APPLICABLE = "n/a"
 
 
-def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
+def rows(result: ClosedLoop, seed: int | None, source: PriorSource = TRUE) -> list[Row]:
     """One plain dictionary per controller and mode, the bounds last: the keys of `wfsobs loop --json`.
 
     residual_rms_nm, residual_rms_mas, strehl : of the simulation after the warm-up, null where the loop is not stable or could
@@ -31,6 +31,7 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
     gain_margin_db, phase_margin_deg, delay_margin_ms : null where a loop has no frequency response or no such limit
     limited : share of the steps in which a limit of the mirror changed the command. Where it is above 0 the loop is not the
         linear one that theory and margins are of: these are null, and `note` says why
+    source : where the prior of the controllers comes from
     """
     plan, warm_up = result.design, result.design.start
     modes = result.scenario.modes
@@ -66,7 +67,7 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
             out.append(
                 row(
                     outcome.controller,
-                    controller_needs(outcome.controller, result.scenario),
+                    controller_needs(outcome.controller, result.scenario, source),
                     mode,
                     outcome.stable[mode],
                     left,
@@ -79,14 +80,15 @@ def rows(result: ClosedLoop, seed: int | None) -> list[Row]:
                     note=outcome.note or (LIMITED if limited else ""),
                 )
             )
+    (spectra,) = words_for((Spectra,), source)
     for bound, left in plan.bounds.items():
-        out += [row(bound, SPECTRA, mode, True, left) for mode in range(len(modes))]
+        out += [row(bound, spectra, mode, True, left) for mode in range(len(modes))]
     return out
 
 
-def controller_needs(controller: str, scenario: Scenario) -> str:
-    """Return what a controller needs beside measurements, for people."""
-    return CONTROLLERS[controller].needs_text(own_settings(CONTROLLERS[controller], scenario))
+def controller_needs(controller: str, scenario: Scenario, source: PriorSource = TRUE) -> str:
+    """Return what a controller needs beside measurements, for people; source : where its prior comes from."""
+    return CONTROLLERS[controller].needs_text(own_settings(CONTROLLERS[controller], scenario), source)
 
 
 def label(controller: str) -> str:

@@ -28,7 +28,7 @@ from wfsobs.observers.base import NOTHING, PLAIN, Look
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
 from wfsobs.observers.step_checks import StepError
-from wfsobs.prior import PARTS, Bands, Part, Prior
+from wfsobs.prior import TRUE, Bands, Part, Prior, PriorSource, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling
 from wfsobs.settings import Section
@@ -114,9 +114,9 @@ class Controller:
         """Return what it needs beside measurements for these settings."""
         return tuple(dict.fromkeys((*self.asks(settings), *self.prior)))
 
-    def needs_text(self, settings: Settings) -> str:
-        """Return what it needs beside measurements, for people."""
-        return ", ".join(dict.fromkeys(word for part in self.parts(settings) for word in PARTS[part])) or NOTHING
+    def needs_text(self, settings: Settings, source: PriorSource = TRUE) -> str:
+        """Return what it needs beside measurements, for people; source : where its prior comes from."""
+        return ", ".join(words_for(self.parts(settings), source)) or NOTHING
 
     def laws(self, prior: Prior, plant: Plant, settings: Settings, n_modes: int) -> tuple[Law, ...]:
         """One law per mode, none for control by nothing. Raises ValueError saying why there is none."""

@@ -8,6 +8,7 @@ from typing import Any
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, LOOP, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import SPECTRA
+from wfsobs.prior import TRUE, PriorSource
 
 Row = dict[str, Any]
 
@@ -22,8 +23,11 @@ NO_ESTIMATE = "zero"
 """The observer that stands for having none; it is never the best, nor worse than itself."""
 
 
-def score_rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
-    """Return one plain dictionary per score: the keys of `wfsobs run --json`, and TIME."""
+def score_rows(scores: Iterable[Score], seed: int | None, source: PriorSource = TRUE) -> list[Row]:
+    """Return one plain dictionary per score: the keys of `wfsobs run --json`, and TIME.
+
+    source : where the prior of the observers comes from
+    """
     return [
         {
             "observer": s.observer,
@@ -36,7 +40,7 @@ def score_rows(scores: Iterable[Score], seed: int | None) -> list[Row]:
             "start_s": s.start,
             "stop_s": s.stop,
             "apart": s.apart,
-            "needs": row_needs(s.observer),
+            "needs": row_needs(s.observer, source),
             "interval_um": None if s.interval is None else list(s.interval),
             "phases_um": None if s.phases is None else list(s.phases),
             **_calibration(s),
@@ -63,11 +67,11 @@ def row_label(observer: str) -> str:
     return NOT_OBSERVERS.get(observer) or OBSERVERS[observer].label
 
 
-def row_needs(observer: str) -> str:
-    """Return what a row needs beside measurements; a bound needs the true spectra."""
+def row_needs(observer: str, source: PriorSource = TRUE) -> str:
+    """Return what a row needs beside measurements, from this source; a bound needs the true spectra."""
     if observer in NOT_OBSERVERS:
         return SPECTRA if observer in BOUNDS else ""
-    return OBSERVERS[observer].needs_text
+    return OBSERVERS[observer].needs_text(source)
 
 
 def can_be_best(observer: str, apart: bool) -> bool:

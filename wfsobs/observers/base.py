@@ -14,7 +14,7 @@ from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
 from wfsobs.observers.step import MakeEstimator, StepObserver
 from wfsobs.observers.step_checks import StepError
-from wfsobs.prior import PARTS, Part, Prior
+from wfsobs.prior import TRUE, Part, Prior, PriorSource, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Record, Sampling, hold_last
 from wfsobs.settings import Group, Section
@@ -229,10 +229,9 @@ class Observer:
 
     @property
     def needed_parts(self) -> tuple[str, ...]:
-        """What it has to be told beside measurements, of the words above."""
-        return tuple(dict.fromkeys(word for part in self.prior for word in PARTS[part]))
+        """What it has to be told of a simulation beside measurements, of the words above."""
+        return words_for(self.prior)
 
-    @property
-    def needs_text(self) -> str:
-        """What it has to be told beside measurements, for people."""
-        return ", ".join(self.needed_parts) or NOTHING
+    def needs_text(self, source: PriorSource = TRUE) -> str:
+        """Return what it has to be told beside measurements, for people; source : where its prior comes from."""
+        return ", ".join(words_for(self.prior, source)) or NOTHING

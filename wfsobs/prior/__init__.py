@@ -2,26 +2,62 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 from wfsobs.prior.parts import Bands, Beams, LgsError, Line, Lines, Model, Spectra
 from wfsobs.record import Training
 
-__all__ = ["PARTS", "Bands", "Beams", "LgsError", "Line", "Lines", "Model", "Part", "Prior", "Spectra", "Training"]
+__all__ = [
+    "GIVEN",
+    "IDENTIFIED",
+    "TRUE",
+    "Bands",
+    "Beams",
+    "LgsError",
+    "Line",
+    "Lines",
+    "Model",
+    "Part",
+    "Prior",
+    "PriorSource",
+    "Spectra",
+    "Training",
+    "words_for",
+]
+
+PriorSource = Literal["true", "identified", "given"]
+"""Where lines and spectra of a prior come from."""
+TRUE: PriorSource = "true"
+"""From the settings that the record was simulated from."""
+IDENTIFIED: PriorSource = "identified"
+"""From an identification."""
+GIVEN: PriorSource = "given"
+"""From settings, on a record that was not simulated from them."""
 
 Part = type[Model] | type[LgsError] | type[Lines] | type[Beams] | type[Bands] | type[Spectra] | type[Training]
 """A kind of thing that an observer or a controller can ask for."""
 
-PARTS: dict[Part, tuple[str, ...]] = {
+_WORDS: dict[Part, tuple[str, ...]] = {
     Model: ("model",),
     LgsError: ("model",),
-    Lines: ("model", "true lines"),
+    Lines: ("model", "{source} lines"),
     Beams: ("model",),
     Bands: ("bands",),
-    Spectra: ("true spectra",),
+    Spectra: ("{source} spectra",),
     Training: ("training data",),
 }
-"""Part -> what it is called in the column "Needs"."""
+"""Part -> what it is called in the column "Needs", by the source of the prior."""
+
+
+def words_for(parts: Iterable[Part], source: PriorSource = TRUE) -> tuple[str, ...]:
+    """Return what parts of a prior are called in the column "Needs", each word once.
+
+    >>> words_for((Model, Lines), IDENTIFIED)
+    ('model', 'identified lines')
+    """
+    return tuple(dict.fromkeys(word.format(source=source) for part in parts for word in _WORDS[part]))
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ class Table:
                 *self._compared_cells(score.observer, score.target, score),
                 number(score.truth_rms * scale),
                 number(score.normalised_rms),
-                row_needs(score.observer),
+                row_needs(score.observer, shown.result.prior_source),
                 NOTHING,
                 *_times(score, shown.result.record.dt),
                 NOTHING,
@@ -134,7 +134,8 @@ class Table:
 
     def _row(self, name: str, target: str, score: Score | None, mark: Markup) -> Row:
         shown, compared = self.run.result, self._compared_cells(name, target, score)
-        cells = [NOTHING, *compared, *[NOTHING] * 2, row_needs(name), *[NOTHING] * 4]
+        needs = row_needs(name, shown.result.prior_source) if shown else row_needs(name)
+        cells = [NOTHING, *compared, *[NOTHING] * 2, needs, *[NOTHING] * 4]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
             cells = [
@@ -146,7 +147,7 @@ class Table:
                 *compared,
                 number(score.truth_rms * scale),
                 (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
-                row_needs(name),
+                needs,
                 NOTHING if score.lag is None else f"{1e3 * score.lag:.2f}".replace("-", "−"),
                 *_times(score, shown.result.record.dt),
                 NOTHING if score.calibration is None else number(score.calibration.sd * scale),
