@@ -1,8 +1,10 @@
-"""The tables of docs/events.md: `python docs/scripts/events.py [seeds] [preset or "bridged" ...]`."""
+"""The tables of docs/events.md: `python docs/scripts/events.py [seeds] [preset or "bridged" ...] [--observers ID,ID...]`."""
 
 from __future__ import annotations
 
-import sys
+import argparse
+from collections.abc import Sequence
+from functools import partial
 from itertools import groupby
 
 import numpy as np
@@ -25,12 +27,12 @@ WINDOW = 2.0
 LEFT_OUT = ("zero", "ridge", "persistence")
 
 
-def tables(preset: str, seeds: int) -> str:
+def tables(preset: str, seeds: int, observers: Sequence[str] | None) -> str:
     """Error on tip before, at its worst after and at the end, and the recovery time, as Markdown."""
     scenario = PRESETS[preset]()
     history = OverTime(scenario, WINDOW)
     for seed in range(1, seeds + 1):
-        history.add(run(scenario.replace({"run.seed": seed})), seed)
+        history.add(run(scenario.replace({"run.seed": seed}), observers=observers), seed)
     out = [f"`{preset}`, tip, rms over {WINDOW:g} s, {seeds} seeds together:\n"]
     lines = [line for line in history.recoveries() if line[0] in CASES[preset] and line[1] == "tip" and line[3] not in LEFT_OUT]
     for (target, _, event), group in groupby(lines, key=lambda line: line[:3]):
@@ -40,13 +42,14 @@ def tables(preset: str, seeds: int) -> str:
     return "\n".join(out)
 
 
-def bridged(seeds: int) -> str:
+def bridged(seeds: int, observers: Sequence[str] | None) -> str:
     """Error on tip within the lost frames of `lost-frames`, and over that of the same records with all their frames."""
     scenario = PRESETS["lost-frames"]()
     stretches = [(e.start, e.start + e.duration) for e in scenario.events]
     squares: dict[tuple[str, str, int], list[tuple[float, float]]] = {}
     for seed in range(1, seeds + 1):
-        pair = [run(scenario.replace({"run.seed": seed, **change})) for change in ({}, {"events": []})]
+        changes = ({"run.seed": seed}, {"run.seed": seed, "events": []})
+        pair = [run(scenario.replace(change), observers=observers) for change in changes]
         for lossy, whole in zip(*(result.estimates for result in pair), strict=True):
             truth = getattr(pair[0].record, lossy.target)
             for i, stretch in enumerate(stretches):
@@ -62,6 +65,11 @@ def bridged(seeds: int) -> str:
 
 
 if __name__ == "__main__":
-    number, *chosen = sys.argv[1:] or ["20"]
-    for one in chosen or [*CASES, "bridged"]:
-        print(bridged(int(number)) if one == "bridged" else tables(one, int(number)))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("seeds", type=int, nargs="?", default=20)
+    parser.add_argument("what", nargs="*", default=[*CASES, "bridged"])
+    parser.add_argument("--observers", type=lambda text: text.split(","), help="these alone; all unless told")
+    given = parser.parse_args()
+    for one in given.what:
+        make = bridged if one == "bridged" else partial(tables, one)
+        print(make(given.seeds, given.observers))
