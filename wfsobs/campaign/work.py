@@ -8,6 +8,7 @@ import socket
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from time import perf_counter, time
 from typing import Any
@@ -202,6 +203,10 @@ def _failure(name: str, reason: str) -> Row:
     return {"name": name, "target": "", "mode": "", "rms_nm": None, "apart": False, "note": reason}
 
 
+@cache
 def blas_kernel() -> str:
-    """Return the kernel that the BLAS library of this process has chosen: the last digits depend on it."""
+    """Return the kernel that the BLAS library of this process has chosen: the last digits depend on it.
+
+    It is chosen once, and to ask takes as long as a tenth of a short run.
+    """
     return next((str(lib.get("architecture")) for lib in threadpool_info() if lib.get("user_api") == "blas"), "")

@@ -194,7 +194,7 @@ def print_table(folder: str, as_csv: bool, parquet: str | None) -> None:
         write_whole(parquet, lambda file: pq.write_table(add_settings(plan, rows), file))
         return
     if as_csv:
-        print_csv(plan, rows.to_pylist())
+        print_csv(plan, rows)
         return
     done = int(finished_runs(plan, Path(folder)).sum())
     show_table(summary_table(plan, rows, f"{plan.name}: {done} of {plan.n_runs} runs"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import sys
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
@@ -12,15 +13,22 @@ from wfsobs.campaign.plan import Campaign
 from wfsobs.campaign.store import RESULTS
 from wfsobs.evaluation.rows import NOT_OBSERVERS
 
+if TYPE_CHECKING:
+    import pyarrow
 
-def print_csv(plan: Campaign, rows: list[dict]) -> None:
+CHUNK = 10_000
+"""Rows that are Python objects at a time: these take far more memory than a table."""
+
+
+def print_csv(plan: Campaign, table: pyarrow.Table) -> None:
     """Print rows, with the settings of their scenarios; numbers with all their digits."""
     out = csv.writer(sys.stdout, lineterminator="\n")
-    columns = list(RESULTS)
-    out.writerow([*columns, *plan.axes])
-    for row in rows:
-        changes = plan.cells[row["cell"]].changes if row["cell"] < len(plan.cells) else {}
-        out.writerow([_text(row[c]) for c in columns] + [_text(changes.get(path)) for path in plan.axes])
+    columns, axes = list(RESULTS), plan.axes
+    out.writerow([*columns, *axes])
+    for part in table.to_batches(max_chunksize=CHUNK):
+        for row in part.to_pylist():
+            changes = plan.cells[row["cell"]].changes if row["cell"] < len(plan.cells) else {}
+            out.writerow([_text(row[c]) for c in columns] + [_text(changes.get(path)) for path in axes])
 
 
 def _text(value: object) -> object:
