@@ -95,16 +95,13 @@ class Cluster:
             self.add_worker()
         return [worker for nanny in self.nannies for worker in spawned(nanny.pid)]
 
-    def kill(self, worker: psutil.Process, with_nanny: bool) -> str:
-        """Kill a worker; with its nanny, start another one."""
-        nanny = next((n for n in self.nannies if n.pid == worker.ppid()), None) if with_nanny else None
-        if nanny is not None:
+    def kill_nanny(self, worker: psutil.Process) -> None:
+        """Kill the nanny of a worker, and start another one."""
+        for nanny in [n for n in self.nannies if worker in descendants(n.pid)]:
             nanny.kill()
             nanny.wait()
             self.nannies.remove(nanny)
             self.add_worker()
-        kill(worker)
-        return "worker and nanny" if nanny is not None else "worker"
 
     def close(self) -> None:
         """Kill all of it."""
@@ -145,6 +142,28 @@ def kill(process: psutil.Process) -> None:
         pass
 
 
+def kill_worker(worker: psutil.Process, cluster: Cluster | None) -> str:
+    """Kill a worker, and its nanny where a cluster is given; return what was killed."""
+    if cluster is not None:
+        cluster.kill_nanny(worker)
+    kill(worker)
+    return "worker" if cluster is None else "worker and nanny"
+
+
+class RowCounter:
+    """Counts the rows of files, each read once."""
+
+    def __init__(self) -> None:
+        self.known: dict[Path, int] = {}
+
+    def count(self, files: Sequence[Path]) -> int:
+        """Return the number of rows."""
+        import pyarrow.parquet as pq
+
+        self.known.update({f: pq.read_metadata(f).num_rows for f in files if f not in self.known})
+        return sum(self.known.values())
+
+
 class Bench:
     """One plan, run in several ways."""
 
@@ -163,22 +182,23 @@ class Bench:
         self,
         out: str,
         shares: Sequence[Sequence[str]],
-        moments: Sequence[float] = (),
+        moments: Sequence[int] = (),
         rng: np.random.Generator | None = None,
         cluster: Cluster | None = None,
     ) -> dict[str, Any]:
-        """Run all shares at once, kill something at the moments [s after the first rows], and return what happened."""
+        """Run all shares at once, kill something when so many rows are written, and return what happened."""
         started, running = time.monotonic(), [self.start(out, options) for options in shares]
         while not self.files(out) and all(p.poll() is None for p in running):
             time.sleep(0.02)
         first = time.monotonic()
         kills, errors = list[str](), list[str]()
-        client = int(rng.integers(len(moments))) if rng is not None else -1
+        client, counter = int(rng.integers(len(moments))) if rng is not None else -1, RowCounter()
         for i, moment in enumerate(moments):
-            while (alive := [p for p in running if p.poll() is None]) and time.monotonic() - first < moment:
-                time.sleep(0.02)
+            while (alive := [p for p in running if p.poll() is None]) and counter.count(self.files(out)) < moment:
+                time.sleep(0.1)
             if not alive or rng is None:
                 break
+            time.sleep(rng.uniform(0.0, self.batch))  # somewhere within a batch
             if i == client:
                 k = running.index(alive[rng.integers(len(alive))])
                 running[k].kill()
@@ -186,16 +206,12 @@ class Bench:
                 running[k] = self.start(out, shares[k])
                 kills.append("client")
                 continue
-            found = [w for w in (cluster.workers() if cluster else [w for p in alive for w in spawned(p.pid)]) if w.is_running()]
-            if not found:
-                kills.append("none: a worker was just starting")
-                continue
-            victim = found[rng.integers(len(found))]
-            if cluster:
-                kills.append(cluster.kill(victim, with_nanny=i % 3 == 2))
-            else:
-                kill(victim)
-                kills.append("worker")
+            while not (found := cluster.workers() if cluster else [w for p in alive for w in spawned(p.pid)]):
+                time.sleep(0.1)  # they are just starting
+                if all(p.poll() is not None for p in alive):
+                    break
+            if found:
+                kills.append(kill_worker(found[rng.integers(len(found))], cluster if i % 3 == 2 else None))
         said = []
         for k, process in enumerate(running):
             answer, trouble = process.communicate()
@@ -222,13 +238,11 @@ class Bench:
 
     def digest(self, out: str) -> dict[str, Any]:
         """Return the digest of a table, its rows, and how many were computed twice."""
-        import pyarrow.parquet as pq
-
         folder = self.folder / out
         command = [sys.executable, "-m", "wfsobs", "campaign", "table", str(folder), "--csv"]
         text = subprocess.run(command, env=ENVIRONMENT, check=True, stdout=subprocess.PIPE).stdout
         files = self.files(out)
-        rows, stored = text.count(b"\n") - 1, sum(pq.read_metadata(f).num_rows for f in files)
+        rows, stored = text.count(b"\n") - 1, RowCounter().count(files)
         return {"sha256": hashlib.sha256(text).hexdigest(), "rows": rows, "twice": stored - rows, "files": len(files)}
 
 
@@ -239,34 +253,35 @@ def do_batch(batch: Batch) -> tuple[float, float, float]:
     return summary.seconds, time.perf_counter() - start, time.thread_time() - cpu
 
 
-def measure_cost(workers: Workers, batches: Sequence[Batch], family: Callable[[], list[psutil.Process]]) -> dict[str, float]:
+def measure_cost(workers: Workers, batches: Sequence[Batch], family: Callable[[], dict[str, psutil.Process]]) -> dict[str, Any]:
     """Return the overhead of one worker over the compute of its batches; the first batch, with its imports, is not counted."""
     executor = workers.executor()
     executor.submit(do_batch, batches[0]).result()
-    cpu, start = cpu_seconds(family()), time.perf_counter()
+    before, start = cpu_seconds(family()), time.perf_counter()
     todo, running, done = list(batches[1:]), set[Any](), list[tuple[float, float, float]]()
     while todo or running:
         while todo and len(running) < AHEAD:
             running.add(executor.submit(do_batch, todo.pop()))
         finished, running = wait(running, return_when=FIRST_COMPLETED)
         done += [future.result() for future in finished]
-    wall, used = time.perf_counter() - start, cpu_seconds(family()) - cpu
+    wall, after = time.perf_counter() - start, cpu_seconds(family())
     workers.close()
     runs, inside, thread = (sum(values) for values in zip(*done, strict=True))
+    used = {name: after[name] - before[name] for name in after}
+    used["worker"] -= thread
     return {
         "batches": len(done),
         "batch_s": round(inside / len(done), 2),
         "batching_wall": round((inside - runs) / runs, 4),
         "all_wall": round((wall - runs) / runs, 4),
-        "all_cpu": round((used - thread) / thread, 4),
-        "cpu_ms_per_batch": round((used - thread) / len(done) * 1e3, 1),
+        "cpu": {name: round(seconds / thread, 4) for name, seconds in used.items()},
+        "compute_cpu_s": round(thread / len(done), 2),
     }
 
 
-def cpu_seconds(processes: Sequence[psutil.Process]) -> float:
+def cpu_seconds(processes: dict[str, psutil.Process]) -> dict[str, float]:
     """Return the processor time of processes [s]."""
-    times = [p.cpu_times() for p in processes]
-    return sum(t.user + t.system for t in times)
+    return {name: sum(p.cpu_times()[:2]) for name, p in processes.items()}
 
 
 def make_batches(plan: Campaign, folder: Path, seconds: float, count: int) -> list[Batch]:
@@ -323,8 +338,8 @@ def disturb(bench: Bench, kills: int, seed: int) -> None:
     say(whole | expected)
     say(bench.run("undisturbed", POOL) | {"part": "started again"})
 
-    def moments() -> list[float]:
-        return list(np.sort(rng.uniform(0.05, 0.85, kills)) * whole["since_first_rows_s"])
+    def moments() -> list[int]:
+        return [int(share * expected["rows"]) for share in np.sort(rng.uniform(0.02, 0.9, kills))]
 
     say_whether_same(bench.run("shares-killed", SHARES, moments(), rng), bench.digest("shares-killed"), expected)
     cluster = Cluster(bench.folder, 2)
@@ -345,12 +360,14 @@ def measure(folder: Path, batch: float, count: int) -> None:
     plan, me = parse_plan(TINY.format(seeds=1), folder), psutil.Process()
     (folder / "cost" / "rows").mkdir(parents=True, exist_ok=True)
     batches = make_batches(plan, folder / "cost", batch, count + 1)
-    say({"part": "pool"} | measure_cost(Processes(1), batches, lambda: [me, *spawned(me.pid)]))
+    say({"part": "pool"} | measure_cost(Processes(1), batches, lambda: {"client": me, "worker": spawned(me.pid)[0]}))
     cluster = Cluster(folder, 1)
     try:
-        pids = [cluster.scheduler.pid, cluster.nannies[0].pid]
-        everything = lambda: [me, *(psutil.Process(pid) for pid in pids), *cluster.workers()]  # noqa: E731
-        say({"part": "dask"} | measure_cost(DaskCluster(cluster.address), batches, everything))
+        here = {"client": me} | {
+            n: psutil.Process(p.pid) for n, p in (("scheduler", cluster.scheduler), ("nanny", cluster.nannies[0]))
+        }
+        family = lambda: here | {"worker": cluster.workers()[0]}  # noqa: E731
+        say({"part": "dask"} | measure_cost(DaskCluster(cluster.address), batches, family))
     finally:
         cluster.close()
 
