@@ -180,6 +180,17 @@ def test_shadow_writes_nothing(tmp_path: Path) -> None:
     assert summary["frames"] == 0 and summary["stuck"] == 1 and source.count == 0
 
 
+def test_a_semaphore_that_another_process_waits_for_is_left_to_it(tmp_path: Path) -> None:
+    source = SharedImage.create(tmp_path / "in.im.shm", (2,))
+    assert source._readers is not None
+    source._readers[:4] = 1  # a process of long standing
+    options = ["--shadow", "--observer", "kf-lgs", "--semaphore", "3", "--seconds", "0.1"]
+    done = CliRunner().invoke(main, ["attach", "--in", source.path, *options])
+    assert done.exit_code == 0, done.output
+    assert f"{source.path}: another process waits for semaphore 3; taking 4\n" in done.stderr
+    assert source._readers.tolist() == [1] * 4 + [0] * 6, "it is given back"
+
+
 @pytest.mark.parametrize(
     ("options", "reason"),
     [

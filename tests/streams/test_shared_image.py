@@ -1,6 +1,9 @@
 """Files of ImageStreamIO: read and written as a C program does, never half a frame, and refused in one line."""
 
+import os
 import struct
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -102,6 +105,33 @@ def test_a_semaphore_that_nobody_waits_for_stays_low(tmp_path: Path) -> None:
     while semaphore.wait(0.01):
         taken += 1
     assert taken == 10
+
+
+def test_two_readers_are_both_woken_by_every_frame(tmp_path: Path) -> None:
+    """Each claims a semaphore where ImageStreamIO has the ids of those who wait; one that has ended holds none."""
+    path = tmp_path / "a.im.shm"
+    writer = SharedImage.create(path, (4,))
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    # 4 float32, 10 semaphores and that of the log, and then the ids; a process of long standing has the first.
+    at = 384 + 16 + 11 * 32
+    struct.pack_into("<5i", writer._map, at, 1, ended.pid, -1, 0, 1)
+    readers = [SharedImage(path), SharedImage(path)]
+    numbers = [reader.claim(3) for reader in readers]
+    assert numbers == [3, 1]
+    assert struct.unpack_from("<10i", writer._map, at) == (1, os.getpid(), -1, os.getpid(), 1, 0, 0, 0, 0, 0)
+    for _ in range(5):
+        writer.write(np.ones(4))
+        for reader, number in zip(readers, numbers, strict=True):
+            semaphore = reader.semaphore(number)
+            assert semaphore is not None and semaphore.wait(10) and not semaphore.wait(0)
+    readers[0].release(3)
+    assert readers[1].claim(3) == 3
+    struct.pack_into("<10i", writer._map, at, *[1] * 10)
+    with pytest.raises(StreamError, match="semaphore 2: other processes wait for all 10"):
+        readers[0].claim(2)
+    with pytest.raises(StreamError, match="semaphore 10: it has 0 to 9"):
+        readers[0].claim(10)
 
 
 @pytest.mark.parametrize("layout", [CURRENT, OLDER])

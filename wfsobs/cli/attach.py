@@ -57,7 +57,10 @@ from wfsobs.units import UNITS, micrometres_per
     "--stuck", type=click.FloatRange(1e-3, 60), default=STUCK, show_default=True, metavar="S", help="Time without a frame."
 )
 @click.option(
-    "--semaphore", type=click.IntRange(0), metavar="N", help="Wait for this one of the stream; else the counter is watched."
+    "--semaphore",
+    type=click.IntRange(0),
+    metavar="N",
+    help="Wait for this one of the stream, or a free one; else the counter is watched.",
 )
 @click.option("--seconds", type=click.FloatRange(0, min_open=True), metavar="S", help="Duration; until Ctrl+C unless told.")
 @click.option("--json", "as_json", is_flag=True, help="At the end print one JSON object.")

@@ -12,6 +12,7 @@ import numpy as np
 
 from wfsobs.observers.step import StepObserver
 from wfsobs.streams.layout import StreamError
+from wfsobs.streams.semaphores import Semaphore
 from wfsobs.streams.shared_image import SharedImage
 from wfsobs.streams.tally import Tally
 from wfsobs.streams.watchdog import Safety, Watchdog
@@ -36,7 +37,7 @@ class Wiring:
     ahead    : frames from the newest measurement to the one that is to be met
     noise    : rms of the noise of a measurement, (n_modes,) [um]
     stuck    : time without a frame after which the stream is stuck [s]
-    semaphore : number of the semaphore that is waited for; None looks at the counter
+    semaphore : number of the semaphore that is waited for, where no other process does; None looks at the counter
     """
 
     elements: tuple[int, ...]
@@ -82,7 +83,8 @@ class Attachment:
         self._source, self._sink, self._observer, self._wiring, self._say = source, sink, observer, wiring, say
         self._elements, n = np.array(wiring.elements), len(wiring.elements)
         self._watchdog = Watchdog(n, wiring.safety, say, wiring.warm_up)
-        self._semaphore = None if wiring.semaphore is None else source.semaphore(wiring.semaphore)
+        self._semaphore: Semaphore | None = None
+        self._semaphore_number: int | None = None
         self._expectation, self._band = np.full(n, np.nan), np.full(n, np.nan)
         self._missing = np.full(n, np.nan)
         self._out = np.zeros(sink.n if sink is not None else 0)
@@ -104,10 +106,9 @@ class Attachment:
         stop : callable
             Whether to end.
         """
+        self._claim()
         gc.collect()
         gc.freeze()
-        if self._semaphore is not None:
-            self._semaphore.drain()
         self._alive = now = monotonic()
         end, spoken = now + seconds, now + 1.0
         try:
@@ -125,6 +126,23 @@ class Attachment:
         finally:
             gc.unfreeze()
             self._send(self._watchdog.safe)
+            self._release()
+
+    def _claim(self) -> None:
+        """Take the semaphore that is wanted, or another one where a process waits for it: two would take each other's frames."""
+        if (wanted := self._wiring.semaphore) is None:
+            return
+        self._semaphore_number = self._source.claim(wanted)
+        if self._semaphore_number != wanted:
+            self._say(f"{self._source.path}: another process waits for semaphore {wanted}; taking {self._semaphore_number}")
+        self._semaphore = self._source.semaphore(self._semaphore_number)
+        if self._semaphore is not None:
+            self._semaphore.drain()
+
+    def _release(self) -> None:
+        if self._semaphore_number is not None:
+            self._source.release(self._semaphore_number)
+            self._semaphore_number = None
 
     def _check_rate(self) -> None:
         """Say once that the loop runs at another rate than the observer is designed for."""
@@ -193,8 +211,9 @@ class Attachment:
             return
         if new.n != self._source.n:
             raise StreamError(f"{new.path}: made anew with {new.n} numbers a frame, it had {self._source.n}")
+        self._release()
         self._source = new
-        self._semaphore = None if self._wiring.semaphore is None else new.semaphore(self._wiring.semaphore)
+        self._claim()
         self._start_anew(new.count, "the stream was made anew")
 
     def _start_anew(self, count: int, reason: str) -> None:

@@ -72,6 +72,7 @@ class Header(NamedTuple):
     layout : its layout;  name : of the stream
     shape  : of the data, the slowest axis first;  dtype : of its numbers
     n_semaphores, semaphores : how many there are, and the offset of the first [bytes], None where they are not in the file
+    readers : offset of the ids of the processes that wait for them, int32, None where they are not in the file
     """
 
     layout: Layout
@@ -80,6 +81,7 @@ class Header(NamedTuple):
     dtype: np.dtype
     n_semaphores: int
     semaphores: int | None
+    readers: int | None
 
 
 def read_header(path: str, buffer: memoryview) -> Header:
@@ -117,17 +119,18 @@ def _layout_of(path: str, buffer: memoryview) -> Layout:
     return LAYOUTS[text]
 
 
-def _semaphores(path: str, layout: Layout, buffer: memoryview, end: int) -> tuple[int, int | None]:
-    """Return how many semaphores there are and where in the file."""
+def _semaphores(path: str, layout: Layout, buffer: memoryview, end: int) -> tuple[int, int | None, int | None]:
+    """Return how many semaphores there are, where in the file, and where the processes that wait for them are."""
     (n,) = struct.unpack_from("<H", buffer, layout.semaphores)
     if layout.data_size is None:
-        return n, None
+        return n, None, None
     (data_size,) = struct.unpack_from("<Q", buffer, layout.data_size)
     (n_keywords,) = struct.unpack_from("<H", buffer, layout.n_keywords)
     first = max(layout.header + data_size, end) + layout.keyword * n_keywords
     if first + n * SEMAPHORE > len(buffer):
         raise StreamError(f"{path}: its header says {n} semaphores, the file ends before them")
-    return n, first
+    readers = first + (n + 1) * SEMAPHORE  # after that of the log
+    return n, first, readers if readers + 4 * n <= len(buffer) else None
 
 
 def new_file(name: str, shape: tuple[int, ...], dtype: np.dtype, layout: Layout) -> bytes:

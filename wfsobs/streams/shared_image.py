@@ -73,6 +73,8 @@ class SharedImage:
         self._count = np.ndarray(1, np.uint64, self._map, layout.count)
         self._writing = np.ndarray(1, np.uint8, self._map, layout.writing)
         self._semaphores = self._find_semaphores()
+        readers = self.header.readers
+        self._readers = None if readers is None else np.ndarray(self.header.n_semaphores, "<i4", self._map, readers)
         self.first = self.count
 
     @classmethod
@@ -153,6 +155,26 @@ class SharedImage:
             raise StreamError(f"{self.path}: semaphore {number}: it has 0 to {len(self._semaphores) - 1}")
         return self._semaphores[number]
 
+    def claim(self, number: int) -> int:
+        """Claim a semaphore for this process: this one, or the first that no process waits for; return its number.
+
+        Programs that choose theirs as ImageStreamIO does leave it alone until `release`, or until this process has ended.
+        Raises StreamError where there is no such semaphore, or none is free.
+        """
+        self.semaphore(number)
+        if self._readers is None:
+            return number
+        for i in (number, *range(len(self._readers))):
+            if not _is_running(int(self._readers[i])):
+                self._readers[i] = os.getpid()
+                return i
+        raise StreamError(f"{self.path}: semaphore {number}: other processes wait for all {len(self._readers)}")
+
+    def release(self, number: int) -> None:
+        """Let others have a semaphore that was claimed."""
+        if self._readers is not None:
+            self._readers[number] = 0
+
     def wait(self, after: int, seconds: float, semaphore: Semaphore | None = None) -> bool:
         """Wait until the counter is another than `after`, at most so long [s]; return whether it is."""
         until = time.monotonic() + seconds
@@ -173,3 +195,16 @@ class SharedImage:
         folder, file = os.path.split(os.path.abspath(self.path))
         stem = f"{folder.replace('/', '.')}.{file.removesuffix(SUFFIX)}"
         return [open_named(f"{stem}_sem{i:02d}") for i in range(n)]
+
+
+def _is_running(process: int) -> bool:
+    """Whether there is such a process; 0 and -1 stand for none."""
+    if process <= 0:
+        return False
+    try:
+        os.getpgid(process)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
