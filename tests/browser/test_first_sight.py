@@ -91,3 +91,21 @@ def test_a_preset_is_chosen_from_the_gallery(open_page: Any) -> None:
     sheet.get_by_role("button", name=re.compile("Strong turbulence")).click()
     expect(sheet).to_be_hidden()
     expect(page.get_by_role("combobox", name="Preset")).to_have_text("Strong turbulence")
+
+
+PAINTED_LAST = """async () => {
+  const view = Bokeh.index.query_one((it) => it.model.type === "Figure")
+  const {paint, _after_layout} = view, done = []
+  view.paint = function () { done.push("painted"); paint.call(this) }
+  view._after_layout = function () { done.push("laid out"); _after_layout.call(this) }
+  view.request_layout(true)
+  await new Promise((go) => setTimeout(go, 1000))
+  Object.assign(view, {paint, _after_layout})
+  return [done.includes("laid out"), done.at(-1)]
+}"""
+"""What a figure does last when it finds that its axes need more room."""
+
+
+def test_a_figure_is_painted_where_its_axes_are(open_page: Any) -> None:
+    page = open_page()
+    assert page.evaluate(PAINTED_LAST) == [True, "painted"]

@@ -44,19 +44,30 @@ function patchTexts(doc) {
 }
 
 // Each part that is put into the page or changes its size has all of it laid out anew, some thirty times until the first picture
-// stands. Once a frame is enough.
+// stands. Once a frame is enough. A figure that asks for it has painted by then, where things were before: it paints again.
 function layOutOnceAFrame() {
   const kind = Bokeh.Models.get("panel.models.esm.ReactiveESM").prototype.default_view.prototype
+  const figure = Bokeh.Models.get("Figure").prototype.default_view.prototype
   if (kind.laidOutOnceAFrame) return
-  const compute = kind.compute_layout
+  const compute = kind.compute_layout, compute_figure = figure.compute_layout
   kind.laidOutOnceAFrame = true
+  figure.compute_layout = function () {
+    this.paintIsDue = true
+    compute_figure.call(this)
+  }
   kind.compute_layout = function () {
     if (this.is_managed) compute.call(this)
     else if (!this.layoutIsDue) {
       this.layoutIsDue = true
       requestAnimationFrame(() => {
         this.layoutIsDue = false
-        if (!this.is_destroyed) compute.call(this)
+        if (this.is_destroyed) return
+        compute.call(this)
+        for (const it of Bokeh.index.query((it) => it.paintIsDue)) {
+          it.paintIsDue = false
+          it.invalidate_painters()
+          it.paint()
+        }
       })
     }
   }
