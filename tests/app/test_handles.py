@@ -222,6 +222,7 @@ class TestGain:
         assert expected is not None
         assert float(values["integrator"]) == pytest.approx(1e3 * expected, rel=0.01)  # three digits, of the gain too
         assert store.scenario.control.integrator == "optimised" and not store.can_undo
+        assert "controllers with NGS" in gain.layer.frame["hint"], "what a drag does not show"
 
     def test_letting_go_sets_the_gain(self, gain: GainEditor, loop: Any) -> None:
         gain.layer._handle_msg({"action": "release", "id": "gain-0", "number": 1, "frequency": 40.0})

@@ -153,6 +153,7 @@ def test_gain_of_the_integrator(page: Page) -> None:
     page.get_by_role("button", name="Closed loop").click()
     gain = handle(page, "Integrator gain")
     expect(gain).to_be_visible()
+    expect(page.get_by_text("Only the integrator has a preview")).to_be_visible()
     margin = page.locator(".numbers span[data-name=gain-margin] b")
     before = margin.inner_text()
     x, y = middle(gain)

@@ -206,7 +206,8 @@ export function render({model, el}) {
     add.disabled = Boolean(frame.add)
     add.title = frame.add || "then click on the spectrum; with the keyboard: a peak in the middle, to be moved from there"
     hint.textContent = "Drag a handle, or use the arrow keys" +
-      (frame.add === undefined ? "." : "; wheel or Page up and down: damping; Delete: remove a peak.")
+      (frame.add === undefined ? "." : "; wheel or Page up and down: damping; Delete: remove a peak.") +
+      (frame.hint ? ` ${frame.hint}` : "")
     note.textContent = frame.note ?? ""
     numbers.replaceChildren(...(frame.numbers ?? []).map(entry))
     place()

@@ -32,6 +32,7 @@ from wfsobs.simulation.true_spectra import has_known_spectra
 from wfsobs.typing import Array
 
 INTEGRATOR = "integrator"
+HINT = "Only the integrator has a preview; the Nyquist figure and controllers with NGS or a GPR follow when the handle is let go."
 
 MOST = 0.98
 """The highest gain that a handle gives, over that at which the loop becomes unstable."""
@@ -120,6 +121,7 @@ class GainEditor:
         if not self.display.editing:
             return
         frame: dict[str, Any] = {"handles": [], "numbers": [], "note": why or self._note, "answered": reply_to, "exponent": 1.0}
+        frame["hint"] = HINT
         frame["limits"] = [0.01, 0.5 / self.store.scenario.dt]
         lines: dict[str, tuple[ArrayLike, ArrayLike]] = {}
         if answer is not None:
