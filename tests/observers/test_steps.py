@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -58,6 +59,23 @@ def test_steps_are_the_run_over_the_record(name: str, preset: str) -> None:
             wfsobs.design(name, scenario, sampling=record.sampling)
         return
     assert step_difference(OBSERVERS[name], *given) <= (GPR if name.startswith("gpr") else ROUNDING)
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_a_design_goes_on_in_another_process(name: str) -> None:
+    """As it is sent there: what shares memory here is apart when it arrives."""
+    record, scenario = with_gaps("paper")
+    seen, part = record.measurements(), slice(0, 150)
+    here = wfsobs.design(name, scenario, sampling=record.sampling)
+    for stretch in (part, slice(150, 300)):
+        there = pickle.loads(pickle.dumps(here))
+        for k in range(*stretch.indices(record.n_steps)):
+            ngs = None if np.isnan(seen.z_ngs[k]).all() else seen.z_ngs[k]
+            for one in (here, there):
+                one.update(seen.z[k], ngs if one.frame else None, np.nan_to_num(seen.u[k]))
+                one.settle()
+            for target in here.targets:
+                np.testing.assert_array_equal(here.predict(0, target), there.predict(0, target))
 
 
 def test_every_causal_observer_has_steps() -> None:

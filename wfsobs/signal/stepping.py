@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -123,10 +123,19 @@ class FilterBank:
                 one[:size, :size], one[:size, n:], one[n:, :size], one[n:, n:] = F, G, H, J
         self._after = [*range(1, len(self.maps)), int(first)]
         self._in, self._out = np.zeros((len(modes), n + m)), np.zeros((len(modes), n + p))
+        self._link(n)
+        self.phase = self.last = 0
+
+    def _link(self, n: int) -> None:
+        """Make the parts of inputs and outputs, which share their memory."""
         self.x, self.v = self._in[:, :n], self._in[:, n:]
         self._next, self._e = self._out[:, :n], self._out[:, n:]
         self._in3, self._out3 = self._in[:, :, None], self._out[:, :, None]
-        self.phase = self.last = 0
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Link the parts again, which a copy and another process receive apart."""
+        self.__dict__.update(state)
+        self._link(self.x.shape[1])
 
     def step(self, v: Array) -> Array:
         """Take the inputs v (n_modes, m) of a step; return its outputs (n_modes, p), valid until the next."""

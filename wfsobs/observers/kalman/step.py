@@ -28,12 +28,16 @@ from wfsobs.typing import Array
 
 
 class Plan(NamedTuple):
-    """A prediction of every mode: rows (n_modes, 1, n) of the state, mean (n_modes,) and sd (maps, n_modes), and their views."""
+    """A prediction of every mode: rows (n_modes, 1, n) of the state, mean (n_modes,) and sd (maps, n_modes)."""
 
     rows: Array
     mean: Array
-    product: Array
     sd: Array
+
+    @property
+    def product(self) -> Array:
+        """The mean as products of rows and states have it, (n_modes, 1, 1): a view."""
+        return self.mean[:, None, None]
 
 
 def plan(rows: Sequence[Array], n: int, sd: Array) -> Plan:
@@ -41,8 +45,7 @@ def plan(rows: Sequence[Array], n: int, sd: Array) -> Plan:
     padded = np.zeros((len(rows), 1, n))
     for one, row in zip(padded, rows, strict=True):
         one[0, : len(row)] = row
-    mean = np.zeros(len(rows))
-    return Plan(padded, mean, mean[:, None, None], sd)
+    return Plan(padded, np.zeros(len(rows)), sd)
 
 
 class LinearEstimator:
@@ -54,8 +57,11 @@ class LinearEstimator:
     def __init__(self, modes: Sequence[ModeFilter]):
         self.modes = tuple(modes)
         self.bank = GapBank([mode.gains for mode in modes], self._gaps)
-        self._state = self.bank.x[:, :, None]
         self._of_equal: dict[bytes, GapGains] = {}
+
+    @property
+    def _state(self) -> Array:
+        return self.bank.x[:, :, None]
 
     def _gaps(self, mode: int) -> GapGains:
         """Return the gains near gaps of a mode; modes of equal models share them."""
@@ -100,19 +106,18 @@ class KalmanEstimator(LinearEstimator):
         self._plans: dict[tuple[float, str], Plan] = {}
         self._variances: dict[int, Array] = {}
         self._record: tuple[Array, Array, list[StatedErrors]] | None = None
-        v = self.bank.v
-        self._lgs, self._ngs = v[:, 0], v[:, 1] if v.shape[1] > 1 else None
 
     @property
     def uses_ngs(self) -> bool:
         """Whether it takes NGS frames."""
-        return self._ngs is not None
+        return self.bank.v.shape[1] > 1
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
-        self._lgs[...] = z
-        if self._ngs is not None:
-            self._ngs[...] = 0.0 if ngs is None else ngs
+        v = self.bank.v
+        v[:, 0] = z
+        if v.shape[1] > 1:
+            v[:, 1] = 0.0 if ngs is None else ngs
         self.bank.advance()
 
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
