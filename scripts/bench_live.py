@@ -4,7 +4,8 @@
 
 Starts `wfsobs live` on the preset paper with the linear observers and the online GPR, opens pages by websocket without a browser,
 and runs an empty loop of the same pace in a process of its own. Prints one JSON object: frames and lost frames; the shares of
-frames that came more than 1 ms late, of the loop and of the empty one; how far the observers were behind, sampled every second
+frames that were late by more than 1 ms: an estimate of the slowest observer (`late_share`), what the source sent
+(`late_share_sent`), and the empty loop (`late_share_empty`); how far the observers were behind, sampled every second
 [s]; processor time of the server and all its processes over time [cores]; memory, proportional set size after the first minute
 (or the first tenth) and at the end [MB].
 """
@@ -134,7 +135,10 @@ def main() -> None:
         end.value = 1
         empty.join(5)
         taken = last["frames"] - first["frames"]
-        was_late = last["late_share"] * last["frames"] - first["late_share"] * first["frames"]
+        late_shares = {
+            name: round((last[name] * last["frames"] - first[name] * first["frames"]) / max(taken, 1), 5)
+            for name in ("late_share", "late_share_sent")
+        }
         settled = min(60.0, 0.1 * a.seconds)
         before = next(mb for at, mb in memory if at >= settled)
         print(
@@ -143,7 +147,7 @@ def main() -> None:
                     "seconds": round(seconds, 1),
                     "frames": taken,
                     "lost": last["lost"] - first["lost"],
-                    "late_share": round(was_late / max(taken, 1), 5),
+                    **late_shares,
                     "late_share_empty": round(late.value / max(frames.value, 1), 5),
                     "behind_s": {"median": sorted(behind)[len(behind) // 2], "max": max(behind)},
                     "cores": round(used / seconds, 3),

@@ -5,8 +5,8 @@ import pytest
 
 from wfsobs.live.alarms import FEWEST, Alarms, drift, noise_of
 from wfsobs.live.board import SLOTS
+from wfsobs.live.crew import slot_width, trace_width
 from wfsobs.live.finding import Finding, PeakFinding
-from wfsobs.live.observing import slot_width, trace_width
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.view import LiveView
 

@@ -14,8 +14,10 @@ import pytest
 import wfsobs
 from wfsobs.live.blocks import Block
 from wfsobs.live.board import Board
+from wfsobs.live.crew import trace_width
+from wfsobs.live.delivery import Delivery, merged_rows
 from wfsobs.live.loop import LiveLoop
-from wfsobs.live.observing import Crew, Order, trace_width
+from wfsobs.live.observing import POLL, REST, Order, Pause, made_crew
 from wfsobs.live.paced import Pace
 from wfsobs.live.ring import LiveFrame, Ring
 from wfsobs.live.rows import Rows
@@ -105,8 +107,8 @@ class Stage:
         self.ring, self.board = Ring(2), Board(2)
         self.traces = Rows(trace_width(2), 4096)
         settings = scenario.to_dict()
-        order = Order(settings, names, record.sampling, self.ring.name, self.traces.name, self.board.name, None, self.said)
-        self.crew, self.number = Crew(order), 0
+        order = Order(settings, names, record.sampling, 0, False, "", "", "", None, self.said)
+        self.crew, self.number = made_crew(order, self.board), 0
 
     def run(self, n):
         r = self.record
@@ -114,10 +116,11 @@ class Stage:
             parts = (r.z[k], r.z_ngs[k], r.u[k], r.turbulence[k], r.vibration[k])
             self.ring.write(np.concatenate(([time.monotonic()], *parts)))
             self.traces.write(self.crew.take(LiveFrame(time.monotonic(), *parts), k))
+            self.crew.settle()
         self.number += n
 
     def view(self, seconds=1.0):
-        return read_view(self.ring, self.traces, self.record.dt, seconds)
+        return read_view(self.ring, [self.traces], self.record.dt, seconds)
 
     def close(self):
         for part in (self.ring, self.traces, self.board):
@@ -191,10 +194,9 @@ def test_observers_come_and_go(stage):
 
 
 def test_a_live_loop_from_start_to_stop():
-    scenario = paper().replace({"run.warm_up": 0.2})
+    scenario = paper().replace({"run.warm_up": 0.2, "gpr_online.training_size": 40, "gpr_online.depth": 10})
     loop = LiveLoop(SimulatedLoop(scenario), scenario, ["kf-multi", "gp-both"], speed=0.5)
     try:
-        names = [loop._processes.feed.ring.name, loop._processes.traces.name, loop.board.name]
         with pytest.raises(SettingError, match="modes and rates cannot change"):
             loop.change({"sensors.exposure_ratio": 10})
         with pytest.raises(SettingError, match="does not run frame by frame"):
@@ -208,8 +210,20 @@ def test_a_live_loop_from_start_to_stop():
         wait(lambda: loop.count > 600)
         loop.change({"turbulence.wind_speed": 20.0})
         loop.pause()
-        wait(lambda: loop.count == loop.newest and "turbulence.wind_speed = 20.0" in [e.line for e in loop.events])
+        loop.switch("gpr-online", True)
+        wait(lambda: len(loop._processes.traces()) == 2)
+        loop.play()
+        wait(lambda: "gpr-online on" in [e.line for e in loop.events] and loop.board["gpr-online"].frames[0] > 100)
+        loop.pause()
+        loop.lose()  # nothing; it is said once the pause has been heard
+        wait(lambda: loop.count == loop.newest and "all frames arrive" in [e.line for e in loop.events])
+        assert "turbulence.wind_speed = 20.0" in [e.line for e in loop.events]
         sent = loop.newest
+        check_late_observer(loop, scenario)
+        loop.tend()
+        assert (loop.delivery.frames, loop.delivery.losses) == (sent, 0) and 0 <= loop.delivery.late_share <= 1
+        names = [loop._processes.feed.ring.name, *(rows.name for rows in loop._processes.traces()), loop.board.name]
+        assert len(names) == 4, "those that learn have a process of their own"
         record, pids = loop.recorder.stop(scenario), loop.pids
         assert record.n_steps == sent == loop.newest
         for score in wfsobs.observe(record, scenario, observers=["kf-multi", "gp-both"]).scores:
@@ -226,6 +240,70 @@ def test_a_live_loop_from_start_to_stop():
             SharedMemory(name=name)
 
 
+def check_late_observer(loop, scenario):
+    """One that was switched on later, in another process, has the estimates of a run that begins there."""
+    view, since = loop.view(600.0), int(loop.board["gpr-online"].since[0])
+    assert view.first == 0 and since % 5 == 0
+    alone, frames = wfsobs.design("gpr-online", scenario), view.frames
+    for k in range(since, view.n):
+        alone.update(frames.z[k], u=frames.u[k])
+        if k > view.n - 10:
+            assert view.estimate("gpr-online", "vibration")[k] == pytest.approx(alone.predict(0)[0], rel=1e-9)
+    assert np.isnan(view.estimate("gpr-online", "vibration")[:since]).all()
+    assert not np.isnan(view.estimate("kf-multi", "vibration")).any()
+
+
+def test_a_frame_is_taken_once_all_crews_have_it_and_late_by_the_last():
+    ring, board, steady, learning = Ring(2), Board(2), Rows(4, 8), Rows(4, 8)
+    try:
+        now = time.monotonic()
+        for due in (now - 0.5, now + 9, now - 0.5, now + 9, now + 9):
+            ring.send(np.full(11, due))
+        delivery = Delivery(ring, board, lambda: [steady, learning])
+        for k, delay in enumerate((0.0001, 0.0002, 0.003, 0.0001, 0.0001)):
+            steady.write(np.array([k, delay, 1.0, np.nan]))
+        delivery.collect()
+        assert (delivery.frames, delivery.late_share, delivery.late_share_sent) == (0, 0.0, 0.4)
+        for k, delay in enumerate((0.002, 0.0004)):
+            learning.write(np.array([k, delay, np.nan, 2.0]))
+        delivery.collect()
+        assert (delivery.frames, delivery.late_share) == (2, 0.5), "the first is late by the second crew"
+        learning.skip_to(4)
+        board.losses[1] = 2
+        learning.write(np.array([4, 0.0001, np.nan, 3.0]))
+        delivery.collect()
+        assert (delivery.count, delivery.losses, delivery.frames) == (5, 2, 3)
+        rows = merged_rows([steady, learning], 0, 5)
+        np.testing.assert_array_equal(rows[:, 2:], [[1, 2], [1, 2], [1, np.nan], [1, np.nan], [1, 3]])
+        assert np.all(rows[:, 1] == [0.002, 0.0004, 0.003, 0.0001, 0.0001])
+        for k in range(5, 25):  # more than the rows hold: what nobody has looked at is not known
+            for rows in (steady, learning):
+                rows.write(np.array([k, 0.0001, 1.0, 1.0]))
+        delivery.collect()
+        assert delivery.frames == 23 and delivery.late_share == pytest.approx(2 / 12)
+    finally:
+        for part in (ring, board, steady, learning):
+            part.release()
+
+
+def test_the_next_look_at_the_ring_is_when_a_frame_is_due(monkeypatch):
+    now, slept = 100.0, []
+    monkeypatch.setattr("wfsobs.live.observing.monotonic", lambda: now)
+    monkeypatch.setattr("wfsobs.live.observing.sleep", slept.append)
+    pause = Pause()
+    pause.note(99.9990)
+    pause.note(99.9998)
+    pause.rest()
+    now = 100.0007
+    pause.rest()
+    now = 100.1001
+    pause.note(100.1)  # frames are far apart: looked at often enough
+    pause.rest()
+    now = 200.0
+    pause.rest()
+    assert slept == pytest.approx([0.0006, POLL, 0.0019, REST], abs=1e-9)
+
+
 def test_nothing_is_left_of_a_loop_whose_owner_is_killed():
     code = (
         "import time\n"
@@ -234,7 +312,7 @@ def test_nothing_is_left_of_a_loop_whose_owner_is_killed():
         "from wfsobs.live.simulated import SimulatedLoop\n"
         "s = PRESETS['paper']()\n"
         "loop = LiveLoop(SimulatedLoop(s), s, ['zero'])\n"
-        "print(*loop.pids, loop._processes.feed.ring.name, loop._processes.traces.name, loop.board.name, flush=True)\n"
+        "print(*loop.pids, loop._processes.feed.ring.name, loop._processes.traces()[0].name, loop.board.name, flush=True)\n"
         "time.sleep(100)\n"
     )
     owner = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)

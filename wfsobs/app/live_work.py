@@ -57,9 +57,10 @@ def live_counts(loop: LiveLoop | None) -> dict[str, Any]:
     """Return what is counted of a loop, as JSON takes it; nothing without one."""
     if loop is None:
         return {}
-    frames, lost, late, _ = (int(x) for x in loop.board.totals)
+    delivery = loop.delivery
+    late = {"late_share": delivery.late_share, "late_share_sent": delivery.late_share_sent}
     behind = (loop.newest - loop.count) * loop.sampling.dt
-    return {"live": {"frames": frames, "lost": lost, "late_share": late / max(frames, 1), "behind_s": round(behind, 3)}}
+    return {"live": {"frames": delivery.frames, "lost": delivery.losses, **late, "behind_s": round(behind, 3)}}
 
 
 class LiveTask(BackgroundTask):

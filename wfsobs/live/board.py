@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from multiprocessing.shared_memory import SharedMemory
 from typing import NamedTuple
 
@@ -19,8 +20,17 @@ SCORED = (*TARGETS, NEXT)
 """What errors are counted of."""
 SLOTS = tuple(o.id for o in OBSERVERS.values() if o.step is not None)
 """Observers that run frame by frame; each has its place."""
+CREWS = ("steady", "learning")
+"""Observers follow in one process, those that learn while they run in another: the others need not wait for them."""
+LEARNING = ("gpr-online", "kf-adaptive", "multirate-adaptive", "gpr-offline")
+"""Observers that learn while they run."""
 
 Integers = NDArray[np.int64]
+
+
+def crew_of(observer: str) -> int:
+    """Return the place in CREWS of the process in which an observer follows."""
+    return CREWS.index("learning" if observer in LEARNING else "steady")
 
 
 class Counts(NamedTuple):
@@ -38,12 +48,6 @@ class Counts(NamedTuple):
     late: Integers
     frames: Integers
     since: Integers
-
-    @classmethod
-    def empty(cls, n_modes: int) -> Counts:
-        """Make counts of an observer that nobody else reads."""
-        shape = (len(SCORED), n_modes)
-        return cls(np.zeros(shape), np.zeros(shape, dtype=np.int64), Latencies(), *np.zeros((3, 1), dtype=np.int64))
 
     def copy(self) -> Counts:
         """Return a copy in memory of its own."""
@@ -63,6 +67,12 @@ class Counts(NamedTuple):
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.sqrt(self.squares[at] / samples)
 
+    def total_rms(self, targets: Sequence[str]) -> float:
+        """Return the rms error over targets and modes [um]; NaN without a sample."""
+        at = [SCORED.index(target) for target in targets]
+        n = int(self.samples[at].sum())
+        return float(np.sqrt(self.squares[at].sum() / n)) if n else float("nan")
+
 
 class Board:
     """The counts of all observers.
@@ -76,30 +86,34 @@ class Board:
 
     Attributes
     ----------
-    totals : Integers
-        Frames that all have taken, frames lost, frames that came late, whether the observers are ready, (4,).
+    losses, is_ready : Integers
+        Of the crews: frames lost, and whether the observers are ready, (len(CREWS),).
+    squares, samples, histograms, late, frames : array
+        As in `Counts`, of all observers, in the order of SLOTS.
     """
 
     def __init__(self, n_modes: int, name: str | None = None):
         n, scored, bins = len(SLOTS), len(SCORED) * n_modes, len(EDGES) + 1
-        size = 4 + n * (2 * scored + bins + 3)
+        size = 2 * len(CREWS) + n * (2 * scored + bins + 3)
         self._memory = SharedMemory(name=name, create=name is None, size=8 * size if name is None else 0)
         self._owner = name is None
         whole = np.ndarray(size, dtype=np.int64, buffer=self._memory.buf)
-        self.totals, slots = whole[:4], whole[4:].reshape(n, -1)
-        shape = (len(SCORED), n_modes)
-        self._counts = {
-            slot: Counts(
-                row[:scored].view(np.float64).reshape(shape),
-                row[scored : 2 * scored].reshape(shape),
-                Latencies(row[2 * scored : -3]),
-                *row[-3:].reshape(3, 1),
-            )
-            for slot, row in zip(SLOTS, slots, strict=True)
-        }
+        self.losses, self.is_ready = whole[: 2 * len(CREWS)].reshape(2, -1)
+        slots, shape = whole[2 * len(CREWS) :].reshape(n, -1), (n, len(SCORED), n_modes)
+        self.squares, self.samples = (
+            slots[:, :scored].view(np.float64).reshape(shape),
+            slots[:, scored : 2 * scored].reshape(shape),
+        )
+        self.histograms = slots[:, 2 * scored : -3]
+        self.late, self.frames, self._since = slots[:, -3:].T
+        self._counts = {slot: self._counts_in(i) for i, slot in enumerate(SLOTS)}
         if self._owner:
-            for counts in self._counts.values():
-                counts.since[0] = -1
+            self._since[:] = -1
+
+    def _counts_in(self, slot: int) -> Counts:
+        own = slice(slot, slot + 1)
+        counts = self.late[own], self.frames[own], self._since[own]
+        return Counts(self.squares[slot], self.samples[slot], Latencies(self.histograms[slot]), *counts)
 
     @property
     def name(self) -> str:
@@ -116,7 +130,8 @@ class Board:
     def release(self) -> None:
         """Give the memory back; the counts stay as they are."""
         self._counts = {name: counts.copy() for name, counts in self._counts.items()}
-        self.totals = self.totals.copy()
+        self.losses, self.is_ready = self.losses.copy(), self.is_ready.copy()
+        self.squares = self.samples = self.histograms = self.late = self.frames = self._since = np.empty(0, dtype=np.int64)
         self._memory.close()
         if self._owner:
             self._memory.unlink()

@@ -2,105 +2,26 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Sequence
-from math import inf, isnan
-from time import monotonic, sleep
+from math import isnan
+from time import sleep
 from typing import Any
-
-import numpy as np
 
 from wfsobs.live.blocks import check_live
 from wfsobs.live.board import Counts
+from wfsobs.live.processes import LiveProcesses
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.simulated import SimulatedLoop
-from wfsobs.live.source import LiveSource, SourceProcess
+from wfsobs.live.source import LiveSource
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.base import TARGETS
-from wfsobs.observers.step import StepObserver
-from wfsobs.observers.step_checks import StepError
 from wfsobs.priors_from.scenario import as_sampled
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
-from wfsobs.stepping import design
-from wfsobs.typing import Array
 
-POLL = 1e-4
-"""Pause between two looks at the ring [s]."""
-LATE = 1e-3
-"""From which delay a frame counts as late [s]."""
+TICK = 0.05
+"""Pause between two looks at the observers [s]."""
 LONG_STEPS = ("kf-adaptive", "multirate-adaptive", "gpr-offline")
 """Observers that are run if named alone."""
-
-
-class Follower:
-    """One observer on a source.
-
-    Parameters
-    ----------
-    observer : StepObserver
-        Before its first frame.
-    scored_from : int
-        First frame of the observer that counts in the error.
-    budget : float
-        Time in which the estimate should be there [s].
-    counts : Counts, optional
-        Where errors and latencies are counted.
-    """
-
-    def __init__(self, observer: StepObserver, scored_from: int, budget: float, counts: Counts | None = None):
-        self.observer, self.scored_from, self.budget = observer, scored_from, budget
-        n_modes = observer.sampling.n_modes
-        self.counts = Counts.empty(n_modes) if counts is None else counts
-        self._places = [TARGETS.index(target) for target in observer.targets]
-        self._expects = len(self._places) == len(TARGETS)
-        self._next = np.full(n_modes, np.nan)
-
-    def take(self, frame: LiveFrame) -> tuple[float, list[Array]]:
-        """Update, estimate and score on one frame; return the time that it took [s], and the estimate of every target."""
-        observer, start = self.observer, monotonic()
-        number = observer.frame
-        ngs = None if number == 0 or np.isnan(frame.ngs[0]) else frame.ngs
-        observer.update(frame.z, ngs, frame.u if observer.estimator.needs_command else None)
-        means = [observer.predict(0, target)[0] for target in observer.targets]
-        spent = monotonic() - start
-        self.counts.latencies.add(spent)
-        self.counts.late[0] += spent > self.budget
-        self.counts.frames[0] += 1
-        if number >= self.scored_from:
-            for place, mean in zip(self._places, means, strict=True):
-                self._score(place, mean - (frame.vibration if place else frame.turbulence))
-            if self._expects:
-                self._score(len(TARGETS), self._next - frame.z)
-        if self._expects:
-            self._next = means[0] + means[1]
-        observer.settle()
-        return spent, means
-
-    def _score(self, place: int, error: Array) -> None:
-        if is_known(error):
-            self.counts.squares[place] += error * error
-            self.counts.samples[place] += 1
-        elif (known := ~np.isnan(error)).any():
-            self.counts.squares[place, known] += error[known] ** 2
-            self.counts.samples[place] += known
-
-    def errors(self, modes: Sequence[str]) -> dict[str, dict[str, float | None]]:
-        """Return target -> mode -> rms error after the warm-up [nm], None without a sample."""
-        return {
-            target: {name: None if isnan(x) else float(x) * 1e3 for name, x in zip(modes, self.counts.rms(target), strict=True)}
-            for target in self.observer.targets
-        }
-
-    def error(self) -> float | None:
-        """Return the rms error over all targets and modes [nm]."""
-        n = int(self.counts.samples[self._places].sum())
-        return float(np.sqrt(self.counts.squares[self._places].sum() / n)) * 1e3 if n else None
-
-
-def is_known(x: Array) -> bool:
-    """Return whether no number is NaN."""
-    return bool(x.dot(x) < inf)
 
 
 def default_observers() -> list[str]:
@@ -140,9 +61,9 @@ def follow(
     Returns
     -------
     dict
-        "frames" delivered to every observer, "lost", "late_share" (reached the observers more than 1 ms after they were due) and
-        "observers": id -> latency "p50_us", "p99_9_us", frames "late" (longer than a frame), "rms_nm" over all targets and modes,
-        "errors_nm" by target and mode.
+        "frames" that every observer has taken, "lost", "late_share" (an estimate came more than 1 ms after they were due),
+        "late_share_sent" (the source sent them more than 1 ms after that) and "observers": id -> latency "p50_us", "p99_9_us",
+        frames "late" (longer than a frame), "rms_nm" over all targets and modes, "errors_nm" by target and mode.
 
     Raises
     ------
@@ -155,65 +76,67 @@ def follow(
             raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
     chosen = list(observers) if observers else default_observers()
     source = source or SimulatedLoop(scenario)
-    sampling = source.sampling
-    scenario, pace = as_sampled(scenario, sampling), sampling.dt / speed
-    first = round(scenario.run.warm_up / scenario.dt)
+    scenario = as_sampled(scenario, source.sampling)
+    processes = LiveProcesses(source, scenario, tuple(dict.fromkeys(chosen)), speed, n_frames)
     try:
-        followers = {name: Follower(design(name, scenario, sampling=sampling), first, pace) for name in dict.fromkeys(chosen)}
-    except StepError as error:
-        raise SettingError(str(error)) from None
-    feed = SourceProcess(source, speed, n_frames)
-    try:
-        feed.start()
-        frames, lost, late = _drain(feed, followers, n_frames, keep, report)
+        _await_observers(processes)
+        processes.feed.start()
+        _drain(processes, n_frames, keep, report)
     finally:
-        feed.stop()
-    modes = [mode.name for mode in scenario.modes][: sampling.n_modes]
+        processes.release()
+    board, delivery = processes.board, processes.delivery
+    modes = [mode.name for mode in scenario.modes][: source.sampling.n_modes]
     return {
-        "frames": frames,
-        "lost": lost,
-        "late_share": late / max(frames, 1),
-        "observers": {
-            name: {
-                "p50_us": f.counts.latencies.quantile(0.5) * 1e6,
-                "p99_9_us": f.counts.latencies.quantile(0.999) * 1e6,
-                "late": int(f.counts.late[0]),
-                "rms_nm": f.error(),
-                "errors_nm": f.errors(modes),
-            }
-            for name, f in followers.items()
-        },
+        "frames": delivery.frames,
+        "lost": n_frames - delivery.frames,
+        "late_share": delivery.late_share,
+        "late_share_sent": delivery.late_share_sent,
+        "observers": {name: _row(board[name], OBSERVERS[name].targets, modes) for name in dict.fromkeys(chosen)},
     }
 
 
+def _row(counts: Counts, targets: Sequence[str], modes: Sequence[str]) -> dict[str, Any]:
+    """Return what is told of an observer."""
+    errors = {target: dict(zip(modes, map(_nanometres, counts.rms(target)), strict=True)) for target in targets}
+    return {
+        "p50_us": counts.latencies.quantile(0.5) * 1e6,
+        "p99_9_us": counts.latencies.quantile(0.999) * 1e6,
+        "late": int(counts.late[0]),
+        "rms_nm": _nanometres(counts.total_rms(targets)),
+        "errors_nm": errors,
+    }
+
+
+def _nanometres(x: float) -> float | None:
+    return None if isnan(x) else float(x) * 1e3
+
+
+def _await_observers(processes: LiveProcesses) -> None:
+    """Wait until the observers are designed. Raises SettingError with the reason where one cannot be."""
+    while not processes.are_ready:
+        if not processes.observers_are_alive:
+            sleep(TICK)  # the line may still be on its way
+            lines = [line for _, line in processes.news()]
+            raise SettingError(lines[-1] if lines else "the process of the observers has ended")
+        sleep(TICK)
+
+
 def _drain(
-    feed: SourceProcess,
-    followers: dict[str, Follower],
-    n_frames: int,
-    keep: Callable[[LiveFrame], None] | None,
-    report: Callable[[float], None],
-) -> tuple[int, int, int]:
-    """Take every frame of a source; return how many were taken, lost and late."""
-    ring, number, lost, late = feed.ring, 0, 0, 0
-    gc.collect()
-    gc.freeze()
-    while number < n_frames:
-        if ring.count <= number:
-            if not feed.is_alive and ring.count <= number:
-                break
-            sleep(POLL)
-            continue
-        frame = ring.read(number)
-        if frame is None:
-            lost += 1
-        else:
-            late += monotonic() - float(frame.due) > LATE
-            for follower in followers.values():
-                follower.take(frame)
-            if keep is not None:
+    processes: LiveProcesses, n_frames: int, keep: Callable[[LiveFrame], None] | None, report: Callable[[float], None]
+) -> None:
+    """Count every frame, and keep it, until all have been taken or no more come."""
+    feed, delivery, kept, reported = processes.feed, processes.delivery, 0, 0
+    is_over = False
+    while not is_over:
+        may_go_on = processes.observers_are_alive and (feed.is_alive or delivery.count < feed.ring.count)
+        is_over = delivery.count >= n_frames or not may_go_on
+        if not is_over:
+            sleep(TICK)
+        delivery.collect()
+        for number in range(kept, delivery.count if keep else 0):
+            if keep is not None and (frame := feed.ring.read(number)) is not None:
                 keep(frame)
-        number += 1
-        if number % 1000 == 0:
-            report(number / n_frames)
-    gc.unfreeze()
-    return number - lost, lost + n_frames - number, late
+            kept = number + 1
+        if delivery.count // 1000 > reported:
+            reported = delivery.count // 1000
+            report(delivery.count / n_frames)

@@ -63,7 +63,7 @@ class LiveLoop:
         self._shadow: Shadow | None = None
         self._log_file = ""
         self._processes = LiveProcesses(source, self.scenario, tuple(dict.fromkeys(observers)), self._speed)
-        self.board = self._processes.board
+        self.board, self.delivery = self._processes.board, self._processes.delivery
         self.recorder = Recorder(self._processes.feed.ring, self.sampling, self.say, source.name == SIMULATION)
         self.workshop = Workshop(self._processes, self.sampling, self.say)
         self._release = finalize(self, self._processes.release)
@@ -77,7 +77,7 @@ class LiveLoop:
     @property
     def is_ready(self) -> bool:
         """Whether the observers are ready for the first frame."""
-        return bool(self.board.totals[3])
+        return self._processes.are_ready
 
     @property
     def observers_are_alive(self) -> bool:
@@ -92,7 +92,7 @@ class LiveLoop:
     @property
     def count(self) -> int:
         """Frames that every observer has taken, or lost."""
-        return self._processes.traces.count
+        return self.delivery.count
 
     @property
     def newest(self) -> int:
@@ -199,7 +199,7 @@ class LiveLoop:
 
     def view(self, seconds: float) -> LiveView:
         """Return the last so many seconds of frames and estimates."""
-        return read_view(self._processes.feed.ring, self._processes.traces, self.sampling.dt, seconds)
+        return read_view(self._processes.feed.ring, self._processes.traces(), self.sampling.dt, seconds)
 
     def tend(self) -> None:
         """Look after the processes; called a few times a second."""
@@ -208,6 +208,7 @@ class LiveLoop:
             self._processes.feed.tell({"play": True})
         for number, line in self._processes.news():
             self.say(line, number)
+        self.delivery.collect()
         self.recorder.collect()
         if self._shadow is not None:
             self._shadow(self)

@@ -139,7 +139,7 @@ def send_frames(desk: Desk, frames: PacedFrames, dt: float) -> None:
         row[1:] = rest
         if (wait := due - monotonic()) > 0:
             sleep(wait)
-        ring.write(row)
+        ring.send(row)
         number += 1
         pace.advance()
         rest = frames.next_row(number)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from threading import Event, Lock
+from threading import Event, RLock
 
-from wfsobs.live.board import Board
-from wfsobs.live.observing import TRACE_CAPACITY, Order, observe_frames, trace_width
+from wfsobs.live.board import CREWS, Board, crew_of
+from wfsobs.live.delivery import Delivery
+from wfsobs.live.observing import CrewProcess, Site
 from wfsobs.live.paced import Command, enter_process
 from wfsobs.live.rows import Rows
 from wfsobs.live.source import LiveSource, SourceProcess, end_process, take_all
@@ -27,48 +28,69 @@ class LiveProcesses:
         Ids of those that run from the start.
     speed : float
         1 is real time.
+    n_frames : int or None
+        Frames until the source ends; None for no end.
 
     Attributes
     ----------
     feed : SourceProcess
         The source.
-    traces : Rows
-        Estimates of the observers.
     board : Board
-        What is counted of them.
+        What is counted of the observers.
+    delivery : Delivery
+        What is counted of the frames.
     workshop : ProcessPoolExecutor
         A process at low priority, which is made when it is first used.
     is_over : threading.Event
         Whether all has ended.
     """
 
-    def __init__(self, source: LiveSource, scenario: Scenario, observers: tuple[str, ...], speed: float):
-        n, context = source.sampling.n_modes, get_context("spawn")
-        self.feed, self.is_over, self._lock = SourceProcess(source, speed), Event(), Lock()
-        self.traces, self.board = Rows(trace_width(n), TRACE_CAPACITY), Board(n)
-        inbox, self._outbox = context.Pipe(duplex=False)
-        self._news = context.Queue()
-        names = self.feed.ring.name, self.traces.name, self.board.name
-        order = Order(scenario.to_dict(), observers, source.sampling, *names, inbox, self._news)
-        self._observing = context.Process(target=observe_frames, args=(order,), daemon=True)
-        self._observing.start()
-        self.workshop = ProcessPoolExecutor(1, context, initializer=enter_process, initargs=(10,))
+    def __init__(
+        self, source: LiveSource, scenario: Scenario, observers: tuple[str, ...], speed: float, n_frames: int | None = None
+    ):
+        self._context = get_context("spawn")
+        self.feed, self.is_over, self._lock = SourceProcess(source, speed, n_frames), Event(), RLock()
+        self.board, self._news = Board(source.sampling.n_modes), self._context.Queue()
+        self._site = Site(scenario.to_dict(), source.sampling, self.feed.ring, self.board, self._news)
+        self.crews: dict[int, CrewProcess] = {}
+        for place in range(len(CREWS)):
+            own = tuple(name for name in observers if crew_of(name) == place)
+            if own or not place:
+                self._start_crew(place, own)
+        self.delivery = Delivery(self.feed.ring, self.board, self.traces)
+        self.workshop = ProcessPoolExecutor(1, self._context, initializer=enter_process, initargs=(10,))
+
+    def _start_crew(self, place: int, observers: tuple[str, ...], *, joins_late: bool = False) -> None:
+        self.crews[place] = CrewProcess(self._context, self._site, observers, place, joins_late)
+
+    def traces(self) -> list[Rows]:
+        """Return the estimates of the crews that take part."""
+        return [crew.traces for crew in list(self.crews.values()) if crew.takes_part]
+
+    @property
+    def are_ready(self) -> bool:
+        """Whether the observers that take part are ready for the first frame."""
+        return all(crew.is_ready for crew in list(self.crews.values()) if crew.takes_part)
 
     @property
     def observers_are_alive(self) -> bool:
         """Whether the observers take what comes."""
-        return not self.is_over.is_set() and self._observing.is_alive()
+        return not self.is_over.is_set() and all(crew.is_alive for crew in list(self.crews.values()))
 
     @property
     def pids(self) -> list[int]:
         """Ids of the processes of source and observers."""
-        return [*self.feed.pids, *([self._observing.pid] if self._observing.pid else [])]
+        return [*self.feed.pids, *(pid for crew in list(self.crews.values()) for pid in crew.pids)]
 
     def tell_observers(self, command: Command) -> None:
-        """Give a command to the observers."""
+        """Give a command to the crew of the observer that it is about, which begins with its first one."""
+        place = crew_of(command["observer"])
         with self._lock:
-            if not self.is_over.is_set():
-                self._outbox.send(command)
+            if self.is_over.is_set() or (place not in self.crews and command["design"] is None):
+                return
+            if place not in self.crews:
+                self._start_crew(place, (), joins_late=True)
+            self.crews[place].tell(command)
 
     def news(self) -> list[tuple[int, str]]:
         """Return what they have said since the last call: number of the frame, one line."""
@@ -76,12 +98,14 @@ class LiveProcesses:
 
     def release(self) -> None:
         """End the processes and give the memory back."""
-        self.is_over.set()
-        end_process(self._observing)
+        with self._lock:
+            self.is_over.set()
+        self.delivery.collect()
+        for crew in self.crews.values():
+            crew.stop()
         workers = [*(self.workshop._processes or {}).values()]
         self.workshop.shutdown(wait=False, cancel_futures=True)
         for worker in workers:
             end_process(worker)
         self.feed.stop()
-        self.traces.release()
         self.board.release()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from time import monotonic
 from typing import NamedTuple
 
 from wfsobs.live.rows import Rows
@@ -10,6 +11,10 @@ from wfsobs.typing import Array
 
 CAPACITY = 1 << 17
 """Frames in the ring: two minutes at 1 kHz."""
+
+
+LATE = 1e-3
+"""From which delay a frame counts as late [s]."""
 
 
 class LiveFrame(NamedTuple):
@@ -41,6 +46,16 @@ class Ring(Rows):
     def __init__(self, n_modes: int, name: str | None = None):
         super().__init__(1 + 5 * n_modes, CAPACITY, name)
         self._parts = [1 + i * n_modes for i in range(6)]
+
+    @property
+    def late(self) -> int:
+        """Number of frames that were sent more than LATE after they were due."""
+        return int(self._head[2])
+
+    def send(self, row: Array) -> None:
+        """Append a frame, the time first at which it was due."""
+        self.write(row)
+        self._head[2] += monotonic() - row[0] > LATE
 
     def read(self, index: int) -> LiveFrame | None:
         """Return the frame of this number, None where it has been overwritten."""

@@ -8,8 +8,8 @@ import numpy as np
 
 from wfsobs.typing import Array
 
-HEAD = 16
-"""Bytes before the rows: the count, and whether the writer has ended."""
+HEAD = 24
+"""Bytes before the rows: the count, whether the writer has ended, and how many came late."""
 
 
 class Rows:
@@ -32,9 +32,11 @@ class Rows:
 
     def __init__(self, width: int, capacity: int, name: str | None = None):
         self._memory = SharedMemory(name=name, create=name is None, size=HEAD + 8 * capacity * width if name is None else 0)
-        self._head = np.ndarray(2, dtype=np.int64, buffer=self._memory.buf)
+        self._head = np.ndarray(3, dtype=np.int64, buffer=self._memory.buf)
         self._rows = np.ndarray((capacity, width), buffer=self._memory.buf, offset=HEAD)
         self.capacity, self._owner = capacity, name is None
+        if self._owner:
+            self._rows[0] = np.nan  # else it would be the one of number 0 before it is written
 
     @property
     def name(self) -> str:
@@ -65,10 +67,10 @@ class Rows:
         row = self._rows[index % self.capacity].copy()
         return None if self._head[0] - index > self.capacity - 1 else row
 
-    def read_rows(self, first: int, stop: int) -> Array:
+    def read_rows(self, first: int, stop: int, width: int | None = None) -> Array:
         """Return copies of the rows first ... stop - 1, (n, width); NaN where they have been overwritten or are yet to come."""
         first, at = max(first, 0), np.arange(max(first, 0), max(stop, first, 0))
-        rows = self._rows[at % self.capacity]
+        rows = self._rows[:, :width][at % self.capacity]
         head = int(self._head[0])
         rows[(head - at > self.capacity - 1) | (at >= head)] = np.nan
         return rows

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from wfsobs.live.board import NEXT, SLOTS
-from wfsobs.live.observing import slot_width
+from wfsobs.live.crew import slot_width
+from wfsobs.live.delivery import merged_rows
 from wfsobs.live.ring import LiveFrame, Ring
 from wfsobs.live.rows import Rows
 from wfsobs.observers.base import TARGETS
@@ -54,7 +54,7 @@ class LiveView:
 
     @property
     def delays(self) -> Array:
-        """Time from when a frame was due to when the observers had it, (n,) [s]."""
+        """Time from when a frame was due to when every observer had an estimate of it, (n,) [s]."""
         return self._traces[:, 1]
 
     def truth(self, target: str) -> Array:
@@ -83,24 +83,17 @@ class LiveView:
         """Return the rms error, (n_modes,) [um]; NaN where there is none."""
         return rms_of_known(self.error(observer, target))
 
-    @cached_property
-    def _known_traces(self) -> Array:
-        """The rows that are those of their frames: others have been overwritten, or skipped."""
-        traces = self._traces.copy()
-        traces[traces[:, 0] != self.first + np.arange(self.n), 1:] = np.nan
-        return traces
-
     def _of(self, observer: str) -> Array:
         width = slot_width(self.n_modes)
         at = 2 + SLOTS.index(observer) * width
-        return self._known_traces[:, at : at + width]
+        return self._traces[:, at : at + width]
 
 
-def read_view(ring: Ring, traces: Rows, dt: float, seconds: float) -> LiveView:
+def read_view(ring: Ring, traces: list[Rows], dt: float, seconds: float) -> LiveView:
     """Return the last so many seconds that all observers have taken."""
-    stop = traces.count
+    stop = min(rows.count for rows in traces)
     first = max(0, stop - max(1, round(seconds / dt)))
-    return LiveView(first, dt, ring.read_frames(first, stop), traces.read_rows(first, stop))
+    return LiveView(first, dt, ring.read_frames(first, stop), merged_rows(traces, first, stop))
 
 
 def rms_of_known(x: Array) -> Array:

@@ -80,7 +80,6 @@ def _number(x: float) -> str:
 
 def status_line(loop: LiveLoop, view: LiveView) -> str:
     """Say how the loop goes, in one line."""
-    taken, lost, late, _ = (int(x) for x in loop.board.totals)
     if not loop.is_ready:
         return "The observers are being designed"
     state = "Running" if loop.is_playing else "Paused"
@@ -88,9 +87,9 @@ def status_line(loop: LiveLoop, view: LiveView) -> str:
     parts = [
         f"{state} at {loop.speed:g} × real time",
         f"{view.dt * (view.first + view.n):.1f} s",
-        f"{taken} frames",
-        f"{lost} lost",
-        f"{100.0 * late / max(1, taken):.2f} % later than 1 ms",
+        f"{loop.delivery.frames} frames",
+        f"{loop.delivery.losses} lost",
+        f"{loop.delivery.late_share:.2%} later than 1 ms",
         f"observers {behind:.2f} s behind",
     ]
     return " · ".join([*parts, "recording"] if loop.recorder.is_on else parts)
