@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from ipaddress import ip_address
+from pathlib import Path
 from typing import Any
 
 import panel as pn
@@ -31,6 +32,7 @@ from wfsobs.app.service import Full, Service
 from wfsobs.app.session import session_page
 from wfsobs.app.warm import warm_up
 from wfsobs.app.work import one_blas_thread
+from wfsobs.campaign.follow import CampaignFolder
 
 CACHE_MB = 256
 MESSAGE_BYTES = 6_000_000
@@ -60,6 +62,7 @@ class Options:
     cache_mb   : results kept [MB]
     log_level  : debug, info, warning or error
     log_requests : also a line per request, which holds the address it came from
+    campaign   : folder of the campaign to show; empty for none
     """
 
     port: int = 5006
@@ -73,6 +76,7 @@ class Options:
     lifetime: float = 60.0
     log_level: str = "info"
     log_requests: bool = False
+    campaign: str = ""
 
 
 def options(*, public: bool | None = None, runs: int | None = None, **values: Any) -> Options:
@@ -91,13 +95,15 @@ def options(*, public: bool | None = None, runs: int | None = None, **values: An
 
 
 def serve(options: Options, live: LiveOrder | None = None) -> None:
-    """Serve the dashboard at http://address:port/prefix until told to stop by SIGINT or SIGTERM. Raises OSError.
+    """Serve the dashboard at http://address:port/prefix until told to stop by SIGINT or SIGTERM. Raises OSError, SettingError.
 
     live : a loop that runs until then, and that every page opens with
     """
     to_stream(options.log_level, options.log_requests)
     prepare()
     service = make_service(options.limits, options.runs, options.cache_mb)
+    if options.campaign:
+        service.campaign = CampaignFolder(Path(options.campaign))
     warm_up(service)
     if live is not None:
         share_loop(live, service)

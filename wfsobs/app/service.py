@@ -29,6 +29,7 @@ from wfsobs.settings.errors import SettingError
 
 if TYPE_CHECKING:
     from wfsobs.app.live_order import LiveOrder
+    from wfsobs.campaign.follow import CampaignFolder
     from wfsobs.live.loop import LiveLoop
 
 Compute = Callable[[Scenario, Watch, Tell, Source | None], RunResults]
@@ -58,6 +59,7 @@ class Service:
         self._last_wish = monotonic()
         self.live: LiveOrder | None = None  # the loop that all sessions watch
         self.live_loop: LiveLoop | None = None
+        self.campaign: CampaignFolder | None = None  # shown to all sessions; no visitor names a folder
         # Its thread is not one of low priority, as those of the jobs are: processes that it starts inherit that.
         self._starter = ThreadPoolExecutor(1, "wfsobs-start")
         self._starter.submit(bool)

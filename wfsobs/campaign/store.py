@@ -79,17 +79,25 @@ def batch_files(folder: Path) -> list[Path]:
     return sorted((folder / ROWS).glob("[!.]*.parquet"))
 
 
-def read_batches(folder: Path, columns: Iterable[str], unreadable: list[Path] | None = None) -> Iterator[pyarrow.Table]:
-    """Yield the rows of one file after the other; one that cannot be read is left out, and appended to `unreadable`."""
+def read_batch(path: Path, columns: Iterable[str]) -> pyarrow.Table | None:
+    """Return the rows of one file; None where it cannot be read."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    try:
+        return pq.ParquetFile(path).read(columns=list(columns))
+    except (OSError, pa.ArrowException):
+        return None
+
+
+def read_batches(folder: Path, columns: Iterable[str], unreadable: list[Path] | None = None) -> Iterator[pyarrow.Table]:
+    """Yield the rows of one file after the other; one that cannot be read is left out, and appended to `unreadable`."""
+    columns = list(columns)
     for path in batch_files(folder):
-        try:
-            yield pq.ParquetFile(path).read(columns=list(columns))
-        except (OSError, pa.ArrowException):
-            if unreadable is not None:
-                unreadable.append(path)
+        if (table := read_batch(path, columns)) is not None:
+            yield table
+        elif unreadable is not None:
+            unreadable.append(path)
 
 
 def read_results(folder: Path, provenance: bool = False) -> pyarrow.Table:

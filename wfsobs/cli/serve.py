@@ -59,6 +59,7 @@ from wfsobs.settings.errors import SettingError
     show_default=True,
     help="Minimum level of messages on standard error.",
 )
+@click.option("--campaign", metavar="DIR", default="", help="Show a campaign on a page of its own, while it runs and after.")
 @click.option("--log-requests", is_flag=True, help="Log every request, with address and query.")
 def serve(**options: Any) -> None:
     """Serve the dashboard (docs/serving.md)."""

@@ -13,6 +13,7 @@ import param
 
 from wfsobs.app.compared import comparison_of
 from wfsobs.app.display import Display
+from wfsobs.app.pages.campaign import CampaignPage
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.figures import Figures
 from wfsobs.app.pages.identify import IdentifyPage
@@ -26,7 +27,7 @@ from wfsobs.app.style import HEARD
 from wfsobs.result import Result
 
 EXPLORE, IDENTIFY, TUNE, SWEEP, LOOP, LIVE = "explore", "identify", "tune", "sweep", "loop", "live"
-FIGURES, MODEL = "figures", "model"
+CAMPAIGN, FIGURES, MODEL = "campaign", "figures", "model"
 TITLES: Mapping[str, str] = MappingProxyType(
     {
         "Explore": EXPLORE,
@@ -35,6 +36,7 @@ TITLES: Mapping[str, str] = MappingProxyType(
         "Sweep": SWEEP,
         "Closed loop": LOOP,
         "Live": LIVE,
+        "Campaign": CAMPAIGN,
         "Paper figures": FIGURES,
         "Model": MODEL,
     }
@@ -62,22 +64,27 @@ class Pages(param.Parameterized):
     def __init__(self, explore: Page, store: Store, display: Display):
         super().__init__()
         self.display = display
+        explored = partial(setattr, self, "current", EXPLORE)
         self._makers: dict[str, Callable[[], Page]] = {
             IDENTIFY: lambda: IdentifyPage(store, display),
             TUNE: lambda: TunePage(store, display),
-            SWEEP: lambda: SweepPage(store, display, partial(setattr, self, "current", EXPLORE)),
+            SWEEP: lambda: SweepPage(store, display, explored),
             LOOP: lambda: ClosedLoopPage(store, display),
             LIVE: lambda: LivePage(store, display),
             FIGURES: lambda: Figures(store.run, display),
             MODEL: lambda: ModelPage(store, display),
         }
+        if store.session.service.campaign is not None:
+            self._makers[CAMPAIGN] = lambda: CampaignPage(store, display, explored)
+        known = {title: name for title, name in TITLES.items() if name == EXPLORE or name in self._makers}
+        self.param["current"].objects = [*known.values()]
         self.by_name: dict[str, Page] = {EXPLORE: explore}
         self.rooms = {
             EXPLORE: explore.view(),
             **{name: pn.Column(visible=False, sizing_mode="stretch_width", margin=0) for name in self._makers},
         }
         self.switch = pmui.RadioButtonGroup.from_param(
-            self.param.current, options=dict(TITLES), size="small", margin=0, color="primary", sx=WRAPPED, stylesheets=[HEARD]
+            self.param.current, options=known, size="small", margin=0, color="primary", sx=WRAPPED, stylesheets=[HEARD]
         )
         self.view = pn.Column(*self.rooms.values(), sizing_mode="stretch_width", margin=0)
         self.param.watch(self._turn, "current")

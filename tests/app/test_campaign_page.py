@@ -1,0 +1,107 @@
+"""The page of a campaign: there if the server has one, true to the comparison of its rows, a square opens its scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.numbers import number
+from wfsobs.app.pages.campaign import CampaignPage
+from wfsobs.app.pages.pages import CAMPAIGN, EXPLORE
+from wfsobs.app.service import Session
+from wfsobs.campaign.compare import compare
+from wfsobs.campaign.follow import CampaignFolder
+from wfsobs.campaign.plan import Campaign, parse_plan
+from wfsobs.campaign.state import open_folder
+from wfsobs.campaign.store import read_results, write_batch
+from wfsobs.campaign.work import run_rows
+from wfsobs.scenario import Scenario
+
+PLAN = """
+name = "Tiny"
+seeds = 2
+first_seed = 7
+observers = ["kf-lgs", "persistence"]
+[settings]
+run.duration = 0.3
+run.warm_up = 0.1
+[grid]
+turbulence.wind_speed = [5, 20]
+sensors.exposure_ratio = [5, 10]
+"""
+PLACE = {"host": "here", "process": 1, "written": 1.0}
+
+
+def add_batch(plan: Campaign, folder: Path, seed: int) -> None:
+    write_batch(folder, [row for cell in plan.cells for row in run_rows(cell, seed, plan.observers, ())], PLACE)
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> Campaign:
+    plan = parse_plan(PLAN, tmp_path)
+    open_folder(plan, tmp_path)
+    add_batch(plan, tmp_path, 7)
+    return plan
+
+
+@pytest.fixture
+def dashboard(loop: Any, short: Scenario, enter: Callable[..., Session], plan: Campaign, tmp_path: Path) -> Dashboard:
+    session = enter()
+    session.service.campaign = CampaignFolder(tmp_path)
+    dashboard = Dashboard(loop.queue.put, session, short)
+    loop.closing.append(dashboard)
+    dashboard.page()
+    return dashboard
+
+
+def open_campaign(dashboard: Dashboard, loop: Any) -> CampaignPage:
+    dashboard.pages.current = CAMPAIGN
+    page = dashboard.pages.by_name[CAMPAIGN]
+    assert isinstance(page, CampaignPage)
+    loop.until(lambda: page.work.campaign is not None)
+    return page
+
+
+def squares(page: CampaignPage) -> dict[int, dict[str, Any]]:
+    return {square["index"]: square for row in page.map.grid["cells"] for square in row}
+
+
+def test_a_campaign_is_followed_and_opened(dashboard: Dashboard, loop: Any, plan: Campaign, tmp_path: Path) -> None:
+    page = open_campaign(dashboard, loop)
+    assert page.status.text.startswith("Tiny: 4 of 8 runs, 4 scenarios, ")
+    assert {square["state"] for square in squares(page).values()} == {"open"}, "one seed decides nothing"
+    add_batch(plan, tmp_path, 8)
+    page.tick()
+    loop.until(lambda: "8 of 8 runs" in page.status.text)
+    assert page.status.text.endswith(", finished")
+    assert "Persistence" in page.table.object
+    page.target.value = "vibration"
+    grid = page.map.grid
+    assert (grid["columns"], grid["rows"]) == (["5", "20"], ["10", "5"]), "the smallest value is at the bottom"
+    best = {c.cell: c for c in compare(read_results(tmp_path)) if (c.target, c.mode, c.is_best) == ("vibration", "tip", True)}
+    assert {cell: square["text"] for cell, square in squares(page).items()} == {c: number(one.rms) for c, one in best.items()}
+    assert "Persistence" not in page.table.object, "it has no estimate of the vibration"
+    assert page.slice is not None
+    y = page.slice.sources["kf-lgs"].data["y"]
+    rms = {c.cell: c.rms for c in compare(read_results(tmp_path)) if (c.target, c.mode, c.name) == ("vibration", "tip", "kf-lgs")}
+    assert y == pytest.approx([(rms[0] * rms[1]) ** 0.5, (rms[2] * rms[3]) ** 0.5]), "geometric mean over the other condition"
+    page.filters["sensors.exposure_ratio"].value = 0
+    assert page.slice.sources["kf-lgs"].data["y"] == pytest.approx([rms[0], rms[2]])
+    page.map._handle_msg({"load": 3})
+    opened = plan.cells[3].scenario().replace({"run.seed": 7})
+    assert dashboard.store.scenario == opened and dashboard.pages.current == EXPLORE
+    for nothing in (-1, 4):
+        page.load(nothing)
+    assert dashboard.store.scenario == opened
+
+
+def test_without_a_campaign_there_is_no_such_page(loop: Any, short: Scenario, enter: Callable[..., Session]) -> None:
+    dashboard = Dashboard(loop.queue.put, enter(), short)
+    loop.closing.append(dashboard)
+    dashboard.page()
+    assert CAMPAIGN not in dashboard.pages.switch.options.values()
+    assert dashboard.view_state.open("view.page=campaign")[0].startswith("view.page = campaign: takes one of explore, ")

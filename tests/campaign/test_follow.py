@@ -1,0 +1,103 @@
+"""Following a campaign: the arrays say what the comparison of all rows says, and what comes later is added."""
+
+import numpy as np
+import pytest
+
+from wfsobs.campaign.axes import MOST_VALUES, plan_axes
+from wfsobs.campaign.compare import compare
+from wfsobs.campaign.errors import CampaignErrors
+from wfsobs.campaign.follow import CampaignFolder
+from wfsobs.campaign.plan import parse_plan
+from wfsobs.campaign.state import open_folder
+from wfsobs.campaign.store import read_results, write_batch
+from wfsobs.campaign.work import run_rows
+from wfsobs.settings.errors import SettingError
+
+PLAN = """
+name = "Tiny"
+seeds = 3
+observers = ["kf-lgs", "persistence"]
+[settings]
+run.duration = 0.3
+run.warm_up = 0.1
+[grid]
+turbulence.wind_speed = [20, 5]
+sensors.exposure_ratio = [5, 10]
+"""
+
+
+@pytest.fixture
+def plan(tmp_path):
+    return parse_plan(PLAN, tmp_path)
+
+
+def add_batch(plan, folder, cells, seeds, written):
+    rows = [row for c in cells for s in seeds for row in run_rows(plan.cells[c], s, plan.observers, plan.controllers)]
+    write_batch(folder, rows, {"host": "here", "process": 1, "written": written})
+
+
+def test_what_is_followed_is_what_is_compared(plan, tmp_path, monkeypatch):
+    open_folder(plan, tmp_path)
+    followed = CampaignFolder(tmp_path)
+    assert followed.read().n_done == 0 and not followed.read().errors
+    add_batch(plan, tmp_path, range(4), (1,), 1000.0)
+    first = followed.read()
+    assert first.n_done == 4 and followed.read() is first
+    monkeypatch.setattr("wfsobs.campaign.follow.time", lambda: 1030.0)
+    add_batch(plan, tmp_path, range(4), (2,), 1020.0)
+    state = followed.read()
+    assert (state.n_done, state.seconds_left) == (8, 20.0), "four runs in 20 s, four are left"
+    monkeypatch.setattr("wfsobs.campaign.follow.time", lambda: 9000.0)
+    assert np.isnan(followed.read().seconds_left), "nothing was written for long"
+    add_batch(plan, tmp_path, range(4), (2, 3), 9001.0)  # one again, by a worker that was taken for dead
+    state = followed.read()
+    table = read_results(tmp_path)
+    assert state.n_done == plan.n_runs and not any(lost.any() for lost in state.failures.values())
+    for one in compare(table):
+        standings = {s.name: s for s in state.errors[one.target, one.mode].standings([one.cell])}
+        mine, best = standings[one.name], next((s for s in standings.values() if s.is_best), None)
+        # The same sums in another order: rounding.
+        assert mine.rms == pytest.approx(one.rms, rel=1e-12)
+        assert (mine.is_best, mine.is_tie) == (one.is_best, one.is_tie)
+        if one.difference is not None:
+            assert mine.above * best.rms == pytest.approx(one.difference, rel=1e-9)
+            assert 0.5 * (mine.high - mine.low) * best.rms == pytest.approx(one.half_width, rel=1e-9)
+
+
+def test_scenarios_that_fail_are_counted(tmp_path):
+    plan = parse_plan('seeds = 2\nobservers = ["kf-lgs"]\n[settings]\nrun.duration = 0.3\nrun.warm_up = 0.1', tmp_path)
+    open_folder(plan, tmp_path)
+    row = {"key": "k", "cell": 0, "scenario": "paper", "seed": 2, "name": "kf-lgs", "target": "", "mode": "", "apart": False}
+    write_batch(tmp_path, [{**row, "rms_nm": None, "note": "no"}], {"host": "", "process": 1, "written": 1.0})
+    state = CampaignFolder(tmp_path).read()
+    assert state.n_done == 1 and state.failures["kf-lgs"].tolist() == [1] and not state.errors
+    assert plan_axes(plan) == []
+
+
+def test_scenarios_are_the_blocks_of_many():
+    """Errors of b are 2, 2 and 2 times those of a: certain; the logarithms of those of c differ by -0.6, 0.1 and 0.8."""
+    a = np.array([10.0, 20.0, 40.0])
+    values = np.stack([a, 2.0 * a * [1.0, 1.001, 0.999], a * np.exp([-0.6, 0.1, 0.8]), 0.5 * a], axis=-1)[:, None, :]
+    errors = CampaignErrors(("a", "b", "c", "bound"), values, np.tile([True, True, True, False], (3, 1)))
+    found = {s.name: s for s in errors.standings([0, 1, 2])}
+    assert found["a"].rms == pytest.approx(20.0) and found["a"].is_best
+    assert found["b"].above == pytest.approx(1.0, abs=1e-3) and not found["b"].is_tie
+    # Student's t of 2 degrees of freedom at 97.5 % is 4.303; the logarithms have mean 0.1 and deviation 0.7.
+    assert found["c"].is_tie and found["c"].high == pytest.approx(np.exp(0.1 + 4.303 * 0.7 / 3**0.5) - 1.0, rel=1e-3)
+    assert np.isnan(found["bound"].above) and not found["bound"].is_best
+    ratio, low, high = errors.over_bound([0, 1, 2])
+    assert ratio[:1] == pytest.approx(2.0) and (low[0], high[0]) == pytest.approx((2.0, 2.0))
+
+
+def test_many_values_are_put_into_bins(tmp_path):
+    plan = parse_plan("[grid]\nturbulence.wind_speed = " + str([5 + i / 10 for i in range(100)]), tmp_path)
+    (axis,) = plan_axes(plan)
+    assert axis.is_binned and len(axis.values) == MOST_VALUES
+    wind = [cell.changes["turbulence.wind_speed"] for cell in plan.cells]
+    assert all(axis.values[i][0] <= w <= axis.values[i][1] for i, w in zip(axis.of_cell, wind, strict=True))
+    assert np.bincount(axis.of_cell).min() >= 6, "of 100 values 6 or 7 are in each of 16 bins"
+
+
+def test_a_folder_without_a_campaign_is_refused(tmp_path):
+    with pytest.raises(SettingError, match="holds no campaign"):
+        CampaignFolder(tmp_path)

@@ -1,0 +1,216 @@
+"""The campaign that the server was started with: how far it is, who is best where, and a way to open a scenario of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from html import escape
+from typing import Any
+
+import numpy as np
+import panel as pn
+import panel_material_ui as pmui
+
+from wfsobs.app.campaign_work import CampaignTask
+from wfsobs.app.controls.status import Status
+from wfsobs.app.display import Display
+from wfsobs.app.jobs.job import FAILED
+from wfsobs.app.pages.campaign_views import CampaignView, Slice, axis_name, standings_html, value_names, winners_grid
+from wfsobs.app.pages.parts import WIDE, PageActions, box, html, legend, line, text
+from wfsobs.app.pages.sweep_settings import line_of
+from wfsobs.app.pages.sweep_views import SweepMap
+from wfsobs.app.store import Store
+from wfsobs.campaign.axes import PlanAxis, plan_axes
+from wfsobs.campaign.follow import CampaignState
+from wfsobs.campaign.report import name_label
+from wfsobs.evaluation.scores import BOUNDS
+from wfsobs.scenario import Scenario
+from wfsobs.settings.errors import SettingError
+
+PERIOD = 5000
+"""Time between two looks at a campaign that is not finished [ms]."""
+ALL, NONE = "", ""
+FIRST_LINES = 5
+"""Observers whose lines are shown first: the best ones."""
+SHADES = (
+    "A full colour: the next is at least 30 % worse. Striped: another does not differ significantly, by a paired t-test over the "
+    "seeds of a scenario, or over the scenarios where a square has several. Click a square to open its scenario in Explore."
+)
+
+
+class CampaignPage(PageActions):
+    """The page. It reads; only the command line of the server names the folder."""
+
+    def __init__(self, store: Store, display: Display, explore: Callable[[], None]):
+        """Make the page. explore : turns to the page that shows a scenario."""
+        self.store, self.display, self._explore = store, display, explore
+        self.work = CampaignTask(store.session)
+        self.status = Status(label="Progress of the campaign", sizing_mode="stretch_width", margin=(4, 0))
+        self.failure = html()
+        self.room = pn.Column(**WIDE, stylesheets=[":host { gap: 10px; }"])
+        self.table, self.legend = html(), html()
+        self.map = SweepMap(self.load, grid={}, **WIDE)
+        self.pane = pn.Column(**WIDE)
+        self.slice: Slice | None = None
+        self.axes: dict[str, PlanAxis] = {}
+        self.filters: dict[str, Any] = {}
+        self.visible, self._targets = False, list[str]()
+        self.work.param.watch(self._take, ["state", "result"])
+        self.work.param.watch(self._say, ["state", "progress", "place", "message"])
+        display.param.watch(lambda _: self.draw(), ["mode", "unit", "dark"])
+        self._callback = pn.state.add_periodic_callback(self.tick, PERIOD, start=False) if pn.state.curdoc else None
+
+    def view(self) -> pn.Column:
+        """Return the contents of the page."""
+        return pn.Column(box("Campaign", self.status, self.failure), self.room, **WIDE, stylesheets=[":host { gap: 10px; }"])
+
+    def show(self, visible: bool) -> None:
+        """Look at the folder, and again and again while the page is shown and the campaign goes on."""
+        self.visible = visible
+        if visible:
+            self.work.look()
+            self.draw()
+        self._pace()
+
+    def tick(self) -> None:
+        """Look whether there is something new."""
+        self.work.look()
+
+    def _pace(self) -> None:
+        if self._callback is not None:
+            self.store.session.post(self._set_pace)  # once the page stands: what comes before that does not reach it
+
+    def _set_pace(self) -> None:
+        state = self.work.campaign
+        wanted = self.visible and (state is None or state.n_done < state.plan.n_runs)
+        if self._callback is not None and wanted != self._callback.running:
+            (self._callback.start if wanted else self._callback.stop)()
+
+    def load(self, cell: int) -> None:
+        """Open the scenario of a cell in Explore, with the first seed of the campaign."""
+        state = self.work.campaign
+        if state is None or not 0 <= cell < len(state.plan.cells):
+            return
+        try:
+            self.store.run_on(None, state.plan.cells[cell].scenario().replace({"run.seed": state.plan.seeds.start}))
+        except SettingError as error:
+            self._refuse(line_of(error))
+        else:
+            self._explore()
+
+    def _take(self, *_: object) -> None:
+        if self.work.state == FAILED:
+            self._refuse(line_of(SettingError(self.work.message)))
+        state = self.work.campaign
+        if state is not None:
+            self._make(state)
+            self.draw()
+            self._pace()
+
+    def _refuse(self, why: str) -> None:
+        self.failure.object = f'<p class="failure" role="status">{escape(why)}</p>'
+
+    def _say(self, *_: object) -> None:
+        """Describe how far the campaign is."""
+        state = self.work.campaign
+        if state is None:
+            self.status.param.update(text=self.work.line("Reading"), progress=self.work.progress)
+            return
+        plan, left = state.plan, state.seconds_left
+        said = f"{plan.name}: {state.n_done} of {plan.n_runs} runs, {len(plan.cells)} scenarios, {state.n_rows} rows"
+        if state.n_done == plan.n_runs:
+            said += ", finished"
+        elif np.isfinite(left):
+            said += f", about {_span(left)} left"
+        self.status.param.update(text=said, progress=state.n_done / plan.n_runs)
+
+    def _make(self, state: CampaignState) -> None:
+        """Make the fields when the first results are there, and anew where there are errors of something else."""
+        targets = list(dict.fromkeys(target for target, _ in state.errors))
+        if targets == self._targets:
+            return
+        self._targets = targets
+        base = state.plan.cells[0].scenario()
+        self.base: Scenario = base
+        self.axes = {axis.path: axis for axis in plan_axes(state.plan)}
+        names = {axis_name(axis, base): path for path, axis in self.axes.items()}
+        style = {"size": "small", "margin": 0, "width": 260}
+        paths = [*self.axes]
+        self.target = pmui.Select(label="Errors of", options={t.capitalize(): t for t in targets}, value=targets[0], **style)
+        self.across = pmui.Select(label="Across", options=names, value=paths[0] if paths else None, **style)
+        self.down = pmui.Select(
+            label="Down", options={"no second condition": NONE, **names}, value=paths[1] if len(paths) > 1 else NONE, **style
+        )
+        self.filters = {
+            path: pmui.Select(
+                label=f"Only {axis_name(axis, base)}",
+                options={"all": -1, **{name: i for i, name in enumerate(value_names(axis))}},
+                value=-1,
+                **style,
+            )
+            for path, axis in self.axes.items()
+        }
+        ranked = [s.name for s in next(iter(state.errors.values())).standings(range(len(state.plan.cells)))]
+        known = [*state.plan.observers, *state.plan.controllers]
+        best = [name for name in ranked if name in known][:FIRST_LINES]
+        self.lines = pmui.MultiChoice(
+            label="Lines", options={name_label(name): name for name in (*known, *BOUNDS)}, value=[*best, *BOUNDS], **WIDE
+        )
+        for field in (self.target, self.across, self.down, self.lines, *self.filters.values()):
+            field.param.watch(lambda _: self.draw(), "value")
+        fields = [line(self.target, self.across, self.down), line(*self.filters.values())] if self.axes else [line(self.target)]
+        self.room[:] = [box("Conditions", *fields), box("Observers", self.table)]
+        if self.axes:
+            self.room.extend(
+                [
+                    box("Best observers", self.map, text(SHADES)),
+                    box("Errors over one condition", self.lines, self.legend, self.pane),
+                ]
+            )
+
+    def view_of(self, state: CampaignState) -> CampaignView | None:
+        """Return what is shown by the fields and the mode of the page; None where there is nothing."""
+        target = self.target.value
+        modes = [mode for known, mode in state.errors if known == target]
+        cells = np.arange(len(state.plan.cells))
+        for path, field in self.filters.items():
+            if field.value >= 0:
+                cells = cells[self.axes[path].of_cell[cells] == field.value]
+        if not modes or not len(cells):
+            return None
+        mode = self.display.mode if self.display.mode in modes else modes[0]
+        return CampaignView(state, target, mode, state.errors[target, mode], cells, self.base)
+
+    def draw(self) -> None:
+        """Send the picture; only aggregates leave the server."""
+        state = self.work.campaign
+        if not self.visible or state is None or not self._targets:
+            return
+        with pn.io.hold():
+            view = self.view_of(state)
+            self.room.visible = view is not None
+            if view is None:
+                return
+            self.table.object = standings_html(view, self.display)
+            if not self.axes:
+                return
+            x = self.axes[self.across.value]
+            y = self.axes[self.down.value] if self.down.value not in (NONE, self.across.value) else None
+            self.map.grid = winners_grid(view, x, y, self.display)
+            self._draw_slice(view, x)
+
+    def _draw_slice(self, view: CampaignView, x: PlanAxis) -> None:
+        if self.slice is None or self.slice.axis is not x:
+            self.slice = Slice(x, self.base)
+            self.pane[:] = [pn.pane.Bokeh(self.slice.figure, **WIDE)]
+        self.slice.draw(view, self.lines.value, self.display)
+        drawn = [name for name in self.lines.value if name in view.errors.names]
+        self.legend.object = legend({name: name_label(name) for name in drawn}, self.display.dark)
+
+
+def _span(seconds: float) -> str:
+    """Write a time for people.
+
+    >>> _span(40), _span(600), _span(9000)
+    ('40 s', '10 min', '2.5 h')
+    """
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
