@@ -116,28 +116,28 @@ def _above(s: CampaignPlace) -> str:
 def winners_grid(view: CampaignView, x: PlanAxis, y: PlanAxis | None, display: Display) -> dict[str, Any]:
     """Describe the map of winners."""
     columns, rows = value_names(x), value_names(y) if y else [""]
+    across, down = axis_name(x, view.base), axis_name(y, view.base) if y else ""  # once: it looks through all settings
     of = np.full((len(columns), len(rows)), None, dtype=object)
     for cell in view.cells.tolist():
         i, j = int(x.of_cell[cell]), int(y.of_cell[cell]) if y else 0
         of[i, j] = [*(of[i, j] or []), cell]
     key: dict[str, str] = {}
     cells = [
-        [_square(view, of[i, j] or [], _where(view, (x, columns[i]), (y, rows[j])), display, key) for i in range(len(columns))]
+        [
+            _square(view, of[i, j] or [], f"{across} {columns[i]}" + (f", {down} {rows[j]}" if y else ""), display, key)
+            for i in range(len(columns))
+        ]
         for j in reversed(range(len(rows)))
     ]
     return {
         "title": f"Best of the campaign, {view.target}, {view.mode}",
-        "across": axis_name(x, view.base),
-        "down": axis_name(y, view.base) if y else "",
+        "across": across,
+        "down": down,
         "columns": columns,
         "rows": rows[::-1],
         "cells": cells,
         "key": [[colour, name] for name, colour in key.items()],
     }
-
-
-def _where(view: CampaignView, *conditions: tuple[PlanAxis | None, str]) -> str:
-    return ", ".join(f"{axis_name(axis, view.base)} {value}" for axis, value in conditions if axis is not None)
 
 
 def _square(view: CampaignView, cells: list[int], where: str, display: Display, key: dict[str, str]) -> dict[str, Any]:
