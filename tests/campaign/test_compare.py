@@ -6,7 +6,8 @@ import pytest
 from scipy.stats import binom, ttest_rel
 
 from wfsobs.campaign.compare import LEVEL, Comparison, compare, paired_difference
-from wfsobs.campaign.stopping import Stop, looks
+from wfsobs.campaign.plan import parse_plan
+from wfsobs.campaign.stopping import Stop, looks, wanted_seeds
 from wfsobs.campaign.store import schema
 
 
@@ -81,3 +82,29 @@ def test_intervals_where_it_is_stopped_cover_at_least_94_per_cent():
         used.append(count)
     assert hits / 4000 >= 0.94
     assert np.mean(used) < 80  # some are stopped before the last look
+
+
+def test_a_look_takes_the_first_seeds_whatever_has_arrived(tmp_path):
+    plan = parse_plan(
+        'seeds = 8\nobservers = ["kf-lgs", "kf-multi"]\n[grid]\nturbulence.wind_speed = [5, 10]\n[stop]\nfirst = 2\n', tmp_path
+    )
+    clear = [10.0, 10.001], [20.0, 20.002]  # by 10 +- 0.02 at the first look
+    reverse = [90.0, 10.0] * 3, [20.0, 80.0] * 3  # of which nothing is clear
+    noise = [10.0, 14.0] * 4, [14.0, 10.0] * 4  # the mean difference is zero
+    table = pa.Table.from_pylist(
+        [
+            {**r, "seed": r["seed"] + 1}
+            for name, first, then, other in zip(("kf-lgs", "kf-multi"), clear, reverse, noise, strict=True)
+            for r in [*rows(first + then, name), *rows(other, name, cell=1)]
+        ],
+        schema=schema(),
+    )
+    shuffled = table.take(np.random.default_rng(3).permutation(len(table)))
+    everything = np.ones((2, 8), dtype=bool)
+    third_is_missing = everything & (np.arange(8) != 2)
+    for arrived in (table, shuffled):
+        assert wanted_seeds(plan, everything, arrived).tolist() == [2, 8]
+        # the second look, at four seeds, waits for the third
+        assert wanted_seeds(plan, third_is_missing, arrived).tolist() == [2, 4]
+    early = table.filter(pa.array(table["seed"].to_numpy() <= 2))
+    assert wanted_seeds(plan, np.arange(8) < [[2], [2]], early).tolist() == [2, 4]
