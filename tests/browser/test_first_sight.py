@@ -99,7 +99,10 @@ PAINTED_LAST = """async () => {
   view.paint = function () { done.push("painted"); paint.call(this) }
   view._after_layout = function () { done.push("laid out"); _after_layout.call(this) }
   view.request_layout(true)
-  await new Promise((go) => setTimeout(go, 1000))
+  const end = performance.now() + 20000
+  while (performance.now() < end && !(done.includes("laid out") && done.at(-1) === "painted")) {
+    await new Promise((go) => setTimeout(go, 50))
+  }
   Object.assign(view, {paint, _after_layout})
   return [done.includes("laid out"), done.at(-1)]
 }"""

@@ -44,31 +44,37 @@ function patchTexts(doc) {
 }
 
 // Each part that is put into the page or changes its size has all of it laid out anew, some thirty times until the first picture
-// stands. Once a frame is enough. A figure that asks for it has painted by then, where things were before: it paints again.
+// stands. Once a frame is enough. A figure that has asked for it paints when it has been done: it would paint where things were.
 function layOutOnceAFrame() {
   const kind = Bokeh.Models.get("panel.models.esm.ReactiveESM").prototype.default_view.prototype
   const figure = Bokeh.Models.get("Figure").prototype.default_view.prototype
   if (kind.laidOutOnceAFrame) return
-  const compute = kind.compute_layout, compute_figure = figure.compute_layout
+  const {compute_layout} = kind, {compute_layout: ask, paint} = figure
+  const due = new Set()
   kind.laidOutOnceAFrame = true
-  figure.compute_layout = function () {
-    this.paintIsDue = true
-    compute_figure.call(this)
-  }
   kind.compute_layout = function () {
-    if (this.is_managed) compute.call(this)
-    else if (!this.layoutIsDue) {
-      this.layoutIsDue = true
+    if (this.is_managed) compute_layout.call(this)
+    else if (!due.has(this)) {
+      due.add(this)
       requestAnimationFrame(() => {
-        this.layoutIsDue = false
-        if (this.is_destroyed) return
-        compute.call(this)
-        for (const it of Bokeh.index.query((it) => it.paintIsDue)) {
-          it.paintIsDue = false
-          it.invalidate_painters()
-          it.paint()
-        }
+        due.delete(this)
+        if (!this.is_destroyed) compute_layout.call(this)
+        if (due.size === 0) paintAll()
       })
+    }
+  }
+  figure.compute_layout = function () {
+    ask.call(this)
+    this.paintIsDue = due.size > 0
+  }
+  figure.paint = function () {
+    if (!this.paintIsDue) paint.call(this)
+  }
+  function paintAll() {
+    for (const view of Bokeh.index.query((it) => it.paintIsDue)) {
+      view.paintIsDue = false
+      view.invalidate_painters()
+      view.paint()
     }
   }
 }
