@@ -76,7 +76,7 @@ class Result:
         """
         import pandas
 
-        return pandas.DataFrame(score_rows(self.scores, self.scenario.run.seed, self.prior_source))
+        return pandas.DataFrame(score_rows(self.scores, self.scenario.run.seed, source=self.prior_source))
 
     def estimate(self, observer: str, target: str) -> Estimate | None:
         """Return the estimate of one observer and target.

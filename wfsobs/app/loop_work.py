@@ -63,9 +63,8 @@ def compute(of: RunResults, watch: Watch, tell: Tell) -> LoopResults | None:
             spectra[outcome.controller] = welch_psd(outcome.residual[start:], record.dt)
         if outcome.controller not in quick[:-1]:
             result = ClosedLoop(plan, record, tuple(outcomes))
-            shown = LoopResults(
-                result, tuple(rows(result, None, of.result.prior_source)), dict(spectra), linear, outcome.controller == names[-1]
-            )
+            table = tuple(rows(result, None, source=of.result.prior_source))
+            shown = LoopResults(result, table, dict(spectra), linear, outcome.controller == names[-1])
             if not shown.complete:
                 tell(result=shown)
     return shown

@@ -152,7 +152,7 @@ def loop(
             one = scenario.replace({"run.seed": scenario.run.seed + i})
             given = simulate(one) if record is None else record
             result = closed_loop(given, plan, Watch(progress=lambda f, i=i: update((i + f) / seeds)))
-            all_rows += loop_rows(result, one.run.seed) if record is None else loop_rows(result, None, GIVEN)
+            all_rows += loop_rows(result, one.run.seed) if record is None else loop_rows(result, None, source=GIVEN)
     if as_json:
         click.echo(json.dumps(all_rows, allow_nan=False))
     else:

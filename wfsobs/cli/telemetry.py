@@ -67,7 +67,7 @@ def observe(
     if not result.scores and not as_json:
         click.echo(f"wfsobs: {record_file}: {len(result.estimates)} estimates, no scores: nothing after the warm-up", err=True)
         return
-    show(score_rows(result.scores, None, result.prior_source), as_json)
+    show(score_rows(result.scores, None, source=result.prior_source), as_json)
 
 
 @click.command()

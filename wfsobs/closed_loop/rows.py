@@ -22,7 +22,7 @@ LIMITED = "theory and margins are not applicable: a limit of the mirror acts, an
 NOT_APPLICABLE = "n/a"
 
 
-def rows(result: ClosedLoop, seed: int | None, source: PriorSource = TRUE) -> list[Row]:
+def rows(result: ClosedLoop, seed: int | None, *, source: PriorSource = TRUE) -> list[Row]:
     """One plain dictionary per controller and mode, the bounds last: the keys of `wfsobs loop --json`.
 
     residual_rms_nm, residual_rms_mas, strehl : of the simulation after the warm-up, null where the loop is not stable or could
@@ -67,7 +67,7 @@ def rows(result: ClosedLoop, seed: int | None, source: PriorSource = TRUE) -> li
             out.append(
                 row(
                     outcome.controller,
-                    controller_needs(outcome.controller, result.scenario, source),
+                    controller_needs(outcome.controller, result.scenario, source=source),
                     mode,
                     outcome.stable[mode],
                     left,
@@ -80,15 +80,15 @@ def rows(result: ClosedLoop, seed: int | None, source: PriorSource = TRUE) -> li
                     note=outcome.note or (LIMITED if limited else ""),
                 )
             )
-    (spectra,) = words_for((Spectra,), source)
+    (spectra,) = words_for((Spectra,), source=source)
     for bound, left in plan.bounds.items():
         out += [row(bound, spectra, mode, True, left) for mode in range(len(modes))]
     return out
 
 
-def controller_needs(controller: str, scenario: Scenario, source: PriorSource = TRUE) -> str:
+def controller_needs(controller: str, scenario: Scenario, *, source: PriorSource = TRUE) -> str:
     """Return what a controller needs beside measurements, for people; source : where its prior comes from."""
-    return CONTROLLERS[controller].needs_text(own_settings(CONTROLLERS[controller], scenario), source)
+    return CONTROLLERS[controller].needs_text(own_settings(CONTROLLERS[controller], scenario), source=source)
 
 
 def label(controller: str) -> str:

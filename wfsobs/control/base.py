@@ -114,9 +114,9 @@ class Controller:
         """Return what it needs beside measurements for these settings."""
         return tuple(dict.fromkeys((*self.asks(settings), *self.prior)))
 
-    def needs_text(self, settings: Settings, source: PriorSource = TRUE) -> str:
+    def needs_text(self, settings: Settings, *, source: PriorSource = TRUE) -> str:
         """Return what it needs beside measurements, for people; source : where its prior comes from."""
-        return ", ".join(words_for(self.parts(settings), source)) or NOTHING
+        return ", ".join(words_for(self.parts(settings), source=source)) or NOTHING
 
     def laws(self, prior: Prior, plant: Plant, settings: Settings, n_modes: int) -> tuple[Law, ...]:
         """One law per mode, none for control by nothing. Raises ValueError saying why there is none."""

@@ -23,7 +23,7 @@ NO_ESTIMATE = "zero"
 """The observer that stands for having none; it is never the best, nor worse than itself."""
 
 
-def score_rows(scores: Iterable[Score], seed: int | None, source: PriorSource = TRUE) -> list[Row]:
+def score_rows(scores: Iterable[Score], seed: int | None, *, source: PriorSource = TRUE) -> list[Row]:
     """Return one plain dictionary per score: the keys of `wfsobs run --json`, and TIME.
 
     source : where the prior of the observers comes from
@@ -40,7 +40,7 @@ def score_rows(scores: Iterable[Score], seed: int | None, source: PriorSource = 
             "start_s": s.start,
             "stop_s": s.stop,
             "apart": s.apart,
-            "needs": row_needs(s.observer, source),
+            "needs": row_needs(s.observer, source=source),
             "interval_um": None if s.interval is None else list(s.interval),
             "phases_um": None if s.phases is None else list(s.phases),
             **_calibration(s),
@@ -67,11 +67,11 @@ def row_label(observer: str) -> str:
     return NOT_OBSERVERS.get(observer) or OBSERVERS[observer].label
 
 
-def row_needs(observer: str, source: PriorSource = TRUE) -> str:
+def row_needs(observer: str, *, source: PriorSource = TRUE) -> str:
     """Return what a row needs beside measurements, from this source; a bound needs the true spectra."""
     if observer in NOT_OBSERVERS:
         return SPECTRA if observer in BOUNDS else ""
-    return OBSERVERS[observer].needs_text(source)
+    return OBSERVERS[observer].needs_text(source=source)
 
 
 def can_be_best(observer: str, apart: bool) -> bool:

@@ -20,17 +20,15 @@ SCORED = (*TARGETS, NEXT)
 """What errors are counted of."""
 SLOTS = tuple(o.id for o in OBSERVERS.values() if o.step is not None)
 """Observers that run frame by frame; each has its place."""
-CREWS = ("steady", "learning")
-"""Observers follow in one process, those that learn while they run in another: the others need not wait for them."""
-LEARNING = ("gpr-online", "kf-adaptive", "multirate-adaptive", "gpr-offline")
-"""Observers that learn while they run."""
+CREWS = ("linear", "others")
+"""Linear observers follow in one process, those that learn or take long in another, so that the linear ones are on time."""
 
 Integers = NDArray[np.int64]
 
 
 def crew_of(observer: str) -> int:
     """Return the place in CREWS of the process in which an observer follows."""
-    return CREWS.index("learning" if observer in LEARNING else "steady")
+    return CREWS.index("linear" if OBSERVERS[observer].linear else "others")
 
 
 class Counts(NamedTuple):

@@ -51,10 +51,10 @@ _WORDS: dict[Part, tuple[str, ...]] = {
 """Part -> what it is called in the column "Needs", by the source of the prior."""
 
 
-def words_for(parts: Iterable[Part], source: PriorSource = TRUE) -> tuple[str, ...]:
+def words_for(parts: Iterable[Part], *, source: PriorSource = TRUE) -> tuple[str, ...]:
     """Return what parts of a prior are called in the column "Needs", each word once.
 
-    >>> words_for((Model, Lines), IDENTIFIED)
+    >>> words_for((Model, Lines), source=IDENTIFIED)
     ('model', 'identified lines')
     """
     return tuple(dict.fromkeys(word.format(source=source) for part in parts for word in _WORDS[part]))

@@ -28,7 +28,7 @@ from wfsobs.settings.errors import SettingError
 
 PERIOD = 5000
 """Time between two looks at a campaign that is not finished [ms]."""
-ALL, NONE = "", ""
+NONE = ""
 FIRST_LINES = 5
 """Observers whose lines are shown first: the best ones."""
 SHADES = (

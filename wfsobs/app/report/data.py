@@ -128,7 +128,7 @@ def state_of(result: Result, states: int = 1, *, is_simulated: bool = True, evid
                 lines |= _frequencies(found[0])
                 for suffix, density in zip(("", "-error") if "error" in signals else ("",), found[1:], strict=False):
                     lines[f"psd{suffix}/{where}"], lines[f"cumulative{suffix}/{where}"] = _spectra(found[0], density[:, i])
-    rows = score_rows(result.scores, scenario.run.seed, result.prior_source)
+    rows = score_rows(result.scores, scenario.run.seed, source=result.prior_source)
     budgets = budget_rows(result) if is_simulated else []
     return State(
         scenario, rows, tuple(_reasons(result)), grid, lines, loop_rows(result), budgets, seeds_of(evidence) if evidence else {}
@@ -161,7 +161,7 @@ def loop_rows(result: Result) -> list[Row]:
     quick = [name for name, controller in CONTROLLERS.items() if controller.predict is None]
     try:
         closed = closed_loop(result.record, design(result.scenario, quick))
-        return controller_rows(closed, result.scenario.run.seed, result.prior_source)
+        return controller_rows(closed, result.scenario.run.seed, source=result.prior_source)
     except RecordError:
         return []
 

@@ -93,7 +93,7 @@ class Table:
                 *self._compared_cells(score.observer, score.target, score),
                 number(score.truth_rms * scale),
                 number(score.normalised_rms),
-                row_needs(score.observer, shown.result.prior_source),
+                row_needs(score.observer, source=shown.result.prior_source),
                 NOTHING,
                 *_times(score, shown.result.record.dt),
                 NOTHING,
@@ -134,7 +134,7 @@ class Table:
 
     def _row(self, name: str, target: str, score: Score | None, mark: Markup) -> Row:
         shown, compared = self.run.result, self._compared_cells(name, target, score)
-        needs = row_needs(name, shown.result.prior_source) if shown else row_needs(name)
+        needs = row_needs(name, source=shown.result.prior_source) if shown else row_needs(name)
         cells = [NOTHING, *compared, *[NOTHING] * 2, needs, *[NOTHING] * 4]
         if shown and score:
             scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
