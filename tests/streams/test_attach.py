@@ -195,7 +195,7 @@ def test_a_semaphore_that_another_process_waits_for_is_left_to_it(tmp_path: Path
     ("options", "reason"),
     [
         ([], "takes --out STREAM, or --shadow"),
-        (["--out", "IN"], "is the stream that is read"),
+        (["--out", "IN"], "is a stream that is read"),
         (["--shadow", "--modes", "0,0"], "different whole numbers"),
         (["--shadow", "--modes", "0,5"], "mode 5: a frame has 2 numbers, 0 to 1"),
         (["--shadow", "--modes", "0,1,2"], "the prior has 2 modes"),

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import click
 import numpy as np
 
-from wfsobs.cli.options import scenario_options, stream_elements
+from wfsobs.cli.options import ngs_options, ngs_wiring, scenario_options, stream_elements
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.step import StepError, StepObserver
 from wfsobs.prior import Model, Training
@@ -20,10 +20,12 @@ from wfsobs.record import Sampling
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import design, prior_in
-from wfsobs.streams.attach import STUCK, Attachment, Wiring
+from wfsobs.streams.attach import Attachment
 from wfsobs.streams.layout import StreamError
+from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage, stream_path
 from wfsobs.streams.watchdog import Fallback, Safety
+from wfsobs.streams.wiring import STUCK, Wiring
 from wfsobs.units import UNITS, micrometres_per
 
 
@@ -40,6 +42,7 @@ from wfsobs.units import UNITS, micrometres_per
     metavar="I,J,...",
     help="Elements of a frame, from 0, that are its modes; the first ones unless told.",
 )
+@ngs_options
 @click.option("--unit", type=click.Choice(UNITS), default="um", show_default=True, help="Unit of the streams.")
 @click.option(
     "--delay",
@@ -74,6 +77,9 @@ def attach(
     prior: str | None,
     name: str,
     modes: str | None,
+    ngs: str | None,
+    ngs_modes: str | None,
+    ngs_lag: int,
     unit: str,
     delay: float,
     fallback: Fallback,
@@ -95,13 +101,18 @@ def attach(
     per_unit = micrometres_per(unit, scenario.telescope.diameter)
     try:
         given = SharedImage(stream_path(source))
-        taken = None if sink is None else _open_sink(sink, given)
-        observer, noise = _design(name, scenario, len(elements), delay - 1)
+        taken = None if sink is None else _open_sink(sink, given, ngs)
+        observer, noise = _design(name, scenario, len(elements), delay - 1, ngs is not None)
         warm_up = max(round(scenario.run.warm_up / scenario.dt), 1)
         largest = np.inf if limit is None else limit * per_unit
         limits = Safety(fallback, largest, calm=warm_up)
         wiring = Wiring(elements, per_unit, delay, noise, limits, warm_up, stuck, semaphore)
-        attachment = Attachment(given, taken, observer, wiring, _say)
+        second = None
+        if ngs is not None:
+            second = NgsStream(
+                SharedImage(stream_path(ngs)), ngs_wiring(scenario, len(elements), ngs_modes, unit, ngs_lag, stuck), _say
+            )
+        attachment = Attachment(given, taken, observer, wiring, _say, second)
         with _stop_signals() as stop:
             attachment.run(seconds or np.inf, report=_say, stop=stop)
     except (StreamError, StepError) as error:
@@ -114,28 +125,30 @@ def _say(line: str) -> None:
     click.echo(f"wfsobs: attach: {line}", err=True)
 
 
-def _open_sink(name: str, source: SharedImage) -> SharedImage:
+def _open_sink(name: str, source: SharedImage, ngs: str | None) -> SharedImage:
     path = stream_path(name)
-    if path.resolve() == stream_path(source.path).resolve():
-        raise SettingError(f"--out {name}: is the stream that is read")
+    if path.resolve() in {stream_path(one).resolve() for one in (source.path, ngs) if one is not None}:
+        raise SettingError(f"--out {name}: is a stream that is read")
     if path.exists():
         return SharedImage(path)
     return SharedImage.create(path, source.header.shape, dtype=source.header.dtype.name, layout=source.header.layout)
 
 
-def _design(name: str, scenario: Scenario, n_modes: int, horizon: float) -> tuple[StepObserver, np.ndarray]:
+def _design(name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs: bool) -> tuple[StepObserver, np.ndarray]:
     """Return the observer, and the rms noise of a measurement that its prior has, (n_modes,) [um]."""
     if name not in OBSERVERS:
         raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
     declared = OBSERVERS[name]
     if Training in (*declared.prior, *declared.asks(observer_settings(declared, scenario))):
         raise StepError(f"{name}: learns from a record beforehand; takes an observer with a model, such as kf-multi")
-    sampling = Sampling(n_modes, scenario.dt, scenario.sensors.exposure_ratio)
+    sampling = Sampling(n_modes, scenario.dt, scenario.sensors.exposure_ratio if has_ngs else None)
+    if has_ngs != ("y_ngs" in declared.needs):
+        raise StepError(
+            f"{name}: takes no NGS; leave --ngs out" if has_ngs else f"{name}: takes an NGS; name its stream by --ngs"
+        )
     observer = design(name, scenario, sampling=sampling, horizon=horizon)
     if observer.estimator.needs_command:
         raise StepError(f"{name}: its windows hold commands, which the stream has not; set its inputs to z")
-    if "y_ngs" in declared.needs:
-        raise StepError(f"{name}: takes an NGS, and the stream has one sensor")
     model = prior_in(name, scenario, (Model,), scenario, sampling, None).model
     return observer, np.array([mode.lgs_noise for mode in model])
 

@@ -11,9 +11,10 @@ from wfsobs.record import DELAY, Record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.settings.errors import SettingError
+from wfsobs.streams.wiring import STUCK, NgsWiring
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import load_record
-from wfsobs.units import UNITS
+from wfsobs.units import UNITS, micrometres_per
 
 
 def scenario_options(command: Callable) -> Callable:
@@ -28,6 +29,24 @@ def scenario_options(command: Callable) -> Callable:
         ),
         click.option("--config", metavar="F.toml", help="Settings from a TOML file, on top of the preset."),
         click.option("--preset", metavar="NAME", help=f"Start from {', '.join(PRESETS)}; paper unless told."),
+    ):
+        command = option(command)
+    return command
+
+
+def ngs_options(command: Callable) -> Callable:
+    """Add --ngs, --ngs-modes and --ngs-lag, the stream of a second sensor."""
+    for option in (
+        click.option(
+            "--ngs-lag",
+            type=click.IntRange(0, 999),
+            default=0,
+            show_default=True,
+            metavar="L",
+            help="LGS frames between the end of an NGS exposure and the NGS frame.",
+        ),
+        click.option("--ngs-modes", metavar="I,J,...", help="Elements of a frame of the NGS that are its modes."),
+        click.option("--ngs", metavar="STREAM", help="Pseudo-open-loop modes of the NGS, for observers of both sensors."),
     ):
         command = option(command)
     return command
@@ -121,13 +140,26 @@ def load_declared(record_file: str, scenario: Scenario, declaration: DeclaredFor
     return record
 
 
-def stream_elements(text: str | None, n_modes: int) -> tuple[int, ...]:
+def stream_elements(text: str | None, n_modes: int, option: str = "--modes") -> tuple[int, ...]:
     """Return the elements of a frame that are the modes."""
     if text is None:
         return tuple(range(n_modes))
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and len(part) < 10 for part in parts) or len(set(parts)) != len(parts):
-        raise SettingError(f"--modes {text}: takes different whole numbers from 0 with commas, such as 0,1")
+        raise SettingError(f"{option} {text}: takes different whole numbers from 0 with commas, such as 0,1")
     if len(parts) > n_modes:
-        raise SettingError(f"--modes {text}: the prior has {n_modes} modes")
+        raise SettingError(f"{option} {text}: the prior has {n_modes} modes")
     return tuple(map(int, parts))
+
+
+def ngs_wiring(scenario: Scenario, n_modes: int, modes: str | None, unit: str, lag: int, stuck: float = STUCK) -> NgsWiring:
+    """Return how the stream of an NGS is read: at the ratio of the scenario, and stuck after three of its frames at least."""
+    elements = stream_elements(modes, n_modes, "--ngs-modes")
+    if len(elements) != n_modes:
+        raise SettingError(f"--ngs-modes {modes}: takes {n_modes} elements, one for each mode of the LGS")
+    ratio = scenario.sensors.exposure_ratio
+    if lag >= ratio:
+        raise SettingError(f"--ngs-lag {lag}: takes 0 to {ratio - 1}, less than an NGS frame")
+    return NgsWiring(
+        elements, micrometres_per(unit, scenario.telescope.diameter), ratio, lag, max(stuck, 3 * ratio * scenario.dt)
+    )

@@ -13,9 +13,10 @@ from wfsobs.live.paced import Desk, Staff, enter_process
 from wfsobs.live.ring import Ring
 from wfsobs.live.source import STREAM
 from wfsobs.record import Sampling
-from wfsobs.streams.attach import LONGEST_GAP, STUCK
+from wfsobs.streams.attach import LONGEST_GAP
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.shared_image import SharedImage
+from wfsobs.streams.wiring import STUCK
 
 TICK = 0.05
 """Longest wait for a frame before a look at the commands [s]."""

@@ -4,50 +4,28 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any
 
 import numpy as np
 
 from wfsobs.observers.step import StepObserver
+from wfsobs.streams.going_back import GoingBack
 from wfsobs.streams.layout import StreamError
+from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.semaphores import Semaphore
 from wfsobs.streams.shared_image import SharedImage
 from wfsobs.streams.tally import Tally
-from wfsobs.streams.watchdog import Safety, Watchdog
+from wfsobs.streams.watchdog import Watchdog
+from wfsobs.streams.wiring import Wiring, check_elements
 from wfsobs.typing import Array
 
-STUCK = 0.1
-"""Time without a frame after which a stream is stuck [s]."""
 TICK = 0.05
 """Longest wait for a frame before a look at the clock and at the wish to stop [s]."""
 RATE_ERROR = 0.05
 """Part of the rate by which a loop may be off the design."""
 LONGEST_GAP = 1000
 """Missing frames that an observer is taken through; after more of them it starts anew."""
-
-
-@dataclass(frozen=True)
-class Wiring:
-    """How an observer is attached.
-
-    elements : number in a frame of the stream of each mode of the observer
-    unit     : micrometres per unit of the streams
-    ahead    : frames from the newest measurement to the one that is to be met
-    noise    : rms of the noise of a measurement, (n_modes,) [um]
-    stuck    : time without a frame after which the stream is stuck [s]
-    semaphore : number of the semaphore that is waited for, where no other process does; None looks at the counter
-    """
-
-    elements: tuple[int, ...]
-    unit: float
-    ahead: float
-    noise: Array
-    safety: Safety = field(default_factory=Safety)
-    warm_up: int = 0
-    stuck: float = STUCK
-    semaphore: int | None = None
 
 
 class Attachment:
@@ -65,6 +43,8 @@ class Attachment:
         Modes, unit, horizon, limits.
     say : callable
         Receives one line about whatever happens.
+    ngs : NgsStream, optional
+        The frames of an NGS, for an observer that takes them.
 
     Raises
     ------
@@ -73,13 +53,17 @@ class Attachment:
     """
 
     def __init__(
-        self, source: SharedImage, sink: SharedImage | None, observer: StepObserver, wiring: Wiring, say: Callable[[str], None]
+        self,
+        source: SharedImage,
+        sink: SharedImage | None,
+        observer: StepObserver,
+        wiring: Wiring,
+        say: Callable[[str], None],
+        ngs: NgsStream | None = None,
     ):
         for stream in (source, sink):
-            if stream is not None and max(wiring.elements) >= stream.n:
-                raise StreamError(
-                    f"{stream.path}: mode {max(wiring.elements)}: a frame has {stream.n} numbers, 0 to {stream.n - 1}"
-                )
+            if stream is not None:
+                check_elements(stream, wiring.elements)
         self._source, self._sink, self._observer, self._wiring, self._say = source, sink, observer, wiring, say
         self._elements, n = np.array(wiring.elements), len(wiring.elements)
         self._watchdog = Watchdog(n, wiring.safety, say, wiring.warm_up)
@@ -90,6 +74,7 @@ class Attachment:
         self._out = np.zeros(sink.n if sink is not None else 0)
         self._count, self._alive = source.first, 0.0
         self._is_stuck = self._is_off_rate = False
+        self._ngs, self._frames = ngs, GoingBack(observer)
         self.tally = Tally(observer.sampling.dt)
 
     def run(
@@ -120,7 +105,7 @@ class Attachment:
                     self._stand_still()
                 now = monotonic()
                 if now >= spoken:
-                    report(self.tally.line(self._watchdog.reason))
+                    report(self._line())
                     self._check_rate()
                     spoken += 1.0
         finally:
@@ -162,21 +147,39 @@ class Attachment:
         count, values = found
         lost = count - self._count - 1
         if lost < 0 or lost > LONGEST_GAP:
-            self._start_anew(count, f"the counter went from {self._count} to {count}")
+            self._begin_at(count, f"the counter went from {self._count} to {count}")
             lost = 0
         self._count = count
         for _ in range(lost):
-            self._observer.update(self._missing)
+            self._frames.update(self._missing)
         z = values[self._elements] * self._wiring.unit
+        found_ngs = self._look_for_ngs()
         error = z - self._expectation if not lost else self._missing
-        estimate = self._step(np.where(np.isfinite(z), z, np.nan))
+        estimate = self._step(np.where(np.isfinite(z), z, np.nan), *found_ngs)
         self._send(self._watchdog.output(estimate, error, self._band, lost))
         self.tally.add(arrival, monotonic(), lost, z, error)
         self._observer.settle()
+        self._frames.keep()
         self._expect()
 
-    def _step(self, z: Array) -> Array:
-        self._observer.update(z)
+    def _look_for_ngs(self) -> tuple[Array | None, int]:
+        """Return the NGS measurement that is new, and how many frames ago it should have been there.
+
+        Where NGS frames have another place than the observer has been given them in, it starts anew.
+        """
+        if self._ngs is None:
+            return None, 0
+        found = self._ngs.look(self._count)
+        if (phase := self._ngs.phase) is not None:
+            age = (self._count - phase) % self._ngs.ratio
+            if self._observer.frame % self._ngs.ratio != age:
+                self._start_anew(self._count, "the NGS frames have found their place")
+                for _ in range(age):
+                    self._frames.update(self._missing)
+        return (None, 0) if found is None else (found[1], found[0])
+
+    def _step(self, z: Array, ngs: Array | None, late: int) -> Array:
+        self._frames.update(z, ngs, late)
         return sum(
             (self._observer.predict(self._wiring.ahead - 1, target)[0] for target in self._observer.targets), np.zeros_like(z)
         )
@@ -214,13 +217,20 @@ class Attachment:
         self._release()
         self._source = new
         self._claim()
-        self._start_anew(new.count, "the stream was made anew")
+        self._begin_at(new.count, "the stream was made anew")
+
+    def _begin_at(self, count: int, reason: str) -> None:
+        """Start anew with a counter that has nothing to do with the one before."""
+        if self._ngs is not None:
+            self._ngs.restart()
+        self._say(reason)
+        self._start_anew(count, reason)
 
     def _start_anew(self, count: int, reason: str) -> None:
         self._observer.reset()
+        self._frames.forget()
         self._expectation = np.full_like(self._expectation, np.nan)
         self._count = count
-        self._say(reason)
         self._watchdog.fall_back(reason)
 
     def _send(self, estimate: Array) -> None:
@@ -228,6 +238,11 @@ class Attachment:
             self._out[self._elements] = estimate / self._wiring.unit
             self._sink.write(self._out)
 
+    def _line(self) -> str:
+        line = self.tally.line(self._watchdog.reason)
+        return line if self._ngs is None else f"{line}; {self._ngs.line()}"
+
     def summary(self) -> dict[str, Any]:
         """Return counts, latencies [us] and errors [nm] so far, as JSON takes them."""
-        return {**self.tally.summary(), "fallbacks": self._watchdog.trips, "output": self._watchdog.reason or "on"}
+        ngs = {} if self._ngs is None else self._ngs.summary()
+        return {**self.tally.summary(), **ngs, "fallbacks": self._watchdog.trips, "output": self._watchdog.reason or "on"}

@@ -120,13 +120,13 @@ class SharedImage:
         except OSError:
             return False
 
-    def read(self) -> tuple[int, Array] | None:
-        """Return the counter and the numbers of the last frame, (n,); None where a writer does not end its frame.
+    def read(self, patience: float = WRITING) -> tuple[int, Array] | None:
+        """Return the counter and the numbers of the last frame, (n,); None where a writer does not end its frame in so long [s].
 
         A frame is taken only if it was not written to meanwhile: the flag of the writer is down before and after, and the
         counter has not moved.
         """
-        until = time.monotonic() + WRITING
+        until = time.monotonic() + patience
         while True:
             before = self.count
             if not self._writing[0]:
