@@ -14,6 +14,7 @@ from wfsobs.live.replay import RecordFrames, Replay, frame_rows
 from wfsobs.live.ring import LiveFrame, Ring
 from wfsobs.scenario.presets import paper
 from wfsobs.streams.shared_image import SharedImage
+from wfsobs.streams.wiring import NgsWiring
 
 
 class Inbox:
@@ -98,6 +99,41 @@ def test_a_stream_is_followed_through_whatever_happens_to_it(stream):
     frames.take()
     assert ring.count == 7 and lines() == [(6, "frames again")]
     np.testing.assert_array_equal(image._values, np.arange(4.0))  # nothing is written to it
+
+
+@pytest.mark.parametrize(("lag", "jitter"), [(0, 0), (0, 1), (2, 1)])
+def test_two_streams_are_the_rows_of_the_record(tmp_path, lag, jitter):
+    """Once the NGS frames have found their place each is in its row, a multiple of the ratio; frames that are missing as well."""
+    record, rng = wfsobs.simulate(paper().replace({"run.duration": 1.5})), np.random.default_rng(3)
+    lgs, ngs = (SharedImage.create(tmp_path / name, (2,), dtype="float64") for name in ("lgs.im.shm", "ngs.im.shm"))
+    ring, inbox, news = Ring(2), Inbox(), queue.Queue()
+    source = StreamSource(lgs.path, (0, 1), 1.0, 1e-3, ngs.path, NgsWiring((0, 1), 1.0, 5, lag))
+    assert source.sampling.ratio == 5 and "multirate-multi" in observers_on(source, paper())
+    frames = StreamFrames(source, Desk(ring.name, 2, inbox, news, 1.0, None))
+    frames._look()
+    inbox.waiting.append({"play": True})
+    frames._follow_commands()
+    arrival = {k: k + lag + int(rng.integers(0, jitter + 1)) for k in range(5, 1400, 5)}
+    arrival[700] = arrival[705]  # nobody sees it
+    for row in range(2, 1400):
+        for k in arrival:
+            if arrival[k] == row:
+                ngs.write(record.z_ngs[k])
+        lgs.write(record.z[row])
+        if not 810 <= row < 813:  # nobody looks
+            frames.take()
+    end = ring.count - ring.count % 5
+    sent = ring.read_frames(0, end)
+    start = 5 * (np.flatnonzero((sent.z[:, None] == record.z[200]).all(axis=2))[0] // 5)
+    assert start % 5 == 0
+    rows = np.arange(200, 200 + end - start)
+    z, expected = record.z[rows].copy(), record.z_ngs[rows].copy()
+    z[810 - 200 : 813 - 200], expected[700 - 200] = np.nan, np.nan
+    np.testing.assert_array_equal(sent.z[start:], z)
+    np.testing.assert_array_equal(sent.ngs[start:], expected)
+    assert [line.removeprefix(f"{ngs.path}: ") for _, line in news.queue] == ["one frame in 5 of the LGS"]
+    frames._ring.release()
+    ring.release()
 
 
 def test_observers_that_a_stream_can_have():

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from os import cpu_count
 
 import click
 import numpy as np
 from rich.table import Table
 
-from wfsobs.cli.options import scenario_options, stream_elements
+from wfsobs.cli.options import ngs_options, ngs_wiring, scenario_options, stream_elements
 from wfsobs.cli.show import progress_bar, show_table
 from wfsobs.files import check_writable
 from wfsobs.live.attached import StreamSource
@@ -33,6 +34,7 @@ from wfsobs.units import UNITS, micrometres_per
 @click.option("--replay", "replay_file", metavar="RECORD", help="Frames of a record, once: .npz, .csv, .fits or AOT.")
 @click.option("--in", "stream", metavar="STREAM", help="Frames of a running loop, in shadow (docs/streams.md).")
 @click.option("--modes", metavar="I,J,...", help="Elements of a frame of the stream, from 0, that are its modes.")
+@ngs_options
 @click.option("--unit", type=click.Choice(UNITS), default="um", show_default=True, help="Unit of the stream.")
 @click.option("--observer", "observers", multiple=True, metavar="NAME", help="Run this observer alone; can be given many times.")
 @click.option("--speed", type=click.FloatRange(0.1, 20), default=1.0, metavar="X", help="1 is real time, the default.")
@@ -52,6 +54,9 @@ def live(
     replay_file: str | None,
     stream: str | None,
     modes: str | None,
+    ngs: str | None,
+    ngs_modes: str | None,
+    ngs_lag: int,
     unit: str,
     observers: tuple[str, ...],
     speed: float,
@@ -72,6 +77,8 @@ def live(
     scenario = configfile.scenario_from(preset, config, assignments)
     check_live(scenario)
     source = _source(scenario, replay_file, stream, modes, unit)
+    if ngs is not None:
+        source = _with_ngs(source, scenario, ngs, ngs_modes, unit, ngs_lag)
     names = tuple(observers or observers_on(source, scenario))
     if headless:
         _run_headless(source, scenario, names, speed, seconds, record_file, as_json)
@@ -96,6 +103,14 @@ def _source(scenario: Scenario, replay_file: str | None, stream: str | None, mod
     elements = stream_elements(modes, len(scenario.modes))
     path = str(stream_path(stream))
     return StreamSource(path, elements, micrometres_per(unit, scenario.telescope.diameter), scenario.dt)
+
+
+def _with_ngs(source: LiveSource, scenario: Scenario, ngs: str, modes: str | None, unit: str, lag: int) -> StreamSource:
+    """Return a stream with that of an NGS. Raises SettingError where the source is none."""
+    if not isinstance(source, StreamSource):
+        raise SettingError("live: --ngs is a stream beside that of --in")
+    wiring = ngs_wiring(scenario, len(source.elements), modes, unit, lag)
+    return replace(source, ngs_path=str(stream_path(ngs)), ngs=wiring)
 
 
 def _run_headless(

@@ -10,13 +10,16 @@ from time import monotonic, sleep
 import numpy as np
 
 from wfsobs.live.paced import Desk, Staff, enter_process
+from wfsobs.live.pairing import PairedFrames
 from wfsobs.live.ring import Ring
 from wfsobs.live.source import STREAM
 from wfsobs.record import Sampling
 from wfsobs.streams.attach import LONGEST_GAP
 from wfsobs.streams.layout import StreamError
+from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage
-from wfsobs.streams.wiring import STUCK
+from wfsobs.streams.wiring import STUCK, NgsWiring
+from wfsobs.typing import Array
 
 TICK = 0.05
 """Longest wait for a frame before a look at the commands [s]."""
@@ -26,7 +29,7 @@ RETRY = 0.5
 
 @dataclass(frozen=True)
 class StreamSource:
-    """A stream as a source: pseudo-open-loop modes of one sensor.
+    """A stream as a source: pseudo-open-loop modes of one sensor, or two streams of two sensors.
 
     Attributes
     ----------
@@ -38,19 +41,25 @@ class StreamSource:
         Micrometres per unit of the stream.
     dt : float
         Time between two frames by the design of the observers [s].
+    ngs_path : str
+        File of the stream of the NGS, "" for none.
+    ngs : NgsWiring, optional
+        How that is read.
     """
 
     path: str
     elements: tuple[int, ...]
     unit: float
     dt: float
+    ngs_path: str = ""
+    ngs: NgsWiring | None = None
     name = STREAM
     has_truth = False
 
     @property
     def sampling(self) -> Sampling:
-        """Modes and step; no NGS."""
-        return Sampling(len(self.elements), self.dt)
+        """Modes and step, and NGS ratio where there is one."""
+        return Sampling(len(self.elements), self.dt, None if self.ngs is None else self.ngs.ratio)
 
     def staff(self, context: SpawnContext, desk: Desk) -> Staff:
         """Return its process."""
@@ -77,9 +86,11 @@ class StreamFrames:
     def __init__(self, source: StreamSource, desk: Desk):
         self._source, self._desk, self._elements = source, desk, np.array(source.elements)
         self._ring = Ring(desk.n_modes, desk.ring_name)
+        self._nothing = np.full(desk.n_modes, np.nan)
         self._row = np.full(1 + 5 * desk.n_modes, np.nan)
         self._row[1 + 2 * desk.n_modes : 1 + 3 * desk.n_modes] = 0.0  # of commands nothing is known: z is all there is
         self._stream: SharedImage | None = None
+        self._pairs: PairedFrames | None = None
         self._count, self._alive, self._steps = 0, monotonic(), 0
         self._is_playing = self._is_stuck = self._is_garbage = False
 
@@ -113,20 +124,34 @@ class StreamFrames:
         self._steps = max(0, self._steps - 1)
         if missing < 0 or missing > LONGEST_GAP:
             self._say("the counter has jumped")
+            self._begin_at()
         else:
-            for _ in range(missing):
-                self._write(np.nan)
+            for k in range(missing, 0, -1):
+                self._send(count - k, self._nothing, is_missing=True)
         z = values[self._elements] * self._source.unit
         is_garbage = not np.isfinite(z).all()
         if is_garbage and not self._is_garbage:
             self._say("numbers that are not finite")
         self._is_garbage = is_garbage
-        self._write(np.where(np.isfinite(z), z, np.nan))
+        self._send(count, np.where(np.isfinite(z), z, np.nan))
 
-    def _write(self, z: object) -> None:
-        self._row[0] = self._alive
-        self._row[1 : 1 + self._desk.n_modes] = z
+    def _send(self, count: int, z: Array, is_missing: bool = False) -> None:
+        """Write a frame, or those that have waited with it for an NGS frame."""
+        if self._pairs is None:
+            self._write(z, self._nothing)
+            return
+        for row in self._pairs.add(count, z, self._ring.count, is_missing):
+            self._write(*row)
+
+    def _write(self, z: Array, ngs: Array) -> None:
+        n = self._desk.n_modes
+        self._row[0], self._row[1 : 1 + n], self._row[1 + n : 1 + 2 * n] = self._alive, z, ngs
         self._ring.write(self._row)
+
+    def _begin_at(self) -> None:
+        """Write what is held back: the counter of the stream is another one from now on."""
+        for row in () if self._pairs is None else self._pairs.restart():
+            self._write(*row)
 
     def _follow_commands(self) -> None:
         while self._desk.inbox.poll():
@@ -143,6 +168,8 @@ class StreamFrames:
             stream = SharedImage(self._source.path)
             if max(self._source.elements) >= stream.n:
                 raise StreamError(f"a frame has {stream.n} numbers, mode {max(self._source.elements)} is not among them")
+            if self._source.ngs is not None and self._pairs is None:
+                self._pairs = self._pair(self._source.ngs)
         except StreamError as error:
             if not self._is_stuck:
                 self._is_stuck = True
@@ -150,6 +177,12 @@ class StreamFrames:
             sleep(RETRY)
             return
         self._stream, self._count = stream, stream.count
+        self._begin_at()
+
+    def _pair(self, wiring: NgsWiring) -> PairedFrames:
+        """Open the stream of the NGS. Raises StreamError."""
+        ngs = NgsStream(SharedImage(self._source.ngs_path), wiring, lambda line: self._desk.say(self._ring.count, line))
+        return PairedFrames(ngs, self._desk.n_modes, wiring.lag)
 
     def _stand_still(self) -> None:
         assert self._stream is not None

@@ -15,8 +15,10 @@ from wfsobs.typing import Array
 
 SEARCH = 20
 """NGS frames from which their place among the LGS frames is found."""
-LONGEST_SEARCH = 1000
+LONGEST_SEARCH = 200
 """NGS frames that it is found from at most: the search is twice as long each time that a place has not held."""
+LONGEST_GAP = 1000
+"""NGS frames that may be missing in a row; after more of them the counter is taken for another one."""
 TOO_LATE = 10
 """NGS frames in a row that come too late before their place is looked for anew."""
 
@@ -84,7 +86,7 @@ class NgsStream:
         number, values = frame
         skipped, self._count = number - self._count - 1, number
         self._note_alive()
-        if not 0 <= skipped <= LONGEST_SEARCH:
+        if not 0 <= skipped <= LONGEST_GAP:
             self._lose_phase("the counter has jumped")
         self._n_frames += 1
         late = self._lateness(number, count - self._wiring.lag)
