@@ -1,5 +1,7 @@
 """Comparisons over seeds: against scipy, and how often their intervals hold."""
 
+import tracemalloc
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -8,7 +10,7 @@ from scipy.stats import binom, ttest_rel
 from wfsobs.campaign.compare import LEVEL, Comparison, compare, paired_difference
 from wfsobs.campaign.plan import parse_plan
 from wfsobs.campaign.stopping import Stop, looks, wanted_seeds
-from wfsobs.campaign.store import schema
+from wfsobs.campaign.store import ROWS, BatchIndex, schema, write_batch
 
 
 def rows(values, name, cell=0):
@@ -91,20 +93,70 @@ def test_a_look_takes_the_first_seeds_whatever_has_arrived(tmp_path):
     clear = [10.0, 10.001], [20.0, 20.002]  # by 10 +- 0.02 at the first look
     reverse = [90.0, 10.0] * 3, [20.0, 80.0] * 3  # of which nothing is clear
     noise = [10.0, 14.0] * 4, [14.0, 10.0] * 4  # the mean difference is zero
-    table = pa.Table.from_pylist(
-        [
-            {**r, "seed": r["seed"] + 1}
-            for name, first, then, other in zip(("kf-lgs", "kf-multi"), clear, reverse, noise, strict=True)
-            for r in [*rows(first + then, name), *rows(other, name, cell=1)]
-        ],
-        schema=schema(),
-    )
-    shuffled = table.take(np.random.default_rng(3).permutation(len(table)))
+    table = [
+        {**r, "seed": r["seed"] + 1, "key": f"{r['cell']} {r['seed']} {name}"}
+        for name, first, then, other in zip(("kf-lgs", "kf-multi"), clear, reverse, noise, strict=True)
+        for r in [*rows(first + then, name), *rows(other, name, cell=1)]
+    ]
+    shuffled = [table[i] for i in np.random.default_rng(3).permutation(len(table))]
     everything = np.ones((2, 8), dtype=bool)
     third_is_missing = everything & (np.arange(8) != 2)
     for arrived in (table, shuffled):
-        assert wanted_seeds(plan, everything, arrived).tolist() == [2, 8]
+        index = written(tmp_path / str(len(list(tmp_path.iterdir()))), [arrived[:5], arrived[5:], arrived[:7]])
+        assert wanted_seeds(plan, everything, index).tolist() == [2, 8]
         # the second look, at four seeds, waits for the third
-        assert wanted_seeds(plan, third_is_missing, arrived).tolist() == [2, 4]
-    early = table.filter(pa.array(table["seed"].to_numpy() <= 2))
+        assert wanted_seeds(plan, third_is_missing, index).tolist() == [2, 4]
+    early = written(tmp_path / "early", [[r for r in table if r["seed"] <= 2]])
     assert wanted_seeds(plan, np.arange(8) < [[2], [2]], early).tolist() == [2, 4]
+
+
+def written(folder, batches):
+    """Write batches, some rows perhaps twice, and return their index."""
+    (folder / ROWS).mkdir(parents=True)
+    for batch in batches:
+        write_batch(folder, batch, {})
+    return BatchIndex(folder)
+
+
+class Counted:
+    """An index that counts the rows that it hands out at a time."""
+
+    def __init__(self, index):
+        self.index, self.n_rows, self.held = index, index.n_rows, []
+
+    def read(self, cells):
+        table = self.index.read(cells)
+        self.held.append(len(table))
+        return table
+
+
+def test_as_many_rows_are_held_whatever_the_number_of_scenarios(tmp_path, monkeypatch):
+    """Counted, and by tracemalloc, which sees numpy and Python; the memory of a process has libraries and freed pages in it."""
+    seeds, held, peaks = 16, [], []
+    monkeypatch.setattr("wfsobs.campaign.stopping.HELD", 10 * 2 * seeds)  # ten scenarios of two observers
+    for n_cells in (20, 160):
+        winds = ", ".join(str(5 + i / 10) for i in range(n_cells))
+        text = f'observers = ["kf-lgs", "kf-multi"]\n[grid]\nturbulence.wind_speed = [{winds}]\n[stop]\nfirst = 4\n'
+        plan, rng = parse_plan(f"seeds = {seeds}\n{text}", tmp_path), np.random.default_rng(4)
+        batches = [
+            [
+                {**r, "seed": r["seed"] + 1, "key": f"{cell} {r['seed']} {name}"}
+                for name in ("kf-lgs", "kf-multi")
+                for r in rows(rng.normal(10, 1, seeds).tolist(), name, cell)
+            ]
+            for cell in range(n_cells)
+        ]
+        index = Counted(written(tmp_path / str(n_cells), batches))
+        everything = np.ones((n_cells, seeds), dtype=bool)
+        wanted_seeds(plan, everything, index)  # what is imported and kept on the first call does not count
+        tracemalloc.start()
+        found = wanted_seeds(plan, everything, index)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        held.append(max(index.held))
+        monkeypatch.setattr("wfsobs.campaign.stopping.HELD", 10**9)
+        assert np.array_equal(found, wanted_seeds(plan, everything, index))
+        monkeypatch.setattr("wfsobs.campaign.stopping.HELD", 10 * 2 * seeds)
+    assert held == [10 * 2 * seeds] * 2
+    # the answer itself has 8 bytes a scenario, 1 kB here; eight times as many scenarios are to take no quarter more
+    assert 0.8 < peaks[1] / peaks[0] < 1.25

@@ -1,5 +1,6 @@
-"""A campaign on a Dask scheduler as users start it, whose workers die."""
+"""A campaign on a Dask scheduler as users start it, whose workers and schedulers die."""
 
+import socket
 import subprocess
 import sys
 import time
@@ -11,49 +12,60 @@ from distributed import Client
 from tests.campaign.test_run import COMMAND, ENVIRONMENT, SHORT_BATCHES, TINY
 
 
+class Cluster:
+    """A scheduler and its workers, each with a nanny that starts it again."""
+
+    def __init__(self, folder, port):
+        self.folder, self.port, self.address = folder, port, f"tcp://127.0.0.1:{port}"
+        self.started = []
+
+    def start(self, program, *arguments):
+        command = [sys.executable, "-m", f"distributed.cli.{program}", *arguments, "--no-dashboard"]
+        self.started.append(subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.DEVNULL))
+        return self.started[-1]
+
+    def start_scheduler(self):
+        return self.start("dask_scheduler", "--host", "127.0.0.1", "--port", str(self.port))
+
+    def start_worker(self):
+        return self.start("dask_worker", self.address, "--nthreads", "1", "--local-directory", str(self.folder))
+
+    def end(self):
+        family = [p for one in self.started if one.poll() is None for p in psutil.Process(one.pid).children(recursive=True)]
+        for one in reversed(self.started):
+            one.kill()
+            one.wait()
+        for p in family:
+            if p.is_running():
+                p.kill()
+
+
 @pytest.fixture
 def cluster(tmp_path):
-    """Start a scheduler and two workers, each with a nanny that starts it again; yield the address and the nannies."""
-    info = tmp_path / "scheduler.json"
-    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
-    started = [
-        subprocess.Popen([*dask, "--no-dashboard", "--scheduler-file", str(info)], env=ENVIRONMENT, stderr=subprocess.DEVNULL)
-    ]
-    while not info.exists():
-        time.sleep(0.1)
-    with Client(scheduler_file=str(info)) as client:
-        address = client.scheduler.address
-        worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"]
-        started += [
-            subprocess.Popen([*worker, "--local-directory", str(tmp_path)], env=ENVIRONMENT, stderr=subprocess.DEVNULL)
-            for _ in range(2)
-        ]
-        client.wait_for_workers(2, timeout=60)
-    yield address, started[1:]
-    family = [p for one in started for p in psutil.Process(one.pid).children(recursive=True)]
-    for one in reversed(started):
-        one.kill()
-        one.wait()
-    for p in family:
-        if p.is_running():
-            p.kill()
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    made = Cluster(tmp_path, port)
+    yield made
+    made.end()
 
 
-def test_a_worker_that_dies_changes_nothing(cluster, tmp_path):
-    address, nannies = cluster
-    plan, out, alone = tmp_path / "plan.toml", tmp_path / "out", tmp_path / "alone"
-    plan.write_text(TINY.format(seeds=40), encoding="utf-8")
-    command = [sys.executable, "-c", SHORT_BATCHES, "campaign", "run", str(plan), "--out", str(out), "--scheduler", address]
-    running = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE)
+def start_campaign(cluster, tmp_path, seeds=40):
+    """Start a campaign of batches of two runs; return its process, the plan and its folder."""
+    plan, out = tmp_path / "plan.toml", tmp_path / "out"
+    plan.write_text(TINY.format(seeds=seeds), encoding="utf-8")
+    command = [sys.executable, "-c", SHORT_BATCHES, "campaign", "run", str(plan), "--out", str(out)]
+    command += ["--scheduler", cluster.address]
+    return subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE), plan, out
+
+
+def wait_for_batch(running, out):
     while not list(out.glob("rows/*.parquet")):
         assert running.poll() is None
         time.sleep(0.01)
-    worker = max(psutil.Process(nannies[0].pid).children(recursive=True), key=lambda p: p.memory_info().rss)  # not its tracker
-    worker.kill()
-    assert running.poll() is None and len(list(out.glob("rows/*.parquet"))) < 40
-    _, said = running.communicate(timeout=200)
-    assert running.returncode == 0, said
-    assert b"80 of 80 runs are done" in said
+
+
+def is_as_undisturbed(plan, out, alone):
+    """Return whether the table is that of a run on one process, byte for byte."""
     subprocess.run([*COMMAND, "campaign", "run", str(plan), "--out", str(alone), "--workers", "1"], env=ENVIRONMENT, check=True)
     tables = [
         subprocess.run(
@@ -61,7 +73,58 @@ def test_a_worker_that_dies_changes_nothing(cluster, tmp_path):
         ).stdout
         for folder in (out, alone)
     ]
-    assert tables[0] == tables[1]
+    return tables[0] == tables[1]
+
+
+def test_a_worker_that_dies_changes_nothing(cluster, tmp_path):
+    cluster.start_scheduler()
+    nannies = [cluster.start_worker() for _ in range(2)]
+    with Client(cluster.address, timeout=60) as client:
+        client.wait_for_workers(2, timeout=60)
+    running, plan, out = start_campaign(cluster, tmp_path)
+    wait_for_batch(running, out)
+    worker = max(psutil.Process(nannies[0].pid).children(recursive=True), key=lambda p: p.memory_info().rss)  # not its tracker
+    worker.kill()
+    assert running.poll() is None and len(list(out.glob("rows/*.parquet"))) < 40
+    _, said = running.communicate(timeout=200)
+    assert running.returncode == 0, said
+    assert b"80 of 80 runs are done" in said
+    assert is_as_undisturbed(plan, out, tmp_path / "alone")
+
+
+def test_a_scheduler_that_is_started_again_changes_nothing(cluster, tmp_path):
+    scheduler = cluster.start_scheduler()
+    cluster.start_worker()
+    running, plan, out = start_campaign(cluster, tmp_path)
+    wait_for_batch(running, out)
+    scheduler.kill()
+    scheduler.wait()
+    while b"is gone: waiting" not in (told := running.stderr.readline()):
+        assert told
+    cluster.start_scheduler()
+    cluster.start_worker()  # the first one ended with its scheduler
+    _, said = running.communicate(timeout=200)
+    assert running.returncode == 0, said
+    assert b"80 of 80 runs are done, 80 of them now; workers or their scheduler were lost" in said
+    assert b"Traceback" not in said and b"ERROR" not in said
+    assert is_as_undisturbed(plan, out, tmp_path / "alone")
+
+
+def test_a_scheduler_without_workers_is_told_and_waited_for(cluster, tmp_path):
+    cluster.start_scheduler()
+    running, _, out = start_campaign(cluster, tmp_path, seeds=2)
+    line = f"wfsobs: no worker at {cluster.address}: waiting; start one with: dask worker {cluster.address} --nthreads 1\n"
+    assert running.stderr.readline().decode() == line
+    running.terminate()  # it does not wait for ever
+    _, said = running.communicate(timeout=60)
+    assert running.returncode == 143 and b"0 of 4 runs are done" in said
+    running, _, out = start_campaign(cluster, tmp_path, seeds=2)
+    assert running.stderr.readline().decode() == line
+    cluster.start_worker()
+    _, said = running.communicate(timeout=200)
+    assert running.returncode == 0 and said.count(b"\n") == 2
+    assert b"going on" in said and b"4 of 4 runs are done" in said
+    assert not list(out.glob("rows/.*"))
 
 
 def test_without_a_scheduler_there_is_one_line(tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -140,30 +141,44 @@ class Samples:
 
 def each_group(table: pyarrow.Table) -> Iterator[Samples]:
     """Yield what ran in each scenario, for each target and mode."""
-    rows = table.sort_by([(c, "ascending") for c in ("cell", "target", "mode", "name", "seed")]).to_pylist()
-    start = 0
-    failed: dict[int, list[tuple[str, int]]] = {}
-    for row in rows:
-        if not row["target"]:
-            failed.setdefault(row["cell"], []).append((row["name"], row["seed"]))
-    while start < len(rows):
-        key = tuple(rows[start][c] for c in ("cell", "target", "mode"))
-        stop = start
-        while stop < len(rows) and tuple(rows[stop][c] for c in ("cell", "target", "mode")) == key:
-            stop += 1
-        part, start = rows[start:stop], stop
-        if not key[1]:
+    if not len(table):
+        return
+    table = table.sort_by([(c, "ascending") for c in ("cell", "target", "mode", "name", "seed")])
+    cell, seed, rms = (table[c].to_numpy() for c in ("cell", "seed", "rms_nm"))
+    apart = table["apart"].fill_null(False).to_numpy()
+    (target, targets), (mode, modes), (name, names) = (_codes(table[c]) for c in ("target", "mode", "name"))
+    changes = np.any(np.diff([cell, target, mode], axis=1) != 0, axis=0)
+    edges = np.concatenate([[0], np.flatnonzero(changes) + 1, [len(table)]])
+    failed_cells, failed_seeds = cell[target == targets.get("", -1)], seed[target == targets.get("", -1)]
+    of_target, of_mode, of_name = (list(texts) for texts in (targets, modes, names))
+    for start, stop in pairwise(edges):
+        what, part = of_target[target[start]], slice(start, stop)
+        if not what:
             continue
-        names = list(dict.fromkeys(r["name"] for r in part))
-        missing = failed.get(key[0], [])
-        seeds = np.array(sorted({r["seed"] for r in part} | {seed for _, seed in missing}))
-        values = np.full((len(seeds), len(names)), np.nan)
-        eligible = np.ones(len(names), dtype=bool)
-        for r in part:
-            column = names.index(r["name"])
-            values[np.searchsorted(seeds, r["seed"]), column] = np.nan if r["rms_nm"] is None else r["rms_nm"]
-            eligible[column] &= (key[1] == "residual" and r["name"] not in BOUNDS) or can_be_best(r["name"], r["apart"])
-        yield Samples(key[0], part[0]["scenario"], key[1], key[2], names, values, eligible)
+        ran, column = np.unique(name[part], return_inverse=True)
+        found = [of_name[code] for code in ran]
+        missing = failed_seeds[slice(*np.searchsorted(failed_cells, [cell[start], cell[start] + 1]))]
+        seeds = np.unique(np.concatenate([seed[part], missing]))
+        values = np.full((len(seeds), len(found)), np.nan)
+        values[np.searchsorted(seeds, seed[part]), column] = rms[part]
+        is_apart = np.bincount(column, weights=apart[part], minlength=len(found)) > 0
+        is_residual = what == "residual"
+        eligible = np.array(
+            [
+                (is_residual and one not in BOUNDS) or can_be_best(one, bool(beside))
+                for one, beside in zip(found, is_apart, strict=True)
+            ]
+        )
+        scenario = table["scenario"][int(start)].as_py()
+        yield Samples(int(cell[start]), scenario, what, of_mode[mode[start]], found, values, eligible)
+
+
+def _codes(column: pyarrow.ChunkedArray) -> tuple[Array, dict[str, int]]:
+    """Return texts as numbers, (n,), and the number of each text, in alphabetical order."""
+    encoded = column.combine_chunks().dictionary_encode()
+    texts = encoded.dictionary.to_pylist()
+    order = {text: i for i, text in enumerate(sorted(texts))}
+    return np.array([order[text] for text in texts])[encoded.indices.to_numpy()], order
 
 
 def _compare_one(group: Samples, level: float) -> list[Comparison]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import threading
@@ -9,12 +10,16 @@ from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
+from time import monotonic
 from typing import Any, Protocol
 
 from wfsobs.settings.errors import SettingError
 
 DASK_TIMEOUT = 60.0
 """How long a scheduler may be away before a campaign gives up [s]."""
+
+PATIENCE = 5.0
+"""How long there may be no worker before it is told [s]."""
 
 DASK_RETRIES = 10
 """How often a scheduler starts a batch again whose worker died."""
@@ -23,9 +28,8 @@ DASK_RETRIES = 10
 class Workers(Protocol):
     """Makes executors: a fresh one after the last one broke."""
 
-    @property
     def count(self) -> int:
-        """Number of batches that run side by side."""
+        """Return how many batches run side by side; zero where none can for now."""
         ...
 
     def executor(self) -> Executor:
@@ -52,8 +56,12 @@ class Processes:
     """
 
     def __init__(self, count: int):
-        self.count = count
+        self._count = count
         self._executor: ProcessPoolExecutor | None = None
+
+    def count(self) -> int:
+        """Return the number of processes."""
+        return self._count
 
     def executor(self) -> Executor:
         """Return a fresh executor; what is left of a broken one is killed, since workers do not end by a signal to terminate."""
@@ -62,7 +70,7 @@ class Processes:
                 process.kill()
         self.close()
         os.environ["OPENBLAS_NUM_THREADS"] = "1"  # inherited by the processes, and read when they import numpy
-        self._executor = ProcessPoolExecutor(self.count, mp_context=get_context("spawn"), initializer=_start_worker)
+        self._executor = ProcessPoolExecutor(self._count, mp_context=get_context("spawn"), initializer=_start_worker)
         return self._executor
 
     def close(self) -> None:
@@ -92,6 +100,8 @@ class DaskCluster:
     ----------
     address : str
         Of the scheduler, such as tcp://head:8786.
+    tell : callable
+        Receives a line when there is no worker, or the scheduler is gone.
 
     Raises
     ------
@@ -99,25 +109,43 @@ class DaskCluster:
         distributed is not installed, or there is no scheduler.
     """
 
-    def __init__(self, address: str):
+    def __init__(self, address: str, tell: Callable[[str], None] = lambda _line: None):
         try:
             import distributed
         except ImportError:
             raise SettingError('--scheduler: needs dask: pip install "wfsobs[dask]"') from None
+        for name in ("distributed", "distributed.client"):  # what they say of a scheduler that is gone is told here
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         self._connect: Callable[[], Any] = lambda: distributed.Client(
             address, timeout=DASK_TIMEOUT, set_as_default=False, name="wfsobs"
         )
-        self.address = address
+        self.address, self._tell = address, tell
         self._client: Any = None
+        self._alone_since: float | None = None
+        self._is_told = False
         self.executor()
 
-    @property
     def count(self) -> int:
-        """Number of threads of all workers."""
-        return max(1, sum(self._client.ncores().values()))
+        """Return the number of threads of all workers; that there is none is told after a few seconds."""
+        try:
+            count = sum(self._client.ncores().values())
+        except Exception:  # the scheduler is gone: the batches that run will say so
+            return 1
+        if count:
+            if self._is_told:
+                self._tell(f"workers have come to {self.address}: going on")
+            self._alone_since, self._is_told = None, False
+            return count
+        self._alone_since = self._alone_since or monotonic()
+        if not self._is_told and monotonic() - self._alone_since > PATIENCE:
+            self._tell(f"no worker at {self.address}: waiting; start one with: dask worker {self.address} --nthreads 1")
+            self._is_told = True
+        return 0
 
     def executor(self) -> Executor:
         """Return a fresh executor, on a fresh connection. Raises SettingError where there is no scheduler."""
+        if self._client is not None and self._client.status != "running":
+            self._tell(f"the scheduler at {self.address} is gone: waiting {DASK_TIMEOUT:g} s for it; what it ran runs again")
         self.close()
         try:
             self._client = self._connect()

@@ -6,14 +6,15 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
+from time import sleep
 
 import numpy as np
 
 from wfsobs.campaign.plan import Campaign, Cell
 from wfsobs.campaign.pools import Workers
-from wfsobs.campaign.state import finished_runs, open_folder
+from wfsobs.campaign.state import finished_runs, open_folder, remove_leftovers
 from wfsobs.campaign.stopping import wanted_seeds
-from wfsobs.campaign.store import read_results
+from wfsobs.campaign.store import BatchIndex
 from wfsobs.campaign.work import Batch, Summary, wfsobs_batch
 from wfsobs.cost import run_seconds
 from wfsobs.settings.errors import SettingError
@@ -23,6 +24,8 @@ BATCH = 3.0
 """Wanted time of a batch [s]: long against the overhead of a scheduler, short against the wait for the last ones."""
 MOST_RUNS = 2000
 """Maximum number of runs of a batch."""
+LOOK = 0.5
+"""Time between two looks at the executor and at whether to stop [s]."""
 AHEAD = 2
 """Batches in the executor per worker."""
 BREAKS = 20
@@ -91,6 +94,7 @@ def run_campaign(
         Results cannot be written.
     """
     open_folder(plan, folder)
+    remove_leftovers(folder)
     progress = Progress(0, 0)
     try:
         while True:
@@ -112,7 +116,7 @@ def run_campaign(
 def _wanted_runs(plan: Campaign, folder: Path, shard: tuple[int, int]) -> tuple[Array, Array]:
     """Return the runs of a share that are wanted by now, and those that are finished, bool (n_runs,)."""
     finished = finished_runs(plan, folder)
-    seeds = wanted_seeds(plan, finished, read_results(folder)) if plan.stop else np.full(len(plan.cells), len(plan.seeds))
+    seeds = wanted_seeds(plan, finished, BatchIndex(folder)) if plan.stop else np.full(len(plan.cells), len(plan.seeds))
     wanted = np.arange(len(plan.seeds)) < seeds[:, None]
     return wanted.ravel() & _share(plan, shard), finished.ravel()
 
@@ -180,7 +184,12 @@ def _drive(
     """Keep the executor busy until all batches are done."""
     executor, running, in_a_row = workers.executor(), dict[Future[Summary], Batch](), 0
     while True:
-        while not must_stop() and len(running) < AHEAD * workers.count and (batch := next(batches, None)) is not None:
+        if not (count := workers.count()):
+            if must_stop():  # nothing would end what waits
+                return
+            sleep(LOOK)
+            continue
+        while not must_stop() and len(running) < AHEAD * count and (batch := next(batches, None)) is not None:
             try:
                 running[executor.submit(wfsobs_batch, batch)] = batch
             except (BrokenExecutor, RuntimeError):  # noticed by a batch that runs, too
@@ -189,7 +198,7 @@ def _drive(
         if not running and (must_stop() or not batches.again):
             return
         broken = not running
-        for future in wait(running, timeout=0.5, return_when=FIRST_COMPLETED).done:
+        for future in wait(running, timeout=LOOK, return_when=FIRST_COMPLETED).done:
             batch = running.pop(future)
             try:
                 summary = future.result()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,12 @@ from wfsobs.campaign.store import PLAN, ROWS, read_batches
 from wfsobs.files import write_whole
 from wfsobs.settings.errors import SettingError
 from wfsobs.typing import Array
+
+LEFTOVER = 3600.0
+"""Age of a temporary file that nobody writes any more [s]; to write a batch takes milliseconds."""
+
+TEMPORARY = re.compile(r"\.(plan\.json|[0-9a-f]{32}\.parquet)\..+")
+"""Names of the temporary files of `wfsobs.files.write_whole`, for the files of this folder."""
 
 
 def open_folder(plan: Campaign, folder: Path) -> None:
@@ -37,6 +45,20 @@ def open_folder(plan: Campaign, folder: Path) -> None:
     if known.exists() and folder_plan(folder).identity() != plan.identity():
         raise SettingError(f"{folder}: holds another campaign; the plan may differ in its number of seeds alone")
     write_whole(known, lambda file: file.write(json.dumps(plan.to_dict()).encode()))
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove temporary files of workers that were killed while they wrote.
+
+    Those are at least LEFTOVER older than the plan, which has just been written: times of one file system are compared, not those
+    of two machines.
+    """
+    now = (folder / PLAN).stat().st_mtime
+    for place in (folder, folder / ROWS):
+        for path in place.glob(".*"):
+            with suppress(FileNotFoundError):  # another share was faster
+                if TEMPORARY.fullmatch(path.name) and now - path.stat().st_mtime > LEFTOVER:
+                    path.unlink()
 
 
 def folder_plan(folder: Path) -> Campaign:

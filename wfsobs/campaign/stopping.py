@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from wfsobs.campaign.compare import LEVEL, Comparison, compare
 from wfsobs.settings.errors import SettingError
@@ -14,6 +14,22 @@ if TYPE_CHECKING:
 
     from wfsobs.campaign.plan import Campaign
     from wfsobs.typing import Array
+
+HELD = 20_000
+"""Rows that are held at a time, but for a scenario that has more."""
+
+
+class CampaignRows(Protocol):
+    """Rows of a campaign, such as `wfsobs.campaign.store.BatchIndex`."""
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows."""
+        ...
+
+    def read(self, cells: range) -> pyarrow.Table:
+        """Return the rows of some scenarios."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -81,10 +97,11 @@ def looks(first: int, last: int) -> tuple[int, ...]:
     return tuple(out)
 
 
-def wanted_seeds(plan: Campaign, complete: Array, table: pyarrow.Table) -> Array:
+def wanted_seeds(plan: Campaign, complete: Array, rows: CampaignRows) -> Array:
     """Return how many seeds each scenario is to have by what is known, (n_cells,).
 
-    At each look the first seeds alone count, so that the order of arrival does not matter.
+    At each look the first seeds alone count, so that the order of arrival does not matter. Some scenarios are decided at a time,
+    so that as many rows are held whatever the number of scenarios.
 
     Parameters
     ----------
@@ -92,7 +109,7 @@ def wanted_seeds(plan: Campaign, complete: Array, table: pyarrow.Table) -> Array
         The campaign.
     complete : Array
         Runs that are finished, bool (n_cells, n_seeds).
-    table : pyarrow.Table
+    rows : CampaignRows
         Their rows.
     """
     import numpy as np
@@ -100,23 +117,30 @@ def wanted_seeds(plan: Campaign, complete: Array, table: pyarrow.Table) -> Array
     if plan.stop is None:
         return np.full(len(plan.cells), len(plan.seeds))
     wanted = np.full(len(plan.cells), plan.stop.looks[0])
-    undecided = np.ones(len(plan.cells), dtype=bool)
-    for count in plan.stop.looks:
+    size = max(1, int(HELD / max(1.0, rows.n_rows / max(1, complete.sum()) * complete.sum(axis=1).max())))
+    for start in range(0, len(wanted), size):
+        cells = range(start, min(start + size, len(wanted)))
+        if complete[cells, : plan.stop.looks[0]].all(axis=1).any():
+            wanted[cells] = _wanted_of(plan, plan.stop, cells, complete[cells], rows.read(cells))
+    return wanted
+
+
+def _wanted_of(plan: Campaign, stop: Stop, cells: range, complete: Array, table: pyarrow.Table) -> Array:
+    """Return how many seeds some scenarios are to have, (n,); complete : (n, n_seeds)."""
+    import numpy as np
+    import pyarrow as pa
+
+    wanted, undecided = np.full(len(cells), stop.looks[0]), np.ones(len(cells), dtype=bool)
+    for count in stop.looks:
         wanted[undecided] = count
         undecided &= complete[:, :count].all(axis=1)  # the others wait for their seeds
         if not undecided.any():
             break
-        first = table["seed"].to_numpy() < plan.seeds.start + count
-        mask = _mask(first & np.isin(table["cell"].to_numpy(), np.flatnonzero(undecided)))
+        table = table.filter(pa.array(undecided[table["cell"].to_numpy() - cells.start]))
+        first = table.filter(pa.array(table["seed"].to_numpy() < plan.seeds.start + count))
         groups: dict[tuple[int, str, str], list[Comparison]] = {}
-        for one in compare(table.filter(mask), plan.stop.level):
+        for one in compare(first, stop.level):
             groups.setdefault((one.cell, one.target, one.mode), []).append(one)
-        open_cells = {key[0] for key, compared in groups.items() if not plan.stop.is_decided(compared)}
-        undecided &= np.isin(np.arange(len(plan.cells)), list(open_cells))
+        open_cells = {key[0] for key, compared in groups.items() if not stop.is_decided(compared)}
+        undecided &= np.isin(cells, list(open_cells))
     return wanted
-
-
-def _mask(values: Array) -> pyarrow.BooleanArray:
-    import pyarrow as pa
-
-    return pa.array(values)

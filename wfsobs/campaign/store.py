@@ -117,17 +117,65 @@ def read_results(folder: Path, provenance: bool = False) -> pyarrow.Table:
     pyarrow.Table
         The rows.
     """
+    columns = [*RESULTS, *(PROVENANCE if provenance else ())]
+    return _each_once(list(read_batches(folder, columns)), columns)
+
+
+def _each_once(tables: Sequence[pyarrow.Table], columns: Sequence[str]) -> pyarrow.Table:
+    """Return the rows of tables, each once, sorted."""
     import numpy as np
     import pyarrow as pa
 
-    columns = [*RESULTS, *(PROVENANCE if provenance else ())]
-    tables = list(read_batches(folder, columns))
     if not tables:
         return pa.schema([f for f in schema() if f.name in columns]).empty_table()
     table = pa.concat_tables(tables).sort_by([(name, "ascending") for name in ORDER])
     keys = [table[name].to_numpy() for name in ORDER]
     again = np.logical_and.reduce([k[1:] == k[:-1] for k in keys])
     return table.filter(pa.array(np.concatenate([[True], ~again])))
+
+
+class BatchIndex:
+    """Which files have rows of which scenarios: what is asked of some of them is read without the others.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the campaign.
+
+    Attributes
+    ----------
+    n_rows : int
+        Number of rows, those computed twice included.
+    """
+
+    COLUMNS = ("key", "cell", "scenario", "seed", "name", "target", "mode", "rms_nm", "apart")
+
+    def __init__(self, folder: Path):
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        self.n_rows = 0
+        self._spans: list[tuple[Path, int, int]] = []
+        for path in batch_files(folder):
+            try:
+                known = pq.read_metadata(path)
+            except (OSError, pa.ArrowException):  # as in `read_batch`
+                continue
+            column = known.schema.names.index("cell")
+            of_groups = [known.row_group(i).column(column).statistics for i in range(known.num_row_groups)]
+            if of_groups:
+                self._spans.append((path, min(s.min for s in of_groups), max(s.max for s in of_groups)))
+                self.n_rows += known.num_rows
+
+    def read(self, cells: range) -> pyarrow.Table:
+        """Return the rows of some scenarios, each once, with COLUMNS, sorted as in `read_results`."""
+        import pyarrow.compute as pc
+
+        tables: list[pyarrow.Table] = []
+        for path, low, high in self._spans:
+            if high >= cells.start and low < cells.stop and (table := read_batch(path, self.COLUMNS)) is not None:
+                tables.append(table.filter((pc.field("cell") >= cells.start) & (pc.field("cell") < cells.stop)))
+        return _each_once(tables, self.COLUMNS)
 
 
 def add_settings(plan: Campaign, table: pyarrow.Table) -> pyarrow.Table:

@@ -117,8 +117,8 @@ def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, sh
         raise SettingError("--workers: only for this machine, not with --scheduler")
     plan, share = load_plan(plan_file), _shard(shard)
     stop = _Stop()
-    place = DaskCluster(scheduler) if scheduler else Processes(workers or usable_processors())
     with _bar(plan.name) as bar:
+        place = DaskCluster(scheduler, _say) if scheduler else Processes(workers or usable_processors())
         task = bar.add_task("runs", total=None)
 
         def tell(state: State) -> None:
@@ -132,11 +132,15 @@ def run(plan_file: str, out: str, workers: int | None, scheduler: str | None, sh
             )
         )
     else:
-        lost = f"; workers were lost {state.breaks} times, and their batches run again" if state.breaks else ""
+        lost = f"; workers or their scheduler were lost {state.breaks} times, and their batches ran again" if state.breaks else ""
         click.echo(f"wfsobs: {out}: {state.n_done} of {state.total} runs are done, {state.runs} of them now{lost}", err=True)
     if stop():
         click.echo("wfsobs: stopped; the same command resumes", err=True)
         sys.exit(STOPPED)
+
+
+def _say(line: str) -> None:
+    click.echo(f"wfsobs: {line}", err=True)
 
 
 class _Stop:
