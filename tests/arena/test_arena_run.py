@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,13 @@ from wfsobs.arena import trials
 from wfsobs.arena.cases import SimulatedCase, mean_square
 from wfsobs.arena.challengers import CHALLENGERS
 from wfsobs.arena.definition import Arena, add_records, load_arena
-from wfsobs.arena.entries import ArenaEntry, admits, code_version, find_entries, load_object
+from wfsobs.arena.entries import ArenaEntry, admits, find_entries, load_object
 from wfsobs.arena.process import Answer, EntryProcess, solve
 from wfsobs.arena.reference import taps_error
 from wfsobs.arena.results import needs_of, tables, write_results
 from wfsobs.arena.run import run_arena
 from wfsobs.arena.tracks import TRACKS
 from wfsobs.arena.trials import try_record
-from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.prior import Prior
 from wfsobs.record import Record
 from wfsobs.settings.errors import SettingError
@@ -109,20 +107,15 @@ def test_who_enters_where() -> None:
     assert tracks("kf-lgs") == ["vibration", "turbulence", "disturbance", "next", "two-sensors", "events"]
     assert tracks("multirate") == ["two-sensors"]
     assert tracks("integrator") == ["closed-loop"]
+    assert tracks("predictive-rls") == ["closed-loop"]
     assert tracks("rls") == ["disturbance", "next", "events"]
 
 
 def test_what_an_entry_is_told() -> None:
     multi, rls = find_entries(["kf-multi", "rls"])
     assert needs_of(multi, TRACKS["vibration"]) == "model, true lines"
-    assert needs_of(multi, TRACKS["next"]) == "model, lines, identified"
+    assert needs_of(multi, TRACKS["next"]) == "model, identified lines"
     assert needs_of(rls, TRACKS["next"]) == "nothing"
-
-
-def test_the_version_of_an_entry_is_that_of_its_code() -> None:
-    nothing = CONTROLLERS["none"]  # without a function of its own
-    assert code_version(nothing) == code_version(replace(nothing, asks=lambda _: ()))
-    assert code_version(CHALLENGERS["rls"].observer) != code_version(CHALLENGERS["imm"].observer)
 
 
 @pytest.mark.parametrize("name", ["nobody", "nowhere:ME", "wfsobs.record:DELAY"])
@@ -174,7 +167,7 @@ def test_telemetry_is_known_by_its_bytes_and_scored_in_parts(arena: Arena, tmp_p
     references = case.reference_squares(given, 0)
     (rls,) = find_entries(["rls"])
     found = try_record(rls, case, 0, given, references, Here(rls), arena.rules)  # type: ignore[arg-type]
-    predicted = CHALLENGERS["rls"].observer.estimate(given.measurements(), Prior())["turbulence"]
+    predicted = CHALLENGERS["rls"].algorithm.estimate(given.measurements(), Prior())["turbulence"]
     squares = np.sum((predicted[:-1] - z[1:]) ** 2, axis=1)[n // 2 : n - 1]
     counts = [part.stop - part.start for part in case.stretches(given)]
     assert len(found.squares) == 8 and sum(counts) == n - 1 - n // 2

@@ -15,22 +15,32 @@ from wfsobs.arena.challengers.avc import lock_lines
 from wfsobs.arena.challengers.coupled_ar import NormalEquations
 from wfsobs.arena.challengers.gru import FILE, predict_gru, stored_weights
 from wfsobs.arena.challengers.imm import run_mixture, to_pairs
-from wfsobs.arena.challengers.rls import histories, predict_rls
+from wfsobs.arena.challengers.predictive import ORDER, PENALTY, PredictiveLaw
+from wfsobs.arena.challengers.rls import MEMORY, histories, predict_rls
 from wfsobs.arena.challengers.subspace import fit_subspace, joint_moments
-from wfsobs.observers.base import TARGETS
+from wfsobs.closed_loop.design import design
+from wfsobs.control.base import Controller
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.mirror import Mirror
+from wfsobs.observers.base import TARGETS, Observer
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Model
+from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.simulation.loop import simulate
-from wfsobs.testing import check_observer
+from wfsobs.testing import check_controller, check_observer
 
 
 @pytest.mark.parametrize("name", CHALLENGERS)
-def test_challengers_keep_the_rules_for_observers(name: str) -> None:
-    check_observer(CHALLENGERS[name].observer, alone=False)
+def test_challengers_keep_the_rules(name: str) -> None:
+    algorithm = CHALLENGERS[name].algorithm
+    if isinstance(algorithm, Observer):
+        check_observer(algorithm, alone=False)
+    else:
+        check_controller(algorithm, alone=False)
 
 
 def test_without_forgetting_rls_is_ridge_least_squares() -> None:
@@ -49,6 +59,41 @@ def test_forgetting_weighs_the_past_exponentially() -> None:
     w = 0.98 ** np.arange(n - 2, -1, -1)
     batch = np.linalg.solve((H[:-1].T * w) @ H[:-1] + 0.1 * 0.98 ** (n - 1) * np.eye(2), (H[:-1].T * w) @ z[1:])
     np.testing.assert_allclose(weights, batch, rtol=0, atol=1e-8)  # rounding of 300 updates
+
+
+@pytest.mark.parametrize("delay", [1.0, 2.0, 2.25])
+def test_predictive_control_commands_what_least_squares_say_of_the_steps_on_which_it_acts(delay: float) -> None:
+    rng, n, dt = np.random.default_rng(8), 300, 1e-3
+    z = rng.standard_normal((n, 2)).cumsum(axis=0) * 0.05
+    law = PredictiveLaw(Mirror(delay), dt, 2)
+    u = np.array([law.command(now, None, np.zeros(2)) for now in z])
+    # a delay of 2.25 frames: a command acts on three quarters of z[k + 2] and a quarter of z[k + 3]
+    ahead = {1.0: {1: 1.0}, 2.0: {2: 1.0}, 2.25: {2: 0.75, 3: 0.25}}[delay]
+    lag, H = max(ahead), histories(z, ORDER)
+    outputs = np.sum([a * z[j : n - lag + j] for j, a in ahead.items()], axis=0)
+    # the penalty is forgotten from the first frame on, also in the `lag` frames before there is an output
+    w = np.exp(-dt / MEMORY * np.arange(n - lag - 1, -1, -1.0))
+    left = (H[: n - lag].T * w) @ H[: n - lag] + PENALTY * np.exp(-dt / MEMORY * n) * np.eye(2 * ORDER)
+    batch = np.linalg.solve(left, (H[: n - lag].T * w) @ outputs)
+    np.testing.assert_allclose(u[-1], -H[-1] @ batch, rtol=1e-5)  # 300 rank-one updates, condition 1e5
+
+
+def test_predictive_control_comes_between_the_integrator_and_the_bound() -> None:
+    """A pure line and resonances, without the slow error of the LGS. The rms of 4 s scatters by a few per cent about its mean."""
+    changes = {"run.duration": 8.0, "vibration.synthesis": "gaussian", "sensors.lgs_low_frequency_rms": 0.0}
+    scenario = PRESETS["peak-jump"]().replace(changes).before_events
+    record, plant = simulate(scenario), plant_of(scenario)
+    assert record.turbulence is not None and record.vibration is not None
+    truth, left = record.turbulence + record.vibration, {}
+    for controller in (CHALLENGERS["predictive-rls"].algorithm, CONTROLLERS["integrator"]):
+        assert isinstance(controller, Controller)
+        settings = own_settings(controller, scenario)
+        measured, prior = controller_arguments(controller, record, settings, prior_for(controller, scenario))
+        laws = controller.laws(prior, plant, settings, measured.n_modes)
+        u, _ = controller.commands(laws, measured, prior, plant, settings)
+        left[controller.id] = np.sqrt(np.mean((truth + plant.mirror.correction(u))[4000:] ** 2))
+    bound = np.sqrt(np.mean(np.square(design(scenario, []).bounds["bound"])))
+    assert 0.95 * bound < left["predictive-rls"] < 0.8 * left["integrator"]
 
 
 def test_coupled_autoregression_is_least_squares_of_all_blocks_and_finds_the_order() -> None:

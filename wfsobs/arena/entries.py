@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from wfsobs import __version__
 from wfsobs.arena.challengers import CHALLENGERS
+from wfsobs.arena.identity import code_version
 from wfsobs.arena.tracks import Track
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
@@ -76,7 +75,7 @@ def _find(name: str) -> ArenaEntry:
     if name in OBSERVERS or name in CONTROLLERS:
         return _of_object(OBSERVERS.get(name) or CONTROLLERS[name], REGISTERED, name)
     if name in CHALLENGERS:
-        return _of_object(CHALLENGERS[name].observer, CHALLENGER, name)
+        return _of_object(CHALLENGERS[name].algorithm, CHALLENGER, name)
     if Path(name).is_dir():
         files = sorted(Path(name).glob("*.npz"))
         digest = hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files))
@@ -94,7 +93,7 @@ def _of_object(algorithm: Any, kind: str, place: str) -> ArenaEntry:
 def load_object(entry: ArenaEntry) -> Any:
     """Return the observer or controller of an entry. Raises SettingError."""
     if entry.kind == CHALLENGER:
-        return CHALLENGERS[entry.place].observer
+        return CHALLENGERS[entry.place].algorithm
     if entry.kind == MODULE:
         return _from_module(entry.place)
     return OBSERVERS.get(entry.place) or CONTROLLERS[entry.place]
@@ -110,16 +109,6 @@ def _from_module(name: str) -> Any:
     if not isinstance(algorithm, kinds):
         raise SettingError(f"--entry {name}: takes an Observer or a Controller, not a {type(algorithm).__name__}")
     return algorithm
-
-
-def code_version(algorithm: Any) -> str:
-    """Return the version of wfsobs with a digest of the module that an object's function is in."""
-    function = algorithm.run if isinstance(algorithm, Observer) else algorithm.predict or algorithm.law
-    try:
-        source = inspect.getsource(inspect.getmodule(function) or function).encode()
-    except (OSError, TypeError):  # no function, or none with a source
-        source = algorithm.id.encode()
-    return f"{__version__} {hashlib.sha256(source).hexdigest()[:16]}"
 
 
 def admits(track: Track, entry: ArenaEntry) -> bool:

@@ -24,6 +24,7 @@ from wfsobs.arena.trials import Trial
 from wfsobs.campaign.keys import PHYSICS_VERSION
 from wfsobs.files import write_whole
 from wfsobs.observers.base import Observer
+from wfsobs.prior import IDENTIFIED, TRUE
 from wfsobs.priors_from.controllers import own_settings
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
@@ -122,9 +123,7 @@ def needs_of(entry: ArenaEntry, track: Track) -> str:
     algorithm = load_object(entry)
     if not isinstance(algorithm, Observer):
         return algorithm.needs_text(own_settings(algorithm, Scenario()))
-    identified = algorithm.needed_parts and track.target == NEXT
-    text = algorithm.needs_text()
-    return f"{text}, identified".replace("true ", "") if identified else text
+    return algorithm.needs_text(source=IDENTIFIED if track.target == NEXT else TRUE)
 
 
 def source_of(entry_id: str) -> str:

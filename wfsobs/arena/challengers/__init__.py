@@ -1,4 +1,4 @@
-"""Predictors from the literature that enter the arena beside the observers, each in a module of its own."""
+"""Predictors and a controller from the literature that enter the arena, each in a module of its own."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from wfsobs.arena.challengers.base import Challenger
 from wfsobs.arena.challengers.coupled_ar import COUPLED_AR
 from wfsobs.arena.challengers.gru import GRU
 from wfsobs.arena.challengers.imm import IMM
+from wfsobs.arena.challengers.predictive import PREDICTIVE_RLS
 from wfsobs.arena.challengers.rls import RLS
 from wfsobs.arena.challengers.subspace import SUBSPACE
 
-CHALLENGERS: dict[str, Challenger] = {one.observer.id: one for one in (RLS, COUPLED_AR, SUBSPACE, IMM, AVC, GRU)}
+CHALLENGERS: dict[str, Challenger] = {one.algorithm.id: one for one in (RLS, COUPLED_AR, SUBSPACE, IMM, AVC, GRU, PREDICTIVE_RLS)}
 """By id, in the order of tables."""

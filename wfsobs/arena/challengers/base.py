@@ -1,4 +1,4 @@
-"""The type of a challenger, and how one that predicts the whole disturbance answers."""
+"""The types of challengers, and how one that predicts the whole disturbance answers."""
 
 from __future__ import annotations
 
@@ -6,20 +6,21 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wfsobs.control.base import Controller
 from wfsobs.observers.base import TURBULENCE, VIBRATION, Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates
 from wfsobs.typing import Array
 
 
 class Challenger(NamedTuple):
-    """An observer that enters the arena alone.
+    """An observer or a controller that enters the arena alone.
 
-    observer : with an id of its own
-    tracks   : ids of those that it was made for
-    source   : publication
+    algorithm : with an id of its own
+    tracks    : ids of those that it was made for
+    source    : publication
     """
 
-    observer: Observer
+    algorithm: Observer | Controller
     tracks: tuple[str, ...]
     source: str
 

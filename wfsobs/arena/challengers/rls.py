@@ -42,6 +42,38 @@ def histories(z: Array, order: int) -> Array:
     return np.hstack([padded[order - 1 - j : order - 1 - j + len(z)] for j in range(order)])
 
 
+class Rls:
+    """Weights of least squares, the past forgotten exponentially, after each pair of input and output.
+
+    Parameters
+    ----------
+    n_inputs, n_outputs : int
+        Sizes.
+    forgetting : float
+        Factor of the past from pair to pair, 1 for none.
+    penalty : float
+        Of the squares of the weights, before the first pair.
+
+    Attributes
+    ----------
+    P : Array
+        Inverse of the weighed sum of the products of inputs, (n_inputs, n_inputs).
+    W : Array
+        Weights, (n_inputs, n_outputs).
+    """
+
+    def __init__(self, n_inputs: int, n_outputs: int, forgetting: float, penalty: float):
+        self.P, self.W, self.forgetting = np.eye(n_inputs) / penalty, np.zeros((n_inputs, n_outputs)), forgetting
+
+    def learn(self, h: Array, output: Array) -> None:
+        """Take a pair into account; h : (n_inputs,), output : (n_outputs,)."""
+        Ph = self.P @ h
+        gain = Ph / (self.forgetting + h @ Ph)
+        self.W += np.outer(gain, output - h @ self.W)
+        self.P -= np.outer(gain, Ph)
+        self.P /= self.forgetting
+
+
 def predict_rls(z: Array, order: int, forgetting: float, penalty: float, watch: Watch | None = None) -> tuple[Array, Array]:
     """Predict by recursive least squares.
 
@@ -66,20 +98,15 @@ def predict_rls(z: Array, order: int, forgetting: float, penalty: float, watch: 
         Weights after the last step, (order * n_modes, n_modes).
     """
     H, n = histories(z, order), len(z)
-    P, W = np.eye(H.shape[1]) / penalty, np.zeros((H.shape[1], z.shape[1]))
+    fit = Rls(H.shape[1], z.shape[1], forgetting, penalty)
     out = np.empty_like(z)
     for k in range(n):
         if watch is not None and k % BLOCK == 0:
             watch.step(k / n)
         if k > 0:
-            h = H[k - 1]
-            Ph = P @ h
-            gain = Ph / (forgetting + h @ Ph)
-            W += np.outer(gain, z[k] - h @ W)
-            P -= np.outer(gain, Ph)
-            P /= forgetting
-        out[k] = H[k] @ W
-    return out, W
+            fit.learn(H[k - 1], z[k])
+        out[k] = H[k] @ fit.W
+    return out, fit.W
 
 
 def recent_sd(z: Array, prediction: Array, forgetting: float) -> Array:

@@ -1,0 +1,83 @@
+"""Which changes of code make an entry run anew, by a package that is written here."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import wfsobs
+from wfsobs.arena import identity
+from wfsobs.arena.challengers import CHALLENGERS
+from wfsobs.arena.identity import code_version
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.observers import OBSERVERS
+
+ASK = "from mine.entry import ME; from wfsobs.arena.identity import code_version; print(code_version(ME))"
+FILES = {
+    "__init__.py": "",
+    "entry.py": """
+from functools import partial
+from wfsobs.observers.base import Observer
+from mine import helper
+from .weights import load
+
+def run(order, measurements, prior, settings, watch):
+    from mine.late import more
+    return {}
+
+ME = Observer("me", "Me", ("vibration",), partial(run, 3))
+""",
+    "helper.py": "import mine.deeper",
+    "deeper.py": "",
+    "late.py": "more = 1",
+    "weights.py": "def load(): pass",
+    "weights.npz": "numbers",
+    "other.py": "",
+}
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    (tmp_path / "mine").mkdir()
+    for name, text in FILES.items():
+        (tmp_path / "mine" / name).write_text(text, encoding="utf-8")
+    return tmp_path / "mine"
+
+
+def version_of(package: Path) -> str:
+    """Return it as a fresh process sees the files."""
+    return subprocess.run([sys.executable, "-c", ASK], cwd=package.parent, check=True, capture_output=True, text=True).stdout
+
+
+def test_a_change_of_what_it_imports_is_another_version_and_one_of_the_rest_is_not(package: Path) -> None:
+    versions = [version_of(package)]
+    assert versions[0].startswith(f"wfsobs {wfsobs.__version__} mine 0 ")
+    (package / "other.py").write_text("changed = 1", encoding="utf-8")
+    assert version_of(package) == versions[0]
+    for name in ("entry.py", "deeper.py", "late.py", "weights.npz"):
+        with (package / name).open("a", encoding="utf-8") as file:
+            file.write("\n# changed\n")
+        versions.append(version_of(package))
+    assert len(set(versions)) == 5
+
+
+def test_code_of_wfsobs_that_an_observer_uses_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The Kalman filter is a module of its own; the session of a page is none of an observer's business."""
+    names = ("kf-lgs", "persistence")
+    before = [code_version(OBSERVERS[name]) for name in names]
+    digest = identity._digest
+    assert all(before)
+    for changed, same in (("single.py", [False, True]), ("sessions.py", [True, True])):
+        monkeypatch.setattr(identity, "_digest", lambda path, changed=changed: b"x" if path.name == changed else digest(path))
+        assert [code_version(OBSERVERS[name]) == was for name, was in zip(names, before, strict=True)] == same
+
+
+def test_what_is_told_counts_and_what_people_read_does_not() -> None:
+    nothing, kf = CONTROLLERS["none"], OBSERVERS["kf-lgs"]
+    assert code_version(nothing) == code_version(replace(nothing, label="Still")) != code_version(CONTROLLERS["integrator"])
+    assert code_version(kf) == code_version(replace(kf, help="else")) != code_version(replace(kf, prior=()))
+    assert code_version(CHALLENGERS["rls"].algorithm) != code_version(CHALLENGERS["imm"].algorithm)

@@ -1,0 +1,141 @@
+"""Predictive control by recursive least squares: what commands are to act against is predicted at once.
+
+Without the commands the loop measures z, and the mirror of weights a[j] acts on z[k+1], ..., z[k+n] by a[1] u[k], ..., a[n] u[k].
+The command that leaves least is the prediction of their weighed mean,
+
+    u[k] = -W h[k],    W h[k] ~ a[1] z[k+1] + ... + a[n] z[k+n],    h[k] = (z[k], z[k-1], ..., z[k-L+1]),
+
+with the W of least squares over all that is known by step k, the past forgotten exponentially: for the paper's delay of two
+frames, z two steps ahead. Predictive control by empirical orthogonal functions (Guyon and Males 2017, arXiv:1707.00570) and,
+without its penalty on commands, data-driven predictive control (Haffert et al. 2021, JATIS 7, 029001) are this with a batch. It
+is told nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from wfsobs.arena.challengers.base import Challenger
+from wfsobs.arena.challengers.rls import BLOCK, MEMORY, ORDER, Rls
+from wfsobs.control.base import Controller, Settings
+from wfsobs.control.law import Law
+from wfsobs.control.mirror import Mirror, Plant
+from wfsobs.control.step import StepController
+from wfsobs.control.step_laws import StepLaw, push_row
+from wfsobs.observers.missing import bridges, fill_missing
+from wfsobs.observers.step_checks import StepError
+from wfsobs.prior import Prior
+from wfsobs.progress import QUIET, Watch
+from wfsobs.record import Measurements, Sampling
+from wfsobs.signal.stepping import Saved
+from wfsobs.typing import Array
+
+PENALTY = 1e-6
+"""Of the squares of the weights at the start [um^2]."""
+
+
+class PredictiveLaw:
+    """The law of all modes, learnt one frame at a time.
+
+    Parameters
+    ----------
+    mirror : Mirror
+        Whose weights make the output of the regression.
+    dt : float
+        Step [s].
+    n_modes : int
+        Number of modes.
+    """
+
+    def __init__(self, mirror: Mirror, dt: float, n_modes: int):
+        self._taps = mirror.taps[1:]
+        self._new = lambda: Rls(ORDER * n_modes, n_modes, float(np.exp(-dt / MEMORY)), PENALTY)
+        self.fit, self._recent = self._new(), np.zeros((ORDER + len(self._taps), n_modes))  # newest first
+
+    def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
+        """Learn from the newest z (n_modes,), and return the command (n_modes,) [um]."""
+        lag = len(self._taps)
+        push_row(self._recent, z)
+        self.fit.learn(self._recent[lag:].ravel(), self._taps[::-1] @ self._recent[:lag])
+        return forward - self._recent[:ORDER].ravel() @ self.fit.W
+
+    def tell(self, command: Array, forward: Array) -> None:
+        """Take no notice: z holds none of the commands."""
+
+    def take_over(self, old: Any) -> None:
+        """Go on from what another law has learnt."""
+        if not isinstance(old, PredictiveLaw) or old._recent.shape != self._recent.shape:
+            raise StepError("the laws are of another kind")
+        self.load(old.save())
+
+    def reset(self) -> None:
+        """Forget all."""
+        self.fit, self._recent[...] = self._new(), 0.0
+
+    def save(self) -> Saved:
+        """Return a copy of the state."""
+        return {"P": self.fit.P.copy(), "W": self.fit.W.copy(), "recent": self._recent.copy()}
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        self.fit.P[...], self.fit.W[...], self._recent[...] = state["P"], state["W"], state["recent"]
+
+
+MakeStepLaw = Callable[[Plant, int], StepLaw]
+"""(plant, number of modes) -> law of all modes, before its first frame."""
+
+
+def predictive_law(plant: Plant, n_modes: int) -> StepLaw:
+    """Return the law before its first frame."""
+    return PredictiveLaw(plant.mirror, plant.dt, n_modes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningController(Controller):
+    """A controller whose law is learnt while it runs, from the LGS alone.
+
+    Attributes
+    ----------
+    step_law : callable
+        Makes the law.
+    """
+
+    step_law: MakeStepLaw
+
+    def laws(self, prior: Prior, plant: Plant, settings: Settings, n_modes: int) -> tuple[Law, ...]:
+        """Return none: there is no linear law before there are measurements."""
+        return ()
+
+    def design(self, prior: Prior, plant: Plant, settings: Settings, sampling: Sampling) -> StepController:
+        """Return the controller one frame at a time, see `Controller.design`."""
+        lgs, _ = bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio)
+        return StepController(self.id, plant, sampling, self.step_law(plant, sampling.n_modes), None, lgs, None)
+
+    def commands(
+        self, laws: Any, measurements: Measurements, prior: Prior, plant: Plant, settings: Settings, watch: Watch = QUIET
+    ) -> tuple[Array, Array]:
+        """Return the commands and whether a limit changed them, see `Controller.commands`."""
+        z = fill_missing(measurements, prior).z
+        law, wanted, none = self.step_law(plant, z.shape[1]), np.empty_like(z), np.zeros(z.shape[1])
+        for k, now in enumerate(z):
+            if k % BLOCK == 0:
+                watch.step(k / len(z))
+            wanted[k] = law.command(now, None, none)
+        taken = np.column_stack([plant.mirror.follow(u) for u in wanted.T])
+        return taken, taken != wanted
+
+
+PREDICTIVE_RLS = Challenger(
+    LearningController(
+        "predictive-rls",
+        "Predictive control, least squares",
+        help="minus what recursive least squares on 20 measurements of all modes predicts",
+        step_law=predictive_law,
+    ),
+    ("closed-loop",),
+    "Guyon and Males 2017, arXiv:1707.00570; Haffert et al. 2021, JATIS 7, 029001",
+)
