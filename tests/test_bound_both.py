@@ -14,7 +14,7 @@ from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.bound_both import bound_rms_of_both, least_errors_of_both
 from wfsobs.evaluation.record_bounds import record_bounds
 from wfsobs.evaluation.rows import can_be_best
-from wfsobs.evaluation.scores import BOUND_BOTH, BOUNDS
+from wfsobs.evaluation.scores import BOUND_BOTH, COMMON_BOUNDS
 from wfsobs.observers.kalman.multirate_optimal import optimal_cycle
 from wfsobs.priors_from.scenario import kalman_model
 from wfsobs.priors_from.turbulence import measurement_noise
@@ -231,4 +231,4 @@ def test_events_have_none_and_no_bound_is_best() -> None:
     record = simulate(scenario)
     assert record_bounds(scenario, record) == []
     found = record_bounds(scenario.before_events, record)
-    assert {bound.row for bound in found} == set(BOUNDS) and not can_be_best(BOUND_BOTH, False)
+    assert {bound.row for bound in found} == set(COMMON_BOUNDS) and not can_be_best(BOUND_BOTH, False)

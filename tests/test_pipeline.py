@@ -11,7 +11,7 @@ import pytest
 from wfsobs import PRESETS, Record, Scenario, SettingError, observe, run, simulate
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.bound_both import bound_rms_of_both
-from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, LOOP, PREDICTION, RESIDUAL
+from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, COMMON_BOUNDS, LOOP, PREDICTION, RESIDUAL
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -43,7 +43,7 @@ def test_results_come_in_the_order_of_the_registry() -> None:
     pairs = [(e.observer, e.target) for e in result.estimates]
     assert pairs == [(name, target) for name in order for target in sorted(OBSERVERS[name].targets)]
     rows = [(*pair, mode) for pair in pairs for mode in ("tip", "tilt")]
-    rows += [(bound, target, mode) for mode in ("tip", "tilt") for bound in BOUNDS for target in TARGETS]
+    rows += [(bound, target, mode) for mode in ("tip", "tilt") for bound in COMMON_BOUNDS for target in TARGETS]
     assert [(s.observer, s.target, s.mode) for s in result.scores] == rows
     found = result.estimate("kf-lgs", "vibration")
     assert found is not None and found.values.shape == result.record.y_lgs.shape and found.seconds_per_step > 0

@@ -15,7 +15,7 @@ from wfsobs.app.store import Store
 from wfsobs.app.views.budget import BudgetView, bar_data
 from wfsobs.app.views.verdict import VerdictLine
 from wfsobs.evaluation.budget import TERMS, Budget
-from wfsobs.evaluation.scores import BOUNDS
+from wfsobs.evaluation.scores import COMMON_BOUNDS
 from wfsobs.simulation.loop import simulate
 
 
@@ -43,7 +43,7 @@ def test_bars_are_as_long_as_the_scores_in_every_mode_and_unit(make_store: Any, 
             assert end(view.bars[target], "LGS KF") == pytest.approx((scores["kf-lgs", target] * scale) ** 2, rel=1e-6)
             for bound, mark in view.bars[target].bounds.items():
                 assert mark.visible and mark.location == pytest.approx((scores[bound, target] * scale) ** 2, rel=1e-12)
-            assert set(view.bars[target].bounds) == set(BOUNDS)
+            assert set(view.bars[target].bounds) == set(COMMON_BOUNDS)
             assert mode in view.bars[target].figure.xaxis.axis_label
     view.open.value = False
     assert not view.room.visible and view.task.state == DONE

@@ -19,7 +19,7 @@ from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import rows
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.scores import BOUNDS
+from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS
 
 
 def opened(dashboard: Dashboard) -> ClosedLoopPage:
@@ -58,7 +58,7 @@ def test_it_says_what_the_command_says(page: ClosedLoopPage, dashboard: Dashboar
         assert float(cards[row["controller"]]["value"]) == pytest.approx(row["residual_rms_nm"], rel=5e-3)
         assert f'data-controller="{row["controller"]}"' in page.table.object
     assert page.table.object.count("best</span>") == 1
-    assert all(f'data-controller="{name}"' in page.table.object for name in BOUNDS)
+    assert all(f'data-controller="{name}"' in page.table.object for name in COMMON_BOUNDS)
     assert page.margins.object.count("data-controller") == len(CURVES)
     assert page.note.object == ""
     the_lines_are_the_results(page, dashboard)

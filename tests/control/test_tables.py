@@ -13,7 +13,7 @@ from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.scores import BOUNDS
+from wfsobs.evaluation.scores import COMMON_BOUNDS
 from wfsobs.scenario import configfile
 from wfsobs.simulation.loop import simulate
 
@@ -31,7 +31,7 @@ def test_json_is_the_rows_of_every_controller_mode_and_seed() -> None:
     rows = json.loads(result.stdout, parse_constant=pytest.fail)
     assert all(row.keys() >= ASKED for row in rows)
     assert [(r["seed"], r["controller"], r["mode"]) for r in rows] == [
-        (seed, name, mode) for seed in (4, 5) for name in (*CONTROLLERS, *BOUNDS) for mode in ("tip", "tilt")
+        (seed, name, mode) for seed in (4, 5) for name in (*CONTROLLERS, *COMMON_BOUNDS) for mode in ("tip", "tilt")
     ]
     for row in rows:
         assert row["stable"] is True and 0 < row["strehl"] < 1
@@ -69,7 +69,7 @@ def test_an_unstable_gain_is_a_row_and_not_a_warning() -> None:
 
 def test_the_table_names_every_controller_and_what_it_needs() -> None:
     table = call(*QUICK).stdout
-    for name in (*CONTROLLERS, *BOUNDS):
+    for name in (*CONTROLLERS, *COMMON_BOUNDS):
         assert label(name) in table
     assert "true spectra, training data" in table and "model, true lines" in table and "nothing" in table
     assert "true spectra, training data" not in call(*QUICK, "--set", "control.integrator=manual").stdout

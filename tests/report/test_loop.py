@@ -13,7 +13,7 @@ from wfsobs.app.report.packing import pack, unpack
 from wfsobs.app.report.page import page
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.evaluation.scores import BOUNDS
+from wfsobs.evaluation.scores import COMMON_BOUNDS
 from wfsobs.result import Result
 from wfsobs.scenario import Scenario
 
@@ -28,7 +28,9 @@ def report(result: Result, short: Scenario) -> Report:
 def test_rows_of_the_controllers_that_take_a_moment(report: Report) -> None:
     (state,) = report.states
     quick = [name for name, controller in CONTROLLERS.items() if controller.predict is None]
-    assert [(r["controller"], r["mode"]) for r in state.loop] == [(n, m) for n in (*quick, *BOUNDS) for m in ("tip", "tilt")]
+    assert [(r["controller"], r["mode"]) for r in state.loop] == [
+        (n, m) for n in (*quick, *COMMON_BOUNDS) for m in ("tip", "tilt")
+    ]
 
 
 def test_they_stand_in_the_page_best_first(report: Report) -> None:

@@ -31,7 +31,8 @@ TERMS: Mapping[str, str] = MappingProxyType(
         ),
         BOUND: (
             "Smallest RMS error that a causal linear observer of the mean LGS measurement, or of both sensors, can have, from "
-            "the true spectra (Wiener). It is a mean over records: on one record an observer may come out a little below."
+            "the true spectra (Wiener). Where the LGS see different air, a third row is that of an observer that is given each "
+            "of them by itself. It is a mean over records: on one record an observer may come out a little below."
         ),
         NEEDS: (
             "What an observer must be given beside measurements: a model, vibration lines, frequency bands or training data."

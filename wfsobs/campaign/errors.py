@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 
 from wfsobs.campaign.compare import LEVEL
 from wfsobs.evaluation.rows import NOT_OBSERVERS, can_be_best
-from wfsobs.evaluation.scores import BOUNDS
+from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS
 from wfsobs.observers import OBSERVERS
 from wfsobs.typing import Array
 
@@ -82,8 +82,8 @@ class CampaignErrors:
 
     @cached_property
     def bound(self) -> Array:
-        """The smallest bound of every scenario [nm], (n_cells,); NaN where none is known."""
-        of = [i for i, name in enumerate(self.names) if name in BOUNDS]
+        """The smallest bound of what all observers are given, of every scenario [nm], (n_cells,); NaN where none is known."""
+        of = [i for i, name in enumerate(self.names) if name in COMMON_BOUNDS]
         known = self.rms[:, of] if of else np.full((len(self.rms), 1), np.nan)
         return np.fmin.reduce(known, axis=1)
 

@@ -130,6 +130,6 @@ CONTROLLERS = Registry(
             look=Look("Int. + online", "#004B00", "#A6E3A6", (10, 2, 2, 2)),
         ),
     ),
-    reserved_ids=("truth", "loop", "bound", "bound-both"),
+    reserved_ids=("truth", "loop", "bound", "bound-both", "bound-stars"),
 )
 """Every controller, in the order of tables and legends."""

@@ -1,4 +1,4 @@
-"""The bounds of a simulated record as rows of its table: that of the LGS alone and that of LGS and NGS."""
+"""The bounds of a simulated record as rows of its table: of the LGS alone, of LGS and NGS, and of every star apart."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from dataclasses import dataclass
 
 from wfsobs.evaluation.bound import LeastError, least_errors
 from wfsobs.evaluation.bound_both import PeriodicError, least_errors_of_both
-from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, Score
+from wfsobs.evaluation.bound_stars import least_errors_of_stars
+from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUND_STARS, Score
 from wfsobs.observers.base import TARGETS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import rms
+from wfsobs.simulation.star_spectra import star_spectra, stars_differ
 from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
 
 
@@ -23,7 +25,7 @@ class Bound:
     Attributes
     ----------
     row : str
-        BOUND or BOUND_BOTH.
+        BOUND, BOUND_BOTH or BOUND_STARS.
     target, mode : str
         Whose.
     column : int
@@ -47,7 +49,13 @@ def record_bounds(scenario: Scenario, record: Record) -> list[Bound]:
 
     def of_mode(mode: int) -> dict[str, dict[str, LeastError] | dict[str, PeriodicError]]:
         spectra = true_spectra(scenario, mode)
-        return {BOUND: least_errors(spectra, n_steps=record.n_steps), BOUND_BOTH: least_errors_of_both(spectra)}
+        found: dict[str, dict[str, LeastError] | dict[str, PeriodicError]] = {
+            BOUND: least_errors(spectra, n_steps=record.n_steps),
+            BOUND_BOTH: least_errors_of_both(spectra),
+        }
+        if stars_differ(scenario, mode):
+            found[BOUND_STARS] = least_errors_of_stars(star_spectra(scenario, mode))
+        return found
 
     with ThreadPoolExecutor(2) as pool:
         found = list(pool.map(of_mode, range(len(modes))))

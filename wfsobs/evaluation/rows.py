@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUNDS, LOOP, Score
+from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUND_STARS, BOUNDS, LOOP, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import SPECTRA
 from wfsobs.prior import TRUE, PriorSource
@@ -15,7 +15,12 @@ Row = dict[str, Any]
 TIME = "time_per_step_us"
 """Computing time per step and mode [us]: in the table, but not part of the result, which the seed determines."""
 
-NOT_OBSERVERS = {LOOP: "Recorded loop", BOUND: "Bound, mean of the LGS", BOUND_BOTH: "Bound, LGS and NGS"}
+NOT_OBSERVERS = {
+    LOOP: "Recorded loop",
+    BOUND: "Bound, mean of the LGS",
+    BOUND_BOTH: "Bound, LGS and NGS",
+    BOUND_STARS: "Bound, every LGS apart, and NGS",
+}
 """Labels of rows in a table of observers that are not observers."""
 
 

@@ -19,10 +19,14 @@ from wfsobs.typing import Array
 PREDICTION, RESIDUAL = NEXT_Z, "residual y"
 """Targets where there is no truth: the next measurement, and the residual of the loop."""
 
-LOOP, BOUND, BOUND_BOTH = "loop", "bound", "bound-both"
-"""Rows that are not observers: the loop that made the record, and the Wiener bounds of the LGS alone and of LGS and NGS."""
+LOOP, BOUND, BOUND_BOTH, BOUND_STARS = "loop", "bound", "bound-both", "bound-stars"
+"""Rows that are not observers: the loop that made the record, and the Wiener bounds of the LGS alone, of LGS and NGS, and of both
+with every star apart."""
 
-BOUNDS = (BOUND, BOUND_BOTH)
+COMMON_BOUNDS = (BOUND, BOUND_BOTH)
+"""The bounds of every scenario that has any."""
+
+BOUNDS = (*COMMON_BOUNDS, BOUND_STARS)
 """The bounds, in the order of tables."""
 
 
@@ -55,7 +59,7 @@ class Score:
     interval : tuple of float or None
         Of the bound of the LGS: range of the rms of an optimal observer in 95 % of records [um].
     phases : tuple of float or None
-        Of the bound of both sensors: the bound in steps with an NGS frame, one step later, ... [um]; `rms` is over all.
+        Of the bounds of both sensors: the bound in steps with an NGS frame, one step later, ... [um]; `rms` is over all.
     calibration : Calibration or None
         How the standard deviation that the observer states fits its errors; None where it states none.
     """

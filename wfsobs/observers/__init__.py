@@ -41,5 +41,5 @@ BUILT_IN = (
 )
 """Those of wfsobs, in the order of tables and legends."""
 
-OBSERVERS = Registry(Observer, registry.OBSERVERS, BUILT_IN, reserved_ids=("truth", "loop", "bound", "bound-both"))
+OBSERVERS = Registry(Observer, registry.OBSERVERS, BUILT_IN, reserved_ids=("truth", "loop", "bound", "bound-both", "bound-stars"))
 """Every observer: those above, and those of installed packages (`wfsobs.registry`)."""

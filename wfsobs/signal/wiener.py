@@ -168,4 +168,5 @@ def circle_mean(spectrum: Array) -> float:
 
 def advance_spectrum(spectrum: Complex | Array, steps: int) -> Complex:
     """Return S_sz of z[k] = s[k - steps] + anything independent: the spectrum with the phase of `steps` ahead."""
-    return spectrum * np.exp(2j * np.pi * steps * np.arange(spectrum.size) / (2 * (spectrum.size - 1)))
+    size = spectrum.shape[-1]
+    return spectrum * np.exp(2j * np.pi * steps * np.arange(size) / (2 * (size - 1)))

@@ -10,12 +10,14 @@ times sinc^2(f T) for the mean over a step. Layers are independent and add. The 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import helmert
 
 from wfsobs.atmosphere.plane_waves import Footprint
 from wfsobs.atmosphere.von_karman import CORE, TurbulenceLayer, fine_rule, nodes_across_wind, von_karman_density
@@ -68,28 +70,78 @@ def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra
     FlowSpectra
         Six densities, (n,) each [um^2/Hz].
     """
-    f, total = _at_nodes(scenario, mode, float(frequency[-1]))
+    shared = _spectra_between(scenario, mode, frequency, apart=False)
+    if len(shared.density) == 2:  # the NGS is on the axis
+        own, measurement = shared.density
+        return FlowSpectra(own, measurement, shared.pair(0, 1), own, own + 0j, shared.pair(0, 1))
+    own, measurement, ngs = shared.density
+    return FlowSpectra(own, measurement, shared.pair(0, 1), ngs, shared.pair(0, 2), shared.pair(2, 1))
+
+
+def star_flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> NDArray[np.complex128]:
+    """Compute the spectra of one mode of frozen flow, every LGS apart.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    mode : int
+        Index of the mode.
+    frequency : Array
+        Frequencies from 0 on, (n,) [Hz].
+
+    Returns
+    -------
+    Array
+        One-sided cross spectra [um^2/Hz] of the signal on the axis, that of the NGS, the mean of the LGS and their orthonormal
+        differences (`star_basis`), (2 + n_lgs, 2 + n_lgs, n).
+    """
+    shared = _spectra_between(scenario, mode, frequency, apart=True)
+    signals = range(len(shared.density))
+    out = np.array([[shared.pair(i, j) if i < j else np.empty_like(shared.pair(0, 0)) for j in signals] for i in signals])
+    for i in signals:
+        out[i, i] = shared.density[i]
+        out[i, :i] = out[:i, i].conj()
+    return out
+
+
+def star_basis(stars: int) -> Array:
+    """Return the weights of the stars in their mean and in orthonormal differences, (n_stars, n_stars)."""
+    differences: Array = helmert(stars)
+    return np.vstack([np.full(stars, 1.0 / stars), differences])
+
+
+@dataclass(frozen=True)
+class _Between:
+    """Densities of signals, (n,) each, and how they are shared at the nodes, interpolated at log frequencies `at`."""
+
+    density: list[Array]
+    nodes: Array
+    at: Array
+    total: NDArray[np.complex128]
+
+    def pair(self, i: int, j: int) -> NDArray[np.complex128]:
+        """Interpolate only the share of the geometric mean: it is smooth, and never above one."""
+        share = self.total[i, j] / np.sqrt(np.maximum((self.total[i, i] * self.total[j, j]).real, 1e-300))
+        real, imaginary = (np.interp(self.at, self.nodes, part) for part in (share.real, share.imag))
+        return np.sqrt(self.density[i] * self.density[j]) * (real + 1j * imaginary)
+
+
+def _spectra_between(scenario: Scenario, mode: int, frequency: Array, *, apart: bool) -> _Between:
+    f, total = _at_nodes(scenario, mode, float(frequency[-1]), apart=apart)
     exposure = np.sinc(f * scenario.dt) ** 2
     at, nodes = np.log(np.maximum(frequency, f[0])), np.log(f)
     density = [np.exp(np.interp(at, nodes, np.log(np.maximum((row[i] * exposure).real, 1e-300)))) for i, row in enumerate(total)]
-
-    def between(i: int, j: int) -> NDArray[np.complex128]:
-        """Interpolate only the share of the geometric mean: it is smooth, and never above one."""
-        share = total[i, j] / np.sqrt(np.maximum((total[i, i] * total[j, j]).real, 1e-300))
-        return np.sqrt(density[i] * density[j]) * (np.interp(at, nodes, share.real) + 1j * np.interp(at, nodes, share.imag))
-
-    shared = between(0, 1)
-    if len(total) == 2:  # the NGS is on the axis
-        return FlowSpectra(density[0], density[1], shared, density[0], density[0] + 0j, shared)
-    return FlowSpectra(density[0], density[1], shared, density[2], between(0, 2), between(2, 1))
+    return _Between(density, nodes, at, total)
 
 
 @lru_cache(maxsize=32)
-def _at_nodes(scenario: Scenario, mode: int, highest: float) -> tuple[Array, NDArray[np.complex128]]:
+def _at_nodes(scenario: Scenario, mode: int, highest: float, *, apart: bool) -> tuple[Array, NDArray[np.complex128]]:
     """Return the nodes in frequency, and the spectra of all layers there, which take a second where there are many."""
     found = atmosphere.layers(scenario)
     f = _frequencies(scenario, min(layer.speed for layer in found), highest)
-    total = np.sum([_layer(scenario, mode, layer, f) for layer in found], axis=0)
+    sight = _stars_apart if apart else _stars_together
+    total = np.sum([_layer(scenario, mode, layer, f, sight) for layer in found], axis=0)
     f.flags.writeable = total.flags.writeable = False
     return f, total
 
@@ -109,11 +161,11 @@ def _frequencies(scenario: Scenario, speed: float, highest: float) -> Array:
     return f[: int(np.searchsorted(f, highest)) + 1]
 
 
-def _layer(scenario: Scenario, mode: int, layer: TurbulenceLayer, f: Array) -> NDArray[np.complex128]:
-    """Return the spectra of one layer between axis, LGS and, off the axis, NGS, (2 or 3, the same, n)."""
+def _layer(scenario: Scenario, mode: int, layer: TurbulenceLayer, f: Array, sight: _Sight) -> NDArray[np.complex128]:
+    """Return the spectra of one layer between the signals, (n_signals, n_signals, n)."""
     kx = 2.0 * np.pi * f / layer.speed
     front = CORE / (0.5 * scenario.telescope.diameter)
-    parts = [_block(scenario, mode, layer, kx[part], front) for part in _blocks(kx, front)]
+    parts = [_block(scenario, mode, layer, kx[part], front, sight) for part in _blocks(kx, front)]
     return np.concatenate(parts, axis=-1)
 
 
@@ -127,7 +179,9 @@ def _blocks(kx: Array, front: float) -> Iterator[slice]:
         start = stop
 
 
-def _block(scenario: Scenario, mode: int, layer: TurbulenceLayer, kx: Array, front: float) -> NDArray[np.complex128]:
+def _block(
+    scenario: Scenario, mode: int, layer: TurbulenceLayer, kx: Array, front: float, sight: _Sight
+) -> NDArray[np.complex128]:
     diameter, q0 = scenario.telescope.diameter, 2.0 * np.pi / scenario.turbulence.outer_scale
     if kx[0] < front:
         ky, weight = nodes_across_wind(q0, front, *fine_rule(layer.height, diameter))
@@ -139,19 +193,35 @@ def _block(scenario: Scenario, mode: int, layer: TurbulenceLayer, kx: Array, fro
         * von_karman_density(kx**2 + ky[:, None] ** 2, layer.strength, scenario.turbulence.outer_scale)
     )
     c, s = np.cos(layer.angle), np.sin(layer.angle)
-    x, y = c * kx - s * ky[:, None], s * kx + c * ky[:, None]
+    signals = sight(scenario, mode, layer, c * kx - s * ky[:, None], s * kx + c * ky[:, None])
+    return np.array([[(density * one.conj() * other).sum(axis=0) for other in signals] for one in signals])
+
+
+_Sight = Callable[[Scenario, int, TurbulenceLayer, Array, Array], list[NDArray[np.complex128]]]
+"""(scenario, mode, layer, k_x, k_y) -> transforms of the signals."""
+
+
+def _stars_together(scenario: Scenario, mode: int, layer: TurbulenceLayer, x: Array, y: Array) -> list[NDArray[np.complex128]]:
+    """Return those of axis, combined LGS and, off the axis, NGS."""
     own = _of_mode(scenario, mode, x, y, Footprint())
-    seen = np.zeros_like(own)
+    combined = np.zeros_like(own)
     for star, gains in zip(atmosphere.laser_stars(scenario), lgs_weights(scenario)[mode], strict=True):
         footprint = _footprint(scenario, star, layer)
         for other, gain in enumerate(gains):
             blind = scenario.sensors.tip_tilt_indetermination and scenario.modes[other].radial_order == 1
             if gain != 0.0 and not blind:
-                seen = seen + gain * _of_mode(scenario, other, x, y, footprint)
-    signals = [own, seen]
+                combined = combined + gain * _of_mode(scenario, other, x, y, footprint)
+    signals = [own, combined]
     if atmosphere.natural_star(scenario) != atmosphere.on_axis():
         signals.append(_of_mode(scenario, mode, x, y, _footprint(scenario, atmosphere.natural_star(scenario), layer)))
-    return np.array([[(density * one.conj() * other).sum(axis=0) for other in signals] for one in signals])
+    return signals
+
+
+def _stars_apart(scenario: Scenario, mode: int, layer: TurbulenceLayer, x: Array, y: Array) -> list[NDArray[np.complex128]]:
+    """Return those of axis, NGS, mean of the LGS and their differences."""
+    stars = (atmosphere.natural_star(scenario), *atmosphere.laser_stars(scenario))
+    ngs, *lgs = (_of_mode(scenario, mode, x, y, _footprint(scenario, star, layer)) for star in stars)
+    return [_of_mode(scenario, mode, x, y, Footprint()), ngs, *np.tensordot(star_basis(len(lgs)), lgs, axes=1)]
 
 
 def _of_mode(scenario: Scenario, mode: int, x: Array, y: Array, footprint: Footprint) -> NDArray[np.complex128]:

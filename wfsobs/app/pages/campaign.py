@@ -152,8 +152,9 @@ class CampaignPage(PageActions):
         ranked = [s.name for s in next(iter(state.errors.values())).standings(range(len(state.plan.cells)))]
         known = [*state.plan.observers, *state.plan.controllers]
         best = [name for name in ranked if name in known][:FIRST_LINES]
+        bounds = [name for name in BOUNDS if any(name in errors.names for errors in state.errors.values())]
         self.lines = pmui.MultiChoice(
-            label="Lines", options={name_label(name): name for name in (*known, *BOUNDS)}, value=[*best, *BOUNDS], **WIDE
+            label="Lines", options={name_label(name): name for name in (*known, *bounds)}, value=[*best, *bounds], **WIDE
         )
         for field in (self.target, self.across, self.down, self.lines, *self.filters.values()):
             field.param.watch(lambda _: self.draw(), "value")

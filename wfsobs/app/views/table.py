@@ -29,7 +29,7 @@ from wfsobs.evaluation.rows import (
     score_rows,
     scored_interval,
 )
-from wfsobs.evaluation.scores import BOUNDS, LOOP, RESIDUAL, Score
+from wfsobs.evaluation.scores import BOUND_STARS, BOUNDS, LOOP, RESIDUAL, Score
 from wfsobs.observers.base import TARGETS
 
 BEST, TIED, ABOVE = macro("tag", "best", "best"), macro("tag", "tied", "tied"), macro("tag", "above", "above truth")
@@ -109,6 +109,8 @@ class Table:
             name: find(shown, name, target, self.display.mode) if shown else None
             for name in (*observers_of(target, with_hidden=True), *BOUNDS)
         }
+        if not scores[BOUND_STARS]:  # only where stars differ
+            del scores[BOUND_STARS]
         marks = self._marks(target, scores)
         order = list(scores.items())
         if self.display.best_first:

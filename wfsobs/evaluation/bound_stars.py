@@ -1,0 +1,60 @@
+"""Bound of every star apart: the minimum error of any causal linear observer of each LGS by itself and of the NGS.
+
+It is as `bound_both`, for observers that are given more than the mean of the LGS. Where all stars see the same turbulence, but
+for independent errors, their mean tells all that they tell and the two bounds are one (`stars_differ`). Every star gives the mode
+that is estimated and no other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wfsobs.evaluation.bound import TOTAL
+from wfsobs.evaluation.bound_both import PeriodicError, exposure_response
+from wfsobs.scenario import Scenario
+from wfsobs.signal.sensor_array import FastSensors, variance_from_sensors
+from wfsobs.signal.slow_sensor import SlowSensor
+from wfsobs.signal.wiener import advance_spectrum, causal_error, factorise
+from wfsobs.simulation.star_spectra import StarSpectra, star_spectra
+
+
+def least_errors_of_stars(spectra: StarSpectra, ahead: int = 0) -> dict[str, PeriodicError]:
+    """Compute the minimum error of phi[k + ahead] from all LGS, each apart, and all NGS frames up to step k.
+
+    Parameters
+    ----------
+    spectra : StarSpectra
+        Spectra of one mode.
+    ahead : int
+        Steps of prediction.
+
+    Returns
+    -------
+    dict of str to PeriodicError
+        Target -> error; TOTAL is that of both together.
+    """
+    known, names = spectra.mean.without_lines, list(spectra.mean.signal)
+    ngs, whitener = known.ngs, factorise(known.measurement)
+    exposure = exposure_response(ngs.ratio, known.measurement.size)
+    frames = SlowSensor(
+        ngs.signal * np.abs(exposure) ** 2, advance_spectrum(ngs.measurement_cross * exposure, 1), ngs.noise, ngs.ratio
+    )
+    others = FastSensors(spectra.differences, spectra.cross, advance_spectrum(spectra.ngs_cross * exposure, 1))
+    wanted = [
+        (
+            advance_spectrum(known.cross[name], 1 + ahead),
+            advance_spectrum(ngs.cross[name] * exposure.conj(), ahead),
+            advance_spectrum(spectra.axis_cross, 1 + ahead) if name == "turbulence" else np.zeros_like(spectra.cross),
+        )
+        for name in names
+    ]
+    gained = variance_from_sensors(wanted, whitener, others, frames)
+    alone = {name: causal_error(known.signal[name], wanted[i][0], whitener) - gained[:, i, i] for i, name in enumerate(names)}
+    fast = np.sum([of_z for of_z, _, _ in wanted], axis=0)
+    total = causal_error(known.total[0], fast, whitener) - gained.sum(axis=(1, 2))
+    return {name: PeriodicError(np.maximum(variance, 0.0)) for name, variance in (*alone.items(), (TOTAL, total))}
+
+
+def bound_rms_of_stars(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:
+    """Return target -> rms [um] of the minimum error, as `least_errors_of_stars`, of one mode of a scenario."""
+    return {name: error.rms for name, error in least_errors_of_stars(star_spectra(scenario, mode), ahead).items()}

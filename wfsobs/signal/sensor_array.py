@@ -1,0 +1,166 @@
+"""What several fast sensors and a slow one add to a fast one: the minimum error of any causal linear observer of all.
+
+As in `slow_sensor`, e are the innovations of the one sensor z, and what is to be gained by the others is the regression of the
+rest of the target on the rests of their measurements, those of age a = 0, 1, ...,
+
+    r_i[a] = y_i'[k - a] + sum_{t > 0} C_i[t + a] e[k+t],
+
+i one of the fast sensors, or the slow one, whose ages are p, p + n, .... The rests y' have the cross spectra
+S_ij - S_iz S_zj / S_z. With every one of them whitened by a causal factor of its own spectrum,
+
+    gain = b' (I + E + K' K)^-1 b,
+
+in which E, the shares that sensors have in common, and K, the innovations that are still to come, are Toeplitz and Hankel
+matrices, multiplied by the FFT. No matrix spectrum is factorised. Measurements older than LONGEST steps are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from wfsobs.signal.slow_sensor import SlowSensor
+from wfsobs.signal.wiener import Complex, Whitener, factorise
+from wfsobs.typing import Array
+
+LONGEST = 8192
+"""Maximum age of a measurement beside z [steps]."""
+
+TOLERANCE = 1e-3
+"""Residual of a solution over its right-hand side."""
+
+
+@dataclass(frozen=True)
+class FastSensors:
+    """m fast sensors beside z.
+
+    Attributes
+    ----------
+    spectra : Array
+        Cross spectra of their measurements, the transform over n of E y_i[k] y_j[k-n], noise included, (m, m, n // 2 + 1).
+    cross : Array
+        Those with z, E y_i[k] z[k-n], (m, n // 2 + 1).
+    slow : Array
+        Those with the slow sensor, E x[k] y_i[k-n], (m, n // 2 + 1).
+    """
+
+    spectra: NDArray[np.complex128]
+    cross: NDArray[np.complex128]
+    slow: NDArray[np.complex128]
+
+
+def variance_from_sensors(
+    targets: Sequence[tuple[Complex, Complex, NDArray[np.complex128]]], whitener: Whitener, fast: FastSensors, slow: SlowSensor
+) -> Array:
+    """Return how much the other sensors lower the variance of the minimum error of z alone.
+
+    Parameters
+    ----------
+    targets : sequence of tuple
+        (S_sz, S_sx, S_sy) of each target, as in `variance_from_frames`, and those with the fast sensors, (m, n // 2 + 1).
+    whitener : Whitener
+        Factor of the spectrum of z.
+    fast, slow : FastSensors, SlowSensor
+        The other sensors.
+
+    Returns
+    -------
+    Array
+        Explained covariance of the targets, (ratio, n_targets, n_targets), p steps after a frame.
+    """
+    n = whitener.n
+    cross = np.vstack([fast.cross, slow.cross])
+    rests = np.empty((len(cross), *cross.shape), dtype=np.complex128)
+    rests[:-1, :-1] = fast.spectra
+    rests[-1, :-1], rests[:-1, -1] = fast.slow, fast.slow.conj()
+    rests[-1, -1] = slow.spectrum
+    rests -= cross[:, None] * cross.conj() / whitener.spectrum
+    factors = np.array([_factor(rests[i, i].real) for i in range(len(rests) - 1)] + [_frame_factor(rests[-1, -1].real, slow, n)])
+    ahead = 1.0 / (whitener.H.conj() * np.sqrt(whitener.innovation_variance))
+    future = _of_future(cross * ahead, n) / factors.conj()
+    wanted = []
+    for of_z, of_x, of_y in targets:
+        own = np.vstack([of_y, of_x]) - of_z * cross.conj() / whitener.spectrum
+        known = future * _of_future(of_z * ahead, n, first=1).conj()
+        past = fft.rfft(_past(own, n), n) / factors.conj()
+        wanted.append(fft.irfft(past + known, n)[:, : min(LONGEST, n // 2)])
+    shares = rests.conj() / (factors.conj()[:, None] * factors)
+    return _gains(_Regression(shares, future, slow.ratio, n), np.array(wanted))
+
+
+def _factor(spectrum: Array) -> Complex:
+    found = factorise(spectrum)
+    return found.H * np.sqrt(found.innovation_variance)
+
+
+def _frame_factor(spectrum: Array, slow: SlowSensor, n: int) -> Complex:
+    """Return the factor of the spectrum of the frames' rests, noise included, one coefficient every `ratio` steps."""
+    frames = n // 2 // slow.ratio
+    covariance = fft.irfft(spectrum, n)[: frames * slow.ratio + 1 : slow.ratio]
+    circle = np.concatenate([covariance, covariance[-2:0:-1]])
+    factor = _factor(np.maximum(fft.rfft(circle).real, 0.0) + slow.noise)
+    spread = np.zeros(n)
+    spread[: frames * slow.ratio : slow.ratio] = fft.irfft(factor, 2 * frames)[:frames]
+    return fft.rfft(spread)
+
+
+def _past(spectrum: Complex, n: int) -> Array:
+    """Return the coefficients at the ages from 0 on, of E s[k] y[k - age]."""
+    out = fft.irfft(spectrum, n)
+    out[..., n // 2 :] = 0.0
+    return out
+
+
+def _of_future(spectrum: Complex, n: int, first: int = 0) -> Complex:
+    """Return the transform of the coefficients of e[k + first], e[k + first + 1], ..., in that order."""
+    backwards = _past(spectrum.conj(), n)
+    backwards[..., :first] = 0.0
+    return fft.rfft(backwards)
+
+
+class _Regression:
+    """I + E + K' K on the ages of each phase of the frames: x of shape (ratio, n_targets, n_sensors, n_ages)."""
+
+    def __init__(self, shares: NDArray[np.complex128], future: Complex, ratio: int, n: int) -> None:
+        self.length = min(LONGEST, n // 2)
+        self.size = fft.next_fast_len(2 * self.length, real=True)
+        kernel = fft.irfft(shares, n)
+        near = np.zeros((*shares.shape[:2], self.size))
+        near[..., : self.length] = kernel[..., : self.length]
+        near[..., 1 - self.length :] = kernel[..., 1 - self.length :]
+        self.shares = fft.rfft(near)
+        for i in range(len(shares)):
+            self.shares[i, i] = 1.0  # they are white
+        self.hankel = fft.rfft(fft.irfft(future, n)[:, : min(self.size, n // 2)], self.size)
+        self.mask = np.ones((ratio, 1, len(shares), self.length))
+        self.mask[:, :, -1] = np.arange(self.length) % ratio == np.arange(ratio)[:, None, None]
+
+    def apply(self, x: Array) -> Array:
+        """Return (I + E + K' K) x at the ages that are measured."""
+        transform = fft.rfft(x, self.size)
+        out = np.einsum("ijf,ptjf->ptif", self.shares, transform)
+        known = fft.irfft(np.einsum("if,ptif->ptf", self.hankel, transform.conj()), self.size)
+        known[..., 0] = known[..., self.length :] = 0.0
+        out += self.hankel * fft.rfft(known, self.size).conj()[:, :, None]
+        return self.mask * fft.irfft(out, self.size)[..., : self.length]
+
+
+def _gains(regression: _Regression, rest: Array) -> Array:
+    """Return b' (I + E + K' K)^-1 b of all pairs of targets at every age, by conjugate gradients. rest : b of each target."""
+    b = regression.mask * rest
+    x, residual, direction = np.zeros_like(b), b.copy(), b.copy()
+    power = np.sum(b**2, axis=(-2, -1), keepdims=True)
+    enough, smallest = TOLERANCE**2 * power, np.finfo(float).tiny
+    while (power > enough).any():
+        moved = regression.apply(direction)
+        step = power / np.maximum(np.sum(direction * moved, axis=(-2, -1), keepdims=True), smallest)
+        x += step * direction
+        residual -= step * moved
+        before, power = power, np.sum(residual**2, axis=(-2, -1), keepdims=True)
+        direction = residual + (power / np.maximum(before, smallest)) * direction
+    out = np.einsum("ptia,puia->ptu", b, x)
+    return 0.5 * (out + out.transpose(0, 2, 1))
