@@ -103,15 +103,6 @@ def test_the_page(dashboard: Dashboard) -> None:
     assert dashboard.display.dark
 
 
-def test_a_narrow_window_closes_the_drawer(dashboard: Dashboard, loop: Any) -> None:
-    page = dashboard.page()
-    frame = dashboard.frame
-    frame.width_px = 390
-    loop.until(lambda: not page.sidebar_open)
-    frame.width_px = 1400
-    loop.until(lambda: page.sidebar_open)
-
-
 def test_the_theme_that_the_system_wants(dashboard: Dashboard, loop: Any) -> None:
     page, frame = dashboard.page(), dashboard.frame
     frame.wants_dark = True

@@ -29,11 +29,17 @@ def toml(table: dict[str, Any]) -> str:
     return "\n".join([*plain, *tables])
 
 
-def test_a_square_opens_its_scenario(make_server: Any, open_page: Any, tmp_path: Path) -> None:
-    plan, folder = parse_plan(toml(PLAN), tmp_path), tmp_path / "campaign"
+def make_campaign(folder: Path) -> None:
+    """Run a small campaign to its end."""
+    plan = parse_plan(toml(PLAN), folder.parent)
     open_folder(plan, folder)
     rows = [row for cell in plan.cells for seed in plan.seeds for row in run_rows(cell, seed, plan.observers, ())]
     write_batch(folder, rows, {"host": "", "process": 1, "written": 1.0})
+
+
+def test_a_square_opens_its_scenario(make_server: Any, open_page: Any, tmp_path: Path) -> None:
+    folder = tmp_path / "campaign"
+    make_campaign(folder)
     server = make_server(["-m", "wfsobs", "serve", "--port", "{port}", "--campaign", str(folder)], tmp_path / "log", "/")
     try:
         page = open_page(url=server.url + "?" + "&".join(f"{path}={value}" for path, value in SHORT.items()))

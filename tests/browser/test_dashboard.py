@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Page, expect
 
 from wfsobs.app.style import observers_of
 from wfsobs.observers.base import TARGETS
@@ -223,6 +223,47 @@ def test_cancel(open_page: Any, server: Any) -> None:
     expect(cancel).to_be_disabled()
     page.get_by_role("button", name="Reset", exact=True).click()
     finished(page)
+
+
+DRAWER = """() => {
+  window.drawerSeen = 0
+  const find = (root) => {
+    for (const it of root.querySelectorAll("*")) {
+      const found = it.matches(".sidebar") ? it : it.shadowRoot && find(it.shadowRoot)
+      if (found) return found
+    }
+  }
+  const look = () => {
+    const it = find(document)
+    if (it && it.checkVisibility({visibilityProperty: true}) && it.getBoundingClientRect().right > 0) window.drawerSeen += 1
+    requestAnimationFrame(look)
+  }
+  look()
+}"""
+"""Counts the frames in which the drawer is seen, from the first on."""
+
+
+@pytest.mark.parametrize(("width", "seen"), [(390, False), (1400, True)], ids=["phone", "wide"])
+def test_the_drawer_of_a_phone_is_closed_from_the_first_frame_on(browser: Browser, server: Any, width: int, seen: bool) -> None:
+    page = browser.new_page(viewport={"width": width, "height": 844})
+    page.add_init_script(f"({DRAWER})()")
+    page.goto(server.url)
+    finished(page)
+    assert bool(page.evaluate("() => window.drawerSeen")) == seen
+    page.close()
+
+
+NAMES = """() => {
+  const found = (root) => [...root.querySelectorAll("*")].flatMap((it) => [
+    ...it.matches(".card .name") ? [it] : [], ...it.shadowRoot ? found(it.shadowRoot) : []])
+  return found(document).filter((it) => it.offsetParent).map((it) => [it.textContent, it.scrollWidth - it.clientWidth])
+}"""
+
+
+@pytest.mark.parametrize("width", [1400, 390], ids=["wide", "phone"])
+def test_the_name_on_every_card_is_readable(open_page: Any, width: int) -> None:
+    names = open_page(width, 844).evaluate(NAMES)
+    assert len(names) > 15 and [name for name, beyond in names if beyond > 0] == []
 
 
 def test_phone(open_page: Any, tmp_path: Path) -> None:

@@ -49,14 +49,10 @@ STALE = "These results are not those of the settings."
 NARROW = {"@media (max-width: 600px)": {"& .header a:has(.title)": {"display": "none !important"}}}
 """On a phone the bar at the top has room for the run, not for the name."""
 
-PHONE_PX = 600
-"""Below this width the drawer lies over the page, and starts closed."""
-
 
 class Frame(JSComponent):
-    """Tells the width, the theme that is wanted and when the first picture stands, and fades the results while they are stale."""
+    """Closes the drawer of a phone, tells the theme that is wanted and when the first picture stands, and fades stale results."""
 
-    width_px = param.Integer(0, doc="Width when the page opened [px].")
     wants_dark = param.Boolean(False, doc="Whether the visitor's system has a dark theme, unless one was chosen here.")
     preferred_theme = param.Selector(
         default="", objects=["", "dark", "light"], doc="The theme that was chosen, for the browser to keep."
@@ -156,10 +152,10 @@ class Dashboard:
         self.frame.on_drawn = lambda: self._post(self.complete)
         if pn.state.curdoc is None:  # nobody will say that it has been drawn
             self.complete()
-        self.frame.param.watch(lambda event: self._post(partial(_open_drawer, page, event.new)), "width_px")
         with edit_readonly(page):
             # Tied to what all sessions do, each change walks all models of the page, and the page outlives its session.
             page.busy = Idle().param.busy
+        self.display.dark = page.dark_theme  # Panel has it from the address
         page.param.watch(self._on_theme, "dark_theme")
         self.frame.param.watch(lambda event: self._post(partial(setattr, page, "dark_theme", event.new)), "wants_dark")
         return page
@@ -214,7 +210,3 @@ def _title() -> pn.pane.HTML:
         margin=0,
         styles={"position": "absolute", "width": "1px", "height": "1px", "overflow": "hidden", "clip-path": "inset(50%)"},
     )
-
-
-def _open_drawer(page: pmui.Page, width: int) -> None:
-    page.sidebar_open = width >= PHONE_PX

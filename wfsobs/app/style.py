@@ -68,6 +68,8 @@ PRIMARY = "#0B4F6C"
 _COMPONENTS = {
     "MuiAppBar": {"styleOverrides": {"root": {"backgroundColor": f"{PRIMARY} !important", "color": "#fff !important"}}},
     "MuiButton": {"styleOverrides": {"root": {"textTransform": "none"}}},
+    # The drawer of a phone is open when the page comes, until the browser has closed it (frame.js).
+    "MuiDrawer": {"styleOverrides": {"modal": {"@media (max-width: 599.95px)": {"visibility": "var(--wfsobs-drawer, hidden)"}}}},
     # Why a setting has no effect is to be read, though its box is grey.
     "MuiFormHelperText": {"styleOverrides": {"root": {"&.Mui-disabled": {"color": "inherit", "opacity": 0.75}}}},
     "MuiToggleButton": {"styleOverrides": {"root": {"textTransform": "none", "whiteSpace": "nowrap"}}},

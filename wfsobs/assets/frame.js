@@ -1,5 +1,5 @@
-// Stands below the results: tells how wide the window is when the page opens and when its first picture stands, and fades the results while they are
-// stale. Fading them from here costs nothing; a change of their own style has the browser lay them all out anew.
+// Stands below the results: closes the drawer of a phone, tells when the first picture stands, and fades the results while they
+// are stale. Fading them from here costs nothing; a change of their own style has the browser lay them all out anew.
 // The theme is the system's, until another is chosen: that one is remembered.
 
 const THEME = "wfsobs-theme"
@@ -128,9 +128,19 @@ function tellDrawn(model) {
   look()
 }
 
+// On a phone the drawer lies over the page: its style hides it until it has been closed here, and is opened.
+const PHONE = "(max-width: 599.95px)"
+function closeDrawer(doc) {
+  const page = [...doc._all_models.values()].find((it) => it.data?.attributes && "sidebar_open" in it.data.attributes)
+  const allow = () => document.documentElement.style.setProperty("--wfsobs-drawer", "visible")
+  if (!page || !matchMedia(PHONE).matches) return allow()
+  page.data.sidebar_open = false
+  page.data.properties.sidebar_open.change.connect(allow)
+}
+
 export function render({model, view, el}) {
+  closeDrawer(view.model.document)
   patchTexts(view.model.document)
-  model.width_px = window.innerWidth
   themes(model)
   tellDrawn(model)
   const fade = () => {
