@@ -14,6 +14,7 @@ from wfsobs.app.views.frames import Frames
 from wfsobs.app.views.gain_editor import GainEditor
 from wfsobs.app.views.spectrum_editor import DRAGGED, SpectrumEditor
 from wfsobs.closed_loop.design import design
+from wfsobs.control.integrator import highest_stable_gain
 from wfsobs.evaluation.theory import Theory
 from wfsobs.priors_from.controllers import plant_of
 from wfsobs.scenario import Scenario
@@ -205,27 +206,27 @@ class TestGain:
         loop.until(lambda: page.results is not None and page.results.complete)
         assert page.editor is None, "made when first wanted"
         dashboard.display.editing = True
-        loop.until(lambda: bool(page.editor.layer.frame.get("handles")))
+        loop.until(lambda: all(it.layer.frame.get("handles") for it in page.editor.handles))
         return page.editor
 
     def test_a_drag_says_what_the_loop_would_do(self, gain: GainEditor, loop: Any) -> None:
         store = gain.store
-        (handle,) = gain.layer.frame["handles"]
-        gain.layer._handle_msg({"action": "drag", "id": "gain-0", "number": 1, "frequency": 0.5 * handle["frequency"]})
-        loop.until(lambda: gain.layer.frame["answered"] == 1)
-        (after,) = gain.layer.frame["handles"]
+        (handle,) = gain.handles[0].layer.frame["handles"]
+        gain.handles[0].layer._handle_msg({"action": "drag", "id": "gain-0", "number": 1, "frequency": 0.5 * handle["frequency"]})
+        loop.until(lambda: gain.handles[0].layer.frame["answered"] == 1)
+        (after,) = gain.handles[0].layer.frame["handles"]
         # between two points of the curve the level is taken as linear
         assert after["frequency"] == pytest.approx(0.5 * handle["frequency"], rel=5e-3)
-        values = {it["name"]: it["value"] for it in gain.layer.frame["numbers"]}
+        values = {it["name"]: it["value"] for it in gain.handles[0].layer.frame["numbers"]}
         scenario = store.scenario.replace({"control.integrator": "manual", "control.gain": float(values["gain"])})
         expected = design(scenario, ["integrator"]).laws["integrator"][0].predicted_rms
         assert expected is not None
         assert float(values["integrator"]) == pytest.approx(1e3 * expected, rel=0.01)  # three digits, of the gain too
         assert store.scenario.control.integrator == "optimised" and not store.can_undo
-        assert "controllers with NGS" in gain.layer.frame["hint"], "what a drag does not show"
+        assert "other controllers follow" in gain.handles[0].layer.frame["hint"], "what a drag does not show"
 
     def test_letting_go_sets_the_gain(self, gain: GainEditor, loop: Any) -> None:
-        gain.layer._handle_msg({"action": "release", "id": "gain-0", "number": 1, "frequency": 40.0})
+        gain.handles[0].layer._handle_msg({"action": "release", "id": "gain-0", "number": 1, "frequency": 40.0})
         control = gain.store.scenario.control
         assert control.integrator == "manual"
         mirror, dt = plant_of(gain.store.scenario).mirror, gain.store.scenario.dt
@@ -236,9 +237,43 @@ class TestGain:
 
     def test_no_handle_makes_the_loop_unstable(self, gain: GainEditor, loop: Any) -> None:
         for i, frequency in enumerate((120.0, 300.0, 499.0), 1):
-            gain.layer._handle_msg({"action": "drag", "id": "gain-0", "number": i, "frequency": frequency})
-            loop.until(lambda i=i: gain.layer.frame["answered"] == i)
-            assert gain.layer.frame["note"] == "" and gain.layer.frame["numbers"]
-        gain.layer._handle_msg({"action": "drag", "id": "gain-0", "number": 4, "frequency": -1.0})
-        loop.until(lambda: gain.layer.frame["answered"] == 4)
-        assert "positive" in gain.layer.frame["note"]
+            gain.handles[0].layer._handle_msg({"action": "drag", "id": "gain-0", "number": i, "frequency": frequency})
+            loop.until(lambda i=i: gain.handles[0].layer.frame["answered"] == i)
+            assert gain.handles[0].layer.frame["note"] == "" and gain.handles[0].layer.frame["numbers"]
+        gain.handles[0].layer._handle_msg({"action": "drag", "id": "gain-0", "number": 4, "frequency": -1.0})
+        loop.until(lambda: gain.handles[0].layer.frame["answered"] == 4)
+        assert "positive" in gain.handles[0].layer.frame["note"]
+
+    def test_on_the_nyquist_figure_as_on_the_rejection(self, gain: GainEditor, loop: Any) -> None:
+        rejection, nyquist = (it.layer for it in gain.handles)
+        (handle,) = nyquist.frame["handles"]
+        shown = margin_of(gain)
+        assert handle["frequency"] == pytest.approx(-1.0 / shown, rel=1e-3) and handle["y"] == 0.0
+        nyquist._handle_msg({"action": "drag", "id": "gain-0", "number": 1, "frequency": -0.25})
+        loop.until(lambda: nyquist.frame["answered"] == 1)
+        # the margin is found on the law itself, the gain of the place in proportion to the highest one, to four decimals
+        assert nyquist.frame["handles"][0]["frequency"] == pytest.approx(-0.25, rel=1e-3)
+        values = {it["name"]: it["value"] for it in nyquist.frame["numbers"]}
+        assert float(values["gain-margin"]) == pytest.approx(20.0 * np.log10(4.0), abs=0.06)  # one decimal
+        assert rejection.frame["numbers"] == nyquist.frame["numbers"], "one gain"
+        (x,), (y,) = (gain.handles[1].lines.source.data[name] for name in ("xs", "ys"))
+        near = np.flatnonzero((y[:-1] < 0.0) & (y[1:] >= 0.0) & (x[1:] < 0.0))
+        share = -y[near] / (y[near + 1] - y[near])
+        assert np.min(np.abs(x[near] + share * (x[near + 1] - x[near]) + 0.25)) < 2e-3, "the line goes through the handle"
+        nyquist._handle_msg({"action": "release", "id": "gain-0", "number": 2, "frequency": -3.0})
+        control = gain.store.scenario.control
+        mirror = plant_of(gain.store.scenario).mirror
+        assert control.gain == pytest.approx(0.98 * highest_stable_gain(mirror, control.leak), abs=1e-4), "beyond -1: 2 % below"
+        loop.finish(gain.store)
+        nyquist._handle_msg({"action": "drag", "id": "gain-0", "number": 3, "frequency": None})
+        loop.until(lambda: nyquist.frame["answered"] == 3)
+        assert "numbers only" in nyquist.frame["note"]
+
+
+def margin_of(gain: GainEditor) -> float:
+    """The gain margin of the closed loop shown."""
+    shown = gain.results()
+    assert shown is not None
+    margins = shown.result.design.laws["integrator"][0].margins
+    assert margins is not None and margins.gain is not None
+    return margins.gain

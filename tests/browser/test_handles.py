@@ -149,12 +149,13 @@ def test_other_handles(page: Page) -> None:
     expect(page.get_by_role("button", name="Undo")).to_be_enabled()
 
 
-def test_gain_of_the_integrator(page: Page) -> None:
+@pytest.mark.parametrize("name", ["Integrator gain", "Integrator gain, Nyquist"])
+def test_gain_of_the_integrator(page: Page, name: str) -> None:
     page.get_by_role("button", name="Closed loop").click()
-    gain = handle(page, "Integrator gain")
+    gain = handle(page, name)
     expect(gain).to_be_visible()
-    expect(page.get_by_text("Only the integrator has a preview")).to_be_visible()
-    margin = page.locator(".numbers span[data-name=gain-margin] b")
+    expect(page.get_by_text("Only the integrator has a preview").first).to_be_visible()
+    margin = page.locator(".numbers span[data-name=gain-margin] b").first
     before = margin.inner_text()
     x, y = middle(gain)
     page.mouse.move(x, y)
@@ -165,4 +166,11 @@ def test_gain_of_the_integrator(page: Page) -> None:
     page.mouse.up()
     expect(page.get_by_role("button", name="Undo")).to_be_enabled()
     page.get_by_role("button", name="Undo").click()
+    expect(margin).to_have_text(before)
+    stood = gain.get_attribute("aria-valuenow")
+    gain.focus()
+    page.keyboard.press("Shift+ArrowLeft")
+    expect(margin).not_to_have_text(before)
+    assert float(gain.get_attribute("aria-valuenow") or "nan") < float(stood or "nan"), "to the left"
+    page.keyboard.press("Escape")
     expect(margin).to_have_text(before)

@@ -167,7 +167,7 @@ export function render({model, el}) {
       event.stopPropagation()
       take(handle, true)
       const step = {frequency: leap ? LEAP : NUDGE, strength: leap ? STRONGER ** 4 : STRONGER, damping: BROADER}[what]
-      move[what] *= step ** sign
+      move[what] *= step ** (sign * Math.sign(move[what]))  // to the right, also where numbers are below zero
       if (what === "frequency") move[what] = within(move[what])
       move.changed = true
       place()

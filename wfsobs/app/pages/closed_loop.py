@@ -58,6 +58,7 @@ class ClosedLoopPage(PageActions):
         self.whole, self.zoom = Trace("whole record"), Trace("zoomed")
         self.spectrum, self.response, self.nyquist = LoopSpectrum(), Response(), Nyquist()
         self.room = figure_with_caption("Rejection and noise transfer", self.response.figure)
+        self.stability = figure_with_caption("Loop gain L, unit circle", self.nyquist.figure)
         self.editor: GainEditor | None = None
         display.param.watch(self._edit, "editing")
         self._edit()
@@ -85,7 +86,7 @@ class ClosedLoopPage(PageActions):
             stylesheets=[GRID],
         )
         stability = pn.Column(
-            figure_with_caption("Loop gain L, unit circle", self.nyquist.figure),
+            self.stability,
             pn.Column(text(ABOUT), self.margins, **WIDE),
             **WIDE,
             stylesheets=[GRID],
@@ -104,8 +105,9 @@ class ClosedLoopPage(PageActions):
     def _edit(self, *_: object) -> None:
         """Make the handle when it is first wanted."""
         if self.display.editing and self.editor is None:
-            self.editor = GainEditor(self.response.figure, self.store, self.display, lambda: self.results)
-            self.room.append(self.editor.layer)
+            self.editor = GainEditor(self.response.figure, self.nyquist.figure, self.store, self.display, lambda: self.results)
+            for room, handle in zip((self.room, self.stability), self.editor.handles, strict=True):
+                room.append(handle.layer)
 
     def show(self, visible: bool) -> None:
         """Compute what has changed meanwhile, and go on while visible."""

@@ -158,8 +158,8 @@ class Nyquist(LoopLines):
         for name, source in self.sources.items():
             of = results.curves.get(name)
             L = of[display.column].loop_gain if of else np.empty(0, dtype=complex)
-            L = np.where(np.abs(L) < 20.0, L, np.nan)
-            source.data = {"x": np.real(L), "y": np.imag(L)}
+            x, y = plane(L)
+            source.data = {"x": x, "y": y}
             margins = results.result.design.laws[name][display.column].margins if name in results.result.design.laws else None
             if margins is None or not L.size:
                 continue
@@ -183,3 +183,9 @@ class Nyquist(LoopLines):
             "colour": [c for *_, c in shown],
             "marker": [m for _, m, _ in shown],
         }
+
+
+def plane(loop_gain: Complex) -> tuple[Array, Array]:
+    """Return the real and imaginary parts of a loop gain, without what is far outside of the figure."""
+    near = np.where(np.abs(loop_gain) < 20.0, loop_gain, np.nan)
+    return np.real(near), np.imag(near)
