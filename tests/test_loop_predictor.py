@@ -68,7 +68,7 @@ def test_without_one_it_learns_from_the_history_in_any_unit(record: wfsobs.Recor
 
 def _told(record: wfsobs.Record) -> LoopPredictor:
     predictor = LoopPredictor(2, HORIZON)
-    predictor._observer = design("kf-multi", wfsobs.PRESETS["paper"](), sampling=record.sampling)
+    predictor._put_in(design("kf-multi", wfsobs.PRESETS["paper"](), sampling=record.sampling))
     return predictor
 
 
@@ -95,7 +95,7 @@ def test_before_a_fit_the_last_measurement_is_the_prediction() -> None:
     ("options", "reason"),
     [
         ({"observer": "kf"}, "no such observer"),
-        ({"observer": "multirate-multi"}, "of one sensor"),
+        ({"observer": "multirate-multi"}, "takes a second sensor"),
         ({"observer": "gpr-online"}, "of turbulence and vibration"),
         ({"observer": "ridge"}, "without training data"),
         ({"modes": [0, 0]}, "different whole numbers from 0 to 1"),

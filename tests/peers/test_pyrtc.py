@@ -14,6 +14,7 @@ from pyrtc.component_loading import import_symbol_from_file
 import wfsobs
 from wfsobs.peers import pyrtc as peer
 from wfsobs.peers.predictor import LoopPredictor
+from wfsobs.scenario.configfile import save_scenario
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "pyrtc" / "loop.yaml"
 NOISE = 0.03
@@ -118,9 +119,95 @@ def test_its_loop_runs_the_predictor_of_the_example(streams: tuple[str, str], di
         signal.close()
 
 
-def test_a_mistake_in_the_configuration_is_told() -> None:
+@pytest.fixture
+def both_sensors(streams: tuple[str, str], tmp_path: Path) -> Iterator[tuple[dict, np.ndarray]]:
+    """Configuration of a loop with a second sensor of four slopes, and what its slopes are of the modes."""
+    to_slopes = np.random.default_rng(6).normal(size=(4, 2))
+    np.save(tmp_path / "ngs.npy", np.linalg.pinv(to_slopes))
+    save_scenario(wfsobs.PRESETS["paper"](), tmp_path / "found.toml")
+    name = f"ngs_{uuid4().hex[:8]}"
+    made = pyshmem.create(name, shape=(4,), dtype="float64")
+    ngs = {"stream": name, "matrix": str(tmp_path / "ngs.npy"), "ratio": 5, "wfc": streams[1]}
+    predictor = {"type": "wfsobs", "rate": 1000.0, "horizon": 2, "delay_frames": 2, "gain": 1.0, "fit_frames": 128}
+    yield predictor | {"prior": str(tmp_path / "found.toml"), "ngs": ngs}, to_slopes
+    made.close()
+    pyshmem.unlink(name)
+
+
+def two_sensor_loop(
+    streams: tuple[str, str], predictor: dict, to_slopes: np.ndarray | None, record: wfsobs.Record, late: int
+) -> np.ndarray:
+    """Run pyRTC's loop on the open-loop measurements of a record; return its commands, (n_steps, 2) [um]."""
+    conf = {"input_streams": {"signal": streams[0]}, "output_streams": {"wfc": streams[1]}, "functions": [], "gain": 0.3}
+    loop = peer.Loop(conf | {"predictor": predictor})
+    signal, applied, sent = pyshmem.open(streams[0]), np.zeros((record.n_steps + 2, 2)), []
+    ngs = None if to_slopes is None else pyshmem.open(predictor["ngs"]["stream"])
+    try:
+        loop.cm = np.eye(2, dtype=np.float32)
+        for t in range(record.n_steps):
+            if t == 200:
+                loop.fit_predictor()
+            k = t - late
+            if ngs is not None and to_slopes is not None and k > 0 and k % 5 == 0:
+                ngs.write(to_slopes @ (record.z_ngs[k] + applied[k - 4 : k + 1].mean(axis=0)))
+            signal.write((record.z[t] + applied[t]).astype(np.float32))
+            loop.predictive_integrator()
+            sent.append(np.array(loop.read_stream("wfc", block=False)).ravel())
+            applied[t + 2] = sent[-1]
+    finally:
+        loop.close()
+        signal.close()
+        if ngs is not None:
+            ngs.close()
+    return np.array(sent)
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_a_second_sensor_in_its_loop(streams: tuple[str, str], both_sensors: tuple[dict, np.ndarray], late: int) -> None:
+    """Its commands are those of our controller of both sensors by itself, and leave less than that of the LGS alone.
+
+    The slopes come before the signal of the frame that they belong to (0), or before the next one (1).
+    """
+    predictor, to_slopes = both_sensors
+    predictor["ngs"]["lag"] = late
+    record = wfsobs.simulate(wfsobs.PRESETS["paper"]().replace({"run.duration": 4.0}))
+    sent = two_sensor_loop(streams, predictor | {"observer": "lqg-multirate-multi"}, to_slopes, record, late)
+    scenario = wfsobs.PRESETS["paper"]()
+    alone, u = wfsobs.design("lqg-multirate-multi", scenario), np.zeros((record.n_steps + 2, 2))
+    for t in range(record.n_steps):
+        ngs = record.z_ngs[t] + u[t - 4 : t + 1].mean(axis=0) if t > 0 and t % 5 == 0 else None
+        u[t + 2] = alone.update(record.z[t] + u[t], ngs)
+    # single precision in its streams, and another start, forgotten as fast as the slow error of the LGS is known: 1 % after 2 s
+    rows = slice(2000, None)
+    is_there = np.arange(2000, record.n_steps) % 5 >= late
+    error = (sent - u[2:])[rows][is_there]
+    assert np.std(error) < 0.01 * np.std(u[2:][rows])
+
+    def rms(commands: np.ndarray) -> float:
+        assert record.turbulence is not None and record.vibration is not None
+        disturbance = (record.turbulence + record.vibration)[2:]  # a command meets the disturbance that z shows two frames later
+        return float(np.sqrt(np.mean((disturbance[rows][:-1] + commands[1:-2][rows][: len(disturbance) - 2001]) ** 2)))
+
+    lgs = {key: value for key, value in predictor.items() if key != "ngs"}
+    single = two_sensor_loop(streams, lgs | {"observer": "lqg-kf-multi"}, None, record, 0)
+    print({"lqg-kf-multi": 1e3 * rms(single), "lqg-multirate-multi": 1e3 * rms(sent)})
+    assert rms(sent) < 0.9 * rms(single)
+
+
+def test_a_mistake_in_the_configuration_is_told(both_sensors: tuple[dict, np.ndarray]) -> None:
+    predictor, _ = both_sensors
+    for change, reason in (
+        ({"ngs": predictor["ngs"] | {"stream": "none"}}, "none: no stream"),
+        ({"ngs": predictor["ngs"] | {"matrix": "none.npy"}}, "none.npy: no matrix"),
+        ({"ngs": predictor["ngs"] | {"lag": 5}}, "ratio = 5, lag = 5"),
+        ({"ngs": predictor["ngs"] | {"rate": 5}}, "ngs: .*rate"),
+        ({"prior": None}, "takes a prior"),
+        ({"observer": "kf-multi"}, "takes no second sensor"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            predictive.make_predictor(predictor | {"observer": "lqg-multirate-multi"} | change, 2)
     peer.register_predictor()
     with pytest.raises(ValueError, match="no such observer"):
         predictive.make_predictor({"type": "wfsobs", "observer": "kf"}, 2)
-    with pytest.raises(ValueError, match="or a controller"):
+    with pytest.raises(ValueError, match="takes a second sensor"):
         predictive.make_predictor({"type": "wfsobs", "observer": "multirate-multi"}, 2)

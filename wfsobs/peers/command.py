@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from wfsobs.control.step import StepController
+from wfsobs.record import Sampling
 from wfsobs.typing import Array
 
 
@@ -25,15 +28,24 @@ class CommandAhead:
 
     def __init__(self, controller: StepController, n_modes: int, delay: int):
         self._controller, self._commands = controller, np.zeros((delay, n_modes))
+        self._mirror = np.zeros((controller.sampling.ratio or 1, n_modes))
 
     @property
     def frame(self) -> int:
         """Frames that it has taken."""
         return self._controller.frame
 
-    def update(self, z: Array) -> None:
-        """Take a pseudo-open-loop measurement, (n_modes,) [um]: of its own loop it would be the residual. Raises StepError."""
-        u = self._controller.update(z + self._commands[-1])
+    @property
+    def sampling(self) -> Sampling:
+        """That of the controller."""
+        return self._controller.sampling
+
+    def update(self, z: Array, ngs: Array | None = None) -> None:
+        """Take pseudo-open-loop measurements, (n_modes,) [um]: of its own loop they would be residuals. Raises StepError."""
+        seen = self._commands[-1].copy()
+        self._mirror[1:] = self._mirror[:-1].copy()
+        self._mirror[0] = seen
+        u = self._controller.update(z + seen, None if ngs is None else ngs + self._mirror.mean(axis=0))
         self._commands[1:] = self._commands[:-1].copy()
         self._commands[0] = u
 
@@ -44,4 +56,15 @@ class CommandAhead:
     def reset(self) -> None:
         """Go back to before the first frame."""
         self._controller.reset()
-        self._commands[:] = 0.0
+        self._commands[:] = self._mirror[:] = 0.0
+
+    def state_dict(self) -> dict[str, Array]:
+        """Return a copy of the state."""
+        own = {"ahead.commands": self._commands.copy(), "ahead.mirror": self._mirror.copy()}
+        return own | self._controller.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Array]) -> None:
+        """Go on from a state of `state_dict`. Raises StepError where it is that of another design."""
+        rest = dict(state)
+        self._commands[:], self._mirror[:] = rest.pop("ahead.commands"), rest.pop("ahead.mirror")
+        self._controller.load_state_dict(rest)

@@ -147,7 +147,7 @@ class Attachment:
         count, values = found
         lost = count - self._count - 1
         if lost < 0 or lost > LONGEST_GAP:
-            self._begin_at(count, f"the counter went from {self._count} to {count}")
+            self._start_anew(count, f"the counter went from {self._count} to {count}")
             lost = 0
         self._count = count
         for _ in range(lost):
@@ -170,12 +170,10 @@ class Attachment:
         if self._ngs is None:
             return None, 0
         found = self._ngs.look(self._count)
-        if (phase := self._ngs.phase) is not None:
-            age = (self._count - phase) % self._ngs.ratio
-            if self._observer.frame % self._ngs.ratio != age:
-                self._start_anew(self._count, "the NGS frames have found their place")
-                for _ in range(age):
-                    self._frames.update(self._missing)
+        phase = self._ngs.phase
+        if phase is not None and self._frames.align((self._count - phase) % self._ngs.ratio):
+            self._expectation = np.full_like(self._expectation, np.nan)
+            self._watchdog.fall_back("the NGS frames have found their place")
         return (None, 0) if found is None else (found[1], found[0])
 
     def _step(self, z: Array, ngs: Array | None, late: int) -> Array:
@@ -209,7 +207,7 @@ class Attachment:
 
     def _follow_new_file(self) -> None:
         try:
-            new = SharedImage(self._source.path)
+            new = self._source.reopen()
         except StreamError:
             return
         if new.n != self._source.n:
@@ -217,20 +215,17 @@ class Attachment:
         self._release()
         self._source = new
         self._claim()
-        self._begin_at(new.count, "the stream was made anew")
-
-    def _begin_at(self, count: int, reason: str) -> None:
-        """Start anew with a counter that has nothing to do with the one before."""
-        if self._ngs is not None:
-            self._ngs.restart()
-        self._say(reason)
-        self._start_anew(count, reason)
+        self._start_anew(new.count, "the stream was made anew")
 
     def _start_anew(self, count: int, reason: str) -> None:
+        """Begin at a counter that has nothing to do with the one before."""
+        if self._ngs is not None:
+            self._ngs.restart()
         self._observer.reset()
         self._frames.forget()
         self._expectation = np.full_like(self._expectation, np.nan)
         self._count = count
+        self._say(reason)
         self._watchdog.fall_back(reason)
 
     def _send(self, estimate: Array) -> None:

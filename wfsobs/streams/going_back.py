@@ -2,8 +2,31 @@
 
 from __future__ import annotations
 
-from wfsobs.observers.step import StepObserver
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+
+from wfsobs.record import Sampling
 from wfsobs.typing import Array
+
+
+class StateObserver(Protocol):
+    """What it takes of a `StepObserver`."""
+
+    @property
+    def frame(self) -> int: ...  # noqa: D102
+
+    @property
+    def sampling(self) -> Sampling: ...  # noqa: D102
+
+    def update(self, z: Array, ngs: Array | None = None, /) -> None: ...  # noqa: D102
+
+    def reset(self) -> None: ...  # noqa: D102
+
+    def state_dict(self) -> dict[str, Array]: ...  # noqa: D102
+
+    def load_state_dict(self, state: Mapping[str, Array], /) -> None: ...  # noqa: D102
 
 
 class GoingBack:
@@ -14,11 +37,11 @@ class GoingBack:
 
     Parameters
     ----------
-    observer : StepObserver
+    observer : StateObserver
         Of a sampling with a ratio; without one there is nothing to go back for.
     """
 
-    def __init__(self, observer: StepObserver):
+    def __init__(self, observer: StateObserver):
         self._observer, self._ratio = observer, observer.sampling.ratio
         self._state: dict[str, Array] | None = None
         self._since: list[Array] = []
@@ -48,6 +71,20 @@ class GoingBack:
         """Keep the state where the next frame is one with an NGS measurement; `update` does it otherwise."""
         if self._ratio is not None and self._observer.frame % self._ratio == 0 and (self._since or self._state is None):
             self._state, self._since = self._observer.state_dict(), []
+
+    def align(self, age: int) -> bool:
+        """Start the observer anew unless its last frame with an NGS measurement was so many frames before the next one.
+
+        age : 0 to ratio - 1, 0 where the next one has an NGS measurement
+        """
+        observer = self._observer
+        if self._ratio is None or observer.frame % self._ratio == age:
+            return False
+        observer.reset()
+        self.forget()
+        for _ in range(age):
+            self.update(np.full(observer.sampling.n_modes, np.nan))
+        return True
 
     def forget(self) -> None:
         """Start anew with an observer that does."""

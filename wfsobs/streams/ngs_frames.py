@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs.streams.layout import StreamError
-from wfsobs.streams.shared_image import SharedImage
-from wfsobs.streams.wiring import NgsWiring, check_elements
+from wfsobs.streams.wiring import FrameStream, NgsWiring, check_elements
 from wfsobs.typing import Array
 
 SEARCH = 20
@@ -32,7 +31,7 @@ class NgsStream:
 
     Parameters
     ----------
-    stream : SharedImage
+    stream : FrameStream
         Pseudo-open-loop modes of the NGS.
     wiring : NgsWiring
         Modes, unit, ratio and lag.
@@ -52,7 +51,7 @@ class NgsStream:
         Counter of an LGS frame to which an NGS frame belongs; the others are multiples of the ratio away. None unless found.
     """
 
-    def __init__(self, stream: SharedImage, wiring: NgsWiring, say: Callable[[str], None]):
+    def __init__(self, stream: FrameStream, wiring: NgsWiring, say: Callable[[str], None]):
         check_elements(stream, wiring.elements)
         self._stream, self._wiring, self._say = stream, wiring, say
         self._elements, self._count, self._alive = np.array(wiring.elements), stream.first, monotonic()
@@ -80,7 +79,7 @@ class NgsStream:
         if self._stream.count == self._count:
             self._check_alive()
             return None
-        if (frame := self._stream.read(patience=0.0)) is None:  # it is being written: the next LGS frame finds it
+        if (frame := self._stream.read(0.0)) is None:  # it is being written: the next LGS frame finds it
             self._check_alive()
             return None
         number, values = frame
@@ -169,7 +168,7 @@ class NgsStream:
         if self._stream.is_current:
             return
         try:
-            new = SharedImage(self._stream.path)
+            new = self._stream.reopen()
             check_elements(new, self._wiring.elements)
         except StreamError:  # not yet, or not what it was: the LGS go on
             return

@@ -120,6 +120,10 @@ class SharedImage:
         except OSError:
             return False
 
+    def reopen(self) -> SharedImage:
+        """Return the stream of the file that is at the path now. Raises StreamError."""
+        return SharedImage(self.path)
+
     def read(self, patience: float = WRITING) -> tuple[int, Array] | None:
         """Return the counter and the numbers of the last frame, (n,); None where a writer does not end its frame in so long [s].
 
