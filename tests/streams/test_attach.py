@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from subprocess import Popen
 from threading import Thread
 
 import numpy as np
@@ -67,6 +68,96 @@ def test_a_modal_filter_in_c_gets_the_numbers_of_the_run_over_the_record(tmp_pat
     assert summary["frames"] == n and summary["missing"] == summary["torn"] == summary["fallbacks"] == 0
     last = SharedImage(taken).read()
     assert last is not None and last[0] == n + 1 and not last[1].any(), "the last thing sent is safe"
+
+
+@contextmanager
+def attached(given: Path, taken: Path) -> Iterator[Popen[str]]:
+    options = ["--preset", "paper", "--set", "run.warm_up=0.5", "--observer", "kf-lgs", "--modes", "3,1", "--json"]
+    streams = ["--in", str(given), "--out", str(taken), "--stuck", str(ENOUGH), "--semaphore", "9"]
+    with started(sys.executable, "-m", "wfsobs", "attach", *streams, *options) as ours:
+        yield ours
+
+
+def frames_of(z: np.ndarray, folder: Path) -> np.ndarray:
+    """Write frames of five numbers for the peer, modes 3 and 1 the measurements; return them."""
+    frames = np.zeros((len(z), 5), "<f4")
+    frames[:, [3, 1]] = z
+    frames.tofile(folder / "values")
+    return frames
+
+
+def test_a_modal_filter_that_waits_for_two_blocks_gets_both(tmp_path: Path, peer: Path) -> None:
+    """Ours are modes 3 and 1; another program writes 0 and 4 after us. Neither touches what the other has written."""
+    n = 700
+    frames = frames_of(measurements(n), tmp_path)
+    given, taken = tmp_path / "aol1_modevalOL.im.shm", tmp_path / "aol1_modevalPF.im.shm"
+    command = [peer, "loop", given, taken, n, 5, tmp_path / "values", tmp_path / "result", int(ENOUGH * 1e6), 2]
+    with started(*command) as loop:
+        wait_until(given.exists)
+        with attached(given, taken) as ours:
+            wait_until(taken.exists)
+            other = SharedImage(taken)
+            for k in range(n):
+                assert other.wait(2 * k, ENOUGH), "ours first, so that the two do not raise the counter at once"
+                other.write(np.array([k + 1.0, -k - 1.0]), np.array([0, 4]))
+            told, _ = loop.communicate(timeout=2 * ENOUGH)
+            ours.send_signal(signal.SIGTERM)
+            _, err = ours.communicate(timeout=ENOUGH)
+    assert ours.returncode == 0, err
+    assert loop.returncode == 0 and int(told) == 0, "frames that were not answered by both"
+    result = np.fromfile(tmp_path / "result", "<f4").reshape(n, 5)
+    expected = stepped(frames[:, [3, 1]].astype(float), "kf-lgs", 1)
+    np.testing.assert_allclose(result[500:, [3, 1]], expected[500:], rtol=0, atol=SINGLE * np.abs(expected).max())
+    np.testing.assert_array_equal(result[:, 0], np.arange(1, n + 1))
+    np.testing.assert_array_equal(result[:, 4], -np.arange(1, n + 1))
+
+
+def test_a_modal_filter_goes_on_without_a_block_that_does_not_come(tmp_path: Path, peer: Path) -> None:
+    """It waits for two, 2 ms at most, and there is ours alone: it ends; few frames count (two late answers at once), or none."""
+    n = 200
+    frames_of(measurements(n), tmp_path)
+    given, taken = tmp_path / "aol1_modevalOL.im.shm", tmp_path / "aol1_modevalPF.im.shm"
+    with started(peer, "loop", given, taken, n, 5, tmp_path / "values", tmp_path / "result", 2000, 2) as loop:
+        wait_until(given.exists)
+        with attached(given, taken) as ours:
+            told, _ = loop.communicate(timeout=ENOUGH)
+            ours.send_signal(signal.SIGTERM)
+            out, err = ours.communicate(timeout=ENOUGH)
+    assert ours.returncode == 0, err
+    assert loop.returncode == 0 and n // 2 < int(told) <= n
+    summary = json.loads(out)
+    assert 0 < summary["frames"] + summary["missing"] <= n and summary["torn"] == 0
+
+
+def test_an_answer_that_a_newer_frame_has_overtaken_is_not_sent(tmp_path: Path) -> None:
+    """Who waits for that of the newer frame gets it; but of two in a row one is sent, so that a slow observer is heard at all."""
+    z = measurements(10)
+    said: list[str] = []
+    streams = Streams(tmp_path, said)
+    expected = stepped(z, "kf-lgs", 1)
+    one, sink = streams.attachment, streams.sink
+    read = one._source.read
+    more = {3, 7, 8}  # the next frame comes while this one is being answered
+
+    def overtaken() -> tuple[int, np.ndarray] | None:
+        found = read()
+        if found is not None and found[0] - 1 in more:
+            streams.source.write(z[found[0]])
+        return found
+
+    one._source.read = overtaken  # pyright: ignore[reportAttributeAccessIssue]
+    counts, values = [], []
+    for k in range(10):
+        if k - 1 not in more:
+            streams.source.write(z[k])
+        one._take(0.0)
+        found = sink.read()
+        assert found is not None
+        counts.append(found[0])
+        values.append(found[1])
+    assert np.diff([0, *counts]).tolist() == [1, 1, 1, 0, 1, 1, 1, 0, 1, 1]
+    is_sent = np.diff([0, *counts]) == 1
+    np.testing.assert_allclose(np.array(values)[is_sent], expected[is_sent], rtol=0, atol=1e-12)
 
 
 class Streams:

@@ -5,6 +5,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -189,6 +190,9 @@ def test_a_stream_that_stops_and_is_made_anew(tmp_path: Path, record: wfsobs.Rec
     got = []
     loop.send(record.z[again])
     assert loop.said[1:] == ["made anew: on with the LGS alone until their place is found"]
+    ngs = loop.attachment._ngs
+    assert ngs is not None
+    ngs._wiring = replace(ngs._wiring, stuck=ENOUGH)
     for row in moved:
         if row % RATIO == 0:
             loop.send_ngs(record.z_ngs[row])

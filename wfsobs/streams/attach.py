@@ -71,9 +71,8 @@ class Attachment:
         self._semaphore_number: int | None = None
         self._expectation, self._band = np.full(n, np.nan), np.full(n, np.nan)
         self._missing = np.full(n, np.nan)
-        self._out = np.zeros(sink.n if sink is not None else 0)
         self._count, self._alive = source.first, 0.0
-        self._is_stuck = self._is_off_rate = False
+        self._is_stuck = self._is_off_rate = self._is_overtaken = False
         self._ngs, self._frames = ngs, GoingBack(observer)
         self.tally = Tally(observer.sampling.dt)
 
@@ -156,7 +155,10 @@ class Attachment:
         found_ngs = self._look_for_ngs()
         error = z - self._expectation if not lost else self._missing
         estimate = self._step(np.where(np.isfinite(z), z, np.nan), *found_ngs)
-        self._send(self._watchdog.output(estimate, error, self._band, lost))
+        output = self._watchdog.output(estimate, error, self._band, lost)
+        self._is_overtaken = self._source.count != count and not self._is_overtaken
+        if not self._is_overtaken:  # else the next answer follows at once, and who waits for it must not get this one
+            self._send(output)
         self.tally.add(arrival, monotonic(), lost, z, error)
         self._observer.settle()
         self._frames.keep()
@@ -230,8 +232,7 @@ class Attachment:
 
     def _send(self, estimate: Array) -> None:
         if self._sink is not None:
-            self._out[self._elements] = estimate / self._wiring.unit
-            self._sink.write(self._out)
+            self._sink.write(estimate / self._wiring.unit, self._elements)
 
     def _line(self) -> str:
         line = self.tally.line(self._watchdog.reason)

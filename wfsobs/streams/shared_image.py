@@ -20,6 +20,8 @@ SUFFIX = ".im.shm"
 FOLDERS = ("/milk/shm", "/dev/shm", "/tmp")
 """Where streams are, the first that exists, unless the environment variable MILK_SHM_DIR says another folder."""
 
+ALL = slice(None)
+"""Every number of a frame."""
 WRITING = 2e-3
 """Time after which a frame that is still being written is given up [s]."""
 POLL = 5e-5
@@ -141,10 +143,10 @@ class SharedImage:
                 return None
             time.sleep(0)
 
-    def write(self, values: Array) -> None:
-        """Write a frame, (n,), raise the counter and wake who waits."""
+    def write(self, values: Array, elements: Array | slice = ALL) -> None:
+        """Write a frame, (n,), or these elements of it, raise the counter and wake who waits."""
         self._writing[0] = 1
-        self._values[:] = values
+        self._values[elements] = values
         struct.pack_into("<qq", self._map, TIMES + 48, *divmod(time.time_ns(), 10**9))
         self._count[0] += np.uint64(1)
         self._writing[0] = 0
