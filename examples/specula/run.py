@@ -1,9 +1,10 @@
 """Controllers of wfsobs in SPECULA beside its integrator and its AVC, and beside what theory says. See docs/specula.md.
 
-    python run.py [SEEDS] [SECONDS]
+    python run.py [SEEDS] [SECONDS] [CONTROLLER ...]
 
-Calibrates the sensor, learns from a loop with the integrator, runs every controller on the same seeds, and prints residuals of
-tip and tilt. Everything is written to ./calibration and ./out. Takes SPECULA's time: about 3 ms of CPU a frame.
+Calibrates the sensor, learns from a loop with the integrator, runs every controller (or those named) on the same seeds, and
+prints residuals of tip and tilt. Everything is written to ./calibration and ./out; ./series.npz has the residuals, and the
+spectra that theory says of them. Takes SPECULA's time: about 3 ms of CPU a frame.
 """
 
 import sys
@@ -21,7 +22,7 @@ from specula.simul import Simul  # noqa: E402
 
 import wfsobs  # noqa: E402
 from wfsobs.control.controllers import CONTROLLERS  # noqa: E402
-from wfsobs.control.residual import residual_variance  # noqa: E402
+from wfsobs.control.residual import residual_density, residual_variance  # noqa: E402
 from wfsobs.prior import Spectra  # noqa: E402
 from wfsobs.priors_from.controllers import own_settings, plant_of, prior_for  # noqa: E402
 from wfsobs.scenario.configfile import load_scenario, save_scenario  # noqa: E402
@@ -127,7 +128,10 @@ def learn(seconds):
 
 
 def theory(name, gain, noise):
-    """Return the rms of the residual of a controller [nm] by the spectra of the atmosphere, the vibrations and the noise."""
+    """Return what the spectra of atmosphere, vibrations and noise say of a controller's residual, tip and tilt together.
+
+    Frequencies [Hz], one-sided spectrum [nm^2/Hz] and rms [nm].
+    """
     layer = [{"height": 0.0, "fraction": 1.0, "wind_factor": 1.0, "wind_direction": 0.0}]
     r0 = 0.9759 * 500e-9 / np.deg2rad(0.65 / 3600.0)
     air = {"source": "frozen-flow", "r0": r0, "outer_scale": 25.0, "wind_speed": 10.0, "layers": layer}
@@ -136,7 +140,7 @@ def theory(name, gain, noise):
     told = load_scenario("found.toml").replace({"control.delay": 2.0})
     told = told.replace({"control.integrator": "manual", "control.gain": GAIN * gain, "control.leak": 1.0})
     controller, plant = CONTROLLERS[name], plant_of(told)
-    total = 0.0
+    total, density = 0.0, np.zeros_like(frequency)
     for mode in range(2):
         turbulence = flow_spectra(scenario, mode, np.maximum(frequency, frequency[1])).own
         disturbance = turbulence + 1e-6 * vibration_spectrum(frequency)
@@ -144,12 +148,15 @@ def theory(name, gain, noise):
         per_sample = [0.5 / DT * one for one in (disturbance, measured, disturbance)]
         law = controller.law(prior_for(controller, told), mode, plant, own_settings(controller, told))
         total += residual_variance(law, Spectra(*per_sample), plant.mirror)
-    return 1e3 * np.sqrt(total)
+        omega = 2.0 * np.pi * DT * frequency
+        through = plant.mirror.response(omega) * law.response(omega)
+        density += residual_density(through, disturbance, disturbance, measured)
+    return frequency, 1e6 * density, 1e3 * np.sqrt(total)
 
 
 def main():
     """Calibrate, learn, run and compare."""
-    seeds, seconds = (int(x) for x in (*sys.argv[1:], "4", "4")[:2])
+    seeds, seconds = (int(x) for x in (*sys.argv[1:3], *("4", "4")[len(sys.argv[1:3]) :]))
     calibrate()
     gain, delay, noise = learn(max(seconds, 8))
     level = 1e3 * np.sqrt(noise[1].mean() * 0.5 / DT)
@@ -178,13 +185,17 @@ def main():
     }
     runs["lqg-kf-multi"]["dm_override"] = {"inputs": {"in_command": "control_new.out_comm"}}
     series = {}
-    for name, changes in runs.items():
+    wanted = sys.argv[3:] or runs
+    for name in wanted:
+        changes = runs[name]
         series[name] = [simulate("run", changes, seconds, seed)["truth"][START:] for seed in range(1, seeds + 1)]
         rms = np.sqrt([np.mean(np.sum(one**2, axis=1)) for one in series[name]])
         print(f"{name}: {rms.mean():.1f} +- {rms.std(ddof=1) / np.sqrt(seeds):.1f} nm", flush=True)
+    for name in set(wanted) & {"integrator", "lqg-kf-multi"}:
+        frequency, density, rms = theory(name, gain, noise)
+        series |= {"theory frequency": frequency, f"theory {name}": density, f"theory rms {name}": rms}
+        print(f"theory, {name}: {rms:.1f} nm", flush=True)
     np.savez("series.npz", gain=gain, frequency=noise[0], noise=noise[1], **series)
-    for name in ("integrator", "lqg-kf-multi"):
-        print(f"theory, {name}: {theory(name, gain, noise):.1f} nm", flush=True)
 
 
 if __name__ == "__main__":
