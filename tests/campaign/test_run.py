@@ -12,7 +12,7 @@ import pytest
 
 import wfsobs
 from wfsobs.campaign.keys import row_key, scenario_digest
-from wfsobs.campaign.store import read_results
+from wfsobs.campaign.store import ROWS, batch_files, read_results, write_batch
 
 TINY = """
 name = "Tiny"
@@ -177,6 +177,23 @@ def test_the_file_for_data_frames_has_the_settings(undisturbed, tmp_path):
     table = pq.read_table(tmp_path / "all.parquet")
     wind = dict(zip(table["cell"].to_pylist(), table["turbulence.wind_speed"].to_pylist(), strict=True))
     assert wind == {0: 5, 1: 10} and table.num_rows == len(read_results(undisturbed))
+
+
+@pytest.mark.parametrize("size", [20, 80])
+def test_the_bytes_of_a_plan_are_those_that_are_written(plan, undisturbed, tmp_path, size):
+    """The same rows as undisturbed, in files of `size` runs: what a key and a row take scatters with their digits."""
+    from wfsobs.campaign.plan import load_plan
+    from wfsobs.cli.campaign import stored_bytes
+
+    rows = read_results(undisturbed, provenance=True).sort_by([("cell", "ascending"), ("seed", "ascending")]).to_pylist()
+    (tmp_path / ROWS).mkdir()
+    of_run = len(rows) // 80
+    for start in range(0, 80, size):
+        write_batch(tmp_path, rows[start * of_run : (start + size) * of_run], {})
+    files = batch_files(tmp_path)
+    assert len(files) == 80 // size
+    written = sum(path.stat().st_size for path in files)
+    assert 0.7 < stored_bytes(load_plan(plan), len(files)) / written < 1.4
 
 
 def test_the_plan_says_how_much_it_is(plan):

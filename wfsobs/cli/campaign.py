@@ -26,8 +26,8 @@ from wfsobs.cli.show import show_table
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.settings.errors import SettingError
 
-ROW_BYTES, FILE_BYTES = 60, 12_000
-"""Measured size of a row in a file, and of a file without rows."""
+KEY_BYTES, ROW_BYTES, FILE_BYTES = 34, 12, 6_000
+"""Measured size of a key, which all rows of an observer on a record share, of the rest of a row, and of a file without rows."""
 
 LONG = 60.0
 """Expected time of a run that is not tried for a plan [s]."""
@@ -64,7 +64,13 @@ def print_plan(plan_file: str, workers: int | None) -> None:
         click.echo(f"  {path}: {', '.join(values[:6])}{f' ... ({len(values)} values)' if len(values) > 6 else ''}")
     click.echo(f"{_span(hours)} of one processor{measured}")
     click.echo(f"{_span(hours / side_by_side)} on {side_by_side} workers, in about {batches:.0f} batches")
-    click.echo(f"{rows} rows, about {(rows * ROW_BYTES + batches * FILE_BYTES) / 1e6:.3g} MB")
+    click.echo(f"{rows} rows, about {stored_bytes(plan, batches) / 1e6:.3g} MB")
+
+
+def stored_bytes(plan: Campaign, batches: float) -> float:
+    """Return about how many bytes the rows of a plan take in so many files."""
+    keys = len(plan.observers) + len(plan.controllers) + len(BOUNDS)
+    return plan.n_runs * (keys * KEY_BYTES + _rows_of_a_run(plan) * ROW_BYTES) + batches * FILE_BYTES
 
 
 def _span(hours: float) -> str:
