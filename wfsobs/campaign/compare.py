@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 LEVEL = 0.95
 """Level of intervals."""
+QUANTILES = (0.05, 0.5, 0.95)
+"""Shares of the seeds of which the rms is stated."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ class Comparison:
         Of the interval of the difference at the level [nm]; None with fewer than two records.
     is_best : bool
         Whether it has the smallest error of those that can be the best and did not fail more often than others.
+    quantiles : tuple of float
+        Of the rms of single records [nm], of QUANTILES; empty without a result.
     """
 
     cell: int
@@ -57,6 +61,7 @@ class Comparison:
     difference: float | None = None
     half_width: float | None = None
     is_best: bool = False
+    quantiles: tuple[float, ...] = ()
 
     @property
     def is_tie(self) -> bool:
@@ -196,5 +201,6 @@ def _compare_one(group: Samples, level: float) -> list[Comparison]:
             difference, half = paired_difference(values[:, i], values[:, ranked[0]], level)
         failures, is_best = len(values) - int(count[i]), bool(ranked) and bool(i == ranked[0])
         where = group.cell, group.scenario, group.target, group.mode
-        out.append(Comparison(*where, names[i], int(count[i]), failures, float(rms[i]), difference, half, is_best))
+        spread = tuple(np.quantile(values[known[:, i], i], QUANTILES).tolist()) if count[i] else ()
+        out.append(Comparison(*where, names[i], int(count[i]), failures, float(rms[i]), difference, half, is_best, spread))
     return out

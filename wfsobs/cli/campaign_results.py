@@ -8,13 +8,16 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from wfsobs.campaign.compare import compare
+from wfsobs.campaign.compare import QUANTILES, compare
 from wfsobs.campaign.plan import Campaign
 from wfsobs.campaign.store import RESULTS
 from wfsobs.evaluation.rows import NOT_OBSERVERS
 
 if TYPE_CHECKING:
     import pyarrow
+
+SPREAD = f"{', '.join(f'{q * 100:g}' for q in QUANTILES)} % of seeds"
+"""Heading of the quantiles."""
 
 CHUNK = 10_000
 """Rows that are Python objects at a time: these take far more memory than a table."""
@@ -38,8 +41,9 @@ def _text(value: object) -> object:
 def summary_table(plan: Campaign, rows: object, title: str) -> Table:
     """Return a table with one row per scenario, target, mode and observer."""
     out = Table(title=title, caption="+-: interval of 95 % of the paired difference from the best; ~: not significant")
-    for name in ("Scenario", "Settings", "Target", "Mode", "Name", "rms, nm", "above the best, nm", "seeds"):
-        out.add_column(name, justify="right" if name in ("rms, nm", "above the best, nm", "seeds") else "left")
+    texts, numbers = ("Scenario", "Settings", "Target", "Mode", "Name"), ("rms, nm", SPREAD, "above the best, nm", "seeds")
+    for name in (*texts, *numbers):
+        out.add_column(name, justify="right" if name in numbers else "left")
     before = None
     for one in compare(rows):
         key = (one.cell, one.target, one.mode)
@@ -57,6 +61,7 @@ def summary_table(plan: Campaign, rows: object, title: str) -> Table:
             *((one.scenario, settings, one.target, one.mode) if new else ("",) * 4),
             label,
             f"{one.rms:.2f}",
+            " ".join(f"{q:.2f}" for q in one.quantiles),
             above,
             f"{one.seeds}{failed}",
         )
