@@ -119,7 +119,8 @@ def observers_reached(before: Scenario, now: Scenario) -> set[str] | None:
     """
     if record_settings(before) != record_settings(now):
         return None
-    changed = {name for name, used in now.effective_values().items() if used != before.effective_values()[name]}
+    values = before.effective_values()
+    changed = {name for name, used in now.effective_values().items() if used != values[name]}
     parts: set[Part] = {Lines} if LINES in changed else set()
     if training_settings(before) != training_settings(now):
         parts.add(Training)

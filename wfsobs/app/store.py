@@ -50,11 +50,11 @@ class Store(param.Parameterized):
         self.run = BackgroundTask(session)
         self.run.param.watch(self._compare, "result")
 
-    def start(self) -> None:
-        """Run the settings as they stand."""
+    def start(self, seconds: float | None = None) -> None:
+        """Run the settings as they stand. seconds : about how long that takes, where it is known."""
         self.waiting = 0.0
         try:
-            self.run.start(self.session.service.run(self.scenario, self.source, self.seconds))
+            self.run.start(self.session.service.run(self.scenario, self.source, self.seconds if seconds is None else seconds))
         except SettingError as error:
             self.run.refuse(str(error))
 
@@ -62,7 +62,7 @@ class Store(param.Parameterized):
         """Run the settings as they stand, unless that takes long: then stop, and wait to be asked."""
         seconds = self.seconds
         if seconds <= AT_ONCE or self.session.service.is_cached(self.scenario, self.source):
-            self.start()
+            self.start(seconds)
         else:
             self.run.cancel()
             self.waiting = seconds

@@ -39,8 +39,8 @@ DRAWING = 0.15
 """What the page takes to draw a delivery [s]."""
 
 
-WEIGHTS = (10.0, SLOW)
-"""As soon as no observer is at work that is lighter than one of these, what is there is delivered."""
+WEIGHTS = (2.0, SLOW)
+"""As soon as no observer is at work that is lighter than one of these, what is there is delivered: first filters of a few ms."""
 
 
 def one_blas_thread() -> None:

@@ -146,7 +146,8 @@ export function render({model, view, el}) {
   const fade = () => {
     const results = el.getRootNode().host?.previousElementSibling
     if (results) {
-      results.style.transition = model.stale ? "opacity 0.2s 0.3s" : "opacity 0.1s"
+      // Results that come within a second are not faded before: without a graphics card each frame of that draws all of them.
+      results.style.transition = model.stale ? "opacity 0.2s 1s" : "none"
       results.style.opacity = model.stale ? "0.45" : "1"
     }
   }

@@ -144,6 +144,7 @@ RIDGE = Observer(
     settings=OFFLINE,
     needs=("training",),
     linear=True,
+    weight=10.0,
     # The penalty (sigma_n l / sigma_SE)^2 is one number.
     tunable=Tunable(
         ("gpr_offline.noise_std", "gpr_offline.depth"),

@@ -61,11 +61,17 @@ class Strip:
         self.cards = Cards(
             items=self.items(), main=MAIN, terms={RELATIVE: TERMS[RELATIVE]}, sizing_mode="stretch_width", margin=0
         )
-        run.param.watch(self._refresh, ["result", "state"])
+        run.param.watch(self._refresh, "result")
+        run.param.watch(self._say_state, "state")
         if seeds is not None:
             seeds.param.watch(self._refresh, "evidence")
         display.param.watch(self._refresh, ["mode", "unit", "dark", "compared_runs"])
         display.param.watch(self._hide, "hidden_lines")
+
+    def _say_state(self, *_: object) -> None:
+        """Whether a run goes on is said on cards without a number alone."""
+        if any(card["value"] == NOTHING for card in self.cards.items):
+            self._refresh()
 
     def _refresh(self, *_: object) -> None:
         self.cards.items = self.items()

@@ -33,6 +33,7 @@ GP_BOTH = Observer(
     settings=GP,
     needs=NGS,
     linear=True,
+    weight=2.0,
     takes_missing=True,
     sensors=("lgs", "ngs"),
     tunable=Tunable(("gp.background_rms", "gp.background_scale"), ("kalman.lgs_noise", "kalman.ngs_noise")),
