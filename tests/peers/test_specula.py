@@ -1,10 +1,15 @@
 """A controller in SPECULA: its filter class as a YAML file asks for it, and its FITS file in SPECULA's own filter."""
 
+import os
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import specula
+from scipy.signal import welch
 
 specula.init(-1, precision=0)
 from specula.base_value import BaseValue  # noqa: E402
@@ -19,6 +24,7 @@ from wfsobs.peers.controller import ControllerError  # noqa: E402
 from wfsobs.scenario.configfile import save_scenario  # noqa: E402
 
 FRAMES = 400
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -78,3 +84,32 @@ def test_a_mistake_in_the_file_is_told(tmp_path: Path) -> None:
     simul = SimulParams(pixel_pupil=8, pixel_pitch=1.0, time_step=1e-3)
     with pytest.raises(ControllerError, match="takes one of none"):
         filter_class(simul, controller="kf-multi", prior=str(tmp_path / "found.toml"))
+
+
+@pytest.mark.timeout(3600)
+def test_theory_says_what_the_loop_of_the_example_leaves(tmp_path: Path) -> None:
+    """4 seeds of 3 s: within 3 standard errors and 3 % of theory. Its spectrum above 60 Hz within 20 %.
+
+    A band has 16 s of each of two modes, 960 independent numbers or more, and the noise that theory is told is of 8 s: 4 %
+    together. Below, the windows of that noise are too short, and a damped line has some twenty independent amplitudes.
+    """
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    script = ROOT / "examples" / "specula" / "run.py"
+    loops = ("integrator", "lqg-kf-multi")
+    done = subprocess.run(
+        [sys.executable, str(script), "4", "3", *loops], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = np.load(tmp_path / "series.npz")
+    for name in loops:
+        rms = np.sqrt([np.mean(np.sum(one**2, axis=1)) for one in found[name]])
+        told = float(found[f"theory rms {name}"])
+        standard_error = rms.std(ddof=1) / np.sqrt(len(rms))
+        print(f"{name}: {np.round(rms, 1)} nm, {rms.mean():.1f} +- {standard_error:.1f} nm; theory {told:.1f} nm")
+        assert abs(rms.mean() - told) < 3 * standard_error + 0.03 * told
+        f, spectra = welch(found[name], 1e3, nperseg=1024, axis=1, detrend=False)
+        fine, density = found["theory frequency"], found[f"theory {name}"]
+        for low, high in ((60, 120), (120, 250), (250, 500)):
+            seen = spectra.mean(axis=0).sum(axis=1)[(f >= low) & (f < high)].mean()
+            assert seen == pytest.approx(density[(fine >= low) & (fine < high)].mean(), rel=0.2)
+        assert re.search(rf"^theory, {name}: {told:.1f} nm$", done.stdout, flags=re.M)

@@ -1,0 +1,117 @@
+"""A stream in which a peak appears, noise rises and frames are lost: each is told once in the log, and once when it is over.
+
+Stream, source, observers, alarms and identification are those of `wfsobs live --in STREAM`, in this process and without a clock.
+"""
+
+import queue
+from concurrent.futures import Future
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import wfsobs
+from tests.live.test_sources import Inbox
+from wfsobs.live.attached import StreamFrames, StreamSource
+from wfsobs.live.board import Board
+from wfsobs.live.crew import trace_width
+from wfsobs.live.observing import Order, made_crew
+from wfsobs.live.paced import Desk
+from wfsobs.live.recording import Recorder
+from wfsobs.live.ring import Ring
+from wfsobs.live.rows import Rows
+from wfsobs.live.shadow import Shadow, append_line
+from wfsobs.live.view import read_view
+from wfsobs.scenario.presets import paper
+from wfsobs.streams.shared_image import SharedImage
+
+SPAN = 8
+"""Length of what is identified [s], in place of a minute."""
+
+
+class Loop:
+    """A live loop on a stream, in steps of a frame."""
+
+    def __init__(self, folder):
+        self.image = SharedImage.create(folder / "modes.im.shm", (2,), dtype="float64")
+        self.scenario, self.log = paper(), folder / "night.log"
+        source = StreamSource(self.image.path, (0, 1), 1.0, 1e-3)
+        self.sampling, self.ring, self.board = source.sampling, Ring(2), Board(2)
+        self.traces = Rows(trace_width(2), 4096)
+        inbox, self.news = Inbox(), queue.Queue()
+        self.frames = StreamFrames(source, Desk(self.ring.name, 2, inbox, self.news, 1.0, None))
+        self.frames._look()
+        inbox.waiting.append({"play": True})
+        self.frames._follow_commands()
+        order = Order(self.scenario.to_dict(), ("kf-multi",), self.sampling, 0, False, "", "", "", None, self.news)
+        self.crew, self.count = made_crew(order, self.board), 0
+        self.recorder = Recorder(self.ring, self.sampling, self.say, False)
+        self.workshop = SimpleNamespace(do=self.do, finding=None)
+        self.shadow = Shadow(self)
+
+    def say(self, line):
+        append_line(str(self.log), self.ring.count * self.sampling.dt, line)
+
+    def do(self, function, *arguments, then):
+        done = Future()
+        done.set_result(function(*arguments))
+        then(done.result())
+
+    def view(self, seconds):
+        return read_view(self.ring, [self.traces], self.sampling.dt, seconds)
+
+    def send(self, z, is_lost):
+        self.image.write(z)
+        if is_lost:
+            return
+        self.frames.take()
+        while self.count < self.ring.count:
+            frame = self.ring.read(self.count)
+            self.traces.write(self.crew.take(frame, self.count))
+            self.count += 1
+        if self.count % 200 == 0:
+            self.shadow(self)
+
+    def release(self):
+        self.frames._ring.release()
+        for shared in (self.ring, self.traces, self.board):
+            shared.release()
+
+
+@pytest.fixture
+def loop(tmp_path, monkeypatch):
+    monkeypatch.setattr("wfsobs.live.shadow.MINUTE", float(SPAN))
+    loop = Loop(tmp_path)
+    yield loop
+    loop.release()
+
+
+def test_a_night_with_a_peak_noise_and_lost_frames(loop):
+    n, rng = 39_000, np.random.default_rng(5)
+    z = wfsobs.simulate(paper().replace({"run.duration": n / 1000})).z
+    t = 1e-3 * np.arange(n)
+    peak, loud, lossy = (16, 24), (33, 35), (36.5, 37.5)
+
+    def between(span):
+        return (t >= span[0]) & (t < span[1])
+
+    z += 0.1 * (np.sin(2 * np.pi * 73.0 * t) * between(peak))[:, None]
+    z += 0.1 * rng.normal(size=z.shape) * between(loud)[:, None]
+    lost = between(lossy) & (rng.random(n) < 0.1)
+    for row, is_lost in zip(z, lost, strict=True):
+        loop.send(row, is_lost)
+    told = [line.split(" ", 2)[1:] for line in loop.log.read_text(encoding="utf-8").splitlines()]
+    lines = [(float(seconds), line) for seconds, line in told]
+
+    def when(start):
+        return [seconds for seconds, line in lines if line.startswith(start)]
+
+    # alarms of a second come at its end, and are over in the first one that is quiet; peaks are those of the last span
+    assert when("ALARM new peak at 73.0") == pytest.approx([24.0], abs=0.5)
+    assert when("peak at 73.0") == [] and when("ALARM peak at 73.0") == pytest.approx([32.0], abs=0.5)
+    assert when("ALARM noise up") == pytest.approx([34.0], abs=1.1) and when("over: noise") == pytest.approx([36.0], abs=1.1)
+    assert [s for s, line in lines if "frames missing" in line] == pytest.approx([37.5, 39.0], abs=1.1)
+    (share,) = [float(line.split()[1].rstrip("%")) for _, line in lines if line.startswith("ALARM") and "missing" in line]
+    assert 1.0 < share < 14.0  # of 1000 frames a part, or all, lose a tenth; 4 standard deviations above
+    assert when("ALARM error of kf-multi up")[-1] > 32 and when("over: error of kf-multi")[-1] > 33
+    assert "kf-multi" in loop.board.active()
