@@ -76,12 +76,12 @@ def errors_under(
         if len(taps) > 1:
             fast, slow = zip(*taps.values(), strict=True)
             taps[TOTAL] = np.sum(fast, axis=0), np.sum(slow, axis=0)
-        out.append({target: PeriodicError(_variance(*pair, target, known)) for target, pair in taps.items()})
+        out.append({target: PeriodicError(variance_of(*pair, target, known)) for target, pair in taps.items()})
     return out
 
 
-def _variance(fast: Array, slow: Array, target: str, spectra: TrueSpectra) -> Array:
-    """Return the variance of the error at every place in the cycle, (ratio,); fast, slow : h_p, g_p (ratio, length)."""
+def variance_of(fast: Array, slow: Array, target: str, spectra: TrueSpectra) -> Array:
+    """Return the variance of the error [um^2] at every place in the cycle, (ratio,); fast, slow : h_p, g_p (ratio, length)."""
     known, ratio = spectra.without_lines, spectra.ngs.ratio
     ngs, n = known.ngs, 2 * (known.measurement.size - 1)
     exposure = exposure_response(ratio, known.measurement.size)
