@@ -27,6 +27,7 @@ def page(dashboard: Dashboard) -> LivePage:
     page = dashboard.pages.by_name[LIVE]
     assert isinstance(page, LivePage)
     page.controls.running.value = ["kf-multi", "gp-both"]
+    page.controls.controllers.value = ["none", "integrator"]
     return page
 
 
@@ -55,35 +56,57 @@ def begin(page: LivePage, loop: Any) -> LiveLoop:
 
 
 def test_a_loop_from_start_to_the_end_of_the_session(page: LivePage, dashboard: Dashboard, loop: Any) -> None:
-    assert page._figures is None and page.loop is None and not page.draw(), "nothing before it is asked for"
+    assert page.picture is None and page.loop is None and not page.draw(), "nothing before it is asked for"
     live = begin(page, loop)
-    assert page.draw() and page._figures is not None
+    assert page.draw() and page.picture is not None
     assert set(live.board.active()) == {"kf-multi", "gp-both"}
     page.buttons["Pause"].param.trigger("clicks")
     wait(lambda: not live.is_playing and live.count == live.newest)
     assert page.buttons["Pause"].label == "Play"
     page.draw()
-    view = live.view(page.window.value)
+    view = live.view(page.controls.window.value)
     best, rms = ranking(view, live.board.active(), "turbulence", 0)[0]
     assert rms == pytest.approx(np.sqrt(np.mean(view.error(best, "turbulence")[:, 0] ** 2)), rel=1e-12)
-    rows = re.findall(r'data-name="([^"]+)".*?</tr>', page.table.object, re.S)
-    assert rows[0] == best and number(1e3 * rms) in page.table.object
+    rows = re.findall(r'data-name="([^"]+)".*?</tr>', page.picture.table.object, re.S)
+    assert rows[0] == best and number(1e3 * rms) in page.picture.table.object
     assert f"{live.count} frames · 0 lost" in page.status.object
     assert f"{live.count * 0.001:.1f} s" in page.status.object
+    check_controllers(page, live)
     # a change in the drawer is one in the loop; what it cannot take is said
     dashboard.store.change("turbulence.wind_speed", 20.0)
     dashboard.store.change("sensors.exposure_ratio", 10)
     wait(lambda: any("Wind speed" in event.line for event in live.events))
     assert live.scenario.turbulence.wind_speed == 20.0 and live.scenario.sensors.exposure_ratio == 5
     page.draw()
-    assert "modes and rates cannot change" in page.news.object and "Wind speed" in page.news.object
+    assert "modes and rates cannot change" in page.picture.news.object and "Wind speed" in page.picture.news.object
     # the page is left, the loop goes on; the session ends, nothing is left
     page.show(False)
     assert not page.draw() and page.work.state == RUNNING
     pids = live.pids
-    assert len(pids) == 3 and all(map(is_running, pids))
+    assert len(pids) == 4 and all(map(is_running, pids))
     dashboard.store.session.leave()
     wait(lambda: not any(map(is_running, pids)))
+
+
+def check_controllers(page: LivePage, live: LiveLoop) -> None:
+    """In the table: rms of the last seconds in nm and mas, Strehl of both modes; and a detector beside that of the star."""
+    assert page.picture is not None
+    wait(lambda: not np.isnan(seen(page, live, "integrator")).any())
+    page.draw()
+    rms = seen(page, live, "integrator")
+    cells = re.findall(r'data-controller="integrator".*?</tr>', page.picture.control_table.object, re.S)[0]
+    mas = 4e-6 / 8.0 * np.degrees(1.0) * 3.6e6  # per micrometre of a Noll tip on 8 m
+    lost = (2 * np.pi / 2.2) ** 2 * np.sum(rms**2)
+    for value in (number(1e3 * rms[0]), number(mas * rms[0]), f"{np.exp(-lost):.4f}"):
+        assert f"<td>{value}</td>" in cells
+    assert len(page.picture.stars.row) == 2 and set(live.controllers) == {"none", "integrator"}
+    page.controls.controllers.value = ["integrator"]
+    assert live.controllers == {"integrator"}
+
+
+def seen(page: LivePage, live: LiveLoop, controller: str) -> Any:
+    left = live.control_view(page.controls.window.value)
+    return np.array([np.nan]) if left is None else left.rms(controller)
 
 
 def test_pictures_wait_for_the_browser(page: LivePage, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -112,3 +112,33 @@ def test_a_message_that_comes_as_the_one_before_has_been_written_is_sent(monkeyp
 
     asyncio.run(main())
     assert [text for text, _ in socket.written] == ["first", "second"]
+
+
+def test_what_changes_while_a_page_is_on_its_way_is_sent() -> None:
+    """Before it is sent, a change is in it; after that it is a message, though the browser has not drawn the page yet."""
+    mend_panel()
+    mend_panel()
+    told: list[Any] = []
+
+    class Connection:
+        protocol = type("", (), {"create": staticmethod(lambda _kind, _id, _document: "page")})
+
+    async def main() -> None:
+        name = generate_session_id()
+        server = ApplicationContext(Application(), io_loop=IOLoop.current())
+        page: Any = await server.create_session_if_needed(name, token=generate_jwt_token(name))
+        where = Range1d()
+        await page.with_document_locked(lambda: page.document.add_root(where))
+        page.document.on_change(lambda event: told.append(getattr(event, "new", None)))
+
+        def change(start: float) -> None:
+            with set_curdoc(page.document), document.hold():
+                where.start = start
+
+        await page.with_document_locked(lambda: change(1.0))
+        assert told == []
+        assert await page._handle_pull(type("", (), {"header": {"msgid": "1"}}), Connection) == "page"
+        await page.with_document_locked(lambda: change(2.0))
+
+    asyncio.run(main())
+    assert told == [2.0]

@@ -29,3 +29,56 @@ def test_a_loop_that_is_changed_while_it_runs(open_page: Any, server: Any) -> No
     page.get_by_role("button", name="Stop", exact=True).click()
     expect(page.get_by_text("Stopped", exact=True)).to_be_visible(timeout=LONG)
     expect(page.get_by_role("button", name="Start", exact=True)).to_be_enabled()
+
+
+QUICK = "?run.duration=1&run.warm_up=0.2&gpr_online.training_size=40&gpr_offline.training_size=40&view.page=live"
+
+
+def begin(page: Any) -> None:
+    page.get_by_role("button", name="Start", exact=True).click()
+    expect(page.get_by_role("figure", name="Waterfall")).to_be_visible(timeout=LONG)
+
+
+def test_a_peak_that_is_moved_in_the_live_spectrum(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK)
+    begin(page)
+    page.get_by_role("combobox", name="Errors of").click()
+    page.get_by_role("option", name="Vibration", exact=True).click()
+    page.get_by_role("checkbox", name="Edit on the figure").check()
+    peak = page.get_by_role("slider", name="Peak 15", exact=True)
+    expect(peak).to_have_attribute("aria-valuetext", "47.44 Hz, 7.90 nm rms, damping 0.004", timeout=LONG)
+    peak.focus()
+    peak.press("Shift+ArrowUp")
+    peak.press("Enter")
+    events = page.get_by_role("list", name="Events")
+    expect(events).to_contain_text("eak 15", timeout=LONG)
+    controllers = page.get_by_role("region", name="Controllers of the live loop")
+    expect(controllers.get_by_text("Integrator", exact=True)).to_be_visible(timeout=LONG)
+    expect(page.get_by_role("figure", name="Star: Integrator")).to_be_visible()
+
+
+WATCH = """() => {
+  window.shown = []
+  const find = (node) => {
+    for (const it of node.querySelectorAll("*")) {
+      if (it.getAttribute("role") === "status" && /real time/.test(it.textContent)) return it.textContent
+      const inner = it.shadowRoot && find(it.shadowRoot)
+      if (inner) return inner
+    }
+  }
+  window.read = () => Number(/· ([0-9.]+) s ·/.exec(find(document))[1])
+  setInterval(() => { const now = window.read(); if (now !== window.shown.at(-1)) window.shown.push(now) }, 20)
+}"""
+SLEEP = "() => { const end = performance.now() + 6000; while (performance.now() < end); return window.read() }"
+
+
+def test_a_page_that_sleeps_and_wakes_shows_now(open_page: Any, server: Any) -> None:
+    """What came while it slept is not made up for, picture by picture: one may have been on its way, the next is of now."""
+    page = open_page(url=server.url + QUICK)
+    begin(page)
+    page.evaluate(WATCH)
+    page.wait_for_function("window.shown.length > 2", timeout=LONG)
+    asleep = page.evaluate(SLEEP)
+    page.wait_for_function(f"window.read() > {asleep} + 5", timeout=LONG)
+    late = [t for t in page.evaluate("window.shown") if asleep + 0.5 < t < asleep + 4.5]
+    assert len(late) <= 1, late

@@ -20,6 +20,7 @@ class LiveOrder:
     scenario  : what the observers are told
     observers : ids of those that run from the start
     speed     : 1 is real time
+    controllers : ids of those that run beside it
     key       : names the loop, where all pages watch the same
     record_file : where all its frames go when it ends; none if empty
     log_file  : to which events and alarms are appended; none if empty
@@ -29,12 +30,15 @@ class LiveOrder:
     scenario: Scenario
     observers: Sequence[str]
     speed: float = 1.0
+    controllers: Sequence[str] = ()
     key: str = ""
     record_file: str = ""
     log_file: str = ""
 
     def begin(self, loop: LiveLoop) -> None:
-        """Begin to record and to raise alarms, if that is wanted; of a stream there are always alarms."""
+        """Begin what runs beside it, to record and to raise alarms, if that is wanted; of a stream there are always alarms."""
+        for name in self.controllers:
+            loop.control(name, True)
         if self.log_file or self.source.name == STREAM:
             loop.watch(self.log_file)
         if self.record_file:

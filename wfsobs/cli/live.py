@@ -16,6 +16,7 @@ from wfsobs.files import check_writable
 from wfsobs.live.attached import StreamSource
 from wfsobs.live.blocks import check_live
 from wfsobs.live.checks import check_slot, observers_on
+from wfsobs.live.control_crew import USUAL
 from wfsobs.live.follow import follow
 from wfsobs.live.recording import open_loop_record, record_of
 from wfsobs.live.replay import Replay
@@ -90,7 +91,7 @@ def live(
         from wfsobs.app.live_order import LiveOrder
     except ModuleNotFoundError as error:
         raise SettingError(f"live: the page needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
-    order = LiveOrder(source, scenario, names, speed, "live", record_file or "", log_file or "")
+    order = LiveOrder(source, scenario, names, speed, USUAL, key="live", record_file=record_file or "", log_file=log_file or "")
     server.serve(server.Options(port=port, open_browser=open_browser, runs=max(2, cpu_count() or 1)), order)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.linalg import schur
@@ -66,7 +67,11 @@ class Law:
 
 def steady_law(cycle: PeriodicFilter, gain: float | None = None, leak: float = 1.0) -> Law:
     """Return the law of a filter of the LGS alone."""
-    return Law(cycle, lambda z: cycle.run(z[:, :1, None])[:, 0, 0], gain, leak)
+    return Law(cycle, partial(_run_steady, cycle), gain, leak)
+
+
+def _run_steady(cycle: PeriodicFilter, z: Array) -> Array:
+    return cycle.run(z[:, :1, None])[:, 0, 0]
 
 
 def transfer(F: Array, G: Array, H: Array, J: float, z: Complex) -> Complex:

@@ -10,6 +10,7 @@ frames, and for n + f frames the mean over the time that the command is held,
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ import numpy as np
 from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.multirate import filter_of_gains, multirate_gains, multirate_noise
+from wfsobs.observers.kalman.multirate import MultiRateFilter, filter_of_gains, multirate_gains, multirate_noise
 from wfsobs.observers.kalman.multirate_multi import every_peak_model
 from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_gains, optimal_model
 from wfsobs.observers.kalman.single import steady_gains
@@ -86,4 +87,9 @@ def _optimal(cycle: Cycle, mirror: Mirror) -> Law:
 
 def _two_sensors(gains: GainCycle, row: Array, model: DisturbanceModel) -> Law:
     filter_ = filter_of_gains(gains, row)
-    return Law(filter_.cycle, lambda z: filter_.run(z)[:, 0], first=filter_.first, model=model, gains=gains, row=row[0])
+    run = partial(_run_first, filter_)
+    return Law(filter_.cycle, run, first=filter_.first, model=model, gains=gains, row=row[0])
+
+
+def _run_first(filter_: MultiRateFilter, z: Array) -> Array:
+    return filter_.run(z)[:, 0]

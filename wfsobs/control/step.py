@@ -82,15 +82,43 @@ class StepController:
         StepError
             A wrong shape, an infinite number, an NGS frame that is not due. The frame is then not taken, and no command is given.
         """
-        y, is_whole = check_frame(self.id, y, "y", self.sampling.n_modes, self.frame)
+        return self._take(y, ngs, "y", is_open=False)
+
+    def update_open_loop(self, z: ArrayLike, ngs: ArrayLike | None = None) -> Array:
+        """As `update`, of measurements of the disturbance alone: those of a record, or of a loop that another controller closes.
+
+        Parameters
+        ----------
+        z, ngs : array_like
+            Pseudo-open-loop measurements, see `StepObserver.update`.
+
+        Returns
+        -------
+        Array
+            Command u[k], (n_modes,) [um].
+
+        Raises
+        ------
+        StepError
+            As `update`.
+        """
+        return self._take(z, ngs, "z", is_open=True)
+
+    @property
+    def correction(self) -> Array:
+        """What the mirror does in the last frame, phi_corr, (n_modes,) [um]: the residual is the disturbance and this."""
+        return self._taps @ self._commands
+
+    def _take(self, x: ArrayLike, ngs: ArrayLike | None, name: str, is_open: bool) -> Array:
+        x, is_whole = check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
         due = self._ngs is not None and self.frame > 0 and self.frame % self._ratio == 0
         slow = None if self._ngs is None else self._check_ngs(ngs, due)
-        seen = self._taps @ self._commands
-        z = self._lgs.complete(y - seen, is_whole)
+        seen = self.correction
+        z = self._lgs.complete(x if is_open else x - seen, is_whole)
         if self._ngs is not None:
             push_row(self._mirror, seen)
             if slow is not None:
-                slow = self._ngs.complete(slow - self._mirror.mean(axis=0))
+                slow = self._ngs.complete(slow if is_open else slow - self._mirror.mean(axis=0))
         forward = self._none
         if self.ahead is not None:
             z, forward = self.ahead.split(z)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.control.step import StepController
 from wfsobs.live.board import SLOTS
+from wfsobs.live.control_crew import SEATS
 from wfsobs.live.follow import default_observers
 from wfsobs.live.source import STREAM, LiveSource
 from wfsobs.observers import OBSERVERS
@@ -22,14 +25,16 @@ SLOWEST, FASTEST = 0.1, 20.0
 """Limits of the speed."""
 
 
-def make_design(name: str, settings: dict[str, Any], sampling: Sampling) -> StepObserver:
-    """Design an observer for a scenario; in another process. Raises ValueError."""
+def make_design(name: str, settings: dict[str, Any], sampling: Sampling) -> StepObserver | StepController:
+    """Design an observer or a controller for a scenario; in another process. Raises ValueError."""
     return design(name, Scenario.from_dict(settings), sampling=sampling)
 
 
 def check_slot(name: str) -> None:
-    """Raise SettingError for an observer that is unknown or does not run frame by frame."""
-    if name not in SLOTS:
+    """Raise SettingError for an observer or controller that is unknown or does not run frame by frame."""
+    if name in CONTROLLERS and name not in SEATS:
+        raise SettingError(f"controller {name!r}: does not run frame by frame; there are {', '.join(SEATS)}")
+    if name not in SLOTS and name not in SEATS:
         raise SettingError(f"observer {name!r}: does not run frame by frame; there are {', '.join(SLOTS)}")
 
 

@@ -10,6 +10,7 @@ from weakref import ReferenceType, finalize, ref
 
 from wfsobs.live.blocks import check_live
 from wfsobs.live.checks import check_slot, check_speed, loss_line, needs_new_frames
+from wfsobs.live.control_process import ControlView
 from wfsobs.live.processes import LiveProcesses
 from wfsobs.live.recording import Recorder
 from wfsobs.live.shadow import Shadow, append_line
@@ -60,6 +61,7 @@ class LiveLoop:
         self.source, self.scenario, self.sampling = source, as_sampled(scenario, source.sampling), source.sampling
         self._speed, self._is_wanted, self._has_begun = check_speed(speed), False, False
         self.events: deque[LiveEvent] = deque(maxlen=MOST_EVENTS)
+        self.controllers: set[str] = set()
         self._shadow: Shadow | None = None
         self._log_file = ""
         self._processes = LiveProcesses(source, self.scenario, tuple(dict.fromkeys(observers)), self._speed)
@@ -166,21 +168,35 @@ class LiveLoop:
         else:
             self._processes.tell_observers({"observer": observer, "design": None})
 
-    def redesign(self, observers: Sequence[str] | None = None, *, scenario: Scenario | None = None) -> None:
-        """Design observers anew beside the loop; each goes on where the one before is.
+    def control(self, controller: str, on: bool) -> None:
+        """Switch a controller beside the loop off, or on with a design for the present settings. Raises SettingError."""
+        check_slot(controller)
+        if on:
+            self.controllers.add(controller)
+            self.redesign([controller])
+        else:
+            self.controllers.discard(controller)
+            self._processes.tell_controllers({"controller": controller, "design": None})
+
+    def redesign(self, names: Sequence[str] | None = None, *, scenario: Scenario | None = None) -> None:
+        """Design observers and controllers anew beside the loop; each goes on where the one before is.
 
         Parameters
         ----------
-        observers : sequence of str, optional
+        names : sequence of str, optional
             Ids; by default of all that run.
         scenario : Scenario, optional
             What they are told; by default the present settings.
         """
-        self.workshop.redesign(self.board.active() if observers is None else observers, scenario or self.scenario)
+        self.workshop.redesign(self.running_ids() if names is None else names, scenario or self.scenario)
 
     def identify(self, seconds: float = MINUTE) -> None:
-        """Identify the last so many seconds beside the loop, and design the observers for it. Raises SettingError."""
-        self.workshop.identify(self.recorder.look_back(seconds, self.scenario), self.scenario, self.board.active())
+        """Identify the last so many seconds beside the loop, and design all for it. Raises SettingError."""
+        self.workshop.identify(self.recorder.look_back(seconds, self.scenario), self.scenario, self.running_ids())
+
+    def running_ids(self) -> list[str]:
+        """Return the ids of the observers and controllers that run."""
+        return [*self.board.active(), *sorted(self.controllers)]
 
     def targets(self, observer: str) -> tuple[str, ...]:
         """Return what an observer estimates."""
@@ -200,6 +216,11 @@ class LiveLoop:
     def view(self, seconds: float) -> LiveView:
         """Return the last so many seconds of frames and estimates."""
         return read_view(self._processes.feed.ring, self._processes.traces(), self.sampling.dt, seconds)
+
+    def control_view(self, seconds: float) -> ControlView | None:
+        """Return what the controllers leave of the last so many seconds that they have taken; None before the first one."""
+        controllers = self._processes.controllers
+        return None if controllers is None else controllers.view(seconds)
 
     def tend(self) -> None:
         """Look after the processes; called a few times a second."""

@@ -7,6 +7,7 @@ from multiprocessing import get_context
 from threading import Event, RLock
 
 from wfsobs.live.board import CREWS, Board, crew_of
+from wfsobs.live.control_process import ControlProcess
 from wfsobs.live.delivery import Delivery
 from wfsobs.live.observing import CrewProcess, Site
 from wfsobs.live.paced import Command, enter_process
@@ -39,6 +40,8 @@ class LiveProcesses:
         What is counted of the observers.
     delivery : Delivery
         What is counted of the frames.
+    controllers : ControlProcess or None
+        Begun with the first controller.
     workshop : ProcessPoolExecutor
         A process at low priority, which is made when it is first used.
     is_over : threading.Event
@@ -52,7 +55,9 @@ class LiveProcesses:
         self.feed, self.is_over, self._lock = SourceProcess(source, speed, n_frames), Event(), RLock()
         self.board, self._news = Board(source.sampling.n_modes), self._context.Queue()
         self._site = Site(scenario.to_dict(), source.sampling, self.feed.ring, self.board, self._news)
+        self._warm_up = scenario.run.warm_up
         self.crews: dict[int, CrewProcess] = {}
+        self.controllers: ControlProcess | None = None
         for place in range(len(CREWS)):
             own = tuple(name for name in observers if crew_of(name) == place)
             if own or not place:
@@ -80,7 +85,8 @@ class LiveProcesses:
     @property
     def pids(self) -> list[int]:
         """Ids of the processes of source and observers."""
-        return [*self.feed.pids, *(pid for crew in list(self.crews.values()) for pid in crew.pids)]
+        others = [] if self.controllers is None else self.controllers.pids
+        return [*self.feed.pids, *(pid for crew in list(self.crews.values()) for pid in crew.pids), *others]
 
     def tell_observers(self, command: Command) -> None:
         """Give a command to the crew of the observer that it is about, which begins with its first one."""
@@ -92,6 +98,16 @@ class LiveProcesses:
                 self._start_crew(place, (), joins_late=True)
             self.crews[place].tell(command)
 
+    def tell_controllers(self, command: Command) -> None:
+        """Give a command to the process of the controllers, which begins with the first one."""
+        with self._lock:
+            if self.is_over.is_set() or (self.controllers is None and command["design"] is None):
+                return
+            if self.controllers is None:
+                site = self._site
+                self.controllers = ControlProcess(self._context, site.sampling, self._warm_up, site.ring, site.news)
+            self.controllers.tell(command)
+
     def news(self) -> list[tuple[int, str]]:
         """Return what they have said since the last call: number of the frame, one line."""
         return [*self.feed.news(), *take_all(self._news)]
@@ -101,7 +117,7 @@ class LiveProcesses:
         with self._lock:
             self.is_over.set()
         self.delivery.collect()
-        for crew in self.crews.values():
+        for crew in (*self.crews.values(), *([self.controllers] if self.controllers else ())):
             crew.stop()
         workers = [*(self.workshop._processes or {}).values()]
         self.workshop.shutdown(wait=False, cancel_futures=True)

@@ -6,9 +6,11 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any
 
+from wfsobs.control.step import StepController
 from wfsobs.live.checks import check_slot, make_design
 from wfsobs.live.finding import Finding, identify_frames
 from wfsobs.live.processes import LiveProcesses
+from wfsobs.observers.step import StepObserver
 from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario
 
@@ -48,25 +50,28 @@ class Workshop:
 
         self._processes.workshop.submit(function, *arguments).add_done_callback(end)
 
-    def redesign(self, observers: Sequence[str], scenario: Scenario) -> None:
-        """Design observers; each goes on where the one before is, or begins. Raises SettingError."""
-        for name in observers:
+    def redesign(self, names: Sequence[str], scenario: Scenario) -> None:
+        """Design observers and controllers; each goes on where the one before is, or begins. Raises SettingError."""
+        for name in names:
             check_slot(name)
         settings = scenario.to_dict()
-        for name in observers:
+        for name in names:
             self.do(make_design, name, settings, self._sampling, then=self._deliver)
 
-    def identify(self, record: Record, scenario: Scenario, observers: Sequence[str]) -> None:
-        """Identify a record, and design observers for what is found."""
+    def identify(self, record: Record, scenario: Scenario, names: Sequence[str]) -> None:
+        """Identify a record, and design observers and controllers for what is found."""
 
         def take(finding: Finding) -> None:
             self.finding = finding
             peaks = ", ".join(f"{p.frequency:.1f} Hz" for p in finding.peaks)
             self._say(f"identified: {len(finding.peaks)} peaks" + (f" at {peaks}" if peaks else ""))
-            if observers:
-                self.redesign(observers, Scenario.from_dict(finding.settings))
+            if names:
+                self.redesign(names, Scenario.from_dict(finding.settings))
 
         self.do(identify_frames, record, scenario.to_dict(), then=take)
 
-    def _deliver(self, observer: Any) -> None:
-        self._processes.tell_observers({"observer": observer.id, "design": observer})
+    def _deliver(self, design: StepObserver | StepController) -> None:
+        if isinstance(design, StepController):
+            self._processes.tell_controllers({"controller": design.id, "design": design})
+        else:
+            self._processes.tell_observers({"observer": design.id, "design": design})

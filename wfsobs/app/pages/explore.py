@@ -11,13 +11,12 @@ import panel as pn
 import panel_material_ui as pmui
 
 from wfsobs.app.causes import Causes
-from wfsobs.app.controls.fields import SOON
-from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display
+from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL
 from wfsobs.app.history import History
-from wfsobs.app.pages.parts import WIDE, box
+from wfsobs.app.pages.parts import WIDE, box, group
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
-from wfsobs.app.style import HEARD, asset
+from wfsobs.app.style import asset
 from wfsobs.app.views.budget import BudgetView
 from wfsobs.app.views.frames import Frames
 from wfsobs.app.views.main_lines import MainLines
@@ -165,15 +164,6 @@ class Explore:
     def _hide(self, target: str, names: list[str]) -> None:
         if names != self.display.hidden_lines.get(target, []):
             self.lines.choose(target, names)
-
-
-def group(display: Display, name: str, options: Any) -> pmui.RadioButtonGroup:
-    """Make the buttons of one switch of the display."""
-    widget = pmui.RadioButtonGroup.from_param(
-        display.param[name], options=options, size="small", margin=0, variant="outlined", stylesheets=[HEARD]
-    )
-    widget._debounce = SOON  # type: ignore[misc]
-    return widget
 
 
 def _caption(text: str, marks: str = "") -> pn.pane.HTML:

@@ -5,41 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from html import escape
-from time import monotonic
 
 import panel as pn
 import param
 
 from wfsobs.app.change_names import name_of_difference
-from wfsobs.app.display import Display, per_micrometre
+from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs.job import FAILED, RUNNING
 from wfsobs.app.jobs.task import IDLE
 from wfsobs.app.live_order import LiveOrder
 from wfsobs.app.live_work import LiveTask, record_saves
 from wfsobs.app.pages.live_controls import LiveControls, Pulse
-from wfsobs.app.pages.live_figures import Detector, LatencyHistogram, RollingSpectra, RollingTraces
-from wfsobs.app.pages.live_table import Bounds, events_html, live_html, peaks_html, ranking, status_line
-from wfsobs.app.pages.parts import WIDE, PageActions, box, figure_with_caption, html, line, text
+from wfsobs.app.pages.live_room import LiveRoom
+from wfsobs.app.pages.live_table import status_line
+from wfsobs.app.pages.parts import WIDE, PageActions, box, html, text
 from wfsobs.app.store import Store
-from wfsobs.live.board import NEXT
-from wfsobs.live.finding import bounds_of
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.view import LiveView
-from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 
 PERIOD = 200
 """Between two pictures [ms]."""
-SLOW = 1.0
-"""Between two tables [s]."""
 LOOK_BACK = 120.0
 """What a recording has of the time before it [s]."""
-GRID = """
-:host { display: grid !important; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 10px; }
-@media (max-width: 1000px) { :host { grid-template-columns: minmax(0, 1fr); } }
-"""
 INTRO = (
     "Simulates the scenario in the drawer by the clock, in a process of its own; every observer follows it frame by frame in "
     "another. A change in the drawer, of wind or peaks or noise, fades in within a second; the observers keep their designs "
@@ -54,14 +44,13 @@ class LivePage(PageActions):
         self.store, self.display = store, display
         self.work = LiveTask(store.session)
         self.controls = c = LiveControls()
-        self.buttons, self.lines, self.target, self.window = c.buttons, c.lines, c.target, c.window
-        self.status, self.table, self.news, self.peaks = html(), html(), html(), html()
+        self.buttons = c.buttons
+        self.status = html()
         self.room = pn.Column(**WIDE, visible=False)
         self.pulse = Pulse(width=0, height=0, margin=0)
-        self.visible, self._table_time = False, 0.0
-        self._figures: tuple[RollingTraces, RollingSpectra, LatencyHistogram, Detector] | None = None
-        self._bounds: Bounds = {}
-        self._bounds_of: Scenario | None = None
+        self.visible = False
+        self.picture: LiveRoom | None = None
+        self._known_loop: LiveLoop | None = None
         self._callback = pn.state.add_periodic_callback(self.tick, PERIOD, start=False) if pn.state.curdoc else None
         self._watch()
         self._say()
@@ -84,12 +73,13 @@ class LivePage(PageActions):
             field.param.watch(
                 lambda _: self._do(lambda loop: loop.lose(lgs=c.lasers.value, ngs=c.ngs.value, loss=c.losses.value)), "value"
             )
-        self.controls.running.param.watch(self._switch, "value")
+        c.running.param.watch(partial(self._switch, LiveLoop.switch), "value")
+        c.controllers.param.watch(partial(self._switch, LiveLoop.control), "value")
         self.work.param.watch(self._say, ["state", "place", "message", "latest"])
         self.store.param.watch(self._follow, "scenario")
-        for owner, name in ((self.window, "value"), (self.target, "value"), (self.lines, "value")):
-            owner.param.watch(lambda _: self.draw(), name)
-        self.display.param.watch(lambda _: self.draw(), ["mode", "unit", "dark", "show"])
+        for field in (c.window, c.target, c.lines, c.waterfall):
+            field.param.watch(lambda _: self.draw(), "value")
+        self.display.param.watch(lambda _: self.draw(), ["mode", "unit", "dark", "show", "spectrum", "editing"])
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
@@ -124,7 +114,13 @@ class LivePage(PageActions):
             self.work.refuse(str(error))
             return
         self.work.begin(
-            LiveOrder(SimulatedLoop(scenario), scenario, tuple(self.controls.running.value), self.controls.speed.value)
+            LiveOrder(
+                SimulatedLoop(scenario),
+                scenario,
+                tuple(self.controls.running.value),
+                self.controls.speed.value,
+                tuple(self.controls.controllers.value),
+            )
         )
 
     @property
@@ -142,55 +138,24 @@ class LivePage(PageActions):
         loop = self.loop
         if loop is None or not self.visible:
             return False
-        view = loop.view(self.window.value)
+        if loop is not self._known_loop and loop.is_ready:  # another page may have started it
+            self._known_loop = loop
+            self.controls.tell(loop)
+        view = loop.view(self.controls.window.value)
         with pn.io.hold():
             self.status.object = f'<p class="text" role="status">{escape(status_line(loop, view))}</p>'
             self.buttons["Pause"].label = "Pause" if loop.is_playing else "Play"
             if view.n > 1:
-                self._draw_figures(loop, view)
-                if monotonic() - self._table_time > SLOW or not loop.is_playing:
-                    self._draw_table(loop, view)
+                self._draw_room(loop, view)
         return True
 
-    def _draw_figures(self, loop: LiveLoop, view: LiveView) -> None:
-        if self._figures is None:
-            self._figures = self._make_figures()
-        traces, spectra, latencies, star = self._figures
-        diameter = loop.scenario.telescope.diameter
-        scale = per_micrometre(self.display.unit, diameter)
-        active = loop.board.active()
-        names = [name for name in active if name in self.lines.value]
-        traces.draw(view, self._target(loop), names, self.display, scale, list(loop.events))
-        spectra.draw(view, self._target(loop), names, self.display, scale)
-        latencies.draw(loop.board, names, loop.sampling.dt, self.display.dark)
-        both = [name for name in active if len(loop.targets(name)) > 1]
-        if both:
-            star.draw(view, ranking(view, both, "next", 0)[0][0], diameter, self.display.dark)
-
-    def _make_figures(self) -> tuple[RollingTraces, RollingSpectra, LatencyHistogram, Detector]:
-        """Make the figures when there is something to show."""
-        made = RollingTraces(), RollingSpectra(), LatencyHistogram(), Detector()
-        titles = "The last seconds", "Spectra", "Latencies", "Star, as it comes (grey) and corrected by the best of both targets"
-        figures = [figure_with_caption(title, drawn.figure) for title, drawn in zip(titles, made, strict=True)]
-        grid = pn.Column(*figures, **WIDE, stylesheets=[GRID])
-        known = box("Observers", self.table, self.news, self.peaks)
-        self.room[:] = [box("Now", line(self.window, self.target), self.lines, grid), known]
-        self.room.visible = True
-        return made
-
-    def _target(self, loop: LiveLoop) -> str:
-        """Return what errors are shown of: without truth, of the next measurement."""
-        return self.target.value if loop.source.has_truth else NEXT
-
-    def _draw_table(self, loop: LiveLoop, view: LiveView) -> None:
-        self._table_time = monotonic()
-        if self._bounds_of is not loop.scenario:
-            self._bounds_of, self._bounds = loop.scenario, {}
-            loop.workshop.do(bounds_of, loop.scenario.to_dict(), then=partial(setattr, self, "_bounds"))
-        scale = per_micrometre(self.display.unit, loop.scenario.telescope.diameter)
-        self.table.object = live_html(loop, view, self._target(loop), self.display, scale, self._bounds)
-        self.news.object = events_html(loop.events, loop.sampling.dt)
-        self.peaks.object = peaks_html(loop.workshop.finding, scale, self.display.unit_label)
+    def _draw_room(self, loop: LiveLoop, view: LiveView) -> None:
+        picture = self.picture or LiveRoom(self.store, self.display, self.controls)
+        picture.draw(loop, view)
+        if self.picture is None:
+            self.picture = picture
+            self.room[:] = picture.view()
+            self.room.visible = True
 
     def _toggle_recording(self, loop: LiveLoop) -> None:
         """Keep every frame, and the last two minutes; or end that."""
@@ -213,14 +178,19 @@ class LivePage(PageActions):
                 loop.say(str(error))
             self.draw()
 
-    def _switch(self, event: param.parameterized.Event) -> None:
+    def _switch(self, act: Callable[[LiveLoop, str, bool], None], event: param.parameterized.Event) -> None:
         for names, on in ((set(event.new) - set(event.old), True), (set(event.old) - set(event.new), False)):
             for name in names:
-                self._do(lambda loop, name=name, on=on: loop.switch(name, on))
+                self._do(lambda loop, name=name, on=on: None if on and name in loop.running_ids() else act(loop, name, on))
 
     def _follow(self, event: param.parameterized.Event) -> None:
         """Change the loop as the settings in the drawer have changed."""
-        self._do(lambda loop: loop.become(event.new.before_events, name_of_difference(loop.scenario, event.new)))
+
+        def become(loop: LiveLoop) -> None:
+            if (wanted := event.new.before_events) != loop.scenario:
+                loop.become(wanted, name_of_difference(loop.scenario, wanted))
+
+        self._do(become)
 
     def _say(self, *_: object) -> None:
         """Enable what can be done, and describe what the job does."""
@@ -229,7 +199,7 @@ class LivePage(PageActions):
             button.disabled = (work.state == RUNNING) if name == "Start" else not runs
         self.buttons["Stop"].disabled = work.state != RUNNING
         waiting = work.line() if work.place else "Starting …"
-        said = {RUNNING: waiting, FAILED: work.message}.get(work.state, "Stopped" if self._figures else "")
+        said = {RUNNING: waiting, FAILED: work.message}.get(work.state, "Stopped" if self.picture else "")
         if not runs:
             self.status.object = f'<p class="{"failure" if work.state == FAILED else "text"}" role="status">{escape(said)}</p>'
         if self._callback is not None:

@@ -10,9 +10,12 @@ import param
 from panel.custom import JSComponent
 
 from wfsobs.app.pages.live_table import QUANTITIES
+from wfsobs.app.pages.live_waterfall import MEASUREMENT
 from wfsobs.app.pages.parts import WIDE, line
 from wfsobs.app.style import asset, look
-from wfsobs.live.follow import default_observers
+from wfsobs.live.board import SLOTS
+from wfsobs.live.control_crew import SEATS, USUAL
+from wfsobs.live.loop import LiveLoop
 from wfsobs.observers.base import TARGETS
 
 PATIENCE = 10.0
@@ -77,12 +80,22 @@ class LiveControls:
         self.ngs = pmui.Checkbox(label="NGS", value=True, **select)
         self.losses = pmui.Select(label="Lost", options=LOSSES, value=0.0, width=150, **select)
         self.running = pmui.MultiChoice(
-            label="Observers", options={look(name).label: name for name in default_observers()}, value=list(FIRST), **WIDE
+            label="Observers", options={look(name).label: name for name in SLOTS}, value=list(FIRST), **WIDE
         )
+        self.controllers = pmui.MultiChoice(
+            label="Controllers", options={look(name).label: name for name in SEATS}, value=list(USUAL), **WIDE
+        )
+        waterfall = {"the measurement": MEASUREMENT} | {f"error of {label}": name for label, name in self.running.options.items()}
+        self.waterfall = pmui.Select(label="Waterfall of", options=waterfall, value=MEASUREMENT, width=230, **select)
         self.lines = pmui.MultiChoice(label="Lines", options=self.running.options, value=list(MAIN), **WIDE)
 
+    def tell(self, loop: LiveLoop) -> None:
+        """Show what runs."""
+        self.running.value = loop.board.active()
+        self.controllers.value = [name for name in SEATS if name in loop.controllers]
+
     def view(self) -> list[Any]:
-        """Return the rows of controls; window, target and lines stand by the figures."""
+        """Return the rows of controls; those of the figures stand by them."""
         b = self.buttons
         return [
             line(b["Start"], b["Pause"], b["Step"], self.speed, b["Stop"]),

@@ -1,4 +1,4 @@
-"""The figures of the live loop: traces that roll, spectra, latencies, and the star on the detector."""
+"""The figures of the live loop: traces that roll, spectra, latencies."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ import numpy as np
 from bokeh.models import ColumnDataSource, Range1d, Span
 from bokeh.plotting import figure
 
-from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.style import look
+from wfsobs.app.display import Display
+from wfsobs.app.pages.live_table import Bounds
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.lines import FigureLines
 from wfsobs.app.views.plots import new_figure
+from wfsobs.app.views.traces import WINDOW_S
 from wfsobs.app.work import TRUTH
+from wfsobs.evaluation.error_spectra import cumulative_rms
+from wfsobs.evaluation.recovery import trailing_rms
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.latencies import EDGES
 from wfsobs.live.board import SLOTS, Board
 from wfsobs.live.view import LiveEvent, LiveView
@@ -28,9 +32,7 @@ DECADES = 7
 """Of the axis of spectra."""
 COARSE = 20
 """Bins of the histogram of latencies that are drawn as one."""
-TRAIL, POINTS = 0.2, 60
-"""Length of the trail of the star [s], and its points."""
-NAMES = (TRUTH, *SLOTS)
+NAMES = (TRUTH, *BOUNDS, *SLOTS)
 
 
 class LiveFigure:
@@ -60,28 +62,47 @@ class RollingTraces(LiveFigure):
             "x", 0, text="line", source=self._marks, angle=np.pi / 2, text_font_size="11px", text_color="#B84A00", x_offset=12
         )
 
+    @staticmethod
+    def run_in(display: Display) -> float:
+        """How much before the window is needed [s]."""
+        return WINDOW_S if display.running else 0.0
+
     def draw(
-        self, view: LiveView, target: str, names: Sequence[str], display: Display, scale: float, events: Sequence[LiveEvent]
+        self,
+        view: LiveView,
+        n: int,
+        target: str,
+        names: Sequence[str],
+        display: Display,
+        scale: float,
+        events: Sequence[LiveEvent],
+        bounds: Bounds,
     ) -> None:
-        """Send the window; scale : of micrometres in the unit shown."""
-        column, last = display.column, view.first + view.n
-        times = envelope_times(view.first, last, BINS, view.dt)
+        """Send the last `n` frames of the view; scale : of micrometres in the unit shown; bounds : of a running rms."""
+        last = view.first + view.n
+        first = max(view.first, last - n)
+        times = envelope_times(first, last, BINS, view.dt)
 
         def trace(x: Array) -> tuple[Array, Array]:
-            return times, scale * envelope(x[:, column], BINS)
+            if display.running:
+                x = trailing_rms(x, min(round(WINDOW_S / view.dt), len(x)))
+            return times, scale * envelope(x[first - view.first :, display.column], BINS)
 
         take = view.error if display.error else view.estimate
         data = {name: trace(take(name, target)) for name in names}
         if not display.error:
             data = {TRUTH: trace(view.truth(target)), **data}
-        self.put(data, display.dark)
         top = 1.1 * max((float(np.nanmax(np.abs(y))) for _, y in data.values() if np.isfinite(y).any()), default=1.0) or 1.0
-        self.figure.x_range.update(start=view.first * view.dt, end=last * view.dt)
-        self.figure.y_range.update(start=-top, end=top)
-        what = "error of" if display.error else ""
+        if display.running:
+            ends = times[[0, -1]]
+            data |= {name: (ends, np.full(2, scale * of[target][display.column])) for name, of in bounds.items() if target in of}
+        self.put(data, display.dark)
+        self.figure.x_range.update(start=first * view.dt, end=last * view.dt)
+        self.figure.y_range.update(start=0.0 if display.running else -top, end=top)
+        what = "running rms of error of" if display.running else "error of" if display.error else ""
         self.figure.yaxis.axis_label = f"{what} {display.mode_label} [{display.unit_label}]".strip()
-        shown = [event for event in events if view.first <= event.frame <= last]
-        self._marks.data = {"x": [event.frame * view.dt for event in shown], "line": [event.line[:40] for event in shown]}
+        marked = [event for event in events if first <= event.frame <= last]
+        self._marks.data = {"x": [event.frame * view.dt for event in marked], "line": [event.line[:40] for event in marked]}
 
 
 class RollingSpectra(LiveFigure):
@@ -103,7 +124,7 @@ class RollingSpectra(LiveFigure):
 
     def draw(self, view: LiveView, target: str, names: Sequence[str], display: Display, scale: float) -> None:
         """Take what is new into the average, and send it."""
-        of, last = (id(view.frames.z.shape), target, display.column, display.error)[1:], view.first + view.n
+        of, last = (target, display.column, display.error), view.first + view.n
         if of != self._of or last < self._last:
             self._sums, self._of, self._last = {}, of, 0
         n = min(view.n, round(1.0 / view.dt))
@@ -124,12 +145,15 @@ class RollingSpectra(LiveFigure):
             now = self._sums[name] = (
                 before + share * (density[:, 0] - before) if before.shape == density[:, 0].shape else density[:, 0]
             )
-            data[name] = frequency[1:], scale**2 * now[1:]
+            of_errors = scale * cumulative_rms(frequency[1:], now[1:]) if display.cumulative else scale**2 * now[1:]
+            data[name] = frequency[1:], of_errors
         self.put(data, display.dark)
         top = 3.0 * max((float(y.max()) for _, y in data.values()), default=1.0) or 1.0
         self.figure.x_range.update(start=1.0, end=0.5 / view.dt)
-        self.figure.y_range.update(start=top * 10.0**-DECADES, end=top)
-        self.figure.yaxis.axis_label = f"PSD, {display.mode_label} [{display.unit_label}²/Hz]"
+        self.figure.y_range.update(start=top * 10.0 ** -(DECADES / 2 if display.cumulative else DECADES), end=top)
+        unit = display.unit_label
+        what = f"rms above, {display.mode_label} [{unit}]" if display.cumulative else f"PSD, {display.mode_label} [{unit}²/Hz]"
+        self.figure.yaxis.axis_label = what
 
 
 class LatencyHistogram(LiveFigure):
@@ -156,41 +180,3 @@ class LatencyHistogram(LiveFigure):
         self.put(data, dark)
         top = 1.1 * max((float(y.max()) for _, y in data.values()), default=1.0) or 1.0
         self.figure.y_range.update(end=top)
-
-
-class Detector:
-    """Where the star is on the detector: as it comes, and behind a mirror that takes an observer's estimate off."""
-
-    def __init__(self) -> None:
-        options = {"x_range": Range1d(start=-1.0, end=1.0), "y_range": Range1d(start=-1.0, end=1.0)}
-        self.figure: figure = new_figure(**options)
-        self.figure.update(height=None, aspect_ratio=1.0, max_width=380, min_width=200)
-        self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = "tip [mas]", "tilt [mas]"
-        self._trails = [ColumnDataSource({"x": [], "y": []}) for _ in range(2)]
-        self._spots = [ColumnDataSource({"x": [], "y": []}) for _ in range(2)]
-        for trail, spot, colour in zip(self._trails, self._spots, ("#888888", "#003DE6"), strict=True):
-            self.figure.line("x", "y", source=trail, line_color=colour, line_alpha=0.5)
-            mark = self.figure.scatter("x", "y", source=spot, size=16, fill_color=colour, line_color=colour, fill_alpha=0.6)
-            self._mark = mark.glyph
-        self._top = 1.0
-
-    def draw(self, view: LiveView, name: str, diameter: float, dark: bool) -> None:
-        """Send the last instants; name : observer whose estimate is taken off."""
-        scale, n = per_micrometre("mas", diameter), max(2, round(TRAIL / view.dt))
-        total = view.truth("turbulence") + view.truth("vibration")
-        if np.isnan(total).all():
-            total, left = view.frames.z, view.error(name, "next")
-        else:
-            left = total - np.nan_to_num(view.estimate(name, "turbulence")) - np.nan_to_num(view.estimate(name, "vibration"))
-        step = max(1, n // POINTS)
-        for x, trail, spot in zip((total, left), self._trails, self._spots, strict=True):
-            points = scale * x[-n:, :2]
-            trail.data = {"x": points[::step, 0], "y": points[::step, 1]}
-            spot.data = {"x": points[-1:, 0], "y": points[-1:, 1]}
-        reach = 1.1 * float(np.nanmax(np.abs(scale * total[:, :2]), initial=1e-3))
-        if not self._top / 1.6 < reach < self._top:
-            self._top = 1.25 * reach
-            for axis in (self.figure.x_range, self.figure.y_range):
-                axis.update(start=-self._top, end=self._top)
-        colour = look(name).colour(dark)
-        self._mark.update(fill_color=colour, line_color=colour)

@@ -6,15 +6,19 @@ from collections.abc import Iterable, Mapping
 from html import escape
 from math import inf, isnan
 
-from wfsobs.app.display import Display
+import numpy as np
+
+from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.render import Row, table
 from wfsobs.app.style import look, swatch
+from wfsobs.closed_loop.run import strehl
 from wfsobs.evaluation.rows import row_label
 from wfsobs.live.board import NEXT, SCORED
 from wfsobs.live.finding import Finding
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.view import LiveEvent, LiveView
+from wfsobs.typing import Array
 
 SHOWN_EVENTS = 8
 QUANTITIES = {"Turbulence": "turbulence", "Vibration": "vibration", "Next measurement": NEXT}
@@ -61,6 +65,33 @@ def _row(loop: LiveLoop, name: str, rms: float, target: str, display: Display, s
         str(int(counts.late[0])),
     ]
     return Row(swatch(name, display.dark) + look(name).label, cells, {"name": name})
+
+
+def control_html(loop: LiveLoop, seconds: float, display: Display) -> str:
+    """Write what every controller leaves, least first; nothing before one runs."""
+    left = loop.control_view(seconds)
+    if left is None or not loop.controllers:
+        return ""
+    c, diameter, column = loop.scenario.control, loop.scenario.telescope.diameter, display.column
+    of = "the disturbance" if loop.source.has_truth else "what its sensor would see, with its noise"
+    columns = {
+        "Controller": "",
+        "Residual [nm]": f"rms of {of}, over the last {seconds:g} s, in the mode shown",
+        "Residual [mas]": "the same; tip and tilt alone",
+        "Since its start [nm]": "after its warm-up",
+        f"Strehl at {c.wavelength:g} µm": f"of all modes together, over the last {seconds:g} s",
+        "Strehl since its start": "after its warm-up",
+    }
+    mas = per_micrometre("mas", diameter) if loop.scenario.modes[column].radial_order == 1 else float("nan")
+    found = {name: (left.rms(name), left.rms_since_start(name)) for name in loop.controllers}
+
+    def cells(now: Array, whole: Array) -> list[str]:
+        ratios = [NOTHING if np.isnan(rms).any() else f"{strehl(rms.tolist(), c.wavelength):.4f}" for rms in (now, whole)]
+        return [*map(_number, (1e3 * now[column], mas * now[column], 1e3 * whole[column])), *ratios]
+
+    order = sorted(found, key=lambda name: inf if isnan(found[name][0][column]) else found[name][0][column])
+    rows = [Row(swatch(name, display.dark) + look(name).label, cells(*found[name]), {"controller": name}) for name in order]
+    return str(table("Controllers of the live loop", columns, [("", rows)]))
 
 
 def peaks_html(finding: Finding | None, scale: float, unit: str) -> str:

@@ -11,13 +11,15 @@ import panel as pn
 import panel_material_ui as pmui
 from bokeh.plotting import figure
 
+from wfsobs.app.controls.fields import SOON
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.status import Status
 from wfsobs.app.copies import EXPLORED, CopiedTask
+from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs.job import CANCELLED, DONE, RUNNING
 from wfsobs.app.jobs.task import IDLE, BackgroundTask
-from wfsobs.app.style import asset, swatch
+from wfsobs.app.style import HEARD, asset, swatch
 from wfsobs.app.views.plots import call
 
 
@@ -70,6 +72,15 @@ def figure_with_caption(title: str, fig: figure) -> pn.Column:
     call(fig, title)
     caption = pn.pane.HTML(f'<div class="caption">{escape(title)}</div>', margin=(8, 0, 0, 0), stylesheets=[asset("style.css")])
     return pn.Column(caption, pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), **WIDE)
+
+
+def group(display: Display, name: str, options: Any) -> pmui.RadioButtonGroup:
+    """Make the buttons of one switch of the display."""
+    widget = pmui.RadioButtonGroup.from_param(
+        display.param[name], options=options, size="small", margin=0, variant="outlined", stylesheets=[HEARD]
+    )
+    widget._debounce = SOON  # type: ignore[misc]
+    return widget
 
 
 def legend(names: Mapping[str, str], dark: bool) -> str:

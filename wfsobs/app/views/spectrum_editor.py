@@ -64,12 +64,25 @@ class SpectrumEditor:
             self.hear, figure=str(fig.name), frame=self._frame(), sizing_mode="stretch_width", margin=0, visible=False
         )
         self.lines = ExtraLines(fig, "predicted", line_alpha=1.0, line_width=1.6, line_dash=[2, 2], level="glyph")
-        self._number, self._moves = 0, False
+        self._number, self._moves, self._rests = 0, False, False
         self._was: dict[str, float] = {}
         store.param.watch(self._follow, "scenario")
         display.param.watch(self._ask, ["mode", "unit", "spectrum", "show", "hidden_lines", "dark"])
         display.param.watch(self._turn, "editing")
         self._turn()
+
+    def turn_to(self, target: str | None) -> None:
+        """Have the handles of another target, where the figure shows another one; none for None."""
+        rests = target is None
+        if rests != self._rests or (target is not None and target != self.target):
+            self.target, self._rests, self._last = target or self.target, rests, []
+            self._follow()
+            self._turn()
+
+    @property
+    def is_on(self) -> bool:
+        """Whether there is something to take hold of."""
+        return self.display.editing and not self._rests
 
     # ------------------------------------------------------------------ what comes in
 
@@ -117,8 +130,8 @@ class SpectrumEditor:
         self._ask()
 
     def _turn(self, *_: object) -> None:
-        self.layer.visible = self.display.editing
-        if self.display.editing:
+        self.layer.visible = self.is_on
+        if self.is_on:
             self.trial = self.store.scenario
             self._ask()
         else:
@@ -128,7 +141,7 @@ class SpectrumEditor:
 
     def _ask(self, *_: object, note: str = "") -> None:
         """Have theory say what it expects of the settings as they would be."""
-        if not self.display.editing or self.display.column >= len(self.trial.modes):
+        if not self.is_on or self.display.column >= len(self.trial.modes):
             return
         if note:
             self._show(note)
@@ -144,7 +157,7 @@ class SpectrumEditor:
         self.frames.ask(self.target, predict, partial(self._land, trial, self._number))
 
     def _land(self, trial: Scenario, reply_to: int, predictions: list[Prediction] | None, why: str) -> None:
-        if not self.display.editing:
+        if not self.is_on:
             return
         self._last = predictions = predictions or []
         if trial == self.store.scenario:

@@ -1,0 +1,116 @@
+"""What is shown of a live loop: figures, detectors and tables, made when there is something to show."""
+
+from __future__ import annotations
+
+from functools import partial
+from time import monotonic
+
+import panel as pn
+import panel_material_ui as pmui
+
+from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display, per_micrometre
+from wfsobs.app.pages.live_controls import LiveControls
+from wfsobs.app.pages.live_figures import LatencyHistogram, RollingSpectra, RollingTraces
+from wfsobs.app.pages.live_stars import Stars
+from wfsobs.app.pages.live_table import Bounds, control_html, events_html, live_html, peaks_html
+from wfsobs.app.pages.live_waterfall import MEASUREMENT, Waterfall
+from wfsobs.app.pages.parts import WIDE, box, figure_with_caption, group, html, line
+from wfsobs.app.store import Store
+from wfsobs.app.views.frames import Frames
+from wfsobs.app.views.spectrum_editor import SpectrumEditor
+from wfsobs.evaluation.theory import Theory
+from wfsobs.live.board import NEXT
+from wfsobs.live.finding import bounds_of
+from wfsobs.live.loop import LiveLoop
+from wfsobs.live.source import SIMULATION
+from wfsobs.live.view import LiveView
+from wfsobs.scenario import Scenario
+
+SLOW = 1.0
+"""Between two tables [s]."""
+GRID = """
+:host { display: grid !important; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 10px; }
+@media (max-width: 1000px) { :host { grid-template-columns: minmax(0, 1fr); } }
+"""
+
+
+class LiveRoom:
+    """The figures and tables of one page."""
+
+    def __init__(self, store: Store, display: Display, controls: LiveControls):
+        self.display, self.store, self.controls = display, store, controls
+        self.traces, self.spectra, self.waterfall = RollingTraces(), RollingSpectra(), Waterfall()
+        self.latencies, self.stars = LatencyHistogram(), Stars()
+        self.table, self.control_table, self.news, self.peaks = html(), html(), html(), html()
+        self.editor: SpectrumEditor | None = None
+        self._table_time = 0.0
+        self._bounds: Bounds = {}
+        self._bounds_of: Scenario | None = None
+        self._spectra_room = figure_with_caption("Spectra", self.spectra.figure)
+
+    def view(self) -> list[pn.Column]:
+        """Return the boxes."""
+        c = self.controls
+        figures = [
+            figure_with_caption("The last seconds", self.traces.figure),
+            self._spectra_room,
+            pn.Column(figure_with_caption("Waterfall", self.waterfall.figure), **WIDE),
+            figure_with_caption("Latencies", self.latencies.figure),
+        ]
+        switches = line(
+            c.window,
+            c.target,
+            group(self.display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS}),
+            group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
+            c.waterfall,
+            pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0),
+        )
+        return [
+            box("Now", switches, c.lines, pn.Column(*figures, **WIDE, stylesheets=[GRID])),
+            box("Observers", self.table, self.peaks),
+            box("Controllers on the same disturbance", c.controllers, self.control_table, self.stars.row),
+            box("Events", self.news),
+        ]
+
+    def draw(self, loop: LiveLoop, view: LiveView) -> None:
+        """Send the present."""
+        display, dark = self.display, self.display.dark
+        target = self._target(loop)
+        scale = per_micrometre(display.unit, loop.scenario.telescope.diameter)
+        active = loop.board.active()
+        names = [name for name in active if name in self.controls.lines.value]
+        before = loop.view(view.n * view.dt + RollingTraces.run_in(display))
+        self.traces.draw(before, view.n, target, names, display, scale, list(loop.events), self._bounds)
+        self.spectra.draw(view, target, names, display, scale)
+        self.latencies.draw(loop.board, names, loop.sampling.dt, dark)
+        what = self.controls.waterfall.value
+        self.waterfall.draw(view, what if what in active else MEASUREMENT, target, display, scale)
+        running = [name for name in self.controls.controllers.value if name in loop.controllers]
+        self.stars.draw(view, loop.control_view(self.controls.window.value), running, loop.scenario, dark)
+        self._edit(loop, target)
+        if monotonic() - self._table_time > SLOW or not loop.is_playing:
+            self._draw_tables(loop, view, target, scale)
+
+    def _target(self, loop: LiveLoop) -> str:
+        """Return what errors are shown of: without truth, of the next measurement."""
+        return self.controls.target.value if loop.source.has_truth else NEXT
+
+    def _draw_tables(self, loop: LiveLoop, view: LiveView, target: str, scale: float) -> None:
+        self._table_time = monotonic()
+        if self._bounds_of is not loop.scenario:
+            self._bounds_of, self._bounds = loop.scenario, {}
+            loop.workshop.do(bounds_of, loop.scenario.to_dict(), then=partial(setattr, self, "_bounds"))
+        self.table.object = live_html(loop, view, target, self.display, scale, self._bounds)
+        self.control_table.object = control_html(loop, self.controls.window.value, self.display)
+        self.news.object = events_html(loop.events, loop.sampling.dt)
+        self.peaks.object = peaks_html(loop.workshop.finding, scale, self.display.unit_label)
+
+    def _edit(self, loop: LiveLoop, target: str) -> None:
+        """Lay the handles over the spectra of a simulation, whose settings they are."""
+        if self.editor is None:
+            if not self.display.editing:
+                return
+            store, session = self.store, self.store.session
+            self.editor = SpectrumEditor(target, self.spectra.figure, store, self.display, Frames(session), Theory())
+            self._spectra_room.append(self.editor.layer)
+        self.editor.turn_to(target if loop.source.name == SIMULATION and target != NEXT else None)
