@@ -208,6 +208,26 @@ def test_a_stream_that_stops_and_is_made_anew(tmp_path: Path, record: wfsobs.Rec
     ]
 
 
+def test_a_frame_that_came_after_the_lgs_frame_waits_for_the_next(tmp_path: Path, record: wfsobs.Record) -> None:
+    """An observer that is late to look: the NGS frame of the next LGS frame is there already. It is neither early nor lost."""
+    name, n = "multirate-multi", 900
+    loop, got = Loop(tmp_path, name), []
+    for row in range(FIRST, n):
+        is_late = row % RATIO == RATIO - 1 and row > 20
+        if row % RATIO == 0 and not (row - 1) > 20:
+            loop.send_ngs(record.z_ngs[row])
+        loop.lgs.write(record.z[row])
+        if is_late and row + 1 < n:
+            loop.send_ngs(record.z_ngs[row + 1])
+        loop.attachment._take(time.monotonic())
+        found = loop.sink.read()
+        assert found is not None
+        got.append(found[1])
+    expected = over_the_record(record, name, FOUND)[: n - FOUND]
+    np.testing.assert_allclose(got[FOUND - FIRST :], expected, rtol=0, atol=close_to(expected))
+    assert len(loop.said) == 3 and loop.attachment.summary()["ngs_late"] == 0
+
+
 def test_an_early_frame_and_a_counter_that_jumps_have_the_place_looked_for_anew(tmp_path: Path, record: wfsobs.Record) -> None:
     loop = Loop(tmp_path, "multirate-optimal")
     loop.run(record, lambda k: k, range(FIRST, 301))
@@ -215,7 +235,7 @@ def test_an_early_frame_and_a_counter_that_jumps_have_the_place_looked_for_anew(
     for row in (301, 302, 303):
         loop.send(record.z[row])
     loop.send_ngs(record.z_ngs[305])
-    loop.send(record.z[304])
+    loop.send(record.z[304])  # written after the NGS frame
     loop.ngs._count[0] += np.uint64(10**6)
     loop.send(record.z[305])
     assert loop.said == ["a frame is 1 LGS frames early: on with the LGS alone until their place is found"]

@@ -140,7 +140,10 @@ class StreamFrames:
         if self._pairs is None:
             self._write(z, self._nothing)
             return
-        for row in self._pairs.add(count, z, self._ring.count, is_missing):
+        assert self._stream is not None
+        write_time = self._stream.write_time
+        is_newest = self._stream.count == count
+        for row in self._pairs.add(count, z, self._ring.count, is_missing or not is_newest, write_time):
             self._write(*row)
 
     def _write(self, z: Array, ngs: Array) -> None:

@@ -29,7 +29,9 @@ class PairedFrames:
         self._nothing = np.full(n_modes, np.nan)
         self._rows: deque[tuple[int, Array, Array]] = deque()
 
-    def add(self, count: int, z: Array, n_sent: int, is_missing: bool = False) -> Iterator[tuple[Array, Array]]:
+    def add(
+        self, count: int, z: Array, n_sent: int, is_missing: bool = False, write_time: int = 0
+    ) -> Iterator[tuple[Array, Array]]:
         """Take an LGS frame, and yield measurements of both sensors that can go out, each (n_modes,) [um].
 
         Parameters
@@ -42,9 +44,12 @@ class PairedFrames:
             Rows that have gone out. The number of a row with an NGS measurement is a multiple of the ratio: where NGS frames have
             another place than before, rows without any measurement go out.
         is_missing : bool
-            Whether it is not there: it waits for the next one that is, as nothing can be told of when an NGS frame has come.
+            Whether it is not there, or not the newest any more: it waits for the next one that is, as nothing can be told of when
+            an NGS frame has come.
+        write_time : int
+            When it was written [ns]; 0 where it is not known.
         """
-        found = None if is_missing else self._ngs.look(count)
+        found = None if is_missing else self._ngs.look(count, write_time)
         if self._ngs.phase is not None:
             n_more = (count - self._ngs.phase - n_sent - len(self._rows)) % self._ngs.ratio
             if n_more:

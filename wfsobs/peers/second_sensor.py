@@ -50,6 +50,11 @@ class SlopeStream:
         return int(self._stream.count)
 
     @property
+    def write_time(self) -> int:
+        """When the last frame was written [ns]."""
+        return round(1e9 * self._stream.write_time)
+
+    @property
     def is_current(self) -> bool:
         """Whether no other stream has taken its name."""
         try:

@@ -171,7 +171,10 @@ class Attachment:
         """
         if self._ngs is None:
             return None, 0
-        found = self._ngs.look(self._count)
+        write_time = self._source.write_time
+        if self._source.count != self._count:  # that of a newer frame: what the NGS has by now waits for it
+            return None, 0
+        found = self._ngs.look(self._count, write_time)
         phase = self._ngs.phase
         if phase is not None and self._frames.align((self._count - phase) % self._ngs.ratio):
             self._expectation = np.full_like(self._expectation, np.nan)

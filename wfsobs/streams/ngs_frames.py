@@ -57,18 +57,24 @@ class NgsStream:
         self._elements, self._count, self._alive = np.array(wiring.elements), stream.first, monotonic()
         self.ratio = wiring.ratio
         self.phase: int | None = None
+        self._write_time = 0
         self._first = 0  # counter of the NGS frame that belongs to the LGS frame `phase`
         self._search, self._pairs = SEARCH, list[tuple[int, int]]()
         self._is_stuck = self._is_off_rate = False
         self._n_frames = self._n_late = self._n_missing = self._too_late = 0
 
-    def look(self, count: int) -> tuple[int, Array] | None:
+    def look(self, count: int, write_time: int = 0) -> tuple[int, Array] | None:
         """Return the NGS frame that has come since the last call.
+
+        Who is late to take an LGS frame may find an NGS frame that has come after it: that waits for the next call. The times
+        at which both were written tell, where both writers say them.
 
         Parameters
         ----------
         count : int
             Counter of the LGS frame that is being taken.
+        write_time : int
+            When that was written [ns]; 0 where it is not known.
 
         Returns
         -------
@@ -78,6 +84,9 @@ class NgsStream:
         """
         if self._stream.count == self._count:
             self._check_alive()
+            return None
+        says_when, self._write_time = write_time > self._write_time > 0, write_time
+        if says_when and self._stream.write_time > write_time:
             return None
         if (frame := self._stream.read(0.0)) is None:  # it is being written: the next LGS frame finds it
             self._check_alive()
@@ -136,7 +145,8 @@ class NgsStream:
         ratio = self.ratio
         offsets = [place - ratio * number for number, place in self._pairs]
         self._pairs = []
-        if max(offsets) - min(offsets) >= ratio:
+        half = len(offsets) // 2
+        if abs(min(offsets[:half]) - min(offsets[half:])) >= 0.5 * ratio:
             if not self._is_off_rate:
                 self._is_off_rate = True
                 rate = (c1 - c0) / (n1 - n0)

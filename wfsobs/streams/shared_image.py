@@ -115,6 +115,12 @@ class SharedImage:
         return int(self._count[0])
 
     @property
+    def write_time(self) -> int:
+        """When its writer says that it wrote the last frame [ns]; what it was made with where the writer does not say."""
+        seconds, rest = struct.unpack_from("<qq", self._map, TIMES + 48)
+        return seconds * 10**9 + rest
+
+    @property
     def is_current(self) -> bool:
         """Whether the file at the path is still this one; a program that starts anew may make another."""
         try:

@@ -27,6 +27,9 @@ class FrameStream(Protocol):
     def count(self) -> int: ...  # noqa: D102
 
     @property
+    def write_time(self) -> int: ...  # noqa: D102
+
+    @property
     def is_current(self) -> bool: ...  # noqa: D102
 
     def read(self, patience: float = ..., /) -> tuple[int, Array] | None: ...  # noqa: D102
