@@ -18,7 +18,10 @@ from wfsobs.app.pages.live import LivePage
 from wfsobs.app.pages.live_table import ranking
 from wfsobs.app.pages.pages import LIVE
 from wfsobs.app.service import Service
+from wfsobs.app.sources import LoadedRecord
 from wfsobs.live.loop import LiveLoop
+from wfsobs.record import Record
+from wfsobs.simulation.loop import simulate
 
 
 @pytest.fixture
@@ -151,3 +154,19 @@ def test_one_job_at_once_is_too_few(page: LivePage, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(page.store.session.service.queue, "_threads", [])
     page.start()
     assert page.work.state == FAILED and "--runs 2" in page.status.object
+
+
+def test_a_record_that_is_loaded_is_played(page: LivePage, dashboard: Dashboard, loop: Any) -> None:
+    """Without NGS frames and without truth: those that need them do not run, and the errors are of the next measurement."""
+    scenario = dashboard.store.scenario
+    made = simulate(scenario)
+    record = Record(y_lgs=made.y_lgs, u=made.u, dt=made.dt)
+    dashboard.store.run_on(LoadedRecord(record, "mine", "key"), scenario)
+    page.controls.running.value = ["kf-multi", "multirate"]
+    live = begin(page, loop)
+    assert live.source.name == "record" and live.board.active() == ["kf-multi"]
+    wait(lambda: live.count > 450)
+    view = live.view(0.1)
+    np.testing.assert_array_equal(view.frames.z, made.z[view.first : view.first + view.n])
+    assert page.draw() and page.picture is not None and "kf-multi" in page.picture.table.object
+    page.work.cancel()

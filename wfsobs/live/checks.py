@@ -43,12 +43,14 @@ def observers_on(source: LiveSource, scenario: Scenario) -> list[str]:
 
     Without NGS frames those that take them are left out; on a stream also those that learn beforehand: there is no record of it.
     """
-    names = default_observers()
-    if source.sampling.ratio is None:
-        names = [name for name in names if "y_ngs" not in OBSERVERS[name].needs]
-    if source.name == STREAM:
-        names = [name for name in names if not learns_beforehand(OBSERVERS[name], scenario)]
-    return names
+    return [name for name in default_observers() if can_run(name, source, scenario)]
+
+
+def can_run(observer: str, source: LiveSource, scenario: Scenario) -> bool:
+    """Return whether a source has what an observer needs."""
+    it = OBSERVERS[observer]
+    has_frames = source.sampling.ratio is not None or "y_ngs" not in it.needs
+    return has_frames and (source.name != STREAM or not learns_beforehand(it, scenario))
 
 
 def learns_beforehand(observer: Observer, scenario: Scenario) -> bool:

@@ -20,8 +20,11 @@ from wfsobs.app.pages.live_controls import LiveControls, Pulse
 from wfsobs.app.pages.live_room import LiveRoom
 from wfsobs.app.pages.live_table import status_line
 from wfsobs.app.pages.parts import WIDE, PageActions, box, html, text
+from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
+from wfsobs.live.checks import can_run
 from wfsobs.live.loop import LiveLoop
+from wfsobs.live.replay import Replay
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.view import LiveView
 from wfsobs.settings.errors import SettingError
@@ -31,9 +34,9 @@ PERIOD = 200
 LOOK_BACK = 120.0
 """What a recording has of the time before it [s]."""
 INTRO = (
-    "Simulates the scenario in the drawer by the clock, in a process of its own; every observer follows it frame by frame in "
-    "another. A change in the drawer, of wind or peaks or noise, fades in within a second; the observers keep their designs "
-    "until they are designed anew."
+    "Simulates the scenario in the drawer by the clock, in a process of its own, or plays the record that is loaded; every "
+    "observer follows it frame by frame in another. A change in the drawer, of wind or peaks or noise, fades in within a second; "
+    "the observers keep their designs until they are designed anew."
 )
 
 
@@ -106,22 +109,18 @@ class LivePage(PageActions):
         self.draw()
 
     def start(self) -> None:
-        """Run the scenario of the drawer, or say in one line why not."""
+        """Run the scenario of the drawer, or the record that is loaded, or say in one line why not."""
         scenario = self.store.scenario.before_events
         try:
             self.store.validate(scenario)
         except SettingError as error:
             self.work.refuse(str(error))
             return
-        self.work.begin(
-            LiveOrder(
-                SimulatedLoop(scenario),
-                scenario,
-                tuple(self.controls.running.value),
-                self.controls.speed.value,
-                tuple(self.controls.controllers.value),
-            )
-        )
+        loaded = self.store.source
+        source = Replay(loaded.record) if isinstance(loaded, LoadedRecord) else SimulatedLoop(scenario)
+        c = self.controls
+        names = tuple(name for name in c.running.value if can_run(name, source, scenario))
+        self.work.begin(LiveOrder(source, scenario, names, c.speed.value, tuple(c.controllers.value)))
 
     @property
     def loop(self) -> LiveLoop | None:
