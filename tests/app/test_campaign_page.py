@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import csv
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
@@ -105,3 +110,35 @@ def test_without_a_campaign_there_is_no_such_page(loop: Any, short: Scenario, en
     dashboard.page()
     assert CAMPAIGN not in dashboard.pages.switch.options.values()
     assert dashboard.view_state.open("view.page=campaign")[0].startswith("view.page = campaign: takes one of explore, ")
+
+
+def test_what_is_copied_has_the_numbers_of_the_page(
+    dashboard: Dashboard, loop: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = open_campaign(dashboard, loop)
+    monkeypatch.chdir(tmp_path.parent)
+    state = page.work.campaign
+    assert state is not None
+    bin_folder = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    done = subprocess.run(
+        f"{dashboard.actions.toolbar.command} --csv",
+        shell=True,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PATH": bin_folder},
+    )
+    assert done.returncode == 0, done.stderr
+    squares: dict[tuple[str, str, str, int], list[float]] = {}
+    for row in csv.DictReader(done.stdout.splitlines()):
+        if row["rms_nm"]:
+            key = row["target"], row["mode"], row["name"], int(row["cell"])
+            squares.setdefault(key, []).append(float(row["rms_nm"]) ** 2)
+    made: dict[str, Any] = {}
+    exec(dashboard.actions.toolbar.python, made)
+    for (target, mode), errors in state.errors.items():
+        assert np.array_equal(made["state"].errors[target, mode].rms, errors.rms, equal_nan=True)
+        for cell, name in np.ndindex(errors.rms.shape):
+            found = squares.get((target, mode, errors.names[name], cell))
+            # the rms over the seeds; of a single float32 the last digit may differ
+            assert (found is None) == bool(np.isnan(errors.rms[cell, name]))
+            assert found is None or np.sqrt(np.mean(found)) == pytest.approx(errors.rms[cell, name], rel=1e-6)

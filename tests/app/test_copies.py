@@ -22,6 +22,7 @@ from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs.job import RUNNING
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.identify import IdentifyPage
+from wfsobs.app.pages.sweep import SweepPage
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.share import from_query
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord
@@ -107,18 +108,17 @@ def columns(dashboard: Dashboard, loop: Any, short: Scenario, tmp_path: Path, mo
     return dashboard
 
 
+def in_shell(command: str) -> str:
+    """What a command prints."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, env={**os.environ, "PATH": path})
+    assert done.returncode == 0, f"{command}\n{done.stderr}"
+    return done.stdout
+
+
 def shell(dashboard: Dashboard) -> Any:
     """What the command that is copied prints as JSON."""
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    done = subprocess.run(
-        f"{dashboard.actions.toolbar.command} --json",
-        shell=True,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PATH": path},
-    )
-    assert done.returncode == 0, f"{dashboard.actions.toolbar.command}\n{done.stderr}"
-    return json.loads(done.stdout.splitlines()[-1])
+    return json.loads(in_shell(f"{dashboard.actions.toolbar.command} --json").splitlines()[-1])
 
 
 def script(dashboard: Dashboard) -> dict[str, Any]:
@@ -195,6 +195,41 @@ def test_tune(board: Dashboard, loop: Any) -> None:
         assert found["settings"] == pytest.approx(expected["settings"], rel=CLOSE)
         for stage in ("before", "after"):
             assert found[stage]["test_um"] == pytest.approx(expected[stage]["test_um"], rel=CLOSE)
+
+
+@pytest.mark.parametrize(
+    "over", [{"turbulence.wind_speed": "5,20"}, {"turbulence.wind_speed": "5,20", "kalman.damping": "0.01,0.1"}]
+)
+def test_sweep(dashboard: Dashboard, loop: Any, tmp_path: Path, monkeypatch: Any, over: dict[str, str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    dashboard.pages.current = "sweep"
+    page = dashboard.pages.by_name["sweep"]
+    assert isinstance(page, SweepPage)
+    (first, values), *second = over.items()
+    page.choose(first)
+    page.values[0].value, page.seeds.value = values, "2"
+    for path, values in second:
+        page.settings[1].value = path
+        page.values[1].value = values
+    page.start()
+    loop.until(lambda: page.work.state != RUNNING, 240)
+    assert page.results is not None
+    expected = page.results.rows()
+    assert len(expected) > 20 * 2 ** len(over)
+    in_shell(f"{dashboard.actions.toolbar.command} --csv sweep.csv")
+    saved = page.saves()["Sweep as CSV"]
+    assert saved is not None
+    on_page = list(csv.DictReader(io.StringIO(saved.content().decode())))
+    for found in (list(csv.DictReader((tmp_path / "sweep.csv").read_text().splitlines())), on_page):
+        assert [list(row) for row in found] == [list(row) for row in expected]
+        for row, shown in zip(found, expected, strict=True):
+            for name, value in shown.items():
+                is_number = isinstance(value, float)
+                assert (float(row[name]) if is_number else row[name]) == (
+                    pytest.approx(value, rel=CLOSE) if is_number else ("" if value is None else str(value))
+                )
+    for row, shown in zip(script(dashboard)["results"].rows(), expected, strict=True):
+        assert row == {name: pytest.approx(v, rel=CLOSE) if isinstance(v, float) else v for name, v in shown.items()}
 
 
 def test_a_link_has_the_simulation_that_is_kept(dashboard: Dashboard, loop: Any, short: Scenario) -> None:

@@ -15,7 +15,7 @@ from wfsobs.scenario import Scenario, configfile
 RECORD, SIMULATION = "wfsobs-record.npz", "wfsobs-simulation.toml"
 """Files of a command: a simulation that is saved, and its settings where they are too long to be written out."""
 
-OBSERVE, LOOP, IDENTIFY, TUNE, SWEEP = "observe", "loop", "identify", "tune", "sweep"
+OBSERVE, LOOP, IDENTIFY, TUNE, SWEEP, CAMPAIGN = "observe", "loop", "identify", "tune", "sweep", "campaign"
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,8 @@ EXPLORED = CopiedTask()
 
 def to_command(scenario: Scenario, preset: str, source: Source | None = None, task: CopiedTask = EXPLORED) -> str:
     """Write the command that prints what a page shows; two where the record has to be simulated first."""
+    if task.what == CAMPAIGN:  # its settings are in its folder
+        return shlex.join(["wfsobs", "campaign", "table", _as_path(task.arguments["folder"])])
     given = _options(scenario, preset, FILE)
     more = [word for name, value in task.arguments.items() for one in _as_list(value) for word in (f"--{name}", str(one))]
     if task.what == SWEEP:  # it simulates the settings, whatever is shown
@@ -41,14 +43,18 @@ def to_command(scenario: Scenario, preset: str, source: Source | None = None, ta
     if source is None and task.what != IDENTIFY:
         return shlex.join(["wfsobs", "run" if task.what == OBSERVE else task.what, *more, *given])
     file, said = (source.name, _stated_options(source)) if isinstance(source, LoadedRecord) else (RECORD, [])
-    # a name that starts with a dash would be read as an option
-    file = f"./{file}" if file.startswith("-") else file
+    file = _as_path(file)
     positional = [file] if task.what in (OBSERVE, IDENTIFY) else ["--record", file]
     command = shlex.join(["wfsobs", task.what, *positional, *more, *given, *said])
     if isinstance(source, LoadedRecord):
         return command
     simulation = _options(source.simulation, preset, SIMULATION) if source else given
     return f"{shlex.join(['wfsobs', 'run', *simulation, '--save', RECORD])} &&\n{command}"
+
+
+def _as_path(name: str) -> str:
+    """Return the name of a file; one that starts with a dash would be read as an option."""
+    return f"./{name}" if name.startswith("-") else name
 
 
 def _as_list(value: Any) -> Sequence[Any]:
@@ -82,6 +88,8 @@ def _stated_options(source: LoadedRecord) -> list[str]:
 
 def to_python(scenario: Scenario, preset: str, source: Source | None = None, task: CopiedTask = EXPLORED) -> str:
     """Write a script that computes and prints what a page shows."""
+    if task.what == CAMPAIGN:
+        return _campaign_script(task.arguments["folder"])
     source = None if task.what == SWEEP else source
     imports, lines = {"import wfsobs"}, [f"scenario = {_scenario_code(scenario, preset, FILE)}"]
     if isinstance(source, LoadedRecord):
@@ -97,6 +105,18 @@ def to_python(scenario: Scenario, preset: str, source: Source | None = None, tas
     if any("configfile." in line for line in lines):
         imports.add("from wfsobs.scenario import configfile")
     return "\n".join([*sorted(imports | more_imports, key=_order), "", *lines, *more_lines, ""])
+
+
+def _campaign_script(folder: str) -> str:
+    return f"""from pathlib import Path
+
+from wfsobs.campaign.follow import CampaignFolder
+
+state = CampaignFolder(Path({folder!r})).read()
+for (target, mode), errors in state.errors.items():
+    for place in errors.standings(range(len(state.plan.cells))):
+        print(target, mode, place.name, place.rms, "nm")
+"""
 
 
 def _order(line: str) -> tuple[bool, str]:
@@ -158,7 +178,8 @@ def _arguments(arguments: Mapping[str, Any]) -> str:
 def _sweep(_has_record: bool, arguments: Mapping[str, Any]) -> Lines:
     axes = ", ".join(f"parse_axis({text!r})" for text in arguments["over"])
     observers = f", {arguments['observer']!r}" if arguments["observer"] else ""
-    return {"from wfsobs.campaign.sweep import parse_axis, plan_sweep, run_sweep"}, [
+    modules = {"sweep": "parse_axis, plan_sweep", "sweep_results": "run_sweep"}
+    return {f"from wfsobs.campaign.{module} import {names}" for module, names in modules.items()}, [
         f"results = run_sweep(plan_sweep(scenario, [{axes}], {arguments['seeds']}{observers}))",
         "for row in results.rows():",
         "    print(*row.values())",

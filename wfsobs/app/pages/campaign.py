@@ -12,6 +12,7 @@ import panel_material_ui as pmui
 
 from wfsobs.app.campaign_work import CampaignTask
 from wfsobs.app.controls.status import Status
+from wfsobs.app.copies import CAMPAIGN, EXPLORED, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.jobs.job import FAILED
 from wfsobs.app.pages.campaign_views import CampaignView, Slice, axis_name, standings_html, value_names, winners_grid
@@ -70,6 +71,12 @@ class CampaignPage(PageActions):
             self.work.look()
             self.draw()
         self._pace()
+
+    @property
+    def task(self) -> CopiedTask:
+        """To print the table of the campaign, whose folder is named as a loaded record is: without where it lies."""
+        folder = self.work.folder
+        return EXPLORED if folder is None else CopiedTask(CAMPAIGN, {"folder": folder.folder.resolve().name})
 
     def tick(self) -> None:
         """Look whether there is something new."""

@@ -20,7 +20,7 @@ from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
 from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.pages.loop_figures import LoopSpectrum, Nyquist, Response, Trace
 from wfsobs.app.pages.loop_table import loop_html, margins_html
-from wfsobs.app.pages.parts import WIDE, PageActions, box, figure_with_caption, html, text
+from wfsobs.app.pages.parts import SMALL_LABEL, WIDE, PageActions, box, figure_with_caption, html, text
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.gain_editor import GainEditor
@@ -57,7 +57,7 @@ class ClosedLoopPage(PageActions):
         self.cards = Cards(items=[], hidden_lines=[], terms={STREHL: TERMS[STREHL]}, sizing_mode="stretch_width", margin=0)
         self.whole, self.zoom = Trace("whole record"), Trace("zoomed")
         self.spectrum, self.response, self.nyquist = LoopSpectrum(), Response(), Nyquist()
-        self.room = figure_with_caption("Rejection and noise transfer", self.response.figure)
+        self.room = figure_with_caption("Rejection and noise transfer", self.response.figure, tall=True)
         self.stability = figure_with_caption("Loop gain L, unit circle", self.nyquist.figure)
         self.editor: GainEditor | None = None
         display.param.watch(self._edit, "editing")
@@ -74,7 +74,7 @@ class ClosedLoopPage(PageActions):
         """Return the contents of the page."""
         figures = pn.Column(
             *(
-                figure_with_caption(title, drawn.figure)
+                figure_with_caption(title, drawn.figure, tall=True)
                 for title, drawn in (
                     ("Residual, whole record", self.whole),
                     ("Spectrum of the residual", self.spectrum),
@@ -100,7 +100,7 @@ class ClosedLoopPage(PageActions):
         )
 
     def _switch(self) -> pmui.Checkbox:
-        return pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0)
+        return pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0, stylesheets=[SMALL_LABEL])
 
     def _edit(self, *_: object) -> None:
         """Make the handle when it is first wanted."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from html import escape
 from types import MappingProxyType
-from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
@@ -13,7 +12,7 @@ import panel_material_ui as pmui
 from wfsobs.app.causes import Causes
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL
 from wfsobs.app.history import History
-from wfsobs.app.pages.parts import WIDE, box, group
+from wfsobs.app.pages.parts import SMALL_LABEL, TALL, WIDE, box, group
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
@@ -37,14 +36,7 @@ GRID = """
 :host { display: grid !important; grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); gap: 10px; }
 @media (max-width: 1000px) { :host { grid-template-columns: minmax(0, 1fr); } }
 """
-TALL: Mapping[str, Any] = MappingProxyType(
-    {**WIDE, "height": 230, "stylesheets": [":host { height: clamp(230px, 42vh, 560px) !important; }"]}
-)
-"""A figure as high as the window has room for, so that a target has its verdict, its cards and its figures in one view."""
-
 GAP = ":host { gap: 10px; }"
-SMALL_LABEL = ".MuiFormControlLabel-label.MuiTypography-root { font-size: 0.8125rem; }"
-"""As large as that of the buttons beside it."""
 ZOOMS: Mapping[str, float | None] = MappingProxyType({"Whole record": None, "2 s": 2.0, "0.2 s": 0.2})
 MARKS = macro("marks", PEAKS, MODEL)
 

@@ -67,11 +67,22 @@ def line(*parts: Any) -> pn.FlexBox:
     return pn.FlexBox(*parts, gap="14px 10px", align_items="center", styles={"padding": "10px 0 4px"}, **WIDE)
 
 
-def figure_with_caption(title: str, fig: figure) -> pn.Column:
-    """Lay out a figure under its caption."""
+SMALL_LABEL = ".MuiFormControlLabel-label.MuiTypography-root { font-size: 0.8125rem; }"
+"""As large as that of the buttons beside it."""
+
+TALL: Mapping[str, Any] = MappingProxyType(
+    {**WIDE, "height": 230, "stylesheets": [":host { height: clamp(230px, 42vh, 560px) !important; }"]}
+)
+"""A figure as high as the window has room for."""
+
+
+def figure_with_caption(title: str, fig: figure, *, tall: bool = False) -> pn.Column:
+    """Lay out a figure under its caption. tall : as high as the window has room for."""
     call(fig, title)
+    if tall:
+        fig.sizing_mode = "stretch_both"
     caption = pn.pane.HTML(f'<div class="caption">{escape(title)}</div>', margin=(8, 0, 0, 0), stylesheets=[asset("style.css")])
-    return pn.Column(caption, pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), **WIDE)
+    return pn.Column(caption, pn.pane.Bokeh(fig, sizing_mode=fig.sizing_mode, margin=0), **(TALL if tall else WIDE))
 
 
 def group(display: Display, name: str, options: Any) -> pmui.RadioButtonGroup:

@@ -38,7 +38,7 @@ FIRST = (("turbulence.wind_speed", "5:25:5"), ("sensors.exposure_ratio", "2,5,10
 SEEDS = 4
 NONE = ""
 QUICK, EVERY = "quick", "every"
-OBSERVERS_OF = {"Without those that learn as they run": QUICK, "All": EVERY}
+OBSERVERS_OF = {"All but those that learn": QUICK, "All": EVERY}
 REDRAW = 0.3
 """Least time between two pictures while runs come in [s]."""
 
