@@ -23,7 +23,7 @@ from wfsobs.campaign.store import add_settings, need_pyarrow, read_results
 from wfsobs.campaign.work import run_rows
 from wfsobs.cli.campaign_results import print_csv, summary_table
 from wfsobs.cli.show import show_table
-from wfsobs.evaluation.scores import BOUNDS
+from wfsobs.evaluation.scores import COMMON_BOUNDS
 from wfsobs.settings.errors import SettingError
 
 KEY_BYTES, ROW_BYTES, FILE_BYTES = 34, 12, 6_000
@@ -69,7 +69,7 @@ def print_plan(plan_file: str, workers: int | None) -> None:
 
 def stored_bytes(plan: Campaign, batches: float) -> float:
     """Return about how many bytes the rows of a plan take in so many files."""
-    keys = len(plan.observers) + len(plan.controllers) + len(BOUNDS)
+    keys = len(plan.observers) + len(plan.controllers) + len(COMMON_BOUNDS)
     return plan.n_runs * (keys * KEY_BYTES + _rows_of_a_run(plan) * ROW_BYTES) + batches * FILE_BYTES
 
 
@@ -96,7 +96,7 @@ def _core_hours(plan: Campaign) -> tuple[float, str]:
 
 def _rows_of_a_run(plan: Campaign) -> int:
     modes = len(plan.cells[0].scenario().modes)
-    observers, controllers = ((len(names) + len(BOUNDS)) * bool(names) for names in (plan.observers, plan.controllers))
+    observers, controllers = ((len(names) + len(COMMON_BOUNDS)) * bool(names) for names in (plan.observers, plan.controllers))
     return modes * (2 * observers + controllers)
 
 
