@@ -1,13 +1,14 @@
 """Measure a live loop and its server beside an empty paced loop.
 
-    python scripts/bench_live.py [--seconds 60] [--pages 5] [--port 5930]
+    python scripts/bench_live.py [--seconds 60] [--pages 5] [--port 5930] [--browser]
 
 Starts `wfsobs live` on the preset paper with the linear observers and the online GPR, opens pages by websocket without a browser,
 and runs an empty loop of the same pace in a process of its own. Prints one JSON object: frames and lost frames; the shares of
 frames that were late by more than 1 ms: an estimate of the slowest observer (`late_share`), what the source sent
 (`late_share_sent`), and the empty loop (`late_share_empty`); how far the observers were behind, sampled every second
 [s]; processor time of the server and all its processes over time [cores]; memory, proportional set size after the first minute
-(or the first tenth) and at the end [MB].
+(or the first tenth) and at the end [MB]. With --browser one more page stands in Chromium, whose processor time does not count;
+how far what it shows is behind the source is read every second [s].
 """
 
 from __future__ import annotations
@@ -16,18 +17,22 @@ import argparse
 import asyncio
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 import time
-from multiprocessing import Process, Value
+from multiprocessing import Manager, Process, Value
 from pathlib import Path
 from urllib.request import urlopen
 
+from playwright.sync_api import sync_playwright
 from visitor import Visitor
 
 LINEAR = ("kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi", "butterworth-cl", "persistence")
 OBSERVERS = (*LINEAR, "gpr-online")
 DT, LATE = 1e-3, 1e-3
+SHOWN = re.compile(r"real time · ([0-9.]+) s ·")
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -50,6 +55,23 @@ def visit(base: str, pages: int) -> None:
         await asyncio.sleep(86_400 + len(kept))
 
     asyncio.run(stay())
+
+
+def watch(url: str, lags, end) -> None:
+    """Keep one page in a browser, and note how far what it shows is behind."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"])
+        page = browser.new_page(viewport={"width": 1400, "height": 1000})
+        page.goto(url)
+        shown = page.get_by_text(SHOWN)
+        shown.wait_for(timeout=120_000)
+        while not end.value:
+            time.sleep(1.0)
+            found, now = SHOWN.search(shown.inner_text()), counts(url)
+            assert found is not None
+            seconds = float(found[1])
+            lags.append(round((now["frames"] + now["lost"]) * DT + now["behind_s"] - seconds, 3))
+        browser.close()
 
 
 def family(pid: int) -> list[int]:
@@ -103,6 +125,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--pages", type=int, default=5)
     parser.add_argument("--port", type=int, default=5930)
+    parser.add_argument("--browser", action="store_true")
     a = parser.parse_args()
     url = f"http://localhost:{a.port}"
     chosen = [word for name in OBSERVERS for word in ("--observer", name)]
@@ -110,6 +133,8 @@ def main() -> None:
     late, frames, end = Value("q", 0), Value("q", 0), Value("b", 0)
     visitors = Process(target=visit, args=(f"localhost:{a.port}", a.pages), daemon=True)
     empty = Process(target=run_empty, args=(late, frames, end), daemon=True)
+    lags = Manager().list()
+    browser = Process(target=watch, args=(url, lags, end))
     try:
         ready = time.monotonic() + 120.0
         while time.monotonic() < ready:
@@ -120,6 +145,8 @@ def main() -> None:
                 pass
             time.sleep(0.5)
         visitors.start()
+        if a.browser:
+            browser.start()
         time.sleep(15.0)  # the pages are open, and their first run is over
         empty.start()
         first, start, cpu = counts(url), time.monotonic(), cpu_seconds(family(server.pid))
@@ -134,6 +161,9 @@ def main() -> None:
         used = cpu_seconds(family(server.pid)) - cpu
         end.value = 1
         empty.join(5)
+        if a.browser:
+            browser.join(30)
+        shown = sorted(lags)
         taken = last["frames"] - first["frames"]
         late_shares = {
             name: round((last[name] * last["frames"] - first[name] * first["frames"]) / max(taken, 1), 5)
@@ -153,14 +183,18 @@ def main() -> None:
                     "cores": round(used / seconds, 3),
                     "memory_mb": {"settled": round(before, 1), "end": round(memory[-1][1], 1)},
                     "pages": pages,
+                    "browser_behind_s": {"median": behind_in_browser[len(lags) // 2], "max": behind_in_browser[-1]}
+                    if lags
+                    else None,
                     "load": os.getloadavg()[0],
                 }
             )
         )
     finally:
         end.value = 1
-        if visitors.pid:
-            visitors.kill()
+        for process in (visitors, browser):
+            if process.pid:
+                process.kill()
         server.terminate()
         server.wait(60)
 
