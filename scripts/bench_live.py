@@ -183,9 +183,7 @@ def main() -> None:
                     "cores": round(used / seconds, 3),
                     "memory_mb": {"settled": round(before, 1), "end": round(memory[-1][1], 1)},
                     "pages": pages,
-                    "browser_behind_s": {"median": behind_in_browser[len(lags) // 2], "max": behind_in_browser[-1]}
-                    if lags
-                    else None,
+                    "browser_behind_s": {"median": shown[len(shown) // 2], "max": shown[-1]} if shown else None,
                     "load": os.getloadavg()[0],
                 }
             )
