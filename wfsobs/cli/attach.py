@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 import click
 import numpy as np
@@ -22,6 +22,7 @@ from wfsobs.settings.group import SettingError
 from wfsobs.stepping import design, prior_in
 from wfsobs.streams.attach import Attachment
 from wfsobs.streams.layout import StreamError
+from wfsobs.streams.network import Publication, Subscription, is_address
 from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage, stream_path
 from wfsobs.streams.watchdog import Fallback, Safety
@@ -31,8 +32,14 @@ from wfsobs.units import UNITS, micrometres_per
 
 @click.command()
 @scenario_options
-@click.option("--in", "source", required=True, metavar="STREAM", help="Pseudo-open-loop modes: a name, or the path of a file.")
-@click.option("--out", "sink", metavar="STREAM", help="Where the estimates go; made if there is none.")
+@click.option(
+    "--in",
+    "source",
+    required=True,
+    metavar="STREAM",
+    help="Pseudo-open-loop modes: a name, the path of a file, or tcp://host:port.",
+)
+@click.option("--out", "sink", metavar="STREAM", help="Where the estimates go, made if there is none; or tcp://*:port.")
 @click.option("--shadow", is_flag=True, help="Write nothing.")
 @click.option("--prior", metavar="FOUND.toml", help="Prior of the observer: the file of `wfsobs identify --out`.")
 @click.option("--observer", "name", default="kf-multi", show_default=True, metavar="ID", help="Observer that runs.")
@@ -89,7 +96,7 @@ def attach(
     seconds: float | None,
     as_json: bool,
 ) -> None:
-    """Run an observer on the shared-memory streams of a running loop (docs/streams.md)."""
+    """Run an observer on the streams of a running loop, in shared memory or by ZeroMQ (docs/streams.md)."""
     if bool(sink) == shadow:
         raise SettingError("attach: takes --out STREAM, or --shadow to write nothing")
     scenario = configfile.scenario_from(preset, config, assignments)
@@ -100,7 +107,7 @@ def attach(
     elements = stream_elements(modes, len(scenario.modes))
     per_unit = micrometres_per(unit, scenario.telescope.diameter)
     try:
-        given = SharedImage(stream_path(source))
+        given = _open_source(source, ngs)
         taken = None if sink is None else _open_sink(sink, given, ngs)
         observer, noise = _design(name, scenario, len(elements), delay - 1, ngs is not None)
         warm_up = max(round(scenario.run.warm_up / scenario.dt), 1)
@@ -118,20 +125,36 @@ def attach(
     except (StreamError, StepError) as error:
         raise SettingError(f"attach: {error}") from None
     if as_json:
-        click.echo(json.dumps(attachment.summary(), allow_nan=False))
+        refused = {"refused": given.n_refused} if isinstance(given, Subscription) else {}
+        click.echo(json.dumps({**attachment.summary(), **refused}, allow_nan=False))
 
 
 def _say(line: str) -> None:
     click.echo(f"wfsobs: attach: {line}", err=True)
 
 
-def _open_sink(name: str, source: SharedImage, ngs: str | None) -> SharedImage:
+def _open_source(name: str, ngs: str | None) -> SharedImage | Subscription:
+    if not is_address(name):
+        return SharedImage(stream_path(name))
+    if ngs is not None:
+        raise SettingError("--ngs: both sensors are read from shared memory alone")
+    return click.get_current_context().with_resource(closing(Subscription(name, _say)))
+
+
+def _open_sink(name: str, source: SharedImage | Subscription, ngs: str | None) -> SharedImage | Publication:
+    dtype = source.header.dtype.name if isinstance(source, SharedImage) else source.dtype
+    if is_address(name):
+        made = click.get_current_context().with_resource(closing(Publication(name, source.n, dtype)))
+        _say(f"{made.path}: estimates go out here")
+        return made
     path = stream_path(name)
     if path.resolve() in {stream_path(one).resolve() for one in (source.path, ngs) if one is not None}:
         raise SettingError(f"--out {name}: is a stream that is read")
     if path.exists():
         return SharedImage(path)
-    return SharedImage.create(path, source.header.shape, dtype=source.header.dtype.name, layout=source.header.layout)
+    if isinstance(source, Subscription):
+        return SharedImage.create(path, (source.n,), dtype=dtype)
+    return SharedImage.create(path, source.header.shape, dtype=dtype, layout=source.header.layout)
 
 
 def _design(name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs: bool) -> tuple[StepObserver, np.ndarray]:

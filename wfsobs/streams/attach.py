@@ -14,7 +14,7 @@ from wfsobs.streams.going_back import GoingBack
 from wfsobs.streams.layout import StreamError
 from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.semaphores import Semaphore
-from wfsobs.streams.shared_image import SharedImage
+from wfsobs.streams.stream import SinkStream, SourceStream
 from wfsobs.streams.tally import Tally
 from wfsobs.streams.watchdog import Watchdog
 from wfsobs.streams.wiring import Wiring, check_elements
@@ -33,9 +33,9 @@ class Attachment:
 
     Parameters
     ----------
-    source : SharedImage
+    source : SourceStream
         Pseudo-open-loop modes, one frame after the other.
-    sink : SharedImage or None
+    sink : SinkStream or None
         Where the estimates go, frames as long as those of the source; None writes nothing.
     observer : StepObserver
         Before its first frame.
@@ -54,8 +54,8 @@ class Attachment:
 
     def __init__(
         self,
-        source: SharedImage,
-        sink: SharedImage | None,
+        source: SourceStream,
+        sink: SinkStream | None,
         observer: StepObserver,
         wiring: Wiring,
         say: Callable[[str], None],

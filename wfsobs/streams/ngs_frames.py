@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from wfsobs.streams.layout import StreamError
-from wfsobs.streams.wiring import FrameStream, NgsWiring, check_elements
+from wfsobs.streams.stream import FrameStream
+from wfsobs.streams.wiring import NgsWiring, check_elements
 from wfsobs.typing import Array
 
 SEARCH = 20

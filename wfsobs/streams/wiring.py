@@ -4,37 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, Self
 
 from wfsobs.streams.layout import StreamError
+from wfsobs.streams.stream import AnyStream
 from wfsobs.streams.watchdog import Safety
 from wfsobs.typing import Array
 
 STUCK = 0.1
 """Time without a frame after which a stream is stuck [s]."""
-
-
-class FrameStream(Protocol):
-    """A stream that is read; see `SharedImage`."""
-
-    path: str
-    first: int
-
-    @property
-    def n(self) -> int: ...  # noqa: D102
-
-    @property
-    def count(self) -> int: ...  # noqa: D102
-
-    @property
-    def write_time(self) -> int: ...  # noqa: D102
-
-    @property
-    def is_current(self) -> bool: ...  # noqa: D102
-
-    def read(self, patience: float = ..., /) -> tuple[int, Array] | None: ...  # noqa: D102
-
-    def reopen(self) -> Self: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -77,7 +54,7 @@ class NgsWiring:
     stuck: float = STUCK
 
 
-def check_elements(stream: FrameStream, elements: Sequence[int]) -> None:
+def check_elements(stream: AnyStream, elements: Sequence[int]) -> None:
     """Raise StreamError where a frame has not all of these numbers."""
     if max(elements) >= stream.n:
         raise StreamError(f"{stream.path}: mode {max(elements)}: a frame has {stream.n} numbers, 0 to {stream.n - 1}")
