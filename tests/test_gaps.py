@@ -178,7 +178,7 @@ def test_what_is_told_nothing_holds_the_last_value() -> None:
     u, n = hold_last(record.u), record.ratio
     np.testing.assert_allclose(by_hand.z, hold_last(pseudo_open_loop(record.y_lgs, u)), atol=1e-12)
     np.testing.assert_allclose(by_hand.z_ngs[n::n], hold_last(replace(record, u=u).z_ngs[n::n]), atol=1e-12)
-    for name in ("persistence", "butterworth-cl", "kf-adaptive", "gpr-online"):
+    for name in ("persistence", "butterworth-cl", "gpr-online"):
         for target, values in run_observer(name, record, scenario()).items():
             np.testing.assert_array_equal(values, run_observer(name, by_hand, scenario())[target])
 

@@ -38,14 +38,14 @@ class MissingSamples:
         Which samples are missing, bool (n,).
     dt : float
         Time step [s].
-    rng : numpy.random.Generator
-        For the records drawn.
+    rng : numpy.random.Generator, optional
+        For the records drawn; who only fills has none.
     """
 
-    def __init__(self, is_missing: Array, dt: float, rng: np.random.Generator):
+    def __init__(self, is_missing: Array, dt: float, rng: np.random.Generator | None = None):
         self.is_missing, self.dt, self.n = is_missing, dt, len(is_missing)
         self.any = bool(is_missing.any())
-        self.noise = rng.standard_normal((DRAWS, self.n)) if self.any else np.zeros((0, self.n))
+        self.noise = rng.standard_normal((DRAWS, self.n)) if self.any and rng is not None else np.zeros((0, self.n))
 
     def rounds(self, left: float) -> int:
         """Return the number of rounds of filling and fitting that leave `left` of the first error; 1 where nothing is missing."""

@@ -11,10 +11,13 @@ anew.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
+from wfsobs.spectral.missing import MissingSamples
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.periodogram import periodogram, periodogram_frequencies
 from wfsobs.spectral.quick_fit import WindowFit
@@ -28,6 +31,8 @@ TRACKED = 0.1
 """Minimum half width of a peak that is tracked, in bins: undamped lines become sharper as the window grows."""
 COARSE = 50, 4
 """As FINE and NEAR of `periodogram`, for long windows: their cells hold many bins."""
+LEFT = 0.02
+"""Share of the error of a first guess by straight lines through gaps that rounds of filling and fitting leave."""
 STARTS = 2
 """Corners of turbulence in the first guess: higher ones converge to the same."""
 
@@ -59,6 +64,33 @@ def quick_spectrum(z: Array, dt: float, most: int, lowest: float = LOWEST, befor
     fit.background()
     _add_peaks(fit, most, lowest)
     return fit.spectrum
+
+
+def quick_spectrum_of_samples(z: Array, dt: float, most: int, lowest: float, before: Spectrum | None) -> tuple[Spectrum, Array]:
+    """Fit as `quick_spectrum` to the samples that are there; z (n,) is NaN where one is missing, by short gaps alone.
+
+    Missing samples are replaced by their expectation given all others, for the spectrum `before`; without one, for that of
+    straight lines through the gaps, then again for what was found. They have no noise: of its density only the measured share
+    is left. What is far above noise is known in a short gap, too.
+
+    Returns
+    -------
+    Spectrum
+        The fit.
+    Array
+        z without gaps, (n,) [um].
+    """
+    samples, level, f = MissingSamples(np.isnan(z), dt), np.nanmean(z), periodogram_frequencies(len(z), dt)
+    filled, measured = samples.interpolate(z), np.sqrt(1.0 - samples.is_missing.mean())
+    if np.ptp(filled) == 0:
+        return quick_spectrum(filled, dt, most, lowest), filled
+    known = before if before is not None and before.processes else None
+    fit = known or quick_spectrum(filled, dt, most, lowest)
+    for _ in range(1 if known else samples.rounds(LEFT)):
+        filled = samples.fill(z - level, fit.psd(f)) + level
+        fit = quick_spectrum(filled, dt, most, lowest, fit)
+        fit = replace(fit, noise=fit.noise / measured)
+    return fit, filled
 
 
 def follow_spectrum(

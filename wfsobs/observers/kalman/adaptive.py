@@ -3,6 +3,9 @@
 It needs no prior and follows changes: noise, turbulence and peaks of every window are identified
 (`wfsobs.spectral.quick`), and the steady-state filter of that model runs until the next. A new filter starts at rest at the
 beginning of its window, so that its state has converged when its estimates begin.
+
+Missing measurements are missing: the filter in charge has the gains that it has near gaps, and a window is identified from the
+samples that it has (`quick_spectrum_of_samples`), those behind its last long gap. Where they are too few the filter goes on.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.adaptive_step import AdaptiveEstimator
 from wfsobs.observers.kalman.spread import target_sd
 from wfsobs.observers.kalman.window_model import NOT_YET, WindowModel, identify_window, lengths, mode_of
+from wfsobs.observers.kalman.with_gaps import run_frames
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling
@@ -78,6 +82,8 @@ def kf_adaptive(measurements: Measurements, _prior: Prior, settings: Adaptive, w
     needed = window + measurements.delay
     if measurements.n_steps < needed:
         raise RecordError(f"the record has {measurements.n_steps} steps; adaptive.window = {settings.window:g} s needs {needed}")
+    if np.isnan(measurements.z).any():
+        return run_frames(AdaptiveEstimator(settings, measurements.sampling), measurements, watch)
     z = measurements.z[measurements.delay :]  # what the mirror did before the record is not known
     columns = []
     for mode in range(measurements.n_modes):  # one after the other: steps as short as these leave a second thread no room
@@ -137,6 +143,7 @@ KF_ADAPTIVE = Observer(
     kf_adaptive,
     help="noise, turbulence and peaks identified anew from the last 4 s, twice a second; not in the paper",
     settings=ADAPTIVE,
+    takes_missing=True,
     tunable=Tunable(("adaptive.window",), ("adaptive.interval",)),  # a shorter interval costs time, which no error shows
     weight=50.0,
     seconds=seconds,

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wfsobs.observers.base import TURBULENCE
+from wfsobs.observers.base import TARGETS, TURBULENCE
+from wfsobs.observers.kalman.gap_bank import STEADY
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.kalman.window_model import (
     NOT_YET,
     WindowModel,
     identify_window,
+    identify_with_gaps,
     lengths,
     mode_of,
     pack_spectrum,
@@ -26,11 +28,14 @@ from wfsobs.typing import Array
 if TYPE_CHECKING:
     from wfsobs.observers.kalman.adaptive import Adaptive
 
+TAIL = 200
+"""Last steps of a window that a new filter takes with their gaps; before them it takes what is expected in these."""
+
 
 class AdaptiveEstimator:
     """`kf_adaptive`, one frame at a time. It identifies in `advance`, in one frame of every interval."""
 
-    horizon, needs_command = None, False
+    horizon, needs_command, uses_ngs = None, False, False
 
     def __init__(self, settings: Adaptive, sampling: Sampling):
         self.settings, self.sampling = settings, sampling
@@ -58,26 +63,43 @@ class AdaptiveEstimator:
         self._samples[:, self._end] = z
         self._end += 1
         full = self.count - self.sampling.delay - self.window
-        if full >= 0 and full % self.interval == 0:
-            for mode in range(len(z)):
-                self._identify(mode)
-            return
-        for kalman, value, mean in zip(self.filters, z, self.means, strict=True):
-            if kalman is not None:
-                kalman.advance(np.array([value - mean]), None, None)
+        is_due = full >= 0 and full % self.interval == 0
+        for mode, value in enumerate(z):
+            kalman = self.filters[mode]
+            if not (is_due and self._identify(mode)) and kalman is not None:
+                kalman.advance(value[None] - self.means[mode], None, None)
 
-    def _identify(self, mode: int) -> None:
-        z = self._samples[mode, self._end - self.window : self._end]
-        self.models[mode] = identify_window(z, self.sampling.dt, self.settings, self.models[mode])
+    def _identify(self, mode: int) -> bool:
+        """Identify the window of a mode; return whether its filter has been started anew."""
+        z, dt = self._samples[mode, self._end - self.window : self._end], self.sampling.dt
+        if np.isnan(z).any():
+            found = identify_with_gaps(z, dt, self.settings, self.models[mode])
+            if found is None:
+                return False
+            self.models[mode], whole = found
+        else:
+            self.models[mode] = identify_window(z, dt, self.settings, self.models[mode])
+            whole = z
         if self.models[mode].spectrum is None:
-            return
-        self.means[mode] = z.mean()
+            return False
+        self.means[mode] = whole.mean()
         self._start(mode)
-        kalman = self.filters[mode]
-        if kalman is not None:
-            gains = kalman.modes[0].gains
-            states = gains.filter(np.eye(len(kalman.modes[0].model.A))).run((z - self.means[mode])[:, None, None])
+        self._run_window(mode, z, whole)
+        return True
+
+    def _run_window(self, mode: int, z: Array, whole: Array) -> None:
+        """Take the filter in charge through its window; z : with its gaps; whole : without, the last part or all of it."""
+        kalman, mean = self.filters[mode], self.means[mode]
+        if kalman is None:
+            return
+        gains, tail = kalman.modes[0].gains, z[z.size - min(TAIL, whole.size - 1) :]
+        states = gains.filter(np.eye(len(kalman.modes[0].model.A))).run((whole - mean)[:, None, None])
+        if not np.isnan(tail).any():
             kalman.bank.x[0] = states[-1, :, 0]
+            return
+        kalman.bank.x[0] = states[-1 - tail.size, :, 0]
+        for value in tail:
+            kalman.advance(value[None] - mean, None, None)
 
     def _start(self, mode: int) -> None:
         """Put the filter that has been found in charge, at rest."""
@@ -94,6 +116,11 @@ class AdaptiveEstimator:
             out[mode] = moving + (mean if target == TURBULENCE else 0.0 * mean)
         return out, sd
 
+    def estimate(self) -> tuple[Array, Array]:
+        """Return the estimates of the last frame, (2, n_modes), and their standard deviations, (2, n_modes)."""
+        values, sd = np.array([self.predict(0, target) for target in TARGETS]).swapaxes(0, 1)
+        return values, sd
+
     def settle(self) -> None:
         """Have nothing left to do."""
 
@@ -101,14 +128,25 @@ class AdaptiveEstimator:
         """Return a copy of the state: the window, what was found in it, and the states of the filters."""
         rows = self.settings.peak_count + 2
         spectra = [[pack_spectrum(one, rows) for one in (found.fit, found.spectrum)] for found in self.models]
-        window, states = np.zeros((len(self.means), self.window)), np.zeros((len(self.means), 3 * rows))
+        n_modes, n = len(self.means), 3 * rows
+        window, states, covariance = np.zeros((n_modes, self.window)), np.zeros((n_modes, n)), np.zeros((n_modes, n, n))
+        near = np.full(n_modes, STEADY)
         size = min(self._end, self.window)
         window[:, self.window - size :] = self._samples[:, self._end - size : self._end]
-        for row, kalman in zip(states, self.filters, strict=True):
+        for mode, kalman in enumerate(self.filters):
             if kalman is not None:
-                row[: kalman.bank.x.shape[1]] = kalman.bank.x[0]
-        counts = np.array([self.count, size])
-        return {"window": window, "spectra": np.array(spectra), "means": self.means.copy(), "states": states, "counts": counts}
+                one = kalman.save()
+                order = one["x"].shape[1]
+                states[mode, :order], near[mode], covariance[mode, :order, :order] = one["x"], *one["near"], *one["covariance"]
+        return {
+            "window": window,
+            "spectra": np.array(spectra),
+            "means": self.means.copy(),
+            "states": states,
+            "near": near,
+            "covariance": covariance,
+            "counts": np.array([self.count, size]),
+        }
 
     def load(self, state: Mapping[str, Array]) -> None:
         """Take over a state."""
@@ -119,13 +157,15 @@ class AdaptiveEstimator:
             self._samples[:, :size] = state["window"][:, self.window - size :]
             self._end = size
         self.means[...] = state["means"]
-        for mode, (packed, x) in enumerate(zip(state["spectra"], state["states"], strict=True)):
+        saved = (state[name] for name in ("spectra", "states", "near", "covariance"))
+        for mode, (packed, x, near, covariance) in enumerate(zip(*saved, strict=True)):
             fit, spectrum = (unpack_spectrum(one, self.sampling.dt) for one in packed)
             self.models[mode] = WindowModel(fit, spectrum, None if spectrum is None else mode_of(spectrum))
             self._start(mode)
             kalman = self.filters[mode]
             if kalman is not None:
-                kalman.bank.x[0] = x[: kalman.bank.x.shape[1]]
+                n = kalman.bank.x.shape[1]
+                kalman.load({"x": x[None, :n], "phase": np.zeros(2), "near": near[None], "covariance": covariance[None, :n, :n]})
 
     def take_over(self, old: Any) -> None:
         """Go on from another design with the same window and as many peaks. Raises StepError."""

@@ -15,7 +15,7 @@ from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.spectral.model import Spectrum
-from wfsobs.spectral.quick import SHORTEST, quick_spectrum
+from wfsobs.spectral.quick import SHORTEST, quick_spectrum, quick_spectrum_of_samples
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
@@ -23,6 +23,11 @@ if TYPE_CHECKING:
 
 STILL = PeriodicFilter([(np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((2, 1)), np.zeros((2, 1)))])
 """The filter of white noise: nothing moves."""
+
+LONG = 0.05
+"""Gap over the window from which on the samples before it are left out: what is far above noise is not known in it."""
+FEWEST, LEAST = 0.75, 0.5
+"""Minimum samples behind the last long gap, over the window; minimum measured share of them."""
 
 
 def lengths(settings: Adaptive, dt: float) -> tuple[int, int]:
@@ -61,6 +66,33 @@ def identify_window(z: Array, dt: float, settings: Adaptive, last: WindowModel) 
             return WindowModel(fit, fit, mode_of(fit))
     except (ValueError, ArithmeticError):
         return WindowModel(fit, last.spectrum, last.mode)
+
+
+def identify_with_gaps(z: Array, dt: float, settings: Adaptive, last: WindowModel) -> tuple[WindowModel, Array] | None:
+    """Identify the model of a window z (n,), NaN where a sample is missing.
+
+    Returns
+    -------
+    tuple or None
+        The model and the samples behind the last long gap, with missing ones replaced by their expectation; None where they are
+        too few, or no filter can be found, and the one in charge goes on.
+    """
+    n, z = len(z), z[_last_long_gap(z) :]
+    if len(z) < max(FEWEST * n, SHORTEST) or np.isnan(z).mean() > 1.0 - LEAST:
+        return None
+    try:
+        with np.errstate(divide="raise", over="raise", invalid="raise"):
+            fit, whole = quick_spectrum_of_samples(z, dt, settings.peak_count, settings.lowest, last.fit)
+            return WindowModel(fit, fit, mode_of(fit)), whole
+    except (ValueError, ArithmeticError):
+        return None
+
+
+def _last_long_gap(z: Array) -> int:
+    """Return where the last long gap of a window ends."""
+    bounds = np.concatenate([[-1], np.flatnonzero(~np.isnan(z)), [len(z)]])
+    ends = bounds[1:][np.diff(bounds) - 1 > LONG * len(z)]
+    return int(ends[-1]) if ends.size else 0
 
 
 def mode_of(spectrum: Spectrum) -> ModeFilter | None:

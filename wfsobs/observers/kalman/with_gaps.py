@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.kalman.frame_step import FrameEstimator
 from wfsobs.observers.kalman.spread import by_name
-from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements
+from wfsobs.typing import Array
 
 
-def run_frames(estimator: KalmanEstimator | FrameEstimator, measurements: Measurements, watch: Watch) -> Estimates:
+class Filters(Protocol):
+    """Filters of all modes in their step form."""
+
+    @property
+    def uses_ngs(self) -> bool: ...  # noqa: D102
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame, NaN where a measurement is missing."""
+        ...
+
+    def estimate(self) -> tuple[Array, Array]:
+        """Return the estimates of the last frame, and their standard deviations."""
+        ...
+
+
+def run_frames(estimator: Filters, measurements: Measurements, watch: Watch) -> Estimates:
     """Run filters over a record with gaps: frame by frame, for all modes at the same time."""
     z, n = measurements.z, measurements.ratio
     z_ngs = measurements.z_ngs if estimator.uses_ngs else None
