@@ -20,7 +20,7 @@ class Place(NamedTuple):
 
 COMMANDS = {
     "arena": Place("arena", "Rank observers and controllers under the same rules on the same records."),
-    "attach": Place("attach", "Run an observer on the shared-memory streams of a running loop."),
+    "attach": Place("attach", "Run an observer on the streams of a running loop, in shared memory or by ZeroMQ."),
     "bench": Place("bench", "Time the observers beside textbook versions, and other libraries if installed."),
     "campaign": Place("campaign", "Run many scenarios and seeds, on many processes or machines."),
     "design": Place("design", "Write a controller for a program elsewhere: C99 with a test, arrays, python-control."),
