@@ -48,7 +48,7 @@ class LivePage(PageActions):
         self.work = LiveTask(store.session)
         self.controls = c = LiveControls()
         self.buttons = c.buttons
-        self.status = html()
+        self.intro, self.status = text(INTRO), html()
         self.room = pn.Column(**WIDE, visible=False)
         self.pulse = Pulse(width=0, height=0, margin=0)
         self.visible = False
@@ -89,7 +89,7 @@ class LivePage(PageActions):
         return pn.Column(
             box(
                 "Live loop",
-                text(INTRO),
+                self.intro,
                 *self.controls.view(),
                 self.status,
                 self.pulse,
@@ -197,6 +197,7 @@ class LivePage(PageActions):
         for name, button in self.buttons.items():
             button.disabled = (work.state == RUNNING) if name == "Start" else not runs
         self.buttons["Stop"].disabled = work.state != RUNNING
+        self.intro.visible = work.state != RUNNING  # room for the figures
         waiting = work.line() if work.place else "Starting …"
         said = {RUNNING: waiting, FAILED: work.message}.get(work.state, "Stopped" if self.picture else "")
         if not runs:
