@@ -13,14 +13,18 @@ import pytest
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs.job import FAILED, RUNNING, Job
 from wfsobs.app.limits import NONE
+from wfsobs.app.live_order import LiveOrder
 from wfsobs.app.numbers import number
 from wfsobs.app.pages.live import LivePage
 from wfsobs.app.pages.live_table import ranking
 from wfsobs.app.pages.pages import LIVE
 from wfsobs.app.service import Service
 from wfsobs.app.sources import LoadedRecord
+from wfsobs.app.store import Store
 from wfsobs.live.loop import LiveLoop
+from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.record import Record
+from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
 
 
@@ -154,6 +158,16 @@ def test_one_job_at_once_is_too_few(page: LivePage, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(page.store.session.service.queue, "_threads", [])
     page.start()
     assert page.work.state == FAILED and "--runs 2" in page.status.object
+
+
+def test_pages_open_with_the_settings_of_the_loop_that_all_watch(loop: Any, enter: Any) -> None:
+    """So that a change in the drawer changes that one setting alone."""
+    session = enter()
+    scenario = PRESETS["night"]().replace({"sensors.lgs_rate": 500.0})
+    session.service.live = LiveOrder(SimulatedLoop(scenario), scenario, (), preset="night")
+    store = Store(loop.queue.put, session)
+    loop.closing.append(store)
+    assert store.scenario == scenario and store.preset == "night" and store.changed_paths() == ["sensors.lgs_rate"]
 
 
 def test_a_record_that_is_loaded_is_played(page: LivePage, dashboard: Dashboard, loop: Any) -> None:

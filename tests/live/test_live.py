@@ -144,7 +144,10 @@ def test_live_numbers_are_those_of_the_recording(session):
         (["--replay", "a.npz", "--in", "b"], "live: --replay and --in are two sources, take one"),
         (["--headless", "--observer", "butterworth-ol"], "looks ahead: it cannot run frame by frame"),
         (["--headless", "--observer", "kf"], "observer 'kf': no such observer; there are"),
-        (["--headless", "--preset", "peak-jump"], "events: a live loop takes none"),
+        (
+            ["--headless", "--preset", "wind-change", "--set", "turbulence.wind_speed=80"],
+            "events: at 11 s turbulence.wind_speed = 160.0: takes a number from 0.1 to 100 m/s",
+        ),
     ],
 )
 def test_what_cannot_run_is_one_line(arguments, line):

@@ -64,10 +64,10 @@ def test_lost_frames_hold_the_command():
         ready.put((0, block))
     frames = SimulatedFrames(paper(), ready)
     before = [frames.next_row(k) for k in range(50)][-1]
-    frames.take({"losses": {"lgs": False, "ngs": True, "loss": 0.0}}, 50)
+    frames.take({"losses": {"lgs": 1.0, "ngs": 0.0}}, 50)
     out = np.array([frames.next_row(k) for k in range(50, 60)])
     assert np.isnan(out[:, :2]).all() and np.all(out[:, 4] == before[4]) and not np.isnan(out[:, 6:]).any()
-    frames.take({"losses": {"lgs": True, "ngs": True, "loss": 0.3}}, 60)
+    frames.take({"losses": {"lgs": 0.3, "ngs": 0.3}}, 60)
     lost = np.isnan([frames.next_row(k)[0] for k in range(60, 1560)]).mean()
     assert lost == pytest.approx(0.3, abs=5 * np.sqrt(0.3 * 0.7 / 1500))  # 5 standard deviations of 1500 draws
 

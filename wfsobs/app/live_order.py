@@ -24,6 +24,7 @@ class LiveOrder:
     key       : names the loop, where all pages watch the same
     record_file : where all its frames go when it ends; none if empty
     log_file  : to which events and alarms are appended; none if empty
+    preset    : where the settings started; none if empty
     """
 
     source: LiveSource
@@ -34,12 +35,13 @@ class LiveOrder:
     key: str = ""
     record_file: str = ""
     log_file: str = ""
+    preset: str = ""
 
     def begin(self, loop: LiveLoop) -> None:
-        """Begin what runs beside it, to record and to raise alarms, if that is wanted; of a stream there are always alarms."""
+        """Begin what runs beside it, to record and to raise alarms: always of a stream or of events."""
         for name in self.controllers:
             loop.control(name, True)
-        if self.log_file or self.source.name == STREAM:
+        if self.log_file or self.source.name == STREAM or loop.programme.scenario.events:
             loop.watch(self.log_file)
         if self.record_file:
             loop.recorder.start()

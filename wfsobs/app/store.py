@@ -41,7 +41,11 @@ class Store(param.Parameterized):
     can_redo = param.Boolean(False, doc="Whether there is an undone change to make again.")
 
     def __init__(self, post: Post, session: Session, scenario: Scenario | None = None):
-        super().__init__(scenario=scenario or PRESETS[next(iter(PRESETS))]())
+        live = session.service.live  # whoever changes a setting of the loop that all watch, changes that one alone
+        if live is not None and scenario is None:
+            super().__init__(scenario=live.scenario, preset=live.preset or next(iter(PRESETS)))
+        else:
+            super().__init__(scenario=scenario or PRESETS[next(iter(PRESETS))]())
         self.session, self.limits = session, session.service.limits
         session.post = post
         self._refusals: dict[str, Any] = {}

@@ -14,10 +14,10 @@ from wfsobs.cli.options import ngs_options, ngs_wiring, scenario_options, stream
 from wfsobs.cli.show import progress_bar, show_table
 from wfsobs.files import check_writable
 from wfsobs.live.attached import StreamSource
-from wfsobs.live.blocks import check_live
 from wfsobs.live.checks import check_slot, observers_on
 from wfsobs.live.control_crew import USUAL
 from wfsobs.live.follow import follow
+from wfsobs.live.programme import acts_of
 from wfsobs.live.recording import open_loop_record, record_of
 from wfsobs.live.replay import Replay
 from wfsobs.live.ring import LiveFrame
@@ -76,8 +76,10 @@ def live(
         if file:
             check_writable(file)
     scenario = configfile.scenario_from(preset, config, assignments)
-    check_live(scenario)
     source = _source(scenario, replay_file, stream, modes, unit)
+    if not isinstance(source, SimulatedLoop):
+        scenario = scenario.before_events
+    acts_of(scenario)
     if ngs is not None:
         source = _with_ngs(source, scenario, ngs, ngs_modes, unit, ngs_lag)
     names = tuple(observers or observers_on(source, scenario))
@@ -91,7 +93,17 @@ def live(
         from wfsobs.app.live_order import LiveOrder
     except ModuleNotFoundError as error:
         raise SettingError(f"live: the page needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
-    order = LiveOrder(source, scenario, names, speed, USUAL, key="live", record_file=record_file or "", log_file=log_file or "")
+    order = LiveOrder(
+        source,
+        scenario,
+        names,
+        speed,
+        USUAL,
+        key="live",
+        record_file=record_file or "",
+        log_file=log_file or "",
+        preset=configfile.preset_name(preset, config),
+    )
     server.serve(server.Options(port=port, open_browser=open_browser, runs=max(2, cpu_count() or 1)), order)
 
 
@@ -141,7 +153,7 @@ def _run_headless(
         frames = LiveFrame(*(np.array(part) for part in zip(*kept, strict=True)))
         is_simulated = isinstance(source, SimulatedLoop)
         record = record_of(frames, scenario) if is_simulated else open_loop_record(frames, source.sampling)
-        save_record(record_file, record, configfile.to_toml(scenario))
+        save_record(record_file, record, configfile.to_toml(scenario.before_events))
     if as_json:
         click.echo(json.dumps(result, allow_nan=False))
         return

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from wfsobs.scenario import Scenario
-from wfsobs.settings.group import SettingError
 from wfsobs.simulation.disturbance import make_disturbance
 from wfsobs.simulation.sensing import measure_open_loop
 from wfsobs.typing import Array
@@ -52,7 +51,7 @@ def endless_blocks(scenario: Scenario, rng: np.random.Generator, length: float =
     Parameters
     ----------
     scenario : Scenario
-        Settings, without events.
+        Settings; their events are left out.
     rng : numpy.random.Generator
         LiveSource of all random numbers.
     length : float
@@ -66,9 +65,10 @@ def endless_blocks(scenario: Scenario, rng: np.random.Generator, length: float =
     Raises
     ------
     SettingError
-        The scenario has events, or the settings exclude each other.
+        The settings exclude each other.
     """
-    check_live(scenario)
+    scenario = scenario.before_events
+    scenario.validate()
     ratio = scenario.sensors.exposure_ratio
     half = max(1, round(0.5 * length / scenario.dt / ratio)) * ratio
     weight = np.sin(0.5 * np.pi * np.arange(half) / half)[:, None]
@@ -77,13 +77,6 @@ def endless_blocks(scenario: Scenario, rng: np.random.Generator, length: float =
         after = _record(scenario, 2 * half, rng)
         yield Block(**{name: _fade(getattr(before, name)[half:], getattr(after, name)[:half], weight) for name in vars(before)})
         before = after
-
-
-def check_live(scenario: Scenario) -> None:
-    """Raise SettingError where a scenario has events, or settings that exclude each other."""
-    if scenario.events:
-        raise SettingError("events: a live loop takes none")
-    scenario.validate()
 
 
 def _record(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> Block:

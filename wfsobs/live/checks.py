@@ -18,7 +18,6 @@ from wfsobs.priors_from.scenario import observer_settings
 from wfsobs.record import Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
-from wfsobs.simulation.loop import record_settings
 from wfsobs.stepping import design
 
 SLOWEST, FASTEST = 0.1, 20.0
@@ -43,7 +42,7 @@ def observers_on(source: LiveSource, scenario: Scenario) -> list[str]:
 
     Without NGS frames those that take them are left out; on a stream also those that learn beforehand: there is no record of it.
     """
-    return [name for name in default_observers() if can_run(name, source, scenario)]
+    return [name for name in default_observers(scenario) if can_run(name, source, scenario)]
 
 
 def can_run(observer: str, source: LiveSource, scenario: Scenario) -> bool:
@@ -63,21 +62,3 @@ def check_speed(speed: float) -> float:
     if not SLOWEST <= speed <= FASTEST:
         raise SettingError(f"speed = {speed:g}: takes a number from {SLOWEST:g} to {FASTEST:g}")
     return speed
-
-
-def needs_new_frames(before: Scenario, now: Scenario) -> bool:
-    """Return whether the open-loop frames of two scenarios differ in more than their random numbers."""
-    trees = [record_settings(scenario) for scenario in (before, now)]
-    for tree in trees:
-        tree.pop("loop", None)
-    return trees[0] != trees[1]
-
-
-def loss_line(lgs: bool, ngs: bool, loss: float) -> str:
-    """Say what of the frames does not arrive.
-
-    >>> loss_line(False, True, 0.1), loss_line(True, True, 0.0)
-    ('lasers out, 10% of frames lost', 'all frames arrive')
-    """
-    parts = [(not lgs, "lasers out"), (not ngs, "no NGS frames"), (loss > 0, f"{loss:.0%} of frames lost")]
-    return ", ".join(line for holds, line in parts if holds) or "all frames arrive"

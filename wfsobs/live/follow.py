@@ -7,26 +7,31 @@ from math import isnan
 from time import sleep
 from typing import Any
 
-from wfsobs.live.blocks import check_live
 from wfsobs.live.board import Counts
 from wfsobs.live.processes import LiveProcesses
+from wfsobs.live.programme import Programme, scenario_on
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.source import LiveSource
 from wfsobs.observers import OBSERVERS
-from wfsobs.priors_from.scenario import as_sampled
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 
 TICK = 0.05
 """Pause between two looks at the observers [s]."""
-LONG_STEPS = ("kf-adaptive", "multirate-adaptive", "gpr-offline")
-"""Observers that are run if named alone."""
+ADAPTIVE = ("kf-adaptive", "multirate-adaptive")
+"""Observers that are run if named, or where there are events; some of their steps are longer than a frame."""
+LONG_STEPS = (*ADAPTIVE, "gpr-offline")
+"""Observers that are run if named alone, where there are no events."""
 
 
-def default_observers() -> list[str]:
-    """Return the ids of the observers that run frame by frame, but for those whose step may be longer than a frame."""
-    return [o.id for o in OBSERVERS.values() if o.step is not None and o.id not in LONG_STEPS]
+def default_observers(scenario: Scenario) -> list[str]:
+    """Return the ids of the observers that run frame by frame, but for those whose step may be longer than a frame.
+
+    Where a scenario has events the adaptive ones run nevertheless.
+    """
+    welcome = ADAPTIVE if scenario.events else ()
+    return [o.id for o in OBSERVERS.values() if o.step is not None and (o.id not in LONG_STEPS or o.id in welcome)]
 
 
 def follow(
@@ -68,20 +73,21 @@ def follow(
     Raises
     ------
     SettingError
-        An observer is unknown or does not run frame by frame, or the scenario has events.
+        An observer is unknown or does not run frame by frame, or an event cannot be played.
     """
-    check_live(scenario)
     for name in observers or ():
         if name not in OBSERVERS:
             raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
-    chosen = list(observers) if observers else default_observers()
+    chosen = list(observers) if observers else default_observers(scenario)
     source = source or SimulatedLoop(scenario)
-    scenario = as_sampled(scenario, source.sampling)
+    told = scenario_on(source, scenario)
+    scenario = told.before_events
     processes = LiveProcesses(source, scenario, tuple(dict.fromkeys(chosen)), speed, n_frames)
     try:
+        programme = Programme(told, processes.feed.tell)
         _await_observers(processes)
         processes.feed.start()
-        _drain(processes, n_frames, keep, report)
+        _drain(processes, lambda frames: programme.play(frames * source.sampling.dt), n_frames, keep, report)
     finally:
         processes.release()
     board, delivery = processes.board, processes.delivery
@@ -122,9 +128,13 @@ def _await_observers(processes: LiveProcesses) -> None:
 
 
 def _drain(
-    processes: LiveProcesses, n_frames: int, keep: Callable[[LiveFrame], None] | None, report: Callable[[float], None]
+    processes: LiveProcesses,
+    play: Callable[[int], None],
+    n_frames: int,
+    keep: Callable[[LiveFrame], None] | None,
+    report: Callable[[float], None],
 ) -> None:
-    """Count every frame, and keep it, until all have been taken or no more come."""
+    """Play events, count every frame, and keep it, until all have been taken or no more come."""
     feed, delivery, kept, reported = processes.feed, processes.delivery, 0, 0
     is_over = False
     while not is_over:
@@ -132,6 +142,7 @@ def _drain(
         is_over = delivery.count >= n_frames or not may_go_on
         if not is_over:
             sleep(TICK)
+        play(feed.ring.count)
         delivery.collect()
         for number in range(kept, delivery.count if keep else 0):
             if keep is not None and (frame := feed.ring.read(number)) is not None:

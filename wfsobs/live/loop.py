@@ -8,17 +8,16 @@ from threading import Event, Thread
 from typing import Any
 from weakref import ReferenceType, finalize, ref
 
-from wfsobs.live.blocks import check_live
-from wfsobs.live.checks import check_slot, check_speed, loss_line, needs_new_frames
+from wfsobs.live.checks import check_slot, check_speed
 from wfsobs.live.control_process import ControlView
 from wfsobs.live.processes import LiveProcesses
+from wfsobs.live.programme import Programme, scenario_on
 from wfsobs.live.recording import Recorder
 from wfsobs.live.shadow import Shadow, append_line
 from wfsobs.live.source import SIMULATION, LiveSource
 from wfsobs.live.view import LiveEvent, LiveView, read_view
 from wfsobs.live.workshop import Workshop
 from wfsobs.observers import OBSERVERS
-from wfsobs.priors_from.scenario import as_sampled
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import sampling_of
@@ -51,20 +50,20 @@ class LiveLoop:
     Raises
     ------
     SettingError
-        An observer is unknown or does not run frame by frame, or the scenario has events.
+        An observer is unknown or does not run frame by frame, or an event cannot be played.
     """
 
     def __init__(self, source: LiveSource, scenario: Scenario, observers: Sequence[str], *, speed: float = 1.0):
-        check_live(scenario)
         for name in observers:
             check_slot(name)
-        self.source, self.scenario, self.sampling = source, as_sampled(scenario, source.sampling), source.sampling
+        self.source, self.sampling, told = source, source.sampling, scenario_on(source, scenario)
         self._speed, self._is_wanted, self._has_begun = check_speed(speed), False, False
         self.events: deque[LiveEvent] = deque(maxlen=MOST_EVENTS)
         self.controllers: set[str] = set()
         self._shadow: Shadow | None = None
         self._log_file = ""
-        self._processes = LiveProcesses(source, self.scenario, tuple(dict.fromkeys(observers)), self._speed)
+        self._processes = LiveProcesses(source, told.before_events, tuple(dict.fromkeys(observers)), self._speed)
+        self.programme = Programme(told, self._processes.feed.tell)
         self.board, self.delivery = self._processes.board, self._processes.delivery
         self.recorder = Recorder(self._processes.feed.ring, self.sampling, self.say, source.name == SIMULATION)
         self.workshop = Workshop(self._processes, self.sampling, self.say)
@@ -106,6 +105,11 @@ class LiveLoop:
         """Ids of the processes of source and observers."""
         return self._processes.pids
 
+    @property
+    def scenario(self) -> Scenario:
+        """The present settings; no events."""
+        return self.programme.present
+
     def play(self) -> None:
         """Have frames come by the clock, once the observers are ready."""
         self._is_wanted, self._has_begun = True, self.is_ready
@@ -129,7 +133,7 @@ class LiveLoop:
 
     def change(self, settings: Mapping[str, Any]) -> None:
         """Change settings, path -> value, of the simulation. Raises SettingError as `become` does."""
-        self.become(self.scenario.replace(settings), ", ".join(f"{path} = {value}" for path, value in settings.items()))
+        self.become(self.programme.scenario.replace(settings), ", ".join(f"{path} = {value}" for path, value in settings.items()))
 
     def become(self, scenario: Scenario, line: str) -> None:
         """Change the settings of the simulation: it fades into that of the new ones; the observers keep their designs.
@@ -137,28 +141,24 @@ class LiveLoop:
         Parameters
         ----------
         scenario : Scenario
-            New settings.
+            New settings, and their events.
         line : str
             For the list of events.
 
         Raises
         ------
         SettingError
-            Modes or rates would change, or the scenario has events; or the source is no simulation.
+            Modes or rates would change, or an event cannot be played; or the source is no simulation.
         """
         if self.source.name != SIMULATION:
             raise SettingError(f"a {self.source.name} has no settings to change")
-        check_live(scenario)
         if sampling_of(scenario) != self.sampling:
             raise SettingError("modes and rates cannot change while the loop runs: start another")
-        is_new = needs_new_frames(self.scenario, scenario)
-        self.scenario = scenario
-        self._processes.feed.tell({"settings": scenario.to_dict(), "is_new": is_new, "line": line})
+        self.programme.become(scenario, line)
 
     def lose(self, *, lgs: bool = True, ngs: bool = True, loss: float = 0.0) -> None:
         """Switch lasers and NGS sensor on and off, and lose a part of the frames."""
-        losses = {"lgs": lgs, "ngs": ngs, "loss": loss}
-        self._processes.feed.tell({"losses": losses, "line": loss_line(lgs, ngs, loss)})
+        self.programme.lose(lgs, ngs, loss)
 
     def switch(self, observer: str, on: bool) -> None:
         """Switch an observer off, or on with a design for the present settings. Raises SettingError."""
@@ -227,6 +227,7 @@ class LiveLoop:
         if self._is_wanted and self.is_ready and not self._has_begun:
             self._has_begun = True
             self._processes.feed.tell({"play": True})
+        self.programme.play(self.newest * self.sampling.dt)
         for number, line in self._processes.news():
             self.say(line, number)
         self.delivery.collect()

@@ -64,9 +64,10 @@ def _make(settings: dict[str, Any], inbox: Connection, ready: Queue[tuple[int, B
     while True:
         block, is_put = next(blocks), False
         while not is_put:
-            if inbox.poll():
-                changed = inbox.recv()["settings"]
+            while inbox.poll():  # only the newest settings are simulated
+                changed, is_put = inbox.recv()["settings"], True
                 generation, blocks = generation + 1, endless_blocks(Scenario.from_dict(changed), rng)
+            if is_put:
                 break
             try:
                 ready.put((generation, block), timeout=0.1)
@@ -158,24 +159,22 @@ class Losses:
 
     Attributes
     ----------
-    lgs, ngs : bool
-        Whether lasers and NGS sensor are on.
-    loss : float
-        Part of the frames that is lost.
+    lgs, ngs : float
+        Shares of the measurements of the two sensors that are lost, 0 to 1.
     """
 
     def __init__(self, n_modes: int):
-        self.lgs, self.ngs, self.loss = True, True, 0.0
+        self.lgs = self.ngs = 0.0
         self._missing, self._rng = np.full(n_modes, np.nan), np.random.default_rng(0)
 
-    def take(self, lgs: bool, ngs: bool, loss: float) -> None:
+    def take(self, lgs: float, ngs: float) -> None:
         """Change what arrives."""
-        self.lgs, self.ngs, self.loss = lgs, ngs, loss
+        self.lgs, self.ngs = lgs, ngs
 
     def apply(self, z: Array, ngs: Array) -> tuple[Array, Array]:
-        """Return the measurements of a frame that arrive; NaN in place of others."""
-        is_lost = self.loss > 0 and self._rng.random() < self.loss
-        return z if self.lgs and not is_lost else self._missing, ngs if self.ngs and not is_lost else self._missing
+        """Return the measurements of a frame that arrive; NaN in place of others. One draw for both: they are lost together."""
+        draw = self._rng.random()
+        return z if draw >= self.lgs else self._missing, ngs if draw >= self.ngs else self._missing
 
 
 class Integrator:

@@ -37,3 +37,13 @@ MUSE_LAYERS = (
     (11000.0, 0.05, 34.3, 0.0),
     (14000.0, 0.05, 17.5, 0.0),
 )
+
+NIGHT_EVENTS: tuple[dict[str, str | float], ...] = (
+    {"kind": "wind", "start": 15.0, "duration": 6.0, "wind_factor": 2.0},
+    {"kind": "laser", "start": 30.0, "duration": 2.0, "lasers": 2},
+    {"kind": "wind", "start": 36.0, "duration": 6.0, "wind_factor": 0.5},
+    {"kind": "frames", "start": 48.0, "duration": 5.0, "sensor": "lgs", "share": 0.1},
+    {"kind": "peak", "start": 60.0, "peak": 2, "frequency_shift": 3.0},
+    {"kind": "frames", "start": 90.0, "duration": 5.0, "sensor": "ngs", "share": 0.5},
+)
+"""Two minutes of the preset night."""

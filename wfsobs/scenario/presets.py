@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from wfsobs.scenario import Scenario
-from wfsobs.scenario.preset_tables import MAVIS_PEAKS, MUSE_LAYERS
+from wfsobs.scenario.preset_tables import MAVIS_PEAKS, MUSE_LAYERS, NIGHT_EVENTS
 
 
 def _system() -> Scenario:
@@ -216,6 +216,18 @@ def lost_frames() -> Scenario:
     return s
 
 
+def night() -> Scenario:
+    """Two minutes in which wind, a line, lasers and frames change: for `wfsobs live`, which plays them over and over.
+
+    As peak-jump. In the first minute the wind doubles and falls back, both lasers are out for 2 s and a tenth of the LGS frames
+    is lost for 5 s. In the second the line is at 50.5 Hz, and half of the NGS frames are lost for 5 s. So the two minutes differ
+    in what is identified.
+    """
+    s = peak_jump()
+    s.update({"run": {"duration": 120.0}, "events": list(NIGHT_EVENTS)})
+    return s
+
+
 PRESETS: dict[str, Callable[[], Scenario]] = {
     "paper": paper,
     "strong-turbulence": strong_turbulence,
@@ -229,4 +241,5 @@ PRESETS: dict[str, Callable[[], Scenario]] = {
     "wind-change": wind_change,
     "laser-dropout": laser_dropout,
     "lost-frames": lost_frames,
+    "night": night,
 }

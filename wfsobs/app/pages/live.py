@@ -110,7 +110,7 @@ class LivePage(PageActions):
 
     def start(self) -> None:
         """Run the scenario of the drawer, or the record that is loaded, or say in one line why not."""
-        scenario = self.store.scenario.before_events
+        scenario = self.store.scenario
         try:
             self.store.validate(scenario)
         except SettingError as error:
@@ -186,8 +186,8 @@ class LivePage(PageActions):
         """Change the loop as the settings in the drawer have changed."""
 
         def become(loop: LiveLoop) -> None:
-            if (wanted := event.new.before_events) != loop.scenario:
-                loop.become(wanted, name_of_difference(loop.scenario, wanted))
+            if (wanted := event.new) != (before := loop.programme.scenario):
+                loop.become(wanted, name_of_difference(before, wanted))
 
         self._do(become)
 

@@ -15,6 +15,7 @@ from wfsobs.app.pages.parts import WIDE, line
 from wfsobs.app.style import asset, look
 from wfsobs.live.board import SLOTS
 from wfsobs.live.control_crew import SEATS, USUAL
+from wfsobs.live.follow import ADAPTIVE
 from wfsobs.live.loop import LiveLoop
 from wfsobs.observers.base import TARGETS
 
@@ -92,6 +93,8 @@ class LiveControls:
     def tell(self, loop: LiveLoop) -> None:
         """Show what runs."""
         self.running.value = loop.board.active()
+        shown = self.lines.value
+        self.lines.value = [*shown, *(name for name in ADAPTIVE if name in self.running.value and name not in shown)]
         self.controllers.value = [name for name in SEATS if name in loop.controllers]
 
     def view(self) -> list[Any]:
