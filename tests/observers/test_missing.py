@@ -179,7 +179,7 @@ def test_bands_hold_what_they_say_in_a_gap(name: str) -> None:
     assert STEPS >= GAPS[-1].stop
 
 
-@pytest.mark.parametrize("name", [*WITH_MODEL, "kf-adaptive"])
+@pytest.mark.parametrize("name", [*WITH_MODEL, "kf-adaptive", "multirate-adaptive"])
 def test_stated_frame_by_frame_as_over_a_record(name: str) -> None:
     """And a state saved within a gap goes on."""
     record, scenario = dropout(**{"adaptive.window": 0.2, "adaptive.interval": 0.05})

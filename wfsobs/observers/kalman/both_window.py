@@ -74,8 +74,12 @@ def window_start(end: int, change: int, lengths: Lengths) -> int:
 
 
 def is_still(surprise: Array) -> bool:
-    """Return whether squared innovations over their variances (n,) are as large as they should be."""
-    return bool(STILL[0] < surprise.mean() < STILL[1])
+    """Return whether squared innovations over their variances (n,) are as large as they should be; NaN where none is.
+
+    Of fewer than half it is not told.
+    """
+    there = surprise[~np.isnan(surprise)]
+    return 2 * there.size < surprise.size or bool(STILL[0] < there.mean() < STILL[1])
 
 
 class BothModel(NamedTuple):
@@ -102,21 +106,35 @@ def identify_both(z: Array, frames: Array, dt: float, settings: Adaptive, last: 
     try:
         with np.errstate(divide="raise", over="raise", invalid="raise"):
             error = quick_spectrum(z.reshape(-1, ratio).mean(axis=1) - frames, dt * ratio, 0, settings.lowest, last.error)
-            e = (error.turbulence.at(dt),) if isinstance(error.turbulence, Ar2) else ()
-            most = settings.peak_count * (2 if len(z) * dt >= 2.0 * settings.window else 1)
-            before = last.spectrum
-            if before is None and e:  # of about the same corner: a guess that needs no search
-                before = Spectrum(error.noise, dt, replace(e[0], rms=float(z.std())))
-            spectrum = follow_spectrum(z, dt, most, settings.lowest, before, *e)
-            ngs = max(error.noise * np.sqrt(max(1.0 - spectrum.noise**2 / ratio / error.noise**2, LEAST)), MIN_NOISE)
-            return BothModel(spectrum, error, ngs, model_cycle(spectrum, error, ngs, ratio))
+            return fit_both(z, error, ratio, settings, last.spectrum)
     except (ValueError, ArithmeticError):
         return last
 
 
+def fit_both(z: Array, error: Spectrum, ratio: int, settings: Adaptive, before: Spectrum | None, share: float = 1.0) -> BothModel:
+    """Return the model of z (n,) and the spectrum of the difference. Raises ValueError and ArithmeticError.
+
+    share : of z that was measured; the rest is its expectation, without noise
+    """
+    dt, e = error.dt / ratio, error_process(error, error.dt / ratio)
+    most = settings.peak_count * (2 if len(z) * dt >= 2.0 * settings.window else 1)
+    if before is None and e:  # of about the same corner: a guess that needs no search
+        before = Spectrum(error.noise, dt, replace(e[0], rms=float(z.std())))
+    spectrum = follow_spectrum(z, dt, most, settings.lowest, before, *e)
+    of_lgs = spectrum.noise**2 / ratio
+    ngs = max(error.noise * np.sqrt(max(1.0 - of_lgs / error.noise**2, LEAST)), MIN_NOISE)
+    spectrum = replace(spectrum, noise=spectrum.noise / np.sqrt(share))
+    return BothModel(spectrum, error, ngs, model_cycle(spectrum, error, ngs, ratio))
+
+
+def error_process(error: Spectrum, dt: float) -> tuple[Ar2, ...]:
+    """Return what the LGS alone see as a process of the fast steps, if there is any."""
+    return (error.turbulence.at(dt),) if isinstance(error.turbulence, Ar2) else ()
+
+
 def model_cycle(spectrum: Spectrum, error: Spectrum, ngs: float, ratio: int) -> Cycle:
     """Return what is estimated by a model. Raises ValueError and ArithmeticError where it has no filter."""
-    e = (error.turbulence.at(spectrum.dt),) if isinstance(error.turbulence, Ar2) else ()
+    e = error_process(error, spectrum.dt)
     turbulence = () if spectrum.turbulence is None else (spectrum.turbulence,)
     model = beam_model(Beams(turbulence), spectrum.resonances)
     return estimated_cycle(model, ratio, max(spectrum.noise, MIN_NOISE), ngs, e)

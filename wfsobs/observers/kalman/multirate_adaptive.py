@@ -29,6 +29,7 @@ from wfsobs.observers.kalman.multirate_adaptive_step import BothEstimator
 from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_filter
 from wfsobs.observers.kalman.single import NGS
 from wfsobs.observers.kalman.spread import target_sd
+from wfsobs.observers.kalman.with_gaps import run_frames
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling
@@ -46,6 +47,8 @@ def multirate_adaptive(measurements: Measurements, _prior: Prior, settings: Adap
     needed = lengths.first + lengths.window
     if measurements.n_steps < needed:
         raise RecordError(f"the record has {measurements.n_steps} steps; adaptive.window = {settings.window:g} s needs {needed}")
+    if np.isnan(measurements.z).any() or np.isnan(measurements.z_ngs[lengths.ratio :: lengths.ratio]).any():
+        return run_frames(BothEstimator(settings, measurements.sampling), measurements, watch)
     v = np.stack([measurements.z, np.nan_to_num(measurements.z_ngs)], axis=1)
     columns = []
     for mode in range(measurements.n_modes):
@@ -123,6 +126,7 @@ MULTIRATE_ADAPTIVE = Observer(
     help="both sensors; noises, turbulence, peaks and the error of the LGS identified from windows that grow; not in the paper",
     settings=ADAPTIVE,
     needs=NGS,
+    takes_missing=True,
     sensors=("lgs", "ngs"),
     tunable=Tunable(("adaptive.window",), ("adaptive.longest", "adaptive.interval")),
     weight=50.0,

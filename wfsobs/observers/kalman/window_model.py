@@ -77,8 +77,8 @@ def identify_with_gaps(z: Array, dt: float, settings: Adaptive, last: WindowMode
         The model and the samples behind the last long gap, with missing ones replaced by their expectation; None where they are
         too few, or no filter can be found, and the one in charge goes on.
     """
-    n, z = len(z), z[_last_long_gap(z) :]
-    if len(z) < max(FEWEST * n, SHORTEST) or np.isnan(z).mean() > 1.0 - LEAST:
+    n, z = len(z), z[last_long_gap(z, LONG * len(z)) :]
+    if len(z) < max(FEWEST * n, SHORTEST) or not is_enough(z):
         return None
     try:
         with np.errstate(divide="raise", over="raise", invalid="raise"):
@@ -88,10 +88,15 @@ def identify_with_gaps(z: Array, dt: float, settings: Adaptive, last: WindowMode
         return None
 
 
-def _last_long_gap(z: Array) -> int:
-    """Return where the last long gap of a window ends."""
+def is_enough(z: Array) -> bool:
+    """Return whether as many samples as an identification takes are there, not NaN."""
+    return bool(np.isnan(z).mean() <= 1.0 - LEAST)
+
+
+def last_long_gap(z: Array, most: float) -> int:
+    """Return where the last gap of more than `most` samples ends, 0 without one."""
     bounds = np.concatenate([[-1], np.flatnonzero(~np.isnan(z)), [len(z)]])
-    ends = bounds[1:][np.diff(bounds) - 1 > LONG * len(z)]
+    ends = bounds[1:][np.diff(bounds) - 1 > most]
     return int(ends[-1]) if ends.size else 0
 
 
