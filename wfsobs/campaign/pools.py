@@ -114,7 +114,8 @@ class DaskCluster:
             import distributed
         except ImportError:
             raise SettingError('--scheduler: needs dask: pip install "wfsobs[dask]"') from None
-        for name in ("distributed", "distributed.client"):  # what they say of a scheduler that is gone is told here
+        # What they say of a scheduler that is gone is told here; the last one of callbacks that find its client closed.
+        for name in ("distributed", "distributed.client", "tornado.application"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
         self._connect: Callable[[], Any] = lambda: distributed.Client(
             address, timeout=DASK_TIMEOUT, set_as_default=False, name="wfsobs"
