@@ -246,6 +246,7 @@ def test_time_windows(open_report: Any) -> None:
     choose(page, "0.5 s")
     assert line(page, "trace-turbulence", "truth")["range"] == line(page, "trace-vibration", "truth")["range"] == [0.75, 1.25]
     choose(page, "Whole record")
+    page.locator("#trace-vibration").scroll_into_view_if_needed()
     box = page.locator("#trace-vibration").bounding_box()
     assert box is not None
     across = [box["x"] + box["width"] * part for part in (0.4, 0.6)]
