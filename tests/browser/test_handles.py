@@ -168,9 +168,10 @@ def test_gain_of_the_integrator(page: Page, name: str) -> None:
     page.get_by_role("button", name="Undo").click()
     expect(margin).to_have_text(before)
     stood = gain.get_attribute("aria-valuenow")
-    gain.focus()
-    page.keyboard.press("Shift+ArrowLeft")
-    expect(margin).not_to_have_text(before)
+    while margin.inner_text() == before:  # a result that comes in makes the handles anew: the key is pressed again
+        gain.focus()
+        page.keyboard.press("Shift+ArrowLeft")
+        page.wait_for_timeout(500)
     assert float(gain.get_attribute("aria-valuenow") or "nan") < float(stood or "nan"), "to the left"
     page.keyboard.press("Escape")
     expect(margin).to_have_text(before)
