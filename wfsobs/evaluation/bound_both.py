@@ -8,6 +8,7 @@ turbulence.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
 
@@ -17,7 +18,7 @@ from scipy.special import diric
 from wfsobs.evaluation.bound import TOTAL
 from wfsobs.scenario import Scenario
 from wfsobs.signal.slow_sensor import SlowSensor, variance_from_frames
-from wfsobs.signal.wiener import Complex, advance_spectrum, causal_error, factorise
+from wfsobs.signal.wiener import Complex, Whitener, advance_spectrum, causal_error, factorise
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array
 
@@ -60,17 +61,40 @@ def least_errors_of_both(spectra: TrueSpectra, ahead: int = 0) -> dict[str, Peri
     dict of str to PeriodicError
         Target -> error; TOTAL is that of both together.
     """
-    known, names = spectra.without_lines, list(spectra.signal)
+    known = spectra.without_lines
     ngs, whitener = known.ngs, factorise(known.measurement)
-    exposure = exposure_response(ngs.ratio, known.measurement.size)
-    frames = SlowSensor(
-        ngs.signal * np.abs(exposure) ** 2, advance_spectrum(ngs.measurement_cross * exposure, 1), ngs.noise, ngs.ratio
-    )
-    fast = [advance_spectrum(known.cross[name], 1 + ahead) for name in names]
-    slow = [advance_spectrum(ngs.cross[name] * exposure.conj(), ahead) for name in names]
-    gained = variance_from_frames(list(zip(fast, slow, strict=True)), whitener, frames)
-    alone = {name: causal_error(known.signal[name], fast[i], whitener) - gained[:, i, i] for i, name in enumerate(names)}
-    total = causal_error(known.total[0], np.sum(fast, axis=0), whitener) - gained.sum(axis=(1, 2))
+    frames, exposure = ngs_frames(known)
+    fast = {name: advance_spectrum(cross, 1 + ahead) for name, cross in known.cross.items()}
+    slow = [advance_spectrum(ngs.cross[name] * exposure.conj(), ahead) for name in fast]
+    gained = variance_from_frames(list(zip(fast.values(), slow, strict=True)), whitener, frames)
+    return least_errors(known, fast, gained, whitener)
+
+
+def ngs_frames(spectra: TrueSpectra) -> tuple[SlowSensor, Complex]:
+    """Return the NGS as a slow sensor beside z, and the response of its exposure."""
+    ngs, exposure = spectra.ngs, exposure_response(spectra.ngs.ratio, spectra.measurement.size)
+    cross = advance_spectrum(ngs.measurement_cross * exposure, 1)
+    return SlowSensor(ngs.signal * np.abs(exposure) ** 2, cross, ngs.noise, ngs.ratio), exposure
+
+
+def least_errors(
+    spectra: TrueSpectra, fast: Mapping[str, Complex], gained: Array, whitener: Whitener
+) -> dict[str, PeriodicError]:
+    """Return the minimum error of each target, and of both together.
+
+    Parameters
+    ----------
+    spectra : TrueSpectra
+        Without the lines that are known.
+    fast : mapping of str to Array
+        Target -> cross spectrum of it and z.
+    gained : Array
+        Covariance of what the other sensors tell of the targets, (ratio, targets, targets) [um^2].
+    whitener : Whitener
+        Minimum-phase factor of the spectrum of z.
+    """
+    alone = {name: causal_error(spectra.signal[name], fast[name], whitener) - gained[:, i, i] for i, name in enumerate(fast)}
+    total = causal_error(spectra.total[0], np.sum(list(fast.values()), axis=0), whitener) - gained.sum(axis=(1, 2))
     return {name: PeriodicError(np.maximum(variance, 0.0)) for name, variance in (*alone.items(), (TOTAL, total))}
 
 

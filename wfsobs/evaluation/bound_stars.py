@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from wfsobs.evaluation.bound import TOTAL
-from wfsobs.evaluation.bound_both import PeriodicError, exposure_response
+from wfsobs.evaluation.bound_both import PeriodicError, least_errors, ngs_frames
 from wfsobs.scenario import Scenario
 from wfsobs.signal.sensor_array import FastSensors, variance_from_sensors
-from wfsobs.signal.slow_sensor import SlowSensor
-from wfsobs.signal.wiener import advance_spectrum, causal_error, factorise
+from wfsobs.signal.wiener import advance_spectrum, factorise
 from wfsobs.simulation.star_spectra import StarSpectra, star_spectra
 
 
@@ -33,26 +31,20 @@ def least_errors_of_stars(spectra: StarSpectra, ahead: int = 0) -> dict[str, Per
     dict of str to PeriodicError
         Target -> error; TOTAL is that of both together.
     """
-    known, names = spectra.mean.without_lines, list(spectra.mean.signal)
+    known = spectra.mean.without_lines
     ngs, whitener = known.ngs, factorise(known.measurement)
-    exposure = exposure_response(ngs.ratio, known.measurement.size)
-    frames = SlowSensor(
-        ngs.signal * np.abs(exposure) ** 2, advance_spectrum(ngs.measurement_cross * exposure, 1), ngs.noise, ngs.ratio
-    )
+    frames, exposure = ngs_frames(known)
     others = FastSensors(spectra.differences, spectra.cross, advance_spectrum(spectra.ngs_cross * exposure, 1))
+    fast = {name: advance_spectrum(cross, 1 + ahead) for name, cross in known.cross.items()}
     wanted = [
         (
-            advance_spectrum(known.cross[name], 1 + ahead),
+            of_z,
             advance_spectrum(ngs.cross[name] * exposure.conj(), ahead),
             advance_spectrum(spectra.axis_cross, 1 + ahead) if name == "turbulence" else np.zeros_like(spectra.cross),
         )
-        for name in names
+        for name, of_z in fast.items()
     ]
-    gained = variance_from_sensors(wanted, whitener, others, frames)
-    alone = {name: causal_error(known.signal[name], wanted[i][0], whitener) - gained[:, i, i] for i, name in enumerate(names)}
-    fast = np.sum([of_z for of_z, _, _ in wanted], axis=0)
-    total = causal_error(known.total[0], fast, whitener) - gained.sum(axis=(1, 2))
-    return {name: PeriodicError(np.maximum(variance, 0.0)) for name, variance in (*alone.items(), (TOTAL, total))}
+    return least_errors(known, fast, variance_from_sensors(wanted, whitener, others, frames), whitener)
 
 
 def bound_rms_of_stars(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:
