@@ -16,6 +16,20 @@ from wfsobs.record import Record, Training
 from wfsobs.scenario import Scenario
 from wfsobs.testing import QUICK
 
+MATCHED = Scenario().replace(
+    {
+        "vibration.source": "ar2",
+        "vibration.peaks": [{"frequency": 47.5, "damping": 0.03, "rms": [0.05, 0.03]}],
+        "kalman.frequency": 47.5,
+        "kalman.damping": 0.03,
+        "kalman.process_noise": "matched",
+        "sensors.lgs_low_frequency_rms": 0.05,
+        "sensors.lgs_rate": 250.0,
+        "loop.closed": False,
+    }
+)
+"""Its truth is the model of `multirate-optimal` and, with its one line, of `multirate-multi`."""
+
 
 def recorded(scenario: Scenario) -> Record:
     """Return the record of a scenario, kept in a file of the session (conftest.py)."""

@@ -7,6 +7,7 @@ from math import sqrt
 import numpy as np
 import pytest
 
+from tests.records import MATCHED
 from wfsobs.evaluation.bound_both import bound_rms_of_both
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.execution import run_observer
@@ -15,23 +16,9 @@ from wfsobs.observers.kalman.multirate_optimal import optimal_model
 from wfsobs.prior import LgsError, Model
 from wfsobs.priors_from.scenario import model_of, prior_of
 from wfsobs.priors_from.turbulence import lgs_error_of
-from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.riccati import periodic_steady_state
 from wfsobs.simulation.loop import simulate
-
-# The truth is the model of `multirate-optimal` and, with its one line, of `multirate-multi`.
-MATCHED = Scenario().replace(
-    {
-        "vibration.source": "ar2",
-        "vibration.peaks": [{"frequency": 47.5, "damping": 0.03, "rms": [0.05, 0.03]}],
-        "kalman.frequency": 47.5,
-        "kalman.damping": 0.03,
-        "kalman.process_noise": "matched",
-        "sensors.lgs_low_frequency_rms": 0.05,
-        "sensors.lgs_rate": 250.0,
-    }
-)
 
 
 @pytest.mark.parametrize("name", ["multirate-optimal", "multirate-multi"])

@@ -5,26 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.records import MATCHED
 from wfsobs.closed_loop.design import design
 from wfsobs.closed_loop.exact_residuals import exact_residuals
 from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.bound_both import bound_rms_of_both
-from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
-
-MATCHED = Scenario().replace(
-    {
-        "vibration.source": "ar2",
-        "vibration.peaks": [{"frequency": 47.5, "damping": 0.03, "rms": [0.05, 0.03]}],
-        "kalman.frequency": 47.5,
-        "kalman.damping": 0.03,
-        "kalman.process_noise": "matched",
-        "sensors.lgs_low_frequency_rms": 0.05,
-        "sensors.lgs_rate": 250.0,
-        "loop.closed": False,
-    }
-)
 
 
 @pytest.mark.parametrize("name", ["integrator", "lqg-kf-lgs", "lqg-kf-multi"])

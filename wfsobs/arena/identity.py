@@ -1,7 +1,7 @@
 """What the results of an entry depend on: its code, with all of its package and of wfsobs that this imports.
 
 A comment in any of it makes an entry run anew, too; that takes time, while a result of other code would be wrong. Packages beside
-these two do not count, and what a module imports by a name made at run time is not digests.
+these two do not count, and what a module imports by a name made at run time is not in the digest.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def least_errors_of_both(spectra: TrueSpectra, ahead: int = 0) -> dict[str, Peri
     fast = {name: advance_spectrum(cross, 1 + ahead) for name, cross in known.cross.items()}
     slow = [advance_spectrum(ngs.cross[name] * exposure.conj(), ahead) for name in fast]
     gained = variance_from_frames(list(zip(fast.values(), slow, strict=True)), whitener, frames)
-    return least_errors(known, fast, gained, whitener)
+    return target_errors(known, fast, gained, whitener)
 
 
 def ngs_frames(spectra: TrueSpectra) -> tuple[SlowSensor, Complex]:
@@ -77,8 +77,8 @@ def ngs_frames(spectra: TrueSpectra) -> tuple[SlowSensor, Complex]:
     return SlowSensor(ngs.signal * np.abs(exposure) ** 2, cross, ngs.noise, ngs.ratio), exposure
 
 
-def least_errors(
-    spectra: TrueSpectra, fast: Mapping[str, Complex], gained: Array, whitener: Whitener
+def target_errors(
+    spectra: TrueSpectra, fast: Mapping[str, Complex], reduction: Array, whitener: Whitener
 ) -> dict[str, PeriodicError]:
     """Return the minimum error of each target, and of both together.
 
@@ -88,13 +88,13 @@ def least_errors(
         Without the lines that are known.
     fast : mapping of str to Array
         Target -> cross spectrum of it and z.
-    gained : Array
+    reduction : Array
         Covariance of what the other sensors tell of the targets, (ratio, targets, targets) [um^2].
     whitener : Whitener
         Minimum-phase factor of the spectrum of z.
     """
-    alone = {name: causal_error(spectra.signal[name], fast[name], whitener) - gained[:, i, i] for i, name in enumerate(fast)}
-    total = causal_error(spectra.total[0], np.sum(list(fast.values()), axis=0), whitener) - gained.sum(axis=(1, 2))
+    alone = {name: causal_error(spectra.signal[name], fast[name], whitener) - reduction[:, i, i] for i, name in enumerate(fast)}
+    total = causal_error(spectra.total[0], np.sum(list(fast.values()), axis=0), whitener) - reduction.sum(axis=(1, 2))
     return {name: PeriodicError(np.maximum(variance, 0.0)) for name, variance in (*alone.items(), (TOTAL, total))}
 
 

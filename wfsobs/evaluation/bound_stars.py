@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wfsobs.evaluation.bound_both import PeriodicError, least_errors, ngs_frames
+from wfsobs.evaluation.bound_both import PeriodicError, ngs_frames, target_errors
 from wfsobs.scenario import Scenario
 from wfsobs.signal.sensor_array import FastSensors, variance_from_sensors
 from wfsobs.signal.wiener import advance_spectrum, factorise
@@ -44,7 +44,7 @@ def least_errors_of_stars(spectra: StarSpectra, ahead: int = 0) -> dict[str, Per
         )
         for name, of_z in fast.items()
     ]
-    return least_errors(known, fast, variance_from_sensors(wanted, whitener, others, frames), whitener)
+    return target_errors(known, fast, variance_from_sensors(wanted, whitener, others, frames), whitener)
 
 
 def bound_rms_of_stars(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:
