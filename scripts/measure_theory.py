@@ -2,9 +2,10 @@
 
     python scripts/measure_theory.py [PRESET ...]
 
-Every frame moves one setting a little further, as a drag does, and predicts all linear observers of the target in one mode. It
-prints the median, the 95th percentile and the maximum [ms], and the median of the processor's time, which does not count others
-at work on the machine; the first frame of a drag, which computes what the others share, stands by itself.
+Every frame moves one setting a little further, as a drag does, and predicts in one mode, as coarsely as a drag does, all linear
+observers of the LGS, then each of the others. It prints the median, the 95th percentile and the maximum [ms], and the median of
+the processor's time, which does not count others at work on the machine; the first frame of a drag, which computes what the
+others share, stands by itself.
 """
 
 from __future__ import annotations
@@ -15,8 +16,11 @@ from time import perf_counter, process_time
 
 import numpy as np
 
+from wfsobs.app.views.spectrum_editor import DRAGGED, LOOSE
 from wfsobs.app.work import one_blas_thread
-from wfsobs.evaluation.theory import Theory
+from wfsobs.evaluation.scores import BOUND
+from wfsobs.evaluation.theory import Theory, is_predicted
+from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 
@@ -47,7 +51,9 @@ def moved_corner(s: Scenario, i: int) -> Scenario:
     return s.replace({"turbulence.wind_speed": s.turbulence.wind_speed * (1.0 + 0.002 * i)})
 
 
-DRAGS: dict[str, tuple[str, Callable[[Scenario, int], Scenario | None]]] = {
+Move = Callable[[Scenario, int], Scenario | None]
+
+DRAGS: dict[str, tuple[str, Move]] = {
     "peak": ("vibration", moved_peak),
     "Kalman peak": ("vibration", moved_model),
     "band": ("vibration", moved_band),
@@ -58,21 +64,36 @@ DRAGS: dict[str, tuple[str, Callable[[Scenario, int], Scenario | None]]] = {
 def main(names: list[str]) -> None:
     """Print a line per preset and drag."""
     one_blas_thread()
-    print(f"{'preset':16}{'drag':20}{'first':>9}{'p50':>9}{'p95':>9}{'max':>9}{'CPU':>9}   ms, {FRAMES} frames")
+    print(f"{'preset':10}{'drag':19}{'observers':19}{'first':>9}{'p50':>9}{'p95':>9}{'max':>9}{'CPU':>9}   ms, {FRAMES} frames")
     for name in names:
         for drag, (target, move) in DRAGS.items():
-            theory, times, busy = Theory(), [], []
-            for i in range(FRAMES + 1):
-                scenario = move(PRESETS[name](), i)
-                if scenario is None:
-                    break
-                start, at_work = perf_counter(), process_time()
-                theory.predict(scenario, 0, target)
-                times.append(1e3 * (perf_counter() - start))
-                busy.append(1e3 * (process_time() - at_work))
-            if times:
-                p50, p95 = np.percentile(times[1:], [50, 95])
-                print(f"{name:16}{drag:20}{times[0]:9.1f}{p50:9.1f}{p95:9.1f}{max(times[1:]):9.1f}{np.median(busy[1:]):9.1f}")
+            for label, observers in groups(target).items():
+                times, busy = drag_times(name, target, move, observers)
+                if times:
+                    p50, p95 = np.percentile(times[1:], [50, 95])
+                    print(f"{name:10}{drag:19}{label:19}{times[0]:9.1f}{p50:9.1f}{p95:9.1f}", end="")
+                    print(f"{max(times[1:]):9.1f}{np.median(busy[1:]):9.1f}", flush=True)
+
+
+def groups(target: str) -> dict[str, list[str]]:
+    """Return what is predicted together: the observers of the LGS and the bound, and each other one."""
+    linear = [o for o in OBSERVERS.values() if is_predicted(o, target)]
+    fast = [o.id for o in linear if o.sensors == ("lgs",)]
+    return {"of the LGS": [*fast, BOUND], **{o.id: [o.id] for o in linear if o.id not in fast}}
+
+
+def drag_times(name: str, target: str, move: Move, observers: list[str]) -> tuple[list[float], list[float]]:
+    """Return the time and the processor's time of every frame of a drag [ms]; none where there is nothing to move."""
+    theory, times, busy = Theory(most=DRAGGED, left=LOOSE), [], []
+    for i in range(FRAMES + 1):
+        scenario = move(PRESETS[name](), i)
+        if scenario is None:
+            break
+        start, at_work = perf_counter(), process_time()
+        theory.predict(scenario, 0, target, observers)
+        times.append(1e3 * (perf_counter() - start))
+        busy.append(1e3 * (process_time() - at_work))
+    return times, busy
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from scipy.signal import get_window
 import wfsobs
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.error_spectra import band_rms, spectra
+from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.evaluation.theory import TRUTH, Prediction, Theory
 from wfsobs.observers import OBSERVERS
@@ -80,10 +81,26 @@ class TestRms:
         expected = np.sqrt(2.0 * (r[0] - r[1]) + noise**2)
         assert predictions(quiet, "turbulence")["persistence"].rms == pytest.approx(expected, rel=1e-6)
 
-    def test_only_of_linear_observers_of_the_lgs(self) -> None:
-        names = set(predictions(PRESETS["paper"](), "vibration"))
-        assert names == {TRUTH, BOUND, "kf-lgs", "kf-multi", "gp-lgs", "butterworth-cl", "zero"}
+    def test_only_of_linear_observers(self) -> None:
+        names = set(predictions(RIGHT, "vibration"))
+        of_both = {"multirate-optimal", "multirate-multi", "gp-both"}
+        assert names == {TRUTH, BOUND, "kf-lgs", "kf-multi", "gp-lgs", "butterworth-cl", "zero", *of_both}
         assert all(OBSERVERS[name].linear for name in names - {TRUTH, BOUND})
+
+    @pytest.mark.parametrize("ratio", [1, 3, 5])
+    @pytest.mark.parametrize("name", ["kf-ngs", "multirate", "multirate-multi"])
+    def test_of_both_sensors_is_the_mean_of_the_exact_error_over_the_cycle(self, name: str, ratio: int) -> None:
+        scenario = RIGHT.replace({"sensors.exposure_ratio": ratio})
+        exact = exact_errors(OBSERVERS[name], scenario)[0]
+        for target in OBSERVERS[name].targets:
+            # responses of one record of impulses, what is left of each in the next
+            assert predictions(scenario, target, observers=[name])[name].rms == pytest.approx(exact[target].rms, rel=1e-8)
+
+    @pytest.mark.parametrize("name", ["kf-multi", "multirate-multi", "gp-both"])
+    def test_with_responses_cut_off_as_in_a_drag_it_is_nearly_the_same(self, name: str) -> None:
+        scenario, of = PRESETS["paper"](), {"observers": [name]}
+        rough, whole = (predictions(scenario, "vibration", theory, **of)[name].rms for theory in (Theory(left=0.001), Theory()))
+        assert rough == pytest.approx(whole, rel=3e-4) and rough != whole  # three digits are shown
 
     def test_none_where_events_change_the_spectra(self) -> None:
         with pytest.raises(ValueError, match="events"):
@@ -127,8 +144,9 @@ class TestSpectrum:
 
     @pytest.mark.parametrize("of_error", [True, False])
     def test_is_that_of_a_long_simulation(self, of_error: bool) -> None:
-        scenario = PRESETS["paper"]().replace({"vibration.synthesis": "gaussian", "run.duration": 200.0})
-        names = ["kf-lgs", "kf-multi", "butterworth-cl"]
+        changes = {"vibration.synthesis": "gaussian", "run.duration": 200.0, "loop.closed": False}
+        scenario = PRESETS["paper"]().replace(changes)
+        names = ["kf-lgs", "kf-multi", "butterworth-cl", "multirate-multi"]
         found = predictions(scenario, "vibration", of_error=of_error)
         result = wfsobs.run(scenario, observers=names)
         for name in names:

@@ -51,7 +51,7 @@ def estimate_and_error(H: Complex, measurement: Array, signal: Array, cross: Com
 
 
 def impulse_response(
-    observer: Observer, prior: Prior, settings: Any, dt: float, most: int, first: int = SHORTEST
+    observer: Observer, prior: Prior, settings: Any, dt: float, most: int, first: int = SHORTEST, left: float = SETTLED
 ) -> dict[str, Array]:
     """Compute the estimates of a linear observer of the LGS from a single sample of one, in one mode.
 
@@ -67,6 +67,8 @@ def impulse_response(
         Maximum number of steps.
     first : int
         Steps of the first try, twice as many in each next, until the response has settled.
+    left : float
+        What may be left at the end of a response, over its maximum.
 
     Returns
     -------
@@ -77,15 +79,16 @@ def impulse_response(
     while True:
         impulse = np.zeros((steps, 1))
         impulse[0] = 1.0
-        found = _estimates(observer, Measurements(impulse, np.zeros_like(impulse), dt), prior, settings)
+        found = record_estimates(observer, Measurements(impulse, np.zeros_like(impulse), dt), prior, settings)
         taps = {target: values[:, 0] for target, values in found.items()}
-        if steps == most or all(_has_settled(h) for h in taps.values()):
+        if steps == most or all(has_settled(h, left) for h in taps.values()):
             return taps
         steps = min(2 * steps, most)
 
 
-def _has_settled(h: Array) -> bool:
-    return float(np.abs(h[-h.size // 8 :]).max()) <= SETTLED * float(np.abs(h).max())
+def has_settled(h: Array, left: float = SETTLED) -> bool:
+    """Return whether no more is left at the end of a response, over its maximum."""
+    return float(np.abs(h[-h.size // 8 :]).max()) <= left * float(np.abs(h).max())
 
 
 def impulse_responses(
@@ -118,7 +121,7 @@ def impulse_responses(
     rest = np.zeros((n_steps, n_modes))
 
     def respond(z: Array, ngs: Array) -> dict[str, Array]:
-        return _estimates(observer, Measurements(z, rest, dt, y_ngs=ngs, ratio=ratio), prior, settings)
+        return record_estimates(observer, Measurements(z, rest, dt, y_ngs=ngs, ratio=ratio), prior, settings)
 
     silence = respond(rest, frames)
     out = {name: (np.zeros((ratio, length, n_modes)), np.zeros((ratio, length, n_modes))) for name in silence}
@@ -134,7 +137,7 @@ def impulse_responses(
     return out
 
 
-def _estimates(observer: Observer, measurements: Measurements, prior: Prior, settings: Any) -> dict[str, Array]:
-    """Return an observer's estimates, zero where there is none."""
+def record_estimates(observer: Observer, measurements: Measurements, prior: Prior, settings: Any) -> dict[str, Array]:
+    """Return an observer's estimates of a record, zero where there is none."""
     found = observer.estimate(measurements, prior, settings, QUIET)
     return {target: np.nan_to_num(values) for target, values in found.items()}

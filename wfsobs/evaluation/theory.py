@@ -4,29 +4,31 @@ They follow from the true spectra of the scenario (`true_spectra`) and the respo
 (`linear_response`), the transform of the estimates from a single sample of one. That is the expectation over records after an
 infinitely long start. A record is one of them, and the scores of a short one scatter around it.
 
-Observers of the LGS that are linear have a prediction. Those that train on a record or learn during it have none, nor has one
-that looks ahead.
+Observers that are linear have a prediction; those of NGS frames by their responses over the cycle of a frame (`cycle_response`).
+Those that train on a record or learn during it have none, nor has one that looks ahead.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import sqrt
 from typing import Any
 
 import numpy as np
 
-from wfsobs.evaluation.linear_response import SHORTEST, estimate_and_error, impulse_response
+from wfsobs.evaluation.cycle_response import CycleTaps, cycle_spectra, cycle_taps, seen_by_both
+from wfsobs.evaluation.linear_response import SETTLED, SHORTEST, estimate_and_error, impulse_response
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.prior import Lines, Prior, Training
+from wfsobs.prior import Beams, LgsError, Lines, Prior, Training
 from wfsobs.priors_from.scenario import lines_of, observer_settings, prior_of
-from wfsobs.priors_from.turbulence import lines_turbulence
+from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import expected_psd
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, error_spectrum, factorise
+from wfsobs.simulation.guide_stars import MEAN
 from wfsobs.simulation.true_spectra import MOST, TrueSpectra, has_known_spectra, n_frequencies, true_spectra
 from wfsobs.simulation.turbulence_spectra import TurbulenceSpectra, turbulence_spectra
 from wfsobs.typing import Array
@@ -60,8 +62,7 @@ class Prediction:
 
 def is_predicted(observer: Observer, target: str) -> bool:
     """Return whether an observer's errors have a prediction."""
-    known = observer.linear and observer.causal and observer.sensors == ("lgs",)
-    return known and target in observer.targets and Training not in observer.prior
+    return observer.linear and observer.causal and target in observer.targets and Training not in observer.prior
 
 
 class Identity:
@@ -88,12 +89,15 @@ class Theory:
     most : int or None
         The most frequencies to compute with, a power of two; None for as many as the scenario needs. With fewer, lines that are
         narrower than their spacing are coarse.
+    left : float
+        What may be left at the end of a response, over its maximum.
     """
 
     resolution: float = 0.5
     most: int | None = None
+    left: float = SETTLED
     _memory: dict[str, tuple[Any, Any]] = field(default_factory=dict, repr=False)
-    _lengths: dict[str, int] = field(default_factory=dict, repr=False)
+    _lengths: dict[tuple[str, float], int] = field(default_factory=dict, repr=False)
 
     def predict(
         self, scenario: Scenario, mode: int, target: str, observers: Iterable[str] | None = None, of_error: bool = True
@@ -133,14 +137,17 @@ class Theory:
             observer = OBSERVERS.get(name)
             if observer is not None and not is_predicted(observer, target):
                 continue
-            H = None if observer is None else self._response(observer, scenario, mode, target, spectra.n)
-            made_of = Identity(spectra), Identity(H), n_steps, of_error
+            response = None if observer is None else self._response(observer, scenario, mode, target, spectra.n)
+            made_of = Identity(spectra), Identity(response), n_steps, of_error
 
-            def make(name: str = name, H: Complex | None = H) -> Prediction:
-                if H is None:
+            def make(name: str = name, response: Complex | CycleTaps | None = response) -> Prediction:
+                if response is None:
                     signal, error = _own(spectra, name, target)
+                elif isinstance(response, CycleTaps):
+                    both = self._keep(f"both {target}", Identity(spectra), lambda: seen_by_both(spectra, target))
+                    signal, error = cycle_spectra(response, both)
                 else:
-                    signal, error = estimate_and_error(H, spectra.measurement, spectra.signal[target], cross)
+                    signal, error = estimate_and_error(response, spectra.measurement, spectra.signal[target], cross)
                 frequency, density = expected_psd(error if of_error else signal, scenario.dt, n_steps, self.resolution)
                 return Prediction(name, target, sqrt(max(circle_mean(error), 0.0)), frequency, density)
 
@@ -165,20 +172,38 @@ class Theory:
         n = min(n_frequencies(scenario), self.most or MOST)
         return self._keep("air", (mode, n, _groups(scenario, *AIR)), lambda: turbulence_spectra(scenario, mode, n))
 
-    def _response(self, observer: Observer, scenario: Scenario, mode: int, target: str, n: int) -> Complex:
+    def _response(self, observer: Observer, scenario: Scenario, mode: int, target: str, n: int) -> Complex | CycleTaps:
         settings, prior, name = observer_settings(observer, scenario), self._prior(observer, scenario, mode), observer.id
+        ratio, left = scenario.sensors.exposure_ratio, self.left
+        first = self._lengths.get((name, left), SHORTEST)
 
-        def taps() -> dict[str, Array]:
-            found = impulse_response(observer, prior, settings, scenario.dt, n, self._lengths.get(name, SHORTEST))
-            self._lengths[name] = len(found[target])
+        def over_cycle() -> dict[str, CycleTaps]:
+            found = cycle_taps(observer, prior, settings, scenario.dt, ratio, n, first, left)
+            self._lengths[name, left] = found[target].fast.shape[1]
             return found
 
-        h = self._keep(f"response {name}", (prior, settings, n), taps)[target]
+        def taps() -> dict[str, Array]:
+            found = impulse_response(observer, prior, settings, scenario.dt, n, first, left)
+            self._lengths[name, left] = len(found[target])
+            return found
+
+        if "ngs" in observer.sensors:
+            return self._keep(f"response {name}", (prior, settings, n, left, ratio), over_cycle)[target]
+        h = self._keep(f"response {name}", (prior, settings, n, left), taps)[target]
         return self._keep(f"response {name}, {target}", Identity(h), lambda: np.fft.rfft(h, n))
 
     def _prior(self, observer: Observer, scenario: Scenario, mode: int) -> Prior:
-        if Lines not in observer.prior:
-            return prior_of(scenario, None, observer.prior, modes=[mode])
+        cheap = [part for part in observer.prior if part not in (Lines, Beams, LgsError)]
+        prior = prior_of(scenario, None, cheap, modes=[mode])
+        if Lines in observer.prior:
+            prior = replace(prior, lines=(self._lines(scenario, mode),))
+        if Beams in observer.prior:
+            prior = replace(prior, beams=(self._seen("beams", scenario, mode, beams_of),))
+        if LgsError in observer.prior:
+            prior = replace(prior, lgs_error=(self._seen("LGS error", scenario, mode, _lgs_error),))
+        return prior
+
+    def _lines(self, scenario: Scenario, mode: int) -> Lines:
         air, k = self._air(scenario, mode), scenario.kalman
         key = (
             Identity(air),
@@ -189,7 +214,19 @@ class Theory:
             k.lgs_noise,
         )
         turbulence = self._keep("turbulence", key, lambda: lines_turbulence(scenario, mode, scenario.dt, air.measurement))
-        return Prior(lines=(lines_of(scenario, mode, turbulence=turbulence),))
+        return lines_of(scenario, mode, turbulence=turbulence)
+
+    def _seen(
+        self, name: str, scenario: Scenario, mode: int, make: Callable[[Scenario, int, float, TurbulenceSpectra], Any]
+    ) -> Any:
+        """Return what an observer is told of the turbulence in the beams; best weights of the LGS depend on the vibration."""
+        air, mean = self._air(scenario, mode), scenario.sensors.lgs_combination == MEAN
+        key = Identity(air), _groups(scenario, "kalman", "multipeak", *([] if mean else ["vibration"]))
+        return self._keep(name, key, lambda: make(scenario, mode, scenario.dt, air))
+
+
+def _lgs_error(scenario: Scenario, mode: int, dt: float, _air: TurbulenceSpectra) -> LgsError:
+    return lgs_error_of(scenario, mode, dt)
 
 
 AIR = ("telescope", "turbulence", "sensors", "run")

@@ -21,6 +21,7 @@ from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.frames import Frames
 from wfsobs.app.views.plots import ExtraLines
 from wfsobs.evaluation.error_spectra import cumulative_rms
+from wfsobs.evaluation.linear_response import SETTLED
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.evaluation.theory import TRUTH, Prediction, Theory
 from wfsobs.observers.base import VIBRATION
@@ -30,9 +31,9 @@ from wfsobs.typing import Array
 
 CAPTION = "Predicted rms error"
 
-DRAGGED = 65_536
-"""The most frequencies to predict with while a handle is on its way: of ut4 that takes half the time, and numbers are within 1 %
-of those once it is let go."""
+DRAGGED, LOOSE = 65_536, 0.001
+"""The most frequencies to predict with while a handle is on its way, and what may be left at the end of a response: numbers are
+within 1 % of those once it is let go, in a fraction of the time."""
 
 
 class HandleLayer(JSComponent):
@@ -148,10 +149,11 @@ class SpectrumEditor:
             return
         hidden = self.display.hidden_lines.get(self.target, [])
         names = (*(name for name in observers_of(self.target) if name not in hidden), BOUND)
-        trial, mode, of_error, most = self.trial, self.display.column, self.display.error, DRAGGED if self._moves else None
+        trial, mode, of_error = self.trial, self.display.column, self.display.error
+        most, left = (DRAGGED, LOOSE) if self._moves else (None, SETTLED)
 
         def predict() -> list[Prediction]:
-            self.theory.most = most
+            self.theory.most, self.theory.left = most, left
             return self.theory.predict(trial, mode, self.target, names, of_error)
 
         self.frames.ask(self.target, predict, partial(self._land, trial, self._number))
