@@ -32,7 +32,7 @@ class CycleTaps(NamedTuple):
     slow: Array
 
 
-class Seen(NamedTuple):
+class BothSensors(NamedTuple):
     """Spectra of a target and of what is measured, all (n // 2 + 1,) [um^2 per sample].
 
     signal, z, frames : of s, z and the NGS with the noise of a frame;  by_z, by_frames : cross spectra of s with these
@@ -47,10 +47,10 @@ class Seen(NamedTuple):
     frames_by_z: Complex
 
 
-def seen_by_both(spectra: TrueSpectra, target: str) -> Seen:
+def both_sensors(spectra: TrueSpectra, target: str) -> BothSensors:
     """Return the spectra of a target and of both sensors."""
     ngs, exposure = spectra.ngs, exposure_response(spectra.ngs.ratio, spectra.measurement.size)
-    return Seen(
+    return BothSensors(
         spectra.signal[target],
         spectra.measurement,
         ngs.signal * np.abs(exposure) ** 2 + ngs.noise,
@@ -124,21 +124,21 @@ def _taps(segments: list[Array], ratio: int) -> CycleTaps:
     return CycleTaps(fast, slow)
 
 
-def cycle_spectra(taps: CycleTaps, seen: Seen) -> tuple[Array, Array]:
+def cycle_spectra(taps: CycleTaps, sensors: BothSensors) -> tuple[Array, Array]:
     """Return the spectra of an estimate and of its error on average over the cycle, (n // 2 + 1,).
 
     What moves to a frequency between those of the DFT is at the nearest one.
     """
-    ratio, n = taps.fast.shape[0], 2 * (seen.z.size - 1)
+    ratio, n = taps.fast.shape[0], 2 * (sensors.z.size - 1)
     places = np.exp(-2j * np.pi * np.outer(np.arange(ratio), np.arange(ratio)) / ratio) / ratio
     fast, slow = (places @ np.fft.rfft(h, n) for h in taps)
     out = np.zeros((2, 2 * n))
     for wave, (c, d) in enumerate(zip(fast, slow, strict=True)):
         shift = round(wave * n / ratio)
-        power = _power(c) * seen.z + _power(d) * seen.frames + 2.0 * _real_product(d * seen.frames_by_z, c)
+        power = _power(c) * sensors.z + _power(d) * sensors.frames + 2.0 * _real_product(d * sensors.frames_by_z, c)
         parts = np.stack([power, power])
         if wave == 0:
-            parts[1] += seen.signal - 2.0 * (_real_product(seen.by_z, c) + _real_product(seen.by_frames, d))
+            parts[1] += sensors.signal - 2.0 * (_real_product(sensors.by_z, c) + _real_product(sensors.by_frames, d))
         parts[:, [0, -1]] *= 0.5  # these are their own at negative frequencies
         out[:, shift : shift + parts.shape[1]] += parts
     circle = out[:, :n] + out[:, n:]

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.evaluation.cycle_response import CycleTaps, cycle_spectra, cycle_taps, seen_by_both
+from wfsobs.evaluation.cycle_response import CycleTaps, cycle_spectra, cycle_taps, both_sensors
 from wfsobs.evaluation.linear_response import SETTLED, SHORTEST, estimate_and_error, impulse_response
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
@@ -144,7 +144,7 @@ class Theory:
                 if response is None:
                     signal, error = _own(spectra, name, target)
                 elif isinstance(response, CycleTaps):
-                    both = self._keep(f"both {target}", Identity(spectra), lambda: seen_by_both(spectra, target))
+                    both = self._keep(f"both {target}", Identity(spectra), lambda: both_sensors(spectra, target))
                     signal, error = cycle_spectra(response, both)
                 else:
                     signal, error = estimate_and_error(response, spectra.measurement, spectra.signal[target], cross)
@@ -198,9 +198,9 @@ class Theory:
         if Lines in observer.prior:
             prior = replace(prior, lines=(self._lines(scenario, mode),))
         if Beams in observer.prior:
-            prior = replace(prior, beams=(self._seen("beams", scenario, mode, beams_of),))
+            prior = replace(prior, beams=(self._in_beams("beams", scenario, mode, beams_of),))
         if LgsError in observer.prior:
-            prior = replace(prior, lgs_error=(self._seen("LGS error", scenario, mode, _lgs_error),))
+            prior = replace(prior, lgs_error=(self._in_beams("LGS error", scenario, mode, _lgs_error),))
         return prior
 
     def _lines(self, scenario: Scenario, mode: int) -> Lines:
@@ -216,7 +216,7 @@ class Theory:
         turbulence = self._keep("turbulence", key, lambda: lines_turbulence(scenario, mode, scenario.dt, air.measurement))
         return lines_of(scenario, mode, turbulence=turbulence)
 
-    def _seen(
+    def _in_beams(
         self, name: str, scenario: Scenario, mode: int, make: Callable[[Scenario, int, float, TurbulenceSpectra], Any]
     ) -> Any:
         """Return what an observer is told of the turbulence in the beams; best weights of the LGS depend on the vibration."""

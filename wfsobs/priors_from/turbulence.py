@@ -67,19 +67,19 @@ def modelled_turbulence(scenario: Scenario, mode: int, dt: float, spectrum: Arra
     return fit_ar3(spectrum, noise**2, _third_order(process))
 
 
-def beams_of(scenario: Scenario, mode: int, dt: float | None = None, seen: TurbulenceSpectra | None = None) -> Beams:
+def beams_of(scenario: Scenario, mode: int, dt: float | None = None, spectra: TurbulenceSpectra | None = None) -> Beams:
     """Return turbulence as the target has it and as the LGS see it in one mode; dt [s]: by default that of the scenario.
 
     Of third order it is fitted to the true spectra of both and to their cross spectrum, else it is the AR(2) and the slow error.
 
-    seen : the true spectra, where already computed
+    spectra : the true ones, where already computed
     """
     dt = dt or scenario.dt
     line_gain = float(lgs_weights(scenario)[mode, :, mode].sum())
     process = one_process(scenario, mode, dt)
     if scenario.turbulence.source == "processes" or not _is_third_order(scenario, process):
         return Beams(lines_turbulence(scenario, mode, dt), lgs=(lgs_error_of(scenario, mode, dt).process,), line_gain=line_gain)
-    found = _shared_turbulence(scenario, mode, dt) if seen is None else _fit_shared(scenario, mode, dt, seen)
+    found = _shared_turbulence(scenario, mode, dt) if spectra is None else _fit_shared(scenario, mode, dt, spectra)
     factor = process.rms / turbulence_process(scenario, mode, dt).rms  # where the strength is set by hand
     common, target, lgs = (tuple(replace(p, rms=factor * p.rms) for p in part) for part in found[1:])
     return Beams(common, target, lgs, found.gain, line_gain)
@@ -91,10 +91,10 @@ def _shared_turbulence(scenario: Scenario, mode: int, dt: float) -> SharedProces
     return _fit_shared(scenario, mode, dt, turbulence_spectra(scenario, mode, n_frequencies(scenario)))
 
 
-def _fit_shared(scenario: Scenario, mode: int, dt: float, seen: TurbulenceSpectra) -> SharedProcess:
+def _fit_shared(scenario: Scenario, mode: int, dt: float, spectra: TurbulenceSpectra) -> SharedProcess:
     noise, _ = measurement_noise(scenario, mode)
     start = _third_order(turbulence_process(scenario, mode, dt))
-    return fit_shared_process(seen.own, seen.measurement, np.real(seen.cross), noise**2, start)
+    return fit_shared_process(spectra.own, spectra.measurement, np.real(spectra.cross), noise**2, start)
 
 
 def _is_third_order(scenario: Scenario, process: Ar2) -> bool:
