@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.evaluation.cycle_response import CycleTaps, cycle_spectra, cycle_taps, both_sensors
+from wfsobs.evaluation.cycle_response import CycleTaps, both_sensors, cycle_spectra, cycle_taps
 from wfsobs.evaluation.linear_response import SETTLED, SHORTEST, estimate_and_error, impulse_response
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
