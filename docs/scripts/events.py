@@ -1,4 +1,4 @@
-"""The tables of docs/events.md: `python docs/scripts/events.py [seeds] [preset or "bridged" ...] [--observers ID,ID...]`."""
+"""The tables of docs/events.md: `docs/scripts/events.py [seeds] [preset, "bridged" or "loop" ...] [--observers ID,ID...]`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from itertools import groupby
 import numpy as np
 
 from wfsobs.cli.recovery_tables import OverTime, recovery_texts
+from wfsobs.closed_loop.run import close_loop
+from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import row_label
 from wfsobs.observers.base import TARGETS
 from wfsobs.pipeline import run
@@ -64,12 +66,43 @@ def bridged(seeds: int, observers: Sequence[str] | None) -> str:
     return "\n".join(out)
 
 
+LOOP_STRETCHES = {
+    "laser-dropout": {
+        "one laser out": (6.0, 10.0),
+        "both out": (15.0, 16.0),
+        "0.2 s after": (16.0, 16.2),
+        "2 s after": (16.0, 18.0),
+    },
+    "lost-frames": {"LGS frames lost": (5.0, 10.0), "NGS frames lost": (13.0, 18.0)},
+}
+"""Preset -> stretches of its record [s]."""
+
+
+def loop(seeds: int, controllers: Sequence[str] | None) -> str:
+    """Residuals of tip in stretches of the presets that lose measurements, seeds together."""
+    names, out = controllers or [name for name, c in CONTROLLERS.items() if c.predict is None and c.law is not None], []
+    for preset, stretches in LOOP_STRETCHES.items():
+        scenario = PRESETS[preset]()
+        squares: dict[str, list[list[float]]] = {name: [] for name in names}
+        for seed in range(1, seeds + 1):
+            result = close_loop(scenario.replace({"run.seed": seed}), controllers=names)
+            for one in result.outcomes:
+                assert one.residual is not None
+                cuts = [slice(round(a / scenario.dt), round(b / scenario.dt)) for a, b in stretches.values()]
+                squares[one.controller].append([float(np.mean(one.residual[cut, 0] ** 2)) for cut in cuts])
+        out.append(f"| `{preset}` | {', nm | '.join(stretches)}, nm |\n|---|{'---|' * len(stretches)}")
+        for name, found in squares.items():
+            out.append(f"| `{name}` | {' | '.join(f'{1e3 * x:.1f}' for x in np.sqrt(np.mean(found, axis=0)))} |")
+        out.append("")
+    return "\n".join(out)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("seeds", type=int, nargs="?", default=20)
-    parser.add_argument("what", nargs="*", default=[*CASES, "bridged"])
+    parser.add_argument("what", nargs="*", default=[*CASES, "bridged", "loop"])
     parser.add_argument("--observers", type=lambda text: text.split(","), help="these alone; all unless told")
     given = parser.parse_args()
     for one in given.what:
-        make = bridged if one == "bridged" else partial(tables, one)
+        make = {"bridged": bridged, "loop": loop}.get(one) or partial(tables, one)
         print(make(given.seeds, given.observers))

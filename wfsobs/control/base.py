@@ -13,7 +13,7 @@ pseudo-open-loop terms the integrator works on z - f, and u[k] = u_int[k] - vib_
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,14 +23,14 @@ from wfsobs.control.integrator import limited_integrator
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Plant
 from wfsobs.control.step import StepController
-from wfsobs.control.step_laws import Integrators, LinearLaws, StepLaw, StepPredict, VibrationAhead
+from wfsobs.control.step_laws import KalmanLaws, StepPredict, VibrationAhead, step_law, take_missing
 from wfsobs.observers.base import NOTHING, PLAIN, Look
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
 from wfsobs.observers.step_checks import StepError
 from wfsobs.prior import TRUE, Bands, Part, Prior, PriorSource, words_for
 from wfsobs.progress import QUIET, Watch
-from wfsobs.record import Measurements, RecordError, Sampling
+from wfsobs.record import Measurements, RecordError, Sampling, hold_last
 from wfsobs.settings import Section
 from wfsobs.typing import Array
 
@@ -123,7 +123,7 @@ class Controller:
         return () if self.law is None else tuple(self.law(prior, mode, plant, settings) for mode in range(n_modes))
 
     def design(self, prior: Prior, plant: Plant, settings: Settings, sampling: Sampling) -> StepController:
-        """Return the controller one frame at a time; missing samples are filled as in `commands`.
+        """Return the controller one frame at a time; missing samples are taken as in `commands`.
 
         Parameters
         ----------
@@ -153,15 +153,13 @@ class Controller:
         found = self.laws(prior, plant, settings, sampling.n_modes)
         if not all(law.stable for law in found):
             raise StepError(f"{self.id}: a pole of the closed loop is not within the unit circle")
-        law: StepLaw | None = None
-        if found:
-            law = LinearLaws(found) if any(one.gain is None for one in found) else Integrators(found, plant.mirror)
-        ahead = None
+        ahead, beside = None, None
         if self.step_predict is not None:
             assert prior.bands is not None
             ahead = VibrationAhead(self.step_predict(prior, plant, settings, sampling), prior.bands, sampling)
-        lgs, ngs = bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio, _line_width(settings))
-        return StepController(self.id, plant, sampling, law, ahead, lgs, ngs if self.ngs else None)
+        if not self._takes_missing(found):
+            beside = bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio, _line_width(settings))
+        return StepController(self.id, plant, sampling, step_law(found, plant.mirror), ahead, self.ngs, beside)
 
     def commands(
         self,
@@ -174,11 +172,13 @@ class Controller:
     ) -> tuple[Array, Array]:
         """(commands that the mirror takes [um], whether a limit changed them), both (n_steps, n_modes).
 
-        laws : of `laws`, from the same prior, plant and settings. Missing samples are bridged by what the controller is told.
-        Raises ValueError, Cancelled.
+        laws : of `laws`, from the same prior, plant and settings. Missing samples are none to the Kalman filters of LQG; others
+        have them bridged by what they are told. Raises ValueError, Cancelled.
         """
         if self.ngs and measurements.y_ngs is None:
             raise RecordError("the record has no NGS measurement")
+        if self._takes_missing(laws):
+            return self._without_missing(laws, replace(measurements, u=hold_last(measurements.u)), plant, watch)
         measurements = fill_missing(measurements, prior, _line_width(settings))
         z = measurements.z
         forward = np.zeros_like(z)
@@ -192,9 +192,29 @@ class Controller:
             known = ~np.isnan(ahead)
             forward = -np.where(known, ahead, 0.0)
             z = z - np.where(known, online_reference(prior.bands, z, measurements.dt), 0.0)
-        inputs = np.stack([z, np.nan_to_num(measurements.z_ngs)], axis=1) if self.ngs else z[:, None]
+        inputs = self._inputs(measurements, z)
         modes = [_limit_commands(law, plant, inputs[:, :, mode], forward[:, mode]) for mode, law in enumerate(laws)]
         return np.column_stack([u for u, _ in modes]), np.column_stack([u != wanted for u, wanted in modes])
+
+    def _takes_missing(self, laws: Sequence[Law]) -> bool:
+        return self.predict is None and take_missing(laws)
+
+    def _inputs(self, measurements: Measurements, z: Array) -> Array:
+        """Return the inputs of the laws, (n_steps, 1 or 2, n_modes) [um], zero where no NGS frame is due."""
+        return np.stack([z, np.nan_to_num(measurements.z_ngs)], axis=1) if self.ngs else z[:, None]
+
+    def _without_missing(
+        self, laws: Sequence[Law], measurements: Measurements, plant: Plant, watch: Watch
+    ) -> tuple[Array, Array]:
+        """Return `commands` of Kalman filters: where measurements are missing, frame by frame."""
+        z, n = measurements.z, measurements.ratio
+        if np.isnan(z).any() or (self.ngs and n is not None and np.isnan(measurements.z_ngs[n::n]).any()):
+            wanted = KalmanLaws(laws).run(measurements, watch)
+        else:
+            inputs = self._inputs(measurements, z)
+            wanted = np.column_stack([law.run(inputs[:, :, mode]) for mode, law in enumerate(laws)])
+        taken = np.column_stack([u if plant.mirror.within(u) else plant.mirror.follow(u) for u in wanted.T])
+        return taken, taken != wanted
 
 
 def _line_width(settings: Settings) -> float:

@@ -16,8 +16,8 @@ from functools import partial
 import numpy as np
 from scipy.linalg import schur
 
+from wfsobs.observers.kalman.mode_filter import ModeFilter
 from wfsobs.signal.periodic import FilterStep, PeriodicFilter
-from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.signal.stepping import GainCycle
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
@@ -31,8 +31,8 @@ class Law:
     run   : z (n_steps, n_inputs) [um] -> u (n_steps,) [um]
     gain, leak : of an integrator
     first : step 0, where it is not one of the cycle
-    model : of the disturbance, the first states of the filter, where there is one
     gains, row : the same filter as an observer: u[k] = row x_hat[k]; None where it is not known as one
+    filter : the Kalman filter that this observer is, to which a missing measurement is none; None where it is no such filter
     """
 
     cycle: PeriodicFilter
@@ -40,9 +40,9 @@ class Law:
     gain: float | None = None
     leak: float = 1.0
     first: FilterStep | None = None
-    model: DisturbanceModel | None = None
     gains: GainCycle | None = None
     row: Array | None = None
+    filter: ModeFilter | None = None
 
     @property
     def poles(self) -> Complex:

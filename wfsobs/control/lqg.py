@@ -18,13 +18,13 @@ import numpy as np
 from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.multirate import MultiRateFilter, filter_of_gains, multirate_gains, multirate_noise
+from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.multirate import MultiRateFilter, filter_of_gains, multirate_mode, multirate_noise
 from wfsobs.observers.kalman.multirate_multi import every_peak_model
-from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_gains, optimal_model
-from wfsobs.observers.kalman.single import steady_gains
+from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_model
+from wfsobs.observers.kalman.single import steady_mode
 from wfsobs.prior import Prior
 from wfsobs.signal.statespace import DisturbanceModel
-from wfsobs.signal.stepping import GainCycle
 from wfsobs.typing import Array
 
 
@@ -47,8 +47,8 @@ def _rows_of(model: DisturbanceModel, mirror: Mirror) -> Array:
 
 def lqg_of(model: DisturbanceModel, noise: float, mirror: Mirror) -> Law:
     """LQG on the LGS with any model; noise [um] of a measurement. Raises RiccatiError."""
-    gains, row = steady_gains(model, noise)[0], _rows_of(model, mirror)
-    return replace(steady_law(gains.filter(row)), model=model, gains=gains, row=row[0])
+    found, row = steady_mode(model, noise), _rows_of(model, mirror)
+    return replace(steady_law(found.gains.filter(row)), gains=found.gains, row=row[0], filter=found)
 
 
 def lqg_kf_lgs(prior: Prior, mode: int, plant: Plant, _settings: Any) -> Law:
@@ -67,7 +67,7 @@ def lqg_multirate(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the paper's multi-rate filter. Raises UnstableCycle."""
     known = prior.model[mode]
     model, noise = known.disturbance(), multirate_noise(settings.multirate, known)
-    return _two_sensors(multirate_gains(model, plant.ratio, *noise), _rows_of(model, plant.mirror), model)
+    return _two_sensors(multirate_mode(model, plant.ratio, *noise), _rows_of(model, plant.mirror))
 
 
 def lqg_multirate_optimal(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
@@ -82,13 +82,13 @@ def lqg_multirate_multi(prior: Prior, mode: int, plant: Plant, settings: Any) ->
 
 def _optimal(cycle: Cycle, mirror: Mirror) -> Law:
     row = command_rows(cycle.steps[0][0], cycle.rows.sum(axis=0), mirror)
-    return _two_sensors(optimal_gains(cycle.steps)[0], row, cycle.model)
+    return _two_sensors(cycle.filter(), row)
 
 
-def _two_sensors(gains: GainCycle, row: Array, model: DisturbanceModel) -> Law:
-    filter_ = filter_of_gains(gains, row)
+def _two_sensors(mode_filter: ModeFilter, row: Array) -> Law:
+    filter_ = filter_of_gains(mode_filter.gains, row)
     run = partial(_run_first, filter_)
-    return Law(filter_.cycle, run, first=filter_.first, model=model, gains=gains, row=row[0])
+    return Law(filter_.cycle, run, first=filter_.first, gains=mode_filter.gains, row=row[0], filter=mode_filter)
 
 
 def _run_first(filter_: MultiRateFilter, z: Array) -> Array:

@@ -31,8 +31,8 @@ class StepController:
         Mirror, step and NGS ratio that it was designed for.
     sampling : Sampling
         Number of modes, step and NGS ratio.
-    bridges : tuple of Bridge
-        What completes LGS measurements and NGS frames; None without NGS.
+    bridges : tuple of Bridge or None
+        What completes LGS measurements and NGS frames; None where missing ones are none to its law.
     frame : int
         Frames that it has taken.
     """
@@ -44,21 +44,22 @@ class StepController:
         sampling: Sampling,
         law: StepLaw | None,
         ahead: VibrationAhead | None,
-        lgs: Bridge,
-        ngs: Bridge | None,
+        uses_ngs: bool,
+        bridges: tuple[Bridge, Bridge] | None,
     ):
         self.id, self.plant, self.sampling, self.law, self.ahead = id, plant, sampling, law, ahead
         self.frame = 0
         n = sampling.n_modes
-        self._lgs, self._ngs, self._ratio = lgs, ngs, sampling.ratio or 0
+        self.uses_ngs, self._ratio = uses_ngs, sampling.ratio or 0
+        self.bridges, (self._lgs, self._ngs) = bridges, bridges or (None, None)
+        if not uses_ngs:
+            self._ngs = None
         self._taps = plant.mirror.taps[1:]
         self._commands = np.zeros((len(self._taps), n))  # commands, newest first
         self._mirror = np.zeros((max(self._ratio, 1), n))  # the mirror in the last measurements, newest first
         self._nothing, self._none = np.full(n, np.nan), np.zeros(n)
-        self.bridges = lgs, ngs
-        self._parts: dict[str, Stateful] = {"lgs": lgs}
-        self._parts |= {} if law is None else {"law": law}
-        self._parts |= {} if ngs is None else {"ngs": ngs}
+        found = {"lgs": self._lgs, "law": law, "ngs": self._ngs}
+        self._parts: dict[str, Stateful] = {name: part for name, part in found.items() if part is not None}
         self._parts |= {} if ahead is None else ahead.parts
 
     def update(self, y: ArrayLike, ngs: ArrayLike | None = None) -> Array:
@@ -70,7 +71,7 @@ class StepController:
             LGS measurement of every mode, residual of the loop, (n_modes,) [um]; NaN is missing.
         ngs : array_like, optional
             NGS measurement, (n_modes,) [um], in the frames that have one: k = n, 2n, ... for the ratio n. One that is due and
-            missing or NaN is predicted.
+            not given, or NaN, is missing.
 
         Returns
         -------
@@ -111,14 +112,17 @@ class StepController:
 
     def _take(self, x: ArrayLike, ngs: ArrayLike | None, name: str, is_open: bool) -> Array:
         x, is_whole = check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
-        due = self._ngs is not None and self.frame > 0 and self.frame % self._ratio == 0
-        slow = None if self._ngs is None else self._check_ngs(ngs, due)
+        due = self.uses_ngs and self.frame > 0 and self.frame % self._ratio == 0
+        slow = self._check_ngs(ngs, due) if self.uses_ngs else None
         seen = self.correction
-        z = self._lgs.complete(x if is_open else x - seen, is_whole)
-        if self._ngs is not None:
+        z = x if is_open else x - seen
+        if self._lgs is not None:
+            z = self._lgs.complete(z, is_whole)
+        if self.uses_ngs:
             push_row(self._mirror, seen)
-            if slow is not None:
-                slow = self._ngs.complete(slow if is_open else slow - self._mirror.mean(axis=0))
+        if slow is not None:
+            slow = slow if is_open else slow - self._mirror.mean(axis=0)
+            slow = slow if self._ngs is None else self._ngs.complete(slow)
         forward = self._none
         if self.ahead is not None:
             z, forward = self.ahead.split(z)
@@ -175,9 +179,9 @@ class StepController:
             self.ahead.estimator.take_over(old.ahead.estimator)
             if self.ahead.bank.x.shape == old.ahead.bank.x.shape:
                 self.ahead.bank.load(old.ahead.bank.save())
-        self._lgs.take_over(old._lgs)
-        if self._ngs is not None and old._ngs is not None:
-            self._ngs.take_over(old._ngs)
+        for bridge, was in ((self._lgs, old._lgs), (self._ngs, old._ngs)):
+            if bridge is not None and was is not None:
+                bridge.take_over(was)
         self._commands[...], self._mirror[...], self.frame = old._commands, old._mirror, old.frame
 
     def _clip(self, command: Array) -> Array:

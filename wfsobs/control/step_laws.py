@@ -9,11 +9,13 @@ import numpy as np
 
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Mirror, Plant
-from wfsobs.observers.kalman.step import carry_state
+from wfsobs.observers.kalman.step import KalmanEstimator
+from wfsobs.observers.kalman.with_gaps import each_frame
 from wfsobs.observers.step import Estimator
 from wfsobs.observers.step_checks import StepError
 from wfsobs.prior import Bands, Prior
-from wfsobs.record import Sampling
+from wfsobs.progress import Watch
+from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.bandpass import bandpass_bank, bank_recursion
 from wfsobs.signal.stepping import FilterBank, Recursion, Saved, Stateful
 from wfsobs.typing import Array
@@ -58,20 +60,12 @@ class LinearLaws:
         """Take no notice: z holds none of the commands."""
 
     def take_over(self, old: Any) -> None:
-        """Go on where the disturbance is in the old laws' states; laws of no model take over a state of the same size."""
+        """Go on from a state of the same size."""
         if not isinstance(old, LinearLaws) or len(old.bank.maps) != len(self.bank.maps):
             raise StepError("the laws are of another kind")
-        self.bank.phase, self.bank.last = old.bank.phase, old.bank.last
-        for x, was, law, before in zip(self.bank.x, old.bank.x, self.laws, old.laws, strict=True):
-            if law.model is not None and before.model is not None:
-                n, m = len(law.model.A), len(before.model.A)
-                x[:n] = carry_state(law.model, before.model, was[:m])
-                if len(x) - n == len(was) - m:
-                    x[n:] = was[m:]
-            elif x.shape == was.shape:
-                x[...] = was
-            else:
-                raise StepError("the laws have states of another size")
+        if old.bank.x.shape != self.bank.x.shape:
+            raise StepError("the laws have states of another size")
+        self.bank.load(old.bank.save())
 
     def reset(self) -> None:
         """Set the state back to rest."""
@@ -84,6 +78,49 @@ class LinearLaws:
     def load(self, state: Mapping[str, Array]) -> None:
         """Take over a state."""
         self.bank.load(state)
+
+
+class KalmanLaws:
+    """Laws as rows of what Kalman filters estimate; a measurement that is missing, NaN, is none to them."""
+
+    def __init__(self, laws: Sequence[Law]):
+        self.laws, known = tuple(laws), [law for law in laws if law.filter is not None and law.row is not None]
+        self.filters = KalmanEstimator([law.filter for law in known if law.filter is not None])
+        self._rows = np.zeros_like(self.filters.bank.x)
+        for row, law in zip(self._rows, known, strict=True):
+            assert law.row is not None
+            row[: len(law.row)] = law.row
+
+    def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
+        """Return the commands of the estimates."""
+        self.filters.advance(z, ngs, None)
+        return np.sum(self._rows * self.filters.bank.x, axis=1) + forward
+
+    def run(self, measurements: Measurements, watch: Watch) -> Array:
+        """Return the commands over a record with gaps, (n_steps, n_modes) [um]. Raises Cancelled."""
+        none = np.zeros(len(self.laws))
+        return np.array([self.command(*frame, none) for frame in each_frame(measurements, self.filters.uses_ngs, watch)])
+
+    def tell(self, command: Array, forward: Array) -> None:
+        """Take no notice: z holds none of the commands."""
+
+    def take_over(self, old: Any) -> None:
+        """Go on where the disturbance is in the old filters' states."""
+        if not isinstance(old, KalmanLaws) or len(old.filters.bank.maps) != len(self.filters.bank.maps):
+            raise StepError("the laws are of another kind")
+        self.filters.take_over(old.filters)
+
+    def reset(self) -> None:
+        """Set the state back to rest."""
+        self.filters.reset()
+
+    def save(self) -> Saved:
+        """Return a copy of the state."""
+        return self.filters.save()
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        self.filters.load(state)
 
 
 class Integrators:
@@ -121,6 +158,20 @@ class Integrators:
     def load(self, state: Mapping[str, Array]) -> None:
         """Take over a state."""
         self._own[...] = state["own"]
+
+
+def take_missing(laws: Sequence[Law]) -> bool:
+    """Return whether a measurement that is missing can be none to all these laws."""
+    return bool(laws) and all(law.filter is not None and law.row is not None for law in laws)
+
+
+def step_law(laws: Sequence[Law], mirror: Mirror) -> StepLaw | None:
+    """Return the laws of all modes, one frame at a time; None for no laws."""
+    if take_missing(laws):
+        return KalmanLaws(laws)
+    if any(one.gain is None for one in laws):
+        return LinearLaws(laws)
+    return Integrators(laws, mirror) if laws else None
 
 
 class VibrationAhead:

@@ -1,6 +1,7 @@
 """A linear controller as C99 without dependencies: a header, a source, and a test on vectors of the run over a record.
 
-Sparse rows of A and dense C and L are tables of constants; one function runs any of the filters. Memory is static.
+Sparse rows of A and dense C and L are tables of constants; one function runs any of the filters. Memory is static. Near gaps the
+covariance of a Kalman filter goes along, in double precision; it starts from that of the steady state, which is a table as well.
 """
 
 from __future__ import annotations
@@ -12,9 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from wfsobs.files import write_whole
-from wfsobs.handover.linear import LinearDesign, predicts_itself
+from wfsobs.handover.linear import LinearDesign
 from wfsobs.handover.vectors import Vectors
 from wfsobs.observers.step_checks import StepError
+from wfsobs.signal.gap_gains import GapGains
+from wfsobs.signal.riccati import Step
 from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 
@@ -29,31 +32,55 @@ class _Tables:
         self._names: dict[tuple[str, bytes], str] = {}
 
     def numbers(self, kind: str, values: Array) -> str:
-        """Return the name of a table of `kind`, real or int."""
+        """Return the name of a table of `kind`, real, double or int."""
         values = np.ascontiguousarray(values).ravel()
         key = kind, values.tobytes()
         if key not in self._names:
             self._names[key] = name = f"t{len(self._names)}"
-            text = ", ".join(repr(float(v)) if kind == "real" else str(int(v)) for v in values)
+            text = ", ".join(str(int(v)) if kind == "int" else repr(float(v)) for v in values)
             self.lines.append(f"static const {kind} {name}[] = {{{text}}};")
         return self._names[key]
 
     def step(self, gain: Gain) -> str:
         """Return the initialiser of a step: sparse A, then rows of C and columns of L."""
-        rows = [np.flatnonzero(row) for row in gain.A]
-        starts = np.concatenate([[0], np.cumsum([len(row) for row in rows])])
-        values = np.concatenate([gain.A[i, row] for i, row in enumerate(rows)])
         second = len(gain.C) > 1
         parts = [
-            self.numbers("real", values),
-            self.numbers("int", np.concatenate(rows)),
-            self.numbers("int", starts),
+            *self.sparse("real", gain.A),
             self.numbers("real", gain.C[0]),
             self.numbers("real", gain.L[:, 0]),
             self.numbers("real", gain.C[1]) if second else "0",
             self.numbers("real", gain.L[:, 1]) if second else "0",
         ]
         return "{" + ", ".join(parts) + "}"
+
+    def sparse(self, kind: str, A: Array) -> list[str]:
+        """Return the names of the non-zero elements of a matrix row by row, their columns, and where each row starts."""
+        rows = [np.flatnonzero(row) for row in A]
+        starts = np.concatenate([[0], np.cumsum([len(row) for row in rows])])
+        values = np.concatenate([A[i, row] for i, row in enumerate(rows)])
+        return [self.numbers(kind, values), self.numbers("int", np.concatenate(rows)), self.numbers("int", starts)]
+
+    def gap_step(self, step: Step, posterior: Array) -> str:
+        """Return the initialiser of a step near a gap: sparse A and Q, C, the variances of the noise, the steady covariance."""
+        A, C, Q, R = step
+        dense = (C, np.diag(R), posterior)
+        return (
+            "{"
+            + ", ".join([*self.sparse("double", A), *self.sparse("double", Q), *(self.numbers("double", x) for x in dense)])
+            + "}"
+        )
+
+    def gaps(self, gaps: GapGains | None, name: str) -> str:
+        """Return the initialiser of the gains near gaps, with their covariance."""
+        if gaps is None:
+            return "{0, 0, 0, 0, 0, 0, 0}"
+        steps = ", ".join(map(self.gap_step, gaps.cycle, gaps.posteriors))
+        n = len(gaps.weights)
+        self.lines.append(f"static const struct gap_step {name}_steps[] = {{{steps}}};")
+        self.lines.append(f"static double {name}_p[{n * n}];")
+        self.lines.append(f"static int {name}_near;")
+        counts = f"{len(gaps.cycle)}, {len(gaps.cycle[0][1])}"
+        return f"{{{counts}, {name}_steps, {self.numbers('double', gaps.weights)}, {gaps.most!r}, {name}_p, &{name}_near}}"
 
     def filter(self, gains: GainCycle | None, name: str) -> str:
         """Return the initialiser of a filter with its state."""
@@ -70,13 +97,12 @@ def source(design: LinearDesign) -> Mapping[str, str]:
     """Return the text files of the design by name."""
     tables, modes = _Tables(), []
     for i, mode in enumerate(design.modes):
-        own = predicts_itself(mode)
         parts = [
             tables.filter(mode.gains, f"u{i}"),
-            tables.filter(None if own else mode.lgs, f"z{i}"),
+            tables.filter(mode.lgs, f"z{i}"),
             tables.filter(mode.ngs if design.ratio else None, f"s{i}"),
+            tables.gaps(mode.gaps, f"g{i}"),
             tables.numbers("real", mode.row),
-            str(int(own)),
         ]
         modes.append("{" + ", ".join(parts) + "}")
     most = max(len(step.A) for mode in design.modes for g in (mode.gains, mode.lgs, mode.ngs) if g for step in g.steps)

@@ -4,7 +4,8 @@ Per mode, with e[k] the innovation of the measurements v[k] (z alone, or z and t
 
     e = v - C x,    w = x + L e,    u = row w,    x <- A w,
 
-(A, C, L) repeating every few steps. Where a measurement is missing its innovation is that of what a filter of its own predicts.
+(A, C, L) repeating every few steps. To a Kalman filter a measurement that is missing is none, and near it the gains are those of
+its covariance (`wfsobs.signal.gap_gains`). To another controller its innovation is that of what a filter of its own predicts.
 """
 
 from __future__ import annotations
@@ -12,11 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
 from wfsobs.control.step import StepController
-from wfsobs.control.step_laws import Integrators, LinearLaws
+from wfsobs.control.step_laws import Integrators, KalmanLaws, LinearLaws
 from wfsobs.observers.step_checks import StepError
+from wfsobs.signal.gap_gains import GapGains
 from wfsobs.signal.stepping import GainCycle
 from wfsobs.typing import Array
 
@@ -25,13 +25,15 @@ class ModeMatrices(NamedTuple):
     """One mode.
 
     gains, row : of the controller
-    lgs, ngs   : of what predicts a missing measurement or NGS frame; None where the last one is held
+    gaps       : gains near gaps; None where missing measurements are bridged
+    lgs, ngs   : of what then predicts a missing measurement or NGS frame; None where the last one is held
     """
 
     gains: GainCycle
     row: Array
-    lgs: GainCycle | None
-    ngs: GainCycle | None
+    gaps: GapGains | None = None
+    lgs: GainCycle | None = None
+    ngs: GainCycle | None = None
 
 
 @dataclass(frozen=True)
@@ -63,14 +65,15 @@ class LinearDesign:
         """Steps after which the gains repeat."""
         return max(len(mode.gains.steps) for mode in self.modes)
 
-    def conventions(self, bridges: bool) -> list[str]:
-        """Return units, signs and timing, as lines of text; bridges : whether missing measurements are predicted."""
+    def conventions(self, takes_gaps: bool) -> list[str]:
+        """Return units, signs and timing, as lines of text; takes_gaps : whether measurements may be missing."""
+        gaps = "none to a Kalman filter, to others predicted, or the last one held"
         seen = " + ".join(f"{tap:g} u[k-{i}]" for i, tap in enumerate(self.taps) if tap)
         lines = [
             f"Controller {self.id} of wfsobs, {len(self.modes)} modes, one call every {self.dt:g} s.",
             "In: z, the pseudo-open-loop measurement of every mode [um rms, Noll-normalised Zernike coefficients].",
             f"    z[k] = y[k] - ({seen}), y the measurement of the sensor, u the commands that the mirror took.",
-            "    NaN is a missing measurement: predicted, or the last one held." if bridges else "    None may be missing.",
+            f"    NaN is a missing measurement: {gaps}." if takes_gaps else "    None may be missing.",
             "Out: u[k], the command of every mode [um], computed once y[k] is known. The residual is disturbance + u.",
             "    Limits of the mirror are the caller's: subtract in z the commands that it took.",
         ]
@@ -90,22 +93,15 @@ def linear_design(controller: StepController) -> LinearDesign:
         raise StepError(f"{controller.id}: there is no law to write")
     if controller.ahead is not None:
         raise StepError(f"{controller.id}: a prediction by Gaussian process regression has no linear form")
-    assert isinstance(law, (LinearLaws, Integrators))
+    assert isinstance(law, (KalmanLaws, LinearLaws, Integrators))
     if isinstance(law, Integrators) and controller.plant.mirror.has_limits:
         raise StepError(f"{controller.id}: limits of the mirror stop an integrator, which no linear form does: leave them at 0")
-    lgs, ngs = controller.bridges
+    lgs, ngs = ({}, {}) if controller.bridges is None else (bridge.gains for bridge in controller.bridges)
     modes = []
     for mode, one in enumerate(law.laws):
         if one.gains is None or one.row is None:
             raise StepError(f"{controller.id}: its law is not known as gains of an observer")
-        modes.append(ModeMatrices(one.gains, one.row, lgs.gains.get(mode), None if ngs is None else ngs.gains.get(mode)))
-    ratio = 0 if ngs is None else controller.sampling.ratio or 0
+        gaps = one.filter.gaps() if one.filter is not None and controller.bridges is None else None
+        modes.append(ModeMatrices(one.gains, one.row, gaps, lgs.get(mode), ngs.get(mode)))
+    ratio = controller.sampling.ratio or 0 if controller.uses_ngs else 0
     return LinearDesign(controller.id, controller.sampling.dt, ratio, controller.plant.mirror.taps, tuple(modes))
-
-
-def predicts_itself(mode: ModeMatrices) -> bool:
-    """Return whether a missing measurement is what the controller's own filter predicts, so that its innovation is zero."""
-    if mode.lgs is None or len(mode.gains.steps) > 1:
-        return False
-    pairs = zip(mode.gains.steps[0], mode.lgs.steps[0], strict=True)
-    return all(a.shape == b.shape and np.array_equal(a, b) for a, b in pairs)

@@ -53,6 +53,12 @@ class GapStep:
 class GapGains:
     """The steps of a filter near its gaps.
 
+    Attributes
+    ----------
+    weights, most : Array, float
+        The filter is steady where all is measured and the sum of `weights` times the covariance above the steady one is at most
+        `most`.
+
     Parameters
     ----------
     cycle : sequence of Step
@@ -66,8 +72,8 @@ class GapGains:
     """
 
     def __init__(self, cycle: Sequence[Step], posteriors: Sequence[Array], rows: Array, scale: float):
-        self._cycle, self._posteriors = tuple(cycle), tuple(posteriors)
-        self._weights, self._least = rows.T @ rows, STEADY * scale
+        self.cycle, self.posteriors = tuple(cycle), tuple(posteriors)
+        self.weights, self.most = rows.T @ rows, STEADY * scale
         self._first: dict[tuple[int, Pattern], GapStep] = {}
         n = len(rows[0])
         self._room = self._free = max(int(KEPT / (8 * n * (2 * n + 2))), 1)
@@ -86,7 +92,7 @@ class GapGains:
         """
         known = self._first.get((j, pattern)) if before is None else before.following.get(pattern)
         if known is None:
-            known = self._make(self._posteriors[j - 1] if before is None else before.posterior, j, pattern)
+            known = self._make(self.posteriors[j - 1] if before is None else before.posterior, j, pattern)
             if self._free == 0:
                 self._first.clear()
                 self._free = self._room
@@ -98,8 +104,8 @@ class GapGains:
         return known
 
     def _make(self, P: Array, j: int, pattern: Pattern) -> GapStep:
-        A, _, Q, _ = self._cycle[j - 1]
-        _, C, _, R = self._cycle[j]
+        A, _, Q, _ = self.cycle[j - 1]
+        _, C, _, R = self.cycle[j]
         P = A @ P @ A.T + Q
         update = np.hstack([A, np.zeros((len(A), len(C)))])
         for i, is_there in enumerate(pattern):  # one after the other, as their noises are independent
@@ -110,5 +116,5 @@ class GapGains:
                 update -= np.outer(gain, C[i] @ update)
                 update[:, len(A) + i] += gain
         P = 0.5 * (P + P.T)
-        is_last = all(pattern) and np.vdot(self._weights, P - self._posteriors[j]) <= self._least
+        is_last = all(pattern) and np.vdot(self.weights, P - self.posteriors[j]) <= self.most
         return GapStep(P, update, bool(is_last))

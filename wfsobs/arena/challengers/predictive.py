@@ -112,8 +112,8 @@ class LearningController(Controller):
 
     def design(self, prior: Prior, plant: Plant, settings: Settings, sampling: Sampling) -> StepController:
         """Return the controller one frame at a time, see `Controller.design`."""
-        lgs, _ = bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio)
-        return StepController(self.id, plant, sampling, self.step_law(plant, sampling.n_modes), None, lgs, None)
+        beside = bridges(prior, sampling.n_modes, sampling.dt, sampling.ratio)
+        return StepController(self.id, plant, sampling, self.step_law(plant, sampling.n_modes), None, False, beside)
 
     def commands(
         self, laws: Any, measurements: Measurements, prior: Prior, plant: Plant, settings: Settings, watch: Watch = QUIET

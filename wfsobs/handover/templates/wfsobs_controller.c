@@ -15,10 +15,29 @@ struct filter {
     real *x;
 };
 
+/* A step of a Kalman filter near a gap: A and Q by their non-zero elements, C, the variances of the noise, the steady covariance. */
+struct gap_step {
+    const double *a;
+    const int *a_columns, *a_starts;
+    const double *q;
+    const int *q_columns, *q_starts;
+    const double *c, *r, *steady;
+};
+
+/* Near a gap the covariance p goes along, until all is measured and the sum of weights (p - steady) is at most most. */
+struct gaps {
+    int count, sensors; /* steps that repeat, 0 where missing measurements are bridged */
+    const struct gap_step *steps;
+    const double *weights;
+    double most;
+    double *p;
+    int *near;
+};
+
 struct mode {
     struct filter law, lgs, ngs; /* the controller, and what predicts missing measurements: n = 0 where the last is held */
+    struct gaps gaps;
     const real *row;
-    int own; /* whether the controller predicts them itself */
 };
 
 @TABLES@
@@ -28,6 +47,7 @@ static const struct mode modes[WFSOBS_MODES] = {
 };
 
 static real last_z[WFSOBS_MODES], last_ngs[WFSOBS_MODES], w[@STATES@];
+static double product[@STATES@ * @STATES@], ahead[@STATES@];
 static unsigned long call;
 
 static real dot(const real *a, const real *b, int n)
@@ -39,17 +59,23 @@ static real dot(const real *a, const real *b, int n)
 
 static int is_missing(real v) { return v != v; }
 
+/* From the state after the measurement, w, to the next step. */
+static void predict(const struct filter *f, const struct step *s)
+{
+    for (int i = 0; i < f->n; i++) {
+        real sum = 0;
+        for (int j = s->starts[i]; j < s->starts[i + 1]; j++) sum += s->a[j] * w[s->columns[j]];
+        f->x[i] = sum;
+    }
+}
+
 /* One step of a filter with its innovations; w holds the state after the measurement. */
 static void move(const struct filter *f, const struct step *s, real e0, real e1)
 {
     for (int i = 0; i < f->n; i++) w[i] = f->x[i] + s->l0[i] * e0;
     if (s->l1)
         for (int i = 0; i < f->n; i++) w[i] += s->l1[i] * e1;
-    for (int i = 0; i < f->n; i++) {
-        real sum = 0;
-        for (int j = s->starts[i]; j < s->starts[i + 1]; j++) sum += s->a[j] * w[s->columns[j]];
-        f->x[i] = sum;
-    }
+    predict(f, s);
 }
 
 static const struct step *at(const struct filter *f)
@@ -75,6 +101,66 @@ static real complete(const struct filter *f, real v, real *last)
     return v;
 }
 
+/* p <- A p A' + Q of a step, p from `from`. */
+static void grow(const struct gap_step *s, const double *from, double *p, int n)
+{
+    for (int i = 0; i < n; i++)
+        for (int k = 0; k < n; k++) {
+            double sum = 0;
+            for (int j = s->a_starts[i]; j < s->a_starts[i + 1]; j++) sum += s->a[j] * from[s->a_columns[j] * n + k];
+            product[i * n + k] = sum;
+        }
+    for (int i = 0; i < n; i++)
+        for (int k = 0; k < n; k++) {
+            double sum = 0;
+            for (int j = s->a_starts[k]; j < s->a_starts[k + 1]; j++) sum += s->a[j] * product[i * n + s->a_columns[j]];
+            p[i * n + k] = sum;
+        }
+    for (int i = 0; i < n; i++)
+        for (int j = s->q_starts[i]; j < s->q_starts[i + 1]; j++) p[i * n + s->q_columns[j]] += s->q[j];
+}
+
+/* Measure v with row c and a noise of variance r: p and w after it. */
+static void measure(const double *c, double r, real v, double *p, int n)
+{
+    double variance = r, e = v;
+    for (int i = 0; i < n; i++) {
+        ahead[i] = 0;
+        for (int k = 0; k < n; k++) ahead[i] += p[i * n + k] * c[k];
+        variance += c[i] * ahead[i];
+        e -= c[i] * w[i];
+    }
+    for (int i = 0; i < n; i++) {
+        w[i] += (real)(ahead[i] / variance * e);
+        for (int k = 0; k < n; k++) p[i * n + k] -= ahead[i] / variance * ahead[k];
+    }
+}
+
+/* Return 0 where a mode is in its steady state and nothing is missing, else take its step and return 1. */
+static int near_gap(const struct mode *m, const struct step *s, const real *v, int due)
+{
+    const struct gaps *g = &m->gaps;
+    const int n = m->law.n, first = m->law.first && call == 0;
+    const int seen = g->sensors > 1 && due ? 2 : 1;
+    const unsigned long count = (unsigned long)g->count;
+    const unsigned long j = (call + count - (unsigned long)m->law.first) % count;
+    const struct gap_step *now = g->steps + j, *before = g->steps + (j + count - 1) % count;
+    double above = 0;
+    int whole = 1;
+    for (int i = 0; i < seen; i++) whole = whole && !is_missing(v[i]);
+    if (whole && !*g->near) return 0;
+    grow(before, *g->near ? g->p : before->steady, g->p, n);
+    for (int i = 0; i < n; i++) w[i] = m->law.x[i];
+    for (int i = 0; i < seen; i++)
+        if (!is_missing(v[i])) measure(now->c + i * n, now->r[i], v[i], g->p, n);
+    for (int i = 0; i < n; i++)
+        for (int k = 0; k < i; k++) g->p[i * n + k] = g->p[k * n + i] = 0.5 * (g->p[i * n + k] + g->p[k * n + i]);
+    for (int i = 0; i < n * n; i++) above += g->weights[i] * (g->p[i] - now->steady[i]);
+    *g->near = first || !whole || above > g->most;
+    predict(&m->law, s);
+    return 1;
+}
+
 void wfsobs_step(const wfsobs_real *z, const wfsobs_real *ngs, wfsobs_real *u)
 {
     int due = WFSOBS_RATIO > 0 && call > 0 && call % (WFSOBS_RATIO > 0 ? WFSOBS_RATIO : 1) == 0;
@@ -82,17 +168,13 @@ void wfsobs_step(const wfsobs_real *z, const wfsobs_real *ngs, wfsobs_real *u)
         const struct mode *m = modes + i;
         const struct filter *f = &m->law;
         const struct step *s = at(f);
-        real e0 = 0, e1 = 0;
-        if (!m->own)
-            e0 = complete(&m->lgs, z[i], last_z + i) - dot(s->c0, f->x, f->n);
-        else if (!is_missing(z[i]))
-            e0 = z[i] - dot(s->c0, f->x, f->n);
-        if (due && s->c1) {
-            volatile real none = 0;
-            real v = ngs ? ngs[i] : none / none;
-            e1 = complete(&m->ngs, v, last_ngs + i) - dot(s->c1, f->x, f->n);
+        volatile real none = 0;
+        real v[2] = {z[i], ngs ? ngs[i] : none / none};
+        if (!m->gaps.count || !near_gap(m, s, v, due)) {
+            real e0 = complete(&m->lgs, v[0], last_z + i) - dot(s->c0, f->x, f->n), e1 = 0;
+            if (due && s->c1) e1 = complete(&m->ngs, v[1], last_ngs + i) - dot(s->c1, f->x, f->n);
+            move(f, s, e0, e1);
         }
-        move(f, s, e0, e1);
         u[i] = dot(m->row, w, f->n);
     }
     call++;
@@ -109,6 +191,7 @@ void wfsobs_reset(void)
         rest(&modes[i].law);
         rest(&modes[i].lgs);
         rest(&modes[i].ngs);
+        if (modes[i].gaps.near) *modes[i].gaps.near = 0;
         last_z[i] = last_ngs[i] = 0;
     }
     call = 0;

@@ -167,15 +167,19 @@ def multirate(measurements: Measurements, prior: Prior, settings: MultiRate, wat
 
 
 def _filters(prior: Prior, settings: MultiRate, ratio: int) -> list[ModeFilter]:
-    """Return the filters of all modes. Near gaps there are more gains than two: those of the covariance as it is there."""
-    modes = []
-    for known in prior.model:
-        model, noises = known.disturbance(), multirate_noise(settings, known)
-        gains = multirate_gains(model, ratio, *noises)
-        R, last = np.diag([noise**2 for noise in noises]), gains.steps[-1]
-        cycle = tuple((A, C if step is last else C * [[1.0], [0.0]], model.Q, R) for step in gains.steps for A, C, _ in [step])
-        modes.append(ModeFilter(model, gains, tuple(multirate_posteriors(model, gains, *noises)), cycle))
-    return modes
+    """Return the filters of all modes."""
+    return [multirate_mode(known.disturbance(), ratio, *multirate_noise(settings, known)) for known in prior.model]
+
+
+def multirate_mode(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float) -> ModeFilter:
+    """Return the filter of a mode; near gaps it has more gains than two: those of the covariance as it is there.
+
+    Raises UnstableCycle.
+    """
+    gains = multirate_gains(model, ratio, lgs_noise, ngs_noise)
+    R, last = np.diag([lgs_noise**2, ngs_noise**2]), gains.steps[-1]
+    cycle = tuple((A, C if step is last else C * [[1.0], [0.0]], model.Q, R) for step in gains.steps for A, C, _ in [step])
+    return ModeFilter(model, gains, tuple(multirate_posteriors(model, gains, lgs_noise, ngs_noise)), cycle)
 
 
 def step_multirate(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:
