@@ -13,7 +13,6 @@ from tests.records import short
 from wfsobs import PRESETS
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers.step_checks import StepError
-from wfsobs.prior import Lines
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -48,10 +47,6 @@ def difference(name: str, record: Record, scenario: Scenario) -> float:
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_steps_are_the_run_over_the_record(name: str, preset: str) -> None:
     record, scenario = with_gaps(preset)
-    if Lines in CONTROLLERS[name].prior and scenario.vibration.source == "psd":
-        with pytest.raises(ValueError, match="table, not lines"):
-            wfsobs.design(name, scenario, sampling=record.sampling)
-        return
     assert difference(name, record, scenario) <= (GPR if "gpr" in name else ROUNDING)
 
 

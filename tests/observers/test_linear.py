@@ -11,7 +11,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.execution import run_observer
 from wfsobs.observers.ridge import TAPS, fit, predict
-from wfsobs.priors_from.scenario import modelled_processes, multi_model, predicted_rms
+from wfsobs.priors_from.scenario import lines_of, modelled_processes, multi_model, predicted_rms
 from wfsobs.priors_from.turbulence import modelled_turbulence
 from wfsobs.record import RecordError
 from wfsobs.scenario import Scenario
@@ -189,7 +189,8 @@ def test_the_third_order_is_an_option() -> None:
     assert isinstance(third, Ar3) and third.rms == pytest.approx(0.5, rel=0.05)
 
 
-def test_a_table_of_a_spectrum_names_no_lines() -> None:
+def test_a_table_of_a_spectrum_is_a_continuum() -> None:
+    """Told 1e-6 um^2/Hz from 1 to 50 Hz: no lines, and processes of that variance, to a tenth."""
     s = small(
         {
             "vibration.source": "psd",
@@ -198,5 +199,6 @@ def test_a_table_of_a_spectrum_names_no_lines() -> None:
             "vibration.psd.tilt": [1e-6, 1e-6],
         }
     )
-    with pytest.raises(ValueError, match=r"vibration\.source = psd"):
-        multi_model(s, 0, s.dt)
+    told = lines_of(s, 0)
+    assert told.lines == () and sum(p.rms**2 for p in told.continuum) == pytest.approx(49e-6, rel=0.1)
+    assert len(multi_model(s, 0, s.dt).A) == 2 * (len(told.turbulence) + len(told.continuum))

@@ -16,6 +16,7 @@ from wfsobs.observers.kalman.multirate_optimal import optimal_cycle, optimal_fil
 from wfsobs.observers.kalman.single import MIN_NOISE, steady_filter
 from wfsobs.prior import Line, Lines
 from wfsobs.priors_from.turbulence import modelled_turbulence
+from wfsobs.priors_from.vibration import vibration_continuum
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
@@ -69,14 +70,18 @@ def follow_signal(
 
 
 def right_model(scenario: Scenario, mode: int, given_lines: Sequence[float]) -> DisturbanceModel | None:
-    """Return the state-space model of the true turbulence and of the lines [Hz] that are given, None where there is neither."""
+    """Return the state-space model of the true turbulence and of the lines [Hz] that are given, None where there is neither.
+
+    Who is given all lines is given what is no line as well.
+    """
     lines = [Line(*line) for line in vibration_lines(scenario, mode)]
     near = is_near(np.array([line.frequency for line in lines]), given_lines)
     known = tuple(line for line, is_given in zip(lines, near, strict=True) if is_given)
     turbulence = true_turbulence(scenario, mode)
     if not (known or turbulence):
         return None
-    return Lines(0.0, scenario.dt, turbulence, known).disturbance(scenario.multipeak.line_width)
+    continuum = vibration_continuum(scenario, mode) if len(known) == len(lines) else ()
+    return Lines(0.0, scenario.dt, turbulence, known, continuum).disturbance(scenario.multipeak.line_width)
 
 
 def true_turbulence(scenario: Scenario, mode: int) -> tuple[Ar2 | Ar3, ...]:

@@ -54,31 +54,33 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True)
 class Lines:
-    """The model of one mode with every line of the vibration.
+    """The model of one mode with the whole vibration.
 
     noise      : rms of the white noise of its measurement [um]
     turbulence : processes whose sum the turbulence is, sampled every `dt` [s]; a coloured background is one of them, as
         measurements alone cannot tell the two apart
     lines      : the peaks of the vibration
+    continuum  : processes whose sum is the part of the vibration that is no peak
     """
 
     noise: float
     dt: float
     turbulence: tuple[Ar2 | Ar3, ...] = ()
     lines: tuple[Line, ...] = ()
+    continuum: tuple[Ar2, ...] = ()
 
     def disturbance(self, line_width: float) -> DisturbanceModel:
         """Return the state-space model, with `line_width` the minimum line width (FWHM) [Hz]."""
-        return disturbance_model(self.turbulence, self.peaks(line_width))
+        return disturbance_model(self.turbulence, self.vibration(line_width))
 
-    def peaks(self, line_width: float) -> list[Ar2]:
-        """Return the processes of the lines."""
+    def vibration(self, line_width: float) -> list[Ar2]:
+        """Return the processes of the vibration: one per line, then the continuum."""
         least = pi * line_width  # as xi w
         peaks = []
         for frequency, damping, rms in self.lines:
             omega = 2.0 * pi * frequency
             peaks.append(Ar2(omega, min(max(damping, least / omega), 1.0), rms, self.dt))
-        return peaks
+        return [*peaks, *self.continuum]
 
 
 @dataclass(frozen=True)

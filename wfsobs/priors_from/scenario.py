@@ -11,6 +11,7 @@ from wfsobs.observers.base import Observer
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.prior import Bands, Beams, LgsError, Line, Lines, Model, Part, Prior, Spectra, Training
 from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence, measurement_noise, one_process
+from wfsobs.priors_from.vibration import vibration_continuum
 from wfsobs.record import Measurements, Record, Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import Group
@@ -127,23 +128,22 @@ def kalman_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
 
 
 def lines_of(scenario: Scenario, mode: int, dt: float | None = None, turbulence: tuple[Ar2 | Ar3, ...] | None = None) -> Lines:
-    """Noise, turbulence and all the lines of one mode. Raises ValueError where the vibration names no lines.
+    """Noise, turbulence, lines and continuum of one mode; a table of a spectrum is a continuum as a whole.
 
     turbulence : that of the same scenario, where already fitted
     """
-    if scenario.vibration.source == "psd":
-        raise ValueError("vibration.source = psd is a table, not lines that a model could have")
     dt = dt or scenario.dt
     return Lines(
         measurement_noise(scenario, mode)[0],
         dt,
         lines_turbulence(scenario, mode, dt) if turbulence is None else turbulence,
         tuple(Line(*line) for line in vibration_lines(scenario, mode)),
+        tuple(process.at(dt) for process in vibration_continuum(scenario, mode)),
     )
 
 
 def multi_model(scenario: Scenario, mode: int, dt: float) -> DisturbanceModel:
-    """Return the state-space model of all peaks. Raises ValueError where the vibration names no lines."""
+    """Return the state-space model of the whole vibration."""
     return lines_of(scenario, mode, dt).disturbance(scenario.multipeak.line_width)
 
 

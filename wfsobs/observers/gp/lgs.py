@@ -73,6 +73,7 @@ def kernels_of(lines: Lines, settings: GaussianProcess) -> tuple[Kernel, Kernel,
     for frequency, damping, rms in lines.lines:
         omega = 2.0 * pi * frequency
         peaks.append(Sho(rms, omega, min(max(damping, pi * LINE_WIDTH / omega), 1.0)))
+    peaks += [Sho(process.rms, process.omega, process.damping) for process in lines.continuum]
     colour = (Matern(settings.background_rms, settings.background_scale * 1e-3, 1),) if settings.background_rms else ()
     return Sum(turbulence or NOTHING), Sum(tuple(peaks) or NOTHING), Sum(colour or NOTHING)
 

@@ -29,15 +29,15 @@ def every_peak_model(rates: MultiRate, peaks: MultiPeak, prior: Prior, mode: int
     beams = prior.beams[mode]
     error = beams.lgs if rates.model_lgs_error else ()
     noises = multirate_noise(rates, prior.model[mode])
-    return estimated_cycle(beam_model(beams, prior.lines[mode].peaks(peaks.line_width)), ratio, *noises, error)
+    return estimated_cycle(beam_model(beams, prior.lines[mode].vibration(peaks.line_width)), ratio, *noises, error)
 
 
-def beam_model(beams: Beams, peaks: Sequence[Ar2]) -> DisturbanceModel:
+def beam_model(beams: Beams, vibration: Sequence[Ar2]) -> DisturbanceModel:
     """Return the model of the target's disturbance, measured as the LGS see it but for what they see alone."""
     turbulence = (*beams.common, *beams.target)
-    model = disturbance_model(turbulence, peaks)
-    gains = [*[beams.gain] * len(beams.common), *[0.0] * len(beams.target), *[beams.line_gain] * len(peaks)]
-    poles = [3 if isinstance(process, Ar3) else 2 for process in (*turbulence, *peaks)]
+    model = disturbance_model(turbulence, vibration)
+    gains = [*[beams.gain] * len(beams.common), *[0.0] * len(beams.target), *[beams.line_gain] * len(vibration)]
+    poles = [3 if isinstance(process, Ar3) else 2 for process in (*turbulence, *vibration)]
     return replace(model, C=model.C * np.repeat(gains, poles))
 
 
