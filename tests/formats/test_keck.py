@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -16,11 +17,15 @@ from wfsobs.telemetry.records import load_record
 DOCS = Path(__file__).parents[2] / "docs" / "scripts"
 
 
-def convert(folder: Path, out: Path) -> None:
-    spec = importlib.util.spec_from_file_location("keck_record", DOCS / "keck_record.py")
+def load_script(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    module.convert(folder, out)
+    return module
+
+
+def convert(folder: Path, out: Path) -> None:
+    load_script("keck_record").convert(folder, out)
 
 
 def test_the_record_of_a_keck_like_loop(tmp_path, capsys) -> None:
@@ -66,3 +71,14 @@ def test_files_that_do_not_go_together(tmp_path) -> None:
     np.save(tmp_path / "Commands_n1.npy", np.zeros((6, 2)))
     with pytest.raises(ValueError, match=r"Centroid has shape \(5, 2\), Commands \(6, 2\)"):
         convert(tmp_path, tmp_path / "keck.npz")
+
+
+def test_taps_predict_what_two_samples_say() -> None:
+    """A cosine is x[k+1] = 2 cos(w) x[k] - x[k-1]: no error, but of the first two where the taps start from zeros."""
+    k = np.arange(400)
+    z = np.cos(0.1 * k[:, None] + [0.0, 1.0])
+    taps_errors = load_script("keck_prediction").taps_errors
+    np.testing.assert_allclose(taps_errors(z, 200, 2, knows_first=True), 0.0, atol=1e-12)
+    at_rest = taps_errors(z, 200, 2, knows_first=False)
+    np.testing.assert_allclose(at_rest[:2], [z[200], z[201] - 2.0 * np.cos(0.1) * z[200]], rtol=1e-10)
+    np.testing.assert_allclose(at_rest[2:], 0.0, atol=1e-12)
