@@ -55,7 +55,8 @@ def ut4() -> Scenario:
       that both LGS have the same cone effect (49 nm rms per axis) and their mean has all of it;
     - vibration: what stands above the synthetic floor of the spectrum, 36.9 nm rms on tip and 50.7 nm on tilt;
     - Kalman filters matched to the scenario, their one peak on the strongest line above 12 Hz, 48.31 Hz with 26.5 nm on tilt;
-      the multi-peak one with turbulence of third order.
+      the multi-peak one with turbulence of third order, and lines 0.02 Hz wide: the true ones are narrower, but what is sure of
+      a line takes long to settle (docs/observers.md).
     """
     s = Scenario()
     s.update(
@@ -63,7 +64,7 @@ def ut4() -> Scenario:
             "turbulence": {"source": "frozen-flow"},
             "vibration": {"source": "measured", "spectrum": "eris-ut4", "part": "lines", "cutoff": 100.0},
             "kalman": {"frequency": 48.31, "damping": 0.001},
-            "multipeak": {"turbulence_order": 3},
+            "multipeak": {"turbulence_order": 3, "line_width": 0.02},
         }
     )
     return s
