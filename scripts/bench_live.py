@@ -3,12 +3,14 @@
     python scripts/bench_live.py [--seconds 60] [--pages 5] [--port 5930] [--browser]
 
 Starts `wfsobs live` on the preset paper with the linear observers and the online GPR, opens pages by websocket without a browser,
-and runs an empty loop of the same pace in a process of its own. Prints one JSON object: frames and lost frames; the shares of
+and runs two empty loops of the same pace in processes of their own. Prints one JSON object: frames and lost frames; the shares of
 frames that were late by more than 1 ms: an estimate of the slowest observer (`late_share`), what the source sent
-(`late_share_sent`), and the empty loop (`late_share_empty`); how far the observers were behind, sampled every second
+(`late_share_sent`), the empty loop (`late_share_empty`), and one that goes first as the source does where the system lets it
+(`late_share_empty_first`, `goes_first`); how far the observers were behind, sampled every second
 [s]; processor time of the server and all its processes over time [cores]; memory, proportional set size after the first minute
-(or the first tenth) and at the end [MB]. With --browser one more page stands in Chromium, whose processor time does not count;
-how far what it shows is behind the source is read every second [s].
+(or the first tenth), at the end, and at most [MB]. With --browser one more page stands in Chromium, whose processor time does not
+count; how far what it shows is behind the source is read every second [s]. What is asked of each follows in a line, passed or
+missed.
 """
 
 from __future__ import annotations
@@ -29,6 +31,8 @@ from urllib.request import urlopen
 from playwright.sync_api import sync_playwright
 from visitor import Visitor
 
+from wfsobs.live.paced import SOURCE, go_first
+
 LINEAR = ("kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi", "butterworth-cl", "persistence")
 OBSERVERS = (*LINEAR, "gpr-online")
 DT, LATE = 1e-3, 1e-3
@@ -36,8 +40,10 @@ SHOWN = re.compile(r"real time · ([0-9.]+) s ·")
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
-def run_empty(late, frames, end) -> None:
-    """Wake every millisecond and do nothing."""
+def run_empty(late, frames, end, first=None) -> None:
+    """Wake every millisecond and do nothing; first : whether it goes first, as the source does, is set where it is given."""
+    if first is not None:
+        first.value = go_first(SOURCE)
     due = time.monotonic() + DT
     while not end.value:
         if (wait := due - time.monotonic()) > 0:
@@ -115,8 +121,20 @@ def memory_mb(pids: list[int]) -> float:
 
 def counts(url: str) -> dict:
     """Return what the server counts of the loop."""
-    with urlopen(f"{url}/liveness", timeout=30) as answer:
+    with urlopen(f"{url}/liveness", timeout=120) as answer:
         return json.load(answer).get("live", {})
+
+
+def judge(result: dict) -> dict[str, bool]:
+    """Say of every number whether it is as good as is asked."""
+    memory, shown = result["memory_mb"], result["browser_behind_s"]
+    bars = {
+        "no frame lost": result["lost"] == 0,
+        "late at most 0.1 percentage points above the empty loop": result["late_share"] <= result["late_share_empty"] + 1e-3,
+        "source and server below 1.5 cores": result["cores"] < 1.5,
+        "memory within 5 %": memory["most"] <= 1.05 * memory["settled"] and memory["end"] >= 0.95 * memory["settled"],
+    }
+    return bars | ({"browser at most 0.5 s behind": shown["max"] <= 0.5} if shown else {})
 
 
 def main() -> None:
@@ -130,9 +148,13 @@ def main() -> None:
     url = f"http://localhost:{a.port}"
     chosen = [word for name in OBSERVERS for word in ("--observer", name)]
     server = subprocess.Popen([sys.executable, "-m", "wfsobs", "live", "--port", str(a.port), *chosen], stderr=subprocess.DEVNULL)
-    late, frames, end = Value("q", 0), Value("q", 0), Value("b", 0)
+    late, frames, late_first, frames_first = (Value("q", 0) for _ in range(4))
+    end, first_of_all = Value("b", 0), Value("b", 0)
     visitors = Process(target=visit, args=(f"localhost:{a.port}", a.pages), daemon=True)
-    empty = Process(target=run_empty, args=(late, frames, end), daemon=True)
+    empties = [
+        Process(target=run_empty, args=(late, frames, end), daemon=True),
+        Process(target=run_empty, args=(late_first, frames_first, end, first_of_all), daemon=True),
+    ]
     lags = Manager().list()
     browser = Process(target=watch, args=(url, lags, end))
     try:
@@ -148,7 +170,8 @@ def main() -> None:
         if a.browser:
             browser.start()
         time.sleep(15.0)  # the pages are open, and their first run is over
-        empty.start()
+        for empty in empties:
+            empty.start()
         first, start, cpu = counts(url), time.monotonic(), cpu_seconds(family(server.pid))
         behind, memory = [], []
         while (elapsed := time.monotonic() - start) < a.seconds:
@@ -156,11 +179,12 @@ def main() -> None:
             behind.append(counts(url)["behind_s"])
             memory.append((elapsed, memory_mb(family(server.pid))))
         last, seconds = counts(url), time.monotonic() - start
-        with urlopen(f"{url}/liveness", timeout=30) as answer:
+        with urlopen(f"{url}/liveness", timeout=120) as answer:
             pages = json.load(answer)["sessions"]
         used = cpu_seconds(family(server.pid)) - cpu
         end.value = 1
-        empty.join(5)
+        for empty in empties:
+            empty.join(5)
         if a.browser:
             browser.join(30)
         shown = sorted(lags)
@@ -171,26 +195,31 @@ def main() -> None:
         }
         settled = min(60.0, 0.1 * a.seconds)
         before = next(mb for at, mb in memory if at >= settled)
-        print(
-            json.dumps(
-                {
-                    "seconds": round(seconds, 1),
-                    "frames": taken,
-                    "lost": last["lost"] - first["lost"],
-                    **late_shares,
-                    "late_share_empty": round(late.value / max(frames.value, 1), 5),
-                    "behind_s": {"median": sorted(behind)[len(behind) // 2], "max": max(behind)},
-                    "cores": round(used / seconds, 3),
-                    "memory_mb": {"settled": round(before, 1), "end": round(memory[-1][1], 1)},
-                    "pages": pages,
-                    "browser_behind_s": {"median": shown[len(shown) // 2], "max": shown[-1]} if shown else None,
-                    "load": os.getloadavg()[0],
-                }
-            )
-        )
+        result = {
+            "seconds": round(seconds, 1),
+            "frames": taken,
+            "lost": last["lost"] - first["lost"],
+            **late_shares,
+            "late_share_empty": round(late.value / max(frames.value, 1), 5),
+            "late_share_empty_first": round(late_first.value / max(frames_first.value, 1), 5),
+            "goes_first": bool(first_of_all.value),
+            "behind_s": {"median": sorted(behind)[len(behind) // 2], "max": max(behind)},
+            "cores": round(used / seconds, 3),
+            "memory_mb": {
+                "settled": round(before, 1),
+                "end": round(memory[-1][1], 1),
+                "most": round(max(mb for at, mb in memory if at >= settled), 1),
+            },
+            "pages": pages,
+            "browser_behind_s": {"median": shown[len(shown) // 2], "max": shown[-1]} if shown else None,
+            "load": os.getloadavg()[0],
+        }
+        print(json.dumps(result))
+        for name, holds in judge(result).items():
+            print(f"{'passed' if holds else 'missed'}: {name}")
     finally:
         end.value = 1
-        for process in (visitors, browser):
+        for process in (visitors, browser, *empties):
             if process.pid:
                 process.kill()
         server.terminate()

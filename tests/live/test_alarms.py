@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wfsobs.live.alarms import FEWEST, Alarms, drift, noise_of
+from wfsobs.live.alarms import FEWEST, Alarms, distinct_peaks, drift, noise_of
 from wfsobs.live.board import SLOTS
 from wfsobs.live.crew import slot_width, trace_width
 from wfsobs.live.finding import Finding, PeakFinding
@@ -24,6 +24,12 @@ def second(noise, error=0.01, missing=0, seed=1):
     return LiveView(0, 1e-3, LiveFrame(np.zeros(1000), z, nothing, nothing, nothing, nothing), traces)
 
 
+def look(alarms, one, first=0, ratio=None):
+    """Have a second judged, its frames and its observer."""
+    alarms.look_at(one.frames, first, ratio)
+    alarms.judge(one, ["kf-multi"])
+
+
 def test_noise_is_that_of_third_differences():
     rng, t = np.random.default_rng(2), np.arange(20_000) * 1e-3
     z = 0.3 * np.sin(2 * np.pi * 2.0 * t)[:, None] + 0.02 * rng.normal(size=(20_000, 2))
@@ -35,23 +41,49 @@ def test_an_alarm_is_told_once_and_when_it_is_over():
     said = []
     alarms = Alarms(said.append)
     for k in range(FEWEST + 2):
-        alarms.look_at(second(0.02, seed=k), ["kf-multi"])
+        look(alarms, second(0.02, seed=k))
     assert said == []
     for k in range(3):
-        alarms.look_at(second(0.05, seed=k), ["kf-multi"])
+        look(alarms, second(0.05, seed=k))
     assert len(said) == 1 and said[0].startswith("ALARM noise up: ")
-    alarms.look_at(second(0.02, error=0.05), ["kf-multi"])
-    alarms.look_at(second(0.02, missing=100), ["kf-multi"])
-    alarms.look_at(second(0.02), ["kf-multi"])
+    look(alarms, second(0.02, error=0.05))
+    look(alarms, second(0.02, missing=100))
+    look(alarms, second(0.02))
     kinds = [line.split(":")[0] if line.startswith(("ALARM e", "ALARM n")) else line for line in said]
     assert kinds == [
         "ALARM noise up",
         "over: noise",
         "ALARM error of kf-multi up",
-        "ALARM 10.0% of frames missing",
+        "ALARM 10.0% of LGS frames missing",
         "over: error of kf-multi",
-        "over: frames missing",
+        "over: LGS frames missing",
     ]
+
+
+def test_ngs_frames_that_were_due_are_missing():
+    said = []
+    alarms = Alarms(said.append)
+    ngs = np.full((1000, 2), np.nan)
+    ngs[3::10] = 0.1  # the first frame has the number 7
+    for lost in (0, 2, 0):
+        frames = LiveFrame(np.zeros(1000), np.zeros((1000, 2)), ngs.copy(), *[np.zeros((1000, 2))] * 3)
+        frames.ngs[3 : 3 + 10 * lost : 10] = np.nan
+        alarms.look_at(frames, 7, 10)
+        alarms.look_at(frames, 7, None)  # no NGS: none is due
+    assert said == ["ALARM 2.0% of NGS frames missing", "over: NGS frames missing"]
+    first = LiveFrame(np.zeros(10), np.zeros((10, 2)), np.full((10, 2), np.nan), *[np.zeros((10, 2))] * 3)
+    alarms.look_at(first, 0, 10)  # none is due with the first frame of all
+    assert len(said) == 2
+
+
+def test_what_varies_from_second_to_second_may_vary():
+    """After errors of 1, 2 and 3 in turn one of 4 is usual; after 2 alone it is an alarm."""
+    for errors, is_alarm in (([0.01, 0.02, 0.03] * 7, False), ([0.02] * 21, True)):
+        said = []
+        alarms = Alarms(said.append)
+        for k, error in enumerate([*errors, 0.04]):
+            alarms.judge(second(1e-6, error=error, seed=k), ["kf-multi"])
+        assert bool(said) == is_alarm
 
 
 def test_peaks_that_are_new_have_moved_or_are_gone():
@@ -69,3 +101,17 @@ def test_peaks_that_are_new_have_moved_or_are_gone():
     alarms.compare(Finding((peak(10),), (0.02,), {}))
     alarms.compare(Finding((peak(10), peak(20)), (0.02,), {}))
     assert said == ["ALARM new peak at 20.00 Hz, 20.0 nm"]
+
+
+def test_a_line_in_pieces_is_one_peak_and_a_faint_one_is_none():
+    pieces = (PeakFinding(50.43, 0.006, 0.0, 3e-3), PeakFinding(50.51, 0.001, 0.0, 3e-2), PeakFinding(50.49, 0.01, 1e-4, 1e-2))
+    others = (PeakFinding(17.2, 0.06, 0.01, 3e-3), PeakFinding(15.7, 0.01, 0.0, 2e-4))
+    found = distinct_peaks(Finding((*pieces, *others), (0.02, 0.01), {}))
+    power = np.array([9.0, 900.0, 100.0])
+    middle = float(power @ [50.43, 50.51, 50.49]) / power.sum()
+    assert [peak.rms for peak in found] == [3e-3, 3e-2]  # a tenth of the noise of 20 nm is 2 nm
+    assert found[1].frequency == pytest.approx(middle, rel=1e-12)
+    own = np.array([0.006, 0.001, 0.01]) ** 2 + (np.array([50.43, 50.51, 50.49]) - middle) ** 2
+    assert found[1].frequency_std == pytest.approx(np.sqrt(power @ own / power.sum()), rel=1e-12)
+    assert drift([PeakFinding(50.5, 1e-4, 0.0, 3e-2)], found[1:]) == []  # a minute does not resolve the difference
+    assert drift([PeakFinding(47.5, 1e-4, 0.0, 3e-2)], found[1:]) == ["peak moved from 47.50 to 50.51 Hz"]

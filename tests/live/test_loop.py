@@ -336,3 +336,25 @@ def is_running(pid):
             return file.read().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
+
+
+TURNS = """
+import os
+from wfsobs.live.paced import SOURCE, go_first
+
+def turn():
+    return os.sched_getparam(0).sched_priority if hasattr(os, "sched_getparam") else 0
+
+print(SOURCE if go_first(SOURCE) else 0, turn())
+go_first(0)
+print(0, turn())
+"""
+
+
+def test_a_process_goes_first_where_the_system_lets_it():
+    """What it says of its turn is what the system says."""
+    lines = subprocess.run([sys.executable, "-c", TURNS], capture_output=True, text=True, check=True).stdout.splitlines()
+    assert len(lines) == 2
+    for line in lines:
+        told, is_so = line.split()
+        assert told == is_so

@@ -21,7 +21,7 @@ from wfsobs.live.recording import Recorder
 from wfsobs.live.ring import Ring
 from wfsobs.live.rows import Rows
 from wfsobs.live.shadow import Shadow, append_line
-from wfsobs.live.view import read_view
+from wfsobs.live.view import last_frames, read_view
 from wfsobs.scenario.presets import paper
 from wfsobs.streams.shared_image import SharedImage
 
@@ -39,15 +39,15 @@ class Loop:
         self.sampling, self.ring, self.board = source.sampling, Ring(2), Board(2)
         self.traces = Rows(trace_width(2), 4096)
         inbox, self.news = Inbox(), queue.Queue()
-        self.frames = StreamFrames(source, Desk(self.ring.name, 2, inbox, self.news, 1.0, None))
-        self.frames._look()
+        self.stream = StreamFrames(source, Desk(self.ring.name, 2, inbox, self.news, 1.0, None))
+        self.stream._look()
         inbox.waiting.append({"play": True})
-        self.frames._follow_commands()
+        self.stream._follow_commands()
         order = Order(self.scenario.to_dict(), ("kf-multi",), self.sampling, 0, False, "", "", "", None, self.news)
         self.crew, self.count = made_crew(order, self.board), 0
         self.recorder = Recorder(self.ring, self.sampling, self.say, False)
         self.workshop = SimpleNamespace(do=self.do, finding=None)
-        self.shadow = Shadow(self)
+        self.shadow = Shadow(self.say, self)
 
     def say(self, line):
         append_line(str(self.log), self.ring.count * self.sampling.dt, line)
@@ -57,14 +57,22 @@ class Loop:
         done.set_result(function(*arguments))
         then(done.result())
 
-    def view(self, seconds):
-        return read_view(self.ring, [self.traces], self.sampling.dt, seconds)
+    @property
+    def newest(self):
+        return self.ring.count
+
+    def frames(self, seconds):
+        first, stop = last_frames(self.newest, self.sampling.dt, seconds)
+        return first, self.ring.read_frames(first, stop)
+
+    def views(self, seconds):
+        return [(read_view(self.ring, [self.traces], self.sampling.dt, seconds), self.board.active())]
 
     def send(self, z, is_lost):
         self.image.write(z)
         if is_lost:
             return
-        self.frames.take()
+        self.stream.take()
         while self.count < self.ring.count:
             frame = self.ring.read(self.count)
             self.traces.write(self.crew.take(frame, self.count))
@@ -73,7 +81,7 @@ class Loop:
             self.shadow(self)
 
     def release(self):
-        self.frames._ring.release()
+        self.stream._ring.release()
         for shared in (self.ring, self.traces, self.board):
             shared.release()
 

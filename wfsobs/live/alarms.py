@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import hypot, isnan
+from dataclasses import replace
+from math import hypot, isnan, sqrt
 
 import numpy as np
 
 from wfsobs.live.board import NEXT
 from wfsobs.live.finding import Finding, PeakFinding
+from wfsobs.live.ring import LiveFrame
 from wfsobs.live.view import LiveView
 from wfsobs.typing import Array
 
 MISSING = 0.01
 """Part of the frames of a second that may be missing."""
-NOISE = 1.5
-"""Factor by which the noise may rise over the median of the minute before."""
-BAND = 2.0
-"""Factor by which the error of the next measurement may rise over the median of the minute before."""
+RISE, SPREADS = 1.5, 6.0
+"""Noise, or the error of the next measurement, may rise to so many times its median of the minute before, and by so many standard
+deviations of a second from the median."""
+CALM = 0.5
+"""Part of that rise below which an alarm is over."""
+NORMAL = 1.4826
+"""Standard deviation of normal numbers over the median of their distances from the median."""
 HISTORY = 60
 """Seconds of which the medians are taken."""
 FEWEST = 10
@@ -26,6 +31,12 @@ SIGMAS = 5.0
 """A peak has moved if its frequencies differ by more than so many standard deviations, and is another beyond REACH."""
 REACH = 0.1
 """Part of its frequency within which a peak is looked for again."""
+CLOSE = 0.02
+"""Part of their frequency within which peaks are one: of two modes, or a line that has been found in pieces."""
+RESOLUTION = 1.0 / 60.0
+"""Standard deviation of a frequency at least [Hz]: a minute resolves no more, and a real line wanders."""
+FAINT = 0.1
+"""A peak weaker than this part of the noise of a frame is found in one minute and not in the next: it is no alarm."""
 
 
 class Alarms:
@@ -43,28 +54,50 @@ class Alarms:
         self._active: set[str] = set()
         self._peaks: tuple[PeakFinding, ...] | None = None
 
-    def look_at(self, second: LiveView, observers: Sequence[str]) -> None:
-        """Judge a second of frames."""
-        z = second.frames.z
-        missing = float(np.isnan(z).any(axis=1).mean())
-        self._set("frames missing", missing > MISSING, f"{missing:.1%} of frames missing")
-        self._judge("noise", noise_of(z), NOISE)
+    def look_at(self, frames: LiveFrame, first: int, ratio: int | None) -> None:
+        """Judge a second of frames.
+
+        Parameters
+        ----------
+        frames : LiveFrame
+            The frames, each part (n, n_modes) [um].
+        first : int
+            Number of the first one.
+        ratio : int or None
+            Every so many frames an NGS measurement is due, but with the first of all; None without an NGS.
+        """
+        numbers = first + np.arange(len(frames.z))
+        self._miss("LGS", frames.z)
+        if ratio is not None:
+            self._miss("NGS", frames.ngs[(numbers % ratio == 0) & (numbers > 0)])
+        self._judge("noise", noise_of(frames.z))
+
+    def judge(self, second: LiveView, observers: Sequence[str]) -> None:
+        """Judge what observers of both targets have expected of a second of frames."""
         for name in observers:
-            self._judge(f"error of {name}", float(np.sqrt(np.mean(second.rms(name, NEXT) ** 2))), BAND)
+            self._judge(f"error of {name}", float(np.sqrt(np.mean(second.rms(name, NEXT) ** 2))))
 
     def compare(self, finding: Finding) -> None:
         """Judge an identification against the one before."""
-        before, self._peaks = self._peaks, finding.peaks
-        for row in [] if before is None else drift(before, finding.peaks):
+        before, self._peaks = self._peaks, distinct_peaks(finding)
+        for row in [] if before is None else drift(before, self._peaks):
             self._say(f"ALARM {row}")
 
-    def _judge(self, what: str, value: float, factor: float) -> None:
-        """Judge a number by its median so far; while it is raised it does not count."""
+    def _miss(self, sensor: str, measured: Array) -> None:
+        """Judge what has come of the measurements that were due, (n, n_modes)."""
+        if len(measured):
+            missing = float(np.isnan(measured).any(axis=1).mean())
+            self._set(f"{sensor} frames missing", missing > MISSING, f"{missing:.1%} of {sensor} frames missing")
+
+    def _judge(self, what: str, value: float) -> None:
+        """Judge a number by what it has been so far; while it is raised it does not count."""
         if isnan(value):
             return
         history = self._history.setdefault(what, [])
         usual = float(np.median(history)) if len(history) >= FEWEST else value
-        is_active = value > factor * usual
+        spread = NORMAL * float(np.median(np.abs(np.subtract(history, usual)))) if history else 0.0
+        rise = max((RISE - 1.0) * usual, SPREADS * spread)
+        is_active = value > usual + rise * (CALM if what in self._active else 1.0)
         self._set(what, is_active, f"{what} up: {1e3 * value:.1f} nm, it was {1e3 * usual:.1f} nm")
         if not is_active:
             history.append(value)
@@ -86,6 +119,28 @@ def noise_of(z: Array) -> float:
     return float(np.sqrt(np.mean(known**2) / 20.0)) if known.size else float("nan")  # 1 + 9 + 9 + 1
 
 
+def distinct_peaks(finding: Finding) -> tuple[PeakFinding, ...]:
+    """Return the peaks that are not faint; CLOSE ones are one, in the middle by their power, as strong as the strongest."""
+    groups: list[list[PeakFinding]] = []
+    for peak in sorted(finding.peaks, key=lambda one: one.frequency):
+        if groups and peak.frequency - groups[-1][-1].frequency < CLOSE * peak.frequency:
+            groups[-1].append(peak)
+        else:
+            groups.append([peak])
+    return tuple(peak for peak in map(_joint_peak, groups) if peak.rms >= FAINT * max(finding.noise, default=0.0))
+
+
+def _joint_peak(peaks: Sequence[PeakFinding]) -> PeakFinding:
+    """Return peaks as one; its standard deviation has their distances in it."""
+    share = np.square([peak.rms for peak in peaks])
+    share = share / share.sum() if share.any() else np.full(len(peaks), 1.0 / len(peaks))
+    frequencies = np.array([peak.frequency for peak in peaks])
+    middle = float(share @ frequencies)
+    variances = np.square([peak.frequency_std for peak in peaks]) + (frequencies - middle) ** 2
+    strongest = max(peaks, key=lambda one: one.rms)
+    return replace(strongest, frequency=middle, frequency_std=sqrt(float(share @ variances)))
+
+
 def drift(before: Sequence[PeakFinding], now: Sequence[PeakFinding]) -> list[str]:
     """Say which peaks are new, have moved or are gone."""
     lines, left = [], [*before]
@@ -95,7 +150,7 @@ def drift(before: Sequence[PeakFinding], now: Sequence[PeakFinding]) -> list[str
             lines.append(f"new peak at {peak.frequency:.2f} Hz, {1e3 * peak.rms:.1f} nm")
             continue
         left.remove(same)
-        std = hypot(same.frequency_std, peak.frequency_std)
+        std = hypot(*(max(one.frequency_std, RESOLUTION) for one in (same, peak)))
         if not isnan(std) and abs(same.frequency - peak.frequency) > SIGMAS * std:
             lines.append(f"peak moved from {same.frequency:.2f} to {peak.frequency:.2f} Hz")
     return lines + [f"peak at {one.frequency:.2f} Hz is gone" for one in left]

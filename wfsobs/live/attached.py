@@ -9,7 +9,7 @@ from time import monotonic, sleep
 
 import numpy as np
 
-from wfsobs.live.paced import Desk, Staff, enter_process
+from wfsobs.live.paced import SOURCE, Desk, Staff, enter_process
 from wfsobs.live.pairing import PairedFrames
 from wfsobs.live.ring import Ring
 from wfsobs.live.source import STREAM
@@ -67,7 +67,7 @@ class StreamSource:
 
 
 def _send(source: StreamSource, desk: Desk) -> None:
-    enter_process()
+    enter_process(turn=SOURCE)
     gc.freeze()
     StreamFrames(source, desk).run()
 

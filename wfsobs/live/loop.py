@@ -211,7 +211,7 @@ class LiveLoop:
 
     def watch(self, log_file: str = "") -> None:
         """Raise alarms from now on; append them, and all events, to a file."""
-        self._log_file, self._shadow = log_file, Shadow(self)
+        self._log_file, self._shadow = log_file, Shadow(self.say, self._processes)
 
     def view(self, seconds: float) -> LiveView:
         """Return the last so many seconds of frames and estimates."""

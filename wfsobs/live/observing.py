@@ -13,7 +13,7 @@ from typing import Any
 
 from wfsobs.live.board import Board
 from wfsobs.live.crew import Crew, trace_width
-from wfsobs.live.paced import Command, enter_process
+from wfsobs.live.paced import FAST_CREW, SLOW_CREW, Command, enter_process, go_first
 from wfsobs.live.ring import Ring
 from wfsobs.live.rows import Rows
 from wfsobs.live.source import end_process
@@ -27,6 +27,8 @@ POLL = 1e-4
 """Pause between two looks at a ring whose next frame is due [s]."""
 REST = 2e-3
 """Pause between two looks at a ring that stands still, and the longest one [s]."""
+HOPELESS = 1.0
+"""Frames that a process may be behind [s] before it gives way to others: it cannot keep up."""
 LOOK = 0.01
 """Pause between two looks at the commands [s]."""
 
@@ -131,7 +133,7 @@ class CrewProcess:
 
 def observe_frames(order: Order) -> None:
     """Follow a ring until the process is ended."""
-    enter_process()
+    enter_process(turn=SLOW_CREW if order.place else FAST_CREW)
     sampling = order.sampling
     ring, board = Ring(sampling.n_modes, order.ring_name), Board(sampling.n_modes, order.board_name)
     traces = Rows(trace_width(sampling.n_modes), TRACE_CAPACITY, order.traces_name)
@@ -149,6 +151,8 @@ def observe_frames(order: Order) -> None:
     while True:
         if (now := monotonic()) >= look:
             look = now + LOOK
+            if (ring.count - number) * sampling.dt > HOPELESS:
+                go_first(0)
             while order.inbox.poll():
                 crew.follow(order.inbox.recv(), number)
         if ring.count <= number:

@@ -25,6 +25,9 @@ IDLE = 0.05
 STALL = 1.0
 """Delay beyond which the frames in between are given up, and the clock starts anew [s]."""
 
+SOURCE, FAST_CREW, SLOW_CREW = 3, 2, 1
+"""Turns of the processes that keep time: what takes least goes first, and delays the others least."""
+
 Command = Mapping[str, Any]
 """What a process of a live loop is told: one word and what belongs to it."""
 
@@ -148,11 +151,16 @@ def send_frames(desk: Desk, frames: PacedFrames, dt: float) -> None:
     ring.close_writer()
 
 
-def enter_process(niceness: int = 0) -> None:
-    """Set up a process of a live loop: it ends with the one that started it, to which alone Ctrl+C goes."""
+def enter_process(niceness: int = 0, *, turn: int = 0) -> None:
+    """Set up a process of a live loop: it ends with the one that started it, to which alone Ctrl+C goes.
+
+    niceness : of one that may wait;  turn : as in `go_first`, of one that keeps time
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if niceness:
         os.nice(niceness)
+    if turn:
+        go_first(turn)
     parent = parent_process()
     assert parent is not None
 
@@ -161,3 +169,16 @@ def enter_process(niceness: int = 0) -> None:
         os._exit(1)
 
     Thread(target=end, daemon=True).start()
+
+
+def go_first(turn: int) -> bool:
+    """Have this process run as soon as it has something to do, before all of a lower turn; return whether the system lets it.
+
+    Turns are those of the real-time policy of Linux, which root may take, who has CAP_SYS_NICE, and others as far as
+    RLIMIT_RTPRIO says; 0 is the usual policy.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR if turn else os.SCHED_OTHER, os.sched_param(turn))
+    except (AttributeError, OSError):  # another system, or no right to it
+        return False
+    return True

@@ -11,8 +11,10 @@ from wfsobs.live.control_process import ControlProcess
 from wfsobs.live.delivery import Delivery
 from wfsobs.live.observing import CrewProcess, Site
 from wfsobs.live.paced import Command, enter_process
+from wfsobs.live.ring import LiveFrame
 from wfsobs.live.rows import Rows
 from wfsobs.live.source import LiveSource, SourceProcess, end_process, take_all
+from wfsobs.live.view import LiveView, last_frames, read_view
 from wfsobs.scenario import Scenario
 
 
@@ -71,6 +73,18 @@ class LiveProcesses:
     def traces(self) -> list[Rows]:
         """Return the estimates of the crews that take part."""
         return [crew.traces for crew in list(self.crews.values()) if crew.takes_part]
+
+    def frames(self, seconds: float) -> tuple[int, LiveFrame]:
+        """Return the number of the first of the last so many seconds of frames that the source has sent, and these frames."""
+        ring = self.feed.ring
+        first, stop = last_frames(ring.count, self._site.sampling.dt, seconds)
+        return first, ring.read_frames(first, stop)
+
+    def views(self, seconds: float) -> list[tuple[LiveView, list[str]]]:
+        """Return the last so many seconds that each process of observers has taken, and the ids of its observers that run."""
+        ring, dt, running = self.feed.ring, self._site.sampling.dt, self.board.active()
+        crews = [(crew, [name for name in running if crew_of(name) == place]) for place, crew in list(self.crews.items())]
+        return [(read_view(ring, [crew.traces], dt, seconds), names) for crew, names in crews if names]
 
     @property
     def are_ready(self) -> bool:

@@ -7,7 +7,7 @@ from multiprocessing.context import SpawnContext
 
 import numpy as np
 
-from wfsobs.live.paced import Command, Desk, Staff, enter_process, send_frames
+from wfsobs.live.paced import SOURCE, Command, Desk, Staff, enter_process, send_frames
 from wfsobs.live.source import RECORD
 from wfsobs.record import Record, Sampling
 from wfsobs.typing import Array
@@ -50,7 +50,7 @@ def frame_rows(record: Record) -> Array:
 
 
 def _send(rows: Array, dt: float, desk: Desk) -> None:
-    enter_process()
+    enter_process(turn=SOURCE)
     send_frames(desk, RecordFrames(rows), dt)
 
 

@@ -1,7 +1,11 @@
-"""Looks after a loop of which no truth is known: alarms every second, an identification every minute."""
+"""Looks after a loop: alarms every second, an identification every minute.
+
+Frames are judged as they come, and the errors of observers as each process of them goes on: none waits for the slowest.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -13,6 +17,7 @@ from wfsobs.settings.group import SettingError
 
 if TYPE_CHECKING:
     from wfsobs.live.loop import LiveLoop
+    from wfsobs.live.processes import LiveProcesses
 
 SECOND, MINUTE = 1.0, 60.0
 
@@ -20,17 +25,21 @@ SECOND, MINUTE = 1.0, 60.0
 class Shadow:
     """Called by its loop a few times a second."""
 
-    def __init__(self, loop: LiveLoop):
-        self._alarms = Alarms(loop.say)
+    def __init__(self, say: Callable[[str], None], processes: LiveProcesses):
+        """Say : receives one line; processes : of its loop."""
+        self._alarms, self._processes = Alarms(say), processes
         self._next_second, self._next_minute = SECOND, MINUTE
 
     def __call__(self, loop: LiveLoop) -> None:
         """Judge what has come since the last call."""
-        now = loop.count * loop.sampling.dt
+        now = loop.newest * loop.sampling.dt
         if now >= self._next_second:
             self._next_second = now + SECOND
-            both = [name for name in loop.board.active() if len(OBSERVERS[name].targets) == len(TARGETS)]
-            self._alarms.look_at(loop.view(SECOND), both)
+            first, frames = self._processes.frames(SECOND)
+            self._alarms.look_at(frames, first, loop.sampling.ratio)
+            for view, observers in self._processes.views(SECOND):
+                both = [name for name in observers if len(OBSERVERS[name].targets) == len(TARGETS)]
+                self._alarms.judge(view, both)
         if now >= self._next_minute:
             self._next_minute = now + MINUTE
             try:

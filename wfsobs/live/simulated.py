@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs.live.blocks import Block, endless_blocks
-from wfsobs.live.paced import Command, Desk, Staff, enter_process, send_frames
+from wfsobs.live.paced import SOURCE, Command, Desk, Staff, enter_process, send_frames
 from wfsobs.live.source import SIMULATION
 from wfsobs.record import Sampling
 from wfsobs.scenario import Scenario
@@ -77,7 +77,7 @@ def _make(settings: dict[str, Any], inbox: Connection, ready: Queue[tuple[int, B
 
 
 def _send(settings: dict[str, Any], ready: Queue[tuple[int, Block]], desk: Desk) -> None:
-    enter_process()
+    enter_process(turn=SOURCE)
     scenario = Scenario.from_dict(settings)
     send_frames(desk, SimulatedFrames(scenario, ready), scenario.dt)
 

@@ -91,9 +91,13 @@ class LiveView:
 
 def read_view(ring: Ring, traces: list[Rows], dt: float, seconds: float) -> LiveView:
     """Return the last so many seconds that all observers have taken."""
-    stop = min(rows.count for rows in traces)
-    first = max(0, stop - max(1, round(seconds / dt)))
+    first, stop = last_frames(min(rows.count for rows in traces), dt, seconds)
     return LiveView(first, dt, ring.read_frames(first, stop), merged_rows(traces, first, stop))
+
+
+def last_frames(count: int, dt: float, seconds: float) -> tuple[int, int]:
+    """Return the numbers of the first of the last so many seconds of frames, and of the one after the last."""
+    return max(0, count - max(1, round(seconds / dt))), count
 
 
 def rms_of_known(x: Array) -> Array:
