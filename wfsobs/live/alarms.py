@@ -83,10 +83,10 @@ class Alarms:
         for row in [] if before is None else drift(before, self._peaks):
             self._say(f"ALARM {row}")
 
-    def _miss(self, sensor: str, measured: Array) -> None:
+    def _miss(self, sensor: str, due: Array) -> None:
         """Judge what has come of the measurements that were due, (n, n_modes)."""
-        if len(measured):
-            missing = float(np.isnan(measured).any(axis=1).mean())
+        if len(due):
+            missing = float(np.isnan(due).any(axis=1).mean())
             self._set(f"{sensor} frames missing", missing > MISSING, f"{missing:.1%} of {sensor} frames missing")
 
     def _judge(self, what: str, value: float) -> None:
