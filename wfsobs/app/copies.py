@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from wfsobs.app.share import FILE, LONGEST, changes
+from wfsobs.app.copied_parts import (
+    RECORD_IMPORTS,
+    as_path,
+    given_options,
+    import_order,
+    record_code,
+    scenario_code,
+    stated_options,
+)
+from wfsobs.app.live_copies import live_command, live_script
+from wfsobs.app.share import FILE
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source
-from wfsobs.scenario import Scenario, configfile
+from wfsobs.scenario import Scenario
 
 RECORD, SIMULATION = "wfsobs-record.npz", "wfsobs-simulation.toml"
 """Files of a command: a simulation that is saved, and its settings where they are too long to be written out."""
 
-OBSERVE, LOOP, IDENTIFY, TUNE, SWEEP, CAMPAIGN = "observe", "loop", "identify", "tune", "sweep", "campaign"
+OBSERVE, LOOP, IDENTIFY, TUNE, SWEEP, CAMPAIGN, LIVE = "observe", "loop", "identify", "tune", "sweep", "campaign", "live"
 
 
 @dataclass(frozen=True)
@@ -35,52 +44,27 @@ EXPLORED = CopiedTask()
 def to_command(scenario: Scenario, preset: str, source: Source | None = None, task: CopiedTask = EXPLORED) -> str:
     """Write the command that prints what a page shows; two where the record has to be simulated first."""
     if task.what == CAMPAIGN:  # its settings are in its folder
-        return shlex.join(["wfsobs", "campaign", "table", _as_path(task.arguments["folder"])])
-    given = _options(scenario, preset, FILE)
+        return shlex.join(["wfsobs", "campaign", "table", as_path(task.arguments["folder"])])
+    if task.what == LIVE:
+        return live_command(scenario, preset, source, task.arguments["order"])
+    given = given_options(scenario, preset, FILE)
     more = [word for name, value in task.arguments.items() for one in _as_list(value) for word in (f"--{name}", str(one))]
     if task.what == SWEEP:  # it simulates the settings, whatever is shown
         source = None
     if source is None and task.what != IDENTIFY:
         return shlex.join(["wfsobs", "run" if task.what == OBSERVE else task.what, *more, *given])
-    file, said = (source.name, _stated_options(source)) if isinstance(source, LoadedRecord) else (RECORD, [])
-    file = _as_path(file)
+    file, said = (source.name, stated_options(source)) if isinstance(source, LoadedRecord) else (RECORD, [])
+    file = as_path(file)
     positional = [file] if task.what in (OBSERVE, IDENTIFY) else ["--record", file]
     command = shlex.join(["wfsobs", task.what, *positional, *more, *given, *said])
     if isinstance(source, LoadedRecord):
         return command
-    simulation = _options(source.simulation, preset, SIMULATION) if source else given
+    simulation = given_options(source.simulation, preset, SIMULATION) if source else given
     return f"{shlex.join(['wfsobs', 'run', *simulation, '--save', RECORD])} &&\n{command}"
-
-
-def _as_path(name: str) -> str:
-    """Return the name of a file; one that starts with a dash would be read as an option."""
-    return f"./{name}" if name.startswith("-") else name
 
 
 def _as_list(value: Any) -> Sequence[Any]:
     return value if isinstance(value, (list, tuple)) else [value]
-
-
-def _options(scenario: Scenario, preset: str, file: str) -> list[str]:
-    words = ["--preset", preset]
-    for path, value in changes(scenario, preset).items():
-        words += ["--set", f"{path}={configfile.format_value(value)}"]
-    return words if len(shlex.join(words)) <= LONGEST else ["--config", file]
-
-
-def _stated_options(source: LoadedRecord) -> list[str]:
-    """List what the user stated about a file, and what tells the file from others."""
-    stated = source.declaration
-    sign = None if stated.command_sign is None else f"{stated.command_sign:+d}"
-    named = {
-        "unit": stated.unit,
-        "command-sign": sign,
-        "command-delay": stated.command_delay,
-        "rate": stated.rate,
-        "sha256": source.sha256 or None,
-    }
-    words = [word for name, value in named.items() if value is not None for word in (f"--{name}", str(value))]
-    return words + [word for role, name in stated.columns.items() for word in ("--column", f"{role}={name}")]
 
 
 # ---------------------------------------------------------------------- Python
@@ -90,21 +74,21 @@ def to_python(scenario: Scenario, preset: str, source: Source | None = None, tas
     """Write a script that computes and prints what a page shows."""
     if task.what == CAMPAIGN:
         return _campaign_script(task.arguments["folder"])
+    if task.what == LIVE:
+        return live_script(scenario, preset, source, task.arguments["order"])
     source = None if task.what == SWEEP else source
-    imports, lines = {"import wfsobs"}, [f"scenario = {_scenario_code(scenario, preset, FILE)}"]
+    imports, lines = {"import wfsobs"}, [f"scenario = {scenario_code(scenario, preset, FILE)}"]
     if isinstance(source, LoadedRecord):
-        stated = "".join(f"{name}={value!r}, " for name, value in vars(source.declaration).items() if value not in (None, {}))
-        imports |= {"from wfsobs.telemetry.intake import DeclaredFormat", "from wfsobs.telemetry.records import load_record"}
-        check = f", sha256={source.sha256!r}" if source.sha256 else ""
-        lines.append(f"record = load_record({source.name!r}, scenario, DeclaredFormat({stated.removesuffix(', ')}){check})")
+        imports |= RECORD_IMPORTS
+        lines.append(record_code(source))
     elif isinstance(source, SimulatedRecord):
-        lines += [f"simulation = {_scenario_code(source.simulation, preset, SIMULATION)}", "record = wfsobs.simulate(simulation)"]
+        lines += [f"simulation = {scenario_code(source.simulation, preset, SIMULATION)}", "record = wfsobs.simulate(simulation)"]
     elif task.what in (LOOP, IDENTIFY):
         lines.append("record = wfsobs.simulate(scenario)")
     more_imports, more_lines = _DOES[task.what](source is not None, task.arguments)
     if any("configfile." in line for line in lines):
         imports.add("from wfsobs.scenario import configfile")
-    return "\n".join([*sorted(imports | more_imports, key=_order), "", *lines, *more_lines, ""])
+    return "\n".join([*sorted(imports | more_imports, key=import_order), "", *lines, *more_lines, ""])
 
 
 def _campaign_script(folder: str) -> str:
@@ -117,16 +101,6 @@ for (target, mode), errors in state.errors.items():
     for place in errors.standings(range(len(state.plan.cells))):
         print(target, mode, place.name, place.rms, "nm")
 """
-
-
-def _order(line: str) -> tuple[bool, str]:
-    return line.startswith("from"), line
-
-
-def _scenario_code(scenario: Scenario, preset: str, file: str) -> str:
-    lines = [f"    {json.dumps(path)}: {value!r},\n" for path, value in changes(scenario, preset).items()]
-    made = f'wfsobs.PRESETS["{preset}"]()' + (f".replace({{\n{''.join(lines)}}})" if lines else "")
-    return made if len(made) <= LONGEST else f'configfile.load_scenario("{file}")'
 
 
 Lines = tuple[set[str], list[str]]

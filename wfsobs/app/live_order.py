@@ -25,6 +25,7 @@ class LiveOrder:
     record_file : where all its frames go when it ends; none if empty
     log_file  : to which events and alarms are appended; none if empty
     preset    : where the settings started; none if empty
+    options   : of `wfsobs live`, that name a stream
     """
 
     source: LiveSource
@@ -36,6 +37,7 @@ class LiveOrder:
     record_file: str = ""
     log_file: str = ""
     preset: str = ""
+    options: Sequence[str] = ()
 
     def begin(self, loop: LiveLoop) -> None:
         """Begin what runs beside it, to record and to raise alarms: always of a stream or of events."""

@@ -12,7 +12,9 @@ from urllib.parse import parse_qsl, quote
 import param
 
 from wfsobs.app.display import Display
-from wfsobs.app.pages.pages import EXPLORE, Pages
+from wfsobs.app.pages.live import LivePage
+from wfsobs.app.pages.live_controls import CONTROLLERS, OBSERVERS, SPEED
+from wfsobs.app.pages.pages import EXPLORE, LIVE, Pages
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.main_lines import MainLines
@@ -41,7 +43,8 @@ class ViewState(param.Parameterized):
         self._fresh = {name: getattr(display, name) for name in SWITCHES}
         self._theme = ""
         display.param.watch(self._refresh, [*SWITCHES, "hidden_lines"])
-        pages.param.watch(self._refresh, "current")
+        self._knows_live = False
+        pages.param.watch(self._turn, "current")
         seeds.param.watch(self._refresh, "count")
         on_settle([traces.x_range], self._refresh)
 
@@ -70,6 +73,9 @@ class ViewState(param.Parameterized):
         refused += self._open_lines(fields)
         refused += self._open_window(fields.get(WINDOW, ""))
         refused += self._open_seeds(fields.get(SEEDS, str(self.seeds.param["count"].default)))
+        if (live := self._live) is not None:
+            fields, of_loop = _split(fields)
+            refused += [f"{PREFIX}{line}" for line in live.open_link(of_loop)]
         known = {PAGE, WINDOW, SEEDS, *SWITCHES, *(HIDE + target for target in TARGETS)}
         refused += [f"{PREFIX}{key}: there is no such part of a view" for key in fields if key not in known]
         self._refresh()
@@ -110,13 +116,34 @@ class ViewState(param.Parameterized):
         self.seeds.count = int(text)
         return []
 
+    @property
+    def _live(self) -> LivePage | None:
+        """The page of the live loop, once it is there."""
+        page = self.pages.by_name.get(LIVE)
+        return page if isinstance(page, LivePage) else None
+
+    def _turn(self, _event: object) -> None:
+        if (live := self._live) is not None and not self._knows_live:
+            self._knows_live = True
+            for field in live.inputs:
+                field.param.watch(self._refresh, "value")
+        self._refresh()
+
     def _refresh(self, *_: object) -> None:
         fields = {} if self.pages.current == EXPLORE else {PAGE: self.pages.current}
         fields |= {name: value for name in SWITCHES if (value := getattr(self.display, name)) != self._fresh[name]}
         fields |= {HIDE + target: ",".join(hidden) for target, hidden in self.lines.choices().items()}
         if (window := self.traces.chosen_window()) is not None:
             fields[WINDOW] = f"{window[0]:.4g},{window[1]:.4g}"
+        if (live := self._live) is not None:
+            fields |= live.link_fields()
         if self.seeds.count != self.seeds.param["count"].default:
             fields[SEEDS] = str(self.seeds.count)
         parts = [f"{PREFIX}{key}={quote(value, safe=',-')}" for key, value in fields.items()]
         self.query = "&".join([*parts, *([f"{THEME}={self._theme}"] if self._theme else [])])
+
+
+def _split(fields: Mapping[str, str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the fields that are not of the live loop, and those that are."""
+    of_loop = {key: fields[key] for key in (OBSERVERS, CONTROLLERS, SPEED) if key in fields}
+    return {key: value for key, value in fields.items() if key not in of_loop}, of_loop

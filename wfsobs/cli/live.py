@@ -10,7 +10,15 @@ import click
 import numpy as np
 from rich.table import Table
 
-from wfsobs.cli.options import ngs_options, ngs_wiring, scenario_options, stream_elements
+from wfsobs.cli.options import (
+    declare_format,
+    load_declared,
+    ngs_options,
+    ngs_wiring,
+    record_options,
+    scenario_options,
+    stream_elements,
+)
 from wfsobs.cli.show import progress_bar, show_table
 from wfsobs.files import check_writable
 from wfsobs.live.attached import StreamSource
@@ -26,8 +34,9 @@ from wfsobs.live.source import LiveSource
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.settings.group import SettingError
 from wfsobs.streams.shared_image import stream_path
-from wfsobs.telemetry.records import load_record, save_record
-from wfsobs.units import UNITS, micrometres_per
+from wfsobs.telemetry.intake import DeclaredFormat
+from wfsobs.telemetry.records import save_record
+from wfsobs.units import micrometres_per
 
 
 @click.command()
@@ -36,8 +45,16 @@ from wfsobs.units import UNITS, micrometres_per
 @click.option("--in", "stream", metavar="STREAM", help="Frames of a running loop, in shadow (docs/streams.md).")
 @click.option("--modes", metavar="I,J,...", help="Elements of a frame of the stream, from 0, that are its modes.")
 @ngs_options
-@click.option("--unit", type=click.Choice(UNITS), default="um", show_default=True, help="Unit of the stream.")
+@record_options
 @click.option("--observer", "observers", multiple=True, metavar="NAME", help="Run this observer alone; can be given many times.")
+@click.option(
+    "--controller",
+    "controllers",
+    multiple=True,
+    metavar="NAME",
+    help="Run this controller alone beside it; can be given many times.",
+)
+@click.option("--no-controllers", is_flag=True, help="Run no controller beside it.")
 @click.option("--speed", type=click.FloatRange(0.1, 20), default=1.0, metavar="X", help="1 is real time, the default.")
 @click.option("--record", "record_file", metavar="RECORD", help="Also save what was sent: .npz, .csv, .fits or .aot.fits.")
 @click.option("--log", "log_file", metavar="FILE", help="Append what happens and alarms, a line each.")
@@ -58,8 +75,15 @@ def live(
     ngs: str | None,
     ngs_modes: str | None,
     ngs_lag: int,
-    unit: str,
+    unit: str | None,
+    command_sign: str | None,
+    command_delay: int | None,
+    rate: float | None,
+    columns: tuple[str, ...],
+    sha256: str | None,
     observers: tuple[str, ...],
+    controllers: tuple[str, ...],
+    no_controllers: bool,
     speed: float,
     record_file: str | None,
     log_file: str | None,
@@ -76,46 +100,60 @@ def live(
         if file:
             check_writable(file)
     scenario = configfile.scenario_from(preset, config, assignments)
-    source = _source(scenario, replay_file, stream, modes, unit)
+    declaration = declare_format(unit, command_sign, command_delay, rate, columns)
+    if not replay_file and (sha256 or replace(declaration, unit=None) != DeclaredFormat()):
+        raise SettingError("live: what is said of a record is of that of --replay")
+    source = _source(scenario, replay_file, stream, modes, declaration, sha256)
     if not isinstance(source, SimulatedLoop):
         scenario = scenario.before_events
     acts_of(scenario)
     if ngs is not None:
-        source = _with_ngs(source, scenario, ngs, ngs_modes, unit, ngs_lag)
+        source = _with_ngs(source, scenario, ngs, ngs_modes, unit or "um", ngs_lag)
     names = tuple(observers or observers_on(source, scenario))
     if headless:
         _run_headless(source, scenario, names, speed, seconds, record_file, as_json)
         return
-    for name in names:
+    beside = () if no_controllers else controllers or USUAL
+    for name in (*names, *beside):
         check_slot(name)
     try:
         from wfsobs.app import serve as server
         from wfsobs.app.live_order import LiveOrder
     except ModuleNotFoundError as error:
         raise SettingError(f"live: the page needs {error.name}; install wfsobs with its extra: wfsobs[app]") from None
+    addresses = {"in": stream, "modes": modes, "ngs": ngs, "ngs-modes": ngs_modes, "ngs-lag": ngs_lag or None, "unit": unit}
     order = LiveOrder(
         source,
         scenario,
         names,
         speed,
-        USUAL,
+        beside,
         key="live",
         record_file=record_file or "",
         log_file=log_file or "",
         preset=configfile.preset_name(preset, config),
+        options=tuple(word for name, value in addresses.items() if stream and value for word in (f"--{name}", str(value))),
     )
     server.serve(server.Options(port=port, open_browser=open_browser, runs=max(2, cpu_count() or 1)), order)
 
 
-def _source(scenario: Scenario, replay_file: str | None, stream: str | None, modes: str | None, unit: str) -> LiveSource:
+def _source(
+    scenario: Scenario,
+    replay_file: str | None,
+    stream: str | None,
+    modes: str | None,
+    declaration: DeclaredFormat,
+    sha256: str | None,
+) -> LiveSource:
     """Return the source that the options name. Raises SettingError, RecordError."""
     if replay_file:
-        return Replay(load_record(replay_file, scenario))
+        return Replay(load_declared(replay_file, scenario, declaration, sha256))
     if not stream:
         return SimulatedLoop(scenario)
     elements = stream_elements(modes, len(scenario.modes))
     path = str(stream_path(stream))
-    return StreamSource(path, elements, micrometres_per(unit, scenario.telescope.diameter), scenario.dt)
+    unit = micrometres_per(declaration.unit or "um", scenario.telescope.diameter)
+    return StreamSource(path, elements, unit, scenario.dt)
 
 
 def _with_ngs(source: LiveSource, scenario: Scenario, ngs: str, modes: str | None, unit: str, lag: int) -> StreamSource:

@@ -75,7 +75,11 @@ def record_options(command: Callable) -> Callable:
             type=click.Choice(["+1", "-1"]),
             help="+1 where y = disturbance + u (the default), -1 where y = disturbance - u.",
         ),
-        click.option("--unit", type=click.Choice(UNITS), help="Unit of the record where the file gives none; um by default."),
+        click.option(
+            "--unit",
+            type=click.Choice(UNITS),
+            help="Unit of the record where the file gives none, or of the stream; um by default.",
+        ),
     ):
         command = option(command)
     return command

@@ -10,6 +10,7 @@ import panel as pn
 import param
 
 from wfsobs.app.change_names import name_of_difference
+from wfsobs.app.copies import LIVE, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs.job import FAILED, RUNNING
@@ -26,6 +27,7 @@ from wfsobs.live.checks import can_run
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.replay import Replay
 from wfsobs.live.simulated import SimulatedLoop
+from wfsobs.live.source import SIMULATION
 from wfsobs.live.view import LiveView
 from wfsobs.settings.errors import SettingError
 
@@ -47,6 +49,7 @@ class LivePage(PageActions):
         self.store, self.display = store, display
         self.work = LiveTask(store.session)
         self.controls = c = LiveControls()
+        self.inputs = (c.running, c.controllers, c.speed)
         self.buttons = c.buttons
         self.intro, self.status = text(INTRO), html()
         self.room = pn.Column(**WIDE, visible=False)
@@ -116,11 +119,31 @@ class LivePage(PageActions):
         except SettingError as error:
             self.work.refuse(str(error))
             return
-        loaded = self.store.source
-        source = Replay(loaded.record) if isinstance(loaded, LoadedRecord) else SimulatedLoop(scenario)
-        c = self.controls
+        self.work.begin(self._order())
+
+    def _order(self) -> LiveOrder:
+        """Return the loop that the page asks for: the one that all pages show, or that of the drawer or of the record loaded."""
+        scenario, loaded, shared, c = self.store.scenario, self.store.source, self.store.session.service.live, self.controls
+        source, options = (SimulatedLoop(scenario), ()) if shared is None else (shared.source, shared.options)
+        if isinstance(loaded, LoadedRecord):
+            source, options = Replay(loaded.record), ()
+        elif source.name == SIMULATION:
+            source = SimulatedLoop(scenario)
         names = tuple(name for name in c.running.value if can_run(name, source, scenario))
-        self.work.begin(LiveOrder(source, scenario, names, c.speed.value, tuple(c.controllers.value)))
+        return LiveOrder(source, scenario, names, c.speed.value, tuple(c.controllers.value), options=options)
+
+    @property
+    def task(self) -> CopiedTask:
+        """To run the loop."""
+        return CopiedTask(LIVE, {"order": self._order()})
+
+    def link_fields(self) -> dict[str, str]:
+        """Return what of the loop a link has beside the settings."""
+        return self.controls.link_fields()
+
+    def open_link(self, fields: Mapping[str, str]) -> list[str]:
+        """Choose what a link has; return a line for each field refused. A loop that runs is left alone."""
+        return self.controls.open_link(fields) if self.loop is None else []
 
     @property
     def loop(self) -> LiveLoop | None:

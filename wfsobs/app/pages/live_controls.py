@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from time import monotonic
 from typing import Any
 
@@ -28,6 +29,8 @@ FIRST = ("kf-lgs", "kf-multi", "multirate", "multirate-multi", "gpr-online")
 """Observers that run first: as many as two cores keep up with beside the page."""
 MAIN = ("kf-multi", "multirate-multi", "gpr-online")
 """Observers whose lines are shown first."""
+OBSERVERS, CONTROLLERS, SPEED = "live.observers", "live.controllers", "live.speed"
+"""Fields of a link."""
 BUTTONS = {
     "Start": "play_arrow",
     "Pause": "pause",
@@ -105,3 +108,22 @@ class LiveControls:
             line(self.lasers, self.ngs, self.losses, b["Design anew"], b["Identify"], b["Record"]),
             self.running,
         ]
+
+    def link_fields(self) -> dict[str, str]:
+        """Return what of the loop differs from what is usual, as a link has it."""
+        chosen = {OBSERVERS: (self.running.value, FIRST), CONTROLLERS: (self.controllers.value, USUAL)}
+        fields = {name: ",".join(now) for name, (now, usual) in chosen.items() if tuple(now) != tuple(usual)}
+        return fields | ({} if self.speed.value == 1.0 else {SPEED: f"{self.speed.value:g}"})
+
+    def open_link(self, fields: Mapping[str, str]) -> list[str]:
+        """Choose what a link has, or what is usual; return a line for each field refused."""
+        refused = []
+        for name, field, usual in ((OBSERVERS, self.running, FIRST), (CONTROLLERS, self.controllers, USUAL)):
+            names, known = fields[name].split(",") if fields.get(name) else [], set(field.options.values())
+            field.value = [one for one in names if one in known] if name in fields else list(usual)
+            refused += [f"{name} = {one[:80]}: there is none of that name" for one in names if one not in known]
+        speeds = {f"{speed:g}": speed for speed in SPEEDS.values()}
+        if (speed := fields.get(SPEED, "1")) not in speeds:
+            refused.append(f"{SPEED} = {speed[:80]}: takes one of {', '.join(speeds)}")
+        self.speed.value = speeds.get(speed, 1.0)
+        return refused
