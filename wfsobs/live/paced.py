@@ -182,3 +182,10 @@ def go_first(turn: int) -> bool:
     except (AttributeError, OSError):  # another system, or no right to it
         return False
     return True
+
+
+def may_go_first() -> bool:
+    """Return whether the system lets processes like this one go first; its own turn is the usual one afterwards."""
+    may = go_first(SOURCE)
+    go_first(0)
+    return may

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from wfsobs.live.blocks import Block, endless_blocks
-from wfsobs.live.paced import SOURCE, Command, Desk, Staff, enter_process, send_frames
+from wfsobs.live.paced import SOURCE, Command, Desk, Staff, enter_process, may_go_first, send_frames
 from wfsobs.live.source import SIMULATION
 from wfsobs.record import Sampling
 from wfsobs.scenario import Scenario
@@ -56,8 +56,11 @@ class SimulatedLoop:
 
 
 def _make(settings: dict[str, Any], inbox: Connection, ready: Queue[tuple[int, Block]]) -> None:
-    """Make blocks ahead of time, at low priority; when the settings change, those of the new ones."""
-    enter_process(niceness=10)
+    """Make blocks ahead of time; when the settings change, those of the new ones.
+
+    It gives way to the other processes of the loop where those cannot go first.
+    """
+    enter_process(niceness=0 if may_go_first() else 10)
     scenario, generation = Scenario.from_dict(settings), 0
     rng = np.random.default_rng(scenario.run.seed)
     blocks = endless_blocks(scenario, rng)
