@@ -170,7 +170,7 @@ def test_what_is_known_is_what_a_whole_run_gives() -> None:
 
 
 CASES = {
-    "multipeak.line_width": {"kf-multi", "multirate-multi"},
+    "multipeak.line_width": {"kf-multi", "kf-coupled", "multirate-multi"},
     "multirate.model_lgs_error": {"multirate", "multirate-optimal"},
     "kalman.ngs_between_frames": {"kf-ngs"},
     "gpr_online.length_scale": {"gpr-online"},

@@ -133,7 +133,8 @@ def _of_modes(prior: Prior, name: str, n: int) -> Prior:
     for part, given in parts.items():
         if given and len(given) < n:
             raise StepError(f"{name}: the prior has {part} of {len(given)} modes, the loop has {n}")
-    return replace(prior, **{part: given[:n] for part, given in parts.items()})
+    flow = None if prior.flow is None else prior.flow.first(n)
+    return replace(prior, flow=flow, **{part: given[:n] for part, given in parts.items()})
 
 
 def _training(scenario: Scenario, train: Record | Training | None) -> Training:

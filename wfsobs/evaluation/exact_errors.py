@@ -55,9 +55,10 @@ def exact_errors(observer: Observer, scenario: Scenario) -> list[dict[str, Perio
     """
     settings = observer_settings(observer, scenario)
     parts = (*observer.prior, *observer.asks(settings))
-    if not observer.linear or not observer.causal or "training" in observer.needs:
+    if not observer.linear or observer.couples_modes or not observer.causal or "training" in observer.needs:
         raise ValueError(
-            f"{observer.id}: the exact error is that of an observer that is linear, causal and needs no training record"
+            f"{observer.id}: the exact error is that of an observer that is linear, causal and needs no training record, "
+            "and takes every mode by itself"
         )
     spectra = [true_spectra(scenario, mode) for mode in range(len(scenario.modes))]
     return errors_under(observer, prior_of(scenario, None, parts), settings, scenario.dt, spectra)

@@ -4,8 +4,8 @@ They follow from the true spectra of the scenario (`true_spectra`) and the respo
 (`linear_response`), the transform of the estimates from a single sample of one. That is the expectation over records after an
 infinitely long start. A record is one of them, and the scores of a short one scatter around it.
 
-Observers that are linear have a prediction; those of NGS frames by their responses over the cycle of a frame (`cycle_response`).
-Those that train on a record or learn during it have none, nor has one that looks ahead.
+Observers that are linear, every mode by itself, have a prediction; those of NGS frames by their responses over the cycle of a
+frame (`cycle_response`). Those that train on a record or learn during it have none, nor has one that looks ahead.
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ class Prediction:
 
 def is_predicted(observer: Observer, target: str) -> bool:
     """Return whether an observer's errors have a prediction."""
-    return observer.linear and observer.causal and target in observer.targets and Training not in observer.prior
+    known = observer.linear and not observer.couples_modes and observer.causal
+    return known and target in observer.targets and Training not in observer.prior
 
 
 class Identity:

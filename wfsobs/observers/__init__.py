@@ -10,6 +10,7 @@ from wfsobs.observers.gp.lgs import GP_LGS
 from wfsobs.observers.gpr.offline import GPR_OFFLINE
 from wfsobs.observers.gpr.online import GPR_ONLINE
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE
+from wfsobs.observers.kalman.coupled import KF_COUPLED
 from wfsobs.observers.kalman.multi import KF_MULTI
 from wfsobs.observers.kalman.multirate import MULTIRATE
 from wfsobs.observers.kalman.multirate_adaptive import MULTIRATE_ADAPTIVE
@@ -22,6 +23,7 @@ from wfsobs.registry import Registry
 BUILT_IN = (
     KF_LGS,
     KF_MULTI,
+    KF_COUPLED,
     KF_ADAPTIVE,
     KF_NGS,
     MULTIRATE,

@@ -107,6 +107,8 @@ class Observer:
         False only for a reference that uses later samples.
     linear : bool
         Whether estimates are a linear function of the measurements, with prior and settings fixed; a constant may be added.
+    couples_modes : bool
+        Whether the estimate of a mode uses the measurements of others.
     takes_missing : bool
         Whether it takes missing measurements as missing, as NaN; by default they are filled by the model of its prior.
     sensors : tuple of str
@@ -135,6 +137,7 @@ class Observer:
     asks: Callable[[Any], tuple[Part, ...]] = _nothing
     causal: bool = True
     linear: bool = False
+    couples_modes: bool = False
     takes_missing: bool = False
     sensors: tuple[str, ...] = ("lgs",)
     tunable: Tunable = NOT_TUNED

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from wfsobs.prior.parts import Bands, Beams, LgsError, Line, Lines, Model, Spectra
+from wfsobs.prior.parts import Bands, Beams, Flow, LgsError, Line, Lines, Model, Spectra
 from wfsobs.record import Training
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "TRUE",
     "Bands",
     "Beams",
+    "Flow",
     "LgsError",
     "Line",
     "Lines",
@@ -36,7 +37,7 @@ IDENTIFIED: PriorSource = "identified"
 GIVEN: PriorSource = "given"
 """From settings, on a record that was not simulated from them."""
 
-Part = type[Model] | type[LgsError] | type[Lines] | type[Beams] | type[Bands] | type[Spectra] | type[Training]
+Part = type[Model] | type[LgsError] | type[Lines] | type[Beams] | type[Flow] | type[Bands] | type[Spectra] | type[Training]
 """A kind of thing that an observer or a controller can ask for."""
 
 _WORDS: dict[Part, tuple[str, ...]] = {
@@ -44,6 +45,7 @@ _WORDS: dict[Part, tuple[str, ...]] = {
     LgsError: ("model",),
     Lines: ("model", "{source} lines"),
     Beams: ("model",),
+    Flow: ("model",),
     Bands: ("bands",),
     Spectra: ("{source} spectra",),
     Training: ("training data",),
@@ -65,7 +67,7 @@ class Prior:
     """The parts that an observer or a controller asked for, empty or None where it did not.
 
     model, lgs_error, lines, beams, spectra : one per mode
-    bands    : of all modes
+    flow, bands : of all modes
     training : a record to learn from
     """
 
@@ -73,6 +75,7 @@ class Prior:
     lgs_error: tuple[LgsError, ...] = ()
     lines: tuple[Lines, ...] = ()
     beams: tuple[Beams, ...] = ()
+    flow: Flow | None = None
     bands: Bands | None = None
     spectra: tuple[Spectra, ...] = ()
     training: Training | None = None

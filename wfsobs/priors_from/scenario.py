@@ -9,7 +9,8 @@ import numpy as np
 
 from wfsobs.observers.base import Observer
 from wfsobs.observers.kalman.single import steady_filter
-from wfsobs.prior import Bands, Beams, LgsError, Line, Lines, Model, Part, Prior, Spectra, Training
+from wfsobs.prior import Bands, Beams, Flow, LgsError, Line, Lines, Model, Part, Prior, Spectra, Training
+from wfsobs.priors_from.flow import flow_of
 from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence, measurement_noise, one_process
 from wfsobs.priors_from.vibration import vibration_continuum
 from wfsobs.record import Measurements, Record, Sampling
@@ -64,6 +65,7 @@ def prior_of(
         lgs_error=tuple(lgs_error_of(scenario, mode, dt) for mode in modes) if LgsError in asked else (),
         lines=tuple(lines_of(scenario, mode, dt) for mode in modes) if Lines in asked else (),
         beams=tuple(beams_of(scenario, mode, dt) for mode in modes) if Beams in asked else (),
+        flow=flow_of(scenario, len(modes), dt) if Flow in asked else None,
         bands=bands_of(scenario) if Bands in asked else None,
         spectra=tuple(spectra or [spectra_of(scenario, mode) for mode in modes]) if Spectra in asked else (),
         training=record.training.copy() if Training in asked and record and record.training else None,

@@ -10,10 +10,10 @@ times sinc^2(f T) for the mean over a step. Layers are independent and add. The 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +70,7 @@ def flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> FlowSpectra
     FlowSpectra
         Six densities, (n,) each [um^2/Hz].
     """
-    shared = _spectra_between(scenario, mode, frequency, apart=False)
+    shared = spectra_between(scenario, mode, frequency, _stars_together)
     if len(shared.density) == 2:  # the NGS is on the axis
         own, measurement = shared.density
         return FlowSpectra(own, measurement, shared.pair(0, 1), own, own + 0j, shared.pair(0, 1))
@@ -96,7 +96,7 @@ def star_flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> NDArra
         One-sided cross spectra [um^2/Hz] of the signal on the axis, that of the NGS, the mean of the LGS and their orthonormal
         differences (`star_basis`), (2 + n_lgs, 2 + n_lgs, n).
     """
-    shared = _spectra_between(scenario, mode, frequency, apart=True)
+    shared = spectra_between(scenario, mode, frequency, _stars_apart)
     signals = range(len(shared.density))
     out = np.array([[shared.pair(i, j) if i < j else np.empty_like(shared.pair(0, 0)) for j in signals] for i in signals])
     for i in signals:
@@ -112,7 +112,7 @@ def star_basis(stars: int) -> Array:
 
 
 @dataclass(frozen=True)
-class _Between:
+class SpectraBetween:
     """Densities of signals, (n,) each, and how they are shared at the nodes, interpolated at log frequencies `at`."""
 
     density: list[Array]
@@ -127,20 +127,20 @@ class _Between:
         return np.sqrt(self.density[i] * self.density[j]) * (real + 1j * imaginary)
 
 
-def _spectra_between(scenario: Scenario, mode: int, frequency: Array, *, apart: bool) -> _Between:
-    f, total = _at_nodes(scenario, mode, float(frequency[-1]), apart=apart)
+def spectra_between(scenario: Scenario, mode: int | None, frequency: Array, sight: Sight) -> SpectraBetween:
+    """Return the spectra [um^2/Hz] of what a sight gives of one mode, or of all (None), at frequencies from 0 on [Hz]."""
+    f, total = _at_nodes(scenario, mode, float(frequency[-1]), sight)
     exposure = np.sinc(f * scenario.dt) ** 2
     at, nodes = np.log(np.maximum(frequency, f[0])), np.log(f)
     density = [np.exp(np.interp(at, nodes, np.log(np.maximum((row[i] * exposure).real, 1e-300)))) for i, row in enumerate(total)]
-    return _Between(density, nodes, at, total)
+    return SpectraBetween(density, nodes, at, total)
 
 
 @lru_cache(maxsize=32)
-def _at_nodes(scenario: Scenario, mode: int, highest: float, *, apart: bool) -> tuple[Array, NDArray[np.complex128]]:
+def _at_nodes(scenario: Scenario, mode: int | None, highest: float, sight: Sight) -> tuple[Array, NDArray[np.complex128]]:
     """Return the nodes in frequency, and the spectra of all layers there, which take a second where there are many."""
     found = atmosphere.layers(scenario)
     f = _frequencies(scenario, min(layer.speed for layer in found), highest)
-    sight = _stars_apart if apart else _stars_together
     total = np.sum([_layer(scenario, mode, layer, f, sight) for layer in found], axis=0)
     f.flags.writeable = total.flags.writeable = False
     return f, total
@@ -161,7 +161,7 @@ def _frequencies(scenario: Scenario, speed: float, highest: float) -> Array:
     return f[: int(np.searchsorted(f, highest)) + 1]
 
 
-def _layer(scenario: Scenario, mode: int, layer: TurbulenceLayer, f: Array, sight: _Sight) -> NDArray[np.complex128]:
+def _layer(scenario: Scenario, mode: int | None, layer: TurbulenceLayer, f: Array, sight: Sight) -> NDArray[np.complex128]:
     """Return the spectra of one layer between the signals, (n_signals, n_signals, n)."""
     kx = 2.0 * np.pi * f / layer.speed
     front = CORE / (0.5 * scenario.telescope.diameter)
@@ -180,7 +180,7 @@ def _blocks(kx: Array, front: float) -> Iterator[slice]:
 
 
 def _block(
-    scenario: Scenario, mode: int, layer: TurbulenceLayer, kx: Array, front: float, sight: _Sight
+    scenario: Scenario, mode: int | None, layer: TurbulenceLayer, kx: Array, front: float, sight: Sight
 ) -> NDArray[np.complex128]:
     diameter, q0 = scenario.telescope.diameter, 2.0 * np.pi / scenario.turbulence.outer_scale
     if kx[0] < front:
@@ -193,11 +193,12 @@ def _block(
         * von_karman_density(kx**2 + ky[:, None] ** 2, layer.strength, scenario.turbulence.outer_scale)
     )
     c, s = np.cos(layer.angle), np.sin(layer.angle)
-    signals = sight(scenario, mode, layer, c * kx - s * ky[:, None], s * kx + c * ky[:, None])
-    return np.array([[(density * one.conj() * other).sum(axis=0) for other in signals] for one in signals])
+    signals = np.asarray(sight(scenario, mode, layer, c * kx - s * ky[:, None], s * kx + c * ky[:, None]))
+    by_kx = np.moveaxis(signals, 2, 0)
+    return np.moveaxis((by_kx.conj() * density.T[:, None]) @ by_kx.swapaxes(1, 2), 0, 2)
 
 
-_Sight = Callable[[Scenario, int, TurbulenceLayer, Array, Array], list[NDArray[np.complex128]]]
+Sight = Callable[[Scenario, Any, TurbulenceLayer, Array, Array], Sequence[NDArray[np.complex128]]]
 """(scenario, mode, layer, k_x, k_y) -> transforms of the signals."""
 
 
@@ -206,21 +207,21 @@ def _stars_together(scenario: Scenario, mode: int, layer: TurbulenceLayer, x: Ar
     own = _of_mode(scenario, mode, x, y, Footprint())
     combined = np.zeros_like(own)
     for star, gains in zip(atmosphere.laser_stars(scenario), lgs_weights(scenario)[mode], strict=True):
-        footprint = _footprint(scenario, star, layer)
+        footprint = footprint_on(scenario, star, layer)
         for other, gain in enumerate(gains):
             blind = scenario.sensors.tip_tilt_indetermination and scenario.modes[other].radial_order == 1
             if gain != 0.0 and not blind:
                 combined = combined + gain * _of_mode(scenario, other, x, y, footprint)
     signals = [own, combined]
     if atmosphere.natural_star(scenario) != atmosphere.on_axis():
-        signals.append(_of_mode(scenario, mode, x, y, _footprint(scenario, atmosphere.natural_star(scenario), layer)))
+        signals.append(_of_mode(scenario, mode, x, y, footprint_on(scenario, atmosphere.natural_star(scenario), layer)))
     return signals
 
 
 def _stars_apart(scenario: Scenario, mode: int, layer: TurbulenceLayer, x: Array, y: Array) -> list[NDArray[np.complex128]]:
     """Return those of axis, NGS, mean of the LGS and their differences."""
     stars = (atmosphere.natural_star(scenario), *atmosphere.laser_stars(scenario))
-    ngs, *lgs = (_of_mode(scenario, mode, x, y, _footprint(scenario, star, layer)) for star in stars)
+    ngs, *lgs = (_of_mode(scenario, mode, x, y, footprint_on(scenario, star, layer)) for star in stars)
     return [_of_mode(scenario, mode, x, y, Footprint()), ngs, *np.tensordot(star_basis(len(lgs)), lgs, axes=1)]
 
 
@@ -229,5 +230,6 @@ def _of_mode(scenario: Scenario, mode: int, x: Array, y: Array, footprint: Footp
     return sensor.transform(x, y, footprint, tabulated_bessel_ratio)[0]
 
 
-def _footprint(scenario: Scenario, star: atmosphere.Star, layer: TurbulenceLayer) -> Footprint:
+def footprint_on(scenario: Scenario, star: atmosphere.Star, layer: TurbulenceLayer) -> Footprint:
+    """Return where the beam of a star crosses a layer."""
     return atmosphere.view(atmosphere.ideal_sensor(scenario), star, (layer,)).footprints[0]

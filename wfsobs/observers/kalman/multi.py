@@ -36,16 +36,17 @@ class MultiPeak(Group):
 
 def kf_multi(measurements: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> Estimates:
     """Run the filter on the LGS measurement, at every fast step."""
-    return run_steady(measurements, _filters(prior, settings), watch)
+    return run_steady(measurements, independent_filters(prior, settings), watch)
 
 
-def _filters(prior: Prior, settings: MultiPeak) -> list[ModeFilter]:
+def independent_filters(prior: Prior, settings: MultiPeak) -> list[ModeFilter]:
+    """Return the steady-state filters of all modes, each of its own."""
     return [steady_mode(one.disturbance(settings.line_width), one.noise) for one in prior.lines]
 
 
 def step_kf_multi(prior: Prior, settings: MultiPeak, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
     """Return the filters of all modes, one frame at a time."""
-    return KalmanEstimator(_filters(prior, settings))
+    return KalmanEstimator(independent_filters(prior, settings))
 
 
 PEAKS = Section("multipeak", "Multi-peak Kalman filter", MultiPeak)

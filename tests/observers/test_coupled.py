@@ -1,0 +1,124 @@
+"""The coupled filter and the bound of coupled modes, against dense algebra, simulated records and the independent filters."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import wfsobs
+from tests.test_mode_spectra import FLOW
+from wfsobs.evaluation.bound import bound_rms
+from wfsobs.evaluation.bound_modes import bound_rms_of_modes
+from wfsobs.evaluation.exact_errors import exact_errors
+from wfsobs.evaluation.theory import is_predicted
+from wfsobs.execution import run_observer
+from wfsobs.observers import OBSERVERS
+from wfsobs.observers.kalman.coupled import CoupledEstimator, CoupledModel
+from wfsobs.prior import Flow, Lines
+from wfsobs.priors_from.scenario import prior_of
+from wfsobs.scenario import Scenario
+from wfsobs.simulation.loop import simulate
+from wfsobs.simulation.mode_spectra import mode_spectra
+
+LINE = {"frequency": 31.0, "damping": 0.02, "rms": [0.05, 0.04]}
+SHAKEN = FLOW.replace({"vibration.source": "peaks", "vibration.peaks": [LINE], "vibration.cutoff": 60.0})
+
+
+def model_of(scenario: Scenario) -> CoupledModel:
+    return CoupledModel(prior_of(scenario, None, (Lines, Flow)), scenario.multipeak)
+
+
+def stated(scenario: Scenario, target: str = "turbulence") -> np.ndarray:
+    return model_of(scenario).plan(0.0, target)[1]
+
+
+def test_the_bound_is_that_of_dense_algebra() -> None:
+    """From 400 measurements of each of five modes, in which the wind crosses the aperture four times, to 1 %; more of the past
+    helps tilt, across the wind, by 5 %.
+    """
+    past, n, modes = 400, 2**15, range(5)
+    frequency = np.hypot(np.fft.rfftfreq(n, FLOW.dt), 1.0 / (n * FLOW.dt))
+    found = mode_spectra(FLOW, frequency)
+    among = np.fft.irfft(found.measurement, n) * (0.5 / FLOW.dt)
+    with_target = np.fft.irfft(found.cross, n)[:, :, 1 : past + 1] * (0.5 / FLOW.dt)  # z[k] is of step k - 1
+    ages = np.arange(past)
+    covariance = among[:, :, (ages - ages[:, None]) % n].transpose(0, 2, 1, 3).reshape(5 * past, 5 * past)
+    noise = prior_of(FLOW, None, (Lines,)).lines[0].noise
+    weights = np.linalg.solve(covariance + noise**2 * np.eye(5 * past), with_target.reshape(5, -1).T)
+    explained = np.einsum("ti,it->t", with_target.reshape(5, -1), weights)
+    own = np.fft.irfft(found.own, n)[:, 0] * (0.5 / FLOW.dt)
+    dense = np.sqrt(own - explained)
+    bound = np.array([one["turbulence"] for one in bound_rms_of_modes(FLOW)])
+    assert (bound < 1.001 * dense).all()
+    np.testing.assert_allclose(np.delete(bound, 1), np.delete(dense, 1), rtol=0.015)
+    assert bound[1] > 0.93 * dense[1]
+    alone = [bound_rms(FLOW, mode)["turbulence"] for mode in modes]
+    assert (bound < 0.95 * np.array(alone)).all() and bound[0] < 0.6 * alone[0]
+
+
+def test_what_it_states_is_near_the_bound_and_below_the_independent_filters() -> None:
+    alone = exact_errors(OBSERVERS["kf-multi"], SHAKEN)
+    bound = bound_rms_of_modes(SHAKEN)
+    for target in ("turbulence", "vibration", "total"):
+        found = stated(SHAKEN, target)
+        for mode in range(2):
+            assert bound[mode][target] * 0.999 < found[mode] < 1.05 * bound[mode][target]
+            assert found[mode] < alone[mode][target].rms
+
+
+def test_errors_are_as_it_states() -> None:
+    """On records of 60 s through ideal sensors: errors go on for a second or so, so that each rms is known to some 5 %."""
+    scenario = SHAKEN.replace({"run.duration": 60.0, "run.seed": 3})
+    record = simulate(scenario)
+    found = run_observer("kf-coupled", record, scenario)
+    for target, truth in (("turbulence", record.turbulence), ("vibration", record.vibration)):
+        error = np.sqrt(np.mean((found[target] - truth)[2000:] ** 2, axis=0))
+        np.testing.assert_allclose(error[:2], stated(scenario, target)[:2], rtol=0.12)
+    assert (found["vibration"][:, 2:] == 0.0).all()  # tip and tilt alone vibrate
+
+
+@pytest.mark.parametrize("changes", [{}, {"telescope.radial_order": 3}, {"turbulence.source": "ar3"}])
+def test_independent_modes_have_the_independent_filters(changes: dict[str, object]) -> None:
+    scenario = wfsobs.PRESETS["paper"]().replace({"run.duration": 1.0, "run.warm_up": 0.1, **changes})
+    record = simulate(scenario)
+    coupled, alone = (run_observer(name, record, scenario) for name in ("kf-coupled", "kf-multi"))
+    for target, values in alone.items():
+        np.testing.assert_array_equal(coupled[target], values)
+
+
+def test_predictions_go_on_from_the_estimate() -> None:
+    """A fraction of a step lies between; what is far ahead is as uncertain as the truth."""
+    model = model_of(SHAKEN)
+    for target, truth in (
+        ("turbulence", np.sqrt(prior_of(SHAKEN, None, (Flow,)).flow.own.sum(axis=1))[:2]),
+        ("vibration", [0.05, 0.04]),
+    ):
+        sd = np.array([model.plan(frames, target)[1][:2] for frames in (0.0, 0.5, 1.0, 1.5, 2.0, 1e5)])
+        assert (np.diff(sd, axis=0) > 0).all()
+        np.testing.assert_allclose(sd[-1], truth, rtol=0.02)
+
+
+def test_a_mode_is_told_by_the_others() -> None:
+    """A pulse in one mode is answered in those of its parity across the wind, by `kf-multi` in its own alone."""
+    observer = wfsobs.design("kf-coupled", FLOW)
+    observer.update(np.array([0.1, 0.0, 0.0, 0.0, 0.0]))
+    answer = np.abs(observer.predict(1, "turbulence")[0])
+    assert isinstance(observer.estimator, CoupledEstimator)
+    assert (answer[[0, 2, 4]] > 1e-4).all() and (answer[[1, 3]] < 1e-9).all()
+
+
+def test_a_new_design_takes_over() -> None:
+    old, new = (wfsobs.design("kf-coupled", SHAKEN.replace({"sensors.lgs_noise": noise})) for noise in (0.02, 0.0201))
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        old.update(rng.standard_normal(5))
+    new.take_over(old)
+    np.testing.assert_allclose(new.predict(0, "turbulence")[0], old.predict(0, "turbulence")[0], atol=0.02)
+
+
+def test_figures_of_single_modes_leave_it_out() -> None:
+    assert not is_predicted(OBSERVERS["kf-coupled"], "turbulence")
+    with pytest.raises(ValueError, match="every mode by itself"):
+        exact_errors(OBSERVERS["kf-coupled"], SHAKEN)
+    with pytest.raises(ValueError, match="independent"):
+        bound_rms_of_modes(FLOW.replace({"turbulence.source": "ar2"}))

@@ -1,0 +1,105 @@
+"""Cross spectra of the modes of frozen flow: what of a mode is told by the others.
+
+The modes are projections of one screen that moves with the wind. What enters the aperture with one mode passes it with another,
+and what the LGS see through a narrower beam as one mode is of several modes of the whole aperture. So the modes have a matrix of
+spectra S(f), Hermitian and positive semidefinite, that `flow_spectra` has the diagonal of.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wfsobs.atmosphere.plane_waves import Footprint
+from wfsobs.atmosphere.von_karman import TurbulenceLayer
+from wfsobs.scenario import Scenario
+from wfsobs.sensors.zernike import tabulated_bessel_ratio
+from wfsobs.simulation import layers as atmosphere
+from wfsobs.simulation.flow_spectra import footprint_on, spectra_between
+from wfsobs.simulation.guide_stars import lgs_weights
+from wfsobs.typing import Array
+
+PER_DECADE = 250
+"""Nodes of the sums over frequency."""
+
+SLOWEST = 1e-4
+"""Minimum frequency of those nodes, over the share of the aperture that the slowest wind crosses in a second."""
+
+
+@dataclass(frozen=True)
+class ModeSpectra:
+    """One-sided spectra of all modes [um^2/Hz].
+
+    Attributes
+    ----------
+    own : Array
+        Densities on the axis, (n_modes, n).
+    measurement : Array
+        Cross spectra of the modes of the combined LGS, without noise: the transform over j of E m_i[k] m_l[k-j],
+        (n_modes, n_modes, n).
+    cross : Array
+        Those of the modes on the axis and the modes of the LGS, (n_modes, n_modes, n).
+    """
+
+    own: Array
+    measurement: NDArray[np.complex128]
+    cross: NDArray[np.complex128]
+
+
+def are_coupled(scenario: Scenario) -> bool:
+    """Return whether modes tell of one another: there are several, of frozen flow."""
+    return scenario.turbulence.source == "frozen-flow" and len(scenario.modes) > 1
+
+
+def mode_spectra(scenario: Scenario, frequency: Array) -> ModeSpectra:
+    """Compute the spectra of all modes of frozen flow.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    frequency : Array
+        Frequencies from 0 on, (n,) [Hz].
+
+    Returns
+    -------
+    ModeSpectra
+        Densities.
+    """
+    found, m = spectra_between(scenario, None, frequency, _all_modes), len(scenario.modes)
+    measurement = np.empty((m, m, frequency.size), dtype=np.complex128)
+    for i in range(m):
+        for j in range(i, m):
+            measurement[i, j] = found.pair(m + i, m + j)
+            measurement[j, i] = measurement[i, j].conj()
+    return ModeSpectra(
+        np.array(found.density[:m]), measurement, np.array([[found.pair(i, m + j) for j in range(m)] for i in range(m)])
+    )
+
+
+def frequency_rule(scenario: Scenario) -> tuple[Array, Array]:
+    """Return nodes and weights [Hz] of a sum that stands for an integral over frequency up to half the rate, (n,) each.
+
+    All weights are positive, so that covariances of such sums are those of a process.
+    """
+    layers = atmosphere.layers(scenario)
+    lowest = SLOWEST * min(layer.speed for layer in layers) / scenario.telescope.diameter
+    highest = 0.5 / scenario.dt
+    edges = np.geomspace(lowest, highest, int(PER_DECADE * np.log10(highest / lowest)) + 1)
+    return np.sqrt(edges[1:] * edges[:-1]), np.diff(edges)
+
+
+def _all_modes(scenario: Scenario, _mode: None, layer: TurbulenceLayer, x: Array, y: Array) -> list[NDArray[np.complex128]]:
+    """Return the transforms of all modes on the axis, then of all modes of the combined LGS."""
+    ideal = atmosphere.ideal_sensor(scenario)
+    own = ideal.transform(x, y, Footprint(), tabulated_bessel_ratio)
+    weights = lgs_weights(scenario)
+    if scenario.sensors.tip_tilt_indetermination:
+        weights = weights * np.array([mode.radial_order != 1 for mode in scenario.modes])
+    combined = np.zeros_like(own)
+    for i, star in enumerate(atmosphere.laser_stars(scenario)):
+        seen = ideal.transform(x, y, footprint_on(scenario, star, layer), tabulated_bessel_ratio)
+        combined += np.tensordot(weights[:, i], seen, axes=1)
+    return [*own, *combined]
