@@ -16,7 +16,11 @@ from wfsobs.observers.kalman.both_window import BothModel, Lengths, both_lengths
 from wfsobs.observers.kalman.multirate_adaptive import next_length, window_start
 from wfsobs.record import RecordError
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.spectral.quick import follow_spectrum
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.statespace import sample_ar3
+from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.quick import follow_spectrum, quick_spectrum
+from wfsobs.spectral.quick_fit import WindowFit
 
 DT, RATIO = 1e-3, 5
 TURBULENCE, ERROR = Ar2(7.0, 0.9, 0.5, DT), Ar2(9.0, 0.9, 0.05, DT)
@@ -55,6 +59,37 @@ def test_close_lines_part_as_the_window_grows() -> None:
         near.append(sorted(p.omega / (2 * pi) for p in found.resonances if abs(p.omega / (2 * pi) - 30.15) < 1.0))
     assert len(near[0]) == 1
     assert near[2] == pytest.approx([30.0, 30.3], abs=0.02)  # a third of a bin
+
+
+STEEP = Ar3(2 * pi, 0.7, 12 * pi, 0.5, DT)
+
+
+def test_densities_of_turbulence_of_third_order() -> None:
+    """Those of the process itself; slopes by central differences, which 1e-6 gives to its square and to 1e-16 / 1e-6."""
+    start = Spectrum(0.002, DT, STEEP, (Ar2(60 * pi, 0.01, 0.02, DT),))
+    fit = WindowFit(sample_ar3(STEEP, 4000, np.random.default_rng(0)), DT, start)
+    f = fit.f[::10]
+    S, slopes = fit.density(fit.x, f)
+    np.testing.assert_allclose(S, start.psd(f), rtol=1e-11)
+    np.testing.assert_allclose(fit.spectrum.psd(f), start.psd(f), rtol=1e-11)
+    for slope, step in zip(slopes, 1e-6 * np.eye(len(fit.x)), strict=True):
+        up, down = (np.log(fit.density(fit.x + sign * step, f)[0]) for sign in (1, -1))
+        np.testing.assert_allclose(slope, (up - down) / 2e-6, atol=1e-6)
+
+
+def test_turbulence_that_falls_steeply() -> None:
+    """16 s, the density in octaves from 2 to 32 Hz: the lowest has 32 bins, known to 18 %, the others more; two and a half of it.
+
+    Turbulence of second order is off by more somewhere.
+    """
+    rng = np.random.default_rng(3)
+    z = sample_ar3(STEEP, 16_000, rng) + 0.002 * rng.standard_normal(16_000)
+    f = np.geomspace(2.0, 32.0, 41)
+    off = [
+        np.abs(np.log(found.psd(f) / Spectrum(0.002, DT, STEEP).psd(f))).max()
+        for found in (follow_spectrum(z, DT, 0, 5.0, None), quick_spectrum(z, DT, 0))
+    ]
+    assert off[0] < 0.45 and off[1] > 0.9
 
 
 def test_near_the_filter_that_is_told_and_far_from_the_lgs_alone() -> None:

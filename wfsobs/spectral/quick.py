@@ -6,7 +6,7 @@ the same once more for the remainder. A false weak peak costs the filter less th
 in `search`.
 
 For windows that grow, the resonances of the window before are a first guess too (`follow_spectrum`): they are tracked, not made
-anew.
+anew. Turbulence is then of third order, since long windows show peaks that what it has too much beyond its corner would hide.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ COARSE = 50, 4
 """As FINE and NEAR of `periodogram`, for long windows: their cells hold many bins."""
 LEFT = 0.02
 """Share of the error of a first guess by straight lines through gaps that rounds of filling and fitting leave."""
+THIRD = 4.0
+"""Third corner of turbulence, over the first two, at which the first fit of long windows starts."""
 STARTS = 2
 """Corners of turbulence in the first guess: higher ones converge to the same."""
 
@@ -98,7 +100,8 @@ def follow_spectrum(
 ) -> Spectrum:
     """Fit noise, turbulence and up to `most` peaks to a window that begins as the one before it did, or thereabouts.
 
-    As `quick_spectrum`, but the first guess has the resonances of `before` too; z is not constant.
+    As `quick_spectrum`, but the first guess has the resonances of `before` too, and turbulence is of third order; z is not
+    constant.
 
     Parameters
     ----------
@@ -117,7 +120,10 @@ def follow_spectrum(
     z = z - z.mean()
     tracked = () if before is None else before.resonances
     start = _background_of(z, dt, before)
-    fit = WindowFit(z, dt, Spectrum(start.noise, dt, start.turbulence, tracked), extra, TRACKED, COARSE)
+    turbulence = start.turbulence
+    if isinstance(turbulence, Ar2):
+        turbulence = Ar3(turbulence.omega, turbulence.damping, THIRD * turbulence.omega, turbulence.rms, dt)
+    fit = WindowFit(z, dt, Spectrum(start.noise, dt, turbulence, tracked), extra, TRACKED, COARSE)
     if not tracked:
         fit.background()
     _add_peaks(fit, most, lowest)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import log, pi
+from dataclasses import replace
+from math import log, pi, sqrt
 
 import numpy as np
 from scipy.special import logit
@@ -11,7 +12,7 @@ from scipy.special import logit
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.spectral.densities import densities
-from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.model import FAST, SLOW, Spectrum
 from wfsobs.spectral.periodogram import FINE, NEAR, Cells, periodogram, periodogram_frequencies
 from wfsobs.typing import Array
 
@@ -44,8 +45,8 @@ REACH = 1.0
 class WindowFit:
     """A fit: periodogram I at f, a finer one, and the parameters of the spectrum.
 
-    x: log noise, then three per process, turbulence first where there is any (`densities`). narrowest : as NARROWEST; cells : as
-    FINE and NEAR.
+    x: log noise, then three per process, turbulence first where there is any (`densities`). Turbulence of third order is that of
+    second order behind one more pole, whose corner is a fourth. narrowest : as NARROWEST; cells : as FINE and NEAR.
     """
 
     def __init__(
@@ -63,7 +64,8 @@ class WindowFit:
         self.fine_f, self.fine = periodogram_frequencies(n, dt, PAD), periodogram(z, dt, PAD)
         self.df = self.f[0]
         processes = [] if start.turbulence is None else [start.turbulence]
-        self.first = 1 + 3 * len(processes)
+        self.third = isinstance(start.turbulence, Ar3)
+        self.first = 1 + 3 * len(processes) + self.third
         self.x = np.concatenate([[log(start.noise)], *map(_numbers, [*processes, *start.resonances])])
         self.add(())
 
@@ -77,19 +79,31 @@ class WindowFit:
         """The fit as processes."""
         found = [
             Ar2(float(np.exp(w)), float(1.0 / (1.0 + np.exp(-d))), float(np.exp(rms)), self.dt)
-            for w, d, rms in self.x[1:].reshape(-1, 3)
+            for w, d, rms in self._of_second_order(self.x)
         ]
-        turbulence = found.pop(0) if self.first > 1 else None
+        turbulence: Ar2 | Ar3 | None = found.pop(0) if self.first > 1 else None
+        if self.third and isinstance(turbulence, Ar2):
+            turbulence = _behind_pole(turbulence, float(np.exp(self.x[4])))
         return Spectrum(float(np.exp(self.x[0])), self.dt, turbulence, tuple(found))
+
+    def _of_second_order(self, x: Array) -> Array:
+        """Return the numbers of all processes as those of second order, a row each."""
+        return np.concatenate([x[1 : self.first - self.third], x[self.first :]]).reshape(-1, 3)
 
     def density(self, x: Array, f: Array) -> tuple[Array, Array]:
         """Return S (len(f),) and the derivatives of its logarithm by x, (len(x), len(f))."""
         noise = np.full_like(f, 2.0 * self.dt * np.exp(2.0 * x[0]))
-        S, slopes = densities(x[1:].reshape(-1, 3), self.dt, f)
+        S, slopes = densities(self._of_second_order(x), self.dt, f)
+        by_corner = np.zeros((0, len(f)))
+        if self.third:
+            falling, slope = one_pole(x[4], self.dt, f)
+            S[0] *= falling
+            by_corner = (S[0] * slope)[None]
         total = noise + S.sum(axis=0)
         if self.extra is not None:
             total += self.extra.psd(f)
-        return total, np.vstack([2.0 * noise, (S[:, None] * slopes).reshape(-1, len(f))]) / total
+        by_numbers = (S[:, None] * slopes).reshape(-1, len(f))
+        return total, np.vstack([2.0 * noise, by_numbers[:3], by_corner, by_numbers[3:]]) / total
 
     def background(self) -> None:
         """Adapt noise and turbulence to this window, whatever its peaks."""
@@ -158,6 +172,9 @@ class WindowFit:
         if self.first > 1:
             x[1] = np.clip(x[1], log(pi * self.df), log(0.5 / self.dt))
             x[2] = np.clip(x[2], logit(0.1), logit(0.99))
+        if self.third:
+            x[1] = np.clip(x[1], log(SLOW / self.dt), log(FAST / self.dt))
+            x[4] = np.clip(x[4], x[1], log(2.0 * FAST / self.dt))
         x[self.first :: 3] = np.clip(x[self.first :: 3], log(4.0 * pi * self.df), log(0.95 * pi / self.dt))
         least = np.minimum(2.0 * pi * self.narrowest * self.df / np.exp(x[self.first :: 3]), WIDEST)
         x[self.first + 1 :: 3] = np.clip(x[self.first + 1 :: 3], logit(least), logit(WIDEST))
@@ -174,4 +191,31 @@ class WindowFit:
 
 
 def _numbers(p: Ar2 | Ar3) -> Array:
-    return np.array([log(p.omega), logit(min(p.damping, 0.99)), log(max(p.rms, 1e-12))])
+    numbers = np.array([log(p.omega), logit(min(p.damping, 0.99)), log(max(p.rms, 1e-12))])
+    if isinstance(p, Ar3):
+        alone = Ar2(p.omega, min(p.damping, 0.99), 1.0, p.dt)
+        numbers = np.append(numbers, log(p.corner))
+        numbers[2] = 0.5 * log(max(_slow_density(p) / _slow_density(alone), 1e-24))
+    return numbers
+
+
+def _behind_pole(p: Ar2, corner: float) -> Ar3:
+    """Return the process of third order with the poles of p and one more, and the density of p at low frequencies."""
+    one = Ar3(p.omega, p.damping, max(corner, p.omega), 1.0, p.dt)
+    return replace(one, rms=sqrt(_slow_density(p) / _slow_density(one)))
+
+
+def _slow_density(p: Ar2 | Ar3) -> float:
+    return float(p.psd(np.zeros(1))[0])
+
+
+def one_pole(number: float, dt: float, f: Array) -> tuple[Array, Array]:
+    """Return the power that passes a pole, 1 at low frequencies, and the derivative of its logarithm by `number`.
+
+    number : log of the corner [rad/s];  f : frequencies [Hz]
+    """
+    decay = float(np.exp(number)) * dt
+    a, turned = np.exp(-decay), 4.0 * np.sin(np.pi * f * dt) ** 2
+    distance = (1.0 - a) ** 2 + a * turned
+    by_a = -2.0 / (1.0 - a) - (turned - 2.0 * (1.0 - a)) / distance
+    return (1.0 - a) ** 2 / distance, -decay * a * by_a
