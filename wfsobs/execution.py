@@ -9,7 +9,7 @@ from wfsobs.dependence import RecordMemo
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate, Estimates
-from wfsobs.priors_from.scenario import arguments, prior_and_settings
+from wfsobs.priors_from.scenario import PriorParts, arguments, prior_and_settings
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record
 from wfsobs.result import Failure
@@ -41,11 +41,12 @@ def each_estimate(
         raise SettingError(f"observer {sorted(unknown)[0]!r}: no such observer; there are {', '.join(OBSERVERS)}")
     chosen = list(OBSERVERS.values()) if observers is None else [OBSERVERS[name] for name in dict.fromkeys(observers)]
     names: dict[str, str] = {}
+    parts: PriorParts = {}
     if memo is not None:
         used = used_settings(scenario)
         for observer in tuple(chosen):
             watch.check()
-            name, found = _recall(observer, record, scenario, used.get(observer.group or ""), memo)
+            name, found = _recall(observer, record, scenario, used.get(observer.group or ""), memo, parts)
             if found:
                 yield from found
                 chosen.remove(observer)
@@ -62,7 +63,7 @@ def each_estimate(
             is_cancelled=watch.is_cancelled,
             partial=lambda target, values, o=observer: on_partial(o.id, target, values) if on_partial else None,
         )
-        for item in _one(observer, record, scenario, inner):
+        for item in _one(observer, record, scenario, inner, parts):
             if memo is not None and isinstance(item, Estimate):
                 memo.note(names[observer.id], item)
             yield item
@@ -93,23 +94,23 @@ def run_observer(name: str, record: Record, scenario: Scenario, watch: Watch = Q
 
 
 def _recall(
-    observer: Observer, record: Record, scenario: Scenario, own: Plain | None, memo: RecordMemo
+    observer: Observer, record: Record, scenario: Scenario, own: Plain | None, memo: RecordMemo, parts: PriorParts
 ) -> tuple[str, list[Estimate]]:
     """Return the name of an observer's estimates, empty where there are none, and those that are known."""
     if observer.missing(record):
         return "", []
     try:
-        return memo.find(observer, prior_and_settings(observer, record, scenario)[0], own)
+        return memo.find(observer, prior_and_settings(observer, record, scenario, parts)[0], own)
     except ValueError:
         return "", []
 
 
-def _one(observer: Observer, record: Record, scenario: Scenario, watch: Watch) -> list[Estimate | Failure]:
+def _one(observer: Observer, record: Record, scenario: Scenario, watch: Watch, parts: PriorParts) -> list[Estimate | Failure]:
     missing = observer.missing(record)
     if missing:
         return [Failure(observer.id, f"{observer.id} left out: the record has no {', '.join(missing)}")]
     try:
-        given = arguments(observer, record, scenario)
+        given = arguments(observer, record, scenario, parts)
         start = perf_counter()
         with detach_watch(watch) as alone:
             values = observer.estimate(*given, alone)

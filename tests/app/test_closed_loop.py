@@ -84,6 +84,22 @@ def the_lines_are_the_results(page: ClosedLoopPage, dashboard: Dashboard) -> Non
     assert page.whole.figure.yaxis.axis_label == "residual tilt [mas]"
 
 
+def test_the_lines_that_matter_come_first_until_others_are_chosen(page: ClosedLoopPage, dashboard: Dashboard) -> None:
+    def shown() -> set[str]:
+        return {name for name, line in page.whole.lines.items() if line.visible} - {"none"}
+
+    def best(mode: str) -> set[str]:
+        rows = [r for r in page.results.rows if r["mode"] == mode and r["controller"] in page.whole.lines]
+        return {r["controller"] for r in sorted(rows, key=lambda r: r["residual_rms_nm"])[:2]}
+
+    assert shown() == {"integrator", "lqg-kf-lgs"} | best("tip")
+    page.cards.hidden_lines = []
+    dashboard.display.mode = "tilt"
+    assert shown() == set(page.whole.lines) - {"none"}, "chosen lines stay"
+    page.cards._handle_msg({"main": True})
+    assert shown() == {"integrator", "lqg-kf-lgs"} | best("tilt")
+
+
 def test_marks_hiding_colours_and_reasons(page: ClosedLoopPage, dashboard: Dashboard) -> None:
     the_marks_lie_on_the_curves_where_the_margins_are(page)
     before = top(page)

@@ -232,7 +232,7 @@ def test_choosing_a_preset(controls: Controls) -> None:
     assert controls.store.scenario == PRESETS["ut4"]() and controls.store.run.state == "running"
     assert controls.reset.disabled and controls.preset.helper_text == "Nothing changed"
     controls.store.change("loop.gain", 0.1)
-    assert "loop.gain" in controls.preset.helper_text and not controls.reset.disabled
+    assert setting_name("loop.gain") in controls.preset.helper_text and not controls.reset.disabled
     controls.reset.clicks += 1
     assert controls.store.scenario == PRESETS["ut4"]()
     controls.store.run.cancel()

@@ -225,6 +225,21 @@ class TestGain:
         assert store.scenario.control.integrator == "optimised" and not store.can_undo
         assert "other controllers follow" in gain.handles[0].layer.frame["hint"], "what a drag does not show"
 
+    def test_what_comes_in_leaves_a_gain_on_its_way_where_it_is(self, gain: GainEditor, loop: Any) -> None:
+        layer = gain.handles[0].layer
+        (before,) = layer.frame["handles"]
+        layer._handle_msg({"action": "drag", "id": "gain-0", "number": 1, "frequency": 0.5 * before["frequency"]})
+        loop.until(lambda: layer.frame["answered"] == 1)
+        held = layer.frame
+        gain.follow()  # as a result does
+        loop.until(lambda: layer.frame is not held)
+        assert layer.frame["numbers"] == held["numbers"] and layer.frame["handles"] == held["handles"]
+        gain._land([1, 1], None, "not stable")
+        assert layer.frame["handles"] == held["handles"], "a handle that went would take the focus with it"
+        layer._handle_msg({"action": "cancel", "id": "gain-0", "number": 2})
+        loop.until(lambda: layer.frame["answered"] == 2)
+        assert layer.frame["handles"] == [before]
+
     def test_letting_go_sets_the_gain(self, gain: GainEditor, loop: Any) -> None:
         gain.handles[0].layer._handle_msg({"action": "release", "id": "gain-0", "number": 1, "frequency": 40.0})
         control = gain.store.scenario.control

@@ -114,10 +114,14 @@ class TestFigures:
         for sheet in figures.sheets:
             for plot in sheet.plots:
                 assert {n: line.glyph.line_color for n, line in plot.lines.items()} == {n: look(n).light for n in plot.lines}
+        heads = [words(sheet.head.object) for sheet in figures.sheets]
+        assert [head.split(" of the paper")[0] for head in heads] == ["Figure 4a", "Figure 4b", "Figure 5", "Figure 6"]
         captions = [words(sheet.caption.object) for sheet in figures.sheets]
-        assert [c.split(" of the paper")[0] for c in captions] == ["Figure 4a", "Figure 4b", "Figure 5", "Figure 6"]
-        assert "RMS error of tilt [nm]: LGS KF" in captions[2] and "16.6e-3" in captions[3]
+        assert "RMS error of tilt [nm]: LGS KF" in captions[2]
+        assert re.search(r"LGS KF [\d.]+ \(paper 16\.6\)", captions[3]), "beside the one of the run, in its unit"
         dashboard.display.param.update(unit="mas", dark=True)
+        # what the paper takes as um is the angle of the tilt over a telescope of 8 m
+        assert "(paper 0.428)" in words(figures.sheets[3].caption.object)
         assert figures.sheets[0].plots[0].figure.yaxis.axis_label == "tip [mas]"
         assert figures.sheets[0].plots[0].lines[TRUTH].glyph.line_color == look(TRUTH).dark
 

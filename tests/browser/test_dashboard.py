@@ -292,6 +292,6 @@ def test_two_sessions_do_not_see_each_other(open_page: Any) -> None:
     box = one.get_by_role("textbox", name="m/s")
     box.fill("30")
     box.press("Enter")
-    expect(one.get_by_text("1 changed: turbulence.wind_speed")).to_be_visible()
+    expect(one.get_by_text("1 changed: Wind speed V₀")).to_be_visible()
     finished(one)
     expect(other.get_by_role("textbox", name="m/s")).to_have_value("15")

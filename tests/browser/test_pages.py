@@ -49,7 +49,7 @@ def test_the_figures_of_the_paper(open_page: Any, tmp_path: Path) -> None:
     assert 0 < len(before) < ALL_LINES, "lines of cards that are not shown, and figures of other pages, are not made yet"
     turn(page, "Paper figures")
     for number in ("4a", "4b", "5", "6"):
-        expect(page.get_by_text(f"Figure {number} of the paper")).to_be_visible(timeout=SLOW)
+        expect(page.get_by_role("heading", name=f"Figure {number} of the paper")).to_be_visible(timeout=SLOW)
     drawn = f"""([before, n]) => {{
         const made = ({LINES})().filter(([name, length]) => !before.includes(name))
         return made.length === n && made.every(([name, length]) => length > 100)
@@ -59,7 +59,7 @@ def test_the_figures_of_the_paper(open_page: Any, tmp_path: Path) -> None:
     page.screenshot(path=tmp_path / "figures.png")
     turn(page, "Explore")
     expect(page.get_by_role("heading", name="RMS errors")).to_be_visible(timeout=SLOW)
-    expect(page.get_by_text("Figure 5 of the paper")).to_be_hidden()
+    expect(page.get_by_role("heading", name="Figure 5 of the paper")).to_be_hidden()
 
 
 def test_the_model(open_page: Any) -> None:
@@ -85,7 +85,7 @@ def test_by_keyboard_on_a_phone(open_page: Any) -> None:
     no_wider_than(page, 390)
     page.get_by_role("button", name="Paper figures", exact=True).focus()
     page.keyboard.press("Space")
-    expect(page.get_by_text("Figure 4a of the paper")).to_be_visible(timeout=SLOW)
+    expect(page.get_by_role("heading", name="Figure 4a of the paper")).to_be_visible(timeout=SLOW)
     no_wider_than(page, 390)
 
 
@@ -129,6 +129,9 @@ def test_cumulative_rms(open_page: Any) -> None:
 
 def test_best_first(open_page: Any) -> None:
     page = open_page()
+    expect(page.get_by_role("columnheader", name=re.compile("Stated"))).to_be_visible()
+    table = page.get_by_role("region", name="RMS errors")
+    assert table.evaluate("it => it.scrollWidth <= it.clientWidth"), "all columns at 1400 pixels, the drawer open"
     rows = page.locator('tr[data-target="turbulence"]:not([data-observer^=bound])')
     expect(rows.first).to_contain_text(re.compile("best|tied"))  # the second once further seeds have come
     page.wait_for_function(f"() => ({ERRORS})().every((error, i, all) => i === 0 || all[i - 1] <= error)")

@@ -53,4 +53,4 @@ def test_tune_stop_and_use_it(open_page: Any, server: Any) -> None:
     table = page.get_by_role("region", name="Before and after")
     expect(table.get_by_text("rms over modes").first).to_be_visible()
     page.get_by_role("button", name="Use it").click()
-    expect(page.get_by_text(re.compile(r"changed: .*kalman\.vibration_rms"))).to_be_visible()
+    expect(page.get_by_text(re.compile(r"changed: .*Model vibration rms"))).to_be_visible()

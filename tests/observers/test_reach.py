@@ -78,7 +78,7 @@ def test_what_reached_the_truth_would_be_found(record: Record, monkeypatch: pyte
     assert given_away(record, record.y_lgs) >= {"turbulence", "vibration"}
     assert given_away(record, lambda: record) >= {"Record"}
     assert given_away(record, partial(print, s)) >= {"Scenario", "Run", "seed"}
-    monkeypatch.setattr("wfsobs.execution.arguments", lambda o, r, s: (record, *door.arguments(o, r, s)[1:]))
+    monkeypatch.setattr("wfsobs.execution.arguments", lambda *given: (record, *door.arguments(*given)[1:]))
     assert "turbulence" in leaks(record, s, monkeypatch, "persistence")
 
 

@@ -169,6 +169,8 @@ class _Work:
         key = (estimate.observer, estimate.target)
         self.estimates.append(estimate)
         self.growing.pop(key, None)
+        if not OBSERVERS[estimate.observer].look.in_figures:
+            return  # it stands in the table alone
         truth = record.truth(estimate.target)
         spectrum = self._spectrum(record, estimate.target, estimate.values)
         if spectrum is not None:

@@ -24,6 +24,7 @@ export function render({model, el}) {
   let view = null, elements = new Map(), number = 0, waiting = 0, newest = null, late = 0, lost = 0, settle = 0
   let move = null  // {id, frequency, strength, damping, byKey, x, y}
   let wantsLast = false
+  let orphan = null  // the handle that had the focus when it went
 
   // ------------------------------------------------------------------ messages
 
@@ -157,6 +158,7 @@ export function render({model, el}) {
       if (event.key === "Enter") return release()
       if (event.key === "Delete" && handle.kind === "peak") {
         event.preventDefault()
+        add.focus()  // a place to go on from
         return send({action: "remove", last: true, id})
       }
       const [what, sign] = {
@@ -195,9 +197,18 @@ export function render({model, el}) {
       it.setAttribute("aria-valuemin", frame.limits[0])
       it.setAttribute("aria-valuemax", frame.limits[1])
     }
-    for (const [id, it] of elements) if (!kept.has(id)) it.remove()
+    const focused = root.getRootNode().activeElement
+    for (const [id, it] of elements) {
+      if (kept.has(id)) continue
+      if (it === focused) orphan = id
+      it.remove()
+    }
     const more = kept.size > elements.size
     elements = kept
+    if (elements.has(orphan)) {  // it is back: who was at it goes on, unless elsewhere by now
+      if (document.activeElement === document.body) elements.get(orphan).focus()
+      orphan = null
+    }
     if (wantsLast && more) {
       wantsLast = false
       elements.get(frame.added)?.focus()

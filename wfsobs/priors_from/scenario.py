@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from math import sqrt
+from types import MappingProxyType
 
 import numpy as np
 
@@ -22,22 +24,45 @@ from wfsobs.signal.statespace import MIN_MODEL_DAMPING, DisturbanceModel
 from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 
+PriorParts = dict[Part, Prior]
+"""Parts of a prior that several observers of one record and scenario are told; they cannot be changed."""
 
-def arguments(observer: Observer, record: Record, scenario: Scenario) -> tuple[Measurements, Prior, Group | None]:
+
+def arguments(
+    observer: Observer, record: Record, scenario: Scenario, known_parts: PriorParts | None = None
+) -> tuple[Measurements, Prior, Group | None]:
     """All that an observer receives of a record and a scenario: measurements, prior and settings of its own.
 
-    Raises ValueError where the scenario has no such prior.
+    known_parts : as in `prior_and_settings`. Raises ValueError where the scenario has no such prior.
     """
-    return record.measurements(open_loop="open_loop_y" in observer.needs), *prior_and_settings(observer, record, scenario)
+    measurements = record.measurements(open_loop="open_loop_y" in observer.needs)
+    return measurements, *prior_and_settings(observer, record, scenario, known_parts)
 
 
-def prior_and_settings(observer: Observer, record: Record, scenario: Scenario) -> tuple[Prior, Group | None]:
+def prior_and_settings(
+    observer: Observer, record: Record, scenario: Scenario, known_parts: PriorParts | None = None
+) -> tuple[Prior, Group | None]:
     """Return the prior and the settings of its own that an observer receives beside the measurements of a record.
+
+    known_parts : what others have been told of the same record and scenario: not made again, and added to
 
     Raises ValueError where the scenario has no such prior.
     """
     settings = observer_settings(observer, scenario)
-    return prior_of(scenario, record, (*observer.prior, *observer.asks(settings))), settings
+    parts = (*observer.prior, *observer.asks(settings))
+    if known_parts is None:
+        return prior_of(scenario, record, parts), settings
+    for part in parts:
+        if part in SHARED and part not in known_parts:
+            known_parts[part] = prior_of(scenario, record, (part,))
+    own = prior_of(scenario, record, [part for part in parts if part not in SHARED])
+    return replace(own, **{SHARED[part]: getattr(known_parts[part], SHARED[part]) for part in parts if part in SHARED}), settings
+
+
+SHARED: Mapping[Part, str] = MappingProxyType(
+    {Model: "model", LgsError: "lgs_error", Lines: "lines", Beams: "beams", Bands: "bands"}
+)
+"""Parts that hold no arrays -> where they stand in a prior."""
 
 
 def observer_settings(observer: Observer, scenario: Scenario) -> Group | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -31,7 +32,12 @@ def bandpass_bank(frequencies: Sequence[float], bandwidth: float, order: int, dt
     list of Array
         Second-order sections, one array per centre.
     """
-    return [butter(order, [f - bandwidth / 2.0, f + bandwidth / 2.0], "bandpass", fs=1.0 / dt, output="sos") for f in frequencies]
+    return [_bandpass(f - bandwidth / 2.0, f + bandwidth / 2.0, order, dt).copy() for f in frequencies]
+
+
+@lru_cache(maxsize=64)  # a run asks several times for the same ones
+def _bandpass(low: float, high: float, order: int, dt: float) -> Array:
+    return butter(order, [low, high], "bandpass", fs=1.0 / dt, output="sos")
 
 
 def filter_causal(bank: Sequence[Array], x: Array) -> Array:

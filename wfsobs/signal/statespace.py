@@ -134,12 +134,21 @@ def disturbance_model(turbulence: Sequence[Ar2 | Ar3], vibration: Sequence[Ar2 |
     now = np.concatenate([m.now for m in models])
     first = np.arange(now.size) < sum(m.now.size for m in models[: len(turbulence)])
     return DisturbanceModel(
-        A=block_diag(*(m.A for m in models)),
+        A=_square_blocks([m.A for m in models]),
         C=np.concatenate([m.before for m in models]),
-        Q=block_diag(*(m.Q for m in models)),
+        Q=_square_blocks([m.Q for m in models]),
         outputs={"turbulence": np.where(first, now, 0.0), "vibration": np.where(first, 0.0, now)},
         pairs=block_diag(*(np.array([m.now, m.before]) for m in models)),
     )
+
+
+def _square_blocks(blocks: Sequence[Array]) -> Array:
+    """Return square matrices along the diagonal; scipy's function for any shape takes ten times as long."""
+    ends = np.cumsum([len(block) for block in blocks])
+    out = np.zeros((ends[-1], ends[-1]))
+    for end, block in zip(ends, blocks, strict=True):
+        out[end - len(block) : end, end - len(block) : end] = block
+    return out
 
 
 def paper_matrices(turbulence: Ar2, vibration: Ar2) -> tuple[Array, Array, Array]:

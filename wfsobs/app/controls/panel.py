@@ -14,7 +14,7 @@ import param
 from wfsobs.app.controls.field import ROOM, TAG, Field, idle_html
 from wfsobs.app.controls.fields import make_field
 from wfsobs.app.controls.gallery import Gallery
-from wfsobs.app.controls.names import preset_title
+from wfsobs.app.controls.names import preset_title, setting_name
 from wfsobs.app.controls.rows import RowEditor
 from wfsobs.app.controls.search import Search
 from wfsobs.app.controls.status import BAR, ON_BAR, STATUS_ON_BAR, Status, status_of
@@ -212,7 +212,7 @@ class Controls:
     def _refresh_preset(self, *_: object) -> None:
         changed = self.store.changed_paths()
         self.preset.value = self.store.preset
-        self.preset.helper_text = f"{len(changed)} changed: {', '.join(changed)}" if changed else NO_CHANGES
+        self.preset.helper_text = f"{len(changed)} changed: {', '.join(map(setting_name, changed))}" if changed else NO_CHANGES
         self.reset.disabled = not changed
         count = Counter(path.split(".")[0] for path in changed)
         names = [title + (f" · {count[name]} changed" if count[name] else "") for name, title in self.topics.items()]

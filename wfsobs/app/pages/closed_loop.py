@@ -24,8 +24,11 @@ from wfsobs.app.pages.parts import SMALL_LABEL, WIDE, PageActions, box, figure_w
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.gain_editor import GainEditor
-from wfsobs.app.views.strip import Cards
+from wfsobs.app.views.strip import MAIN, Cards
 from wfsobs.control.controllers import CONTROLLERS
+
+REFERENCES = ("integrator", "lqg-kf-lgs")
+"""Shown at first beside the best, of which there are two."""
 
 ZOOM_S = 0.5
 """Length of the zoomed trace [s], in the middle of the record."""
@@ -54,7 +57,9 @@ class ClosedLoopPage(PageActions):
         self.work = BackgroundTask(store.session)
         self.visible, self._of = False, object()
         self.note, self.table, self.margins = html(), html(), html()
-        self.cards = Cards(items=[], hidden_lines=[], terms={STREHL: TERMS[STREHL]}, sizing_mode="stretch_width", margin=0)
+        terms = {STREHL: TERMS[STREHL]}
+        self.cards = Cards(items=[], hidden_lines=[], terms=terms, main=MAIN, sizing_mode="stretch_width", margin=0)
+        self.cards.on_main, self._main, self._is_chosen = self._show_main, list[str](), False
         self.whole, self.zoom = Trace("whole record"), Trace("zoomed")
         self.spectrum, self.response, self.nyquist = LoopSpectrum(), Response(), Nyquist()
         self.room = figure_with_caption("Rejection and noise transfer", self.response.figure, tall=True)
@@ -68,7 +73,7 @@ class ClosedLoopPage(PageActions):
         run.param.watch(self._follow, ["result", "state"])
         display.param.watch(self._redraw, ["mode", "unit"])
         display.param.watch(self._restyle, "dark")
-        self.cards.param.watch(self._restyle, "hidden_lines")
+        self.cards.param.watch(self._choose, "hidden_lines")
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""
@@ -168,6 +173,8 @@ class ClosedLoopPage(PageActions):
             self.zoom.draw(shown, self.display, max(middle - half, begin), min(middle + half, n))
             for drawn in (self.spectrum, self.response, self.nyquist):
                 drawn.draw(shown, self.display)
+            if shown.complete and not self._is_chosen:
+                self._show_main()
             self._restyle()
             if self.editor is not None:
                 self.editor.follow()
@@ -182,6 +189,22 @@ class ClosedLoopPage(PageActions):
                 self.table.object = loop_html(self.results, self.display)
                 self.margins.object = margins_html(self.results, self.display)
                 self.cards.items = self._items(self.results)
+
+    def _choose(self, *_: object) -> None:
+        """Keep to the lines that a visitor has chosen."""
+        self._is_chosen = self.cards.hidden_lines != self._main
+        self._restyle()
+
+    def _show_main(self) -> None:
+        """Show the few lines that matter: the references, and the best two of the mode."""
+        shown = self.results
+        if shown is None:
+            return
+        of_mode = [r for r in shown.rows if r["mode"] == self.display.mode and r["controller"] in CONTROLLERS]
+        ranked = sorted((r for r in of_mode if r["residual_rms_nm"] is not None), key=lambda r: r["residual_rms_nm"])
+        main = {*REFERENCES, *(r["controller"] for r in ranked[:2])}
+        self._main = [name for name in CONTROLLERS if name not in main]
+        self.cards.hidden_lines = self._main
 
     def _items(self, results: LoopResults) -> list[dict[str, Any]]:
         """Describe a card per controller."""

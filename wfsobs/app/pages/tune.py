@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from html import escape
 from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
 
 from wfsobs.app.controls.fields import parse_number
+from wfsobs.app.controls.names import setting_name
 from wfsobs.app.copies import TUNE, CopiedTask
 from wfsobs.app.display import UNITS, Display, per_micrometre
 from wfsobs.app.downloads import Save, table_csv
@@ -132,7 +134,8 @@ class TunePage(PageActions):
         name = self.observer.value
         targets = list(OBSERVERS[name].targets)
         self.target.param.update(options=targets, value=VIBRATION if VIBRATION in targets else targets[0])
-        self.search_space.object = f'<p class="text">Searched: {", ".join(OBSERVERS[name].tunable.usual)}.</p>'
+        names = ", ".join(map(setting_name, OBSERVERS[name].tunable.usual))
+        self.search_space.object = f'<p class="text">Searched: {escape(names)}.</p>'
 
     def _tuning_result(self) -> TuningResult | None:
         return self.work.result

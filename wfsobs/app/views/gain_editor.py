@@ -44,8 +44,8 @@ class GainEditor:
         self.store, self.display, self.results = store, display, results
         self.frames, self.theory = Frames(store.session), Theory()
         self.handles = RejectionHandle(rejection, self.hear), NyquistHandle(nyquist, self.hear)
-        self._note = ""
-        store.param.watch(self.follow, "scenario")
+        self._note, self._trial, self._known_gain = "", None, None
+        store.param.watch(self._take_over, "scenario")
         display.param.watch(self.follow, ["editing", "mode", "unit", "dark"])
         self.follow()
 
@@ -59,13 +59,19 @@ class GainEditor:
         law = laws[self.display.column].law if self.display.column < len(laws) else None
         return law.gain if law else None
 
+    def _take_over(self, *_: object) -> None:
+        """Show the gain of settings that have changed, here or elsewhere."""
+        self._trial = None
+        self.follow()
+
     def follow(self, *_: object) -> None:
-        """Show the gain as it is."""
+        """Show the gain as it is; while a handle is on its way that of the handle, whatever comes in."""
         for handle in self.handles:
             handle.layer.visible = self.display.editing
             if not self.display.editing:
                 handle.lines.draw({}, self.display.dark)
-        if self.display.editing and (gain := self.gain) is not None:
+        gain = self.gain if self._trial is None else self._trial
+        if self.display.editing and gain is not None:
             self._ask(gain)
 
     def hear(self, handle: GainHandle, message: Mapping[str, Any]) -> None:
@@ -78,6 +84,7 @@ class GainEditor:
         try:
             if action in ("drag", "release"):
                 gain = round(handle.gain_at(self.store.scenario, message["frequency"]), 4)
+            self._trial = gain if action == "drag" else None
             if action == "release":
                 self.store.replace({"control.integrator": "manual", "control.gain": gain})
         except (SettingError, ValueError, KeyError) as error:
@@ -116,6 +123,8 @@ class GainEditor:
                     gain, design, at = answer
                     lines = {INTEGRATOR: handle.line(at)}
                     frame["handles"], frame["numbers"] = [handle.entry(gain, at, design)], self._numbers(gain, design)
+                else:  # where it was: a handle that goes takes the focus of the keyboard with it
+                    frame["handles"] = handle.layer.frame.get("handles", [])
                 handle.lines.draw(lines, self.display.dark)
                 handle.layer.frame = frame
 
