@@ -120,8 +120,8 @@ class TestFigures:
         assert "RMS error of tilt [nm]: LGS KF" in captions[2]
         assert re.search(r"LGS KF [\d.]+ \(paper 16\.6\)", captions[3]), "beside the one of the run, in its unit"
         dashboard.display.param.update(unit="mas", dark=True)
-        # what the paper takes as um is the angle of the tilt over a telescope of 8 m
-        assert "(paper 0.428)" in words(figures.sheets[3].caption.object)
+        # an rms coefficient of 16.6 nm is a slope of four times that over 8 m, 8.3 nrad
+        assert f"(paper {8.3e-9 * np.degrees(1.0) * 3.6e6:.2f})" in words(figures.sheets[3].caption.object)
         assert figures.sheets[0].plots[0].figure.yaxis.axis_label == "tip [mas]"
         assert figures.sheets[0].plots[0].lines[TRUTH].glyph.line_color == look(TRUTH).dark
 
