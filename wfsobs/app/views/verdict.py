@@ -65,7 +65,7 @@ class VerdictLine:
         scale = per_micrometre(self.display.unit, shown.scenario.telescope.diameter)
         first, *others = found.sentences(scale, self.display.unit_label)
         more = "".join(f"<br>{escape(sentence)}" for sentence in others)
-        text = f"<strong>{explain_first(first, 'bound', BOUND)}</strong>{more}"
+        text = f"<strong>{explain_first(first, 'bound', BOUND)}</strong>{more}".replace(" %", "&nbsp;%")
         self._sentence = of, text
         return _paragraph(text, "verdict")
 
