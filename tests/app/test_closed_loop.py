@@ -93,6 +93,8 @@ def test_the_lines_that_matter_come_first_until_others_are_chosen(page: ClosedLo
         return {r["controller"] for r in sorted(rows, key=lambda r: r["residual_rms_nm"])[:2]}
 
     assert shown() == {"integrator", "lqg-kf-lgs"} | best("tip")
+    spectra = [page.spectrum.sources[name].data["y"] for name in shown()]
+    assert page.spectrum.figure.y_range.end == pytest.approx(3.0 * max(np.max(y) for y in spectra)), "no room for hidden ones"
     page.cards.hidden_lines = []
     dashboard.display.mode = "tilt"
     assert shown() == set(page.whole.lines) - {"none"}, "chosen lines stay"

@@ -183,8 +183,8 @@ class ClosedLoopPage(PageActions):
         with pn.io.hold():
             for drawn in self._figures:
                 drawn.restyle(self.display.dark, self.cards.hidden_lines)
-            for trace in (self.whole, self.zoom):
-                trace.fit(self.cards.hidden_lines)
+            for drawn in (self.whole, self.zoom, self.spectrum):
+                drawn.fit(self.cards.hidden_lines)
             if self.results is not None:
                 self.table.object = loop_html(self.results, self.display)
                 self.margins.object = margins_html(self.results, self.display)

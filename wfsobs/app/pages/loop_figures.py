@@ -39,10 +39,6 @@ class LoopLines:
         """Set the colours of light or dark mode, and hide lines."""
         restyle(self.lines, dark, hidden_names)
 
-    def highest(self) -> float:
-        """Find the largest number in any line."""
-        return max((float(np.max(s.data["y"])) for s in self.sources.values() if len(s.data["y"])), default=0.0)
-
 
 class Trace(LoopLines):
     """The residual of every controller over time; that of none would dwarf the rest."""
@@ -97,9 +93,14 @@ class LoopSpectrum(LoopLines):
             source.data = {"x": frequency[1:], "y": scale * density[1:, display.column]}
             if frequency.size:
                 self.figure.x_range.update(start=float(frequency[1]), end=float(frequency[-1]))
-        top = 3.0 * self.highest() or 1.0
-        self.figure.y_range.update(start=top * 10.0**-DECADES, end=top)
         self.figure.yaxis.axis_label = f"PSD of residual, {display.mode_label} [{display.unit_label}²/Hz]"
+
+
+    def fit(self, hidden_names: list[str]) -> None:
+        """Have the axis hold every visible line, but for what lies too far below the highest."""
+        lines = [s.data["y"] for name, s in self.sources.items() if name not in hidden_names and len(s.data["y"])]
+        top = 3.0 * max((float(np.max(y)) for y in lines), default=0.0) or 1.0
+        self.figure.y_range.update(start=top * 10.0**-DECADES, end=top)
 
 
 class Response(LoopLines):
