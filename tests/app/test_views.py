@@ -81,6 +81,7 @@ class TestTraces:
         others = [name for name in drawn.lines if name not in (TRUTH, "multirate-optimal")]
         dashboard.display.hidden_lines = {"turbulence": others}
         assert drawn.band.renderer is not None and drawn.band.renderer.visible
+        assert drawn.band.label.visible and "95 %" in drawn.band.label.text
         band, half = drawn.band.source.data, 1.959964e3 * shown.sd[:, 0]
         start = round(band["x"][100] / 1e-3)  # bins of 4 steps hold nearly every phase of 5
         assert band["high"][100] == pytest.approx(np.nanmax(half[start : start + 3]), rel=0.05)

@@ -208,3 +208,18 @@ def test_where_a_handle_comes_back_the_keyboard_does_too(page: Page) -> None:
     expect(handle(page, "Peak 15")).to_have_count(0)
     page.evaluate(frame, False)
     expect(handle(page, "Peak 15")).to_be_focused()
+
+
+def test_handles_outside_of_a_zoom_are_counted_and_come_back_by_a_double_click(page: Page) -> None:
+    figure = page.get_by_role("figure", name="Turbulence spectrum")
+    x, y = middle(figure)
+    expect(handle(page, "Corner of the turbulence")).to_be_visible()
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 60, y, steps=5)
+    page.mouse.up()
+    expect(handle(page, "Corner of the turbulence")).to_be_hidden()
+    expect(page.get_by_text("Outside of the zoom: 1 more.")).to_be_visible()
+    page.mouse.dblclick(x, y)
+    expect(handle(page, "Corner of the turbulence")).to_be_visible()
+    expect(page.get_by_text("Outside of the zoom: 1 more.")).to_have_count(0)

@@ -49,3 +49,5 @@ def test_a_brush_over_time_and_over_a_band(open_page: Any) -> None:
     before = page.evaluate(points)
     page.get_by_role("checkbox", name="Spectra of the window").check()
     page.wait_for_function(f"before => ({points})() !== before", arg=before)
+    page.mouse.dblclick(at["x"] + 0.6 * at["width"], y)
+    expect(line.filter(has_text="Hz")).to_have_count(0)  # all frequencies again

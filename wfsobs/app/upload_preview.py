@@ -37,6 +37,7 @@ class PreviewView:
         self.text.object = f"<p><b>{escape(name)}</b></p>{_list(known.lines() if known else [str(preview)])}"
         if isinstance(preview, Preview):
             self.text.object += f'<p>What the data say:</p><div class="evidence">{_list(preview.reading.lines())}</div>'
+        self.figure.visible = known is not None
         for mode, source in enumerate(self.sources):
             there = known is not None and mode < known.spectrum.shape[1]
             x, y = (known.frequency, known.spectrum[:, mode]) if known and there else (NOTHING, NOTHING)

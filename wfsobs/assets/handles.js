@@ -19,7 +19,7 @@ export function render({model, el}) {
   add.type = "button"
   const numbers = make("div", "numbers", bar), note = make("span", "note", bar)
   note.setAttribute("role", "status")
-  const hint = make("span", "hint", bar)
+  const hint = make("span", "hint", bar), away = make("span", "away", bar)
 
   let view = null, elements = new Map(), number = 0, waiting = 0, newest = null, late = 0, lost = 0, settle = 0
   let move = null  // {id, frequency, strength, damping, byKey, x, y}
@@ -93,6 +93,7 @@ export function render({model, el}) {
     if (!view) return
     const here = root.getBoundingClientRect(), there = view.el.getBoundingClientRect(), box = view.frame.bbox
     const {x_scale, y_scale} = view.frame
+    let outside = 0
     for (const handle of model.frame.handles ?? []) {
       const it = elements.get(handle.id)
       if (!it) continue
@@ -101,9 +102,11 @@ export function render({model, el}) {
       let sy = {model: box.bottom - 28, band: box.bottom - 9}[handle.kind] ?? (Number.isFinite(handle.y) ? y_scale.compute(handle.y) : (box.top + box.bottom) / 2)
       if (held && move.sy !== undefined && handle.strength) sy = move.sy
       it.hidden = sx < box.left - 1 || sx > box.right + 1
+      outside += it.hidden
       it.style.left = `${there.left - here.left + sx}px`
       it.style.top = `${there.top - here.top + Math.min(Math.max(sy, box.top + 6), box.bottom - 6)}px`
     }
+    away.textContent = outside ? `Outside of the zoom: ${outside} more. A double click on the figure shows all.` : ""
   }
 
   // ------------------------------------------------------------------ a handle

@@ -89,6 +89,8 @@ def suggest_roles(names: Iterable[str]) -> dict[str, str]:
 
     >>> suggest_roles(["t [ms]", "wfs_x", "wfs_y", "dm_cmd[0]", "dm_cmd[1]", "flux"])
     {'time': 't [ms]', 'y_lgs/tip': 'wfs_x', 'y_lgs/tilt': 'wfs_y', 'u/tip': 'dm_cmd[0]', 'u/tilt': 'dm_cmd[1]'}
+    >>> suggest_roles(["tip_res_nm", "tilt_cmd_nm"])
+    {'y_lgs/tip': 'tip_res_nm', 'u/tilt': 'tilt_cmd_nm'}
     """
     found: dict[str, str] = {}
     for name in names:
@@ -105,6 +107,8 @@ def _role_of(name: str) -> str | None:
         return None
     axis = next((mode for mode, known in AXES.items() if words[-1] in known), None)
     rest = words[:-1] if axis and len(words) > 1 else words
+    if axis is None and words[0] in AXES:  # x, y and numbers in front are names of other things as well
+        axis, rest = words[0], words[1:]
     for signal, known in WORDS.items():
         if axis and known & set(rest):
             return f"{signal}/{axis}"

@@ -95,7 +95,6 @@ class LoopSpectrum(LoopLines):
                 self.figure.x_range.update(start=float(frequency[1]), end=float(frequency[-1]))
         self.figure.yaxis.axis_label = f"PSD of residual, {display.mode_label} [{display.unit_label}²/Hz]"
 
-
     def fit(self, hidden_names: list[str]) -> None:
         """Have the axis hold every visible line, but for what lies too far below the highest."""
         lines = [s.data["y"] for name, s in self.sources.items() if name not in hidden_names and len(s.data["y"])]

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColumnDataSource, GlyphRenderer, Line
+from bokeh.events import DoubleTap
+from bokeh.models import ColumnDataSource, CustomJS, GlyphRenderer, Line
 from bokeh.plotting import figure
 from numpy.typing import ArrayLike
 
@@ -94,6 +95,12 @@ def restyle(lines: dict[str, GlyphRenderer], dark: bool, hidden_names: list[str]
     for name, line in lines.items():
         line.glyph.line_color = look(name).colour(dark)
         line.visible = name not in hidden_names
+
+
+def show_all_on_double_click(fig: figure) -> None:
+    """Have a double click show all of the horizontal axis, in the browser."""
+    show_all = "axis.setv({start: axis.reset_start ?? axis.start, end: axis.reset_end ?? axis.end})"
+    fig.js_on_event(DoubleTap, CustomJS(args={"axis": fig.x_range}, code=show_all))
 
 
 class ExtraLines:

@@ -11,7 +11,7 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.lines import FigureLines
-from wfsobs.app.views.plots import MODEL, PEAKS, ComparedLines, marked_peaks, new_figure, send
+from wfsobs.app.views.plots import MODEL, PEAKS, ComparedLines, marked_peaks, new_figure, send, show_all_on_double_click
 from wfsobs.app.views.settle import on_settle, zoom_of
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, Array, Key, RunResults, SignalAndError
@@ -59,6 +59,7 @@ class _Spectrum:
         self.figure.xaxis.axis_label = "frequency [Hz]"
         if target == VIBRATION:
             self._add_marks()
+        show_all_on_double_click(self.figure)
         policy = UnionRenderers()
         self.sources = {
             name: ColumnDataSource({"x": [], "y": []}, selection_policy=policy) for name in (TRUTH, *observers_of(target))

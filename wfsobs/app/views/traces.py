@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, GlyphRenderer, Range1d, Span
+from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, GlyphRenderer, Label, Range1d, Span
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
@@ -16,7 +16,7 @@ from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.envelope import band_envelope, envelope, envelope_times
 from wfsobs.app.views.event_marks import EventMarks, events_of, room
 from wfsobs.app.views.lines import FigureLines
-from wfsobs.app.views.plots import ComparedLines, new_figure, send
+from wfsobs.app.views.plots import ComparedLines, new_figure, send, show_all_on_double_click
 from wfsobs.app.views.settle import on_settle, zoom_of
 from wfsobs.app.views.target_figures import TargetFigures, shows_error
 from wfsobs.app.work import TRUTH, RunResults
@@ -108,13 +108,16 @@ class _Band:
         if self.renderer is None:
             look_of = {"fill_alpha": 0.2, "name": "band", "level": "underlay"}
             self.renderer = self.figure.varea("x", "low", "high", source=self.source, **look_of)
-        self.renderer.glyph.fill_color = colour
-        self.renderer.visible = True
+            place = {"x": 6, "y": 6, "x_units": "screen", "y_units": "screen", "text_font_size": "12px"}
+            self.label = Label(text="shaded: where 95 % are by its own model", **place)
+            self.figure.add_layout(self.label)
+        self.renderer.glyph.fill_color = self.label.text_color = colour
+        self.renderer.visible = self.label.visible = True
 
     def hide(self) -> None:
         """Show no band."""
         if self.renderer is not None:
-            self.renderer.visible = False
+            self.renderer.visible = self.label.visible = False
 
 
 class _Trace:
@@ -127,6 +130,7 @@ class _Trace:
         self.figure = new_figure(x_range=x_range, y_range=Range1d(start=-1.0, end=1.0))
         self.figure.xaxis.axis_label = "time [s]"
         self.figure.add_tools(crosshair)
+        show_all_on_double_click(self.figure)
         self.warm_up = BoxAnnotation(left=0, right=0, fill_color="#808080", fill_alpha=0.10, line_width=0, level="underlay")
         self.figure.add_layout(self.warm_up)
         self.lines = FigureLines(self.figure, {name: (self.source, name) for name in self.names})
