@@ -175,7 +175,7 @@ CASES = {
     "kalman.ngs_between_frames": {"kf-ngs"},
     "gpr_online.length_scale": {"gpr-online"},
     "gpr_offline.length_scale": {"gpr-offline", "ridge"},
-    "adaptive.peak_count": {"kf-adaptive", "multirate-adaptive"},
+    "adaptive.peak_count": {"kf-adaptive", "multirate-adaptive", "gpr-adaptive"},
     "sensors.spots.lgs_photons": set(),
     "gpr_online.highpass": set(),
     "kalman.lgs_noise": set(),

@@ -1,7 +1,8 @@
 """Estimates of the computing time and memory of a run, from its settings.
 
 Measured as processor time on the machine of docs/benchmarks.md (2 virtual cores of an AMD EPYC, one BLAS thread),
-10 s to 300 s of record, m from 20 to 2048, d from 20 to 2000; there a run of the paper's takes 0.62 s, the estimate is 0.55 s.
+10 s to 300 s of record, m from 20 to 2048, d from 20 to 2000; there a run of the paper's takes 0.62 s without the adaptive
+GPR, the estimate is 0.69 s.
 The depth and the exposure ratio cost next to nothing. Modes run side by side on two cores, except those of the adaptive filter,
 whose steps are too small for that. A busy machine takes two to three times as long: the estimate only tells a
 moment from a wait.
@@ -28,7 +29,7 @@ def run_seconds(scenario: Scenario, observers: Sequence[str] | None = None) -> f
 
     >>> from wfsobs.scenario.presets import paper
     >>> round(run_seconds(paper()), 1), round(run_seconds(paper().replace({"run.duration": 300})))
-    (0.7, 23)
+    (1.1, 42)
     """
     return sum(
         seconds for part, seconds in part_seconds(scenario).items() if part == REST or observers is None or part in observers

@@ -7,6 +7,7 @@ from wfsobs.observers.base import Observer
 from wfsobs.observers.baselines import BUTTERWORTH_CL, BUTTERWORTH_OL, PERSISTENCE, ZERO
 from wfsobs.observers.gp.both import GP_BOTH
 from wfsobs.observers.gp.lgs import GP_LGS
+from wfsobs.observers.gpr.adaptive import GPR_ADAPTIVE
 from wfsobs.observers.gpr.offline import GPR_OFFLINE
 from wfsobs.observers.gpr.online import GPR_ONLINE
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE
@@ -36,6 +37,7 @@ BUILT_IN = (
     BUTTERWORTH_CL,
     GPR_OFFLINE,
     GPR_ONLINE,
+    GPR_ADAPTIVE,
     RIDGE,
     RIDGE_30,
     PERSISTENCE,

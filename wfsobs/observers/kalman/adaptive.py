@@ -71,6 +71,12 @@ class Adaptive(Group):
         label="Minimum frequency",
         doc="Minimum frequency of a peak [Hz]; at least 15 over the window.",
     )
+    depth = Whole(
+        400,
+        bounds=(1, 2000),
+        label="Depth of the GPR",
+        doc="Samples in a window of the adaptive GPR; at most an eighth of the identification window.",
+    )
 
 
 def kf_adaptive(measurements: Measurements, _prior: Prior, settings: Adaptive, watch: Watch) -> Estimates:

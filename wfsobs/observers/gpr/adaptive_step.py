@@ -1,0 +1,155 @@
+"""The adaptive GPR of several modes one frame at a time. It learns in `settle`, after one frame of every interval."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from wfsobs.observers.gpr.learning import Learnt, learn, nothing_learnt
+from wfsobs.observers.kalman.window_model import lengths, pack_spectrum, unpack_spectrum
+from wfsobs.observers.step_checks import StepError
+from wfsobs.record import Sampling
+from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.signal.stepping import Saved
+from wfsobs.spectral.quick import SHORTEST
+from wfsobs.typing import Array
+
+if TYPE_CHECKING:
+    from wfsobs.observers.kalman.adaptive import Adaptive
+
+
+class Schedule(NamedTuple):
+    """When it learns from what, all in steps.
+
+    first, interval : until the first time of learning, and from one to the next
+    longest         : maximum length of the identification window
+    depth           : of a window of the regression
+    """
+
+    first: int
+    interval: int
+    longest: int
+    depth: int
+
+
+def schedule_of(settings: Adaptive, dt: float) -> Schedule:
+    """Return the schedule of settings. Raises RecordError for a window of too few samples."""
+    window, interval = lengths(settings, dt)
+    first = max(window // 2, SHORTEST)
+    return Schedule(first, interval, 2 * window, min(settings.depth, first // 4))
+
+
+class AdaptiveGprEstimator:
+    """`gpr_adaptive`, one frame at a time, for the vibration now or `horizon` frames ahead.
+
+    Raises StepError where the horizon leaves too few targets.
+    """
+
+    needs_command = False
+
+    def __init__(self, settings: Adaptive, sampling: Sampling, horizon: int = 0):
+        self.settings, self.sampling, self._ahead, self.horizon = settings, sampling, horizon, float(horizon)
+        self.schedule = schedule_of(settings, sampling.dt)
+        if horizon >= self.schedule.first // 4:
+            raise StepError(f"gpr-adaptive: {horizon} frames ahead: takes less than an eighth of adaptive.window")
+        n = sampling.n_modes
+        self._samples = np.zeros((n, 2 * self.schedule.longest))  # newest last; moved to the front at the end
+        self._recent = np.zeros((n, self.schedule.depth))  # whitened, in a ring
+        self._states = np.zeros((n, 2))  # of the whiteners
+        self._mean, self._sd = np.full(n, np.nan), np.full(n, np.nan)
+        self.reset()
+
+    def reset(self) -> None:
+        """Set the state back to the start."""
+        self._end = self.count = 0
+        self._pending = False
+        self.learnt = [nothing_learnt(self.schedule.depth)] * self.sampling.n_modes
+        self._whiteners = [one.whitener for one in self.learnt]
+        self._recent[...], self._states[...], self._mean[...], self._sd[...] = 0.0, 0.0, np.nan, np.nan
+
+    def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
+        """Take a frame; those of the mirror's first delay are left out: what it did before is not known."""
+        self.settle()
+        self.count += 1
+        if self.count <= self.sampling.delay:
+            return
+        if self._end == self._samples.shape[1]:
+            self._samples[:, : self.schedule.longest] = self._samples[:, -self.schedule.longest :]
+            self._end = self.schedule.longest
+        self._samples[:, self._end] = z
+        self._end += 1
+        since = self.count - self.sampling.delay - self.schedule.first
+        if since > 0:
+            self._estimate(z)
+        self._pending = since >= 0 and since % self.schedule.interval == 0
+
+    def _estimate(self, z: Array) -> None:
+        """Whiten the samples z (n_modes,), and put their windows through the weights."""
+        self._recent[:, 1:] = self._recent[:, :-1].copy()
+        for mode, (one, (F, G, H, J)) in enumerate(zip(self.learnt, self._whiteners, strict=True)):
+            state, value = self._states[mode, : len(F)], z[mode] - one.mean
+            self._recent[mode, 0] = H[0] @ state + J[0, 0] * value
+            state[...] = F @ state + G[:, 0] * value
+            self._mean[mode], self._sd[mode] = one.weights @ self._recent[mode], one.sd
+
+    def settle(self) -> None:
+        """Learn, where the last frame ended an interval; estimates of the next frames are of it."""
+        if not self._pending:
+            return
+        self._pending = False
+        size = min(self.count - self.sampling.delay, self.schedule.longest)
+        for mode, last in enumerate(self.learnt):
+            z = self._samples[mode, self._end - size : self._end]
+            s = self.settings
+            one = learn(z, self.sampling.dt, self.schedule.depth, s.peak_count, s.lowest, last, self._ahead)
+            self.learnt[mode], self._whiteners[mode] = one, one.whitener
+            self._whiten_past(mode, z - one.mean)
+
+    def _whiten_past(self, mode: int, z: Array) -> None:
+        """Take the new whitener of a mode through its window z (n,), from rest."""
+        F, G, H, J = self._whiteners[mode]
+        out = PeriodicFilter([(F, G, np.vstack([H, F]), np.vstack([J, G]))]).run(z[:, None, None])[:, :, 0]
+        self._recent[mode] = out[: -self.schedule.depth - 1 : -1, 0]
+        self._states[mode, : len(F)] = out[-1, 1:]
+
+    def predict(self, frames: float, target: str) -> tuple[Array, Array]:
+        """Return mean and standard deviation of the vibration; NaN before it has learnt once."""
+        return self._mean, self._sd
+
+    def save(self) -> Saved:
+        """Return a copy of the state: the window, what was learnt, and the states of the whiteners."""
+        self.settle()
+        size, rows = min(self._end, self.schedule.longest), self.settings.peak_count + 2
+        samples = np.zeros((len(self._mean), self.schedule.longest))
+        samples[:, self.schedule.longest - size :] = self._samples[:, self._end - size : self._end]
+        return {
+            "samples": samples,
+            "spectra": np.array([pack_spectrum(one.fit, rows) for one in self.learnt]),
+            "weights": np.array([one.weights for one in self.learnt]),
+            "means": np.array([[one.mean, one.sd] for one in self.learnt]),
+            "recent": self._recent.copy(),
+            "states": self._states.copy(),
+            "estimates": np.array([self._mean, self._sd]),
+            "count": np.array(self.count),
+        }
+
+    def load(self, state: Mapping[str, Array]) -> None:
+        """Take over a state."""
+        self.count, self._end, self._pending = int(state["count"]), self.schedule.longest, False
+        size = min(max(self.count - self.sampling.delay, 0), self.schedule.longest)
+        self._samples[:, self._end - size : self._end] = state["samples"][:, self._end - size :]
+        packed = zip(state["spectra"], state["means"].tolist(), state["weights"], strict=True)
+        self.learnt = [
+            Learnt(unpack_spectrum(table, self.sampling.dt), mean, weights.copy(), sd) for table, (mean, sd), weights in packed
+        ]
+        self._whiteners = [one.whitener for one in self.learnt]
+        self._recent[...], self._states[...] = state["recent"], state["states"]
+        self._mean[...], self._sd[...] = state["estimates"]
+
+    def take_over(self, old: Any) -> None:
+        """Go on from another design with the same windows, number of peaks and horizon. Raises StepError."""
+        if (old.schedule, old.settings.peak_count, old.horizon) != (self.schedule, self.settings.peak_count, self.horizon):
+            raise StepError("the designs have other windows, another number of peaks or horizon")
+        self.load(old.save())

@@ -1,0 +1,119 @@
+"""What the adaptive GPR learns from a window of measurements: inputs, kernel, targets, and the weights of its regression.
+
+The spectrum of the window (`wfsobs.spectral.quick`) says which lines stand above the continuum, S_z = S_c + S_v. From it come
+
+- the inputs: z whitened by the continuum, the innovations of a Kalman filter that knows of turbulence and noise alone. They are
+  high-passed with the corner and the slope that the turbulence has, and lines stand out of them;
+- the kernel: weights of a window with the spectrum S_v S_c / S_z: the bands of the lines, as wide as they rise above the
+  continuum;
+- the targets: the vibration that the smoother of that spectrum finds, from the past and the future of a step as far as they are
+  in the window. The expectation given the window of x of a quantity and of its expectation given all of z are the same, so that a
+  regression on them tends to the best there is, without the lag of causal band-passes and without their turbulence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from wfsobs.observers.base import VIBRATION
+from wfsobs.observers.gpr.band_regression import fit_bands
+from wfsobs.observers.kalman.single import MIN_NOISE
+from wfsobs.signal.periodic import FilterStep, PeriodicFilter
+from wfsobs.signal.riccati import steady_state
+from wfsobs.signal.smoother import smoother
+from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
+from wfsobs.spectral.model import Spectrum
+from wfsobs.spectral.periodogram import periodogram, periodogram_frequencies
+from wfsobs.spectral.quick import quick_spectrum
+from wfsobs.typing import Array
+
+WORTH = 8.0
+"""Minimum gain of log-likelihood of a line that is learnt: twice what the fit asks, since a false one is turbulence."""
+BINS = 16384
+"""Steps of the DFT that turns the spectrum of weights into their covariance; more than twice the depth."""
+SETTLED = 2
+"""Depths of a window until filters that start at rest have settled: the first training window ends there."""
+
+
+class Learnt(NamedTuple):
+    """What has been learnt from one window.
+
+    fit     : its spectrum, None before the first
+    mean    : of the window [um]
+    weights : of the whitened samples, the newest first, (depth,); zero where no line stands above the continuum
+    sd      : standard deviation of the estimate's error by the model [um], NaN without one
+    """
+
+    fit: Spectrum | None
+    mean: float
+    weights: Array
+    sd: float
+
+    @property
+    def whitener(self) -> FilterStep:
+        """The filter of the inputs."""
+        return whitener_of(self.fit)
+
+
+def nothing_learnt(depth: int) -> Learnt:
+    """Return what is known before the first window: there is no estimate."""
+    return Learnt(None, 0.0, np.full(depth, np.nan), np.nan)
+
+
+def learn(z: Array, dt: float, depth: int, most: int, lowest: float, last: Learnt, horizon: int = 0) -> Learnt:
+    """Learn from a window z (n,) [um]; where it has no spectrum, what was learnt last stays.
+
+    depth : samples in a window of the regression; most, lowest : maximum number and minimum frequency [Hz] of lines; horizon :
+    steps from a window's end to its target
+    """
+    mean = float(z.mean())
+    z = z - mean
+    try:
+        with np.errstate(divide="raise", over="raise", invalid="raise"):
+            fit = quick_spectrum(z, dt, most, lowest, last.fit)
+            lines = standing(fit, z)
+            if not lines.resonances:
+                return Learnt(fit, mean, np.zeros(depth), np.nan)
+            target = smoother(_model(lines), VIBRATION, max(lines.noise, MIN_NOISE))
+            x = PeriodicFilter([whitener_of(fit)]).run(z[:, None, None])[:, 0, 0]
+            first = SETTLED * depth
+            found = fit_bands(x, target.run(z)[first + horizon :], first, weight_covariance(lines, depth))
+            sd = np.sqrt(target.variance + found.noise**2 + found.spread**2)
+            return Learnt(fit, mean, found.weights, float(sd))
+    except (ValueError, ArithmeticError):
+        return last
+
+
+def standing(fit: Spectrum, z: Array) -> Spectrum:
+    """Return the spectrum with the lines alone that are worth WORTH in log-likelihood of z (n,), mean zero."""
+    f, found = periodogram_frequencies(len(z), fit.dt), periodogram(z, fit.dt)
+    S = fit.psd(f)
+    without = [np.maximum(S - line.psd(f), 1e-6 * S) for line in fit.resonances]
+    worth = [float(np.sum(np.log(rest / S) + found / rest - found / S)) for rest in without]
+    kept = tuple(line for line, gain in zip(fit.resonances, worth, strict=True) if gain > WORTH)
+    return replace(fit, resonances=kept)
+
+
+def whitener_of(fit: Spectrum | None) -> FilterStep:
+    """Return the filter z -> innovations of the continuum, over their rms, and their states; (F, G, H, J)."""
+    if fit is None or fit.turbulence is None:
+        noise = 1.0 if fit is None else max(fit.noise, MIN_NOISE)
+        return np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), np.array([[1.0 / noise]])
+    model, noise = disturbance_model([fit.turbulence], []), max(fit.noise, MIN_NOISE)
+    s, C = steady_state(model.A, model.C, model.Q, np.array(noise**2)), model.C[None]
+    scale = np.sqrt(float((C @ s.P @ C.T)[0, 0]) + noise**2)
+    return model.A - s.K @ C, s.K, -C / scale, np.array([[1.0 / scale]])
+
+
+def weight_covariance(lines: Spectrum, depth: int) -> Array:
+    """Return the covariance of the weights at lags 0 ... depth - 1, (depth,), of the spectrum S_v S_c / S_z."""
+    f = np.fft.rfftfreq(BINS, lines.dt)
+    whole, continuum = lines.psd(f), replace(lines, resonances=()).psd(f)
+    return np.fft.irfft((whole - continuum) * continuum / whole)[:depth]
+
+
+def _model(lines: Spectrum) -> DisturbanceModel:
+    return disturbance_model([] if lines.turbulence is None else [lines.turbulence], lines.resonances)
