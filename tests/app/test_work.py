@@ -62,7 +62,7 @@ def test_deliveries_are_held_back(short: Scenario, monkeypatch: pytest.MonkeyPat
     compute(short, QUIET, lambda result: told.append(result))
     quick, shown = told
     assert quick is not None and shown is not None
-    learning = {"gpr-online", "kf-adaptive", "multirate-adaptive"}
+    learning = {"gpr-online", "gpr-adaptive", "kf-adaptive", "multirate-adaptive"}
     for here, missing in ((quick, {"gpr-offline", "ridge", "gp-lgs", "gp-both", *learning}), (shown, learning)):
         assert {name for name, _ in keys(here)} == set(OBSERVERS) - missing
 
