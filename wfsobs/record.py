@@ -75,6 +75,8 @@ class Signals:
         Open-loop LGS measurement, with the mirror at rest, (n_steps, n_modes) [um].
     delay : int
         Steps from a command to the first measurement that sees it, y_lgs[k] = phi_dist[k-1] + u[k-delay] + noise.
+    lgs_stars : Array or None
+        Number of LGS that y_lgs is the combination of, the first ones, (n_steps,), integers; None where it is all, or not known.
     """
 
     y_lgs: Array
@@ -84,6 +86,7 @@ class Signals:
     ratio: int | None = None
     open_loop_y: Array | None = None
     delay: int = DELAY
+    lgs_stars: Array | None = None
 
     @property
     def n_steps(self) -> int:
@@ -174,6 +177,7 @@ class Record(Signals):
             self.ratio,
             None if twin is None else _own(twin),
             self.delay,
+            None if self.lgs_stars is None else self.lgs_stars.copy(),
         )
 
     def truth(self, target: str) -> Array | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -62,10 +63,11 @@ def model_of(name: str, scenario: Scenario, record: Record, mode: int) -> Model:
     return Model(found.steps, found.rows)
 
 
-def textbook(model: Model, z: Array) -> tuple[Array, Array]:
+def textbook(model: Model, z: Array, at: Sequence[Model] | None = None) -> tuple[Array, Array]:
     """Estimates of the targets and their standard deviations, (n, 2), by the filter whose covariance goes along.
 
-    z : (n, m), NaN is missing. It starts without knowledge: from a covariance after many steps without a measurement.
+    z  : (n, m), NaN is missing. It starts without knowledge: from a covariance after many steps without a measurement.
+    at : the model by step, where C and R change
     """
     n = len(model.cycle)
     P, x, values, sd = np.zeros_like(model.cycle[0][0]), np.zeros(len(model.cycle[0][0])), [], []
@@ -73,7 +75,7 @@ def textbook(model: Model, z: Array) -> tuple[Array, Array]:
     for _ in range(20):
         P, power = P + power @ P @ power.T, power @ power
     for k, row in enumerate(z):
-        _, C, _, R = model.cycle[(k - (n > 1)) % n]
+        _, C, _, R = (model if at is None else at[k]).cycle[(k - (n > 1)) % n]
         there = ~np.isnan(row)
         if there.any():
             C, R = C[there], R[np.ix_(there, there)]
@@ -195,6 +197,7 @@ def test_stated_frame_by_frame_as_over_a_record(name: str) -> None:
         vibration=None,
         training=None,
         open_loop_y=None,
+        lgs_stars=record.lgs_stars[cut],
     )
     observer, given = OBSERVERS[name], arguments(OBSERVERS[name], record, scenario)
     found = observer.estimate(*given)

@@ -208,7 +208,8 @@ class Controller:
     ) -> tuple[Array, Array]:
         """Return `commands` of Kalman filters: where measurements are missing, frame by frame."""
         z, n = measurements.z, measurements.ratio
-        if np.isnan(z).any() or (self.ngs and n is not None and np.isnan(measurements.z_ngs[n::n]).any()):
+        lost = np.isnan(z).any() or (self.ngs and n is not None and np.isnan(measurements.z_ngs[n::n]).any())
+        if lost or measurements.lgs_stars is not None:
             wanted = KalmanLaws(laws).run(measurements, watch)
         else:
             inputs = self._inputs(measurements, z)

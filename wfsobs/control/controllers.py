@@ -12,7 +12,7 @@ from wfsobs.control.lqg import lqg_kf_lgs, lqg_kf_multi, lqg_multirate, lqg_mult
 from wfsobs.control.mirror import Plant
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead, step_gpr_offline_ahead, step_gpr_online_ahead
 from wfsobs.observers.base import Look
-from wfsobs.prior import Bands, Beams, LgsError, Lines, Model, Part, Prior, Spectra, Training
+from wfsobs.prior import Bands, Beams, LgsError, LgsStars, Lines, Model, Part, Prior, Spectra, Training
 from wfsobs.registry import Registry
 
 
@@ -60,7 +60,7 @@ CONTROLLERS = Registry(
             "LQG, LGS KF",
             lqg_kf_lgs,
             help="minus what the LGS Kalman filter predicts",
-            prior=(Model,),
+            prior=(Model, LgsStars),
             look=Look("LQG LGS KF", "#FF6600", "#FF8533"),
         ),
         Controller(
@@ -68,7 +68,7 @@ CONTROLLERS = Registry(
             "LQG, multi-peak KF",
             lqg_kf_multi,
             help="minus what the Kalman filter of every peak predicts",
-            prior=(Lines,),
+            prior=(Lines, LgsStars),
             settings=("multipeak",),
             look=Look("LQG multi-peak", "#00707F", "#4DD0E1", (14, 3)),
         ),
@@ -77,7 +77,7 @@ CONTROLLERS = Registry(
             "LQG, multi-rate KF",
             lqg_multirate,
             help="minus what the paper's multi-rate filter predicts",
-            prior=(Model,),
+            prior=(Model, LgsStars),
             settings=("multirate",),
             ngs=True,
             look=Look("LQG multi-rate", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
@@ -87,7 +87,7 @@ CONTROLLERS = Registry(
             "LQG, optimal multi-rate KF",
             lqg_multirate_optimal,
             help="minus what the optimal multi-rate filter predicts",
-            prior=(Model, LgsError),
+            prior=(Model, LgsError, LgsStars),
             settings=("multirate",),
             ngs=True,
             look=Look("LQG optimal", "#7A1FA2", "#C9A0FF", (3, 2)),
@@ -97,7 +97,7 @@ CONTROLLERS = Registry(
             "LQG, multi-rate multi-peak KF",
             lqg_multirate_multi,
             help="minus what the optimal multi-rate filter of every peak predicts",
-            prior=(Model, Lines, Beams),
+            prior=(Model, LgsStars, Lines, Beams),
             settings=("multirate", "multipeak"),
             ngs=True,
             look=Look("LQG opt. peaks", "#B40000", "#FF7A70", (8, 3)),

@@ -18,12 +18,13 @@ import numpy as np
 from wfsobs.control.law import Law, steady_law
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.observers.base import TARGETS
-from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
 from wfsobs.observers.kalman.multirate import MultiRateFilter, filter_of_gains, multirate_mode, multirate_noise
 from wfsobs.observers.kalman.multirate_multi import every_peak_model
 from wfsobs.observers.kalman.multirate_optimal import Cycle, optimal_model
 from wfsobs.observers.kalman.single import steady_mode
 from wfsobs.prior import Prior
+from wfsobs.signal.gap_gains import ONE, SensorMean
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.typing import Array
 
@@ -45,44 +46,46 @@ def _rows_of(model: DisturbanceModel, mirror: Mirror) -> Array:
     return command_rows(model.A, model.output_rows(TARGETS).sum(axis=0), mirror)
 
 
-def lqg_of(model: DisturbanceModel, noise: float, mirror: Mirror) -> Law:
-    """LQG on the LGS with any model; noise [um] of a measurement. Raises RiccatiError."""
-    found, row = steady_mode(model, noise), _rows_of(model, mirror)
+def lqg_of(model: DisturbanceModel, noise: float, mirror: Mirror, mean: SensorMean = ONE) -> Law:
+    """LQG on the LGS with any model; noise [um] of a measurement, the mean over all LGS. Raises RiccatiError."""
+    found, row = steady_mode(model, noise)._replace(mean=mean), _rows_of(model, mirror)
     return replace(steady_law(found.gains.filter(row)), gains=found.gains, row=row[0], filter=found)
 
 
 def lqg_kf_lgs(prior: Prior, mode: int, plant: Plant, _settings: Any) -> Law:
     """With the model of the LGS Kalman filter: turbulence and one vibration peak."""
     model = prior.model[mode]
-    return lqg_of(model.disturbance(), model.lgs_noise, plant.mirror)
+    return lqg_of(model.disturbance(), model.lgs_noise, plant.mirror, lgs_mean(prior, mode))
 
 
 def lqg_kf_multi(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With every peak of the vibration in the model."""
     lines = prior.lines[mode]
-    return lqg_of(lines.disturbance(settings.multipeak.line_width), lines.noise, plant.mirror)
+    return lqg_of(lines.disturbance(settings.multipeak.line_width), lines.noise, plant.mirror, lgs_mean(prior, mode))
 
 
 def lqg_multirate(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the paper's multi-rate filter. Raises UnstableCycle."""
     known = prior.model[mode]
     model, noise = known.disturbance(), multirate_noise(settings.multirate, known)
-    return _two_sensors(multirate_mode(model, plant.ratio, *noise), _rows_of(model, plant.mirror))
+    found = multirate_mode(model, plant.ratio, *noise)._replace(mean=lgs_mean(prior, mode))
+    return _two_sensors(found, _rows_of(model, plant.mirror))
 
 
 def lqg_multirate_optimal(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the optimal multi-rate filter."""
-    return _optimal(optimal_model(settings.multirate, prior, mode, plant.ratio), plant.mirror)
+    return _optimal(optimal_model(settings.multirate, prior, mode, plant.ratio), prior, mode, plant.mirror)
 
 
 def lqg_multirate_multi(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the optimal multi-rate filter and every peak of the vibration in its model."""
-    return _optimal(every_peak_model(settings.multirate, settings.multipeak, prior, mode, plant.ratio), plant.mirror)
+    cycle = every_peak_model(settings.multirate, settings.multipeak, prior, mode, plant.ratio)
+    return _optimal(cycle, prior, mode, plant.mirror)
 
 
-def _optimal(cycle: Cycle, mirror: Mirror) -> Law:
+def _optimal(cycle: Cycle, prior: Prior, mode: int, mirror: Mirror) -> Law:
     row = command_rows(cycle.steps[0][0], cycle.rows.sum(axis=0), mirror)
-    return _two_sensors(cycle.filter(), row)
+    return _two_sensors(cycle.filter()._replace(mean=lgs_mean(prior, mode, cycle.has_lgs_error)), row)
 
 
 def _two_sensors(mode_filter: ModeFilter, row: Array) -> Law:

@@ -62,7 +62,7 @@ class StepController:
         self._parts: dict[str, Stateful] = {name: part for name, part in found.items() if part is not None}
         self._parts |= {} if ahead is None else ahead.parts
 
-    def update(self, y: ArrayLike, ngs: ArrayLike | None = None) -> Array:
+    def update(self, y: ArrayLike, ngs: ArrayLike | None = None, stars: int | None = None) -> Array:
         """Take the measurements of a frame and return its command.
 
         Parameters
@@ -72,6 +72,8 @@ class StepController:
         ngs : array_like, optional
             NGS measurement, (n_modes,) [um], in the frames that have one: k = n, 2n, ... for the ratio n. One that is due and
             not given, or NaN, is missing.
+        stars : int, optional
+            LGS that y is the mean over; by default all.
 
         Returns
         -------
@@ -83,14 +85,14 @@ class StepController:
         StepError
             A wrong shape, an infinite number, an NGS frame that is not due. The frame is then not taken, and no command is given.
         """
-        return self._take(y, ngs, "y", is_open=False)
+        return self._take(y, ngs, stars, "y", is_open=False)
 
-    def update_open_loop(self, z: ArrayLike, ngs: ArrayLike | None = None) -> Array:
+    def update_open_loop(self, z: ArrayLike, ngs: ArrayLike | None = None, stars: int | None = None) -> Array:
         """As `update`, of measurements of the disturbance alone: those of a record, or of a loop that another controller closes.
 
         Parameters
         ----------
-        z, ngs : array_like
+        z, ngs, stars : array_like
             Pseudo-open-loop measurements, see `StepObserver.update`.
 
         Returns
@@ -103,14 +105,14 @@ class StepController:
         StepError
             As `update`.
         """
-        return self._take(z, ngs, "z", is_open=True)
+        return self._take(z, ngs, stars, "z", is_open=True)
 
     @property
     def correction(self) -> Array:
         """What the mirror does in the last frame, phi_corr, (n_modes,) [um]: the residual is the disturbance and this."""
         return self._taps @ self._commands
 
-    def _take(self, x: ArrayLike, ngs: ArrayLike | None, name: str, is_open: bool) -> Array:
+    def _take(self, x: ArrayLike, ngs: ArrayLike | None, stars: int | None, name: str, is_open: bool) -> Array:
         x, is_whole = check_frame(self.id, x, name, self.sampling.n_modes, self.frame)
         due = self.uses_ngs and self.frame > 0 and self.frame % self._ratio == 0
         slow = self._check_ngs(ngs, due) if self.uses_ngs else None
@@ -128,6 +130,7 @@ class StepController:
             z, forward = self.ahead.split(z)
         u = self._none.copy()
         if self.law is not None:
+            self.law.see_stars(stars)
             u = self._clip(self.law.command(z, slow, forward))
             self.law.tell(u, forward)
         push_row(self._commands, u)

@@ -27,6 +27,10 @@ StepPredict = Callable[[Prior, Plant, Any, Sampling], Estimator]
 class StepLaw(Stateful, Protocol):
     """The laws of all modes, one frame at a time."""
 
+    def see_stars(self, count: int | None) -> None:
+        """Take the LGS measurement of the next frame for the mean over so many stars; None for all."""
+        ...
+
     def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
         """Return the commands (n_modes,) [um] that the laws want, `forward` included."""
         ...
@@ -47,6 +51,9 @@ class LinearLaws:
         self.laws = tuple(laws)
         self.bank = FilterBank([Recursion(law.cycle.steps, law.first) for law in laws])
         self._v = np.zeros((len(laws), laws[0].cycle.steps[0][1].shape[1]))
+
+    def see_stars(self, count: int | None) -> None:
+        """Take no notice: there is one gain."""
 
     def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
         """Return what the filters give."""
@@ -91,6 +98,10 @@ class KalmanLaws:
             assert law.row is not None
             row[: len(law.row)] = law.row
 
+    def see_stars(self, count: int | None) -> None:
+        """Take the LGS measurement of the next frame for the mean over so many stars; None for all."""
+        self.filters.see_stars(count)
+
     def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
         """Return the commands of the estimates."""
         self.filters.advance(z, ngs, None)
@@ -99,7 +110,7 @@ class KalmanLaws:
     def run(self, measurements: Measurements, watch: Watch) -> Array:
         """Return the commands over a record with gaps, (n_steps, n_modes) [um]. Raises Cancelled."""
         none = np.zeros(len(self.laws))
-        return np.array([self.command(*frame, none) for frame in each_frame(measurements, self.filters.uses_ngs, watch)])
+        return np.array([self.command(*frame, none) for frame in each_frame(self.filters, measurements, watch)])
 
     def tell(self, command: Array, forward: Array) -> None:
         """Take no notice: z holds none of the commands."""
@@ -132,6 +143,9 @@ class Integrators:
         self._leak = np.array([law.leak for law in laws])
         self._taps = mirror.taps[1:]
         self._own = np.zeros((len(self._taps), len(laws)))  # newest first
+
+    def see_stars(self, count: int | None) -> None:
+        """Take no notice: there is one gain."""
 
     def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
         """Return leak u - g y, y the measurement with the integrator's own commands alone."""

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from wfsobs.control.step import StepController
 from wfsobs.control.step_laws import Integrators, KalmanLaws, LinearLaws
 from wfsobs.observers.step_checks import StepError
-from wfsobs.signal.gap_gains import GapGains
+from wfsobs.signal.gap_gains import ONE, GapGains
 from wfsobs.signal.stepping import GainCycle
 from wfsobs.typing import Array
 
@@ -101,7 +101,7 @@ def linear_design(controller: StepController) -> LinearDesign:
     for mode, one in enumerate(law.laws):
         if one.gains is None or one.row is None:
             raise StepError(f"{controller.id}: its law is not known as gains of an observer")
-        gaps = one.filter.gaps() if one.filter is not None and controller.bridges is None else None
+        gaps = one.filter._replace(mean=ONE).gaps() if one.filter is not None and controller.bridges is None else None
         modes.append(ModeMatrices(one.gains, one.row, gaps, lgs.get(mode), ngs.get(mode)))
     ratio = controller.sampling.ratio or 0 if controller.uses_ngs else 0
     return LinearDesign(controller.id, controller.sampling.dt, ratio, controller.plant.mirror.taps, tuple(modes))

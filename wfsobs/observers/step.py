@@ -98,8 +98,9 @@ class StepObserver:
         self._parts: dict[str, Stateful] = {name: part for name, part in found.items() if part is not None}
         self._allowed_requests: set[tuple[float, str]] = set()
         self._nothing = np.full(sampling.n_modes, np.nan)
+        self._see_stars: Callable[[int | None], None] | None = getattr(estimator, "see_stars", None)
 
-    def update(self, z: ArrayLike, ngs: ArrayLike | None = None, u: ArrayLike | None = None) -> None:
+    def update(self, z: ArrayLike, ngs: ArrayLike | None = None, u: ArrayLike | None = None, stars: int | None = None) -> None:
         """Take the measurements of a frame.
 
         Parameters
@@ -111,6 +112,8 @@ class StepObserver:
             that is due and missing or NaN is predicted.
         u : array_like, optional
             Command u[k], (n_modes,) [um]; for observers alone whose windows hold commands.
+        stars : int, optional
+            LGS that z is the mean over; by default all. A filter that is told them has the noise of those that are there.
 
         Raises
         ------
@@ -131,6 +134,8 @@ class StepObserver:
             z = self._lgs.complete(z, is_whole)
         if slow is not None and self._ngs is not None:
             slow = self._ngs.complete(slow)
+        if self._see_stars is not None:
+            self._see_stars(stars)
         self.estimator.advance(z, slow, u)
         self.frame += 1
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from wfsobs.prior.parts import Bands, Beams, Flow, LgsError, Line, Lines, Model, Spectra
+from wfsobs.prior.parts import Bands, Beams, Flow, LgsError, LgsStars, Line, Lines, Model, Spectra
 from wfsobs.record import Training
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "Beams",
     "Flow",
     "LgsError",
+    "LgsStars",
     "Line",
     "Lines",
     "Model",
@@ -37,12 +38,23 @@ IDENTIFIED: PriorSource = "identified"
 GIVEN: PriorSource = "given"
 """From settings, on a record that was not simulated from them."""
 
-Part = type[Model] | type[LgsError] | type[Lines] | type[Beams] | type[Flow] | type[Bands] | type[Spectra] | type[Training]
+Part = (
+    type[Model]
+    | type[LgsError]
+    | type[LgsStars]
+    | type[Lines]
+    | type[Beams]
+    | type[Flow]
+    | type[Bands]
+    | type[Spectra]
+    | type[Training]
+)
 """A kind of thing that an observer or a controller can ask for."""
 
 _WORDS: dict[Part, tuple[str, ...]] = {
     Model: ("model",),
     LgsError: ("model",),
+    LgsStars: (),
     Lines: ("model", "{source} lines"),
     Beams: ("model",),
     Flow: ("model",),
@@ -66,13 +78,14 @@ def words_for(parts: Iterable[Part], *, source: PriorSource = TRUE) -> tuple[str
 class Prior:
     """The parts that an observer or a controller asked for, empty or None where it did not.
 
-    model, lgs_error, lines, beams, spectra : one per mode
+    model, lgs_error, stars, lines, beams, spectra : one per mode
     flow, bands : of all modes
     training : a record to learn from
     """
 
     model: tuple[Model, ...] = ()
     lgs_error: tuple[LgsError, ...] = ()
+    stars: tuple[LgsStars, ...] = ()
     lines: tuple[Lines, ...] = ()
     beams: tuple[Beams, ...] = ()
     flow: Flow | None = None

@@ -9,8 +9,11 @@ from dataclasses import dataclass
 from math import pi
 from typing import NamedTuple
 
+import numpy as np
+
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
+from wfsobs.signal.gap_gains import ONE, SensorMean
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
@@ -42,6 +45,27 @@ class LgsError(NamedTuple):
     """The slow error of the LGS together in one mode, as a process at the fast step."""
 
     process: Ar2
+
+
+@dataclass(frozen=True)
+class LgsStars:
+    """The LGS together in one mode where some of them are out: the first 1, 2, ... of them.
+
+    noise : rms of the white noise over that of all, by how many there are
+    slow  : one process less, at the fast step: the first s have the slow error of all, and of these processes that of s and those
+        behind it, all independent. For the mean over equal stars that is exact (Helmert contrasts).
+    """
+
+    noise: tuple[float, ...]
+    slow: tuple[Ar2, ...] = ()
+
+    def sensor_mean(self, has_slow_error: bool) -> SensorMean:
+        """Return them as a measurement; has_slow_error: to a filter that models the slow error of all."""
+        found = [(i, p) for i, p in enumerate(self.slow) if p.rms > 0] if has_slow_error else []
+        if not found:
+            return ONE._replace(noise=np.array(self.noise), C=np.zeros((len(self.noise), 0)))
+        model, behind = disturbance_model([process for _, process in found], ()), np.repeat([i for i, _ in found], 2)
+        return SensorMean(np.array(self.noise), model.A, model.Q, (behind >= np.arange(len(self.noise))[:, None]) * model.C)
 
 
 class Line(NamedTuple):

@@ -11,9 +11,9 @@ import numpy as np
 
 from wfsobs.observers.base import Observer
 from wfsobs.observers.kalman.single import steady_filter
-from wfsobs.prior import Bands, Beams, Flow, LgsError, Line, Lines, Model, Part, Prior, Spectra, Training
+from wfsobs.prior import Bands, Beams, Flow, LgsError, LgsStars, Line, Lines, Model, Part, Prior, Spectra, Training
 from wfsobs.priors_from.flow import flow_of
-from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence, measurement_noise, one_process
+from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence, measurement_noise, one_process, stars_of
 from wfsobs.priors_from.vibration import vibration_continuum
 from wfsobs.record import Measurements, Record, Sampling
 from wfsobs.scenario import Scenario
@@ -89,6 +89,7 @@ def prior_of(
         model=tuple(model_of(scenario, mode, dt) for mode in modes) if Model in asked else (),
         lgs_error=tuple(lgs_error_of(scenario, mode, dt) for mode in modes) if LgsError in asked else (),
         lines=tuple(lines_of(scenario, mode, dt) for mode in modes) if Lines in asked else (),
+        stars=tuple(stars_of(scenario, mode, dt) for mode in modes) if LgsStars in asked else (),
         beams=tuple(beams_of(scenario, mode, dt) for mode in modes) if Beams in asked else (),
         flow=flow_of(scenario, len(modes), dt) if Flow in asked else None,
         bands=bands_of(scenario) if Bands in asked else None,

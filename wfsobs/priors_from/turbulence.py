@@ -8,12 +8,12 @@ from functools import lru_cache
 import numpy as np
 
 from wfsobs.observers.kalman.single import MIN_NOISE
-from wfsobs.prior import Beams, LgsError
+from wfsobs.prior import Beams, LgsError, LgsStars
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3, fit_ar3
 from wfsobs.signal.shared_process import SharedProcess, fit_shared_process
-from wfsobs.simulation.guide_stars import lgs_error_process, lgs_noise_rms, lgs_weights
+from wfsobs.simulation.guide_stars import lgs_error_process, lgs_error_variance, lgs_noise_rms, lgs_weights
 from wfsobs.simulation.layers import relative_rms
 from wfsobs.simulation.sensor_noise import noise_rms
 from wfsobs.simulation.true_spectra import lgs_turbulence_spectrum, n_frequencies
@@ -25,6 +25,18 @@ from wfsobs.typing import Array
 def lgs_error_of(scenario: Scenario, mode: int, dt: float | None = None) -> LgsError:
     """Return the slow error of the combined LGS in one mode."""
     return LgsError(lgs_error_process(scenario, mode, dt or scenario.dt))
+
+
+def stars_of(scenario: Scenario, mode: int, dt: float | None = None) -> LgsStars:
+    """Return what the LGS together are in one mode where some are out; dt [s]: by default that of the scenario.
+
+    What the variance of the error grows by where one is out is a slow error of its own.
+    """
+    count, process = scenario.sensors.lgs_count, lgs_error_process(scenario, mode, dt or scenario.dt)
+    noises = np.array([max(lgs_noise_rms(scenario, mode, stars), MIN_NOISE) for stars in range(1, count + 1)])
+    growth = -np.diff([lgs_error_variance(scenario, mode, stars) for stars in range(1, count + 1)])
+    slow = tuple(replace(process, rms=float(np.sqrt(max(variance, 0.0)))) for variance in growth)
+    return LgsStars(tuple((noises / noises[-1]).tolist()), slow)
 
 
 def one_process(scenario: Scenario, mode: int, dt: float) -> Ar2:

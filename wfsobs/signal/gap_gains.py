@@ -2,7 +2,8 @@
 
     P = A P[k-1] A' + Q,    S = C P C' + R,    L = P C' S^-1,    P[k] = P - L S L',
 
-row by row of C, those that were measured.
+row by row of C, those that were measured. The first row may be the mean over several sensors of which some are out
+(`SensorMean`): its noise is then greater, and it sees states beside those of the filter, which the mean over all does not see.
 
 The covariance does not depend on what is measured, only on which measurements there are. So the steps are kept, and a gap of the
 same length costs nothing the second time.
@@ -11,9 +12,12 @@ same length costs nothing the second time.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
+from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.riccati import Step
 from wfsobs.typing import Array
 
@@ -23,8 +27,26 @@ STEADY = 3e-3
 KEPT = 16e6
 """Memory for steps that are kept, per model [bytes]."""
 
-Pattern = tuple[bool, ...]
-"""Which measurements of a step there are."""
+Pattern = tuple[int, ...]
+"""How many sensors each measurement of a step is the mean over, 0 where it is missing."""
+
+
+class SensorMean(NamedTuple):
+    """A measurement that is the mean over 1, 2, ... N sensors.
+
+    noise : rms of its noise over that of the mean over all, (N,)
+    A, Q  : of what it sees beside the states of the filter, (e, e)
+    C     : how, (N, e); its last row is zero
+    """
+
+    noise: Array
+    A: Array
+    Q: Array
+    C: Array
+
+
+ONE = SensorMean(np.ones(1), np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((1, 0)))
+"""A measurement by one sensor."""
 
 
 class GapStep:
@@ -69,11 +91,17 @@ class GapGains:
         Rows of the state whose variances say whether the filter is steady, (p, n).
     scale : float
         Variance that theirs are compared with.
+    mean : SensorMean
+        The sensors of the first measurement.
     """
 
-    def __init__(self, cycle: Sequence[Step], posteriors: Sequence[Array], rows: Array, scale: float):
-        self.cycle, self.posteriors = tuple(cycle), tuple(posteriors)
-        self.weights, self.most = rows.T @ rows, STEADY * scale
+    def __init__(self, cycle: Sequence[Step], posteriors: Sequence[Array], rows: Array, scale: float, mean: SensorMean = ONE):
+        e = len(mean.A)
+        beside = lyapunov(mean.A, mean.Q) if e else mean.A
+        self.cycle = tuple((block_diag(A, mean.A), np.pad(C, ((0, 0), (0, e))), block_diag(Q, mean.Q), R) for A, C, Q, R in cycle)
+        self.posteriors = tuple(block_diag(P, beside) for P in posteriors)
+        rows = np.pad(rows, ((0, 0), (0, e)))
+        self.weights, self.most, self._mean = rows.T @ rows, STEADY * scale, mean
         self._first: dict[tuple[int, Pattern], GapStep] = {}
         n = len(rows[0])
         self._room = self._free = max(int(KEPT / (8 * n * (2 * n + 2))), 1)
@@ -87,8 +115,8 @@ class GapGains:
             The step before; None where the filter was steady.
         j : int
             Which step of the cycle.
-        pattern : tuple of bool
-            Which of its measurements there are.
+        pattern : tuple of int
+            Its measurements.
         """
         known = self._first.get((j, pattern)) if before is None else before.following.get(pattern)
         if known is None:
@@ -108,13 +136,22 @@ class GapGains:
         _, C, _, R = self.cycle[j]
         P = A @ P @ A.T + Q
         update = np.hstack([A, np.zeros((len(A), len(C)))])
-        for i, is_there in enumerate(pattern):  # one after the other, as their noises are independent
-            if is_there and C[i].any():
-                ahead = P @ C[i]
-                gain = ahead / (C[i] @ ahead + R[i, i])
+        for i, sensors in enumerate(pattern):  # one after the other, as their noises are independent
+            if sensors and C[i].any():
+                row, variance = (C[i], R[i, i]) if i else self._first_row(C, R, sensors)
+                ahead = P @ row
+                gain = ahead / (row @ ahead + variance)
                 P = P - np.outer(gain, ahead)
-                update -= np.outer(gain, C[i] @ update)
+                update -= np.outer(gain, row @ update)
                 update[:, len(A) + i] += gain
         P = 0.5 * (P + P.T)
-        is_last = all(pattern) and np.vdot(self.weights, P - self.posteriors[j]) <= self.most
+        is_last = (
+            all(pattern) and pattern[0] == len(self._mean.noise) and np.vdot(self.weights, P - self.posteriors[j]) <= self.most
+        )
         return GapStep(P, update, bool(is_last))
+
+    def _first_row(self, C: Array, R: Array, sensors: int) -> tuple[Array, float]:
+        """Return row and variance of the noise of the mean over so many sensors."""
+        row, beside, factor = C[0].copy(), self._mean.C[sensors - 1], self._mean.noise[sensors - 1]
+        row[len(row) - len(beside) :] = beside
+        return row, R[0, 0] * factor**2

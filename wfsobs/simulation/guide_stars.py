@@ -101,11 +101,15 @@ def lgs_turbulence_covariance(scenario: Scenario) -> Array:
     return out
 
 
-def lgs_error_variance(scenario: Scenario, mode: int) -> float:
-    """Return the variance [um^2] of the combined LGS turbulence minus that on the axis, without noise."""
-    combined = np.concatenate([np.zeros((1, len(scenario.modes))), lgs_weights(scenario)[mode]])
+def lgs_error_variance(scenario: Scenario, mode: int, stars: int | None = None) -> float:
+    """Return the variance [um^2] of the combined LGS turbulence minus that on the axis, without noise.
+
+    stars : as in `lgs_weights`
+    """
+    combined = np.concatenate([np.zeros((1, len(scenario.modes))), lgs_weights(scenario, stars)[mode]])
     combined[0, mode] = -1.0
-    return float(np.einsum("ij,ijkl,kl->", combined, lgs_turbulence_covariance(scenario), combined))
+    n = len(combined)
+    return float(np.einsum("ij,ijkl,kl->", combined, lgs_turbulence_covariance(scenario)[:n, :, :n], combined))
 
 
 def lgs_error_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
@@ -117,9 +121,9 @@ def lgs_error_process(scenario: Scenario, mode: int, dt: float) -> Ar2:
     return replace(turbulence_process(scenario, mode, dt), rms=rms)
 
 
-def lgs_noise_rms(scenario: Scenario, mode: int) -> float:
-    """Return the rms [um] of the white noise of the combined LGS in one mode."""
+def lgs_noise_rms(scenario: Scenario, mode: int, stars: int | None = None) -> float:
+    """Return the rms [um] of the white noise of the combined LGS in one mode; stars: as `lgs_weights`."""
     if scenario.sensors.lgs_combination == MEAN:
-        return float(noise_rms(scenario, "lgs")[mode] / np.sqrt(scenario.sensors.lgs_count))
-    own = lgs_weights(scenario)[mode]
+        return float(noise_rms(scenario, "lgs")[mode] / np.sqrt(stars or scenario.sensors.lgs_count))
+    own = lgs_weights(scenario, stars)[mode]
     return float(np.sqrt(np.einsum("ij,jk,ik->", own, noise_covariance(scenario, "lgs"), own)))

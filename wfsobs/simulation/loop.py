@@ -132,6 +132,7 @@ def measure_closed_loop(scenario: Scenario, open_loop: OpenLoop) -> Measurements
         y_ngs=open_loop.ngs + frame_mean(delay_signal(u, DELAY - 1), n),
         ratio=n,
         open_loop_y=open_loop.lgs,
+        lgs_stars=open_loop.stars,
     )
 
 

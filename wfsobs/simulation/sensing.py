@@ -27,10 +27,13 @@ class OpenLoop:
         Combined LGS, (n_steps, n_modes); NaN where a frame is missing.
     ngs : Array
         NGS, (n_steps, n_modes); NaN in steps without a frame or where it is missing.
+    stars : Array or None
+        Number of LGS at each step, (n_steps,); None for all at all steps.
     """
 
     lgs: Array
     ngs: Array
+    stars: Array | None = None
 
 
 def measure_open_loop(scenario: Scenario, disturbance: Disturbance, rng: np.random.Generator, watch: Watch = QUIET) -> OpenLoop:
@@ -81,7 +84,8 @@ def measure_open_loop(scenario: Scenario, disturbance: Disturbance, rng: np.rand
     ngs = np.where(is_frame[:, None], frame_mean(total, n) + noise, np.nan)
     lost = events.missing_frames(scenario, n_steps, lost_rng)
     lgs[lost["lgs"]], ngs[lost["ngs"]] = np.nan, np.nan
-    return OpenLoop(lgs, ngs)
+    is_whole = (working == scenario.sensors.lgs_count).all()
+    return OpenLoop(lgs, ngs, None if is_whole else working)
 
 
 def measure_noise(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> OpenLoop:

@@ -1,8 +1,8 @@
 """From the named arrays of a file to a `Record`: the only check of shapes, units, signs and clocks.
 
 A record has y_lgs and u (n_steps, n_modes) and dt or time; optionally y_ngs (the same shape, NaN where there is no frame, or
-one row per frame) with ratio or time_ngs, the truth turbulence and vibration, open_loop_y, and for the offline GPR training_y,
-training_u and training_open_loop_y (n, n_modes).
+one row per frame) with ratio or time_ngs, the truth turbulence and vibration, open_loop_y, lgs_stars (n_steps,), and for the
+offline GPR training_y, training_u and training_open_loop_y (n, n_modes).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from wfsobs.record import DELAY, Record, RecordError, Training
 from wfsobs.scenario import Scenario
 from wfsobs.telemetry import timestamps as clock
-from wfsobs.telemetry.formats.contents import FAST, NGS, SIGNALS, TRAINING, Contents
+from wfsobs.telemetry.formats.contents import FAST, NGS, SIGNALS, STARS, TRAINING, Contents
 from wfsobs.typing import Array
 from wfsobs.units import ANGLES, micrometres_per, parse_unit
 
@@ -66,6 +66,8 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     signals["u"] *= sign
     if "training_u" in signals:
         signals["training_u"] *= sign
+    if STARS in arrays:
+        signals[STARS] = _star_counts(arrays[STARS], n)
     dt, ratio = _apply_timestamps(signals, arrays, declaration)
     if np.isnan(signals["y_lgs"]).all(axis=0).any():
         raise RecordError("y_lgs holds no measurement of one of its modes")
@@ -73,7 +75,8 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
     if delay < 1:
         raise RecordError(f"delay takes a whole number from 1, not {delay}")
     fields = {name: signals[name] for name in (*FAST, NGS) if name in signals}
-    return Record(**fields, dt=dt, ratio=ratio, training=_training(signals), delay=delay, origin=origin)
+    stars = np.nan_to_num(signals[STARS][:, 0]).astype(int) if STARS in signals else None
+    return Record(**fields, dt=dt, ratio=ratio, training=_training(signals), delay=delay, origin=origin, lgs_stars=stars)
 
 
 def _signal(name: str, raw: Array) -> Array:
@@ -88,6 +91,13 @@ def _signal(name: str, raw: Array) -> Array:
         row, column = np.argwhere(bad)[0]
         raise RecordError(f"{name} is {out[row, column]} at step {row}, mode {column}; it takes finite numbers")
     return out
+
+
+def _star_counts(raw: Array, n: int) -> Array:
+    """Return how many LGS there are as a column, (n, 1)."""
+    if raw.dtype.kind not in "fiu" or raw.shape != (n,) or not (np.isfinite(raw) & (raw >= 0) & (raw == np.round(raw))).all():
+        raise RecordError(f"{STARS} takes {n} whole numbers from 0, not {raw.dtype} of shape {raw.shape}")
+    return raw.astype(np.float64)[:, None]
 
 
 def _into_micrometres(
@@ -174,7 +184,7 @@ def _stamped_frames(signals: dict[str, Array], arrays: Mapping[str, Array], star
     inside = (steps >= 0) & (steps < n)
     signals[NGS] = np.full((n, frames.shape[1]), np.nan)
     signals[NGS][steps[inside]] = frames[inside]
-    for name in (*FAST, NGS):
+    for name in (*FAST, NGS, STARS):
         if name in signals:
             signals[name] = signals[name][steps[0] % ratio :]
     return ratio

@@ -30,7 +30,8 @@ def run_steps(observer: StepObserver, measurements: Measurements, steps: Iterabl
     out = {target: np.full_like(z, np.nan) for target in observer.targets}
     for k in range(measurements.n_steps) if steps is None else steps:
         due = z_ngs is not None and n is not None and k > 0 and k % n == 0
-        observer.update(z[k], z_ngs[k] if z_ngs is not None and due else None, u=u[k])
+        stars = None if measurements.lgs_stars is None else int(measurements.lgs_stars[k])
+        observer.update(z[k], z_ngs[k] if z_ngs is not None and due else None, u=u[k], stars=stars)
         for target, values in out.items():
             values[k] = observer.predict(0, target)[0]
     return out
@@ -49,7 +50,7 @@ def run_loop(controller: StepController, measurements: Measurements) -> Array:
         ngs = None
         if z_ngs is not None and n is not None and k > 0 and k % n == 0:
             ngs = z_ngs[k] + seen[k + 1 - n : k + 1].mean(axis=0)
-        u[k] = controller.update(z[k] + seen[k], ngs)
+        u[k] = controller.update(z[k] + seen[k], ngs, None if measurements.lgs_stars is None else int(measurements.lgs_stars[k]))
     return u
 
 

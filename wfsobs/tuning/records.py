@@ -170,6 +170,7 @@ def piece(record: Record, start: int, stop: int) -> Record:
         turbulence=part(record.turbulence),
         vibration=part(record.vibration),
         open_loop_y=part(record.open_loop_y),
+        lgs_stars=part(record.lgs_stars),
     )
 
 

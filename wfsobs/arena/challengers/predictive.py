@@ -56,6 +56,9 @@ class PredictiveLaw:
         self._new = lambda: Rls(ORDER * n_modes, n_modes, float(np.exp(-dt / MEMORY)), PENALTY)
         self.fit, self._recent = self._new(), np.zeros((ORDER + len(self._taps), n_modes))  # newest first
 
+    def see_stars(self, count: int | None) -> None:
+        """Take no notice: it learns from the mean as it is."""
+
     def command(self, z: Array, ngs: Array | None, forward: Array) -> Array:
         """Learn from the newest z (n_modes,), and return the command (n_modes,) [um]."""
         lag = len(self._taps)

@@ -19,11 +19,11 @@ from scipy.linalg import block_diag
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.gp.kernels import Kernel, Matern, Poles, Sho, SquaredExponentialInTime, Sum
-from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
 from wfsobs.observers.kalman.single import run_steady, seen_mode
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.missing import LINE_WIDTH
-from wfsobs.prior import Lines, Prior
+from wfsobs.prior import LgsStars, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.settings import Group, Real, Section
@@ -114,9 +114,9 @@ def measured_late(model: DisturbanceModel) -> DisturbanceModel:
 def filters_of(prior: Prior, settings: GaussianProcess) -> list[ModeFilter]:
     """Return the steady-state filters of z of all modes."""
     out = []
-    for lines in prior.lines:
+    for mode, lines in enumerate(prior.lines):
         model = sampled_model(kernels_of(lines, settings), lines.dt)
-        out.append(seen_mode(model, measured_late(model), lines.noise))
+        out.append(seen_mode(model, measured_late(model), lines.noise)._replace(mean=lgs_mean(prior, mode)))
     return out
 
 
@@ -136,7 +136,7 @@ GP_LGS = Observer(
     TARGETS,
     gp_lgs,
     help="Gaussian process in time, a kernel for the turbulence and one per line, as a filter; not in the paper",
-    prior=(Lines,),
+    prior=(Lines, LgsStars),
     settings=GP,
     linear=True,
     weight=2.0,

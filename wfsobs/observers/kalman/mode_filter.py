@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from wfsobs.observers.base import TARGETS
+from wfsobs.prior import Prior
 from wfsobs.signal.filter_covariance import lyapunov
-from wfsobs.signal.gap_gains import GapGains
+from wfsobs.signal.gap_gains import ONE, GapGains, SensorMean
 from wfsobs.signal.riccati import Step
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.signal.stepping import GainCycle
@@ -23,12 +24,14 @@ class ModeFilter(NamedTuple):
     gains    : of the filter
     posterior : covariance after the measurement, of every step that repeats; empty where it is not known
     cycle    : (A, C, Q, R) of every step that repeats, C zero where nothing is measured
+    mean     : the LGS whose mean it measures
     """
 
     model: DisturbanceModel
     gains: GainCycle
     posterior: tuple[Array, ...] = ()
     cycle: tuple[Step, ...] = ()
+    mean: SensorMean = ONE
 
     def rows(self, targets: Sequence[str]) -> Array:
         """Return rows of the whole state that give several targets, (len(targets), n)."""
@@ -52,14 +55,23 @@ class ModeFilter(NamedTuple):
         """Return the gains near gaps; steady again is what knows every process and the measurement as well as without one."""
         targets, (_, C, _, _) = self.rows(tuple(self.model.outputs)), self.cycle[-1]
         scale = np.mean([np.sum((targets @ P) * targets) for P in self.posterior])
-        return GapGains(self.cycle, self.posterior, np.vstack([self._pad_rows(self.model.pairs), C]), float(scale))
+        rows = np.vstack([self._pad_rows(self.model.pairs), C])
+        return GapGains(self.cycle, self.posterior, rows, float(scale), self.mean)
 
     def digest(self) -> bytes:
         """Return what tells models apart."""
-        return b"".join(x.tobytes() for step in (*self.cycle, (self.rows(TARGETS),)) for x in step)
+        return b"".join(x.tobytes() for step in (*self.cycle, (self.rows(TARGETS),), self.mean) for x in step)
 
     def _pad_rows(self, rows: Array) -> Array:
         return np.pad(rows, ((0, 0), (0, len(self.gains.steps[0].A) - rows.shape[1])))
+
+
+def lgs_mean(prior: Prior, mode: int, has_slow_error: bool = False) -> SensorMean:
+    """Return the LGS whose mean a filter measures, one where it is not told.
+
+    has_slow_error : whether the slow error of all is in its model
+    """
+    return prior.stars[mode].sensor_mean(has_slow_error) if prior.stars else ONE
 
 
 class StatedErrors:
@@ -89,8 +101,9 @@ class StatedErrors:
             self._least.append(np.array([0.0, 0.0, 0.0, other @ S @ other + c @ Q @ c + R[0, 0]]))
 
     def sd(self, P: Array, j: int) -> Array:
-        """Return them after step j of the cycle, (4,); P : covariance after the measurement, (n, n)."""
+        """Return them after step j of the cycle, (4,); P : covariance after the measurement, (n, n) or of more states."""
         rows = self._rows[j]
+        P = P[: rows.shape[1], : rows.shape[1]]
         variances = np.einsum("ij,ij->i", rows @ P, rows)
         variances[3] -= variances[4]
         return np.sqrt(np.maximum(variances[:4] + self._least[j], 0.0))

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
 from wfsobs.observers.kalman.single import run_steady, steady_mode
 from wfsobs.observers.kalman.step import KalmanEstimator
-from wfsobs.prior import Lines, Prior
+from wfsobs.prior import LgsStars, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.settings import Group, Real, Section, Whole
@@ -41,7 +41,8 @@ def kf_multi(measurements: Measurements, prior: Prior, settings: MultiPeak, watc
 
 def independent_filters(prior: Prior, settings: MultiPeak) -> list[ModeFilter]:
     """Return the steady-state filters of all modes, each of its own."""
-    return [steady_mode(one.disturbance(settings.line_width), one.noise) for one in prior.lines]
+    found = [steady_mode(one.disturbance(settings.line_width), one.noise) for one in prior.lines]
+    return [one._replace(mean=lgs_mean(prior, mode)) for mode, one in enumerate(found)]
 
 
 def step_kf_multi(prior: Prior, settings: MultiPeak, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
@@ -57,7 +58,7 @@ KF_MULTI = Observer(
     TARGETS,
     kf_multi,
     help="every line of the scenario in its model, turbulence of order 2 or 3; not in the paper",
-    prior=(Lines,),
+    prior=(Lines, LgsStars),
     settings=PEAKS,
     linear=True,
     takes_missing=True,

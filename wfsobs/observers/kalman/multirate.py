@@ -19,12 +19,12 @@ import param
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
 from wfsobs.observers.kalman.single import MODEL, NGS
 from wfsobs.observers.kalman.spread import by_target
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.kalman.with_gaps import run_frames
-from wfsobs.prior import Model, Prior
+from wfsobs.prior import LgsStars, Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.settings import Group, Real, Section
@@ -147,7 +147,7 @@ def run_modes(measurements: Measurements, modes: Sequence[ModeFilter], watch: Wa
     """Run the filters of all modes on both sensors."""
     n, z_ngs = measurements.ratio, measurements.z_ngs
     assert n is not None
-    if np.isnan(measurements.z).any() or np.isnan(z_ngs[n::n]).any():
+    if measurements.lgs_stars is not None or np.isnan(measurements.z).any() or np.isnan(z_ngs[n::n]).any():
         return run_frames(KalmanEstimator(modes), measurements, watch)
     z = np.stack([measurements.z, np.nan_to_num(z_ngs)], axis=1)
     columns, sd = [], []
@@ -168,7 +168,8 @@ def multirate(measurements: Measurements, prior: Prior, settings: MultiRate, wat
 
 def _filters(prior: Prior, settings: MultiRate, ratio: int) -> list[ModeFilter]:
     """Return the filters of all modes."""
-    return [multirate_mode(known.disturbance(), ratio, *multirate_noise(settings, known)) for known in prior.model]
+    found = [multirate_mode(known.disturbance(), ratio, *multirate_noise(settings, known)) for known in prior.model]
+    return [one._replace(mean=lgs_mean(prior, mode)) for mode, one in enumerate(found)]
 
 
 def multirate_mode(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_noise: float) -> ModeFilter:
@@ -194,7 +195,7 @@ MULTIRATE = Observer(
     (TURBULENCE,),
     multirate,
     help="LGS at every step, NGS at every n-th, two gains",
-    prior=(Model,),
+    prior=(Model, LgsStars),
     settings=RATES,
     needs=NGS,
     linear=True,

@@ -18,7 +18,7 @@ from wfsobs.observers.kalman.multi import PEAKS, MultiPeak
 from wfsobs.observers.kalman.multirate import MultiRate, multirate_noise
 from wfsobs.observers.kalman.multirate_optimal import Cycle, OptimalFilters, estimated_cycle
 from wfsobs.observers.kalman.single import NGS
-from wfsobs.prior import Beams, Lines, Model, Prior
+from wfsobs.prior import Beams, LgsStars, Lines, Model, Prior
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
@@ -49,7 +49,7 @@ MULTIRATE_MULTI = Observer(
     TARGETS,
     _FILTERS.run,
     help="both sensors, every line of the scenario in the model; not in the paper",
-    prior=(Model, Lines, Beams),
+    prior=(Model, LgsStars, Lines, Beams),
     settings=PEAKS,
     needs=NGS,
     linear=True,

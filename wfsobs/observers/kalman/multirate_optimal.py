@@ -18,7 +18,7 @@ from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, Look, Observer
 from wfsobs.observers.estimates import Estimates
-from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
 from wfsobs.observers.kalman.multirate import (
     RATES,
     TUNABLE,
@@ -30,7 +30,7 @@ from wfsobs.observers.kalman.multirate import (
 )
 from wfsobs.observers.kalman.single import NGS
 from wfsobs.observers.kalman.step import KalmanEstimator
-from wfsobs.prior import LgsError, Model, Prior
+from wfsobs.prior import LgsError, LgsStars, Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.ar2 import Ar2
@@ -90,11 +90,16 @@ def optimal_filter(cycle: list[Step], outputs: Array) -> tuple[MultiRateFilter, 
 
 
 class Cycle(NamedTuple):
-    """What is estimated in one mode: (A, C, Q, R) of the steps, rows of the state per target, and the disturbance alone."""
+    """What is estimated in one mode.
+
+    steps : (A, C, Q, R) of the steps;  rows : of the state per target
+    model : of the disturbance alone;  has_lgs_error : whether the slow error of the LGS is among the states
+    """
 
     steps: list[Step]
     rows: Array
     model: DisturbanceModel
+    has_lgs_error: bool = False
 
     def filter(self) -> ModeFilter:
         """Return the optimal filter."""
@@ -115,7 +120,7 @@ def estimated_cycle(
     """Return `optimal_cycle` with the rows of all targets."""
     steps = optimal_cycle(model, ratio, lgs_noise, ngs_noise, lgs_error)
     rows = model.output_rows(TARGETS)
-    return Cycle(steps, np.hstack([rows, np.zeros((len(rows), len(steps[0][0]) - rows.shape[1]))]), model)
+    return Cycle(steps, np.hstack([rows, np.zeros((len(rows), len(steps[0][0]) - rows.shape[1]))]), model, bool(lgs_error))
 
 
 class OptimalFilters(NamedTuple):
@@ -133,7 +138,8 @@ class OptimalFilters(NamedTuple):
 
     def _filters(self, prior: Prior, settings: Any, sampling: Sampling) -> list[ModeFilter]:
         assert sampling.ratio is not None
-        return [self.cycle_of(settings, prior, mode, sampling.ratio).filter() for mode in range(sampling.n_modes)]
+        found = [self.cycle_of(settings, prior, mode, sampling.ratio) for mode in range(sampling.n_modes)]
+        return [one.filter()._replace(mean=lgs_mean(prior, mode, one.has_lgs_error)) for mode, one in enumerate(found)]
 
 
 _FILTERS = OptimalFilters(optimal_model)
@@ -144,7 +150,7 @@ MULTIRATE_OPTIMAL = Observer(
     TARGETS,
     _FILTERS.run,
     help="periodic gains, frames as the means that they are; not in the paper",
-    prior=(Model, LgsError),
+    prior=(Model, LgsError, LgsStars),
     settings=RATES,
     needs=NGS,
     linear=True,

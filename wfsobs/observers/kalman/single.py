@@ -17,11 +17,11 @@ import numpy as np
 from wfsobs.observers.base import TARGETS, TURBULENCE, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.frame_step import FrameEstimator
-from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
 from wfsobs.observers.kalman.spread import FrameErrors, by_target
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.kalman.with_gaps import run_frames
-from wfsobs.prior import Model, Prior
+from wfsobs.prior import LgsStars, Model, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.ar2 import Ar2
@@ -61,13 +61,18 @@ def steady_filter(model: DisturbanceModel, noise: float, outputs: Array | None =
 
 def kf_lgs(measurements: Measurements, prior: Prior, _settings: None, watch: Watch) -> Estimates:
     """Run the Kalman filter on the LGS measurement, at every fast step."""
-    return run_steady(measurements, [steady_mode(one.disturbance(), one.lgs_noise) for one in prior.model], watch)
+    return run_steady(measurements, _lgs_filters(prior), watch)
+
+
+def _lgs_filters(prior: Prior) -> list[ModeFilter]:
+    found = enumerate(prior.model)
+    return [steady_mode(one.disturbance(), one.lgs_noise)._replace(mean=lgs_mean(prior, mode)) for mode, one in found]
 
 
 def run_steady(measurements: Measurements, modes: Sequence[ModeFilter], watch: Watch) -> Estimates:
     """Run the filters of all modes on z."""
     z, columns, sd = measurements.z, [], []
-    if np.isnan(z).any():
+    if np.isnan(z).any() or measurements.lgs_stars is not None:
         return run_frames(KalmanEstimator(modes), measurements, watch)
     for mode, one in enumerate(modes):
         watch.step(mode / measurements.n_modes)
@@ -79,7 +84,7 @@ def run_steady(measurements: Measurements, modes: Sequence[ModeFilter], watch: W
 
 def step_kf_lgs(prior: Prior, _settings: None, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
     """Return the filters of all modes, one frame at a time."""
-    return KalmanEstimator([steady_mode(one.disturbance(), one.lgs_noise) for one in prior.model])
+    return KalmanEstimator(_lgs_filters(prior))
 
 
 def steady_mode(model: DisturbanceModel, noise: float) -> ModeFilter:
@@ -168,7 +173,7 @@ KF_LGS = Observer(
     TARGETS,
     kf_lgs,
     help="steady-state Kalman filter, one vibration peak in its model",
-    prior=(Model,),
+    prior=(Model, LgsStars),
     linear=True,
     takes_missing=True,
     # The gain depends on the ratios of turbulence, vibration and noise. Turbulence tuned for vibration would be no turbulence.

@@ -56,7 +56,7 @@ class LinearEstimator:
 
     def __init__(self, modes: Sequence[ModeFilter]):
         self.modes = tuple(modes)
-        self.bank = GapBank([mode.gains for mode in modes], self._gaps)
+        self.bank = GapBank([mode.gains for mode in modes], self._gaps, [mode.mean for mode in modes])
         self._of_equal: dict[bytes, GapGains] = {}
 
     @property
@@ -89,7 +89,7 @@ class LinearEstimator:
         for mode, (new, was) in enumerate(zip(self.modes, old.modes, strict=True)):
             x = old.bank.x[mode, : len(was.model.A)]
             self.bank.x[mode, : len(new.model.A)] = carry_state(new.model, was.model, x)
-            self.bank.set_near(mode, old.bank.near[mode] if new.digest() == was.digest() else None)
+            self.bank.take_near(mode, old.bank if new.digest() == was.digest() else None)
 
 
 class KalmanEstimator(LinearEstimator):
@@ -111,6 +111,10 @@ class KalmanEstimator(LinearEstimator):
     def uses_ngs(self) -> bool:
         """Whether it takes NGS frames."""
         return self.bank.v.shape[1] > 1
+
+    def see_stars(self, count: int | None) -> None:
+        """Take the LGS measurement of the next frame for the mean over so many stars; None for all."""
+        self.bank.stars = count
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""

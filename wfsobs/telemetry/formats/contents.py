@@ -25,9 +25,12 @@ TIME, TIME_NGS = "time", "time_ngs"
 CLOCKS = (TIME, TIME_NGS)
 """Arrays (n,) [s]."""
 
+STARS = "lgs_stars"
+"""Array (n,) of whole numbers; in .npz alone."""
+
 NUMBERS = ("dt", "ratio", "delay", "command_sign")
 TEXTS = ("unit", "origin", "scenario")
-NAMES = (*SIGNALS, *CLOCKS, *NUMBERS, *TEXTS)
+NAMES = (*SIGNALS, *CLOCKS, STARS, *NUMBERS, *TEXTS)
 
 COLUMN = re.compile(r"(?:truth/)?(?P<array>[a-z_]+)/(?P<mode>[A-Za-z0-9 -]+?)(?:_(?P<unit>[A-Za-zµμ]+))?$")
 """Name of a column of one mode, such as y_lgs/tip_um."""
