@@ -1,21 +1,27 @@
-"""The tables of docs/events.md: `docs/scripts/events.py [seeds] [preset, "bridged" or "loop" ...] [--observers ID,ID...]`."""
+"""The tables of docs/events.md: `docs/scripts/events.py [seeds] [preset, bridged, loop, stars ...] [--observers ID,ID...]`."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import groupby
 
 import numpy as np
 
 from wfsobs.cli.recovery_tables import OverTime, recovery_texts
-from wfsobs.closed_loop.run import close_loop
+from wfsobs.closed_loop.design import design
+from wfsobs.closed_loop.run import close_loop, closed_loop
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import row_label
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.pipeline import run
+from wfsobs.priors_from.scenario import arguments
 from wfsobs.scenario.presets import PRESETS
+from wfsobs.simulation.loop import simulate
+from wfsobs.typing import Array
 
 CASES = {
     "peak-jump": TARGETS[1:],
@@ -97,12 +103,40 @@ def loop(seeds: int, controllers: Sequence[str] | None) -> str:
     return "\n".join(out)
 
 
+ONE_OUT = {"run.duration": 8.0, "events": [{"kind": "laser", "start": 4.0, "duration": 4.0, "lasers": 1}]}
+"""Changes of `laser-dropout`: one of two is out in the second half."""
+
+
+def stars(seeds: int, names: Sequence[str] | None) -> str:
+    """Errors and residuals of tip with one of two lasers out, of filters that take it for both and of such as are told."""
+    names = names or ("kf-lgs", "kf-multi", "multirate", "multirate-optimal", "multirate-multi")
+    scenario, squares = PRESETS["laser-dropout"]().replace(ONE_OUT), dict[str, list[list[float]]]()
+    plan, half = design(scenario, [f"lqg-{name}" for name in names]), slice(round(4.0 / scenario.dt), None)
+    for seed in range(1, seeds + 1):
+        record = simulate(scenario.replace({"run.seed": seed}))
+        errors: dict[str, list[Array]] = {}
+        for one in (replace(record, lgs_stars=None), record):
+            for name in names:
+                found = OBSERVERS[name].estimate(*arguments(OBSERVERS[name], one, scenario.before_events))
+                for target in OBSERVERS[name].targets:
+                    errors.setdefault(f"{target}, {row_label(name)}", []).append(found[target] - record.truth(target))
+            for outcome in closed_loop(one, plan).outcomes:
+                assert outcome.residual is not None
+                errors.setdefault(f"residual, `{outcome.controller}`", []).append(outcome.residual)
+        for row, pair in errors.items():
+            squares.setdefault(row, []).append([float(np.mean(x[half, 0] ** 2)) for x in pair])
+    out = ["| one of two lasers out | taken for both, nm | told, nm |\n|---|---:|---:|"]
+    for row, pairs in sorted(squares.items()):
+        out.append(f"| {row} | {' | '.join(f'{1e3 * x:.2f}' for x in np.sqrt(np.mean(pairs, axis=0)))} |")
+    return "\n".join(out)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("seeds", type=int, nargs="?", default=20)
-    parser.add_argument("what", nargs="*", default=[*CASES, "bridged", "loop"])
+    parser.add_argument("what", nargs="*", default=[*CASES, "bridged", "loop", "stars"])
     parser.add_argument("--observers", type=lambda text: text.split(","), help="these alone; all unless told")
     given = parser.parse_args()
     for one in given.what:
-        make = {"bridged": bridged, "loop": loop}.get(one) or partial(tables, one)
+        make = {"bridged": bridged, "loop": loop, "stars": stars}.get(one) or partial(tables, one)
         print(make(given.seeds, given.observers))
