@@ -22,7 +22,7 @@ from wfsobs.evaluation.linear_response import SETTLED, SHORTEST, estimate_and_er
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.prior import Beams, LgsError, Lines, Prior, Training
+from wfsobs.prior import Beams, LgsError, LgsStars, Lines, Prior, Training
 from wfsobs.priors_from.scenario import lines_of, observer_settings, prior_of
 from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence
 from wfsobs.scenario import Scenario
@@ -194,7 +194,7 @@ class Theory:
         return self._keep(f"response {name}, {target}", Identity(h), lambda: np.fft.rfft(h, n))
 
     def _prior(self, observer: Observer, scenario: Scenario, mode: int) -> Prior:
-        cheap = [part for part in observer.prior if part not in (Lines, Beams, LgsError)]
+        cheap = [part for part in observer.prior if part not in (Lines, Beams, LgsError, LgsStars)]
         prior = prior_of(scenario, None, cheap, modes=[mode])
         if Lines in observer.prior:
             prior = replace(prior, lines=(self._lines(scenario, mode),))
