@@ -73,7 +73,7 @@ def star_by_star(name: str, scenario: Scenario, record: Record, mode: int) -> li
         lines = prior.lines[mode]
         seen = measured_late(sampled_model(kernels_of(lines, scenario.gp), lines.dt))
     elif name == "multirate-multi":
-        seen = beam_model(prior.beams[mode], prior.lines[mode].peaks(scenario.multipeak.line_width))
+        seen = beam_model(prior.beams[mode], prior.lines[mode].vibration(scenario.multipeak.line_width))
     else:
         seen = prior.model[mode].disturbance()
     error = disturbance_model([low_frequency_process(scenario, mode)], ())
