@@ -13,12 +13,10 @@ from wfsobs.scenario import Scenario
 
 SEEDS = range(1, 11)
 OBSERVERS = ("kf-lgs", "kf-multi", "kf-coupled")
-ASTERISM = {"sensors.lgs_count": 4, "sensors.lgs_radius": 17.5}
 CASES: dict[str, dict[str, Any]] = {
     "two LGS on the axis, their mean": {},
     "the same in wind of 5 m/s": {"turbulence.wind_speed": 5.0},
     "the same in wind of 30 m/s": {"turbulence.wind_speed": 30.0},
-    'four LGS at 17.5", minimum variance': {**ASTERISM, "sensors.lgs_combination": "minimum-variance"},
 }
 
 
