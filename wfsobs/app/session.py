@@ -18,6 +18,7 @@ import panel as pn
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.mends import mend_panel
 from wfsobs.app.service import Post
+from wfsobs.app.share import has_settings
 
 log = logging.getLogger(__name__)
 
@@ -28,8 +29,9 @@ def session_page(build: Callable[[Post], Dashboard]) -> Any:
     try:
         post = Poster()
         dashboard = build(post)
-        if query := page_query():
-            dashboard.actions.open_link(query)
+        query = page_query()
+        if has_settings(query) or (query and dashboard.store.session.service.live is None):
+            dashboard.actions.open_link(query)  # else the settings are those of the loop that all pages show
         session_page = dashboard.page()
         if query:
             dashboard.actions.open_view(query)

@@ -108,6 +108,15 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
     return Link(scenario, name, (*rejected, *refused, *more), simulation)
 
 
+def has_settings(query: str) -> bool:
+    """Return whether a query has settings, and not the view alone.
+
+    >>> has_settings("?view.page=live&theme=dark"), has_settings("?preset=ut4&view.page=live")
+    (False, True)
+    """
+    return any(not key.startswith(PASSED_OVER) for key, _ in parse_qsl(query.removeprefix("?"), keep_blank_values=True))
+
+
 def value_text(path: str, value: Any) -> str:
     """Write a setting's plain value as a link has it."""
     if isinstance(value, list) and value and isinstance(value[0], dict):

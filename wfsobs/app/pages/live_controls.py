@@ -31,6 +31,8 @@ MAIN = ("kf-multi", "multirate-multi", "gpr-online")
 """Observers whose lines are shown first."""
 OBSERVERS, CONTROLLERS, SPEED = "live.observers", "live.controllers", "live.speed"
 """Fields of a link."""
+APART: dict[str, Any] = {**WIDE, "margin": (10, 0, 4, 0)}
+"""As wide as the page, its label clear of the row above."""
 BUTTONS = {
     "Start": "play_arrow",
     "Pause": "pause",
@@ -84,18 +86,18 @@ class LiveControls:
         self.ngs = pmui.Checkbox(label="NGS", value=True, **select)
         self.losses = pmui.Select(label="Lost", options=LOSSES, value=0.0, width=150, **select)
         self.running = pmui.MultiChoice(
-            label="Observers", options={look(name).label: name for name in SLOTS}, value=list(FIRST), **WIDE
+            label="Observers", options={look(name).label: name for name in SLOTS}, value=list(FIRST), **APART
         )
         self.controllers = pmui.MultiChoice(
-            label="Controllers", options={look(name).label: name for name in SEATS}, value=list(USUAL), **WIDE
+            label="Controllers", options={look(name).label: name for name in SEATS}, value=list(USUAL), **APART
         )
         waterfall = {"the measurement": MEASUREMENT} | {f"error of {label}": name for label, name in self.running.options.items()}
         self.waterfall = pmui.Select(label="Waterfall of", options=waterfall, value=MEASUREMENT, width=230, **select)
-        self.lines = pmui.MultiChoice(label="Lines", options=self.running.options, value=list(MAIN), **WIDE)
+        self.lines = pmui.MultiChoice(label="Lines", options=self.running.options, value=list(MAIN), **APART)
 
     def tell(self, loop: LiveLoop) -> None:
         """Show what runs."""
-        self.running.value = loop.board.active()
+        self.running.value, self.speed.value = loop.board.active(), loop.speed
         shown = self.lines.value
         self.lines.value = [*shown, *(name for name in ADAPTIVE if name in self.running.value and name not in shown)]
         self.controllers.value = [name for name in SEATS if name in loop.controllers]

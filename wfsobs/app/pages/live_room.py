@@ -14,16 +14,20 @@ from wfsobs.app.pages.live_figures import LatencyHistogram, RollingSpectra, Roll
 from wfsobs.app.pages.live_stars import Stars
 from wfsobs.app.pages.live_table import Bounds, control_html, events_html, live_html, peaks_html
 from wfsobs.app.pages.live_waterfall import MEASUREMENT, Waterfall
-from wfsobs.app.pages.parts import WIDE, box, figure_with_caption, group, html, line
+from wfsobs.app.pages.parts import WIDE, box, figure_with_caption, group, html, legend, line
 from wfsobs.app.store import Store
+from wfsobs.app.style import look
 from wfsobs.app.views.frames import Frames
 from wfsobs.app.views.spectrum_editor import SpectrumEditor
+from wfsobs.app.work import TRUTH
+from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.evaluation.theory import Theory
 from wfsobs.live.board import NEXT
 from wfsobs.live.finding import bounds_of
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.source import SIMULATION
 from wfsobs.live.view import LiveView
+from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
 
 SLOW = 1.0
@@ -43,6 +47,7 @@ class LiveRoom:
         self.latencies, self.stars = LatencyHistogram(), Stars()
         self.table, self.control_table, self.news, self.peaks = html(), html(), html(), html()
         self.editor: SpectrumEditor | None = None
+        self.legend = html()
         self._table_time = 0.0
         self._bounds: Bounds = {}
         self._bounds_of: Scenario | None = None
@@ -66,7 +71,7 @@ class LiveRoom:
             pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0),
         )
         return [
-            box("Now", switches, c.lines, pn.Column(*figures, **WIDE, stylesheets=[GRID])),
+            box("Now", switches, c.lines, self.legend, pn.Column(*figures, **WIDE, stylesheets=[GRID])),
             box("Observers", self.table, self.peaks),
             box("Controllers on the same disturbance", c.controllers, self.control_table, self.stars.row),
             box("Events", self.news),
@@ -100,10 +105,20 @@ class LiveRoom:
         if self._bounds_of is not loop.scenario:
             self._bounds_of, self._bounds = loop.scenario, {}
             loop.workshop.do(bounds_of, loop.scenario.to_dict(), then=partial(setattr, self, "_bounds"))
+        self.legend.object = self._legend(loop, target)
         self.table.object = live_html(loop, view, target, self.display, scale, self._bounds)
         self.control_table.object = control_html(loop, self.controls.window.value, self.display)
         self.news.object = events_html(loop.events, loop.sampling.dt)
         self.peaks.object = peaks_html(loop.workshop.finding, scale, self.display.unit_label)
+
+    def _legend(self, loop: LiveLoop, target: str) -> str:
+        """Write what the lines of the figures are."""
+        wanted = TARGETS if target == NEXT else (target,)
+        active = [name for name in loop.board.active() if name in self.controls.lines.value]
+        names = [name for name in active if set(wanted) <= set(loop.targets(name))]
+        truth = [] if self.display.error else [TRUTH]
+        bounds = [name for name in BOUNDS if self.display.running and target in self._bounds.get(name, ())]
+        return legend({name: look(name).label for name in (*truth, *names, *bounds)}, self.display.dark)
 
     def _edit(self, loop: LiveLoop, target: str) -> None:
         """Lay the handles over the spectra of a simulation, whose settings they are."""

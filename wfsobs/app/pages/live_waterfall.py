@@ -19,8 +19,8 @@ COLUMNS, ROWS = 120, 128
 """Spectra that are kept: a minute. Frequencies of each, in equal steps of the logarithm."""
 LOWEST = 1.0
 """Frequency at which it begins [Hz]."""
-DECADES = 5
-"""Of the colours."""
+FLOOR, DECADES = 0.05, 2.0
+"""The darkest colour is that below which this part of the spectra is; the colours span so many decades at least."""
 MOST_MISSING = 0.2
 """Part of a second that may be missing; it is bridged by straight lines."""
 
@@ -84,7 +84,7 @@ class Waterfall:
         if not np.isfinite(image).any():
             return
         high = float(np.nanmax(image))
-        self._colours.update(low=high * 10.0**-DECADES, high=high)
+        self._colours.update(low=min(float(np.nanquantile(image, FLOOR)), high * 10.0**-DECADES), high=high)
         self._bar.update(
             title=f"{display.unit_label}²/Hz",
             background_fill_alpha=0.0,
