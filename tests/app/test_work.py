@@ -63,7 +63,7 @@ def test_deliveries_are_held_back(short: Scenario, monkeypatch: pytest.MonkeyPat
     quick, shown = told
     assert quick is not None and shown is not None
     learning = {"gpr-online", "gpr-adaptive", "kf-adaptive", "multirate-adaptive"}
-    for here, missing in ((quick, {"gpr-offline", "ridge", "gp-lgs", "gp-both", *learning}), (shown, learning)):
+    for here, missing in ((quick, {"gpr-offline", "ridge", "gp-lgs", "gp-both", "kf-coupled", *learning}), (shown, learning)):
         assert {name for name, _ in keys(here)} == set(OBSERVERS) - missing
 
 
