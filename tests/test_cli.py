@@ -106,6 +106,7 @@ def test_observers_that_lack_something_are_left_out_with_a_line(tmp_path):
         ("kf-lgs", "next z"),
         ("kf-multi", "next z"),
         ("kf-adaptive", "next z"),
+        ("kf-coupled", "next z"),
         ("gp-lgs", "next z"),
         ("zero", "next z"),
         ("loop", "residual y"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -86,7 +86,7 @@ class Signals:
     ratio: int | None = None
     open_loop_y: Array | None = None
     delay: int = DELAY
-    lgs_stars: Array | None = None
+    lgs_stars: Array | None = field(default=None, kw_only=True)
 
     @property
     def n_steps(self) -> int:
@@ -177,7 +177,7 @@ class Record(Signals):
             self.ratio,
             None if twin is None else _own(twin),
             self.delay,
-            None if self.lgs_stars is None else self.lgs_stars.copy(),
+            lgs_stars=None if self.lgs_stars is None else self.lgs_stars.copy(),
         )
 
     def truth(self, target: str) -> Array | None:

@@ -89,7 +89,9 @@ def test_what_is_allowed_is_within_every_bound(duration: float, rate: float, m: 
 
 
 def test_the_whole_run_is_bounded_where_each_setting_is_not() -> None:
-    assert refused(Limits(seconds=3), {"run.duration": 100}).startswith("The run would take about 8 s, at most 3 on this server")
+    expected = run_seconds(PRESETS["paper"]().replace({"run.duration": 100}))
+    line = refused(Limits(seconds=3), {"run.duration": 100})
+    assert line.startswith(f"The run would take about {expected:.0f} s, at most 3 on this server")
     assert refused(Limits(megabytes=50), {}).startswith("The run would take about 108 MB of memory, at most 50")
 
 

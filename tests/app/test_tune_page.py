@@ -91,7 +91,7 @@ def using_it_leaves_the_other_settings(page: TunePage, dashboard: Dashboard, fou
 
 def test_a_gpr_and_its_likelihood(page: TunePage, dashboard: Dashboard, loop: Any) -> None:
     page.observer.value, page.evaluations.value = "gpr-offline", "3"
-    assert page.target.options == ["vibration"] and "gpr_offline.noise_std" in page.search_space.object
+    assert page.target.options == ["vibration"] and "Offline GPR: Noise" in page.search_space.object
     found = tuned(page, loop)
     assert found.before.likelihood and found.after.likelihood
     cells = row(page.table.object, "likelihood", "tilt")

@@ -39,6 +39,7 @@ def told(name: str, between: str) -> tuple[Prior, object]:
         one,
         model=one.model[:1] * RECORDS,
         lgs_error=(LgsError(slow),) * RECORDS if one.lgs_error else (),
+        stars=one.stars[:1] * RECORDS,
         lines=one.lines[:1] * RECORDS,
         beams=tuple(replace(beams, lgs=(slow,)) for beams in one.beams[:1]) * RECORDS,
     )
@@ -114,6 +115,9 @@ def test_stated_frame_by_frame_as_over_a_record(name: str) -> None:
 @pytest.mark.parametrize("name", list(OBSERVERS))
 def test_every_observer_with_a_model_states_something(name: str) -> None:
     changes = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50, "adaptive.window": 0.5}
+    if name == "gpr-adaptive":  # half a second is too short for it to be sure of a line
+        changes |= {"run.duration": 3.0, "adaptive.window": 1.0}
+    known = slice(round(changes["run.duration"] * 500), None)
     found = wfsobs.run(wfsobs.PRESETS["paper"]().replace(changes), observers=[name])
     with_model = name.startswith(("kf", "multirate", "gp"))
     assert found.estimates
@@ -122,9 +126,9 @@ def test_every_observer_with_a_model_states_something(name: str) -> None:
         if estimate.sd is not None:
             assert estimate.sd.shape == estimate.values.shape
             stated = np.isfinite(estimate.sd)
-            assert not stated[np.isnan(estimate.values)].any() and stated[1000:].all()
+            assert not stated[np.isnan(estimate.values)].any() and stated[known].all()
             # zero where its model has no vibration: what was identified in a short window
-            assert (estimate.sd[1000:] >= 0).all() and ("adaptive" in name or (estimate.sd[1000:] > 0).all())
+            assert (estimate.sd[known] >= 0).all() and ("adaptive" in name or (estimate.sd[known] > 0).all())
     for score in found.scores:
         if score.observer == name:
             assert (score.calibration is not None) == with_model

@@ -62,7 +62,8 @@ def split_record(
     """
     assert record.turbulence is not None and record.vibration is not None and record.ratio is not None
     assert record.open_loop_y is not None
-    total, noise, nothing = OpenLoop(record.open_loop_y, record.z_ngs), simulate_noise(scenario), np.zeros_like(record.vibration)
+    total = OpenLoop(record.open_loop_y, record.z_ngs, record.lgs_stars)
+    noise, nothing = simulate_noise(scenario), np.zeros_like(record.vibration)
     split = [split_lines(x, record.dt, *of) for x, *of in zip(record.vibration.T, lines, given_lines, strict=True)]
     known = np.column_stack(split)
     others = record.vibration - known
@@ -93,7 +94,8 @@ def split_lines(vibration: Array, dt: float, lines: Sequence[float], given_lines
 
 def sum_sources(parts: Sequence[Source]) -> OpenLoop:
     """Return the measurements of several sources together."""
-    return OpenLoop(sum(part.measurement.lgs for part in parts), sum(part.measurement.ngs for part in parts))  # type: ignore[arg-type]
+    seen = [part.measurement for part in parts]
+    return OpenLoop(sum(one.lgs for one in seen), sum(one.ngs for one in seen), seen[0].stars)  # type: ignore[arg-type]
 
 
 def _see(signal: Array, ratio: int) -> OpenLoop:
@@ -102,4 +104,5 @@ def _see(signal: Array, ratio: int) -> OpenLoop:
 
 
 def _where_measured(open_loop: OpenLoop, total: OpenLoop) -> OpenLoop:
-    return OpenLoop(np.where(np.isnan(total.lgs), np.nan, open_loop.lgs), np.where(np.isnan(total.ngs), np.nan, open_loop.ngs))
+    lgs, ngs = np.where(np.isnan(total.lgs), np.nan, open_loop.lgs), np.where(np.isnan(total.ngs), np.nan, open_loop.ngs)
+    return OpenLoop(lgs, ngs, total.stars)

@@ -22,6 +22,7 @@ from wfsobs.prior import Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, RecordError, Sampling
 from wfsobs.signal.periodic import PeriodicFilter
+from wfsobs.spectral.quick import SHORTEST
 from wfsobs.typing import Array
 
 
@@ -62,7 +63,9 @@ def step_gpr_adaptive(_prior: Prior, settings: Adaptive, sampling: Sampling, hor
 
 
 def seconds(settings: Adaptive, n_steps: int, n_modes: int, dt: float) -> float:
-    """6 ms + 1.3 us per sample for every time of learning, one mode after the other [s]."""
+    """6 ms + 1.3 us per sample for every time of learning, one mode after the other [s]; nothing for a window that it refuses."""
+    if settings.window < SHORTEST * dt:
+        return 0.0
     schedule = schedule_of(settings, dt)
     ends = range(schedule.first, n_steps, schedule.interval)
     return n_modes * sum(6e-3 + 1.3e-6 * min(end, schedule.longest) for end in ends)
