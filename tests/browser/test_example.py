@@ -38,5 +38,5 @@ def test_settings_of_another_package_in_the_drawer(with_example: Any, open_page:
     box.fill("1")
     box.press("Enter")
     expect(error).to_have_text(re.compile(rf"^(?!(.*\s)?{re.escape(before)}$).*\d$", re.S))
-    expect(page.get_by_text("low_pass.corner").first).to_be_visible()
+    expect(page.get_by_text("Low-pass: Corner").first).to_be_visible()
     page.screenshot(path=tmp_path / "drawer.png")

@@ -66,7 +66,7 @@ def test_by_mouse(page: Page) -> None:
     expect(peak).to_have_attribute("aria-valuetext", STANDS)
     curve = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
         .filter(m => m.type === "GlyphRenderer" && m.name === "predicted" && m.data_source.data.ys?.length > 3)
-        .map(m => m.data_source.data.ys[0][60])[0]"""
+        .map(m => m.data_source.data.ys.map(y => y[60]).join()).join()"""
     page.wait_for_function(curve)
     before = page.evaluate(curve)
     x, y = middle(peak)

@@ -96,11 +96,14 @@ class Traces(TargetFigures):
 
 
 class _Band:
-    """The band around a line that is alone; nothing in the figure until there is one."""
+    """The band around a line that is alone, and what it is in words; no band in the figure until there is one."""
 
     def __init__(self, fig: figure):
         self.figure, self.source = fig, ColumnDataSource({"x": [], "low": [], "high": []})
         self.renderer: GlyphRenderer | None = None
+        place = {"x": 6, "y": 6, "x_units": "screen", "y_units": "screen", "text_font_size": "12px"}
+        self.label = Label(text="shaded: where 95 % are by its own model", visible=False, **place)
+        fig.add_layout(self.label)  # from the start: the browser looks for it in vain if it comes later
 
     def draw(self, x: Array, low: Array, high: Array, colour: str) -> None:
         """Shade what is between two edges."""
@@ -108,9 +111,6 @@ class _Band:
         if self.renderer is None:
             look_of = {"fill_alpha": 0.2, "name": "band", "level": "underlay"}
             self.renderer = self.figure.varea("x", "low", "high", source=self.source, **look_of)
-            place = {"x": 6, "y": 6, "x_units": "screen", "y_units": "screen", "text_font_size": "12px"}
-            self.label = Label(text="shaded: where 95 % are by its own model", **place)
-            self.figure.add_layout(self.label)
         self.renderer.glyph.fill_color = self.label.text_color = colour
         self.renderer.visible = self.label.visible = True
 
