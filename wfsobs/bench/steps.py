@@ -67,6 +67,17 @@ def reference_step() -> Step:
 
 
 @contextmanager
+def set_aside() -> Iterator[None]:
+    """Have the garbage collector leave alone what is there already: it would go through all of that before every timing."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+
+
+@contextmanager
 def quiet() -> Iterator[None]:
     """Keep the garbage collector out."""
     was = gc.isenabled()

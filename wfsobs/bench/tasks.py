@@ -12,7 +12,7 @@ from wfsobs.bench.filters import adaptive_record, kalman_record, multirate_recor
 from wfsobs.bench.gpr import offline, online_record, online_stream
 from wfsobs.bench.measure import OURS, Row, measure_time, peak_memory_mb, row, with_ratios
 from wfsobs.bench.sizes import Sizes
-from wfsobs.bench.steps import steps
+from wfsobs.bench.steps import set_aside, steps
 from wfsobs.bench.turbulence import frozen
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
@@ -87,7 +87,7 @@ def measure_all(
     libraries = external.is_installed() if libraries is None else libraries
     total, done = sum(task.weight for task in TASKS), 0.0
     found: list[list[Row]] = []
-    with threadpool_limits(1, user_api="blas"):
+    with threadpool_limits(1, user_api="blas"), set_aside():
         for task in TASKS:
             found.append(with_ratios(list(task.run(sizes, libraries))))
             done += task.weight
