@@ -14,7 +14,8 @@ from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.bound_both import bound_rms_of_both, least_errors_of_both
 from wfsobs.evaluation.record_bounds import record_bounds
 from wfsobs.evaluation.rows import can_be_best
-from wfsobs.evaluation.scores import BOUND_BOTH, COMMON_BOUNDS
+from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, COMMON_BOUNDS
+from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.multirate_optimal import optimal_cycle
 from wfsobs.priors_from.scenario import kalman_model
 from wfsobs.priors_from.turbulence import measurement_noise
@@ -232,3 +233,16 @@ def test_events_have_none_and_no_bound_is_best() -> None:
     assert record_bounds(scenario, record) == []
     found = record_bounds(scenario.before_events, record)
     assert {bound.row for bound in found} == set(COMMON_BOUNDS) and not can_be_best(BOUND_BOTH, False)
+
+
+def test_what_is_remembered_is_of_these_settings() -> None:
+    scenario = PRESETS["paper"]().replace({"run.duration": 2.0})
+    for changed in ({"run.seed": 7}, {"turbulence.wind_speed": 30.0}, {"sensors.lgs_noise": 0.01}, {"run.duration": 3.0}):
+        record_bounds(scenario, simulate(scenario))  # in the memory before each
+        other = scenario.replace(changed)
+        found = {(it.row, it.target, it.column): it.error.rms for it in record_bounds(other, simulate(other))}
+        for mode in range(2):
+            both, alone = bound_rms_of_both(other, mode), bound_rms(other, mode)
+            for target in TARGETS:
+                assert found[BOUND_BOTH, target, mode] == both[target], changed
+                assert found[BOUND, target, mode] == alone[target], changed

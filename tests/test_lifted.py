@@ -62,6 +62,8 @@ def test_blocks_give_what_the_plain_loop_gives(
     # products of matrices cost eps of the same loop with absolute values, times the numbers summed per step (n + m)
     tolerance = 1e-14 * (n + m) * bound(steps, v, x0)
     assert np.abs(got - plain(steps, v, x0)).max() <= max(tolerance, 1e-13)
+    since = data.draw(st.integers(0, n_steps))
+    assert np.abs(PeriodicFilter(steps).run(v, x0, since=since) - got[since:]).max(initial=0.0) <= max(tolerance, 1e-13)
     if len(steps) == 1:
         zero = PeriodicFilter(steps).run(v)
         assert np.abs(zero - plain(steps, v, 0 * x0)).max() <= max(tolerance, 1e-13)

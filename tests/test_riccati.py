@@ -255,6 +255,9 @@ def test_periodic_solution_around_the_cycle() -> None:
         after = A @ (state.P - gain @ Cj @ state.P) @ A.T + Q
         assert np.allclose(after, states[(i + 1) % 5].P, rtol=0, atol=1e-10 * np.abs(state.P).max())
         assert np.allclose(state.L, gain, rtol=0, atol=1e-10)
+    # a step that comes again as the same object is taken by halves, equal ones are taken one by one
+    for one, other in zip(periodic_steady_state([tuple(step) for step in map(list, cycle)]), states, strict=True):
+        assert np.allclose(one.P, other.P, rtol=0, atol=1e-10 * np.abs(one.P).max())
     steady = steady_state(model.A, model.C, model.Q, np.array(4e-4))
     for state in periodic_steady_state([(model.A, model.C[None], model.Q, np.array([[4e-4]]))] * 3):
         assert np.allclose(state.P, steady.P, rtol=0, atol=1e-10 * np.abs(steady.P).max())

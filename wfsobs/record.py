@@ -77,6 +77,9 @@ class Signals:
         Steps from a command to the first measurement that sees it, y_lgs[k] = phi_dist[k-1] + u[k-delay] + noise.
     lgs_stars : Array or None
         Number of LGS that y_lgs is the combination of, the first ones, (n_steps,), integers; None where it is all, or not known.
+    y_stars : Array or None
+        Measurement of each LGS by itself, (n_steps, n_lgs, n_modes) [um], NaN where a star is out or a frame is missing; None
+        where it is not known, or where all see the same.
     """
 
     y_lgs: Array
@@ -87,6 +90,7 @@ class Signals:
     open_loop_y: Array | None = None
     delay: int = DELAY
     lgs_stars: Array | None = field(default=None, kw_only=True)
+    y_stars: Array | None = field(default=None, kw_only=True)
 
     @property
     def n_steps(self) -> int:
@@ -112,6 +116,13 @@ class Signals:
     def z(self) -> Array:
         """Pseudo-open-loop LGS measurement, z[k] = y_lgs[k] - u[k-delay] = phi_dist[k-1] + noise [um]; NaN where either is."""
         return pseudo_open_loop(self.y_lgs, self.u, self.delay)
+
+    @property
+    def z_stars(self) -> Array:
+        """Pseudo-open-loop measurement of each LGS, (n_steps, n_lgs, n_modes) [um]. Raises RecordError without stars apart."""
+        if self.y_stars is None:
+            raise RecordError("the record has no y_stars")
+        return self.y_stars - delay_signal(self.u, self.delay)[:, None]
 
     @property
     def z_ngs(self) -> Array:
@@ -178,6 +189,7 @@ class Record(Signals):
             None if twin is None else _own(twin),
             self.delay,
             lgs_stars=None if self.lgs_stars is None else self.lgs_stars.copy(),
+            y_stars=None if self.y_stars is None else _own(self.y_stars),
         )
 
     def truth(self, target: str) -> Array | None:

@@ -154,6 +154,8 @@ def _without_budget(observer: Observer, by_name: bool) -> str:
     """Return why an observer has no budget, empty if it has."""
     if not observer.causal:
         return "looks ahead"
+    if "y_stars" in observer.needs:
+        return "takes every LGS by itself"
     return "" if observer.linear or by_name else "not linear, takes 16 runs: only if named"
 
 

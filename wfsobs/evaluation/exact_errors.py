@@ -33,7 +33,9 @@ from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array
 
 
-def exact_errors(observer: Observer, scenario: Scenario) -> list[dict[str, PeriodicError]]:
+def exact_errors(
+    observer: Observer, scenario: Scenario, *, spectra: Sequence[TrueSpectra] = ()
+) -> list[dict[str, PeriodicError]]:
     """Compute the errors of an observer that is told the scenario, mode by mode.
 
     Parameters
@@ -42,6 +44,8 @@ def exact_errors(observer: Observer, scenario: Scenario) -> list[dict[str, Perio
         Linear and causal, one mode apart from the others, without a training record.
     scenario : Scenario
         Of known spectra (`has_known_spectra`).
+    spectra : sequence of TrueSpectra
+        Mode by mode, what it meets; by default the true spectra of the scenario, which leave out aliasing (`lenslet_spectra`).
 
     Returns
     -------
@@ -60,8 +64,8 @@ def exact_errors(observer: Observer, scenario: Scenario) -> list[dict[str, Perio
             f"{observer.id}: the exact error is that of an observer that is linear, causal and needs no training record, "
             "and takes every mode by itself"
         )
-    spectra = [true_spectra(scenario, mode) for mode in range(len(scenario.modes))]
-    return errors_under(observer, prior_of(scenario, None, parts), settings, scenario.dt, spectra)
+    met = spectra or [true_spectra(scenario, mode) for mode in range(len(scenario.modes))]
+    return errors_under(observer, prior_of(scenario, None, parts), settings, scenario.dt, met)
 
 
 def errors_under(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 
 from wfsobs.evaluation.bound import LeastError, least_errors
 from wfsobs.evaluation.bound_both import PeriodicError, least_errors_of_both
@@ -16,6 +17,8 @@ from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import rms
 from wfsobs.simulation.star_spectra import star_spectra, stars_differ
 from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
+
+Errors = dict[str, LeastError] | dict[str, PeriodicError]
 
 
 @dataclass(frozen=True)
@@ -45,26 +48,28 @@ def record_bounds(scenario: Scenario, record: Record) -> list[Bound]:
     """Compute the bounds of a record that was simulated from the scenario; none where its spectra are not known."""
     if not has_known_spectra(scenario):
         return []
-    modes = scenario.modes[: record.n_modes]
+    found = _least_of_modes(scenario.replace({"run.seed": 0}), record.n_modes, record.n_steps)
+    return [
+        Bound(row, target, it.name, i, errors[target])
+        for i, it in enumerate(scenario.modes[: record.n_modes])
+        for row, errors in found[i].items()
+        for target in TARGETS
+    ]
 
-    def of_mode(mode: int) -> dict[str, dict[str, LeastError] | dict[str, PeriodicError]]:
+
+@lru_cache(maxsize=4)  # no seed changes them, and they take longer than most observers
+def _least_of_modes(scenario: Scenario, n_modes: int, n_steps: int) -> list[dict[str, Errors]]:
+    """Compute row -> target -> error of the first modes of a scenario."""
+
+    def of_mode(mode: int) -> dict[str, Errors]:
         spectra = true_spectra(scenario, mode)
-        found: dict[str, dict[str, LeastError] | dict[str, PeriodicError]] = {
-            BOUND: least_errors(spectra, n_steps=record.n_steps),
-            BOUND_BOTH: least_errors_of_both(spectra),
-        }
+        found: dict[str, Errors] = {BOUND: least_errors(spectra, n_steps=n_steps), BOUND_BOTH: least_errors_of_both(spectra)}
         if stars_differ(scenario, mode):
             found[BOUND_STARS] = least_errors_of_stars(star_spectra(scenario, mode))
         return found
 
     with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(of_mode, range(len(modes))))
-    return [
-        Bound(row, target, it.name, i, errors[target])
-        for i, it in enumerate(modes)
-        for row, errors in found[i].items()
-        for target in TARGETS
-    ]
+        return list(pool.map(of_mode, range(n_modes)))
 
 
 def bound_scores(bounds: Sequence[Bound], record: Record, scores: Sequence[Score], warm_up: float) -> list[Score]:

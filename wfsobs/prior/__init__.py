@@ -6,13 +6,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from wfsobs.prior.parts import Bands, Beams, Flow, LgsError, LgsStars, Line, Lines, Model, Spectra
+from wfsobs.prior.parts import Asterism, Bands, Beams, Flow, LgsError, LgsStars, Line, Lines, Model, Spectra
 from wfsobs.record import Training
 
 __all__ = [
     "GIVEN",
     "IDENTIFIED",
     "TRUE",
+    "Asterism",
     "Bands",
     "Beams",
     "Flow",
@@ -45,6 +46,7 @@ Part = (
     | type[Lines]
     | type[Beams]
     | type[Flow]
+    | type[Asterism]
     | type[Bands]
     | type[Spectra]
     | type[Training]
@@ -58,6 +60,7 @@ _WORDS: dict[Part, tuple[str, ...]] = {
     Lines: ("model", "{source} lines"),
     Beams: ("model",),
     Flow: ("model",),
+    Asterism: ("model",),
     Bands: ("bands",),
     Spectra: ("{source} spectra",),
     Training: ("training data",),
@@ -79,7 +82,7 @@ class Prior:
     """The parts that an observer or a controller asked for, empty or None where it did not.
 
     model, lgs_error, stars, lines, beams, spectra : one per mode
-    flow, bands : of all modes
+    flow, asterism, bands : of all modes
     training : a record to learn from
     """
 
@@ -89,6 +92,7 @@ class Prior:
     lines: tuple[Lines, ...] = ()
     beams: tuple[Beams, ...] = ()
     flow: Flow | None = None
+    asterism: Asterism | None = None
     bands: Bands | None = None
     spectra: tuple[Spectra, ...] = ()
     training: Training | None = None

@@ -172,3 +172,37 @@ class Flow:
     def first(self, n: int) -> Flow:
         """Return that of the first n modes."""
         return Flow(self.omega, self.own[:n], self.measurement[:n, :n], self.cross[:n, :n], self.line_gain[:n])
+
+
+@dataclass(frozen=True)
+class Asterism:
+    """Turbulence of all modes as the target, every LGS and the NGS have it, without noise; sums as in `Flow`.
+
+    Beams are the mean of the LGS, their orthonormal differences, and the NGS.
+
+    omega       : nodes [rad per step], (n,)
+    own         : powers of the target, (n_modes, n) [um^2]
+    measurement : cross powers between modes of the beams, (n_beams, n_modes, n_beams, n_modes, n) [um^2]
+    cross       : those of the target and the beams, (n_modes, n_beams, n_modes, n) [um^2]
+    basis       : weights of the LGS in their mean and in the differences, (n_lgs, n_lgs)
+    noise       : rms of the white noise of one LGS in a step, (n_modes,) [um]
+    ngs_noise   : that of an NGS frame, (n_modes,) [um]
+    combination : weight of mode k of each LGS in mode i of z, (n_modes, n_lgs, n_modes)
+    ratio       : steps per NGS frame
+    """
+
+    omega: Array
+    own: Array
+    measurement: Complex
+    cross: Complex
+    basis: Array
+    noise: Array
+    ngs_noise: Array
+    combination: Array
+    ratio: int
+
+    def first(self, n: int) -> Asterism:
+        """Return that of the first n modes."""
+        among, noises = self.measurement[:, :n, :, :n], (self.noise[:n], self.ngs_noise[:n])
+        combination = self.combination[:n, :, :n]
+        return Asterism(self.omega, self.own[:n], among, self.cross[:n, :, :n], self.basis, *noises, combination, self.ratio)

@@ -11,8 +11,8 @@ import numpy as np
 
 from wfsobs.observers.base import Observer
 from wfsobs.observers.kalman.single import steady_filter
-from wfsobs.prior import Bands, Beams, Flow, LgsError, LgsStars, Line, Lines, Model, Part, Prior, Spectra, Training
-from wfsobs.priors_from.flow import flow_of
+from wfsobs.prior import Asterism, Bands, Beams, Flow, LgsError, LgsStars, Line, Lines, Model, Part, Prior, Spectra, Training
+from wfsobs.priors_from.flow import asterism_of, flow_of
 from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence, measurement_noise, one_process, stars_of
 from wfsobs.priors_from.vibration import vibration_continuum
 from wfsobs.record import Measurements, Record, Sampling
@@ -60,7 +60,7 @@ def prior_and_settings(
 
 
 SHARED: Mapping[Part, str] = MappingProxyType(
-    {Model: "model", LgsError: "lgs_error", Lines: "lines", Beams: "beams", Bands: "bands"}
+    {Model: "model", LgsError: "lgs_error", Lines: "lines", Beams: "beams", Bands: "bands", LgsStars: "stars"}
 )
 """Parts that hold no arrays -> where they stand in a prior."""
 
@@ -92,6 +92,7 @@ def prior_of(
         stars=tuple(stars_of(scenario, mode, dt) for mode in modes) if LgsStars in asked else (),
         beams=tuple(beams_of(scenario, mode, dt) for mode in modes) if Beams in asked else (),
         flow=flow_of(scenario, len(modes), dt) if Flow in asked else None,
+        asterism=asterism_of(scenario, len(modes), dt) if Asterism in asked else None,
         bands=bands_of(scenario) if Bands in asked else None,
         spectra=tuple(spectra or [spectra_of(scenario, mode) for mode in modes]) if Spectra in asked else (),
         training=record.training.copy() if Training in asked and record and record.training else None,

@@ -27,6 +27,7 @@ from wfsobs.scenario.timeline import shift, turbulence_time
 from wfsobs.sensors.modes import Mode, modes_up_to
 from wfsobs.settings.errors import SettingError
 from wfsobs.settings.group import Group
+from wfsobs.settings.parameters import declared_settings
 from wfsobs.settings.sections import Section, section
 
 if TYPE_CHECKING:
@@ -95,11 +96,11 @@ class Scenario(Group):
     @classmethod
     @lru_cache(maxsize=4)
     def _with(cls, own: tuple[Section, ...]) -> dict[str, param.Parameter]:
-        known = super().settings()
+        known = declared_settings(cls)
         for name, label, group in own:
             if name not in known:
                 cls.param.add_parameter(name, cast(param.Parameter, section(group, label)))
-        declared, names = super().settings(), [one.name for one in own]
+        declared, names = declared_settings(cls), [one.name for one in own]
         rest = [name for name in known if name not in names]
         before = rest.index("control")
         return {name: declared[name] for name in (*rest[:before], *names, *rest[before:])}

@@ -14,7 +14,7 @@ import param
 
 from wfsobs.settings.errors import SettingError, shorten
 from wfsobs.settings.group_text import one_line, settings_html, why_idle
-from wfsobs.settings.parameters import allowed_values, hint
+from wfsobs.settings.parameters import allowed_values, hint, settings_once
 from wfsobs.settings.tree import Plain, put_value, to_native
 
 
@@ -87,8 +87,8 @@ class Group(param.Parameterized):
 
     @classmethod
     def settings(cls) -> dict[str, param.Parameter]:
-        """Return name -> param.Parameter of every setting, in order of declaration."""
-        return {k: p for k, p in cls.param.objects("existing").items() if k != "name"}
+        """Return name -> param.Parameter of every setting, in order of declaration; not to be changed."""
+        return settings_once(cls)
 
     def to_dict(self) -> Plain:
         """Return the tree as nested plain values."""

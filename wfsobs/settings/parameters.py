@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import param
@@ -101,3 +102,14 @@ def unit_of(p: param.Parameter) -> str:
     """Return the unit of a setting: the text in [brackets] in its documentation, or nothing."""
     match = re.search(r"(?<=\s)\[([^\]]+)\]", p.doc or "")
     return match.group(1) if match else ""
+
+
+def declared_settings(cls: type[param.Parameterized]) -> dict[str, param.Parameter]:
+    """Return name -> param.Parameter of every setting of a class, in order of declaration."""
+    return {name: p for name, p in cls.param.objects("existing").items() if name != "name"}
+
+
+@cache
+def settings_once(cls: type[param.Parameterized]) -> dict[str, param.Parameter]:
+    """Return `declared_settings` of a class that gets no more of them: asked some thousand times for a change of one."""
+    return declared_settings(cls)

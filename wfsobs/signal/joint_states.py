@@ -98,10 +98,10 @@ def shared_covariance(powers: Complex, responses: Sequence[Complex]) -> Array:
 
 
 class LeastVariance:
-    """Estimates of least variance that are linear in states of this covariance, (n, n) [um^2]."""
+    """Estimates of least variance that are linear in states of this covariance, (n, n) [um^2]; size : n."""
 
     def __init__(self, covariance: Array):
-        variance = np.diag(covariance)
+        variance, self.size = np.diag(covariance), len(covariance)
         self._scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
         correlation = covariance / np.outer(self._scale, self._scale)
         self._factor = cho_factor(correlation + RIDGE * np.eye(len(correlation)))

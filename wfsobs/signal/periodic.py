@@ -42,7 +42,7 @@ class PeriodicFilter:
             out = F @ out
         return out
 
-    def run(self, v: Array, x0: Array | None = None) -> Array:
+    def run(self, v: Array, x0: Array | None = None, *, since: int = 0) -> Array:
         """Filter the inputs v.
 
         Parameters
@@ -51,11 +51,13 @@ class PeriodicFilter:
             Inputs, (n_steps, m, n_columns); every column is a signal of its own.
         x0 : Array, optional
             Initial state, (n, n_columns); zero by default.
+        since : int
+            First step whose outputs are wanted.
 
         Returns
         -------
         Array
-            Outputs e, (n_steps, p, n_columns).
+            Outputs e, (n_steps - since, p, n_columns).
         """
         n_steps, m, columns = v.shape
         cycle = len(self.steps)
@@ -69,9 +71,10 @@ class PeriodicFilter:
         n = F.shape[0]
         start = np.zeros((n, columns)) if x0 is None else x0
         states = _block_states(F, (G @ inputs).reshape(n, blocks, columns), start)
-        out = H @ states.reshape(n, -1) + J @ inputs
-        p = H.shape[0] // length
-        return out.reshape(length, p, blocks, columns).transpose(2, 0, 1, 3).reshape(-1, p, columns)[:n_steps]
+        p, left = H.shape[0] // length, since // length  # blocks without wanted outputs
+        out = H @ states[:, left:].reshape(n, -1) + J @ inputs[:, left * columns :]
+        steps = out.reshape(length, p, blocks - left, columns).transpose(2, 0, 1, 3).reshape(-1, p, columns)
+        return steps[since - left * length : n_steps - left * length]
 
     def _lift(self, length: int) -> tuple[Array, Array, Array, Array]:
         """Return the map of one block: (F, G, H, J) with all the inputs and outputs of the block stacked."""
@@ -82,10 +85,11 @@ class PeriodicFilter:
         for i in range(length):
             Fi, Gi, Hi, Ji = self.steps[i % len(self.steps)]
             rows, columns = slice(i * p, (i + 1) * p), slice(i * m, (i + 1) * m)
+            before = slice(i * m)
             H[rows] = Hi @ state
-            J[rows] = Hi @ from_inputs
+            J[rows, before] = Hi @ from_inputs[:, before]
             J[rows, columns] = Ji
-            state, from_inputs = Fi @ state, Fi @ from_inputs
+            state, from_inputs[:, before] = Fi @ state, Fi @ from_inputs[:, before]
             from_inputs[:, columns] = Gi
         return state, from_inputs, H, J
 

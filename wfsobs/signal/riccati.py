@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
+from itertools import groupby
 
 import numpy as np
 
@@ -155,7 +156,7 @@ def _compose(first: Map, then: Map) -> Map:
 
 def _double_cycle(cycle: Sequence[Step]) -> Array:
     """Return the covariance after very many cycles, by doubling until it is constant or only rounding changes it."""
-    m = reduce(_compose, (_map(*step) for step in cycle))
+    m = reduce(_compose, (_power_of_map(_map(*step), n) for step, n in _runs(cycle)))
     last = np.inf
     for _ in range(60):
         before = m
@@ -167,6 +168,21 @@ def _double_cycle(cycle: Sequence[Step]) -> Array:
             break
         last = moved
     return m[2]
+
+
+def _runs(cycle: Sequence[Step]) -> list[tuple[Step, int]]:
+    """Return the steps of a cycle, each with how often it comes in a row as the same object."""
+    runs = [list(run) for _, run in groupby(cycle, key=id)]
+    return [(run[0], len(run)) for run in runs]
+
+
+def _power_of_map(m: Map, times: int) -> Map:
+    """Return the map of `times` equal steps, by halves."""
+    if times == 1:
+        return m
+    half = _power_of_map(m, times // 2)
+    both = _compose(half, half)
+    return _compose(both, m) if times % 2 else both
 
 
 def _without_measurements(cycle: Sequence[Step]) -> Array:

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.signal import lfilter, lfiltic
 
 from wfsobs.signal.ar2 import Ar2
@@ -134,26 +133,27 @@ def disturbance_model(turbulence: Sequence[Ar2 | Ar3], vibration: Sequence[Ar2 |
     now = np.concatenate([m.now for m in models])
     first = np.arange(now.size) < sum(m.now.size for m in models[: len(turbulence)])
     return DisturbanceModel(
-        A=_square_blocks([m.A for m in models]),
+        A=blocks_along_diagonal([m.A for m in models]),
         C=np.concatenate([m.before for m in models]),
-        Q=_square_blocks([m.Q for m in models]),
+        Q=blocks_along_diagonal([m.Q for m in models]),
         outputs={"turbulence": np.where(first, now, 0.0), "vibration": np.where(first, 0.0, now)},
-        pairs=block_diag(*(np.array([m.now, m.before]) for m in models)),
+        pairs=blocks_along_diagonal([np.array([m.now, m.before]) for m in models]),
     )
 
 
-def _square_blocks(blocks: Sequence[Array]) -> Array:
-    """Return square matrices along the diagonal; scipy's function for any shape takes ten times as long."""
-    ends = np.cumsum([len(block) for block in blocks])
-    out = np.zeros((ends[-1], ends[-1]))
-    for end, block in zip(ends, blocks, strict=True):
-        out[end - len(block) : end, end - len(block) : end] = block
+def blocks_along_diagonal(blocks: Sequence[Array]) -> Array:
+    """Return matrices (n_i, m_i) along a diagonal, (sum n_i, sum m_i); scipy's function takes ten times as long."""
+    rows, columns = np.cumsum([block.shape for block in blocks], axis=0).T
+    out = np.zeros((rows[-1], columns[-1]))
+    for row, column, block in zip(rows, columns, blocks, strict=True):
+        n, m = block.shape
+        out[row - n : row, column - m : column] = block
     return out
 
 
 def paper_matrices(turbulence: Ar2, vibration: Ar2) -> tuple[Array, Array, Array]:
     """Return A (6, 6), B (6,) and C (6,) of the paper's eq. 7, with the B_u that its equations 3 to 5 imply."""
-    A = block_diag(turbulence.transition, vibration.transition, [[0.0, 0.0], [1.0, 0.0]])
+    A = blocks_along_diagonal([turbulence.transition, vibration.transition, np.array([[0.0, 0.0], [1.0, 0.0]])])
     B = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
     C = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 1.0])
     return A, B, C

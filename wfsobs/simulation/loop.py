@@ -133,6 +133,7 @@ def measure_closed_loop(scenario: Scenario, open_loop: OpenLoop) -> Measurements
         ratio=n,
         open_loop_y=open_loop.lgs,
         lgs_stars=open_loop.stars,
+        y_stars=None if open_loop.each is None else open_loop.each + delay_signal(u, DELAY)[:, None],
     )
 
 

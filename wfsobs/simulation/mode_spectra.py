@@ -17,7 +17,7 @@ from wfsobs.atmosphere.von_karman import TurbulenceLayer
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.zernike import tabulated_bessel_ratio
 from wfsobs.simulation import layers as atmosphere
-from wfsobs.simulation.flow_spectra import footprint_on, spectra_between
+from wfsobs.simulation.flow_spectra import Sight, footprint_on, spectra_between, star_basis
 from wfsobs.simulation.guide_stars import lgs_weights
 from wfsobs.typing import Array
 
@@ -30,17 +30,17 @@ SLOWEST = 1e-4
 
 @dataclass(frozen=True)
 class ModeSpectra:
-    """One-sided spectra of all modes [um^2/Hz].
+    """One-sided spectra of all modes [um^2/Hz], between the axis and beams: the combined LGS, or those of `beam_spectra`.
 
     Attributes
     ----------
     own : Array
         Densities on the axis, (n_modes, n).
     measurement : Array
-        Cross spectra of the modes of the combined LGS, without noise: the transform over j of E m_i[k] m_l[k-j],
-        (n_modes, n_modes, n).
+        Cross spectra of all modes of the first beam, then of the next, without noise: the transform over j of E m_i[k] m_l[k-j],
+        (n_beams n_modes, n_beams n_modes, n).
     cross : Array
-        Those of the modes on the axis and the modes of the LGS, (n_modes, n_modes, n).
+        Those of the modes on the axis and the modes of the beams, (n_modes, n_beams n_modes, n).
     """
 
     own: Array
@@ -54,7 +54,7 @@ def are_coupled(scenario: Scenario) -> bool:
 
 
 def mode_spectra(scenario: Scenario, frequency: Array) -> ModeSpectra:
-    """Compute the spectra of all modes of frozen flow.
+    """Compute the spectra of all modes of frozen flow, on the axis and in the combined LGS.
 
     Parameters
     ----------
@@ -68,15 +68,37 @@ def mode_spectra(scenario: Scenario, frequency: Array) -> ModeSpectra:
     ModeSpectra
         Densities.
     """
-    found, m = spectra_between(scenario, None, frequency, _all_modes), len(scenario.modes)
-    measurement = np.empty((m, m, frequency.size), dtype=np.complex128)
-    for i in range(m):
-        for j in range(i, m):
-            measurement[i, j] = found.pair(m + i, m + j)
-            measurement[j, i] = measurement[i, j].conj()
-    return ModeSpectra(
-        np.array(found.density[:m]), measurement, np.array([[found.pair(i, m + j) for j in range(m)] for i in range(m)])
-    )
+    return _spectra(scenario, frequency, _all_modes)
+
+
+def beam_spectra(scenario: Scenario, frequency: Array) -> ModeSpectra:
+    """Compute those of every beam by itself: the mean of the LGS, their orthonormal differences (`star_basis`), and the NGS.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    frequency : Array
+        Frequencies from 0 on, (n,) [Hz].
+
+    Returns
+    -------
+    ModeSpectra
+        Densities, of n_lgs + 1 beams.
+    """
+    return _spectra(scenario, frequency, _all_modes_of_beams)
+
+
+def _spectra(scenario: Scenario, frequency: Array, sight: Sight) -> ModeSpectra:
+    found, m = spectra_between(scenario, None, frequency, sight), len(scenario.modes)
+    beams = range(m, len(found.density))
+    measurement = np.empty((len(beams), len(beams), frequency.size), dtype=np.complex128)
+    for i in beams:
+        for j in range(i, beams.stop):
+            measurement[i - m, j - m] = found.pair(i, j)
+            measurement[j - m, i - m] = measurement[i - m, j - m].conj()
+    cross = np.array([[found.pair(i, j) for j in beams] for i in range(m)])
+    return ModeSpectra(np.array(found.density[:m]), measurement, cross)
 
 
 def frequency_rule(scenario: Scenario) -> tuple[Array, Array]:
@@ -103,3 +125,20 @@ def _all_modes(scenario: Scenario, _mode: None, layer: TurbulenceLayer, x: Array
         seen = ideal.transform(x, y, footprint_on(scenario, star, layer), tabulated_bessel_ratio)
         combined += np.tensordot(weights[:, i], seen, axes=1)
     return [*own, *combined]
+
+
+def _all_modes_of_beams(
+    scenario: Scenario, _mode: None, layer: TurbulenceLayer, x: Array, y: Array
+) -> list[NDArray[np.complex128]]:
+    """Return the transforms of all modes on the axis, in the mean of the LGS, in each of their differences, and in the NGS."""
+    ideal = atmosphere.ideal_sensor(scenario)
+
+    def seen(star: atmosphere.Star) -> NDArray[np.complex128]:
+        return ideal.transform(x, y, footprint_on(scenario, star, layer), tabulated_bessel_ratio)
+
+    own = ideal.transform(x, y, Footprint(), tabulated_bessel_ratio)
+    stars = np.array([seen(star) for star in atmosphere.laser_stars(scenario)])
+    if scenario.sensors.tip_tilt_indetermination:
+        stars[:, [mode.radial_order == 1 for mode in scenario.modes]] = 0.0
+    lgs = np.tensordot(star_basis(len(stars)), stars, axes=1)
+    return [*own, *np.concatenate(lgs), *seen(atmosphere.natural_star(scenario))]

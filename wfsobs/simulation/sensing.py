@@ -29,11 +29,14 @@ class OpenLoop:
         NGS, (n_steps, n_modes); NaN in steps without a frame or where it is missing.
     stars : Array or None
         Number of LGS at each step, (n_steps,); None for all at all steps.
+    each : Array or None
+        Every LGS by itself, (n_steps, n_lgs, n_modes); NaN where it is out or a frame is missing; None where all see the same.
     """
 
     lgs: Array
     ngs: Array
     stars: Array | None = None
+    each: Array | None = None
 
 
 def measure_open_loop(scenario: Scenario, disturbance: Disturbance, rng: np.random.Generator, watch: Watch = QUIET) -> OpenLoop:
@@ -85,7 +88,19 @@ def measure_open_loop(scenario: Scenario, disturbance: Disturbance, rng: np.rand
     lost = events.missing_frames(scenario, n_steps, lost_rng)
     lgs[lost["lgs"]], ngs[lost["ngs"]] = np.nan, np.nan
     is_whole = (working == scenario.sensors.lgs_count).all()
-    return OpenLoop(lgs, ngs, None if is_whole else working)
+    each = _apart(seen, disturbance.vibration, errors, working) if len(seen) > 1 and scenario.sensors.lgs_radius > 0 else None
+    if each is not None:
+        each[lost["lgs"]] = np.nan
+    return OpenLoop(lgs, ngs, None if is_whole else working, each)
+
+
+def _apart(turbulence_per_star: Sequence[Array], vibration: Array, errors: Sequence[Array], working: Array) -> Array:
+    """Return what every LGS measures, (n_steps, n_lgs, n_modes), NaN where it is out; the first ones work."""
+    out = np.empty((len(vibration), len(errors), vibration.shape[1]))
+    for star, (turbulence, error) in enumerate(zip(turbulence_per_star, errors, strict=True)):
+        out[:, star] = delay_signal(turbulence + vibration, 1) + error
+        out[working <= star, star] = np.nan
+    return out
 
 
 def measure_noise(scenario: Scenario, n_steps: int, rng: np.random.Generator) -> OpenLoop:

@@ -27,8 +27,8 @@ from wfsobs.typing import Array
 DECAYED = 2.5
 """Decay of correlations after half the DFT, as an exponent; a line that wraps around by then brings nothing new."""
 
-SMOOTH = 4.0
-"""The same for processes of a known width, whose correlations must not wrap around: exp(-10) of them does."""
+SMOOTH = 5.0
+"""The same for processes of a known width, whose correlations must not wrap around: exp(-12.5) of them does."""
 
 MOST = 2**20
 """Maximum length of the DFT: an AR(2) that decays more slowly wraps around, which changes the bound by little."""

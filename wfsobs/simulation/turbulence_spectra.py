@@ -11,7 +11,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.wiener import Complex
-from wfsobs.simulation.flow_spectra import flow_spectra
+from wfsobs.simulation.flow_spectra import FlowSpectra, flow_spectra
 from wfsobs.simulation.guide_stars import lgs_weights, low_frequency_process
 from wfsobs.simulation.turbulence import processes, table_variance, third_order_process, turbulence_process
 from wfsobs.typing import Array
@@ -69,9 +69,14 @@ def _table(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
 
 
 def _frozen_flow(scenario: Scenario, mode: int, n: int) -> TurbulenceSpectra:
+    return per_sample(scenario, n, lambda frequency: flow_spectra(scenario, mode, frequency))
+
+
+def per_sample(scenario: Scenario, n: int, densities: Callable[[Array], FlowSpectra]) -> TurbulenceSpectra:
+    """Return the spectra of frozen flow for a DFT of `n` steps; densities : frequencies [Hz] -> spectra [um^2/Hz]."""
     # Along the wind the spectrum falls as f^2 to zero at 0 Hz, a notch that the DFT does not resolve: here it is a bin wide.
     frequency = np.hypot(np.fft.rfftfreq(n, scenario.dt), 1.0 / (n * scenario.dt))
-    found = flow_spectra(scenario, mode, frequency)
+    found = densities(frequency)
     scaled = {id(part): 0.5 / scenario.dt * part for part in found}  # on the axis the NGS shares its arrays with the truth
     return TurbulenceSpectra(*(scaled[id(part)] for part in found))
 

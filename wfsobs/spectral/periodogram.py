@@ -94,7 +94,10 @@ class Cells:
         fine, near = sizes
         size = np.maximum(j / fine, 1.0)
         for centre in resonances:
-            size = np.minimum(size, np.maximum(np.abs(j - centre / f[0]) / near, 1.0))
+            bin_ = centre / f[0]
+            # no further off than where |j - bin| / near = j / fine, cells are narrower than elsewhere
+            first, last = int(bin_ * fine / (fine + near)), int(bin_ * fine / (fine - near)) + 1
+            size[first:last] = np.minimum(size[first:last], np.maximum(np.abs(j[first:last] - bin_) / near, 1.0))
         cell = np.floor(np.cumsum(1.0 / size) + 1e-6).astype(int)
         count = np.bincount(cell, keep)
         used = count > 0

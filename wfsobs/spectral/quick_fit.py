@@ -60,14 +60,15 @@ class WindowFit:
     ):
         n = len(z)
         self.extra, self.narrowest, self.sizes = extra, narrowest, cells
-        self.dt, self.f, self.I = dt, periodogram_frequencies(n, dt), periodogram(z, dt)
-        self.fine_f, self.fine = periodogram_frequencies(n, dt, PAD), periodogram(z, dt, PAD)
+        self.dt, self.fine_f, self.fine = dt, periodogram_frequencies(n, dt, PAD), periodogram(z, dt, PAD)
+        self.f, self.I = self.fine_f[PAD - 1 :: PAD], self.fine[PAD - 1 :: PAD]
         self.df = self.f[0]
         processes = [] if start.turbulence is None else [start.turbulence]
         self.third = isinstance(start.turbulence, Ar3)
         self.first = 1 + 3 * len(processes) + self.third
         self.x = np.concatenate([[log(start.noise)], *map(_numbers, [*processes, *start.resonances])])
-        self.add(())
+        self._last: tuple[Array, Array, tuple[Array, Array]] = (self.f[:0], self.x[:0], (self.f[:0], self.f[:0]))
+        self._average()
 
     @property
     def resonances(self) -> Array:
@@ -92,6 +93,8 @@ class WindowFit:
 
     def density(self, x: Array, f: Array) -> tuple[Array, Array]:
         """Return S (len(f),) and the derivatives of its logarithm by x, (len(x), len(f))."""
+        if f is self._last[0] and np.array_equal(x, self._last[1]):  # `improve` ends where `prune` and others begin
+            return self._last[2]
         noise = np.full_like(f, 2.0 * self.dt * np.exp(2.0 * x[0]))
         S, slopes = densities(self._of_second_order(x), self.dt, f)
         by_corner = np.zeros((0, len(f)))
@@ -101,9 +104,11 @@ class WindowFit:
             by_corner = (S[0] * slope)[None]
         total = noise + S.sum(axis=0)
         if self.extra is not None:
-            total += self.extra.psd(f)
+            total += self.extra_density if f is self.cells.frequency else self.extra.psd(f)
         by_numbers = (S[:, None] * slopes).reshape(-1, len(f))
-        return total, np.vstack([2.0 * noise, by_numbers[:3], by_corner, by_numbers[3:]]) / total
+        found = total, np.vstack([2.0 * noise, by_numbers[:3], by_corner, by_numbers[3:]]) / total
+        self._last = f, x, found
+        return found
 
     def background(self) -> None:
         """Adapt noise and turbulence to this window, whatever its peaks."""
@@ -121,11 +126,11 @@ class WindowFit:
         at = self.f if self.sizes == (FINE, NEAR) else self.cells.frequency
         S = np.interp(f, at, self.density(self.x, at)[0])
         ratio = self.fine / S
-        inner = ratio[1:-1]
+        inner, lowest = ratio[1:-1], max(lowest, FEWEST * self.df)
         noise = 2.0 * self.dt * np.exp(2.0 * self.x[0])
-        height = HEIGHT + np.log(f / AT) + DEEPER * np.log(S / noise)
-        high = ((ratio > height) & (f >= max(lowest, FEWEST * self.df)))[1:-1]
+        high = (inner > HEIGHT + log(lowest / AT)) & (f[1:-1] >= lowest)  # few: the least height of all, since S > noise
         top = 1 + np.flatnonzero((inner >= ratio[:-2]) & (inner > ratio[2:]) & high)
+        top = top[ratio[top] > HEIGHT + np.log(f[top] / AT) + DEEPER * np.log(S[top] / noise)]
         taken = list(np.exp(self.resonances[:, 0]) / (2.0 * pi))
         found: list[tuple[float, float]] = []
         for i in top[np.argsort(-ratio[top])]:
@@ -140,9 +145,16 @@ class WindowFit:
             half = START * self.df
             new = Ar2(2.0 * pi * frequency, min(half / frequency, WIDEST), float(np.sqrt(0.5 * pi * half * density)), self.dt)
             self.x = np.concatenate([self.x, _numbers(new)])
+        if peaks:
+            self._average()
+        return len(peaks) > 0
+
+    def _average(self) -> None:
+        """Average the periodogram in cells that are narrow near the resonances."""
         centres = np.exp(self.resonances[:, 0]) / (2.0 * pi)
         self.cells = Cells(self.f, self.I, np.ones(len(self.f)), centres, sizes=self.sizes)
-        return len(peaks) > 0
+        if self.extra is not None:
+            self.extra_density = self.extra.psd(self.cells.frequency)
 
     def improve(self) -> None:
         """Take Newton steps with the expected second derivatives, damped (Levenberg, Marquardt) where they lead uphill."""
@@ -164,7 +176,7 @@ class WindowFit:
             gain, x, S, slopes, value, held = value - there, trial, S_there, slopes_there, there, 0.3 * held
             if gain < ENOUGH:
                 break
-        self.x = x
+        self.x, self._last = x, (f, x, (S, slopes))
 
     def _clip_to_bounds(self, x: Array) -> Array:
         """Return x with every parameter clipped to its bounds."""

@@ -1,0 +1,52 @@
+"""Bound of an asterism: the minimum error of any linear observer of every LGS by itself in all modes, and of the NGS frames.
+
+It is as `bound_stars`, which takes one mode at a time, and is found as `bound_modes`: by the best weights of very many means of
+the past, of the LGS and of the NGS frames, beside the states of `kf-asterism`. Lines are as wide as those of the record at least.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wfsobs.evaluation.bound_modes import TRUE_MODEL
+from wfsobs.observers.base import TARGETS
+from wfsobs.observers.estimates import TOTAL
+from wfsobs.observers.kalman.asterism_model import AsterismModel
+from wfsobs.prior import Asterism, Lines
+from wfsobs.priors_from.scenario import prior_of
+from wfsobs.scenario import Scenario
+from wfsobs.signal.joint_states import running_means
+from wfsobs.simulation.synthesis import line_width
+
+TURNS = (0.0, 2.0, 4.0)
+FINE = running_means([0.0, *(2.0**i for i in range(12))], TURNS)
+"""Means over 1 to 2048 steps."""
+FINE_FRAMES = running_means([0.0, *(2.0**i for i in range(9))], TURNS)
+"""Means over 1 to 256 frames."""
+
+
+def bound_rms_of_asterism(scenario: Scenario, ahead: float = 0.0) -> list[dict[str, float]]:
+    """Return the minimum error of phi[k + ahead] from all modes of every LGS and all NGS frames up to step k.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    ahead : float
+        Steps of prediction.
+
+    Returns
+    -------
+    list of dict
+        Per mode: target -> rms over all steps [um]; TOTAL is that of both together.
+
+    Raises
+    ------
+    ValueError
+        All LGS see the same.
+    """
+    told = scenario.replace({**TRUE_MODEL, "multipeak.line_width": line_width(scenario)})
+    prior = prior_of(told, None, (Lines, Asterism))
+    model = AsterismModel(prior, told.multipeak, scenario.sensors.exposure_ratio, FINE, FINE_FRAMES)
+    found = {target: np.sqrt(np.mean(model.plan(ahead, target)[1][:-1] ** 2, axis=0)) for target in (*TARGETS, TOTAL)}
+    return [{target: float(sd[mode]) for target, sd in found.items()} for mode in range(len(scenario.modes))]
