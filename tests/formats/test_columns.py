@@ -12,8 +12,9 @@ from click.testing import CliRunner
 
 from wfsobs.cli import main
 from wfsobs.record import RecordError
-from wfsobs.telemetry.columns import suggest_roles
+from wfsobs.telemetry.columns import suggest_clock, suggest_roles
 from wfsobs.telemetry.intake import DeclaredFormat
+from wfsobs.telemetry.preview import ColumnsPreview, preview_any
 from wfsobs.telemetry.records import read_columns, read_record
 
 RNG = np.random.default_rng(2)
@@ -111,3 +112,17 @@ def test_on_the_command_line(tmp_path: Path) -> None:
         assert rms[mode] == pytest.approx(1e-3 * np.sqrt(np.mean(values**2)), rel=1e-2), "to the samples that are scored"
     done = CliRunner().invoke(main, ["observe", str(path), "--column", "time"])
     assert done.exit_code != 0 and "--column time: takes ROLE=NAME" in done.output
+
+
+def test_what_always_rises_is_proposed_as_the_time() -> None:
+    """With jitter and a lost row; a count of frames is not, nor what has a name that says what it is."""
+    count, lost = np.arange(float(N)), np.delete(TIME + 1e-4 * RNG.standard_normal(N), 7)
+    assert suggest_clock({"n": count, "a": Y[:, 0], "b": lost}) == "b"
+    assert suggest_clock({"n [ms]": count}) == "n [ms]", "a rate of 1 kHz"
+    assert suggest_clock({"n": count, "a": Y[:, 0], "b": np.full(3, np.nan)}) is None
+    table = np.column_stack([TIME, Y, U]).tolist()
+    for first, role in (("p", {"time": "p"}), ("wfs x", {"y_lgs/tip": "wfs x"})):
+        lines = [f"{first},q,r,s,v", *(",".join(map(repr, row)) for row in table)]
+        found = preview_any("\n".join(lines).encode(), "a.csv")
+        assert isinstance(found, ColumnsPreview) and found.roles == role
+        assert "50 values, 4, 4.002, 4.004 ..." in found.columns[first]

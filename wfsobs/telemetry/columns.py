@@ -100,6 +100,19 @@ def suggest_roles(names: Iterable[str]) -> dict[str, str]:
     return found
 
 
+def suggest_clock(columns: Mapping[str, Array]) -> str | None:
+    """Return the first column that always rises, by a step of no less than 10 us and no more than 0.1 s; None without one.
+
+    >>> suggest_clock({"frame": np.arange(9.0), "tip": np.zeros(9), "when": 12.5 + 1e-3 * np.arange(9)})
+    'when'
+    """
+    for name, values in columns.items():
+        steps = np.diff(values)
+        if steps.size and np.all(steps > 0) and 1e-5 <= np.median(steps) * SECONDS.get(heading_unit(name), 1.0) <= 0.1:
+            return name
+    return None
+
+
 def _role_of(name: str) -> str | None:
     bare = UNIT.sub("", name) if heading_unit(name) else name
     words = re.findall(r"[a-z]+|\d+", bare.lower())
@@ -120,7 +133,12 @@ def describe_values(values: Array) -> str:
 
     >>> describe_values(np.array([0.5, np.nan, -0.5]))
     '3 values, 0.5, nan, -0.5 ..., rms 0.5'
+    >>> describe_values(np.array([1200.0, 1200.001, 1200.002]))
+    '3 values, 1200, 1200.001, 1200.002 ..., rms 1.2e+03'
     """
     known = values[np.isfinite(values)]
     spread = f", rms {np.sqrt(np.mean(known**2)):.3g}" if known.size else ""
-    return f"{values.size} values, {', '.join(f'{x:.4g}' for x in values[:3])} ...{spread}"
+    written = ([f"{x:.{digits}g}" for x in values[:3]] for digits in range(4, 17))
+    n_different = len({repr(float(x)) for x in values[:3]})
+    first = next((texts for texts in written if len(set(texts)) == n_different), [str(x) for x in values[:3]])
+    return f"{values.size} values, {', '.join(first)} ...{spread}"

@@ -1,8 +1,8 @@
 """From the named arrays of a file to a `Record`: the only check of shapes, units, signs and clocks.
 
 A record has y_lgs and u (n_steps, n_modes) and dt or time; optionally y_ngs (the same shape, NaN where there is no frame, or
-one row per frame) with ratio or time_ngs, the truth turbulence and vibration, open_loop_y, lgs_stars (n_steps,), and for the
-offline GPR training_y, training_u and training_open_loop_y (n, n_modes).
+one row per frame) with ratio or time_ngs, the truth turbulence and vibration, open_loop_y, lgs_stars (n_steps,), y_stars
+(n_steps, n_lgs, n_modes), and for the offline GPR training_y, training_u and training_open_loop_y (n, n_modes).
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ import numpy as np
 from wfsobs.record import DELAY, Record, RecordError, Training
 from wfsobs.scenario import Scenario
 from wfsobs.telemetry import timestamps as clock
-from wfsobs.telemetry.formats.contents import FAST, NGS, SIGNALS, STARS, TRAINING, Contents
+from wfsobs.telemetry.bridged import without_bridged
+from wfsobs.telemetry.formats.contents import APART, FAST, NGS, SIGNALS, STARS, TRAINING, Contents
 from wfsobs.typing import Array
 from wfsobs.units import ANGLES, micrometres_per, parse_unit
 
@@ -62,6 +63,8 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
         rows = signals[name].shape[0] if name == NGS else rows  # may have one row per frame
         if signals[name].shape != (rows, n_modes):
             raise RecordError(f"{name} has shape {signals[name].shape}; expected ({rows}, {n_modes})")
+    if APART in arrays:
+        signals[APART] = _stars_apart(arrays[APART], n, n_modes)
     origin, sign = _into_micrometres(signals, contents, declaration, scenario.telescope.diameter)
     signals["u"] *= sign
     if "training_u" in signals:
@@ -76,7 +79,10 @@ def to_record(contents: Contents, scenario: Scenario, declaration: DeclaredForma
         raise RecordError(f"delay takes a whole number from 1, not {delay}")
     fields = {name: signals[name] for name in (*FAST, NGS) if name in signals}
     stars = np.nan_to_num(signals[STARS][:, 0]).astype(int) if STARS in signals else None
-    return Record(**fields, dt=dt, ratio=ratio, training=_training(signals), delay=delay, origin=origin, lgs_stars=stars)
+    apart = signals[APART].reshape(len(signals["y_lgs"]), -1, n_modes) if APART in signals else None
+    beside = {"lgs_stars": stars, "y_stars": apart}
+    record = Record(**fields, dt=dt, ratio=ratio, training=_training(signals), delay=delay, origin=origin, **beside)
+    return record if stars is not None or record.missing else without_bridged(record)
 
 
 def _signal(name: str, raw: Array) -> Array:
@@ -98,6 +104,13 @@ def _star_counts(raw: Array, n: int) -> Array:
     if raw.dtype.kind not in "fiu" or raw.shape != (n,) or not (np.isfinite(raw) & (raw >= 0) & (raw == np.round(raw))).all():
         raise RecordError(f"{STARS} takes {n} whole numbers from 0, not {raw.dtype} of shape {raw.shape}")
     return raw.astype(np.float64)[:, None]
+
+
+def _stars_apart(raw: Array, n: int, n_modes: int) -> Array:
+    """Return every LGS by itself, a column per star and mode, (n, n_lgs n_modes)."""
+    if raw.ndim != 3 or raw.shape[::2] != (n, n_modes):
+        raise RecordError(f"{APART} has shape {raw.shape}; expected ({n}, n_lgs, {n_modes})")
+    return _signal(APART, raw.reshape(n, -1))
 
 
 def _into_micrometres(
@@ -184,7 +197,7 @@ def _stamped_frames(signals: dict[str, Array], arrays: Mapping[str, Array], star
     inside = (steps >= 0) & (steps < n)
     signals[NGS] = np.full((n, frames.shape[1]), np.nan)
     signals[NGS][steps[inside]] = frames[inside]
-    for name in (*FAST, NGS, STARS):
+    for name in (*FAST, NGS, STARS, APART):
         if name in signals:
             signals[name] = signals[name][steps[0] % ratio :]
     return ratio

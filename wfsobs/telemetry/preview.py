@@ -15,9 +15,9 @@ import numpy as np
 from wfsobs.record import Record, RecordError, hold_last
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import rms, welch_psd
-from wfsobs.telemetry.columns import describe_values, suggest_roles
+from wfsobs.telemetry.columns import describe_values, suggest_clock, suggest_roles
 from wfsobs.telemetry.command_response import CommandResponse, command_response
-from wfsobs.telemetry.formats.contents import Contents
+from wfsobs.telemetry.formats.contents import TIME, Contents
 from wfsobs.telemetry.formats.psd import NoSpectrumError, read_psd
 from wfsobs.telemetry.intake import DeclaredFormat, to_record
 from wfsobs.telemetry.records import read_columns, read_contents
@@ -60,9 +60,16 @@ class Reading:
         """Return the evidence, a line each."""
         lines = self.response.lines() if self.response else ["sign and delay: too few steps, or commands that do not move"]
         if self.units:
-            ways = " or ".join(f"{unit} ({1e3 * rms:.3g} nm rms of z)" for unit, rms in self.units.items())
+            ways = " or ".join(f"{unit} ({float(f'{1e3 * rms:.3g}'):g} nm rms of z)" for unit, rms in self.units.items())
             lines.append(f"unit {'undecided' if len(self.units) > 1 else 'proposed'}: the numbers are plausible as {ways}")
         return lines
+
+    @property
+    def missing(self) -> str:
+        """What has to be said before the record can be used, in a line; empty where nothing is."""
+        if set(self.units) <= {"um"}:
+            return ""
+        return f"Choose the unit first: the file does not say it, and the numbers are plausible as {' or '.join(self.units)}."
 
 
 @dataclass(frozen=True)
@@ -193,7 +200,11 @@ def _preview_columns(data: bytes, name: str, no_record: RecordError) -> ColumnsP
     if len(long) < 2:
         raise no_record from None
     offered = dict(list(long.items())[:MOST_OFFERED])
-    return ColumnsPreview(name, str(no_record), {k: describe_values(v) for k, v in offered.items()}, suggest_roles(offered))
+    roles = suggest_roles(offered)
+    clock = suggest_clock({key: values for key, values in offered.items() if key not in roles.values()})
+    if TIME not in roles and clock is not None:
+        roles[TIME] = clock
+    return ColumnsPreview(name, str(no_record), {k: describe_values(v) for k, v in offered.items()}, roles)
 
 
 def preview(data: bytes, name: str, scenario: Scenario | None = None, declaration: DeclaredFormat | None = None) -> Preview:

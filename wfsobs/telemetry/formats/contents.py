@@ -28,9 +28,12 @@ CLOCKS = (TIME, TIME_NGS)
 STARS = "lgs_stars"
 """Array (n,) of whole numbers; in .npz alone."""
 
+APART = "y_stars"
+"""Array (n, n_lgs, n_modes); in .npz alone."""
+
 NUMBERS = ("dt", "ratio", "delay", "command_sign")
 TEXTS = ("unit", "origin", "scenario")
-NAMES = (*SIGNALS, *CLOCKS, STARS, *NUMBERS, *TEXTS)
+NAMES = (*SIGNALS, *CLOCKS, STARS, APART, *NUMBERS, *TEXTS)
 
 COLUMN = re.compile(r"(?:truth/)?(?P<array>[a-z_]+)/(?P<mode>[A-Za-z0-9 -]+?)(?:_(?P<unit>[A-Za-zµμ]+))?$")
 """Name of a column of one mode, such as y_lgs/tip_um."""

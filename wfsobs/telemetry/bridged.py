@@ -1,0 +1,110 @@
+"""Measurements that somebody has filled in, found by the noise that they lack.
+
+Where a frame was lost, telemetry often has the last value once more, a line between neighbours or a prediction. An observer that
+takes these for measurements trusts them, and starts wrong after the gap. A frame is taken for missing where
+
+- the measurement, or the pseudo-open-loop of it, is the same in all modes for the third time, or
+- the last WINDOW frames follow a cubic as no measured ones do: the squares that are left are below SHARE of their usual mean.
+
+No later frame decides, and nothing is found before USUAL / 10 frames with noise. Windows overlap, so that one in 10^9 of white
+noise of usual strength would be below SHARE, and that of one real frame at the end is not where the gap was long. What lasts
+longer than LONGEST is no gap but what the sensor measures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from wfsobs.record import Record, hold_last
+from wfsobs.typing import Array
+
+WINDOW = 24
+"""Frames that are fitted by a cubic."""
+
+SHARE = 0.05
+"""Of the usual mean square of what a cubic leaves over."""
+
+USUAL = 2000
+"""Frames that the usual mean square is the mean of; a tenth of them have to be there first."""
+
+LONGEST = 10.0
+"""Gap that is taken for one, at most [s]."""
+
+ROUNDING = 1e-12
+"""Of a number, that is no noise."""
+
+AT_ONCE = 100_000
+"""Windows that are fitted at once, for the memory."""
+
+
+def without_bridged(record: Record) -> Record:
+    """Return a record that tells no missing frames with those missing that were filled in; its origin says how many."""
+    bridged = find_bridged(record.y_lgs, hold_last(record.z), record.dt)
+    if not bridged.any():
+        return record
+    said = f"{bridged.sum()} LGS frames without noise of their own taken for missing"
+    y_lgs = np.where(bridged[:, None], np.nan, record.y_lgs)
+    return replace(record, y_lgs=y_lgs, origin=", ".join(filter(None, (record.origin, said))))
+
+
+def find_bridged(y: Array, z: Array, dt: float) -> Array:
+    """Return which frames were filled in.
+
+    Parameters
+    ----------
+    y : Array
+        Measurements, (n, n_modes), without NaN.
+    z : Array
+        Pseudo-open-loop measurements of the same frames, (n, n_modes).
+    dt : float
+        Time step [s].
+
+    Returns
+    -------
+    Array
+        True where a frame was filled in, (n,).
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # of values beyond all measure, which are found elsewhere
+        rounding = ROUNDING * (np.abs(y) + np.abs(z))
+        again = _is_again(y, 0.0 * rounding) | _is_again(z, rounding)
+        again[1:] &= again[:-1]
+        return _lacking(again, _squares_of_cubic(z), rounding, LONGEST / dt)
+
+
+def _lacking(again: Array, left_over: Array, rounding: Array, longest: float) -> Array:
+    """Return which frames repeat, or lack the noise that those before them have, (n,); none before there is some noise."""
+    usual, seen, lasting, apart = np.zeros(left_over.shape[1]), 0, 0, 0
+    out = np.zeros(len(left_over), dtype=bool)
+    for k, squares in enumerate(left_over):
+        apart = 0 if again[k] else apart + 1  # a window that has frames that repeat says nothing of the others
+        has_noise = seen >= USUAL // 10 and bool((np.isfinite(usual) & (usual > rounding[k] ** 2)).all())
+        lacks = has_noise and bool(again[k] or (apart >= WINDOW and (squares <= SHARE * usual).all()))
+        lasting = lasting + 1 if lacks else 0
+        out[k] = 0 < lasting <= longest
+        if lasting > longest:
+            seen = 0
+        if not out[k] and k >= WINDOW:
+            seen += 1
+            usual = usual + (squares - usual) / min(seen, USUAL)
+    return out
+
+
+def _is_again(x: Array, rounding: Array) -> Array:
+    """Return where x (n, n_modes) is in all modes what it was one frame before, but for rounding, (n,)."""
+    out = np.zeros(len(x), dtype=bool)
+    out[1:] = (np.abs(np.diff(x, axis=0)) <= rounding[1:]).all(axis=1)
+    return out
+
+
+def _squares_of_cubic(z: Array) -> Array:
+    """Return the sum of squares that a cubic leaves of the last WINDOW frames, (n, n_modes); zeros before there are so many."""
+    powers = np.vander(np.linspace(-1.0, 1.0, WINDOW), 4)
+    rest = np.linalg.qr(powers, mode="complete")[0][:, 4:]
+    out = np.zeros_like(z)
+    for first in range(0, max(len(z) - WINDOW + 1, 0), AT_ONCE):
+        windows = sliding_window_view(z[first : first + AT_ONCE + WINDOW - 1], WINDOW, axis=0)
+        out[first + WINDOW - 1 : first + WINDOW - 1 + len(windows)] = np.sum((windows @ rest) ** 2, axis=-1)
+    return out
