@@ -12,9 +12,13 @@ from typing import Any
 import numpy as np
 
 from wfsobs import PRESETS, simulate
+from wfsobs.priors_from.selection import usual_observers
 from wfsobs.record import Record, Training
 from wfsobs.scenario import Scenario
 from wfsobs.testing import QUICK
+
+ON_PAPER = usual_observers(PRESETS["paper"]())
+"""Observers that the paper's preset has something for, whose modes are independent and whose LGS are on the axis."""
 
 MATCHED = Scenario().replace(
     {

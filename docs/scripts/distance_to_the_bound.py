@@ -1,6 +1,7 @@
 """The tables of docs/observers.md: computed error of observers that use both sensors, over the bound of both sensors.
 
-`distance_to_the_bound.py [preset ...]` computes, `distance_to_the_bound.py --records [preset ...]` holds records against it.
+`distance_to_the_bound.py [preset ...]` computes, `distance_to_the_bound.py --records [preset ...]` holds records against it, with
+`--lenslets` those of Shack-Hartmann sensors against spectra that have their aliasing.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
+from wfsobs.simulation.lenslet_spectra import true_lenslet_spectra
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.true_spectra import has_known_spectra
 from wfsobs.typing import Array
@@ -27,8 +29,10 @@ NAMES = ("multirate-multi", "multirate-optimal")
 TARGETS = ("turbulence", "vibration", TOTAL)
 SEEDS = range(1, 21)
 LONG = {"run.duration": 20.0, "run.warm_up": 10.0, "loop.closed": False}
-AS_THE_SPECTRA = {"vibration.synthesis": "gaussian", "sensors.kind": "zernike"}
-"""Records after what filters take to settle, of a period sixteen times as long; spectra leave out the aliasing of lenslets."""
+"""Records after what filters take to settle."""
+ENDLESS = {"vibration.synthesis": "gaussian"}
+"""Of a period sixteen times as long."""
+LENSLETS, RECORDS = "--lenslets", "--records"
 
 
 def rows(preset: str) -> Iterator[str]:
@@ -44,10 +48,11 @@ def rows(preset: str) -> Iterator[str]:
         yield f"| {' | '.join(cells)} |"
 
 
-def confirmed_rows(preset: str) -> Iterator[str]:
+def confirmed_rows(preset: str, has_lenslets: bool) -> Iterator[str]:
     """Yield a row per mode and target: rms computed, rms over the records [nm], their ratio, standard errors between them."""
-    scenario = PRESETS[preset]().replace(LONG | AS_THE_SPECTRA)
-    expected = exact_errors(OBSERVERS[NAMES[0]], scenario)
+    scenario = PRESETS[preset]().replace(LONG | ENDLESS | ({} if has_lenslets else {"sensors.kind": "zernike"}))
+    spectra = [true_lenslet_spectra(scenario, mode) for mode in range(len(scenario.modes))] if has_lenslets else []
+    expected = exact_errors(OBSERVERS[NAMES[0]], scenario, spectra=spectra)
     squares = np.array([square_errors(NAMES[0], simulate(scenario.replace({"run.seed": seed})), scenario) for seed in SEEDS])
     for mode in range(min(len(scenario.modes), 2)):
         for i, target in enumerate(TARGETS):
@@ -67,13 +72,13 @@ def square_errors(name: str, record: Record, scenario: Scenario) -> Array:
 
 
 if __name__ == "__main__":
-    holds_records = "--records" in sys.argv
-    presets = [name for name in sys.argv[1:] if name != "--records"]
+    options = {word for word in sys.argv[1:] if word.startswith("--")}
+    presets = [name for name in sys.argv[1:] if name not in options]
     heads = ["Preset, mode", "bound of both [nm]", *(f"`{name}`" for name in NAMES)]
-    if holds_records:
+    if RECORDS in options:
         heads = [f"`{NAMES[0]}`", "computed [nm]", "records [nm]", "ratio", "standard errors"]
     print(f"| {' | '.join(heads)} |")
     print("|---" * len(heads) + "|")
     for preset in presets or [name for name, make in PRESETS.items() if has_known_spectra(make())]:
-        for row in (confirmed_rows if holds_records else rows)(preset):
+        for row in confirmed_rows(preset, LENSLETS in options) if RECORDS in options else rows(preset):
             print(row, flush=True)

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import wfsobs
 from tests.test_mode_spectra import FLOW
+from wfsobs.campaign.plan import parse_plan
+from wfsobs.campaign.sweep import parse_axis, plan_sweep
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.bound_modes import bound_rms_of_modes
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.evaluation.theory import is_predicted
 from wfsobs.execution import run_observer
+from wfsobs.live.checks import observers_on
+from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.observers import OBSERVERS
-from wfsobs.observers.kalman.coupled import CoupledEstimator, CoupledModel
+from wfsobs.observers.kalman.coupled import INDEPENDENT, CoupledEstimator, CoupledModel
+from wfsobs.pipeline import observe
 from wfsobs.prior import Flow, Lines
 from wfsobs.priors_from.scenario import prior_of
+from wfsobs.priors_from.selection import has_prior, usual_observers
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
 from wfsobs.simulation.mode_spectra import mode_spectra
+from wfsobs.testing import check_observer
 
 LINE = {"frequency": 31.0, "damping": 0.02, "rms": [0.05, 0.04]}
 SHAKEN = FLOW.replace({"vibration.source": "peaks", "vibration.peaks": [LINE], "vibration.cutoff": 60.0})
@@ -78,12 +87,32 @@ def test_errors_are_as_it_states() -> None:
 
 
 @pytest.mark.parametrize("changes", [{}, {"telescope.radial_order": 3}, {"turbulence.source": "ar3"}])
-def test_independent_modes_have_the_independent_filters(changes: dict[str, object]) -> None:
+def test_where_modes_are_independent_it_refuses_and_runs_only_if_named(changes: dict[str, object]) -> None:
     scenario = wfsobs.PRESETS["paper"]().replace({"run.duration": 1.0, "run.warm_up": 0.1, **changes})
     record = simulate(scenario)
-    coupled, alone = (run_observer(name, record, scenario) for name in ("kf-coupled", "kf-multi"))
-    for target, values in alone.items():
-        np.testing.assert_array_equal(coupled[target], values)
+    (line,) = observe(record, scenario, observers=["kf-coupled"]).failures
+    assert line.reason == f"kf-coupled left out: {INDEPENDENT}"
+    with pytest.raises(ValueError, match="modes tell nothing of one another"):
+        wfsobs.design("kf-coupled", scenario)
+    assert "kf-coupled" not in {*usual_observers(scenario), *observers_on(SimulatedLoop(scenario), scenario)}
+    assert not has_prior(OBSERVERS["kf-coupled"], FLOW, n_modes=1), "as of a record of one mode"
+
+
+def test_who_names_no_observer_has_it_where_modes_are_coupled() -> None:
+    """In a run, in a live loop, and in plans of which every scenario has coupled modes."""
+    assert "kf-coupled" in usual_observers(FLOW) and "kf-coupled" in observers_on(SimulatedLoop(FLOW), FLOW)
+    wind, source = parse_axis("turbulence.wind_speed=5,10"), parse_axis("turbulence.source=frozen-flow,ar2")
+    assert plan_sweep(FLOW, [wind], 1).observers == tuple(usual_observers(FLOW))
+    for axes in ([source], [wind, source]):
+        assert plan_sweep(FLOW, axes, 1).observers == tuple(name for name in usual_observers(FLOW) if name != "kf-coupled")
+    assert plan_sweep(FLOW, [source], 1, ["kf-coupled"]).observers == ("kf-coupled",)
+    for presets, has in ((("higher-orders",), True), (("higher-orders", "paper"), False)):
+        text = "\n".join(f'[[scenario]]\npreset = "{name}"' for name in presets)
+        assert ("kf-coupled" in parse_plan(text, Path()).observers) == has
+
+
+def test_it_keeps_the_rules_of_observers() -> None:
+    check_observer(OBSERVERS["kf-coupled"], SHAKEN.replace({"run.duration": 1.5}), alone=False)
 
 
 def test_predictions_go_on_from_the_estimate() -> None:

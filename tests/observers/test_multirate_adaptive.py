@@ -77,6 +77,28 @@ def test_densities_of_turbulence_of_third_order() -> None:
         np.testing.assert_allclose(slope, (up - down) / 2e-6, atol=1e-6)
 
 
+def test_the_density_of_a_fit_is_that_of_its_spectrum_at_every_stage() -> None:
+    """Whatever was computed before: after Newton steps, new peaks and pruned ones, in its cells and elsewhere."""
+    rng, dt = np.random.default_rng(2), 1e-3
+    known, line = Ar2(12.0, 0.8, 0.05, dt), Ar2(2 * pi * 47.0, 0.01, 0.02, dt)
+    z = known.sample(8000, rng) + line.sample(8000, rng) + 0.02 * rng.standard_normal(8000)
+    fit = WindowFit(z, dt, Spectrum(0.03, dt, Ar3(20.0, 0.7, 60.0, 0.1, dt)), known)
+
+    def check() -> None:
+        for f in (fit.cells.frequency, fit.f, fit.cells.frequency):
+            np.testing.assert_allclose(fit.density(fit.x, f)[0], fit.spectrum.psd(f) + known.psd(f), rtol=1e-9)
+
+    check()
+    fit.background()
+    check()
+    assert fit.add(fit.maxima(5.0, 20))
+    check()
+    fit.improve()
+    check()
+    fit.prune()
+    check()
+
+
 def test_turbulence_that_falls_steeply() -> None:
     """16 s, the density in octaves from 2 to 32 Hz: the lowest has 32 bins, known to 18 %, the others more; two and a half of it.
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.records import ON_PAPER
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import BANDS, LINES, MODEL, TRAINING, Observer
@@ -54,7 +55,7 @@ def estimates(observer: Observer, record: Record, s: Scenario) -> np.ndarray:
     return np.concatenate([values.ravel() for values in run_observer(observer.id, record, s).values()])
 
 
-@pytest.mark.parametrize("name", OBSERVERS)
+@pytest.mark.parametrize("name", ON_PAPER)
 def test_an_observer_depends_on_what_it_is_said_to_need(name: str, record: Record) -> None:
     observer = OBSERVERS[name]
     base = estimates(observer, record, scenario())

@@ -12,6 +12,7 @@ from scipy.integrate import quad
 from scipy.special import ndtr
 
 import wfsobs
+from tests.records import ON_PAPER
 from wfsobs.evaluation.calibration import calibration, crps, half_width
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.gpr.kernels import SquaredExponential
@@ -112,7 +113,7 @@ def test_stated_frame_by_frame_as_over_a_record(name: str) -> None:
         assert np.isfinite(sd[estimate.target][350:]).all()
 
 
-@pytest.mark.parametrize("name", list(OBSERVERS))
+@pytest.mark.parametrize("name", ON_PAPER)
 def test_every_observer_with_a_model_states_something(name: str) -> None:
     changes = {"run.duration": 2.0, "gpr_online.training_size": 20, "gpr_offline.training_size": 50, "adaptive.window": 0.5}
     if name == "gpr-adaptive":  # half a second is too short for it to be sure of a line

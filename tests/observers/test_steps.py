@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import wfsobs
-from tests.records import short
+from tests.records import ON_PAPER, short
 from wfsobs import PRESETS
 from wfsobs.control.mirror import Mirror, Plant
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead
@@ -23,6 +23,7 @@ from wfsobs.observers.missing import fill_missing
 from wfsobs.observers.step_checks import StepError
 from wfsobs.prior import Bands, Lines, Model, Prior, Training
 from wfsobs.priors_from.scenario import arguments, kalman_model, prior_of
+from wfsobs.priors_from.selection import has_prior
 from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.progress import QUIET
 from wfsobs.record import Record, hold_last, pseudo_open_loop
@@ -54,14 +55,17 @@ def test_steps_are_the_run_over_the_record(name: str, preset: str) -> None:
     record, scenario = with_gaps(preset)
     try:
         given = arguments(OBSERVERS[name], record, scenario)
+        is_given = has_prior(OBSERVERS[name], scenario)
     except ValueError:  # a vibration that is a table has no lines
-        with pytest.raises(ValueError, match="table, not lines"):
+        is_given = False
+    if not is_given:
+        with pytest.raises(ValueError, match=r"table, not lines|modes tell nothing|all LGS see the same"):
             wfsobs.design(name, scenario, sampling=record.sampling)
         return
     assert step_difference(OBSERVERS[name], *given) <= (GPR if name.startswith("gpr") else ROUNDING)
 
 
-@pytest.mark.parametrize("name", STEPS)
+@pytest.mark.parametrize("name", [name for name in STEPS if name in ON_PAPER])
 def test_a_design_goes_on_in_another_process(name: str) -> None:
     """As it is sent there: what shares memory here is apart when it arrives."""
     record, scenario = with_gaps("paper")

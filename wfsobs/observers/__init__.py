@@ -11,6 +11,7 @@ from wfsobs.observers.gpr.adaptive import GPR_ADAPTIVE
 from wfsobs.observers.gpr.offline import GPR_OFFLINE
 from wfsobs.observers.gpr.online import GPR_ONLINE
 from wfsobs.observers.kalman.adaptive import KF_ADAPTIVE
+from wfsobs.observers.kalman.asterism import KF_ASTERISM
 from wfsobs.observers.kalman.coupled import KF_COUPLED
 from wfsobs.observers.kalman.multi import KF_MULTI
 from wfsobs.observers.kalman.multirate import MULTIRATE
@@ -25,6 +26,7 @@ BUILT_IN = (
     KF_LGS,
     KF_MULTI,
     KF_COUPLED,
+    KF_ASTERISM,
     KF_ADAPTIVE,
     KF_NGS,
     MULTIRATE,

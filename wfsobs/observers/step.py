@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wfsobs.observers.missing import Bridge
-from wfsobs.observers.step_checks import StepError, check_frame, check_not_due, check_state
+from wfsobs.observers.step_checks import StepError, check_each, check_frame, check_not_due, check_state
 from wfsobs.signal.stepping import Stateful, load_parts, save_parts
 from wfsobs.typing import Array
 
@@ -98,9 +98,18 @@ class StepObserver:
         self._parts: dict[str, Stateful] = {name: part for name, part in found.items() if part is not None}
         self._allowed_requests: set[tuple[float, str]] = set()
         self._nothing = np.full(sampling.n_modes, np.nan)
+        self._each_shape: tuple[int, int] | None = getattr(estimator, "each_shape", None)
         self._see_stars: Callable[[int | None], None] | None = getattr(estimator, "see_stars", None)
 
-    def update(self, z: ArrayLike, ngs: ArrayLike | None = None, u: ArrayLike | None = None, stars: int | None = None) -> None:
+    def update(
+        self,
+        z: ArrayLike,
+        ngs: ArrayLike | None = None,
+        u: ArrayLike | None = None,
+        *,
+        stars: int | None = None,
+        each: ArrayLike | None = None,
+    ) -> None:
         """Take the measurements of a frame.
 
         Parameters
@@ -114,12 +123,14 @@ class StepObserver:
             Command u[k], (n_modes,) [um]; for observers alone whose windows hold commands.
         stars : int, optional
             LGS that z is the mean over; by default all. A filter that is told them has the noise of those that are there.
+        each : array_like, optional
+            Every LGS by itself, as z, (n_lgs, n_modes) [um], NaN where one is out; for observers alone that take them apart.
 
         Raises
         ------
         StepError
-            A wrong shape, an infinite number, an NGS frame that is not due, no command where one is needed. The frame is then
-            not taken.
+            A wrong shape, an infinite number, an NGS frame that is not due, no command, or no LGS apart, where that is needed.
+            The frame is then not taken.
         """
         z, is_whole = self._check(z, "z")
         due = self._needs_ngs and self.frame > 0 and self.frame % self._ratio == 0
@@ -130,6 +141,8 @@ class StepObserver:
             u, _ = self._check(u, "u")
         else:
             u = None
+        if self._each_shape is not None:
+            self.estimator.see_each(check_each(self.id, each, self._each_shape, self.frame))  # type: ignore[attr-defined]
         if self._lgs is not None:
             z = self._lgs.complete(z, is_whole)
         if slow is not None and self._ngs is not None:

@@ -26,6 +26,16 @@ def check_frame(id: str, x: ArrayLike, name: str, n_modes: int, frame: int) -> t
     return x, is_whole
 
 
+def check_each(id: str, each: ArrayLike | None, shape: tuple[int, int], frame: int) -> Array:
+    """Return the measurement of every LGS by itself as an array, NaN where one is out. Raises StepError."""
+    x = None if each is None else np.asarray(each, dtype=float)
+    if x is None or x.shape != shape:
+        raise StepError(f"{id}: takes every LGS by itself: update(z, each=...) of the shape {shape}, (n_lgs, n_modes)")
+    if np.isinf(x).any():
+        raise StepError(f"{id}: each is infinite in frame {frame}; NaN stands for a star that is out")
+    return x
+
+
 def check_not_due(id: str, ngs: ArrayLike | None, ratio: int, frame: int) -> None:
     """Raise StepError for an NGS frame where none is due."""
     if ngs is not None and not np.isnan(ngs).all():

@@ -161,6 +161,8 @@ class LoopPredictor:
         if self._id in CONTROLLERS:
             return
         declared = OBSERVERS[self._id]
+        if "y_stars" in declared.needs:
+            raise PredictorError(f"{self._id}: takes every LGS by itself, which a predictor is not given")
         if Training in declared.prior or len(declared.targets) < 2:
             raise PredictorError(
                 f"{self._id}: takes an observer of turbulence and vibration without training data, or a controller"

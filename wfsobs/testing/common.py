@@ -36,7 +36,7 @@ class CheckError(AssertionError):
 def change_from(x: Array, start: int, rng: np.random.Generator) -> Array:
     """Return x (n_steps, n_modes) with other numbers from the step `start` on."""
     out = x.copy()
-    out[start:] += 3.0 * np.std(hold_last(x)) * rng.standard_normal(out[start:].shape)
+    out[start:] += 3.0 * np.std(hold_last(x.reshape(len(x), -1))) * rng.standard_normal(out[start:].shape)
     return out
 
 

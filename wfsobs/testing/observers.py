@@ -84,7 +84,7 @@ def _check_shapes(observer: Observer, base: Estimates, measurements: Measurement
 
 
 def _check_untouched(observer: Observer, measurements: Measurements, fresh: Measurements) -> None:
-    for name in ("y_lgs", "u", "y_ngs", "open_loop_y"):
+    for name in ("y_lgs", "u", "y_ngs", "open_loop_y", "y_stars"):
         was = getattr(fresh, name)
         if was is not None and not np.array_equal(getattr(measurements, name), was, equal_nan=True):
             raise CheckError(f"{observer.id}: changes its measurements ({name})")
@@ -100,6 +100,7 @@ def _check_causal(observer: Observer, arguments: tuple[Measurements, Prior, Any]
             y_lgs=change_from(measured.y_lgs, k + 1, rng),
             u=change_from(measured.u, k + 1, rng),
             y_ngs=None if measured.y_ngs is None else change_from(measured.y_ngs, k + 1, rng),
+            y_stars=None if measured.y_stars is None else change_from(measured.y_stars, k + 1, rng),
         )
         _compare(
             observer,

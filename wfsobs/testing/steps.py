@@ -27,11 +27,13 @@ def run_steps(observer: StepObserver, measurements: Measurements, steps: Iterabl
     measurements = replace(measurements, u=hold_last(measurements.u))
     z, u, n = measurements.z, measurements.u, measurements.ratio
     z_ngs = None if n is None or measurements.y_ngs is None else measurements.z_ngs
+    z_stars = None if measurements.y_stars is None else measurements.z_stars
     out = {target: np.full_like(z, np.nan) for target in observer.targets}
     for k in range(measurements.n_steps) if steps is None else steps:
         due = z_ngs is not None and n is not None and k > 0 and k % n == 0
         stars = None if measurements.lgs_stars is None else int(measurements.lgs_stars[k])
-        observer.update(z[k], z_ngs[k] if z_ngs is not None and due else None, u=u[k], stars=stars)
+        each = None if z_stars is None else z_stars[k]
+        observer.update(z[k], z_ngs[k] if z_ngs is not None and due else None, u=u[k], stars=stars, each=each)
         for target, values in out.items():
             values[k] = observer.predict(0, target)[0]
     return out
@@ -50,7 +52,8 @@ def run_loop(controller: StepController, measurements: Measurements) -> Array:
         ngs = None
         if z_ngs is not None and n is not None and k > 0 and k % n == 0:
             ngs = z_ngs[k] + seen[k + 1 - n : k + 1].mean(axis=0)
-        u[k] = controller.update(z[k] + seen[k], ngs, None if measurements.lgs_stars is None else int(measurements.lgs_stars[k]))
+        stars = None if measurements.lgs_stars is None else int(measurements.lgs_stars[k])
+        u[k] = controller.update(z[k] + seen[k], ngs, stars=stars)
     return u
 
 

@@ -53,7 +53,9 @@ def _pieces(z: Array, dt: float, settings: Adaptive, schedule: Schedule) -> Iter
     for now in range(schedule.first, n, schedule.interval):
         start, stop = max(now - schedule.longest, 0), min(now + schedule.interval, n)
         last = learn(z[start:now], dt, schedule.depth, settings.peak_count, settings.lowest, last)
-        x = PeriodicFilter([last.whitener]).run((z[start:stop] - last.mean)[:, None, None])[now - start - schedule.depth + 1 :]
+        x = PeriodicFilter([last.whitener]).run(
+            (z[start:stop] - last.mean)[:, None, None], since=now - start - schedule.depth + 1
+        )
         yield now / n, np.array([np.convolve(x[:, 0, 0], last.weights, "valid"), np.full(stop - now, last.sd)])
 
 
@@ -63,12 +65,12 @@ def step_gpr_adaptive(_prior: Prior, settings: Adaptive, sampling: Sampling, hor
 
 
 def seconds(settings: Adaptive, n_steps: int, n_modes: int, dt: float) -> float:
-    """6 ms + 1.3 us per sample for every time of learning, one mode after the other [s]; nothing for a window that it refuses."""
+    """2 ms + 3.2 us per sample for every time of learning, one mode after the other [s]; nothing for a window that it refuses."""
     if settings.window < SHORTEST * dt:
         return 0.0
     schedule = schedule_of(settings, dt)
     ends = range(schedule.first, n_steps, schedule.interval)
-    return n_modes * sum(6e-3 + 1.3e-6 * min(end, schedule.longest) for end in ends)
+    return n_modes * sum(2e-3 + 3.2e-6 * min(end, schedule.longest) for end in ends)
 
 
 GPR_ADAPTIVE = Observer(
@@ -76,7 +78,7 @@ GPR_ADAPTIVE = Observer(
     "Adaptive GPR",
     (VIBRATION,),
     gpr_adaptive,
-    help="told nothing: inputs, kernel and targets of the regression learnt from the last 8 s, twice a second; not in the paper",
+    help="told nothing: inputs, kernel and targets of the regression learnt from the last 8 s, every 0.75 s; not in the paper",
     settings=ADAPTIVE,
     tunable=Tunable(("adaptive.window", "adaptive.depth"), ("adaptive.interval",)),
     weight=50.0,

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from wfsobs.observers.kalman.adaptive import Adaptive
 
 
+SLOWER = 1.5
+"""Time from learning to learning, over `adaptive.interval`: less often costs errors, more often processor time alone."""
+
+
 class Schedule(NamedTuple):
     """When it learns from what, all in steps.
 
@@ -38,7 +42,7 @@ def schedule_of(settings: Adaptive, dt: float) -> Schedule:
     """Return the schedule of settings. Raises RecordError for a window of too few samples."""
     window, interval = lengths(settings, dt)
     first = max(window // 2, SHORTEST)
-    return Schedule(first, interval, 2 * window, min(settings.depth, first // 4))
+    return Schedule(first, round(SLOWER * interval), 2 * window, min(settings.depth, first // 4))
 
 
 class AdaptiveGprEstimator:

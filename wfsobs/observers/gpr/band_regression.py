@@ -15,6 +15,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided, sliding_window_view
 from scipy.linalg import toeplitz
 from scipy.linalg.lapack import dpstrf
 
@@ -46,24 +47,24 @@ def factor_of(covariance: Array, digits: float = DIGITS) -> Array:
     C = toeplitz(covariance / covariance[0])
     factor, pivots, rank, _ = dpstrf(C, tol=digits, lower=1)
     out = np.zeros((len(C), rank))
-    out[pivots - 1] = np.tril(factor)[:, :rank]
+    out[pivots - 1] = np.tril(factor[:, :rank])
     return out
 
 
 def window_products(x: Array, targets: Array, first: int, depth: int) -> tuple[Array, Array]:
     """Return X'X (depth, depth) and X'f (depth,) of the windows that end at first ... first + len(targets) - 1.
 
-    x : samples (n,); first >= depth. Inner products slide: the next diagonal has one sample less and one more.
+    x : samples (n,); first >= depth. Inner products slide: the next on a diagonal has one sample less and one more.
     """
     end = first + len(targets)
     lags = x[first - depth + 1 : end]
-    gram = np.empty((depth, depth))
-    gram[0] = np.correlate(lags, x[first:end], "valid")[::-1]
-    come, gone = x[first - 1 : first - depth - 1 if first > depth else None : -1], x[end - 1 : end - depth - 1 : -1]
-    for i in range(depth - 1):
-        gram[i + 1, 0] = gram[0, i + 1]
-        gram[i + 1, 1:] = gram[i, :-1] + come[i] * come[:-1] - gone[i] * gone[:-1]
-    return gram, np.correlate(lags, targets, "valid")[::-1]
+    ends = [x[last - 1 : last - depth - 1 if last > depth else None : -1] for last in (first, end)]
+    come, gone = (sliding_window_view(np.concatenate([part[:-1], np.zeros(depth)]), depth) * part[:, None] for part in ends)
+    diagonals = np.cumsum(np.vstack([np.correlate(lags, x[first:end], "valid")[::-1], (come - gone)[:-1]]), axis=0)
+    upper = np.zeros((depth, 2 * depth))
+    as_strided(upper, diagonals.shape, (sum(upper.strides), upper.strides[1]))[...] = diagonals  # [i, j] at [i, i + j]
+    upper = upper[:, :depth]
+    return upper + np.triu(upper, 1).T, np.correlate(lags, targets, "valid")[::-1]
 
 
 def fit_bands(x: Array, targets: Array, first: int, covariance: Array) -> BandRegression:

@@ -14,6 +14,7 @@ The spectrum of the window (`wfsobs.spectral.quick`) says which lines stand abov
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from wfsobs.signal.periodic import FilterStep, PeriodicFilter
 from wfsobs.signal.riccati import steady_state
 from wfsobs.signal.smoother import smoother
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
+from wfsobs.spectral.missed import missed_variance
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.periodogram import periodogram, periodogram_frequencies
 from wfsobs.spectral.quick import quick_spectrum
@@ -44,7 +46,7 @@ class Learnt(NamedTuple):
     fit     : its spectrum, None before the first
     mean    : of the window [um]
     weights : of the whitened samples, the newest first, (depth,); zero where no line stands above the continuum
-    sd      : standard deviation of the estimate's error by the model [um], NaN without one
+    sd      : standard deviation of the estimate's error [um]: by the model, and what lines may be missed; NaN before the first
     """
 
     fit: Spectrum | None
@@ -75,13 +77,14 @@ def learn(z: Array, dt: float, depth: int, most: int, lowest: float, last: Learn
         with np.errstate(divide="raise", over="raise", invalid="raise"):
             fit = quick_spectrum(z, dt, most, lowest, last.fit)
             lines = standing(fit, z)
+            missed = missed_variance(lines, z, lowest)
             if not lines.resonances:
-                return Learnt(fit, mean, np.zeros(depth), np.nan)
+                return Learnt(fit, mean, np.zeros(depth), float(np.sqrt(missed)))
             target = smoother(_model(lines), VIBRATION, max(lines.noise, MIN_NOISE))
             x = PeriodicFilter([whitener_of(fit)]).run(z[:, None, None])[:, 0, 0]
             first = SETTLED * depth
             found = fit_bands(x, target.run(z)[first + horizon :], first, weight_covariance(lines, depth))
-            sd = np.sqrt(target.variance + found.noise**2 + found.spread**2)
+            sd = np.sqrt(target.variance + found.noise**2 + found.spread**2 + missed)
             return Learnt(fit, mean, found.weights, float(sd))
     except (ValueError, ArithmeticError):
         return last
@@ -97,6 +100,7 @@ def standing(fit: Spectrum, z: Array) -> Spectrum:
     return replace(fit, resonances=kept)
 
 
+@lru_cache(maxsize=64)
 def whitener_of(fit: Spectrum | None) -> FilterStep:
     """Return the filter z -> innovations of the continuum, over their rms, and their states; (F, G, H, J)."""
     if fit is None or fit.turbulence is None:

@@ -6,7 +6,7 @@ The states of the independent filters of `kalman.multi`, one per mode, and runni
 Longer means gain a little in an endless record, and lose more in its first seconds. Since the estimates of the independent
 filters are among what is weighed, it is no worse than they are where it is told the truth.
 
-Where modes tell nothing of one another, the prior has no such matrix, and the independent filters themselves run.
+Where modes tell nothing of one another, the prior has no such matrix: there is nothing to couple, and the observer refuses.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy.linalg import block_diag
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates
 from wfsobs.observers.kalman.mode_filter import ModeFilter
-from wfsobs.observers.kalman.multi import PEAKS, MultiPeak, independent_filters, kf_multi
+from wfsobs.observers.kalman.multi import PEAKS, MultiPeak, independent_filters
 from wfsobs.observers.kalman.step import KalmanEstimator, matrix_power
 from wfsobs.prior import Flow, Lines, Prior
 from wfsobs.progress import Watch
@@ -34,6 +34,10 @@ from wfsobs.typing import Array
 
 MEANS = running_means((0.0, 3.0, 9.0, 27.0, 81.0, 243.0))
 """The running means of each measurement, the first of them the measurement itself."""
+
+
+INDEPENDENT = "the modes tell nothing of one another: `kf-multi` estimates each by itself"
+"""Why there is no coupled filter."""
 
 
 class CoupledModel:
@@ -56,10 +60,16 @@ class CoupledModel:
         Of the independent filters.
     means : StateFilter
         As the attribute.
+
+    Raises
+    ------
+    ValueError
+        The prior has no flow.
     """
 
     def __init__(self, prior: Prior, settings: MultiPeak, means: StateFilter = MEANS):
-        assert prior.flow is not None
+        if prior.flow is None:
+            raise ValueError(INDEPENDENT)
         self.means = means
         self.filters, self._flow = independent_filters(prior, settings), prior.flow
         silent = Ar2(1.0, 1.0, 0.0, prior.lines[0].dt)
@@ -135,8 +145,6 @@ def _with_means(one: ModeFilter, means: StateFilter) -> StateFilter:
 
 def kf_coupled(measurements: Measurements, prior: Prior, settings: MultiPeak, watch: Watch) -> Estimates:
     """Run the filter on the LGS measurements of all modes, at every fast step."""
-    if prior.flow is None:
-        return kf_multi(measurements, prior, settings, watch)
     model, z = CoupledModel(prior, settings), measurements.z
     weights = np.vstack([model.plan(0.0, target)[0] for target in TARGETS])
     out, start = np.zeros((len(z), len(weights))), 0
@@ -209,20 +217,13 @@ class CoupledEstimator:
         self.means[...], self._is_first = state["means"], bool(state["is_first"])
 
     def take_over(self, old: Any) -> None:
-        """Go on from another design; independent filters alone have no means, which then start anew."""
-        if isinstance(old, CoupledEstimator):
-            self.kalman.take_over(old.kalman)
-            self.means[...], self._is_first = old.means, old._is_first
-        else:
-            self.kalman.take_over(old)
+        """Go on from another design."""
+        self.kalman.take_over(old.kalman)
+        self.means[...], self._is_first = old.means, old._is_first
 
 
-def step_kf_coupled(
-    prior: Prior, settings: MultiPeak, _sampling: Sampling, _horizon: float
-) -> CoupledEstimator | KalmanEstimator:
+def step_kf_coupled(prior: Prior, settings: MultiPeak, _sampling: Sampling, _horizon: float) -> CoupledEstimator:
     """Return the filter one frame at a time."""
-    if prior.flow is None:
-        return KalmanEstimator(independent_filters(prior, settings))
     return CoupledEstimator(CoupledModel(prior, settings))
 
 
@@ -231,7 +232,7 @@ KF_COUPLED = Observer(
     "Coupled KF",
     TARGETS,
     kf_coupled,
-    help="every mode from the measurements of all, for frozen flow; `kf-multi` where modes are independent; not in the paper",
+    help="every mode from the measurements of all, for frozen flow of two modes or more; not in the paper",
     prior=(Lines, Flow),
     settings=PEAKS,
     linear=True,

@@ -73,32 +73,37 @@ def _adapt(v: Array, dt: float, lengths: Lengths, settings: Adaptive, tell: Call
         if found.cycle is not None:
             run = run_window(found.cycle, v[start : min(due, n)], end - start)
             for stop in range(end + lengths.interval, min(due, n) + 1, lengths.interval):
-                if not is_still(run.surprise[stop - lengths.interval - start : stop - start]):
+                if not is_still(run.surprise[stop - lengths.interval - end : stop - end]):
                     changed, due = stop - lengths.interval, stop
                     break
-            out[:, end - 1 : due] = run.estimates[:, end - 1 - start : due - start]
+            out[:, end - 1 : due] = run.estimates[:, : due - end + 1]
         end = due
         start = window_start(end, changed, lengths)
     return out
 
 
 class WindowRun(NamedTuple):
-    """A filter over a window: estimates and standard deviations (2, n, 2) [um]; squared innovations over their variances (n,)."""
+    """A filter from the last step of its window on.
+
+    estimates : of that step and the n behind it, and their standard deviations, (2, n + 1, 2) [um]
+    surprise  : squared innovations of those n over their variances, (n,)
+    """
 
     estimates: Array
     surprise: Array
 
 
 def run_window(cycle: Cycle, v: Array, size: int) -> WindowRun:
-    """Run the filter of a cycle over v (n, 2) from its first step on; size : steps of which it is the model."""
+    """Run the filter of a cycle over v (n, 2) from its first step on; size : steps of its window, which come first."""
     frames = len(cycle.steps)
     means = np.array([v[:size, 0].mean(), v[frames - 1 : size : frames, 1].mean()])
     A, C, _, R = cycle.steps[0]
     filter_, states = optimal_filter(cycle.steps, np.vstack([cycle.rows, C[0] @ A]))
-    found = filter_.cycle.run((v - means)[:, :, None])[:, :, 0]
-    innovations = v[:, 0] - means[0] - np.append(0.0, found[:-1, 2])
-    variance = np.resize([C[0] @ s.P @ C[0] + R[0, 0] for s in states], len(v))
-    sd = np.resize(target_sd(cycle.rows, [s.posterior for s in states]), (len(v), len(TARGETS)))
+    found = filter_.cycle.run((v - means)[:, :, None], since=size - 1)[:, :, 0]
+    innovations = v[size:, 0] - means[0] - found[:-1, 2]
+    phase = np.arange(size - 1, len(v)) % frames
+    variance = np.array([C[0] @ s.P @ C[0] + R[0, 0] for s in states])[phase[1:]]
+    sd = target_sd(cycle.rows, [s.posterior for s in states])[phase]
     return WindowRun(np.array([found[:, :2] + [means[1], 0.0], sd]), innovations**2 / variance)
 
 

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, Look, Observer
 from wfsobs.observers.estimates import Estimates
@@ -37,7 +36,7 @@ from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.filter_covariance import Step
 from wfsobs.signal.riccati import SteadyState, periodic_steady_state
-from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
+from wfsobs.signal.statespace import DisturbanceModel, blocks_along_diagonal, disturbance_model
 from wfsobs.signal.stepping import Gain, GainCycle
 from wfsobs.typing import Array
 
@@ -48,26 +47,26 @@ def optimal_cycle(
     """Return (A, C, Q, R) of the steps k = 1 ... n, the NGS frame at the last; noises as standard deviations [um].
 
     State (disturbance model, slow LGS errors if any, frame). C has two rows at every step, LGS and NGS; where there is no
-    frame the second is zero.
+    frame the second is zero. Steps without a frame are one and the same.
     """
     A0, C0, Q0 = model.A, model.C, model.Q
     now = sum(model.outputs.values()) / ratio
     if lgs_error:
         error = disturbance_model(lgs_error, ())
-        A0, Q0 = block_diag(A0, error.A), block_diag(Q0, error.Q)
+        A0, Q0 = blocks_along_diagonal([A0, error.A]), blocks_along_diagonal([Q0, error.Q])
         C0, now = np.append(C0, error.C), np.append(now, np.zeros(len(error.A)))
     n = len(A0)
     R = np.diag([lgs_noise**2, ngs_noise**2])
-    steps: list[Step] = []
-    for j in range(1, ratio + 1):
-        frame = j == ratio
-        A = block_diag(A0, np.array([[0.0 if frame else 1.0]]))
-        A[n, :n] = now
-        C = np.zeros((2, n + 1))
-        C[0, :n] = C0
-        C[1, n] = float(frame)
-        steps.append((A, C, block_diag(Q0, np.zeros((1, 1))), R))
-    return steps
+    Q = np.zeros((n + 1, n + 1))
+    Q[:n, :n] = Q0
+
+    def step(frame: bool) -> Step:
+        A, C = np.zeros((n + 1, n + 1)), np.zeros((2, n + 1))
+        A[:n, :n], A[n, :n], A[n, n] = A0, now, float(not frame)
+        C[0, :n], C[1, n] = C0, float(frame)
+        return A, C, Q, R
+
+    return [*([step(False)] * (ratio - 1)), step(True)]
 
 
 def optimal_gains(cycle: list[Step]) -> tuple[GainCycle, list[SteadyState]]:

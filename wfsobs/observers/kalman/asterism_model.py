@@ -1,0 +1,250 @@
+"""Weights of the states of the asterism's filter, in every step after an NGS frame.
+
+States are those of the independent filter of a mode and running means, of the mean of the LGS in all modes, then of each
+difference; and those of the filter and the means of the NGS frames, mode after mode. Where LGS are out, the weights are of the
+states of the others alone (`signal.present_inputs`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
+from wfsobs.observers.estimates import TOTAL
+from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.multi import MultiPeak, independent_filters
+from wfsobs.observers.kalman.single import steady_mode
+from wfsobs.observers.kalman.step import matrix_power
+from wfsobs.prior import Asterism, Prior
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.filter_covariance import lyapunov
+from wfsobs.signal.frame_shares import frame_response, frame_shares
+from wfsobs.signal.joint_states import StateFilter, running_means, shared_covariance
+from wfsobs.signal.present_inputs import Present, PresentInputs
+from wfsobs.signal.statespace import disturbance_model
+from wfsobs.signal.wiener import Complex
+from wfsobs.typing import Array
+
+MEANS = running_means((0.0, 3.0, 9.0, 27.0, 81.0, 243.0))
+"""Of the LGS: over these steps, the first of them the measurement itself."""
+
+FRAME_MEANS = running_means((0.0, 1.0, 3.0, 9.0, 27.0, 81.0))
+"""Of the NGS: over these frames."""
+
+ALIKE = "all LGS see the same: `multirate-multi` takes their mean and the NGS"
+"""Why there is no filter of the asterism."""
+
+
+class Beginning(NamedTuple):
+    """A filter, and its state where the first measurement is 1: (n,)."""
+
+    filter: StateFilter
+    first: Array
+
+
+def frame_filters(prior: Prior, settings: MultiPeak, asterism: Asterism) -> list[ModeFilter]:
+    """Return a filter of the NGS frames of each mode, with its lines, as if frames were samples."""
+    found = []
+    for one, noise in zip(prior.lines, asterism.ngs_noise, strict=True):
+        step = asterism.ratio * one.dt
+        peaks = [peak.at(step) for peak in one.vibration(settings.line_width)]
+        turbulence = [replace(process, dt=step) for process in one.turbulence]
+        found.append(steady_mode(disturbance_model(turbulence, peaks), float(noise)))
+    return found
+
+
+def _with_means(one: ModeFilter, means: StateFilter) -> Beginning:
+    """Return a filter and means of the same measurement, of which the means begin as if it had always been what it is first."""
+    step = one.gains.steps[0]
+    reduced = (np.eye(len(step.A)) - step.L @ step.C) @ step.A
+    whole = StateFilter(block_diag(reduced, means.F), np.concatenate([step.L[:, 0], means.G]))
+    at_rest = np.linalg.solve(np.eye(len(means.F)) - means.F, means.G)
+    return Beginning(whole, np.concatenate([np.zeros(len(reduced)), at_rest]))
+
+
+class AsterismModel:
+    """Covariances of states and targets, and weights.
+
+    Attributes
+    ----------
+    fast, slow : list of Beginning
+        Of every LGS measurement in each mode, and of the NGS frames.
+    basis : Array
+        Weights of the LGS in their mean and their differences, (n_lgs, n_lgs).
+
+    Parameters
+    ----------
+    prior : Prior
+        With lines and asterism.
+    settings : MultiPeak
+        Of the independent filters.
+    ratio : int or None
+        Steps per NGS frame.
+    means, frame_means : StateFilter
+        Running means of every LGS measurement, and of every NGS frame.
+
+    Raises
+    ------
+    ValueError
+        The prior has no asterism, or another ratio.
+    """
+
+    def __init__(
+        self,
+        prior: Prior,
+        settings: MultiPeak,
+        ratio: int | None,
+        means: StateFilter = MEANS,
+        frame_means: StateFilter = FRAME_MEANS,
+    ):
+        asterism = prior.asterism
+        if asterism is None:
+            raise ValueError(ALIKE)
+        if ratio != asterism.ratio:
+            raise ValueError(f"the prior has an NGS frame every {asterism.ratio} steps, the loop every {ratio}")
+        self.basis, self.ratio, self._asterism = asterism.basis, asterism.ratio, asterism
+        self.fast = [_with_means(one, means) for one in independent_filters(prior, settings)]
+        self.slow = [_with_means(one, frame_means) for one in frame_filters(prior, settings, asterism)]
+        silent = Ar2(1.0, 1.0, 0.0, prior.lines[0].dt)
+        self._peaks = [disturbance_model((), one.vibration(settings.line_width) or [silent]) for one in prior.lines]
+        self._responses = [one.filter.response(asterism.omega) for one in self.fast] * self.n_stars
+        self._of_frames = [frame_response(one.filter, asterism.ratio, asterism.omega) for one in self.slow]
+        n_inputs = (self.n_stars + 1) * len(self._peaks)
+        self._powers = asterism.measurement.reshape(n_inputs, n_inputs, -1)
+        self._estimates = self._add_states()
+
+    @property
+    def n_stars(self) -> int:
+        """Number of LGS."""
+        return len(self.basis)
+
+    def plan(self, frames: float, target: str, present: Present | None = None) -> tuple[Array, Array]:
+        """Return weights and standard deviations of a target, or TOTAL, so many frames ahead.
+
+        present : LGS that are there, by default all; with none, the weights are of the NGS alone
+
+        Returns
+        -------
+        weights : Array
+            0, 1, ... steps after an NGS frame, and at last before the first, (ratio + 1, n_modes, n_states).
+        sd : Array
+            (ratio + 1, n_modes) [um].
+        """
+        found = [self._target(frames, target, phase) for phase in range(self.ratio)]
+        return self._estimates.estimate([*found, found[-1]], present or (True,) * self.n_stars)
+
+    def stand_ins(self, present: Present) -> Array:
+        """Return weights that predict the next measurement of every LGS, in all modes, (ratio + 1, n_lgs, n_modes, n_states)."""
+        variance = np.diag(self._measurement_covariance())
+        found = [(self._next_measurement(phase), variance) for phase in range(self.ratio)]
+        weights = self._estimates.estimate([*found, found[-1]], present)[0]
+        stars = weights.reshape(self.ratio + 1, self.n_stars, -1)
+        return (np.linalg.inv(self.basis) @ stars).reshape(self.ratio + 1, self.n_stars, len(self._peaks), -1)
+
+    def next_z_sd(self, present: Present) -> Array:
+        """Return the standard deviations of the next z less the sum of both estimates, (ratio + 1, n_modes) [um].
+
+        present : as in `plan`; z is the mean of those that are there, or of all where none is
+        """
+        combination, noise = self._combination(present), self._asterism.noise
+        rows = np.einsum("isk,sb->ibk", combination, np.linalg.inv(self.basis)).reshape(len(noise), -1)
+        seen = np.sum((rows @ self._measurement_covariance()) * rows, axis=1) + np.sum((combination * noise) ** 2, axis=(1, 2))
+        weights, sd = self.plan(0.0, TOTAL, present)
+        ahead = [rows @ self._next_measurement(phase) for phase in range(self.ratio)]
+        told = self._target(0.0, TOTAL, 0)[1] - sd**2  # the variance of the estimate
+        variance = seen + told - 2.0 * np.sum(weights * np.array([*ahead, ahead[-1]]), axis=2)
+        return np.sqrt(np.maximum(variance, 0.0))
+
+    def _add_states(self) -> PresentInputs:
+        """Compute covariances of the lines and the states in every phase, and return estimates from the latter."""
+        asterism, m, stars = self._asterism, len(self._peaks), self.n_stars
+        powers = self._powers
+        n = stars * m
+        fast, slow = shared_covariance(powers[:n, :n], self._responses), shared_covariance(powers[n:, n:], self._of_frames)
+        n_fast, self.n_states = len(fast), len(fast) + len(slow)
+        sizes = [*(one.filter.G.size for one in self.fast)] * stars + [one.filter.G.size for one in self.slow]
+        starts = np.cumsum([0, *sizes])
+        self._places = [np.r_[starts[i] : starts[i + 1], starts[n + i] : starts[n + i + 1]] for i in range(m)]
+        noises = zip(asterism.noise / np.sqrt(stars), asterism.ngs_noise, strict=True)
+        shares = [
+            frame_shares(one.filter, late.filter, self.ratio, model, *both)
+            for one, late, model, both in zip(self.fast, self.slow, self._peaks, noises, strict=True)
+        ]
+        self._of_lines = [[share.disturbance for share in one] for one in shares]
+        of_noise = [
+            lyapunov(one.filter.F, np.outer(one.filter.G, noise**2 * one.filter.G))
+            for one, noise in zip(self.fast, asterism.noise, strict=True)
+        ]
+        first = starts[m]
+        fast[first:, first:] += block_diag(*of_noise * (stars - 1))
+        covariances, seen_by_ngs = [], powers[:n, n:]
+        for phase in range(self.ratio):
+            between = self._between(seen_by_ngs, phase)
+            covariance = np.block([[fast, between], [between.T, slow]])
+            for places, one in zip(self._places, shares, strict=True):
+                covariance[np.ix_(places, places)] += one[phase].states
+            covariances.append(covariance)
+        return PresentInputs(covariances, self.basis, n_fast)
+
+    def _between(self, powers: Complex, phase: int) -> Array:
+        """Return the covariance of the states of the LGS and of the NGS, so many steps after a frame."""
+        late = self._late(phase)
+        return np.vstack(
+            [
+                np.hstack([np.real((one * row[j]) @ other.conj().T) for j, other in enumerate(late)])
+                for one, row in zip(self._responses, powers, strict=True)
+            ]
+        )
+
+    def _late(self, phase: int) -> list[Complex]:
+        """Return the responses of the states of the NGS so many steps after a frame."""
+        return [one * np.exp(-1j * phase * self._asterism.omega) for one in self._of_frames]
+
+    def _target(self, frames: float, target: str, phase: int) -> tuple[Array, Array]:
+        """Return covariances of the target and the states, and its variance."""
+        if target == TOTAL:
+            (one, own), (other, more) = (self._target(frames, part, phase) for part in TARGETS)
+            return one + other, own + more
+        return self._of_turbulence(frames, phase) if target == TURBULENCE else self._of_vibration(frames, phase)
+
+    def _of_turbulence(self, frames: float, phase: int) -> tuple[Array, Array]:
+        asterism, m = self._asterism, len(self._peaks)
+        ahead = (asterism.cross * np.exp(1j * asterism.omega * (1.0 + frames))).reshape(m, (self.n_stars + 1) * m, -1)
+        return self._with_states(ahead, phase), asterism.own.sum(axis=1)
+
+    def _next_measurement(self, phase: int) -> Array:
+        """Return those of the next measurement and the states: of the mean of the LGS, then each difference, in all modes."""
+        n = self.n_stars * len(self._peaks)
+        cross = self._with_states(self._powers[:n] * np.exp(1j * self._asterism.omega), phase)
+        for i, (model, of_lines) in enumerate(zip(self._peaks, self._of_lines, strict=True)):
+            cross[i, self._places[i]] += np.ravel(model.C @ model.A @ of_lines[phase])
+        return cross
+
+    def _measurement_covariance(self) -> Array:
+        """Return that of the measurements of `_next_measurement`, without noise, (n_lgs * n_modes, n_lgs * n_modes)."""
+        n, lines = self.n_stars * len(self._peaks), [(model.C @ model.C.T).item() for model in self._peaks]
+        return np.real(self._powers[:n, :n].sum(axis=2)) + np.diag(np.pad(lines, (0, n - len(lines))))
+
+    def _combination(self, present: Present) -> Array:
+        """Return the weights of the LGS in z, of these alone where it is their mean; NaN where a z of some is not known."""
+        there, own = np.array(present), self._asterism.combination
+        if there.all() or not there.any():
+            return own
+        is_mean = np.allclose(own, np.eye(len(own))[:, None] / self.n_stars)
+        return own * (there * self.n_stars / there.sum())[:, None] if is_mean else np.full_like(own, np.nan)
+
+    def _with_states(self, powers: Complex, phase: int) -> Array:
+        """Return covariances of signals and the states, from the cross powers of the signals and all inputs."""
+        return np.hstack([np.real(powers[:, i] @ one.conj().T) for i, one in enumerate([*self._responses, *self._late(phase)])])
+
+    def _of_vibration(self, frames: float, phase: int) -> tuple[Array, Array]:
+        out, variances = np.zeros((len(self._peaks), self.n_states)), []
+        for i, (model, cross) in enumerate(zip(self._peaks, self._of_lines, strict=True)):
+            now = model.outputs[VIBRATION]
+            out[i, self._places[i]] = now @ matrix_power(model.A, frames) @ cross[phase]
+            variances.append(now @ now)  # the states have unit variance
+        return out, np.array(variances)
