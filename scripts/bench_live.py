@@ -2,15 +2,17 @@
 
     python scripts/bench_live.py [--seconds 60] [--pages 5] [--port 5930] [--browser]
 
-Starts `wfsobs live` on the preset paper with the linear observers and the online GPR, opens pages by websocket without a browser,
-and runs two empty loops of the same pace in processes of their own. Prints one JSON object: frames and lost frames; the shares of
-frames that were late by more than 1 ms: an estimate of the slowest observer (`late_share`), what the source sent
-(`late_share_sent`), the empty loop (`late_share_empty`), and one that goes first as the source does where the system lets it
-(`late_share_empty_first`, `goes_first`); how far the observers were behind, sampled every second
-[s]; processor time of the server and all its processes over time [cores]; memory, proportional set size after the first minute
-(or the first tenth), at the end, and at most [MB]. With --browser one more page stands in Chromium, whose processor time does not
-count; how far what it shows is behind the source is read every second [s]. What is asked of each follows in a line, passed or
-missed.
+Starts `wfsobs live` on the preset paper with all linear observers and the online GPR, opens pages by websocket without a browser
+that answer each picture as one that has painted it, and runs two empty loops of the same pace in processes of their own. Prints
+one JSON object: frames and lost frames; the shares of frames that were late by more than 1 ms: an estimate of the slowest
+observer (`late_share`), what the source sent (`late_share_sent`), the empty loop (`late_share_empty`), and one that goes first as
+the source does where the system lets it (`late_share_empty_first`, `goes_first`); how far the observers were behind, sampled
+every second [s]; processor time of the server and all its processes over time [cores]; memory, proportional set size after the
+first minute (or the first tenth), at the end, and at most [MB]; pictures a second that each page has received; how far they were
+behind the source as they came (`page_behind_s`), and what is on the page just before the next one comes
+(`page_behind_before_next_s`) [s]. With --browser one more page stands in Chromium, whose processor time does not count: how long
+it takes to show the present, and how far behind the source it is from then on, read twice a second [s]. What is asked of each
+follows in a line, passed or missed.
 """
 
 from __future__ import annotations
@@ -19,24 +21,26 @@ import argparse
 import asyncio
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
 import time
-from multiprocessing import Manager, Process, Value
+from multiprocessing import Manager, Process, Queue, Value
 from pathlib import Path
 from urllib.request import urlopen
 
+from live_pages import SHOWN, lags_of, watch_pages
 from playwright.sync_api import sync_playwright
-from visitor import Visitor
 
+from wfsobs import PRESETS
+from wfsobs.live.checks import observers_on
 from wfsobs.live.paced import SOURCE, go_first
+from wfsobs.live.simulated import SimulatedLoop
+from wfsobs.observers import OBSERVERS
 
-LINEAR = ("kf-lgs", "kf-multi", "kf-ngs", "multirate", "multirate-optimal", "multirate-multi", "butterworth-cl", "persistence")
-OBSERVERS = (*LINEAR, "gpr-online")
 DT, LATE = 1e-3, 1e-3
-SHOWN = re.compile(r"real time · ([0-9.]+) s ·")
+PAGE_BEHIND, PICTURES = 0.5, 5.0
+"""[s], per second"""
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -53,30 +57,28 @@ def run_empty(late, frames, end, first=None) -> None:
         due += DT
 
 
-def visit(base: str, pages: int) -> None:
+def visit(base: str, pages: int, pictures) -> None:
     """Open pages, and keep them open."""
-
-    async def stay() -> None:
-        kept = [await Visitor(base).open() for _ in range(pages)]
-        await asyncio.sleep(86_400 + len(kept))
-
-    asyncio.run(stay())
+    asyncio.run(watch_pages(base, pages, pictures))
 
 
-def watch(url: str, lags, end) -> None:
-    """Keep one page in a browser, and note how far what it shows is behind."""
+def watch(url: str, opened, lags, end) -> None:
+    """Keep one page in a browser: note how long it takes to show the present, and from then on how far it is behind."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"])
-        page = browser.new_page(viewport={"width": 1400, "height": 1000})
+        page, start = browser.new_page(viewport={"width": 1400, "height": 1000}), time.monotonic()
         page.goto(url)
         shown = page.get_by_text(SHOWN)
         shown.wait_for(timeout=120_000)
         while not end.value:
-            time.sleep(1.0)
             found, now = SHOWN.search(shown.inner_text()), counts(url)
             assert found is not None
-            seconds = float(found[1])
-            lags.append(round((now["frames"] + now["lost"]) * DT + now["behind_s"] - seconds, 3))
+            lag = sent_seconds(now) - float(found[1])
+            if opened.value:
+                lags.append(round(lag, 3))
+                time.sleep(0.5)
+            elif lag <= PAGE_BEHIND:
+                opened.value = time.monotonic() - start
         browser.close()
 
 
@@ -125,6 +127,17 @@ def counts(url: str) -> dict:
         return json.load(answer).get("live", {})
 
 
+def sent_seconds(now: dict) -> float:
+    """Return the time of the newest frame that the source has sent [s]."""
+    return (now["frames"] + now["lost"]) * DT + now["behind_s"]
+
+
+def chosen_observers() -> list[str]:
+    """Return every linear observer that runs frame by frame on the preset, and the online GPR."""
+    paper = PRESETS["paper"]()
+    return [name for name in observers_on(SimulatedLoop(paper), paper) if OBSERVERS[name].linear or name == "gpr-online"]
+
+
 def judge(result: dict) -> dict[str, bool]:
     """Say of every number whether it is as good as is asked."""
     memory, shown = result["memory_mb"], result["browser_behind_s"]
@@ -134,7 +147,10 @@ def judge(result: dict) -> dict[str, bool]:
         "source and server below 1.5 cores": result["cores"] < 1.5,
         "memory within 5 %": memory["most"] <= 1.05 * memory["settled"] and memory["end"] >= 0.95 * memory["settled"],
     }
-    return bars | ({"browser at most 0.5 s behind": shown["max"] <= 0.5} if shown else {})
+    if rates := result["pictures_per_s"]:
+        bars[f"pages at most {PAGE_BEHIND} s behind"] = result["page_behind_before_next_s"]["max"] <= PAGE_BEHIND
+        bars[f"{PICTURES:g} pictures a second"] = min(rates) >= PICTURES
+    return bars | ({f"browser at most {PAGE_BEHIND} s behind": shown["max"] <= PAGE_BEHIND} if shown else {})
 
 
 def main() -> None:
@@ -146,17 +162,18 @@ def main() -> None:
     parser.add_argument("--browser", action="store_true")
     a = parser.parse_args()
     url = f"http://localhost:{a.port}"
-    chosen = [word for name in OBSERVERS for word in ("--observer", name)]
+    chosen = [word for name in chosen_observers() for word in ("--observer", name)]
     server = subprocess.Popen([sys.executable, "-m", "wfsobs", "live", "--port", str(a.port), *chosen], stderr=subprocess.DEVNULL)
     late, frames, late_first, frames_first = (Value("q", 0) for _ in range(4))
     end, first_of_all = Value("b", 0), Value("b", 0)
-    visitors = Process(target=visit, args=(f"localhost:{a.port}", a.pages), daemon=True)
+    pictures, polls, told = Queue(), [], []
+    visitors = Process(target=visit, args=(f"localhost:{a.port}", a.pages, pictures), daemon=True)
     empties = [
         Process(target=run_empty, args=(late, frames, end), daemon=True),
         Process(target=run_empty, args=(late_first, frames_first, end, first_of_all), daemon=True),
     ]
-    lags = Manager().list()
-    browser = Process(target=watch, args=(url, lags, end))
+    lags, opened = Manager().list(), Value("d", 0.0)
+    browser = Process(target=watch, args=(url, opened, lags, end))
     try:
         ready = time.monotonic() + 120.0
         while time.monotonic() < ready:
@@ -176,11 +193,13 @@ def main() -> None:
         behind, memory = [], []
         while (elapsed := time.monotonic() - start) < a.seconds:
             time.sleep(1.0)
-            behind.append(counts(url)["behind_s"])
+            now = counts(url)
+            behind.append(now["behind_s"])
+            polls.append((time.monotonic(), sent_seconds(now)))
+            while not pictures.empty():
+                told.append(pictures.get())
             memory.append((elapsed, memory_mb(family(server.pid))))
         last, seconds = counts(url), time.monotonic() - start
-        with urlopen(f"{url}/liveness", timeout=120) as answer:
-            pages = json.load(answer)["sessions"]
         used = cpu_seconds(family(server.pid)) - cpu
         end.value = 1
         for empty in empties:
@@ -210,7 +229,8 @@ def main() -> None:
                 "end": round(memory[-1][1], 1),
                 "most": round(max(mb for at, mb in memory if at >= settled), 1),
             },
-            "pages": pages,
+            **lags_of(told, polls, start),
+            "browser_opened_s": round(opened.value, 1) if a.browser else None,
             "browser_behind_s": {"median": shown[len(shown) // 2], "max": shown[-1]} if shown else None,
             "load": os.getloadavg()[0],
         }

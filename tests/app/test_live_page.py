@@ -12,17 +12,20 @@ import pytest
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs.job import FAILED, RUNNING, Job
+from wfsobs.app.jobs.task import IDLE
 from wfsobs.app.limits import NONE
 from wfsobs.app.live_order import LiveOrder
 from wfsobs.app.numbers import number
 from wfsobs.app.pages.live import LivePage
 from wfsobs.app.pages.live_table import ranking
-from wfsobs.app.pages.pages import LIVE
+from wfsobs.app.pages.pages import EXPLORE, LIVE
 from wfsobs.app.service import Service
+from wfsobs.app.session import opens_on_live
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.simulated import SimulatedLoop
+from wfsobs.live.view import SHARED, SharedView
 from wfsobs.record import Record
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
@@ -116,6 +119,26 @@ def seen(page: LivePage, live: LiveLoop, controller: str) -> Any:
     return np.array([np.nan]) if left is None else left.rms(controller)
 
 
+def test_pages_share_what_was_read_a_moment_ago(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the same window, while the loop plays."""
+    now, shared = [5.0], SharedView()
+    read: list[float] = []
+    monkeypatch.setattr("wfsobs.live.view.monotonic", lambda: now[0])
+
+    def look(seconds: float, *, anew: bool = False) -> int:
+        view: Any = read.append
+        shared.look(view, seconds, anew=anew)
+        return len(read)
+
+    assert [look(2.0), look(2.0)] == [1, 1]
+    assert look(5.0) == 2 and read[-1] == 5.0, "another window"
+    assert look(5.0, anew=True) == 3
+    now[0] += 0.5 * SHARED
+    assert look(5.0) == 3
+    now[0] += SHARED
+    assert look(5.0) == 4
+
+
 def test_pictures_wait_for_the_browser(page: LivePage, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[int] = []
     monkeypatch.setattr(page, "draw", lambda: drawn.append(1) is None)
@@ -168,6 +191,45 @@ def test_pages_open_with_the_settings_of_the_loop_that_all_watch(loop: Any, ente
     store = Store(loop.queue.put, session)
     loop.closing.append(store)
     assert store.scenario == scenario and store.preset == "night" and store.changed_paths() == ["sensors.lgs_rate"]
+
+
+def test_a_page_that_opens_on_live_has_its_first_run_when_another_page_needs_it(loop: Any, enter: Any) -> None:
+    """Until then the modes of the settings are offered, in place of those of a run."""
+    scenario = PRESETS["higher-orders"]().replace({"run.duration": 1.0, "run.warm_up": 0.2})
+    runs: list[Any] = []
+    dashboard = Dashboard(loop.queue.put, enter(lambda asked, *_: runs.append(asked)), PRESETS["paper"]())
+    loop.closing.append(dashboard)
+    dashboard.store.rests = True
+    dashboard.page()
+    dashboard.pages.current = LIVE
+    dashboard.start()
+    dashboard.store.load(scenario)
+    assert dashboard.store.run.state == IDLE
+    modes = [mode.name for mode in scenario.modes]
+    assert list(dashboard.modes.list.options.values()) == modes and len(modes) > 2 and dashboard.modes.list.visible
+    dashboard.display.mode = modes[3]
+    dashboard.pages.current = EXPLORE
+    loop.finish(dashboard.store)
+    assert runs == [scenario] and dashboard.display.mode == modes[3]
+    dashboard.pages.current = LIVE
+    dashboard.store.change("turbulence.wind_speed", 21.0)  # from now on as everywhere
+    loop.finish(dashboard.store)
+    assert len(runs) == 2
+
+
+@pytest.mark.parametrize(
+    ("query", "is_shared", "is_live"),
+    [
+        ("", False, False),
+        ("", True, True),
+        ("?theme=dark", True, True),
+        ("?view.page=live", False, True),
+        ("?preset=ut4&view.page=live", True, True),
+        ("?view.page=explore", True, False),
+    ],
+)
+def test_which_page_an_address_opens_with(query: str, is_shared: bool, is_live: bool) -> None:
+    assert opens_on_live(query, is_shared) == is_live
 
 
 def test_a_record_that_is_loaded_is_played(page: LivePage, dashboard: Dashboard, loop: Any) -> None:

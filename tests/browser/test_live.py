@@ -7,6 +7,8 @@ from typing import Any
 
 from playwright.sync_api import expect
 
+from tests.browser.conftest import DONE, SETTINGS, finished
+
 LONG = 120_000
 
 
@@ -35,12 +37,13 @@ QUICK = "?run.duration=1&run.warm_up=0.2&gpr_online.training_size=40&gpr_offline
 
 
 def begin(page: Any) -> None:
+    page.wait_for_function(SETTINGS, polling=100)
     page.get_by_role("button", name="Start", exact=True).click()
     expect(page.get_by_role("figure", name="Waterfall")).to_be_visible(timeout=LONG)
 
 
 def test_a_peak_that_is_moved_in_the_live_spectrum(open_page: Any, server: Any) -> None:
-    page = open_page(url=server.url + QUICK)
+    page = open_page(url=server.url + QUICK, wait=False)
     begin(page)
     page.get_by_role("combobox", name="Errors of").click()
     page.get_by_role("option", name="Vibration", exact=True).click()
@@ -76,7 +79,7 @@ SLEEP = "() => { const end = performance.now() + 6000; while (performance.now() 
 
 def test_a_page_that_sleeps_and_wakes_shows_now(open_page: Any, server: Any) -> None:
     """What came while it slept is not made up for, picture by picture: one may have been on its way, the next is of now."""
-    page = open_page(url=server.url + QUICK)
+    page = open_page(url=server.url + QUICK, wait=False)
     begin(page)
     page.evaluate(WATCH)
     page.wait_for_function("window.shown.length > 2", timeout=LONG)
@@ -84,3 +87,17 @@ def test_a_page_that_sleeps_and_wakes_shows_now(open_page: Any, server: Any) -> 
     page.wait_for_function(f"window.read() > {asleep} + 5", timeout=LONG)
     late = [t for t in page.evaluate("window.shown") if asleep + 0.5 < t < asleep + 4.5]
     assert len(late) <= 1, late
+
+
+def test_a_page_that_opens_on_live_runs_nothing_until_another_page_needs_it(open_page: Any, server: Any) -> None:
+    page = open_page(url=server.url + QUICK + "&view.mode=tilt", wait=False)
+    begin(page)
+    wind = page.get_by_role("textbox", name="Wind speed V₀ [m/s]")
+    wind.fill("20")
+    wind.press("Enter")
+    expect(page.get_by_role("list", name="Events")).to_contain_text("Wind speed V₀ 15 → 20 m/s", timeout=LONG)
+    assert not page.evaluate(DONE)
+    expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
+    page.get_by_role("button", name="Explore", exact=True).click()
+    finished(page)
+    expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")

@@ -128,7 +128,7 @@ def test_controllers_beside_a_loop_that_runs():
     loop = LiveLoop(SimulatedLoop(scenario), scenario, ["persistence"], speed=2.0)
     try:
         assert loop.control_view(1.0) is None
-        with pytest.raises(SettingError, match="does not run frame by frame"):
+        with pytest.raises(SettingError, match="no such observer or controller"):
             loop.control("no-such-controller", True)
         loop.play()
         for name in ("integrator", "none"):

@@ -15,6 +15,7 @@ from wfsobs.live.ring import CAPACITY, Ring
 from wfsobs.live.simulated import Integrator
 from wfsobs.observers import OBSERVERS
 from wfsobs.scenario.presets import paper
+from wfsobs.telemetry.records import save_record
 
 
 def frames(n, length, seed=1, **changes):
@@ -142,8 +143,8 @@ def test_live_numbers_are_those_of_the_recording(session):
     ("arguments", "line"),
     [
         (["--replay", "a.npz", "--in", "b"], "live: --replay and --in are two sources, take one"),
-        (["--headless", "--observer", "butterworth-ol"], "looks ahead: it cannot run frame by frame"),
-        (["--headless", "--observer", "kf"], "observer 'kf': no such observer; there are"),
+        (["--headless", "--observer", "butterworth-ol"], "observer 'butterworth-ol': does not run frame by frame; there are"),
+        (["--headless", "--observer", "kf"], "'kf': no such observer or controller; there are"),
         (
             ["--headless", "--preset", "wind-change", "--set", "turbulence.wind_speed=80"],
             "events: at 11 s turbulence.wind_speed = 160.0: takes a number from 0.1 to 100 m/s",
@@ -155,3 +156,21 @@ def test_what_cannot_run_is_one_line(arguments, line):
         [sys.executable, "-m", "wfsobs", "live", "--seconds", "1", *arguments], capture_output=True, text=True, timeout=200
     )
     assert done.returncode == 2 and line in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_without_a_page_what_happens_and_alarms_go_to_a_log(tmp_path):
+    record = wfsobs.simulate(paper().replace({"run.duration": 6.0}))
+    record.y_lgs[2000:4000] = np.nan
+    save_record(tmp_path / "gap.npz", record)
+    command = [sys.executable, "-m", "wfsobs", "live", "--headless", "--json", "--replay", "gap.npz", "--log", "night.log"]
+    done = subprocess.run(
+        [*command, "--seconds", "6", "--observer", "kf-lgs"], capture_output=True, text=True, timeout=200, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["frames"] == 6000
+    lines = [line.split(" ", 2) for line in (tmp_path / "night.log").read_text(encoding="utf-8").splitlines()]
+    when = {what: float(seconds) for _, seconds, what in lines}
+    first = next(line for line in when if line.startswith("ALARM"))
+    assert first.endswith("of LGS frames missing")
+    # judged by the second, in which at least 1 % of the frames are missing from 2.01 s to 4.99 s
+    assert 2.0 < when[first] < when["over: LGS frames missing"] <= 6.0

@@ -1,22 +1,13 @@
 """The preset night, three times as fast: every event is told, and the alarms of each come when they should."""
 
-import queue
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
+from tests.live.in_process import LoopInProcess
 from tests.live.test_programme import Maker
-from wfsobs.live.board import Board
-from wfsobs.live.crew import trace_width
-from wfsobs.live.observing import Order, made_crew
 from wfsobs.live.programme import Programme
-from wfsobs.live.recording import Recorder
-from wfsobs.live.ring import Ring
-from wfsobs.live.rows import Rows
 from wfsobs.live.shadow import Shadow
 from wfsobs.live.simulated import SimulatedFrames
-from wfsobs.live.view import last_frames, read_view
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.stepping import sampling_of
 
@@ -30,19 +21,14 @@ def fast_night():
     return night.replace({"run.duration": night.run.duration / FASTER, "events": events})
 
 
-class Night:
-    """A live loop on the night, in this process and without a clock."""
+class Night(LoopInProcess):
+    """A live loop on the night."""
 
     def __init__(self):
-        told = fast_night()
-        self.scenario, self.sampling, self.lines = told.before_events, sampling_of(told), []
+        told, self.lines = fast_night(), []
+        super().__init__(told.before_events, sampling_of(told), True)
         maker = Maker(self.scenario)
         source = SimulatedFrames(self.scenario, maker)
-        self.ring, self.board, self.traces = Ring(2), Board(2), Rows(trace_width(2), 4096)
-        order = Order(self.scenario.to_dict(), ("kf-multi",), self.sampling, 0, False, "", "", "", None, queue.Queue())
-        crew = made_crew(order, self.board)
-        self.recorder = Recorder(self.ring, self.sampling, self.say, True)
-        self.workshop = SimpleNamespace(do=lambda function, *given, then: then(function(*given)), finding=None)
         programme = Programme(told, lambda command: self.say(source.take(maker.tell(command), self.newest)))
         shadow = Shadow(self.say, self)
         for k in range(round((told.run.duration + 2.0) / self.sampling.dt)):
@@ -50,28 +36,11 @@ class Night:
                 programme.play(k * self.sampling.dt)
                 shadow(self)
             self.ring.write(np.concatenate(([0.0], source.next_row(k))))
-            frame = self.ring.read(k)
-            assert frame is not None
-            self.traces.write(crew.take(frame, k))
+            self.observe()
 
     def say(self, line):
         if line:
             self.lines.append((self.newest * self.sampling.dt, line))
-
-    @property
-    def newest(self):
-        return self.ring.count
-
-    def frames(self, seconds):
-        first, stop = last_frames(self.newest, self.sampling.dt, seconds)
-        return first, self.ring.read_frames(first, stop)
-
-    def views(self, seconds):
-        return [(read_view(self.ring, [self.traces], self.sampling.dt, seconds), self.board.active())]
-
-    def release(self):
-        for shared in (self.ring, self.traces, self.board):
-            shared.release()
 
 
 @pytest.fixture

@@ -3,25 +3,15 @@
 Stream, source, observers, alarms and identification are those of `wfsobs live --in STREAM`, in this process and without a clock.
 """
 
-import queue
-from concurrent.futures import Future
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 import wfsobs
+from tests.live.in_process import LoopInProcess
 from tests.live.test_sources import Inbox
 from wfsobs.live.attached import StreamFrames, StreamSource
-from wfsobs.live.board import Board
-from wfsobs.live.crew import trace_width
-from wfsobs.live.observing import Order, made_crew
 from wfsobs.live.paced import Desk
-from wfsobs.live.recording import Recorder
-from wfsobs.live.ring import Ring
-from wfsobs.live.rows import Rows
 from wfsobs.live.shadow import Shadow, append_line
-from wfsobs.live.view import last_frames, read_view
 from wfsobs.scenario.presets import paper
 from wfsobs.streams.shared_image import SharedImage
 
@@ -29,61 +19,35 @@ SPAN = 8
 """Length of what is identified [s], in place of a minute."""
 
 
-class Loop:
+class Loop(LoopInProcess):
     """A live loop on a stream, in steps of a frame."""
 
     def __init__(self, folder):
-        self.image = SharedImage.create(folder / "modes.im.shm", (2,), dtype="float64")
-        self.scenario, self.log = paper(), folder / "night.log"
+        self.image, self.log = SharedImage.create(folder / "modes.im.shm", (2,), dtype="float64"), folder / "night.log"
         source = StreamSource(self.image.path, (0, 1), 1.0, 1e-3)
-        self.sampling, self.ring, self.board = source.sampling, Ring(2), Board(2)
-        self.traces = Rows(trace_width(2), 4096)
-        inbox, self.news = Inbox(), queue.Queue()
+        super().__init__(paper(), source.sampling, False)
+        inbox = Inbox()
         self.stream = StreamFrames(source, Desk(self.ring.name, 2, inbox, self.news, 1.0, None))
         self.stream._look()
         inbox.waiting.append({"play": True})
         self.stream._follow_commands()
-        order = Order(self.scenario.to_dict(), ("kf-multi",), self.sampling, 0, False, "", "", "", None, self.news)
-        self.crew, self.count = made_crew(order, self.board), 0
-        self.recorder = Recorder(self.ring, self.sampling, self.say, False)
-        self.workshop = SimpleNamespace(do=self.do, finding=None)
         self.shadow = Shadow(self.say, self)
 
     def say(self, line):
-        append_line(str(self.log), self.ring.count * self.sampling.dt, line)
-
-    def do(self, function, *arguments, then):
-        done = Future()
-        done.set_result(function(*arguments))
-        then(done.result())
-
-    @property
-    def newest(self):
-        return self.ring.count
-
-    def frames(self, seconds):
-        first, stop = last_frames(self.newest, self.sampling.dt, seconds)
-        return first, self.ring.read_frames(first, stop)
-
-    def views(self, seconds):
-        return [(read_view(self.ring, [self.traces], self.sampling.dt, seconds), self.board.active())]
+        append_line(str(self.log), self.newest * self.sampling.dt, line)
 
     def send(self, z, is_lost):
         self.image.write(z)
         if is_lost:
             return
         self.stream.take()
-        while self.count < self.ring.count:
-            frame = self.ring.read(self.count)
-            self.traces.write(self.crew.take(frame, self.count))
-            self.count += 1
+        self.observe()
         if self.count % 200 == 0:
             self.shadow(self)
 
     def release(self):
         self.stream._ring.release()
-        for shared in (self.ring, self.traces, self.board):
-            shared.release()
+        super().release()
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ loop.play()
 while loop.observers_are_alive and loop.count < n:
     time.sleep(0.1)
 for observer in loop.board.active():
-    for target in loop.targets(observer):
+    for target in OBSERVERS[observer].targets:
         print(observer, target, *(1e3 * loop.board[observer].rms(target)), "nm")
 loop.stop()
 """
@@ -54,7 +54,7 @@ def _loop_options(order: LiveOrder) -> list[str]:
 
 def live_script(scenario: Scenario, preset: str, source: Source | None, order: LiveOrder) -> str:
     """Write a script that runs the loop for 10,000 frames, or a record to its end, and prints the errors."""
-    imports = {"import time", "import wfsobs", "from wfsobs.live.loop import LiveLoop"}
+    imports = {"import time", "import wfsobs", "from wfsobs.live.loop import LiveLoop", "from wfsobs.observers import OBSERVERS"}
     lines = [f"scenario = {scenario_code(scenario, preset, FILE)}"]
     if "configfile." in lines[0]:
         imports.add("from wfsobs.scenario import configfile")

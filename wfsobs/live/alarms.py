@@ -30,9 +30,11 @@ FEWEST = 10
 SIGMAS = 5.0
 """A peak has moved if its frequencies differ by more than so many standard deviations, and is another beyond REACH."""
 REACH = 0.1
-"""Part of its frequency within which a peak is looked for again."""
+"""Part of its frequency within which a peak of its size is looked for again."""
 CLOSE = 0.02
 """Part of their frequency within which peaks are one: of two modes, or a line that has been found in pieces."""
+SIZE = 2.0
+"""Factor within which a line that has moved keeps its rms: what is left of it in a minute in which it jumps may be nearer."""
 RESOLUTION = 1.0 / 60.0
 """Standard deviation of a frequency at least [Hz]: a minute resolves no more, and a real line wanders."""
 FAINT = 0.1
@@ -52,7 +54,7 @@ class Alarms:
         self._say = say
         self._history: dict[str, list[float]] = {}
         self._active: set[str] = set()
-        self._peaks: tuple[PeakFinding, ...] | None = None
+        self._peaks: list[tuple[PeakFinding, ...]] = []
 
     def look_at(self, frames: LiveFrame, first: int, ratio: int | None) -> None:
         """Judge a second of frames.
@@ -79,8 +81,9 @@ class Alarms:
 
     def compare(self, finding: Finding) -> None:
         """Judge an identification against the one before."""
-        before, self._peaks = self._peaks, distinct_peaks(finding)
-        for row in [] if before is None else drift(before, self._peaks):
+        self._peaks = [*self._peaks[-2:], distinct_peaks(finding)]
+        *earlier, now = self._peaks
+        for row in drift(earlier[-1], now, earlier[0] if len(earlier) > 1 else ()) if earlier else []:
             self._say(f"ALARM {row}")
 
     def _miss(self, sensor: str, due: Array) -> None:
@@ -141,16 +144,59 @@ def _joint_peak(peaks: Sequence[PeakFinding]) -> PeakFinding:
     return replace(strongest, frequency=middle, frequency_std=sqrt(float(share @ variances)))
 
 
-def drift(before: Sequence[PeakFinding], now: Sequence[PeakFinding]) -> list[str]:
-    """Say which peaks are new, have moved or are gone."""
-    lines, left = [], [*before]
+def drift(before: Sequence[PeakFinding], now: Sequence[PeakFinding], earlier: Sequence[PeakFinding] = ()) -> list[str]:
+    """Say which peaks are new, have moved or are gone.
+
+    A line that moves in the midst of a minute is two peaks in that minute: one is new. In the next one the other is gone, and has
+    moved to it if the minute before the two, `earlier`, had the one and not the other.
+    """
+    lines, same = [], _pairs(before, now)
     for peak in now:
-        same = min(left, key=lambda one: abs(one.frequency - peak.frequency), default=None)
-        if same is None or abs(same.frequency - peak.frequency) > REACH * peak.frequency:
+        if (one := same.get(peak)) is None:
             lines.append(f"new peak at {peak.frequency:.2f} Hz, {1e3 * peak.rms:.1f} nm")
             continue
-        left.remove(same)
-        std = hypot(*(max(one.frequency_std, RESOLUTION) for one in (same, peak)))
-        if not isnan(std) and abs(same.frequency - peak.frequency) > SIGMAS * std:
-            lines.append(f"peak moved from {same.frequency:.2f} to {peak.frequency:.2f} Hz")
-    return lines + [f"peak at {one.frequency:.2f} Hz is gone" for one in left]
+        std = hypot(*(max(each.frequency_std, RESOLUTION) for each in (one, peak)))
+        if not isnan(std) and abs(one.frequency - peak.frequency) > SIGMAS * std:
+            lines.append(f"peak moved from {one.frequency:.2f} to {peak.frequency:.2f} Hz")
+    for last in before:
+        if last not in same.values():
+            to = _new_place(last, now, earlier)
+            moved = "" if to is None else f"peak moved from {last.frequency:.2f} to {to.frequency:.2f} Hz"
+            lines.append(moved or f"peak at {last.frequency:.2f} Hz is gone")
+    return lines
+
+
+def _pairs(before: Sequence[PeakFinding], now: Sequence[PeakFinding]) -> dict[PeakFinding, PeakFinding]:
+    """Return peak -> the one before that it is: in its place, or else of its size and within REACH; the nearest ones first."""
+    near = [
+        (not _is_near(one, peak, CLOSE), abs(one.frequency - peak.frequency), peak, one)
+        for peak in now
+        for one in before
+        if _is_near(one, peak, CLOSE) or (_is_near(one, peak, REACH) and _are_alike(one, peak))
+    ]
+    pairs: dict[PeakFinding, PeakFinding] = {}
+    for *_, peak, one in sorted(near, key=lambda pair: pair[:2]):
+        if peak not in pairs and one not in pairs.values():
+            pairs[peak] = one
+    return pairs
+
+
+def _new_place(last: PeakFinding, now: Sequence[PeakFinding], earlier: Sequence[PeakFinding]) -> PeakFinding | None:
+    """Return where a peak has gone from its last place since the minute `earlier`, which had the one and not the other."""
+    was = [one for one in earlier if _is_near(one, last, CLOSE)]
+    places = [
+        peak
+        for peak in now
+        if _is_near(last, peak, REACH)
+        and not any(_is_near(one, peak, CLOSE) for one in earlier)
+        and any(_are_alike(one, peak) for one in was)
+    ]
+    return min(places, key=lambda peak: abs(peak.frequency - last.frequency), default=None)
+
+
+def _is_near(one: PeakFinding, other: PeakFinding, share: float) -> bool:
+    return abs(one.frequency - other.frequency) <= share * other.frequency
+
+
+def _are_alike(one: PeakFinding, other: PeakFinding) -> bool:
+    return other.rms <= SIZE * one.rms and one.rms <= SIZE * other.rms

@@ -18,8 +18,8 @@ NEXT = "next"
 """The next measurement: what an observer of turbulence and vibration expects of it is their sum."""
 SCORED = (*TARGETS, NEXT)
 """What errors are counted of."""
-SLOTS = tuple(o.id for o in OBSERVERS.values() if o.step is not None)
-"""Observers that run frame by frame; each has its place."""
+SLOTS = tuple(o.id for o in OBSERVERS.values() if o.step is not None and "y_stars" not in o.needs)
+"""Observers that run frame by frame, on what a live source sends: no LGS by itself; each has its place."""
 CREWS = ("linear", "others")
 """Linear observers follow in one process, those that learn or take long in another, so that the linear ones are on time."""
 

@@ -8,13 +8,13 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.step import StepController
 from wfsobs.live.board import SLOTS
 from wfsobs.live.control_crew import SEATS
-from wfsobs.live.follow import default_observers
 from wfsobs.live.source import STREAM, LiveSource
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.observers.step import StepObserver
 from wfsobs.prior import Training
 from wfsobs.priors_from.scenario import observer_settings
+from wfsobs.priors_from.selection import has_prior
 from wfsobs.record import Sampling
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
@@ -22,6 +22,10 @@ from wfsobs.stepping import design
 
 SLOWEST, FASTEST = 0.1, 20.0
 """Limits of the speed."""
+ADAPTIVE = ("kf-adaptive", "multirate-adaptive")
+"""Observers that are run if named, or where there are events; some of their steps are longer than a frame."""
+LONG_STEPS = (*ADAPTIVE, "gpr-offline")
+"""Observers that are run if named alone, where there are no events."""
 
 
 def make_design(name: str, settings: dict[str, Any], sampling: Sampling) -> StepObserver | StepController:
@@ -31,25 +35,35 @@ def make_design(name: str, settings: dict[str, Any], sampling: Sampling) -> Step
 
 def check_slot(name: str) -> None:
     """Raise SettingError for an observer or controller that is unknown or does not run frame by frame."""
-    if name in CONTROLLERS and name not in SEATS:
-        raise SettingError(f"controller {name!r}: does not run frame by frame; there are {', '.join(SEATS)}")
-    if name not in SLOTS and name not in SEATS:
-        raise SettingError(f"observer {name!r}: does not run frame by frame; there are {', '.join(SLOTS)}")
+    if name in SLOTS or name in SEATS:
+        return
+    if name not in OBSERVERS and name not in CONTROLLERS:
+        raise SettingError(f"{name!r}: no such observer or controller; there are {', '.join((*SLOTS, *SEATS))}")
+    kind, known = ("controller", SEATS) if name in CONTROLLERS else ("observer", SLOTS)
+    is_of_stars = name in OBSERVERS and "y_stars" in OBSERVERS[name].needs
+    why = "takes every LGS by itself, which no live source sends" if is_of_stars else "does not run frame by frame"
+    raise SettingError(f"{kind} {name!r}: {why}; there are {', '.join(known)}")
 
 
 def observers_on(source: LiveSource, scenario: Scenario) -> list[str]:
     """Return the ids of the observers that run frame by frame on a source, but for those whose step may be longer than a frame.
 
-    Without NGS frames those that take them are left out; on a stream also those that learn beforehand: there is no record of it.
+    Where a scenario has events the adaptive ones run nevertheless. Without NGS frames those that take them are left out; on a
+    stream also those that learn beforehand: there is no record of it.
     """
-    return [name for name in default_observers(scenario) if can_run(name, source, scenario)]
+    welcome = ADAPTIVE if scenario.events else ()
+    return [name for name in SLOTS if (name not in LONG_STEPS or name in welcome) and can_run(name, source, scenario)]
 
 
 def can_run(observer: str, source: LiveSource, scenario: Scenario) -> bool:
     """Return whether a source has what an observer needs."""
     it = OBSERVERS[observer]
     has_frames = source.sampling.ratio is not None or "y_ngs" not in it.needs
-    return has_frames and (source.name != STREAM or not learns_beforehand(it, scenario))
+    return (
+        has_frames
+        and has_prior(it, scenario, source.sampling.n_modes)
+        and (source.name != STREAM or not learns_beforehand(it, scenario))
+    )
 
 
 def learns_beforehand(observer: Observer, scenario: Scenario) -> bool:

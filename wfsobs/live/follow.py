@@ -8,8 +8,8 @@ from time import sleep
 from typing import Any
 
 from wfsobs.live.board import Counts
-from wfsobs.live.processes import LiveProcesses
-from wfsobs.live.programme import Programme, scenario_on
+from wfsobs.live.checks import observers_on
+from wfsobs.live.loop import TICK, LiveLoop
 from wfsobs.live.ring import LiveFrame
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.source import LiveSource
@@ -17,21 +17,8 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 
-TICK = 0.05
-"""Pause between two looks at the observers [s]."""
-ADAPTIVE = ("kf-adaptive", "multirate-adaptive")
-"""Observers that are run if named, or where there are events; some of their steps are longer than a frame."""
-LONG_STEPS = (*ADAPTIVE, "gpr-offline")
-"""Observers that are run if named alone, where there are no events."""
-
-
-def default_observers(scenario: Scenario) -> list[str]:
-    """Return the ids of the observers that run frame by frame, but for those whose step may be longer than a frame.
-
-    Where a scenario has events the adaptive ones run nevertheless.
-    """
-    welcome = ADAPTIVE if scenario.events else ()
-    return [o.id for o in OBSERVERS.values() if o.step is not None and (o.id not in LONG_STEPS or o.id in welcome)]
+PAUSE = 0.05
+"""Pause between two looks at the loop [s]."""
 
 
 def follow(
@@ -43,6 +30,7 @@ def follow(
     speed: float = 1.0,
     keep: Callable[[LiveFrame], None] | None = None,
     report: Callable[[float], None] = lambda _: None,
+    log_file: str = "",
 ) -> dict[str, Any]:
     """Let observers follow a source in real time.
 
@@ -53,7 +41,7 @@ def follow(
     n_frames : int
         Frames to follow.
     observers : sequence of str, optional
-        Ids; by default those of `default_observers`.
+        Ids; by default those of `observers_on`.
     source : LiveSource, optional
         Of the frames; by default the simulation of the scenario.
     speed : float
@@ -62,6 +50,8 @@ def follow(
         Receives every frame.
     report : callable
         Receives the share that is done, about once a second.
+    log_file : str
+        Raise alarms, and append them and what else happens to this file.
 
     Returns
     -------
@@ -75,29 +65,25 @@ def follow(
     SettingError
         An observer is unknown or does not run frame by frame, or an event cannot be played.
     """
-    for name in observers or ():
-        if name not in OBSERVERS:
-            raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
-    chosen = list(observers) if observers else default_observers(scenario)
     source = source or SimulatedLoop(scenario)
-    told = scenario_on(source, scenario)
-    scenario = told.before_events
-    processes = LiveProcesses(source, scenario, tuple(dict.fromkeys(chosen)), speed, n_frames)
+    chosen = list(dict.fromkeys(observers or observers_on(source, scenario)))
+    loop = LiveLoop(source, scenario, chosen, speed=speed, n_frames=n_frames)
+    if log_file:
+        loop.watch(log_file)
     try:
-        programme = Programme(told, processes.feed.tell)
-        _await_observers(processes)
-        processes.feed.start()
-        _drain(processes, lambda frames: programme.play(frames * source.sampling.dt), n_frames, keep, report)
+        _await_observers(loop)
+        loop.play()
+        _drain(loop, n_frames, keep, report)
     finally:
-        processes.release()
-    board, delivery = processes.board, processes.delivery
+        loop.stop()
+    board, delivery = loop.board, loop.delivery
     modes = [mode.name for mode in scenario.modes][: source.sampling.n_modes]
     return {
         "frames": delivery.frames,
         "lost": n_frames - delivery.frames,
         "late_share": delivery.late_share,
         "late_share_sent": delivery.late_share_sent,
-        "observers": {name: _row(board[name], OBSERVERS[name].targets, modes) for name in dict.fromkeys(chosen)},
+        "observers": {name: _row(board[name], OBSERVERS[name].targets, modes) for name in chosen},
     }
 
 
@@ -117,37 +103,28 @@ def _nanometres(x: float) -> float | None:
     return None if isnan(x) else float(x) * 1e3
 
 
-def _await_observers(processes: LiveProcesses) -> None:
+def _await_observers(loop: LiveLoop) -> None:
     """Wait until the observers are designed. Raises SettingError with the reason where one cannot be."""
-    while not processes.are_ready:
-        if not processes.observers_are_alive:
-            sleep(TICK)  # the line may still be on its way
-            lines = [line for _, line in processes.news()]
-            raise SettingError(lines[-1] if lines else "the process of the observers has ended")
-        sleep(TICK)
+    while not loop.is_ready:
+        if not loop.observers_are_alive:
+            sleep(2.0 * TICK)  # the line may still be on its way
+            raise SettingError(loop.events[-1].line if loop.events else "the process of the observers has ended")
+        sleep(PAUSE)
 
 
-def _drain(
-    processes: LiveProcesses,
-    play: Callable[[int], None],
-    n_frames: int,
-    keep: Callable[[LiveFrame], None] | None,
-    report: Callable[[float], None],
-) -> None:
-    """Play events, count every frame, and keep it, until all have been taken or no more come."""
-    feed, delivery, kept, reported = processes.feed, processes.delivery, 0, 0
+def _drain(loop: LiveLoop, n_frames: int, keep: Callable[[LiveFrame], None] | None, report: Callable[[float], None]) -> None:
+    """Keep every frame, until all have been taken or no more come."""
+    kept = reported = 0
     is_over = False
     while not is_over:
-        may_go_on = processes.observers_are_alive and (feed.is_alive or delivery.count < feed.ring.count)
-        is_over = delivery.count >= n_frames or not may_go_on
+        may_go_on = loop.observers_are_alive and (loop.feed.is_alive or loop.count < loop.newest)
+        is_over = loop.count >= n_frames or not may_go_on
         if not is_over:
-            sleep(TICK)
-        play(feed.ring.count)
-        delivery.collect()
-        for number in range(kept, delivery.count if keep else 0):
-            if keep is not None and (frame := feed.ring.read(number)) is not None:
+            sleep(PAUSE)
+        for number in range(kept, loop.count if keep else 0):
+            if keep is not None and (frame := loop.feed.ring.read(number)) is not None:
                 keep(frame)
             kept = number + 1
-        if delivery.count // 1000 > reported:
-            reported = delivery.count // 1000
-            report(delivery.count / n_frames)
+        if loop.count // 1000 > reported:
+            reported = loop.count // 1000
+            report(loop.count / n_frames)

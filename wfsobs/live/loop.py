@@ -13,19 +13,16 @@ from wfsobs.live.control_process import ControlView
 from wfsobs.live.processes import LiveProcesses
 from wfsobs.live.programme import Programme, scenario_on
 from wfsobs.live.recording import Recorder
-from wfsobs.live.shadow import Shadow, append_line
+from wfsobs.live.shadow import MINUTE, Shadow, append_line
 from wfsobs.live.source import SIMULATION, LiveSource
-from wfsobs.live.view import LiveEvent, LiveView, read_view
+from wfsobs.live.view import LiveEvent, LiveView, SharedView, read_view
 from wfsobs.live.workshop import Workshop
-from wfsobs.observers import OBSERVERS
 from wfsobs.scenario import Scenario
 from wfsobs.settings.group import SettingError
 from wfsobs.stepping import sampling_of
 
 TICK = 0.2
 """Pause between two looks at the processes [s]."""
-MINUTE = 60.0
-"""What is identified [s]."""
 MOST_EVENTS = 200
 """Events that are kept."""
 
@@ -46,6 +43,8 @@ class LiveLoop:
         Ids of those that run from the start.
     speed : float
         1 is real time.
+    n_frames : int, optional
+        Frames until the source ends; by default it has no end of its own.
 
     Raises
     ------
@@ -53,7 +52,9 @@ class LiveLoop:
         An observer is unknown or does not run frame by frame, or an event cannot be played.
     """
 
-    def __init__(self, source: LiveSource, scenario: Scenario, observers: Sequence[str], *, speed: float = 1.0):
+    def __init__(
+        self, source: LiveSource, scenario: Scenario, observers: Sequence[str], *, speed: float = 1.0, n_frames: int | None = None
+    ):
         for name in observers:
             check_slot(name)
         self.source, self.sampling, told = source, source.sampling, scenario_on(source, scenario)
@@ -61,11 +62,11 @@ class LiveLoop:
         self.events: deque[LiveEvent] = deque(maxlen=MOST_EVENTS)
         self.controllers: set[str] = set()
         self._shadow: Shadow | None = None
-        self._log_file = ""
-        self._processes = LiveProcesses(source, told.before_events, tuple(dict.fromkeys(observers)), self._speed)
-        self.programme = Programme(told, self._processes.feed.tell)
-        self.board, self.delivery = self._processes.board, self._processes.delivery
-        self.recorder = Recorder(self._processes.feed.ring, self.sampling, self.say, source.name == SIMULATION)
+        self._log_file, self.readings = "", SharedView()
+        self._processes = LiveProcesses(source, told.before_events, tuple(dict.fromkeys(observers)), self._speed, n_frames)
+        self.feed, self.board, self.delivery = self._processes.feed, self._processes.board, self._processes.delivery
+        self.programme = Programme(told, self.feed.tell)
+        self.recorder = Recorder(self.feed.ring, self.sampling, self.say, source.name == SIMULATION)
         self.workshop = Workshop(self._processes, self.sampling, self.say)
         self._release = finalize(self, self._processes.release)
         Thread(target=_keep, args=(ref(self), self._processes.is_over), daemon=True, name="wfsobs-live").start()
@@ -98,7 +99,7 @@ class LiveLoop:
     @property
     def newest(self) -> int:
         """Frames that the source has sent."""
-        return self._processes.feed.ring.count
+        return self.feed.ring.count
 
     @property
     def pids(self) -> list[int]:
@@ -114,22 +115,22 @@ class LiveLoop:
         """Have frames come by the clock, once the observers are ready."""
         self._is_wanted, self._has_begun = True, self.is_ready
         if self._has_begun:
-            self._processes.feed.tell({"play": True})
+            self.feed.tell({"play": True})
 
     def pause(self) -> None:
         """Have no more frames come."""
         self._is_wanted = False
-        self._processes.feed.tell({"play": False})
+        self.feed.tell({"play": False})
 
     def step(self, frames: int = 1) -> None:
         """Have so many frames come, and then no more."""
         self.pause()
-        self._processes.feed.tell({"step": frames})
+        self.feed.tell({"step": frames})
 
     def set_speed(self, speed: float) -> None:
         """Set the speed. Raises SettingError."""
         self._speed = check_speed(speed)
-        self._processes.feed.tell({"speed": self._speed})
+        self.feed.tell({"speed": self._speed})
 
     def change(self, settings: Mapping[str, Any]) -> None:
         """Change settings, path -> value, of the simulation. Raises SettingError as `become` does."""
@@ -198,10 +199,6 @@ class LiveLoop:
         """Return the ids of the observers and controllers that run."""
         return [*self.board.active(), *sorted(self.controllers)]
 
-    def targets(self, observer: str) -> tuple[str, ...]:
-        """Return what an observer estimates."""
-        return OBSERVERS[observer].targets
-
     def say(self, line: str, frame: int | None = None) -> None:
         """Add a line to the list of events."""
         event = LiveEvent(self.newest if frame is None else frame, line)
@@ -215,7 +212,7 @@ class LiveLoop:
 
     def view(self, seconds: float) -> LiveView:
         """Return the last so many seconds of frames and estimates."""
-        return read_view(self._processes.feed.ring, self._processes.traces(), self.sampling.dt, seconds)
+        return read_view(self.feed.ring, self._processes.traces(), self.sampling.dt, seconds)
 
     def control_view(self, seconds: float) -> ControlView | None:
         """Return what the controllers leave of the last so many seconds that they have taken; None before the first one."""
@@ -226,7 +223,7 @@ class LiveLoop:
         """Look after the processes; called a few times a second."""
         if self._is_wanted and self.is_ready and not self._has_begun:
             self._has_begun = True
-            self._processes.feed.tell({"play": True})
+            self.feed.tell({"play": True})
         self.programme.play(self.newest * self.sampling.dt)
         for number, line in self._processes.news():
             self.say(line, number)

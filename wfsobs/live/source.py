@@ -71,10 +71,6 @@ class SourceProcess:
         for process in self._processes:
             process.start()
 
-    def start(self) -> None:
-        """Send the first frame, once it is made."""
-        self.tell({"play": True})
-
     def tell(self, command: Command) -> None:
         """Give a command to the process that sends; new settings to the others as well."""
         for pipe in (*self._staff.outboxes, self._outbox) if command.get("is_new") else (self._outbox,):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf
+from time import monotonic
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +17,9 @@ from wfsobs.live.ring import LiveFrame, Ring
 from wfsobs.live.rows import Rows
 from wfsobs.observers.base import TARGETS
 from wfsobs.typing import Array
+
+SHARED = 0.1
+"""How old what pages share may be [s]."""
 
 
 class LiveEvent(NamedTuple):
@@ -87,6 +93,21 @@ class LiveView:
         width = slot_width(self.n_modes)
         at = 2 + SLOTS.index(observer) * width
         return self._traces[:, at : at + width]
+
+
+class SharedView:
+    """The last seconds as they were read last, for pages that look one after the other: a reading takes milliseconds."""
+
+    def __init__(self) -> None:
+        self._last: tuple[float, LiveView] | None = None
+        self._at = -inf
+
+    def look(self, read: Callable[[float], LiveView], seconds: float, *, anew: bool) -> LiveView:
+        """Return the last so many seconds, up to SHARED old, or read `anew`."""
+        if anew or self._last is None or self._last[0] != seconds or monotonic() - self._at > SHARED:
+            self._at = monotonic()
+            self._last = seconds, read(seconds)
+        return self._last[1]
 
 
 def read_view(ring: Ring, traces: list[Rows], dt: float, seconds: float) -> LiveView:

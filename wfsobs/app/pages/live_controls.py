@@ -15,8 +15,8 @@ from wfsobs.app.pages.live_waterfall import MEASUREMENT
 from wfsobs.app.pages.parts import WIDE, line
 from wfsobs.app.style import asset, look
 from wfsobs.live.board import SLOTS
+from wfsobs.live.checks import ADAPTIVE
 from wfsobs.live.control_crew import SEATS, USUAL
-from wfsobs.live.follow import ADAPTIVE
 from wfsobs.live.loop import LiveLoop
 from wfsobs.observers.base import TARGETS
 
@@ -54,6 +54,18 @@ class Pulse(JSComponent):
     def __init__(self, **params: Any):
         self.answer, self._time = -1, 0.0
         super().__init__(**params)
+
+    def _update_model(self, events: Any, msg: dict[str, Any], root: Any, model: Any, doc: Any, comm: Any) -> None:
+        """Send the number alone: the usual way looks at all that a component may have, which takes as long as a figure."""
+        if set(msg) != {"picture"}:
+            super()._update_model(events, msg, root, model, doc, comm)
+            return
+        ref = root.ref["id"]
+        self._changing[ref] = ["picture"]  # it comes from here, not from the browser
+        try:
+            model.data.picture = msg["picture"]
+        finally:
+            self._changing.pop(ref, None)
 
     def _handle_msg(self, data: object) -> None:
         if isinstance(data, dict) and isinstance(number := data.get("painted"), int):

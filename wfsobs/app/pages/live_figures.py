@@ -42,12 +42,15 @@ class LiveFigure:
         self.figure = fig
         self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in NAMES}
         self.lines = FigureLines(fig, {name: (source, "y") for name, source in self.sources.items()})
+        self._style: tuple[bool, set[str]] = (False, set())
 
     def put(self, data: Mapping[str, tuple[Array, Array]], dark: bool) -> None:
         """Show these lines, x and y by name, and no others."""
         for name, (x, y) in data.items():
             self.sources[name].data = {"x": x.astype(np.float32), "y": y.astype(np.float32)}
-        self.lines.restyle(dark, [name for name in NAMES if name not in data])
+        if (style := (dark, set(data))) != self._style:
+            self._style = style
+            self.lines.restyle(dark, [name for name in NAMES if name not in data])
 
 
 class RollingTraces(LiveFigure):

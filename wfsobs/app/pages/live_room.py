@@ -13,8 +13,9 @@ from wfsobs.app.pages.live_controls import LiveControls
 from wfsobs.app.pages.live_figures import LatencyHistogram, RollingSpectra, RollingTraces
 from wfsobs.app.pages.live_stars import Stars
 from wfsobs.app.pages.live_table import Bounds, control_html, events_html, live_html, peaks_html
+from wfsobs.app.pages.live_text import live_text
 from wfsobs.app.pages.live_waterfall import MEASUREMENT, Waterfall
-from wfsobs.app.pages.parts import WIDE, box, figure_with_caption, group, html, legend, line
+from wfsobs.app.pages.parts import WIDE, box, figure_with_caption, group, legend, line
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.frames import Frames
@@ -27,6 +28,7 @@ from wfsobs.live.finding import bounds_of
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.source import SIMULATION
 from wfsobs.live.view import LiveView
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario import Scenario
 
@@ -45,9 +47,9 @@ class LiveRoom:
         self.display, self.store, self.controls = display, store, controls
         self.traces, self.spectra, self.waterfall = RollingTraces(), RollingSpectra(), Waterfall()
         self.latencies, self.stars = LatencyHistogram(), Stars()
-        self.table, self.control_table, self.news, self.peaks = html(), html(), html(), html()
+        self.table, self.control_table, self.news, self.peaks = (live_text() for _ in range(4))
         self.editor: SpectrumEditor | None = None
-        self.legend = html()
+        self.legend = live_text()
         self._table_time = 0.0
         self._bounds: Bounds = {}
         self._bounds_of: Scenario | None = None
@@ -84,10 +86,10 @@ class LiveRoom:
         scale = per_micrometre(display.unit, loop.scenario.telescope.diameter)
         active = loop.board.active()
         names = [name for name in active if name in self.controls.lines.value]
-        before = loop.view(view.n * view.dt + RollingTraces.run_in(display))
+        run_in = RollingTraces.run_in(display)
+        before = loop.view(view.n * view.dt + run_in) if run_in else view
         self.traces.draw(before, view.n, target, names, display, scale, list(loop.events), self._bounds)
         self.spectra.draw(view, target, names, display, scale)
-        self.latencies.draw(loop.board, names, loop.sampling.dt, dark)
         what = self.controls.waterfall.value
         self.waterfall.draw(view, what if what in active else MEASUREMENT, target, display, scale)
         running = [name for name in self.controls.controllers.value if name in loop.controllers]
@@ -95,6 +97,7 @@ class LiveRoom:
         self._edit(loop, target)
         if monotonic() - self._table_time > SLOW or not loop.is_playing:
             self._draw_tables(loop, view, target, scale)
+            self.latencies.draw(loop.board, names, loop.sampling.dt, dark)
 
     def _target(self, loop: LiveLoop) -> str:
         """Return what errors are shown of: without truth, of the next measurement."""
@@ -115,7 +118,7 @@ class LiveRoom:
         """Write what the lines of the figures are."""
         wanted = TARGETS if target == NEXT else (target,)
         active = [name for name in loop.board.active() if name in self.controls.lines.value]
-        names = [name for name in active if set(wanted) <= set(loop.targets(name))]
+        names = [name for name in active if set(wanted) <= set(OBSERVERS[name].targets)]
         truth = [] if self.display.error else [TRUTH]
         bounds = [name for name in BOUNDS if self.display.running and target in self._bounds.get(name, ())]
         return legend({name: look(name).label for name in (*truth, *names, *bounds)}, self.display.dark)

@@ -44,6 +44,7 @@ class Detector:
         self._trail, self._spot = ColumnDataSource({"x": [], "y": []}), ColumnDataSource({"x": [], "y": []})
         self._line = self.figure.line("x", "y", source=self._trail, line_alpha=0.5).glyph
         self._core = self.figure.circle("x", "y", radius=1.0, source=self._spot, fill_alpha=0.6).glyph
+        self._style: tuple[float, float, str] | None = None
 
     def view(self) -> pn.Column:
         """Return the detector under its caption."""
@@ -55,9 +56,12 @@ class Detector:
         points = points[~np.isnan(points).any(axis=1)]
         self._trail.data = {"x": points[:, 0], "y": points[:, 1]}
         self._spot.data = {"x": points[-1:, 0], "y": points[-1:, 1]}
+        colour = look(self.name).colour(dark)
+        if (style := (reach, radius, colour)) == self._style:
+            return
+        self._style = style
         for axis in (self.figure.x_range, self.figure.y_range):
             axis.update(start=-reach, end=reach)
-        colour = look(self.name).colour(dark)
         self._line.line_color = colour
         self._core.update(radius=radius, fill_color=colour, line_color=colour)
 

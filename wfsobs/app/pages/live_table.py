@@ -114,7 +114,7 @@ def status_line(loop: LiveLoop, view: LiveView) -> str:
     if not loop.is_ready:
         return "The observers are being designed"
     state = "Running" if loop.is_playing else "Paused"
-    behind = (loop.newest - loop.count) * loop.sampling.dt / loop.speed
+    behind = max(loop.newest - loop.count, 0) * loop.sampling.dt / loop.speed  # the two are read one after the other
     parts = [
         f"{state} at {loop.speed:g} × real time",
         f"{view.dt * (view.first + view.n):.1f} s",
