@@ -138,7 +138,8 @@ class TestTable:
 
     def test_marks(self, dashboard: Dashboard) -> None:
         html = dashboard.explore.table.pane.object
-        assert html.count(">best<") == 2, "one causal observer per target"
+        assert html.count(">smallest<") == 2, "one causal observer per target, of one record"
+        assert ">best<" not in html
         worse = [
             s
             for s in dashboard.store.run.result.result.scores

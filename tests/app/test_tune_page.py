@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from wfsobs.app.controls.names import setting_name
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.limits import Limits
@@ -68,7 +69,7 @@ def test_it_shows_what_the_core_finds(page: TunePage, dashboard: Dashboard, loop
     assert row(table, "other target", "rms over modes")[:2] == [number(1e3 * s.rms, 4) for s in (before.other, after.other)]
     for path, value in changed_settings(expected.scenario, before.scenario).items():
         text = f"{value:.6g}" if isinstance(value, float) else str(value)
-        assert row(table, "setting", path)[1] == text
+        assert row(table, "setting", setting_name(path))[1] == text
     assert "likelihood" not in table, "it is no GPR"
     data = page.figure.source.data
     np.testing.assert_allclose(data["tried"], [1e3 * e.rms for e in expected.history])

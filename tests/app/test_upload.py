@@ -80,7 +80,7 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     rows = re.findall(r"<tr data-observer.*?</tr>", pinned)
     assert len(rows) == len(found) and all('"range">+0.0 %</span>' in row for row in rows)
     least = min(x.rms for x in expected.scores if x.mode == "tip")
-    assert pinned.count("tag best") == sum(x.rms == least for x in expected.scores if x.mode == "tip")
+    assert pinned.count("tag smallest") == sum(x.rms == least for x in expected.scores if x.mode == "tip")
     assert re.fullmatch(r"\d\.\d\d × z, next z", notes["kf-lgs"]) and notes["gpr-online"] == "no truth"
     assert notes["butterworth-ol"] in ("no result", "no truth")
     dashboard.display.show = "error"  # there is none, and nothing breaks
@@ -220,6 +220,25 @@ def test_the_data_propose_sign_and_delay(dashboard: Dashboard, loop: Any, short:
     assert "sign -1: commands move with the measurement" in dashboard.upload.content.text.object, (
         "of the file, however it is read"
     )
+
+
+def test_a_record_whose_unit_nobody_knows_waits_for_it(dashboard: Dashboard, loop: Any) -> None:
+    """Of 200 nm rms in um on 8 m as well as in urad, and the same in nm, which nobody would take for um."""
+    rng, upload = np.random.default_rng(5), dashboard.upload
+    for scale, right, plausible in ((0.2, "um", True), (200.0, "nm", False)):
+        file = io.BytesIO()
+        np.savez(file, y_lgs=scale * rng.standard_normal((3000, 2)), u=np.zeros((3000, 2)), dt=np.array(1e-3))
+        previewed(dashboard, loop, file.getvalue(), "night.npz")
+        assert upload.use.disabled and "Choose the unit first" in upload.missing.object
+        assert ("plausible as um or" in upload.missing.object) == plausible and right in upload.missing.object
+        upload.confirm()
+        assert dashboard.store.source is None
+        upload.fields.unit.value = right
+        loop.until(lambda: not upload.use.disabled)
+        assert upload.missing.object == "" and upload._preview is not None
+        assert upload._preview.rms["z"][0] == pytest.approx(0.2, rel=0.05)  # 1 / sqrt(2 N) = 1.3 %
+        upload.fields.unit.value = SILENT
+        upload.discard()
 
 
 def test_template_and_sample(dashboard: Dashboard, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.records import ON_PAPER
 from wfsobs.app import work
 from wfsobs.app.work import TRUTH, RunResults, compute
 from wfsobs.dependence import Memo
 from wfsobs.evaluation.error_spectra import scored_samples
-from wfsobs.observers import OBSERVERS
 from wfsobs.progress import QUIET, Cancelled, Watch
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import welch_psd
@@ -63,14 +63,14 @@ def test_deliveries_are_held_back(short: Scenario, monkeypatch: pytest.MonkeyPat
     quick, shown = told
     assert quick is not None and shown is not None
     learning = {"gpr-online", "gpr-adaptive", "kf-adaptive", "multirate-adaptive"}
-    for here, missing in ((quick, {"gpr-offline", "ridge", "gp-lgs", "gp-both", "kf-coupled", *learning}), (shown, learning)):
-        assert {name for name, _ in keys(here)} == set(OBSERVERS) - missing
+    for here, missing in ((quick, {"gpr-offline", "ridge", *learning}), (shown, learning)):
+        assert {name for name, _ in keys(here)} == set(ON_PAPER) - missing
 
 
 def test_only_what_depends_runs(short: Scenario) -> None:
     memo, told = Memo(), []
     first = compute(short, QUIET, lambda **_: None, None, memo)
-    assert set(first.ran) == set(OBSERVERS)
+    assert set(first.ran) == set(ON_PAPER)
     changed = short.replace({"kalman.ngs_between_frames": "propagate"})
     shown = compute(changed, QUIET, lambda **news: told.append(news), None, memo)
     assert shown.ran == ("kf-ngs",) and shown.scenario == changed and shown.result.record is first.result.record

@@ -29,6 +29,7 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
+SEEDS = "view.seeds="
 CLOSED_MID_UPDATE = (
     "WebSocketClosedError",
     "StreamClosedError",
@@ -127,17 +128,25 @@ class Watched:
             self.faults.append(f"request: {request.url}")
 
 
+def with_seeds(url: str, seeds: int) -> str:
+    """Return an address that asks for so many seeds, unless it says how many or there are to be as many as ever."""
+    return url if not seeds or SEEDS in url else f"{url}{'&' if '?' in url else '?'}{SEEDS}{seeds}"
+
+
 @pytest.fixture
 def open_page(server: Server, browser: Browser) -> Iterator[Any]:
-    """A function that opens the dashboard in a window of some size and waits for the first result."""
+    """A function that opens the dashboard in a window of some size and waits for the first result.
+
+    It has one seed, so that nothing runs on in idle time and takes the processor from the next test; 0: as many as a visitor has.
+    """
     start = len(server.log.read_text())
     opened: list[tuple[Page, Watched]] = []
 
-    def open_it(width: int = 1400, height: int = 1000, url: str = "", wait: bool = True, **options: Any) -> Page:
+    def open_it(width: int = 1400, height: int = 1000, url: str = "", wait: bool = True, seeds: int = 1, **options: Any) -> Page:
         page = browser.new_page(viewport={"width": width, "height": height}, **options)
         page.set_default_timeout(120_000)
         opened.append((page, Watched(page)))
-        page.goto(url or server.url)
+        page.goto(with_seeds(url or server.url, seeds))
         if wait:
             finished(page)
         return page

@@ -10,7 +10,9 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-QUICK = "?run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5"
+QUICK = (
+    "?run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5&view.seeds=1"
+)
 
 
 class Cable:
@@ -20,6 +22,8 @@ class Cable:
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.port = self.listener.getsockname()[1]
         self.to, self.whole = 0, True
+        self.quick = threading.Event()
+        self.quick.set()
         self.ends: list[socket.socket] = []
         threading.Thread(target=self._accept, daemon=True).start()
 
@@ -38,11 +42,13 @@ class Cable:
                 continue
             self.ends += [near, far]
             for one, other in ((near, far), (far, near)):
-                threading.Thread(target=self._carry, args=(one, other), daemon=True).start()
+                threading.Thread(target=self._carry, args=(one, other, one is far), daemon=True).start()
 
-    def _carry(self, one: socket.socket, other: socket.socket) -> None:
+    def _carry(self, one: socket.socket, other: socket.socket, back: bool) -> None:
         try:
             while part := one.recv(65536):
+                if back:
+                    self.quick.wait()
                 other.sendall(part)
         except OSError:
             pass
@@ -58,7 +64,10 @@ class Cable:
                 continue
         self.ends = []
 
-    def mend(self) -> None:
+    def mend(self, quick: bool = True) -> None:
+        """Make it whole again; what the server says arrives later unless it is quick."""
+        if not quick:
+            self.quick.clear()
         self.whole = True
 
 
@@ -109,6 +118,10 @@ def speed(page: Page, text: str) -> None:
     box.press("Enter")
 
 
+CONNECTING = "() => Bokeh.index.roots[0].model.document.wfsobs.connection?.socket?.readyState === WebSocket.CONNECTING"
+"""Whether the browser has a socket that waits for its answer: it cannot be sent by yet."""
+
+
 def peak(page: Page) -> Any:
     return page.locator('input[data-cell="0.frequency"]')
 
@@ -146,6 +159,25 @@ def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> 
     expect(page.get_by_role("status").filter(has_text="Compared with")).to_contain_text(
         "Wind speed V₀ 15 → 22 m/s"
     )  # the same session: its pinned run is there
+    done(page)
+
+
+def test_what_is_changed_while_the_line_comes_back_counts_once(page: Page, cable: Cable) -> None:
+    peaks = page.locator('input[data-cell$=".frequency"]').count()
+    cable.cut()
+    expect(banner(page, "connection to the server is lost")).to_be_visible()
+    cable.mend(quick=False)
+    page.wait_for_function(CONNECTING)
+    peak(page).fill("6.5")
+    peak(page).press("Enter")
+    page.get_by_role("button", name="+ Add peak").click()
+    damping = page.locator('input[data-cell="0.damping"]')
+    damping.fill("0.02")  # and on with the typing
+    cable.quick.set()
+    expect(banner(page, "Connected again")).to_be_visible()
+    page.wait_for_function("() => location.search.includes('vibration.peaks=6.5,0.02,')")
+    expect(page.locator('input[data-cell$=".frequency"]')).to_have_count(peaks + 1)
+    expect(damping).to_have_value("0.02")
     done(page)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from tests.browser.conftest import with_seeds
 from wfsobs.app.style import observers_of
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario.presets import PRESETS
@@ -247,7 +248,7 @@ DRAWER = """() => {
 def test_the_drawer_of_a_phone_is_closed_from_the_first_frame_on(browser: Browser, server: Any, width: int, seen: bool) -> None:
     page = browser.new_page(viewport={"width": width, "height": 844})
     page.add_init_script(f"({DRAWER})()")
-    page.goto(server.url)
+    page.goto(with_seeds(server.url, 1))
     finished(page)
     assert bool(page.evaluate("() => window.drawerSeen")) == seen
     page.close()

@@ -19,7 +19,7 @@ def set_seeds(page: Page, count: int) -> None:
 
 
 def test_seeds_give_intervals_and_go_with_the_settings(open_page: Any, server: Any) -> None:
-    page: Page = open_page(url=server.url + QUICK)
+    page: Page = open_page(url=server.url + QUICK, seeds=0)
     set_seeds(page, 3)
     expect(page.locator(".seeds")).to_have_text("over 3 seeds", timeout=120_000)
     row = page.locator('tr[data-target="vibration"][data-observer="kf-lgs"]')
@@ -35,7 +35,7 @@ def test_seeds_give_intervals_and_go_with_the_settings(open_page: Any, server: A
 
 def test_what_one_is_at_stays_when_seeds_come(open_page: Any, server: Any) -> None:
     """What stands in a text or a card changes; the word that is open, the focus and the card do not go with it."""
-    page: Page = open_page(url=f"{server.url}{QUICK}&run.seed=4711")  # nobody has its seeds yet
+    page: Page = open_page(url=f"{server.url}{QUICK}&run.seed=4711", seeds=0)  # nobody has its seeds yet
     set_seeds(page, 3)
     card = page.locator('.card[data-name="kf-lgs"]').first
     card.evaluate("card => { card.same = true }")

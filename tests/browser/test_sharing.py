@@ -170,7 +170,7 @@ def test_menus_by_keyboard(open_short: Any) -> None:
 
 
 def test_back_and_reload_return_to_the_view(open_page: Any) -> None:
-    page = open_page()
+    page = open_page(seeds=0)
     page.get_by_role("button", name="Tilt", exact=True).click()
     page.wait_for_function("location.search.includes('view.mode=tilt')")
     page.get_by_role("button", name="Model", exact=True).click()

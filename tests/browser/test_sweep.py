@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from playwright.sync_api import Locator, Page, expect
@@ -112,3 +113,26 @@ def test_error_over_a_setting_of_the_drawer(open_page: Any, server: Any) -> None
     expect(page.get_by_role("figure", name="Error over Exposure ratio n, turbulence")).to_be_visible()
     expect(page.get_by_role("button", name=re.compile(r"^Exposure ratio n 10: .*3 seeds$"))).to_have_count(2)
     look_for_faults(page)
+
+
+def test_a_sweep_over_one_setting_runs_after_back(open_page: Any, server: Any) -> None:
+    """With no second setting chosen, to Explore and back."""
+    page = open_page(url=server.url + QUICK)
+    page.get_by_role("button", name="Sweep", exact=True).click()
+    page.get_by_role("combobox", name="and over").click()
+    page.get_by_role("option", name="no second setting").click()
+    enter(page, "Values", "5,20")
+    enter(page, "Seeds of each", "1")
+    page.get_by_role("button", name="Explore", exact=True).click()
+    page.wait_for_function("() => !location.search.includes('view.page')")
+    page.go_back()
+    page.wait_for_function("() => location.search.includes('view.page=sweep')")
+    expect(page.get_by_text("2 scenarios × 1 seed = 2 runs")).to_be_visible()
+    page.get_by_role("button", name="Run the sweep").click()
+    expect(page.get_by_text("Finished · 2 of 2 runs")).to_be_visible(timeout=90_000)
+    page.get_by_role("button", name="Save").click()
+    with page.expect_download() as saved:
+        page.get_by_text("Sweep as CSV").click()
+    head, *rows = Path(saved.value.path()).read_text().splitlines()
+    assert head.startswith("turbulence.wind_speed,target,mode,observer,seeds,mean_rms_nm")
+    assert {row.split(",")[0] for row in rows} == {"5", "20"} and {row.split(",")[4] for row in rows} == {"1"}

@@ -88,7 +88,7 @@ def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any)
         want = {}
         for row in state.rows:
             name = row_label(row["observer"]) + (" looks ahead" if is_non_causal(row["observer"]) else "")
-            lag = "–" if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−")
+            lag = "–" if row["lag_s"] is None else f"{1e3 * row['lag_s']:z.2f}".replace("-", "−")
             spread = "" if row["interval_um"] is None else f" {' – '.join(number(1e3 * x) for x in row['interval_um'])} "
             assert (spread == "") == (row["observer"] != BOUND)
             want[f"{row['target'].capitalize()}, {row['mode']}", name] = [
@@ -101,13 +101,14 @@ def test_the_numbers_are_those_of_the_run(report: Report, text: str, parse: Any)
                 "–" if row[TIME] is None else number(row[TIME] / 1000.0, 2),
                 "–" if row["sd_um"] is None else number(1e3 * row["sd_um"]),
             ]
-        plain = {key: [re.sub(r"^(best|above truth) ", "", cell) for cell in cells] for key, cells in got.items()}
+        plain = {key: [re.sub(r"^(smallest|above truth) ", "", cell) for cell in cells] for key, cells in got.items()}
         assert plain == want
+        assert not any("−0.00" in cells for cells in plain.values()), "a lag of nothing has no sign"
         for key in {title for title, _ in want}:
             others = ("looks ahead", "Bound")
             causal = {name: c for (title, name), c in got.items() if title == key and not any(o in name for o in others)}
-            best = [name for name, cells in causal.items() if cells[0].startswith("best ")]
-            assert best == [next(iter(causal))], "the first of them is the best"
+            best = [name for name, cells in causal.items() if cells[0].startswith("smallest ")]
+            assert best == [next(iter(causal))], "the first of them, and of one record no more than that"
         above = {key for key, cells in got.items() if cells[2].startswith("above truth")}
         assert above == {key for key, cells in want.items() if cells[2] != "1.00" and float(cells[2]) > 1}
 

@@ -49,7 +49,7 @@ class Toolbar(JSComponent):
     largest = param.Integer(LARGEST, doc="The largest scenario file that is read [bytes].")
 
     _esm = asset("figures.js") + asset("actions.js")
-    _stylesheets = [asset("actions.css")]  # noqa: RUF012
+    _stylesheets = [asset("actions.css")]
 
     def __init__(self, **params: Any):
         self.on_action: Callable[[dict[str, Any]], None] | None = None

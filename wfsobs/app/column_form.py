@@ -13,7 +13,7 @@ from wfsobs.telemetry.columns import ROLES
 
 HINT = (
     "Say what the columns are. A record needs a measurement and a command of the same modes, and a time or a rate; "
-    "what their names suggest is filled in."
+    "what their names suggest is filled in, and what always rises as the time."
 )
 
 
@@ -26,7 +26,7 @@ class ColumnForm(JSComponent):
     hint = param.String(HINT, doc="What to do.")
 
     _esm = asset("columns.js")
-    _stylesheets = [asset("columns.css")]  # noqa: RUF012
+    _stylesheets = [asset("columns.css")]
 
     def __init__(self, on_change: Callable[[], None], **params: Any):
         self.on_change = on_change

@@ -22,7 +22,7 @@ class Connection(JSComponent):
     last_arrival = param.Integer(0, doc="Number of the last question that has arrived, and all before it.")
 
     _esm = asset("connection.js")
-    _stylesheets = [asset("connection.css")]  # noqa: RUF012
+    _stylesheets = [asset("connection.css")]
 
     def __init__(self, take: Callable[[dict[str, Any]], None], **params: Any):
         """Connect a page. take : makes a change again that did not arrive."""

@@ -21,7 +21,6 @@ from wfsobs.app.display import Display
 from wfsobs.app.help import Help
 from wfsobs.app.history import History
 from wfsobs.app.jobs.job import FAILED
-from wfsobs.app.jobs.task import IDLE
 from wfsobs.app.pages.explore import Explore
 from wfsobs.app.pages.pages import LIVE, Pages
 from wfsobs.app.pages.parts import WIDE
@@ -169,9 +168,13 @@ class Dashboard:
             self.drawer[:] = [self.controls.view()]
 
     def start(self) -> None:
-        """Start the first run, unless settings from a link have brought one or would take long."""
-        if self.store.run.state == IDLE:
-            self.store.follow()
+        """Start the first run, unless settings from a link have brought one or would take long, or the page opens on Live."""
+        if self.store.rests and self.pages.current == LIVE:
+            self.modes.offer(self.store.scenario.modes)
+            self.store.param.watch(lambda event: self.store.rests and self.modes.offer(event.new.modes), "scenario")
+            self.pages.param.watch(lambda _: self.store.rests and self.store.wake(), "current")
+        else:
+            self.store.wake()
 
     def close(self) -> None:
         """Release what the session holds; called when it ends."""

@@ -37,7 +37,7 @@ class Help(JSComponent):
     terms = param.Dict(dict(TERMS), doc="Word -> what it means.")
 
     _esm = asset("help.js")
-    _stylesheets = [asset("help.css")]  # noqa: RUF012
+    _stylesheets = [asset("help.css")]
 
     def __init__(self, **params: Any):
         super().__init__(width=36, margin=0, **params)

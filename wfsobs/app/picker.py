@@ -29,7 +29,7 @@ class Picker(JSComponent):
     part = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
     _esm = asset("parts.js") + asset("upload.js")
-    _stylesheets = [asset("actions.css")]  # noqa: RUF012
+    _stylesheets = [asset("actions.css")]
 
     def __init__(self, **params: Any):
         self.on_message: Callable[[dict[str, Any]], None] | None = None

@@ -11,14 +11,16 @@ from collections.abc import Callable
 from functools import partial
 from html import escape
 from typing import Any
-from urllib.parse import quote, urlencode
+from urllib.parse import parse_qsl, quote, urlencode
 
 import panel as pn
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.mends import mend_panel
+from wfsobs.app.pages.pages import LIVE
 from wfsobs.app.service import Post
 from wfsobs.app.share import has_settings
+from wfsobs.app.view_state import PAGE, PREFIX
 
 log = logging.getLogger(__name__)
 
@@ -30,6 +32,7 @@ def session_page(build: Callable[[Post], Dashboard]) -> Any:
         post = Poster()
         dashboard = build(post)
         query = page_query()
+        dashboard.store.rests = opens_on_live(query, dashboard.store.session.service.live is not None)
         if has_settings(query) or (query and dashboard.store.session.service.live is None):
             dashboard.actions.open_link(query)  # else the settings are those of the loop that all pages show
         session_page = dashboard.page()
@@ -42,6 +45,11 @@ def session_page(build: Callable[[Post], Dashboard]) -> Any:
     except Exception as error:
         log.exception("the page could not be built")
         return error_page(error)
+
+
+def opens_on_live(query: str, is_shared: bool) -> bool:
+    """Whether a page opens on the live loop: by its address, or because all pages show one."""
+    return dict(parse_qsl(query.removeprefix("?"))).get(PREFIX + PAGE, LIVE if is_shared else "") == LIVE
 
 
 def page_query() -> str:

@@ -12,7 +12,7 @@ import param
 from param.parameterized import batch_call_watchers
 
 from wfsobs.app.jobs.job import DONE
-from wfsobs.app.jobs.task import BackgroundTask
+from wfsobs.app.jobs.task import IDLE, BackgroundTask
 from wfsobs.app.service import Post, Session
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, Step, give_same_record
 from wfsobs.cost import rerun_seconds, run_seconds
@@ -52,6 +52,8 @@ class Store(param.Parameterized):
         self._past: list[Step] = []
         self._future: list[Step] = []
         self.run = BackgroundTask(session)
+        self.rests = False
+        """Whether runs wait until a page needs one."""
         self.run.param.watch(self._compare, "result")
 
     def start(self, seconds: float | None = None) -> None:
@@ -63,13 +65,21 @@ class Store(param.Parameterized):
             self.run.refuse(str(error))
 
     def follow(self) -> None:
-        """Run the settings as they stand, unless that takes long: then stop, and wait to be asked."""
+        """Run the settings as they stand, unless that takes long: then stop, and wait to be asked; not at all while it rests."""
+        if self.rests:
+            return
         seconds = self.seconds
         if seconds <= AT_ONCE or self.session.service.is_cached(self.scenario, self.source):
             self.start(seconds)
         else:
             self.run.cancel()
             self.waiting = seconds
+
+    def wake(self) -> None:
+        """Rest no more: run what nobody has asked for yet."""
+        self.rests = False
+        if self.run.state == IDLE:
+            self.follow()
 
     @property
     def seconds(self) -> float:

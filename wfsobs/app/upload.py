@@ -44,6 +44,7 @@ class Upload:
         self.picker.on_message = self.handle
         self.use = pmui.Button(label="Use this record", color="primary", size="small", margin=4)
         self.drop = pmui.Button(label="Discard", variant="outlined", size="small", margin=4)
+        self.missing = pn.pane.HTML("", margin=(8, 4))
         self.content = PreviewView()
         self.form: ColumnForm | None = None
         self.take = pmui.Button(
@@ -164,7 +165,9 @@ class Upload:
         self._preview = None if isinstance(preview, RecordError) else preview
         self.use.label = "Use this spectrum" if isinstance(preview, SpectrumPreview) else "Use this record"
         self.picker.message = "" if self._preview else str(preview)
-        self.use.disabled = self._preview is None
+        missing = preview.reading.missing if isinstance(preview, Preview) else ""
+        self.missing.object = missing and f'<span role="status">{missing}</span>'
+        self.use.disabled = self._preview is None or bool(missing)
         self.content.show(self._name, preview)
         self.take.visible = isinstance(preview, Preview) and differs_from_proposals(preview)
         self._lay_out()
@@ -187,16 +190,15 @@ class Upload:
                 *([self.form] if self.form is not None else []),
                 pn.FlexBox(*self.fields.widgets, self.take, gap="8px", align_items="center", margin=0),
                 pn.pane.Bokeh(self.content.figure, sizing_mode="stretch_width", margin=0),
-                pn.Row(self.use, self.drop, margin=0),
+                pn.FlexBox(self.use, self.drop, self.missing, align_items="center", margin=0),
             ]
         self.room.visible = True
 
     def confirm(self) -> None:
         """Let the record take the place of the simulation, the settings of rate, ratio and length with it."""
-        found = self._preview
-        if isinstance(found, SpectrumPreview):
+        if isinstance(found := self._preview, SpectrumPreview):
             self._vibrate(found)
-        if not isinstance(found, Preview):
+        if not isinstance(found, Preview) or found.reading.missing:
             return
         record, stated, digest = found.record, self.read_fields(), hashlib.sha256(self._content).hexdigest()
         try:

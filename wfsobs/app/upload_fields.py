@@ -23,7 +23,7 @@ class UploadFields:
         """Make the fields. on_change : called after every change of one."""
         self.unit = _select("Unit", [SILENT, *UNITS])
         self.sign = _select("Commands", {SILENT: 0, "are added to the measurement (+1)": 1, "are subtracted (-1)": -1})
-        self.delay, self.rate = _text("Delay of commands [steps]"), _text("Rate [Hz]")
+        self.delay, self.rate = _text("Delay of commands [steps]", 240), _text("Rate [Hz]")
         self.widgets = (self.unit, self.sign, self.delay, self.rate)
         for widget in self.widgets:
             widget.param.watch(lambda _event: on_change(), "value")
@@ -69,5 +69,5 @@ def _select(label: str, options: Any) -> pmui.Select:
     return pmui.Select(label=label, options=options, value=first, size="small", width=190, margin=(4, 0))
 
 
-def _text(label: str) -> pmui.TextInput:
-    return pmui.TextInput(label=label, value="", placeholder=SILENT, size="small", width=190, margin=(4, 0))
+def _text(label: str, width: int = 190) -> pmui.TextInput:
+    return pmui.TextInput(label=label, value="", placeholder=SILENT, size="small", width=width, margin=(4, 0))

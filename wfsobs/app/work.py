@@ -26,6 +26,7 @@ from wfsobs.observers.base import SLOW, TARGETS
 from wfsobs.observers.estimates import Estimate
 from wfsobs.pipeline import as_stated, collect
 from wfsobs.prior import GIVEN, TRUE
+from wfsobs.priors_from.selection import usual_observers
 from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.result import Failure
@@ -39,8 +40,8 @@ DRAWING = 0.15
 """What the page takes to draw a delivery [s]."""
 
 
-WEIGHTS = (2.0, SLOW)
-"""As soon as no observer is at work that is lighter than one of these, what is there is delivered: first filters of a few ms."""
+WEIGHTS = (10.0, SLOW)
+"""As soon as no observer is at work that is lighter than one of these, what is there is delivered: first what takes a few ms."""
 
 
 def one_blas_thread() -> None:
@@ -79,6 +80,7 @@ class _Work:
         self.stage = 0
         self.lock, self.telling = threading.Lock(), threading.Lock()
         self.record: Record | None = None
+        self.usual: list[str] = []
 
     def run(self) -> RunResults:
         self.watch.step(0.0)
@@ -90,6 +92,7 @@ class _Work:
             stated = as_stated(record, stated)
             stated.validate()
         self.record, self.known_estimates = record, RecordMemo(self.memo, record)
+        self.usual = usual_observers(stated, record)
         self.bounds = self.memo.get(self._name_of_bounds(record)) if self.simulation is not None else _Bounds()
         self._add_truth(record)
         known = self.known_estimates
@@ -122,7 +125,7 @@ class _Work:
     def _left(self) -> set[str]:
         """List the observers that have not delivered everything."""
         said = {(e.observer, e.target) for e in self.estimates}
-        left = {o.id for o in OBSERVERS.values() if any((o.id, target) not in said for target in o.targets)}
+        left = {name for name in self.usual if any((name, target) not in said for target in OBSERVERS[name].targets)}
         return left - {f.observer for f in self.failures}
 
     def _let_draw(self) -> None:
@@ -141,7 +144,7 @@ class _Work:
         told = TRUE if self.source is None else GIVEN
         result = collect(self.scenario, record, self.estimates, self.failures, least=least, source=told)
         partial = {key: values.copy() for key, values in self.growing.items()}
-        ran = tuple(name for name in OBSERVERS if name not in self.known_estimates.known_observers)
+        ran = tuple(name for name in self.usual if name not in self.known_estimates.known_observers)
         return RunResults(result, partial, dict(self.spectra), perf_counter() - self.start_time, self.source, least, ran)
 
     def _progress(self, fraction: float) -> None:

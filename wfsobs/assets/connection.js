@@ -45,6 +45,13 @@ function socketOf(act) {
   return socket
 }
 
+// What is being typed counts as typed: the box that it stands in is about to be drawn anew.
+function finishTyping() {
+  let box = document.activeElement
+  while (box?.shadowRoot?.activeElement) box = box.shadowRoot.activeElement
+  box?.blur()
+}
+
 // The path of the setting that a component, or what holds its data, stands for; or nothing.
 function settingOf(model) {
   const of = model?.data ? model : [...model?.document?._all_models.values() ?? []].find((it) => it.data === model)
@@ -53,7 +60,7 @@ function settingOf(model) {
 
 class Link {
   constructor(doc) {
-    Object.assign(this, {doc, state: "connected", asked: 0, unsent: [], socket: null, connection: null, refused: 0, wait: 0, ticks: 0})
+    Object.assign(this, {doc, state: "connected", asked: 0, unsent: [], kept: new Set(), away: false, socket: null, connection: null, refused: 0, wait: 0, ticks: 0})
     doc.on_change((event) => this.changed(event))
     doc.on_event("connection_lost", (_, event) => this.lost(event.connection.deref()))
     window.addEventListener("offline", () => {
@@ -122,14 +129,25 @@ class Link {
   lost(connection) {
     if (this.connection) return
     this.connection = connection
+    this.away = true
     const link = this
+    // A socket that is not open yet throws, and nobody else hears of the change then; one that is open takes it before what was kept.
+    if (!Object.hasOwn(connection, "send")) {
+      const {send} = connection
+      connection.send = function (message) {
+        if (!link.away || message.msgtype() !== "PATCH-DOC") send.call(this, message)
+      }
+    }
     connection._repull_session_doc = async function (resolve, reject) {
       try {
         const {doc_json, buffers} = await this._pull_doc_json()
         if (!JSON.stringify(doc_json).includes(link.session)) throw new Error("another session")
         const {document} = this.session
+        finishTyping()
         document.constructor.from_json(doc_json, [], buffers).destructively_move(document)
         document._new_models.clear() // the server has them
+        link.away = false
+        link.kept = new Set(link.unsent) // what comes now is sent as ever
         resolve(this.session)
       } catch (error) {
         if (error.message === "another session") link.end()
@@ -195,11 +213,12 @@ class Link {
     this.ready ||= this.doc.is_idle
     if (!this.ready || !this.due) return
     this.due = false
-    this.send(this.unsent.filter((it) => it.number > this.model.last_arrival))
+    this.unsent = this.unsent.filter((it) => it.number > this.model.last_arrival)
+    this.send(this.unsent.filter((it) => this.kept.has(it)))
   }
 
   send(changes) {
-    this.unsent = changes.map((it) => ({...it, number: this.asked + 1}))
+    for (const it of changes) it.number = this.asked + 1
     const settings = changes.filter((it) => it.setting)
     if (settings.length) this.model.send_msg({changes: settings})
     for (const {id, attr, value} of changes.filter((it) => !it.setting)) {
@@ -220,6 +239,7 @@ class Link {
     try {
       const [search, unsent] = JSON.parse(sessionStorage.getItem(UNSENT)) ?? []
       if (search === location.search) this.unsent = unsent.map((it) => ({...it, id: "", number: 1}))
+      this.kept = new Set(this.unsent)
     } catch { /* nothing kept */ }
   }
 }

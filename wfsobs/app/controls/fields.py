@@ -24,8 +24,9 @@ UNNAMED = {
     "& .MuiInputLabel-root": {"clipPath": "inset(50%)", "overflow": "hidden", "width": "1px", "height": "1px"},
     "& legend": {"display": "none"},
     "& fieldset": {"top": 0},
+    "& input": {"textOverflow": "ellipsis"},
 }
-"""A box whose name is heard but not seen: the slider beside it has the same."""
+"""A box whose name is heard but not seen: the slider beside it has the same. A number that is too long is seen to be."""
 
 
 SOON = 5

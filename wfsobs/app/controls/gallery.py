@@ -20,7 +20,7 @@ class Gallery(JSComponent):
     items = param.List([], doc="{name, title, line, peaks: [Hz, um], events} of every preset.")
 
     _esm = asset("gallery.js")
-    _stylesheets = [asset("gallery.css")]  # noqa: RUF012
+    _stylesheets = [asset("gallery.css")]
 
     def __init__(self, choose: Callable[[str], None], **params: Any):
         """Make the button. choose : starts from the preset of a name."""

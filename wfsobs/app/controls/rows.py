@@ -29,7 +29,7 @@ class RowTable(JSComponent):
     noun = param.String("item", doc="What an item is called.")
 
     _esm = asset("rows.js")
-    _stylesheets = [asset("rows.css")]  # noqa: RUF012
+    _stylesheets = [asset("rows.css")]
 
     def __init__(self, **params: Any):
         self.on_edit: Any = None

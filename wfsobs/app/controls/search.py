@@ -19,7 +19,7 @@ class Search(JSComponent):
     items = param.List([], doc="{path, label, topic, doc, unused} of every setting.")
 
     _esm = asset("over.js") + asset("search.js")
-    _stylesheets = [asset("search.css")]  # noqa: RUF012
+    _stylesheets = [asset("search.css")]
 
     def __init__(self, reveal: Callable[[str], None], idle: Callable[[], Mapping[str, str]], **params: Any):
         """Make the box.

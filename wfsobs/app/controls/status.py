@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import param
 from panel.custom import JSComponent
 
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
+from wfsobs.app.run_results import RunResults
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset
-from wfsobs.observers import OBSERVERS
 
 ON_BAR = {
     "color": "#fff",
@@ -48,13 +46,13 @@ class Status(JSComponent):
     label = param.String("Progress of the run", doc="What the bar is the progress of.")
 
     _esm = asset("status.js")
-    _stylesheets = [asset("status.css")]  # noqa: RUF012
+    _stylesheets = [asset("status.css")]
 
 
 def status_of(store: Store) -> tuple[str, str]:
     """Describe the run in one line, and what was refused in another."""
     run = store.run
-    seconds = f" in {run.result.seconds:.2f} s{_share(run.result.ran)}" if run.result and run.state == DONE else ""
+    seconds = f" in {run.result.seconds:.2f} s{_share(run.result)}" if run.result and run.state == DONE else ""
     text = {
         RUNNING: run.line(),
         DONE: f"Done{seconds}",
@@ -67,9 +65,10 @@ def status_of(store: Store) -> tuple[str, str]:
     return text, note
 
 
-def _share(ran: Sequence[str] | None) -> str:
+def _share(run: RunResults) -> str:
     """Say how many observers ran where not all did."""
-    return f", {len(ran)} of {len(OBSERVERS)} ran" if ran is not None and len(ran) < len(OBSERVERS) else ""
+    every = {item.observer for item in (*run.result.estimates, *run.result.failures)}
+    return f", {len(run.ran)} of {len(every)} ran" if run.ran is not None and len(run.ran) < len(every) else ""
 
 
 def waiting_text(seconds: float) -> str:

@@ -29,12 +29,12 @@ def identification_html(mode: IdentifiedMode, display: Display, diameter: float)
 
 
 def deviation_text(number: Number) -> str:
-    """Write a number and its standard deviation.
+    """Write a number and its standard deviation, where there is one.
 
-    >>> deviation_text(Number(47.43812, 0.0264))
-    '47.438 ± 0.026'
+    >>> deviation_text(Number(47.43812, 0.0264)), deviation_text(Number(1.9, float("nan")))
+    ('47.438 ± 0.026', '1.9')
     """
-    return format_number(number).replace("+-", "±").replace("-", "−")
+    return format_number(number).replace("+-", "±").replace("-", "−").removesuffix(" ± −")
 
 
 def verdict_html(result: Identification) -> str:

@@ -18,14 +18,15 @@ from wfsobs.app.downloads import Save, table_csv
 from wfsobs.app.jobs.job import RUNNING
 from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
 from wfsobs.app.pages.sweep_settings import line_of, read_axis, sweep_settings, usual_values
-from wfsobs.app.pages.sweep_views import SweepLines, SweepMap, axis_title, legend_of_shades, map_grid
+from wfsobs.app.pages.sweep_views import SweepMap, axis_title, legend_of_shades, line_part, map_grid
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.sweep_work import SweepTask
+from wfsobs.app.views.sweep_lines import SweepLines
 from wfsobs.campaign.sweep import MOST_SEEDS, Sweep, plan_sweep
 from wfsobs.campaign.sweep_results import SweepResults
-from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
+from wfsobs.priors_from.selection import quick_observers
 from wfsobs.settings.errors import SettingError
 
 INTRO = (
@@ -139,7 +140,7 @@ class SweepPage(PageActions):
 
     def _observers(self) -> list[str] | None:
         """Return the ids of the observers; None for all."""
-        return [o.id for o in OBSERVERS.values() if not o.slow] if self.observers.value == QUICK else None
+        return quick_observers(self.store.scenario) if self.observers.value == QUICK else None
 
     def start(self) -> None:
         """Run the sweep that the fields describe, or say in one line why not."""
@@ -176,8 +177,7 @@ class SweepPage(PageActions):
 
     def saves(self) -> Mapping[str, Save | None]:
         """Offer the errors of all cells, as `wfsobs sweep --csv` writes them."""
-        results = self.results
-        known = results is not None and results.rows()
+        known = self.results and self.results.rows()
         return {"Sweep as CSV": Save("wfsobs-sweep.csv", "text/csv", lambda: table_csv(known)) if known else None}
 
     def _suggest(self, event: param.parameterized.Event, values: pmui.TextInput) -> None:
@@ -236,12 +236,12 @@ class SweepPage(PageActions):
             self._compare()
 
     def _draw_lines(self, results: SweepResults, target: str) -> None:
+        part = line_part(results, target, self.display)
         if target not in self.lines:
-            self.lines[target] = SweepLines(results, target)
+            self.lines[target] = SweepLines(part)
             self.panes[target][:] = [pn.pane.Bokeh(self.lines[target].figure, **WIDE)]
         lines = self.lines[target]
-        lines.draw(results, self.display)
-        lines.restyle(self.display.dark)
+        lines.draw(part, self.display.dark)
         self.legends[target].object = legend({name: look(name).label for name in lines.sources}, self.display.dark)
 
     def _compare(self, *_: Any) -> None:

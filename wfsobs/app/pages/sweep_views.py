@@ -1,4 +1,4 @@
-"""A sweep in maps and figures: the best observer of each cell by its colour, the errors of all over one setting."""
+"""A sweep in maps and lines: the best observer of each cell by its colour, the errors of all over one setting."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import param
-from bokeh.models import ColumnDataSource, FixedTicker, Range1d
-from bokeh.plotting import figure
 from panel.custom import JSComponent
 
 from wfsobs.app.controls.names import setting_name
@@ -16,14 +14,12 @@ from wfsobs.app.display import Display, per_micrometre, unit_text
 from wfsobs.app.numbers import number
 from wfsobs.app.report.text import value_of
 from wfsobs.app.style import asset, look, observers_of
-from wfsobs.app.views.plots import add_line, call, new_figure
 from wfsobs.campaign.sweep_results import SweepResults
 from wfsobs.evaluation.evidence import FEWEST
 from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.scenario import Scenario
 from wfsobs.settings.parameters import unit_of
-from wfsobs.typing import Array
 
 FULL_MARGIN = 0.3
 """Margin of the best from which its colour is full: the second is 30 % worse."""
@@ -44,7 +40,7 @@ class SweepMap(JSComponent):
     grid = param.Dict({}, doc="Title, names of the axes and their values, cells row by row, and the key of the colours.")
 
     _esm = asset("sweep.js")
-    _stylesheets = [asset("sweep.css")]  # noqa: RUF012
+    _stylesheets = [asset("sweep.css")]
 
     def __init__(self, load: Callable[[int], None], **params: Any):
         """Make the map. load : takes the number of a cell."""
@@ -82,13 +78,36 @@ def map_grid(results: SweepResults, target: str, display: Display) -> dict[str, 
     }
 
 
+def line_part(results: SweepResults, target: str, display: Display) -> dict[str, Any]:
+    """Describe the errors over the one setting of a sweep, in the mode and unit shown, as `SweepLines` draws them."""
+    (axis,) = results.sweep.axes
+    is_numeric = all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in axis.values)
+    x = np.array(axis.values if is_numeric else range(len(axis.values)), dtype=float)
+    cells = np.argsort(x).tolist()
+    scale = np.array([per_micrometre(display.unit, results.sweep.value(cell, "telescope.diameter")) for cell in cells])
+    names = (BOUND, BOUND_BOTH, *(name for name in observers_of(target) if name in results.sweep.observers))
+    unknown = (np.nan,) * 3
+    errors = {name: [results.error(cell, (name, target, display.mode)) or unknown for cell in cells] for name in names}
+    return {
+        "title": f"Error over {setting_name(axis.path)}, {target}",
+        "mode": display.mode,
+        "across": axis_title(results.sweep.base, axis.path),
+        "up": f"mean rms error, {display.mode_label} [{display.unit_label}]",
+        "values": x[cells].tolist(),
+        "texts": None if is_numeric else [value_of(axis.values[cell]) for cell in cells],
+        "errors": {name: (scale * np.array(known).T).tolist() for name, known in errors.items()},
+    }
+
+
 def report_part(results: SweepResults) -> dict[str, Any]:
-    """Describe the maps of every target and mode and the errors of all cells, as plain values for a report; errors in [nm]."""
+    """Describe a sweep for a report as plain values: maps and lines of every target and mode, errors of all cells [nm]."""
     groups = list(dict.fromkeys(key[1:] for key in results.known_keys()))
     rows = results.rows()
     axes = [axis.path for axis in results.sweep.axes]
+    shown = [(target, Display(mode=mode, unit="nm", dark=False)) for target, mode in groups]
     return {
-        "maps": [map_grid(results, target, Display(mode=mode, unit="nm", dark=False)) for target, mode in groups],
+        "maps": [map_grid(results, target, display) for target, display in shown],
+        "lines": [line_part(results, target, display) for target, display in shown] if len(axes) == 1 else [],
         "columns": [*(axis_title(results.sweep.base, path) for path in axes), *REPORT_COLUMNS],
         "rows": [[*(value_of(row[path]) for path in axes), *_report_cells(row)] for row in rows[:MOST_ROWS]],
         "left_out": max(0, len(rows) - MOST_ROWS),
@@ -163,68 +182,6 @@ def ink_on(ground: str) -> str:
 
 def _channels(colour: str) -> list[int]:
     return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
-
-
-class SweepLines:
-    """Errors over one setting: a line per observer and bound, and the intervals of the means as bars."""
-
-    def __init__(self, results: SweepResults, target: str):
-        self.target, (axis,) = target, results.sweep.axes
-        values = axis.values
-        self.numeric = all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
-        self.x = np.array(values if self.numeric else range(len(values)), dtype=float)
-        order = np.argsort(self.x)
-        self.order = order.tolist()
-        logarithmic = self.numeric and self.x.min() > 0 and _unevenness(np.log(self.x)) < _unevenness(self.x)
-        low, high = float(self.x.min()), float(self.x.max())
-        room = 0.03 * (high - low)
-        ends = (low / 1.1, high * 1.1) if logarithmic else (low - room, high + room)
-        self.figure: figure = new_figure(
-            x_range=Range1d(start=ends[0], end=ends[1]),
-            y_range=Range1d(start=0.0, end=1.0),
-            x_axis_type="log" if logarithmic else "linear",
-        )
-        call(self.figure, f"Error over {setting_name(axis.path)}, {target}")
-        self.figure.xaxis.axis_label = axis_title(results.sweep.base, axis.path)
-        if not self.numeric:
-            self.figure.xaxis.ticker = FixedTicker(ticks=self.x.tolist())
-            self.figure.xaxis.major_label_overrides = {float(i): value_of(v) for i, v in enumerate(values)}
-        self.names = [name for name in observers_of(target) if name in results.sweep.observers]
-        self.sources, self.glyphs = {}, {}
-        for name in (BOUND, BOUND_BOTH, *self.names):
-            source = self.sources[name] = ColumnDataSource({"x": [], "y": [], "low": [], "high": []})
-            bar = self.figure.segment("x", "low", "x", "high", source=source, line_width=2, line_alpha=0.35, level="underlay")
-            line = add_line(self.figure, name, source)
-            self.glyphs[name] = line, bar, self.figure.scatter("x", "y", source=source, size=5)
-
-    def draw(self, results: SweepResults, display: Display) -> None:
-        """Send what is known of every line."""
-        cells = self.order
-        diameters = [results.sweep.value(cell, "telescope.diameter") for cell in cells]
-        scale = np.array([per_micrometre(display.unit, diameter) for diameter in diameters])
-        highest = []
-        for name, source in self.sources.items():
-            errors = [results.error(cell, (name, self.target, display.mode)) or (np.nan,) * 3 for cell in cells]
-            y, low, high = scale * np.array(errors).T
-            source.data = {"x": self.x[cells], "y": y, "low": low, "high": high}
-            if np.isfinite(y).any():
-                highest.append(float(np.nanmax(y)))
-        top = 1.08 * max(highest, default=1.0)
-        self.figure.y_range.update(start=0.0, end=top, reset_start=0.0, reset_end=top)
-        self.figure.yaxis.axis_label = f"mean rms error, {display.mode_label} [{display.unit_label}]"
-
-    def restyle(self, dark: bool) -> None:
-        """Set the colours of light or dark mode."""
-        for name, (line, bar, dots) in self.glyphs.items():
-            colour = look(name).colour(dark)
-            line.glyph.line_color = bar.glyph.line_color = colour
-            dots.glyph.update(line_color=colour, fill_color=colour)
-
-
-def _unevenness(x: Array) -> float:
-    """Return the range of the steps between sorted values over their mean; without steps to compare, 0."""
-    steps = np.diff(np.sort(x))
-    return float(np.ptp(steps) / steps.mean())
 
 
 def legend_of_shades() -> str:

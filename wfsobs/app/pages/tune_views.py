@@ -9,6 +9,7 @@ import numpy as np
 from bokeh.models import ColumnDataSource, DataRange1d
 from markupsafe import Markup
 
+from wfsobs.app.controls.names import setting_name
 from wfsobs.app.display import NO_ANGLE, UNITS, Display, per_micrometre
 from wfsobs.app.numbers import NOTHING, change, number
 from wfsobs.app.render import Row, macro, table
@@ -83,7 +84,7 @@ def tuning_html(result: TuningResult, display: Display, diameter: float) -> str:
 
 
 def _row(section: str, name: str, before: float | str | None, after: float | str | None, scale: float) -> Row:
-    error = section in (VALIDATION, TEST, OTHER)
+    error, name = section in (VALIDATION, TEST, OTHER), setting_name(name) if section == SETTING else name
     cells = [_cell(x, scale if error else 1.0) for x in (before, after)]
     known = error and isinstance(before, float) and isinstance(after, float)
     cells.append(change(before, after) if known else "")  # type: ignore[arg-type]

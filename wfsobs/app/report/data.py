@@ -25,8 +25,8 @@ from wfsobs.evaluation.budget import budget_row, error_budget
 from wfsobs.evaluation.error_spectra import cumulative_rms, spectra
 from wfsobs.evaluation.evidence import Evidence
 from wfsobs.evaluation.rows import Row, score_rows
-from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
+from wfsobs.priors_from.selection import usual_observers
 from wfsobs.record import RecordError
 from wfsobs.result import Result
 from wfsobs.scenario import Scenario
@@ -169,7 +169,8 @@ def loop_rows(result: Result) -> list[Row]:
 def _reasons(result: Result) -> list[str]:
     """Why an observer gave nothing."""
     done = {item.observer for item in (*result.estimates, *result.failures)}
-    waiting = [f"{name} left out: not finished when the report was made" for name in OBSERVERS if name not in done]
+    usual = usual_observers(result.scenario, result.record)
+    waiting = [f"{name} left out: not finished when the report was made" for name in usual if name not in done]
     return [f.reason for f in result.failures] + waiting
 
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 from bokeh.models import BoxAnnotation, ColumnDataSource, CrosshairTool, DataRenderer, HoverTool, Range1d, Span, VSpan
 from bokeh.plotting import figure
 
 from wfsobs.app.style import look, observers_of
 from wfsobs.app.views.plots import MODEL, PEAKS, add_line, new_figure
+from wfsobs.app.views.sweep_lines import SweepLines
 from wfsobs.app.work import TRUTH
 from wfsobs.observers.base import TARGETS, VIBRATION
 
-TRACE, SPECTRUM, SWEEP = "trace", "spectrum", "sweep"
+TRACE, SPECTRUM, SWEEP, PART = "trace", "spectrum", "sweep", "part"
 
 WARM_UP, WINDOW = "warm-up", "window"
 NOW = "now"
@@ -18,10 +22,10 @@ SHADES = {WARM_UP: "#808080", WINDOW: "#2B8AB3"}
 """Stretches of a trace that are shaded."""
 
 
-def all_figures(sweeps: bool) -> dict[str, figure]:
+def all_figures(sweeps: bool, parts: Sequence[Mapping[str, Any]] = ()) -> dict[str, figure]:
     """Make all figures by name, as in "trace-turbulence"; the traces share their time axis, the spectra their frequencies.
 
-    sweeps : with those of errors over a setting that varies
+    sweeps : with those of errors over a setting that varies; parts : errors of a sweep over one setting, which have their data
     """
     times, frequencies = Range1d(start=0.0, end=10.0), Range1d(start=0.5, end=500.0)
     crosshair = CrosshairTool(dimensions="height", overlay=Span(dimension="height", line_alpha=0.4, line_width=1))
@@ -30,6 +34,7 @@ def all_figures(sweeps: bool) -> dict[str, figure]:
     if sweeps:
         values = Range1d(start=0.0, end=1.0)
         made |= {f"{SWEEP}-{target}": _sweep(target, values) for target in TARGETS}
+    made |= {f"{PART}-{i}": _part(part) for i, part in enumerate(parts)}
     for name, fig in made.items():  # see-through from the start: a white ground leaves its edge behind in dark mode
         fig.update(name=name, background_fill_alpha=0.0, border_fill_alpha=0.0)
     return made
@@ -78,6 +83,13 @@ def _sweep(target: str, values: Range1d) -> figure:
         add_line(fig, name, source, name)
         fig.scatter("x", name, source=source, size=5, color=look(name).light, name=name)
     return fig
+
+
+def _part(part: Mapping[str, Any]) -> figure:
+    """Errors of a sweep over its one setting, as on the page of sweeps."""
+    lines = SweepLines(part)
+    lines.draw(part)
+    return lines.figure
 
 
 def _names(target: str) -> list[str]:

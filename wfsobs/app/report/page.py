@@ -109,7 +109,8 @@ def _line_names() -> list[str]:
 def _figures(report: Report) -> dict[str, Any]:
     """Collect the figures without data, and where each is drawn."""
     document = Document()
-    for figure in all_figures(bool(_sweeps(report))).values():
+    parts = report.sweep["lines"] if report.sweep else ()
+    for figure in all_figures(bool(_sweeps(report)), parts).values():
         document.add_root(figure)
     return {"document": document.to_json(deferred=False), "roots": {root.id: str(root.name) for root in document.roots}}
 

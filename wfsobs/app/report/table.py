@@ -53,7 +53,7 @@ def _body(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> dict[str, Any
                 "mark": marks.get(row["observer"]),
                 "interval": row["interval_um"] or intervals.get(f"{row['observer']}/{target}/{mode}"),
                 "meaning": IN_MOST if row["interval_um"] else over_seeds,
-                "lag": NOTHING if row["lag_s"] is None else f"{1e3 * row['lag_s']:.2f}".replace("-", "−"),
+                "lag": NOTHING if row["lag_s"] is None else f"{1e3 * row['lag_s']:z.2f}".replace("-", "−"),
                 "time": row[TIME],
                 "factor": None if row[TIME] is None else 1e-6 * row[TIME] / dt,
             }
@@ -63,8 +63,8 @@ def _body(rows: list[Row], dt: float, seeds: Mapping[str, Any]) -> dict[str, Any
 
 
 def _marks(rows: list[Row], leaders: Sequence[str]) -> dict[str, str]:
-    """Mark the best: over several seeds only if it differs significantly from all others, which are tied with it if not."""
+    """Mark the best, which differs significantly from all others over the seeds, or those tied; of one record the smallest."""
     if leaders:
         return dict.fromkeys(leaders, "tied" if len(leaders) > 1 else "best")
     rivals = {row["observer"]: row["rms_um"] for row in rows if can_be_best(row["observer"], row["apart"])}
-    return dict.fromkeys(rank_observers(rivals)[:1], "best")
+    return dict.fromkeys(rank_observers(rivals)[:1], "smallest")

@@ -21,6 +21,7 @@ from wfsobs.app.picker import LARGEST, PART, PartialFile, file_message, too_larg
 from wfsobs.app.session_file import SUFFIX, read_session, write_session
 from wfsobs.app.session_values import SessionError
 from wfsobs.app.style import asset, look
+from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.rows import can_be_best
 from wfsobs.evaluation.scores import PREDICTION, Score
 from wfsobs.observers.base import TARGETS
@@ -43,7 +44,7 @@ class Sheet(JSComponent):
     part = param.Integer(PART, doc="How much is sent at a time [bytes].")
 
     _esm = asset("patch.js") + asset("parts.js") + asset("history.js")
-    _stylesheets = [asset("history.css")]  # noqa: RUF012
+    _stylesheets = [asset("history.css")]
 
     def __init__(self, hear: Callable[[dict[str, Any]], None], **params: Any):
         self._hear = hear
@@ -206,6 +207,7 @@ def best_scores(entry: HistoryEntry, display: Display) -> str:
             s for s in entry.scores if (s.target, s.mode) == (target, display.mode) and can_be_best(s.observer, s.apart)
         ]
         if scores:
-            best = min(scores, key=lambda s: s.rms)
-            parts.append(f"{target.capitalize()} {number(best.rms * scale)} {display.unit_label} ({look(best.observer).label})")
+            errors = {s.observer: s.rms for s in scores}
+            best = rank_observers(errors)[0]
+            parts.append(f"{target.capitalize()} {number(errors[best] * scale)} {display.unit_label} ({look(best).label})")
     return ", ".join(parts)

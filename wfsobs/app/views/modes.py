@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import panel as pn
 import panel_material_ui as pmui
 
@@ -43,10 +45,11 @@ class ModeSwitch:
 
     def _fit(self, *_: object) -> None:
         """Offer the modes of the run shown."""
-        shown = self.run.result
-        if shown is None:
-            return
-        modes = shown.scenario.modes[: shown.result.record.n_modes]
+        if (shown := self.run.result) is not None:
+            self.offer(shown.scenario.modes[: shown.result.record.n_modes])
+
+    def offer(self, modes: Sequence[Mode]) -> None:
+        """Offer modes to choose from."""
         if self.display.mode not in [mode.name for mode in modes]:
             self.display.mode = modes[0].name
         options = {_title(mode): mode.name for mode in modes}

@@ -16,7 +16,7 @@ class Readout(JSComponent):
     labels = param.Dict({}, doc="Name of a line in the figures -> what it is called.")
 
     _esm = asset("readout.js")
-    _stylesheets = [asset("readout.css")]  # noqa: RUF012
+    _stylesheets = [asset("readout.css")]
 
     def __init__(self, **params: Any):
         super().__init__(labels=labels(), width=0, height=0, margin=0, **params)

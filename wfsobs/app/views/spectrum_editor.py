@@ -43,7 +43,7 @@ class HandleLayer(JSComponent):
     frame = param.Dict({}, doc="What is shown: handles, numbers, a note, and the number of the message that is answered.")
 
     _esm = asset("handles.js")
-    _stylesheets = [asset("handles.css")]  # noqa: RUF012
+    _stylesheets = [asset("handles.css")]
 
     def __init__(self, hear: Callable[[Mapping[str, Any]], None], **params: Any):
         self._hear = hear

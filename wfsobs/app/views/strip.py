@@ -33,7 +33,7 @@ class Cards(JSComponent):
     main = param.String("", doc="What the button is called that shows the lines that matter; none if empty.")
 
     _esm = asset("patch.js") + asset("strip.js")
-    _stylesheets = [asset("style.css"), asset("strip.css")]  # noqa: RUF012
+    _stylesheets = [asset("style.css"), asset("strip.css")]
 
     def __init__(self, **params: Any):
         self.on_main: Callable[[], None] = lambda: None

@@ -30,9 +30,13 @@ from wfsobs.evaluation.rows import (
     scored_interval,
 )
 from wfsobs.evaluation.scores import BOUND_STARS, BOUNDS, LOOP, RESIDUAL, Score
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
+from wfsobs.priors_from.selection import is_usual
 
 BEST, TIED, ABOVE = macro("tag", "best", "best"), macro("tag", "tied", "tied"), macro("tag", "above", "above truth")
+SMALLEST = macro("tag", "smallest", "smallest")
+"""Error of one record, which does not tell who is best."""
 
 
 def find(results: RunResults, observer: str, target: str, mode: str) -> Score | None:
@@ -89,7 +93,7 @@ class Table:
         for score in scores:
             is_best = score.rms == best and can_be_best(score.observer, score.apart)
             cells = [
-                (BEST if is_best else "") + number(score.rms * scale),
+                (SMALLEST if is_best else "") + number(score.rms * scale),
                 *self._compared_cells(score.observer, score.target, score),
                 number(score.truth_rms * scale),
                 number(score.normalised_rms),
@@ -108,6 +112,7 @@ class Table:
         scores = {
             name: find(shown, name, target, self.display.mode) if shown else None
             for name in (*observers_of(target, with_hidden=True), *BOUNDS)
+            if not shown or name in BOUNDS or is_usual(OBSERVERS[name], shown.result.scenario, shown.result.record)
         }
         if not scores[BOUND_STARS]:  # only where stars differ
             del scores[BOUND_STARS]
@@ -119,12 +124,12 @@ class Table:
         return title, [self._row(name, target, score, marks.get(name, Markup())) for name, score in order]
 
     def _marks(self, target: str, scores: Mapping[str, Score | None]) -> dict[str, Markup]:
-        """Mark the best: over several seeds only if it differs significantly from all others, which are tied with it if not."""
+        """Mark the best, which differs significantly from all others over seeds, or those tied; of one record the smallest."""
         evidence = self.seeds.evidence if self.seeds else None
         if evidence and (leaders := evidence.leaders(target, self.display.mode)):
             return dict.fromkeys(leaders, TIED if len(leaders) > 1 else BEST)
         rivals = {n: s.rms for n, s in scores.items() if s and can_be_best(n, s.apart)}
-        return dict.fromkeys(rank_observers(rivals)[:1], BEST)
+        return dict.fromkeys(rank_observers(rivals)[:1], SMALLEST)
 
     def _over_seeds(self, name: str, target: str, scale: float) -> Markup:
         """Write the interval of the mean error over several seeds, to stand before that of the record."""
@@ -150,7 +155,7 @@ class Table:
                 number(score.truth_rms * scale),
                 (ABOVE if (score.normalised_rms or 0.0) > 1.0 else "") + number(score.normalised_rms),
                 needs,
-                NOTHING if score.lag is None else f"{1e3 * score.lag:.2f}".replace("-", "−"),
+                NOTHING if score.lag is None else f"{1e3 * score.lag:z.2f}".replace("-", "−"),
                 *_times(score, shown.result.record.dt),
                 NOTHING if score.calibration is None else number(score.calibration.sd * scale),
             ]
