@@ -57,9 +57,9 @@ def test_whole_runs_of_the_benchmarks_page(changes: dict[str, float], measured: 
     assert 0.7 < run_seconds(paper().replace(changes), others) / measured < 1.3
 
 
-@pytest.mark.parametrize(("changes", "measured"), [({}, 0.26), ({"adaptive.window": 2}, 0.19), ({"run.duration": 30}, 0.95)])
+@pytest.mark.parametrize(("changes", "measured"), [({}, 0.22), ({"adaptive.window": 2}, 0.13), ({"run.duration": 30}, 1.13)])
 def test_adaptive_gpr_near_what_was_measured(changes: dict[str, float], measured: float) -> None:
-    """On a busy machine: processor time, times 0.68, which is what a quiet one takes for `kf-adaptive` of what that one took."""
+    """Processor time of a machine that did nothing else."""
     assert 0.7 < part_seconds(paper().replace(changes))["gpr-adaptive"] / 2 / measured < 1.3
 
 

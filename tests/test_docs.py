@@ -438,3 +438,14 @@ def test_the_page_of_loops() -> None:
     names = run_page(DOCS / "your-loop.md")
     assert names["residual"][500:].std() < 0.25 * names["disturbance"][500:].std()
     assert np.isfinite(names["mean"]).all() and (names["sd"] > 0).all()
+
+
+def test_a_ratio_of_paired_errors_and_its_jackknife() -> None:
+    """Of the means; its standard error is zero where errors go together, and that of a mean where the other is constant."""
+    rms_ratio = script("told_nothing").rms_ratio
+    squares = np.random.default_rng(1).uniform(1.0, 1.1, 400)
+    assert rms_ratio(4.0 * squares, squares) == pytest.approx((2.0, 0.0), abs=1e-12)
+    # the square root halves the relative error; what it bends is as small as the spread itself, 3 %
+    ratio, spread = rms_ratio(squares, np.full(400, 1.0))
+    assert ratio == pytest.approx(np.sqrt(squares.mean()), rel=1e-12)
+    assert spread == pytest.approx(0.5 * squares.std(ddof=1) / 20.0 / ratio, rel=1e-2)

@@ -97,6 +97,17 @@ def test_cells_keep_every_bin_once() -> None:
     assert np.all(cells.count[np.abs(cells.frequency - 30.0) < 0.4] == 1.0)
 
 
+@pytest.mark.parametrize("sizes", [(200, 8), (50, 4)])
+def test_cells_are_as_wide_as_they_may_be(sizes: tuple[int, int]) -> None:
+    """By the definition, over all bins: a cell ends where the sum of one over the widest cell at a bin passes a whole number."""
+    f, centres = periodogram_frequencies(20_000, DT), [0.02, 7.3, 30.0, 32.0, 480.0, 600.0]
+    j = np.arange(1.0, len(f) + 1.0)
+    distances = [np.maximum(np.abs(j - centre / f[0]) / sizes[1], 1.0) for centre in centres]
+    widest = np.min([np.maximum(j / sizes[0], 1.0), *distances], axis=0)
+    count = np.bincount(np.floor(np.cumsum(1.0 / widest) + 1e-6).astype(int))
+    assert np.array_equal(Cells(f, f, np.ones(len(f)), centres, sizes=sizes).count, count[count > 0])
+
+
 @pytest.mark.parametrize("n", [2000, 59_998, 60_013])
 def test_fast_length(n: int) -> None:
     assert 0.98 * n < fast_length(n) <= n

@@ -16,7 +16,6 @@ from wfsobs.atmosphere.von_karman import FIELD
 from wfsobs.dependence import observers_reached
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.per_mode import AT_ONCE
-from wfsobs.priors_from.scenario import observer_settings
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import TRAINING_MARGIN
 
@@ -29,7 +28,7 @@ def run_seconds(scenario: Scenario, observers: Sequence[str] | None = None) -> f
 
     >>> from wfsobs.scenario.presets import paper
     >>> round(run_seconds(paper()), 1), round(run_seconds(paper().replace({"run.duration": 300})))
-    (1.1, 42)
+    (1.1, 44)
     """
     return sum(
         seconds for part, seconds in part_seconds(scenario).items() if part == REST or observers is None or part in observers
@@ -56,7 +55,7 @@ def part_seconds(scenario: Scenario) -> dict[str, float]:
     air = _steps_of_air(scenario)
     return {
         **{
-            o.id: o.seconds(observer_settings(o, scenario), n, n_modes, scenario.dt)
+            o.id: o.seconds(None if o.group is None else getattr(scenario, o.group), n, n_modes, scenario.dt)
             for o in OBSERVERS.values()
             if o.seconds is not None
         },

@@ -10,6 +10,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimate, Estimates
 from wfsobs.priors_from.scenario import PriorParts, arguments, prior_and_settings
+from wfsobs.priors_from.selection import usual_observers
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record
 from wfsobs.result import Failure
@@ -32,6 +33,7 @@ def each_estimate(
 
     Each receives measurements, its prior and its settings: neither record nor scenario.
 
+    observers  : ids; by default those of `usual_observers`
     on_partial : receives (observer, target, values so far) from observers that compute in blocks
     memo       : estimates that are known by what they depend on; they come first, without a run
     """
@@ -39,7 +41,8 @@ def each_estimate(
     unknown = set(observers or ()) - set(OBSERVERS)
     if unknown:
         raise SettingError(f"observer {sorted(unknown)[0]!r}: no such observer; there are {', '.join(OBSERVERS)}")
-    chosen = list(OBSERVERS.values()) if observers is None else [OBSERVERS[name] for name in dict.fromkeys(observers)]
+    names_of = usual_observers(scenario, record) if observers is None else dict.fromkeys(observers)
+    chosen = [OBSERVERS[name] for name in names_of]
     names: dict[str, str] = {}
     parts: PriorParts = {}
     if memo is not None:

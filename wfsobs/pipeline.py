@@ -37,7 +37,7 @@ def run(scenario: Scenario, *, observers: Sequence[str] | None = None, watch: Wa
     scenario : Scenario
         Settings of the run.
     observers : sequence of str, optional
-        Ids of the observers; by default all.
+        Ids of the observers; by default all that the scenario has something for.
     watch : Watch, optional
         Receives the progress, and is asked at every block of work whether to stop.
 
@@ -90,7 +90,7 @@ def observe(
     scenario : Scenario, optional
         Settings; the models of the observers are made from it unless there is a `prior`. By default those of `Scenario()`.
     observers : sequence of str, optional
-        Ids of the observers; by default all.
+        Ids of the observers; by default all that the scenario has something for.
     prior : Identification or Scenario, optional
         What observers are told: what `identify` found, or the settings that were made of it. Their own settings stay those of
         `scenario`.

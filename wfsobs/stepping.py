@@ -134,7 +134,8 @@ def _of_modes(prior: Prior, name: str, n: int) -> Prior:
         if given and len(given) < n:
             raise StepError(f"{name}: the prior has {part} of {len(given)} modes, the loop has {n}")
     flow = None if prior.flow is None else prior.flow.first(n)
-    return replace(prior, flow=flow, **{part: given[:n] for part, given in parts.items()})
+    asterism = None if prior.asterism is None else prior.asterism.first(n)
+    return replace(prior, flow=flow, asterism=asterism, **{part: given[:n] for part, given in parts.items()})
 
 
 def _training(scenario: Scenario, train: Record | Training | None) -> Training:

@@ -17,6 +17,7 @@ from wfsobs.bench.turbulence import frozen
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
 from wfsobs.pipeline import run
+from wfsobs.priors_from.selection import usual_observers
 from wfsobs.simulation.loop import simulate
 
 
@@ -43,7 +44,7 @@ def whole_run(sizes: Sizes, _libraries: Collection[str]) -> Iterator[Row]:
     yield row("whole-run", size, OURS, seconds, scenario.n_steps)
     learning = tuple(name for name, observer in OBSERVERS.items() if observer.slow)
     for variant, left_out in (("without-online-gpr", ("gpr-online",)), ("without-learning", learning)):
-        quick = [name for name in OBSERVERS if name not in left_out]
+        quick = [name for name in usual_observers(scenario) if name not in left_out]
         seconds, _ = measure_time(lambda quick=quick: run(scenario, observers=quick), sizes.repeats)
         yield row("whole-run", size, variant, seconds, scenario.n_steps)
 

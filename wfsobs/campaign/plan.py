@@ -13,6 +13,7 @@ from wfsobs.campaign.points import Changes, conditions, grid, product, sample
 from wfsobs.campaign.stopping import Stop, parse_stop
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.observers import OBSERVERS
+from wfsobs.priors_from.selection import common_observers
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import load_scenario, parse_toml, preset
 from wfsobs.settings.errors import SettingError
@@ -173,19 +174,18 @@ def parse_plan(text: str, folder: Path) -> Campaign:
     controllers = _ids(values, "controllers", [], list(CONTROLLERS))
     if not observers and not controllers:
         raise SettingError("observers = []: without controllers there is nothing to run")
-    axes = [
-        conditions(_table(values, "conditions"), folder),
-        sample(_table(values, "sample")),
-        grid(dict(leaves(_table(values, "grid")))),
-    ]
+    varied = dict(leaves(_table(values, "grid")))
+    axes = [conditions(_table(values, "conditions"), folder), sample(_table(values, "sample")), grid(varied)]
     cells: list[Cell] = []
     for name, base in _scenarios(values, folder):
         cells += [Cell(len(cells) + i, name, base, changes) for i, changes in enumerate(product(axes))]
+    checked: list[Scenario] = []
     for cell in _corners(cells, axes):
         try:
-            cell.scenario()
+            checked.append(cell.scenario())
         except SettingError as error:
             raise SettingError(f"scenario {cell.index} ({cell.name}): {error}") from None
+    observers = observers if "observers" in values else common_observers(checked)
     stop = parse_stop(_table(values, "stop"), count)
     return Campaign(str(values.get("name", "Campaign")), tuple(cells), range(first, first + count), observers, controllers, stop)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import isfinite
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 from wfsobs.campaign.points import Changes, grid
 from wfsobs.cost import run_seconds
 from wfsobs.observers import OBSERVERS
+from wfsobs.priors_from.selection import common_observers
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation, parse_variation
 from wfsobs.settings.errors import SettingError
@@ -161,7 +162,7 @@ def plan_sweep(base: Scenario, axes: Sequence[Variation], seeds: int, observers:
     seeds : int
         Number of seeds of each scenario: base.run.seed, base.run.seed + 1, ...
     observers : sequence of str, optional
-        Ids; by default all.
+        Ids; by default all that every scenario has something for.
 
     Returns
     -------
@@ -191,6 +192,5 @@ def plan_sweep(base: Scenario, axes: Sequence[Variation], seeds: int, observers:
     if len(sweep.cells) > MOST_CELLS:
         counts = " x ".join(str(len(axis.values)) for axis in axes)
         raise SettingError(f"--over: {counts} = {len(sweep.cells)} scenarios, at most {MOST_CELLS} are allowed")
-    for cell in sweep.edge:
-        sweep.scenario(cell)
-    return sweep
+    scenarios = [sweep.scenario(cell) for cell in sweep.edge]
+    return sweep if observers is not None else replace(sweep, observers=common_observers(scenarios))

@@ -164,6 +164,8 @@ def _design(name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs
     declared = OBSERVERS[name]
     if Training in (*declared.prior, *declared.asks(observer_settings(declared, scenario))):
         raise StepError(f"{name}: learns from a record beforehand; takes an observer with a model, such as kf-multi")
+    if "y_stars" in declared.needs:
+        raise StepError(f"{name}: takes every LGS by itself; the stream is of them together")
     sampling = Sampling(n_modes, scenario.dt, scenario.sensors.exposure_ratio if has_ngs else None)
     if has_ngs != ("y_ngs" in declared.needs):
         raise StepError(

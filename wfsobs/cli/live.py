@@ -111,7 +111,7 @@ def live(
         source = _with_ngs(source, scenario, ngs, ngs_modes, unit or "um", ngs_lag)
     names = tuple(observers or observers_on(source, scenario))
     if headless:
-        _run_headless(source, scenario, names, speed, seconds, record_file, as_json)
+        _run_headless(source, scenario, names, speed, seconds, record_file, log_file, as_json)
         return
     beside = () if no_controllers else controllers or USUAL
     for name in (*names, *beside):
@@ -171,6 +171,7 @@ def _run_headless(
     speed: float,
     seconds: float,
     record_file: str | None,
+    log_file: str | None,
     as_json: bool,
 ) -> None:
     kept: list[LiveFrame] = []
@@ -186,6 +187,7 @@ def _run_headless(
             speed=speed,
             keep=kept.append if record_file else None,
             report=update,
+            log_file=log_file or "",
         )
     if record_file and kept:
         frames = LiveFrame(*(np.array(part) for part in zip(*kept, strict=True)))

@@ -62,7 +62,7 @@ class StepController:
         self._parts: dict[str, Stateful] = {name: part for name, part in found.items() if part is not None}
         self._parts |= {} if ahead is None else ahead.parts
 
-    def update(self, y: ArrayLike, ngs: ArrayLike | None = None, stars: int | None = None) -> Array:
+    def update(self, y: ArrayLike, ngs: ArrayLike | None = None, *, stars: int | None = None) -> Array:
         """Take the measurements of a frame and return its command.
 
         Parameters
@@ -87,7 +87,7 @@ class StepController:
         """
         return self._take(y, ngs, stars, "y", is_open=False)
 
-    def update_open_loop(self, z: ArrayLike, ngs: ArrayLike | None = None, stars: int | None = None) -> Array:
+    def update_open_loop(self, z: ArrayLike, ngs: ArrayLike | None = None, *, stars: int | None = None) -> Array:
         """As `update`, of measurements of the disturbance alone: those of a record, or of a loop that another controller closes.
 
         Parameters

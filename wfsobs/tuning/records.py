@@ -171,6 +171,7 @@ def piece(record: Record, start: int, stop: int) -> Record:
         vibration=part(record.vibration),
         open_loop_y=part(record.open_loop_y),
         lgs_stars=part(record.lgs_stars),
+        y_stars=None if record.y_stars is None else record.z_stars[start:stop] + delay_signal(u, record.delay)[:, None],
     )
 
 
