@@ -91,10 +91,10 @@ class Pages(param.Parameterized):
 
     def sweep_over(self, path: str) -> None:
         """Turn to the error over one setting."""
-        self.current = SWEEP
-        page = self.by_name[SWEEP]
+        page = self._made(SWEEP)
         assert isinstance(page, SweepPage)
-        page.choose(path)
+        page.choose(path)  # before the page is sent: a field that the browser is about to make may miss a change
+        self.current = SWEEP
 
     def shown_beside(self, result: Result) -> dict[str, Any]:
         """Return what a report has of the last sweep, and of the runs that a result is compared with; None for nothing."""
@@ -102,11 +102,17 @@ class Pages(param.Parameterized):
         sweep = report_part(page.results) if isinstance(page, SweepPage) and page.results else None
         return {"sweep": sweep, "comparison": comparison_of(self.display.compared_runs, result)}
 
+    def _made(self, name: str) -> Page:
+        """Return a page, made where it has not been opened before."""
+        if name not in self.by_name:
+            self.by_name[name] = self._makers[name]()
+        return self.by_name[name]
+
     def _turn(self, _event: object) -> None:
         name = self.current
         with pn.io.hold():
-            if name in self._makers and name not in self.by_name:
-                page = self.by_name[name] = self._makers[name]()
+            page = self._made(name)
+            if name != EXPLORE and not len(self.rooms[name]):
                 page.show(True)
                 self.rooms[name][:] = [page.view()]
             for other, room in self.rooms.items():
