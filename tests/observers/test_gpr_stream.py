@@ -5,10 +5,11 @@ import pytest
 from scipy.signal import lfilter
 
 from wfsobs.execution import run_observer
+from wfsobs.observers.gpr import sliding_regression
 from wfsobs.observers.gpr.inputs import scale_of
 from wfsobs.observers.gpr.kernels import ConditionError, SquaredExponential
 from wfsobs.observers.gpr.online import predict_sliding
-from wfsobs.observers.gpr.sliding_regression import SlidingRegression
+from wfsobs.observers.gpr.sliding_regression import ENOUGH, SlidingRegression
 from wfsobs.observers.gpr.stream import OnlineGprStream
 from wfsobs.priors_from.scenario import bands_of
 from wfsobs.scenario.presets import paper
@@ -58,7 +59,9 @@ def split_direct(signals, targets, depth, m, kernel, steps):
 
 @pytest.mark.parametrize("kind", ["raw", "high-pass", "standardised"])
 @pytest.mark.parametrize("inputs", ["u-y", "z"])
-def test_the_stream_gives_the_numbers_of_the_record_version(inputs, kind):
+@pytest.mark.parametrize("enough", [0.0, ENOUGH])
+def test_the_stream_gives_the_numbers_of_the_record_version(inputs, kind, enough, monkeypatch):
+    monkeypatch.setattr(sliding_regression, "ENOUGH", enough)  # 0: every update is refined
     scenario = paper().replace(
         {
             "run.duration": 1.5,
@@ -75,8 +78,9 @@ def test_the_stream_gives_the_numbers_of_the_record_version(inputs, kind):
     observer = OnlineGprStream(scenario.gpr_online, bands_of(scenario), scenario.dt, scale)
     got = np.array([observer.step(y, u) for y, u in zip(record.y_lgs[:, 1], record.u[:, 1], strict=True)])
     assert np.array_equal(np.isnan(got), np.isnan(expected))
-    # Both round; cond is about 1e4 here, so 100 eps cond is 2e-10 of the spread.
-    assert np.nanmax(np.abs(got - expected)) < 1e-9 * np.nanstd(expected)
+    # Both round; cond is about 1e4 here, so 100 eps cond is 2e-10 of the spread. Rows of M N - I that are wrong by ENOUGH
+    # count with the square root of the 100 windows each, some of them with the same sign.
+    assert np.nanmax(np.abs(got - expected)) < (1e-9 + 50 * enough) * np.nanstd(expected)
 
 
 def test_estimate_comes_before_update_and_z_windows_need_no_command():

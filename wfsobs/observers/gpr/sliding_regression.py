@@ -28,6 +28,8 @@ from wfsobs.observers.gpr.kernels import ConditionError, Points, SquaredExponent
 from wfsobs.signal.stepping import Saved
 from wfsobs.typing import Array
 
+ENOUGH = 2e-10
+"""Of M N - I. Predictions then differ by up to 1e-8 of their rms from those that are always refined."""
 SAVED = ("history", "products", "kappa", "weights", "M", "N")
 """Arrays of the state."""
 
@@ -51,8 +53,8 @@ class SlidingRegression:
         self._newest = kernel.points(np.zeros(1))
         self._kappa = np.zeros(m)
         self._weights = np.zeros((3, m))  # a without the newest target, b, N e_newest
-        self._M = np.zeros((m, m), order="F")  # lower triangles
-        self._N = np.zeros((m, m), order="F")
+        self._M = np.zeros((m, m), order="F")
+        self._N = np.zeros((m, m), order="F")  # lower triangle
         self._last_target = 0.0
 
     @property
@@ -131,9 +133,11 @@ class SlidingRegression:
             gone = q / np.sqrt(q[s])
         ab[:, s] = v[s] = 0.0
         r = self._solve_without(v, gone, s)
-        r += self._solve_without(v - dsymv(1.0, M, r, lower=1), gone, s)
         gamma = self.kernel.own(self._newest)[0] + self.kernel.noise_std**2
         sigma = gamma - v @ r
+        if not self._is_enough(v, r, sigma, s):
+            r += self._solve_without(v - dsymv(1.0, M, r, lower=1), gone, s)
+            sigma = gamma - v @ r
         if not sigma > 0.0:
             raise ConditionError(
                 "the covariance is no longer positive definite: raise noise_std or length_scale, or lower signal_std"
@@ -147,7 +151,7 @@ class SlidingRegression:
         np.divide(t, -sigma, out=h)
         _set_column(N, s, h)
         v[s] = gamma
-        _set_column(M, s, v)
+        M[s] = M[:, s] = v
         self._points.norm2[s], self._points.delta[s] = self._newest.norm2[0], self._newest.delta[0]
         self._points = self._points._replace(largest=max(self._points.largest, self._newest.largest))
         self._renew_products()
@@ -159,6 +163,12 @@ class SlidingRegression:
         out -= old_column * (old_column @ v)
         out[s] = 0.0
         return out
+
+    def _is_enough(self, v: Array, r: Array, sigma: float, s: int) -> bool:
+        """Whether the new column of N, r / sigma, is right to ENOUGH, as the oldest and the middle row of M_ r = v tell."""
+        oldest, middle = (s + 1) % self.m, (s + self.m // 2) % self.m
+        M, enough = self._M, ENOUGH * sigma
+        return abs(v[oldest] - M[:, oldest] @ r) <= enough and abs(v[middle] - M[:, middle] @ r) <= enough
 
     def _renew_products(self) -> None:
         """Recompute some inner products from their samples, in turn: rounding of the others has no time to grow."""
