@@ -91,7 +91,7 @@ class Pages(param.Parameterized):
 
     def sweep_over(self, path: str) -> None:
         """Turn to the error over one setting."""
-        page = self._made(SWEEP)
+        page = self._page_of(SWEEP)
         assert isinstance(page, SweepPage)
         page.choose(path)  # before the page is sent: a field that the browser is about to make may miss a change
         self.current = SWEEP
@@ -102,7 +102,7 @@ class Pages(param.Parameterized):
         sweep = report_part(page.results) if isinstance(page, SweepPage) and page.results else None
         return {"sweep": sweep, "comparison": comparison_of(self.display.compared_runs, result)}
 
-    def _made(self, name: str) -> Page:
+    def _page_of(self, name: str) -> Page:
         """Return a page, made where it has not been opened before."""
         if name not in self.by_name:
             self.by_name[name] = self._makers[name]()
@@ -111,7 +111,7 @@ class Pages(param.Parameterized):
     def _turn(self, _event: object) -> None:
         name = self.current
         with pn.io.hold():
-            page = self._made(name)
+            page = self._page_of(name)
             if name != EXPLORE and not len(self.rooms[name]):
                 page.show(True)
                 self.rooms[name][:] = [page.view()]
