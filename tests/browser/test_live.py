@@ -89,6 +89,34 @@ def test_a_page_that_sleeps_and_wakes_shows_now(open_page: Any, server: Any) -> 
     assert len(late) <= 1, late
 
 
+TRACE = """() => {
+  const all = Bokeh.documents.flatMap((it) => [...it._all_models.values()])
+  const lines = (it) => it.renderers.filter((line) => line.glyph?.type === "Line" && line.visible)
+  const isTraces = (it) => it.type === "Figure" && it.below.some((axis) => axis.axis_label === "time of the loop [s]")
+  const figure = all.filter(isTraces).find((it) => lines(it).length)
+  const largest = (y) => Math.max(...[...y].filter(Number.isFinite).map(Math.abs))
+  const told = ({x, y}) => ({first: x[0], last: x[x.length - 1], most: largest(y), same: x.length === y.length})
+  return {end: figure.x_range.end, top: figure.y_range.end, lines: lines(figure).map((it) => told(it.data_source.data))}
+}"""
+
+
+def test_traces_of_all_observers_follow_the_loop(open_page: Any, server: Any) -> None:
+    """What comes with a picture reaches the right line: all end where the axis ends, and the largest fills it to 1 / 1.1."""
+    page = open_page(url=server.url + QUICK, wait=False)
+    begin(page)
+    ends = []
+    for _ in range(4):
+        page.wait_for_timeout(1500)
+        seen = page.evaluate(TRACE)
+        ends.append(seen["end"])
+        assert len(seen["lines"]) == 3 and all(line["same"] for line in seen["lines"])
+        for line in seen["lines"]:
+            # a bin of the envelope is a 300th of the window of at most ten seconds; times come in single precision
+            assert abs(line["last"] - seen["end"]) < 0.05 and line["first"] < line["last"]
+        assert abs(max(line["most"] for line in seen["lines"]) / seen["top"] - 1 / 1.1) < 1e-3
+    assert sorted(set(ends)) == ends
+
+
 def test_a_page_that_opens_on_live_runs_nothing_until_another_page_needs_it(open_page: Any, server: Any) -> None:
     page = open_page(url=server.url + QUICK + "&view.mode=tilt", wait=False)
     begin(page)

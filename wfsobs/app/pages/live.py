@@ -175,7 +175,7 @@ class LivePage(PageActions):
         return True
 
     def _draw_room(self, loop: LiveLoop, view: LiveView) -> None:
-        picture = self.picture or LiveRoom(self.store, self.display, self.controls)
+        picture = self.picture or LiveRoom(self.store, self.display, self.controls, self.pulse)
         picture.draw(loop, view)
         if self.picture is None:
             self.picture = picture

@@ -49,6 +49,7 @@ class Pulse(JSComponent):
     """Tells when a picture has been painted."""
 
     picture = param.Integer(0, doc="Number of the last one.")
+    changes = param.List([], doc="What a Painter changes with it.")
     _esm = asset("pulse.js")
 
     def __init__(self, **params: Any):
@@ -56,20 +57,25 @@ class Pulse(JSComponent):
         super().__init__(**params)
 
     def _update_model(self, events: Any, msg: dict[str, Any], root: Any, model: Any, doc: Any, comm: Any) -> None:
-        """Send the number alone: the usual way looks at all that a component may have, which takes as long as a figure."""
-        if set(msg) != {"picture"}:
+        """Send what changes alone: the usual way looks at all that a component may have, which takes as long as a figure."""
+        if not set(msg) <= {"picture", "changes"}:
             super()._update_model(events, msg, root, model, doc, comm)
             return
         ref = root.ref["id"]
-        self._changing[ref] = ["picture"]  # it comes from here, not from the browser
+        self._changing[ref] = list(msg)  # it comes from here, not from the browser
         try:
-            model.data.picture = msg["picture"]
+            model.data.update(**msg)
         finally:
             self._changing.pop(ref, None)
 
     def _handle_msg(self, data: object) -> None:
         if isinstance(data, dict) and isinstance(number := data.get("painted"), int):
             self.answer = number
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether the browser has drawn the page."""
+        return self.answer >= 0
 
     @property
     def is_free(self) -> bool:

@@ -9,6 +9,7 @@ from bokeh.models import ColumnDataSource, Range1d, Span
 from bokeh.plotting import figure
 
 from wfsobs.app.display import Display
+from wfsobs.app.pages.live_paint import Painter
 from wfsobs.app.pages.live_table import Bounds
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.lines import FigureLines
@@ -38,8 +39,8 @@ NAMES = (TRUTH, *BOUNDS, *SLOTS)
 class LiveFigure:
     """A figure with a line per observer, each made when it is first shown."""
 
-    def __init__(self, fig: figure):
-        self.figure = fig
+    def __init__(self, fig: figure, painter: Painter):
+        self.figure, self.painter = fig, painter
         self.sources = {name: ColumnDataSource({"x": [], "y": []}) for name in NAMES}
         self.lines = FigureLines(fig, {name: (source, "y") for name, source in self.sources.items()})
         self._style: tuple[bool, set[str]] = (False, set())
@@ -47,7 +48,7 @@ class LiveFigure:
     def put(self, data: Mapping[str, tuple[Array, Array]], dark: bool) -> None:
         """Show these lines, x and y by name, and no others."""
         for name, (x, y) in data.items():
-            self.sources[name].data = {"x": x.astype(np.float32), "y": y.astype(np.float32)}
+            self.painter.data(self.sources[name], {"x": x, "y": y})
         if (style := (dark, set(data))) != self._style:
             self._style = style
             self.lines.restyle(dark, [name for name in NAMES if name not in data])
@@ -56,8 +57,8 @@ class LiveFigure:
 class RollingTraces(LiveFigure):
     """The last seconds of errors, or of estimates and truth."""
 
-    def __init__(self) -> None:
-        super().__init__(new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=Range1d(start=-1.0, end=1.0)))
+    def __init__(self, painter: Painter) -> None:
+        super().__init__(new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=Range1d(start=-1.0, end=1.0)), painter)
         self.figure.xaxis.axis_label = "time of the loop [s]"
         self._marks = ColumnDataSource({"x": [], "line": []})
         self.figure.vspan(x="x", source=self._marks, line_color="#B84A00", line_dash=[2, 2])
@@ -100,25 +101,28 @@ class RollingTraces(LiveFigure):
             ends = times[[0, -1]]
             data |= {name: (ends, np.full(2, scale * of[target][display.column])) for name, of in bounds.items() if target in of}
         self.put(data, display.dark)
-        self.figure.x_range.update(start=first * view.dt, end=last * view.dt)
-        self.figure.y_range.update(start=0.0 if display.running else -top, end=top)
+        self.painter.update(self.figure.x_range, start=first * view.dt, end=last * view.dt)
+        self.painter.update(self.figure.y_range, start=0.0 if display.running else -top, end=top)
         what = "running rms of error of" if display.running else "error of" if display.error else ""
         self.figure.yaxis.axis_label = f"{what} {display.mode_label} [{display.unit_label}]".strip()
         marked = [event for event in events if first <= event.frame <= last]
-        self._marks.data = {"x": [event.frame * view.dt for event in marked], "line": [event.line[:40] for event in marked]}
+        marks = {"x": [event.frame * view.dt for event in marked], "line": [event.line[:40] for event in marked]}
+        if marks != self._marks.data:
+            self._marks.data = marks
 
 
 class RollingSpectra(LiveFigure):
     """Spectra of the errors, averaged over time with weights that fade."""
 
-    def __init__(self) -> None:
+    def __init__(self, painter: Painter) -> None:
         super().__init__(
             new_figure(
                 x_range=Range1d(start=1.0, end=500.0),
                 y_range=Range1d(start=1e-6, end=1.0),
                 x_axis_type="log",
                 y_axis_type="log",
-            )
+            ),
+            painter,
         )
         self.figure.xaxis.axis_label = "frequency [Hz]"
         self._sums: dict[str, Array] = {}
@@ -162,9 +166,9 @@ class RollingSpectra(LiveFigure):
 class LatencyHistogram(LiveFigure):
     """How long the steps of each observer take, beside the time of a frame."""
 
-    def __init__(self) -> None:
+    def __init__(self, painter: Painter) -> None:
         super().__init__(
-            new_figure(x_range=Range1d(start=1.0, end=1e5), y_range=Range1d(start=0.0, end=100.0), x_axis_type="log")
+            new_figure(x_range=Range1d(start=1.0, end=1e5), y_range=Range1d(start=0.0, end=100.0), x_axis_type="log"), painter
         )
         self._limit = Span(location=1000.0, dimension="height", line_dash=[6, 3], line_color="#888888")
         self.figure.add_layout(self._limit)

@@ -9,8 +9,9 @@ import panel as pn
 import panel_material_ui as pmui
 
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL, Display, per_micrometre
-from wfsobs.app.pages.live_controls import LiveControls
+from wfsobs.app.pages.live_controls import LiveControls, Pulse
 from wfsobs.app.pages.live_figures import LatencyHistogram, RollingSpectra, RollingTraces
+from wfsobs.app.pages.live_paint import Painter
 from wfsobs.app.pages.live_stars import Stars
 from wfsobs.app.pages.live_table import Bounds, control_html, events_html, live_html, peaks_html
 from wfsobs.app.pages.live_text import live_text
@@ -43,10 +44,11 @@ GRID = """
 class LiveRoom:
     """The figures and tables of one page."""
 
-    def __init__(self, store: Store, display: Display, controls: LiveControls):
+    def __init__(self, store: Store, display: Display, controls: LiveControls, pulse: Pulse):
         self.display, self.store, self.controls = display, store, controls
-        self.traces, self.spectra, self.waterfall = RollingTraces(), RollingSpectra(), Waterfall()
-        self.latencies, self.stars = LatencyHistogram(), Stars()
+        self._painter = painter = Painter(pulse)
+        self.traces, self.spectra, self.waterfall = RollingTraces(painter), RollingSpectra(painter), Waterfall()
+        self.latencies, self.stars = LatencyHistogram(painter), Stars(painter)
         self.table, self.control_table, self.news, self.peaks = (live_text() for _ in range(4))
         self.editor: SpectrumEditor | None = None
         self.legend = live_text()
@@ -98,6 +100,7 @@ class LiveRoom:
         if monotonic() - self._table_time > SLOW or not loop.is_playing:
             self._draw_tables(loop, view, target, scale)
             self.latencies.draw(loop.board, names, loop.sampling.dt, dark)
+        self._painter.send()
 
     def _target(self, loop: LiveLoop) -> str:
         """Return what errors are shown of: without truth, of the next measurement."""

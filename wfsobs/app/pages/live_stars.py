@@ -10,6 +10,7 @@ from bokeh.models import BasicTicker, ColumnDataSource, Range1d
 from bokeh.plotting import figure
 
 from wfsobs.app.display import per_micrometre
+from wfsobs.app.pages.live_paint import Painter
 from wfsobs.app.pages.parts import WIDE
 from wfsobs.app.style import asset, look
 from wfsobs.app.views.plots import call, new_figure
@@ -32,7 +33,8 @@ FWHM = 1.03
 class Detector:
     """One detector: the core of the star, and where it has been in the last instants."""
 
-    def __init__(self, name: str):
+    def __init__(self, name: str, painter: Painter):
+        self.painter = painter
         self.name, self.label = name, "As it comes" if name == TRUTH else look(name).label
         ranges = {"x_range": Range1d(start=-1.0, end=1.0), "y_range": Range1d(start=-1.0, end=1.0)}
         self.figure: figure = new_figure(**ranges)
@@ -54,8 +56,8 @@ class Detector:
     def draw(self, points: Array, reach: float, radius: float, dark: bool) -> None:
         """Send the last instants (n, 2), the newest last; reach : of the axes;  radius : of the core, all in mas."""
         points = points[~np.isnan(points).any(axis=1)]
-        self._trail.data = {"x": points[:, 0], "y": points[:, 1]}
-        self._spot.data = {"x": points[-1:, 0], "y": points[-1:, 1]}
+        for source, shown in ((self._trail, points), (self._spot, points[-1:])):
+            self.painter.data(source, {"x": shown[:, 0], "y": shown[:, 1]})
         colour = look(self.name).colour(dark)
         if (style := (reach, radius, colour)) == self._style:
             return
@@ -69,7 +71,8 @@ class Detector:
 class Stars:
     """The detectors, of one scale."""
 
-    def __init__(self) -> None:
+    def __init__(self, painter: Painter) -> None:
+        self._painter = painter
         self.row = pn.Column(**WIDE, stylesheets=[GRID])
         self._detectors: dict[str, Detector] = {}
         self._reach = 1.0
@@ -82,7 +85,7 @@ class Stars:
         if left is not None:
             signals |= {name: left.residual(name) for name in names if CONTROLLERS[name].law is not None}
         if list(signals) != list(self._detectors):
-            self._detectors = {name: self._detectors.get(name) or Detector(name) for name in signals}
+            self._detectors = {name: self._detectors.get(name) or Detector(name, self._painter) for name in signals}
             self.row[:] = [detector.view() for detector in self._detectors.values()]
         reach = 1.1 * float(np.nanmax(np.abs(scale * signals[TRUTH][:, :2]), initial=1e-3))
         if not self._reach / 1.6 < reach < self._reach:
