@@ -4,7 +4,8 @@ Where a frame was lost, telemetry often has the last value once more, a line bet
 takes these for measurements trusts them, and starts wrong after the gap. A frame is taken for missing where
 
 - the measurement, or the pseudo-open-loop of it, is the same in all modes for the third time, or
-- the last WINDOW frames follow a cubic as no measured ones do: the squares that are left are below SHARE of their usual mean.
+- the last WINDOW frames follow a polynomial as no measured ones do: the squares left over are below SHARE of their usual mean.
+  DEGREE is such that a line of 50 Hz at 1 kHz, which a prediction goes on with, leaves 1e-5 of its power.
 
 No later frame decides, and nothing is found before USUAL / 10 frames with noise. Windows overlap, so that one in 10^9 of white
 noise of usual strength would be below SHARE, and that of one real frame at the end is not where the gap was long. What lasts
@@ -21,11 +22,14 @@ from numpy.lib.stride_tricks import sliding_window_view
 from wfsobs.record import Record, hold_last
 from wfsobs.typing import Array
 
-WINDOW = 24
-"""Frames that are fitted by a cubic."""
+WINDOW = 28
+"""Frames that are fitted by a polynomial."""
+
+DEGREE = 8
+"""Of the polynomial."""
 
 SHARE = 0.05
-"""Of the usual mean square of what a cubic leaves over."""
+"""Of the usual mean square of what the polynomial leaves over."""
 
 USUAL = 2000
 """Frames that the usual mean square is the mean of; a tenth of them have to be there first."""
@@ -71,7 +75,7 @@ def find_bridged(y: Array, z: Array, dt: float) -> Array:
         rounding = ROUNDING * (np.abs(y) + np.abs(z))
         again = _is_again(y, 0.0 * rounding) | _is_again(z, rounding)
         again[1:] &= again[:-1]
-        return _lacking(again, _squares_of_cubic(z), rounding, LONGEST / dt)
+        return _lacking(again, _squares_left_over(z), rounding, LONGEST / dt)
 
 
 def _lacking(again: Array, left_over: Array, rounding: Array, longest: float) -> Array:
@@ -99,10 +103,10 @@ def _is_again(x: Array, rounding: Array) -> Array:
     return out
 
 
-def _squares_of_cubic(z: Array) -> Array:
-    """Return the sum of squares that a cubic leaves of the last WINDOW frames, (n, n_modes); zeros before there are so many."""
-    powers = np.vander(np.linspace(-1.0, 1.0, WINDOW), 4)
-    rest = np.linalg.qr(powers, mode="complete")[0][:, 4:]
+def _squares_left_over(z: Array) -> Array:
+    """Return what a polynomial leaves of the squares of the last WINDOW frames, (n, n_modes); zeros before there are so many."""
+    powers = np.polynomial.chebyshev.chebvander(np.linspace(-1.0, 1.0, WINDOW), DEGREE)
+    rest = np.linalg.qr(powers, mode="complete")[0][:, DEGREE + 1 :]
     out = np.zeros_like(z)
     for first in range(0, max(len(z) - WINDOW + 1, 0), AT_ONCE):
         windows = sliding_window_view(z[first : first + AT_ONCE + WINDOW - 1], WINDOW, axis=0)
