@@ -237,6 +237,26 @@ class TestReuse:
         gc.collect()
         assert len(memo) == 0
 
+    def test_what_follows_from_an_estimate_is_made_once_as_long_as_it_is_held(
+        self, before: tuple[Memo, Record, list[Any]]
+    ) -> None:
+        memo, record, kept = before
+        known = RecordMemo(memo, record)
+        list(each_estimate(record, BASE, observers=["kf-lgs"], memo=known))
+        estimate = next(e for e in kept if e.observer == "kf-lgs")
+        made: list[str] = []
+
+        def derive(of: Estimate, what: str) -> Failure:
+            return known.derive(of, what, lambda: made.append(what) or Failure(what, what))  # type: ignore[func-returns-value]
+
+        held = [derive(estimate, what) for what in ("a", "b", "a")]
+        assert made == ["a", "b"] and held[0] is held[2] is not held[1]
+        del held
+        gc.collect()
+        derive(estimate, "a")
+        derive(Estimate("nobody", "turbulence", estimate.values, 0.0), "a")
+        assert made == ["a", "b", "a", "a"]
+
 
 class TestDigest:
     def test_it_tells_values_from_each_other(self) -> None:

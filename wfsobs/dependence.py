@@ -7,7 +7,7 @@ what changed nothing of these changes nothing of the estimate. So there is no li
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 from weakref import WeakValueDictionary
@@ -137,6 +137,7 @@ class RecordMemo:
     def __init__(self, memo: Memo, record: Record):
         self.memo, self.record = memo, record_digest(record)
         self.known_observers: set[str] = set()
+        self._names: dict[tuple[str, str], str] = {}
 
     def find(self, observer: Observer, prior: Prior, own: Plain | None) -> tuple[str, list[Estimate]]:
         """Return the name of an observer's estimates, and the estimates, one per target; none unless all are known.
@@ -148,8 +149,24 @@ class RecordMemo:
         if any(e is None for e in found):
             return name, []
         self.known_observers.add(observer.id)
+        self._names |= {(observer.id, target): name for target in observer.targets}
         return name, found
 
     def note(self, name: str, estimate: Estimate) -> None:
         """Note an estimate of this name."""
+        self._names[estimate.observer, estimate.target] = name
         self.memo.put(f"{name} {estimate.target}", estimate)
+
+    def derive(self, estimate: Estimate, what: str, make: Callable[[], T]) -> T:
+        """Return what follows from an estimate and the record alone; made where it is not known.
+
+        what : says what it is, and on what else it depends
+        """
+        of = self._names.get((estimate.observer, estimate.target))
+        if of is None:
+            return make()
+        name = f"{what} of {of} {estimate.target}"
+        if (known := self.memo.get(name)) is not None:
+            return known
+        made = make()
+        return made if made is None else self.memo.put(name, made)

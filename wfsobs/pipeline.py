@@ -10,7 +10,7 @@ import numpy as np
 
 from wfsobs.dependence import RecordMemo
 from wfsobs.evaluation.record_bounds import Bound, bound_scores, record_bounds
-from wfsobs.evaluation.scores import score
+from wfsobs.evaluation.scores import Derive, make_anew, score
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.estimates import Estimate
@@ -163,11 +163,13 @@ def collect(
     least: Sequence[Bound] = (),
     start: float = 0.0,
     source: PriorSource = TRUE,
+    derive: Derive = make_anew,
 ) -> Result:
     """Score estimates, and return a Result in the order of the registry, the bounds last. Raises Cancelled.
 
     start  : from which samples count [s], or from the end of the warm-up
     source : where the prior of the observers comes from
+    derive : recalls scores that are known
     """
     warm_up = max(scenario.run.warm_up, start)
     order = {name: i for i, name in enumerate(OBSERVERS)}
@@ -175,7 +177,7 @@ def collect(
     ordered = sorted(estimates, key=lambda e: (order[e.observer], e.target))
     watch.check()
     known = record.turbulence is not None or record.vibration is not None
-    scores = score(record, ordered, warm_up=warm_up, mode_names=names)
+    scores = score(record, ordered, warm_up=warm_up, mode_names=names, derive=derive)
     if known:
         scores.sort(key=lambda s: (order[s.observer], s.target))
     scores += bound_scores(least, record, scores, warm_up)

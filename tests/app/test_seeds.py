@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wfsobs.app import seeds as module
 from wfsobs.app.cache import Cache
 from wfsobs.app.display import Display
 from wfsobs.app.jobs.job import CLICK, DONE, IDLE_TIME, SWEEP, Job
@@ -27,7 +26,7 @@ from wfsobs.progress import Watch
 
 @pytest.fixture
 def queue() -> Iterator[JobQueue]:
-    queue = JobQueue(1, Cache(1_000_000))
+    queue = JobQueue(1, Cache(1_000_000), rest=0.0)
     yield queue
     queue.close(5.0)
 
@@ -82,10 +81,20 @@ def test_idle_time_does_not_take_the_turn_of_who_asks(queue: JobQueue) -> None:
     assert log == ["a", "b", "idle", "idle", "idle"]
 
 
+def test_a_job_for_idle_time_begins_some_time_after_the_last_answer() -> None:
+    queue, begun = JobQueue(2, Cache(1_000_000), rest=0.25), []
+    queue.submit(Job("run", lambda *_: begun.append(monotonic())), "a", lambda _news: None)
+    queue.submit(Job("seed", lambda *_: begun.append(monotonic()), priority=IDLE_TIME), "a", lambda _news: None)
+    wait(lambda: len(begun) == 2)
+    queue.close(5.0)
+    assert begun[1] - begun[0] >= 0.25
+
+
 @pytest.fixture
-def store(make_store: Any, monkeypatch: pytest.MonkeyPatch) -> Store:
-    monkeypatch.setattr(module, "REST", 0.0)
-    return make_store()
+def store(make_store: Any) -> Store:
+    store = make_store()
+    store.session.service.queue.rest = 0.0
+    return store
 
 
 def test_every_seed_is_that_of_the_library_and_the_views_say_so(store: Store, loop: Any, short: Any) -> None:

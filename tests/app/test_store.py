@@ -183,6 +183,15 @@ def test_what_was_posted_before_a_run_was_superseded_does_not_land_after(make_st
     assert store.run.result.scenario.turbulence.wind_speed == 20.0
 
 
+def test_a_run_is_done_once_its_result_has_landed(make_store: Any, loop: Any) -> None:
+    """So that figures are drawn before what follows a whole run; a change in between supersedes it as any other."""
+    store, seen = make_store(), []
+    store.run.param.watch(lambda *events: seen.append({e.name: e.new for e in events}), ["state", "result"])
+    store.start()
+    loop.finish(store)
+    assert seen[-1] == {"state": "done"} and "result" in seen[-2] and "state" not in seen[-2]
+
+
 def test_many_changes_in_a_row_show_only_the_last(make_store: Any, loop: Any) -> None:
     store = make_store()
     speeds: list[float] = []

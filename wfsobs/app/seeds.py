@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from time import perf_counter, sleep
 
 import numpy as np
 import param
@@ -30,9 +29,6 @@ SEEDS = 8
 
 MOST = 50
 
-REST = 1.0
-"""Time left to the page and the browser before a seed [s]."""
-
 PATIENCE = 20.0
 """A scenario whose run takes longer has no further seeds [s]."""
 
@@ -53,15 +49,11 @@ class SeedScores:
 def run_seed(
     scenario: Scenario, source: Source | None, seed: int, watch: Watch, _tell: Tell, memo: Memo | None = None
 ) -> SeedScores:
-    """Run every observer on the record of another seed, after a rest. Raises SettingError, Cancelled.
+    """Run every observer on the record of another seed. Raises SettingError, Cancelled.
 
     memo : what is known in it by what it depends on does not run
     """
     memo = Memo() if memo is None else memo
-    until = perf_counter() + REST
-    while perf_counter() < until:
-        watch.check()
-        sleep(0.02)
     simulation = (scenario if source is None or source.simulation is None else source.simulation).replace({"run.seed": seed})
     record = simulate_once(simulation, memo, watch)
     result = observe(record, scenario, watch=watch, memo=RecordMemo(memo, record))

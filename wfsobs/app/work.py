@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from bisect import bisect
 from dataclasses import replace
+from functools import partial
 from time import perf_counter, sleep
 
 import numpy as np
@@ -142,7 +143,8 @@ class _Work:
     def _so_far(self, record: Record) -> RunResults:
         least = self.bounds or ()
         told = TRUE if self.source is None else GIVEN
-        result = collect(self.scenario, record, self.estimates, self.failures, least=least, source=told)
+        derive = self.known_estimates.derive
+        result = collect(self.scenario, record, self.estimates, self.failures, least=least, source=told, derive=derive)
         partial = {key: values.copy() for key, values in self.growing.items()}
         ran = tuple(name for name in self.usual if name not in self.known_estimates.known_observers)
         return RunResults(result, partial, dict(self.spectra), perf_counter() - self.start_time, self.source, least, ran)
@@ -175,26 +177,25 @@ class _Work:
         if not OBSERVERS[estimate.observer].look.in_figures:
             return  # it stands in the table alone
         truth = record.truth(estimate.target)
-        spectrum = self._spectrum(record, estimate.target, estimate.values)
+        make = partial(self._spectrum, record, estimate.target, estimate.values)
+        spectrum = self.known_estimates.derive(estimate, f"spectra {self.scenario.run.warm_up}", make)
         if spectrum is not None:
             self.spectra[key] = spectrum if truth is not None else replace(spectrum, error=np.full_like(spectrum.error, np.nan))
 
     def _add_truth(self, record: Record) -> None:
         for target in TARGETS:
             truth = record.truth(target)
-            spectrum = self._spectrum(record, target, truth) if truth is not None else None
+            if truth is None:
+                continue
+            name = digest("spectra", self.known_estimates.record, target, self.scenario.run.warm_up)
+            spectrum = self.memo.get(name) or self._spectrum(record, target, truth)
             if spectrum is not None:
-                self.spectra[TRUTH, target] = spectrum
+                self.spectra[TRUTH, target] = self.memo.put(name, spectrum)
 
     def _spectrum(self, record: Record, target: str, values: Array) -> SignalAndError | None:
         """Over the samples that count for the scores; None where there are too few."""
-        warm_up = self.scenario.run.warm_up
-        name = digest("spectra", self.known_estimates.record, target, values, warm_up)
-        known = self.memo.get(name)
-        if known is None:
-            found = spectra(record, target, values, warm_up)
-            known = self.memo.put(name, SignalAndError(*found)) if found else None
-        return known
+        found = spectra(record, target, values, self.scenario.run.warm_up)
+        return SignalAndError(*found) if found else None
 
 
 def _stage(left: set[str]) -> int:

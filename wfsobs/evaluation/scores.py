@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from hashlib import blake2b
 
 import numpy as np
 
 from wfsobs.evaluation.calibration import Calibration, calibration
 from wfsobs.evaluation.lag import lag
+from wfsobs.evaluation.samples import common_samples, samples_after, stretch_of
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import NEXT_Z, Estimate
 from wfsobs.record import Record
@@ -28,10 +31,6 @@ COMMON_BOUNDS = (BOUND, BOUND_BOTH)
 
 BOUNDS = (*COMMON_BOUNDS, BOUND_STARS)
 """The bounds, in the order of tables."""
-
-
-SHARE = 0.5
-"""Minimum share of the samples after the warm-up that observers in a table have in common; those that leave fewer stand apart."""
 
 
 @dataclass(frozen=True)
@@ -80,37 +79,22 @@ class Score:
     calibration: Calibration | None = None
 
 
-def common_samples(samples: Sequence[Array]) -> list[tuple[Array, bool]]:
-    """Select the samples on which estimates are scored.
+Derive = Callable[[Estimate, str, Callable[[], Score]], Score]
+"""Recalls, or makes, what follows from an estimate and its record alone, by name."""
 
-    Starting with the estimate with most samples, every estimate takes part that leaves SHARE of the samples in common. These are
-    scored on the common samples, every other one on its own, apart.
 
-    Parameters
-    ----------
-    samples : sequence of Array
-        Samples that each estimate has, bool (n,).
-
-    Returns
-    -------
-    list of (Array, bool)
-        Samples of each estimate, and whether it stands apart.
-    """
-    if not samples:
-        return []
-    order = sorted(range(len(samples)), key=lambda i: -samples[i].sum())
-    shared, apart = samples[order[0]], set()
-    for i in order[1:]:
-        both = shared & samples[i]
-        if both.sum() >= SHARE * samples[order[0]].sum():
-            shared = both
-        else:
-            apart.add(i)
-    return [(samples[i] if i in apart else shared, i in apart) for i in range(len(samples))]
+def make_anew(_estimate: Estimate, _name: str, make: Callable[[], Score]) -> Score:
+    """Recall nothing."""
+    return make()
 
 
 def score(
-    record: Record, estimates: Sequence[Estimate], *, warm_up: float = 0.0, mode_names: Sequence[str] | None = None
+    record: Record,
+    estimates: Sequence[Estimate],
+    *,
+    warm_up: float = 0.0,
+    mode_names: Sequence[str] | None = None,
+    derive: Derive = make_anew,
 ) -> list[Score]:
     """Score estimates: the error where the record has a truth, else that of predicting the next measurement.
 
@@ -124,6 +108,8 @@ def score(
         Start of the record that does not count [s].
     mode_names : sequence of str, optional
         Names of the columns; by default those of Noll's order.
+    derive : callable, optional
+        Recalls a score against the truth where it is known.
 
     Returns
     -------
@@ -132,10 +118,14 @@ def score(
     """
     names = [m.name for m in modes_up_to(HIGHEST_ORDER)][: record.n_modes] if mode_names is None else list(mode_names)
     known = record.turbulence is not None or record.vibration is not None
-    return (supervised_scores if known else unsupervised_scores)(record, estimates, warm_up, names)
+    if known:
+        return supervised_scores(record, estimates, warm_up, names, derive)
+    return unsupervised_scores(record, estimates, warm_up, names)
 
 
-def supervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:
+def supervised_scores(
+    record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str], derive: Derive = make_anew
+) -> list[Score]:
     """Score estimates against the truth, those of a target and mode on common samples.
 
     None for a target without truth or where no sample is left.
@@ -147,28 +137,32 @@ def supervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: fl
             continue
         for mode, name in enumerate(mode_names):
             true = truth[:, mode]
-            counts = _after(record, warm_up) & ~np.isnan(true)
+            counts = samples_after(record, warm_up) & ~np.isnan(true)
             scored = common_samples([counts & ~np.isnan(e.values[:, mode]) for e in of])
+            words = {id(samples): blake2b(samples.tobytes(), digest_size=16).hexdigest() for samples, _ in scored}
             for e, (samples, apart) in zip(of, scored, strict=True):
-                if not samples.any():
-                    continue
-                t, value = true[samples], e.values[samples, mode]
-                out.append(
-                    Score(
-                        e.observer,
-                        target,
-                        name,
-                        rms(value - t),
-                        rms(t),
-                        _ratio(value - t, t),
-                        lag(t, value, record.dt),
-                        e.seconds_per_step,
-                        *_stretch(samples, record.dt),
-                        apart,
-                        calibration=None if e.sd is None else calibration(value - t, e.sd[samples, mode]),
-                    )
-                )
+                if samples.any():
+                    make = partial(_score_mode, e, true, mode, name, record.dt, samples, apart)
+                    out.append(derive(e, f"score {mode} {name} {words[id(samples)]} {apart}", make))
     return out
+
+
+def _score_mode(e: Estimate, true: Array, mode: int, name: str, dt: float, samples: Array, apart: bool) -> Score:
+    """Score one mode of an estimate on some samples of the truth (n_steps,) [um]."""
+    t, value = true[samples], e.values[samples, mode]
+    return Score(
+        e.observer,
+        e.target,
+        name,
+        rms(value - t),
+        rms(t),
+        _ratio(value - t, t),
+        lag(t, value, dt),
+        e.seconds_per_step,
+        *stretch_of(samples, dt),
+        apart,
+        calibration=None if e.sd is None else calibration(value - t, e.sd[samples, mode]),
+    )
 
 
 def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: float, mode_names: list[str]) -> list[Score]:
@@ -184,7 +178,7 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
     for estimate in estimates:
         whole.setdefault(estimate.observer, []).append(estimate)
     both = {observer: parts for observer, parts in whole.items() if {e.target for e in parts} == set(TARGETS)}
-    counts = _after(record, warm_up + record.dt)
+    counts = samples_after(record, warm_up + record.dt)
     for mode, name in enumerate(mode_names):
         z, left = record.z[:, mode], record.y_lgs[:, mode]
         measured = counts & ~np.isnan(z)
@@ -205,7 +199,7 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
                         _ratio(error[samples], z[samples]),
                         None,
                         max(e.seconds_per_step for e in parts),
-                        *_stretch(samples, record.dt),
+                        *stretch_of(samples, record.dt),
                         apart,
                         calibration=None if sd is None else calibration(error[samples], _later(sd[:, mode])[samples]),
                     )
@@ -222,25 +216,15 @@ def unsupervised_scores(record: Record, estimates: Sequence[Estimate], warm_up: 
                     _ratio(left[samples], z[samples]),
                     None,
                     0.0,
-                    *_stretch(samples, record.dt),
+                    *stretch_of(samples, record.dt),
                 )
             )
     return out
 
 
-def _after(record: Record, warm_up: float) -> Array:
-    """Return which steps are after the warm-up [s]."""
-    return np.arange(record.n_steps) >= round(warm_up / record.dt)
-
-
 def _later(x: Array) -> Array:
     """Return x one step later, NaN first."""
     return np.concatenate([[np.nan], x[:-1]])
-
-
-def _stretch(samples: Array, dt: float) -> tuple[float, float]:
-    """Return the time [s] of the first sample and of the end of the last."""
-    return float(np.argmax(samples) * dt), float((samples.size - np.argmax(samples[::-1])) * dt)
 
 
 def _ratio(error: Array, signal: Array) -> float | None:

@@ -14,6 +14,9 @@ from wfsobs.app.store import Store
 
 ROOM = {"sizing_mode": "stretch_width", "margin": (4, 0)}
 
+SOON = 5
+"""How long a change in the browser waits for the next to go with it [ms]: by default 50, a tenth of a redraw."""
+
 TAG = "setting:"
 """Stands before the path of its setting in the tag of a widget: the browser knows by it what was changed."""
 
@@ -28,6 +31,8 @@ class Field:
         self.store, self.path, self.parameter = store, path, p
         self.idle = self._note_html = ""
         self.widgets = self._widgets()
+        for widget in self.widgets:
+            widget._debounce = SOON
         self.view = pn.Column(self._row(), sizing_mode="stretch_width", margin=0)
         self.refresh()
         store.param.watch(self.refresh, ["scenario", "errors"])

@@ -29,10 +29,6 @@ UNNAMED = {
 """A box whose name is heard but not seen: the slider beside it has the same. A number that is too long is seen to be."""
 
 
-SOON = 5
-"""How long a message of a slider or switch waits for the next to go with it [ms]: by default 50, a tenth of a redraw."""
-
-
 def number_text(value: float) -> str:
     """Write a number as a person would type it."""
     return f"{value:.10g}"
@@ -148,7 +144,6 @@ class SliderField(TextField):
             **names,
             **ROOM,
         )
-        slider._debounce = SOON  # type: ignore[misc]
         slider.param.watch(self._on_release, "value_throttled")
         text = self._text(
             label=names["label"], tags=[TAG + self.path], width=NUMBER_WIDTH, margin=(4, 0, 4, 8), align="end", sx=UNNAMED

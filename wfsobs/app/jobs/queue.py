@@ -23,6 +23,9 @@ log = logging.getLogger(__name__)
 PATIENCE = 60.0
 """A sweep that has waited longer goes like a click [s], so that its turn comes."""
 
+REST = 1.0
+"""Time left to the page and the browser before a job for idle time [s]."""
+
 
 class JobQueue:
     """Threads of their own, as many as jobs may be done at once, and the results kept of jobs that have a key.
@@ -32,13 +35,14 @@ class JobQueue:
     turn first come first served. What is wanted twice is done once.
     """
 
-    def __init__(self, workers: int, cache: Cache[Any]):
-        self.cache = cache
+    def __init__(self, workers: int, cache: Cache[Any], rest: float = REST):
+        self.cache, self.rest = cache, rest
         self.closing = False
         self._waiting: list[Job] = []
         self._running: list[Job] = []
         self._shared_jobs: dict[str, Job] = {}
         self._turn = 0  # the latest that has begun
+        self._last_answer = -math.inf  # when something was last handed over, which is to be drawn
         self._change = threading.Condition()
         self._timers: dict[Job, threading.Timer] = {}
         self._threads = [threading.Thread(target=self._work, name=f"wfsobs-work-{i}", daemon=True) for i in range(workers)]
@@ -61,6 +65,7 @@ class JobQueue:
                 event("result", session=owner, key=job.key[:12], cache=how)
             before()
             if found is not None:
+                self._last_answer = monotonic()
                 listener({"state": DONE, "progress": 1.0, "result": found})
                 return lambda: None
             if shared is not None and joined:
@@ -149,6 +154,7 @@ class JobQueue:
             finally:
                 with self._change:
                     self._running.remove(job)
+                    self._last_answer = monotonic()
                     if again:
                         self._waiting.append(job)
                     else:
@@ -161,8 +167,10 @@ class JobQueue:
         """Take the first job of the line; None when there will be no more."""
         with self._change:
             while not self.closing:
-                job = next(filter(self._has_room, self._line()), None)
-                if job is not None and not (job.priority == IDLE_TIME and self.is_busy()):
+                job, rest = next(filter(self._has_room, self._line()), None), 0.0
+                if job is not None and job.priority == IDLE_TIME:
+                    rest = math.inf if self.is_busy() else self._last_answer + self.rest - monotonic()
+                if job is not None and rest <= 0.0:
                     self._waiting.remove(job)
                     if job in self._timers:
                         self._timers.pop(job).cancel()
@@ -171,7 +179,7 @@ class JobQueue:
                     job.tell_place(0)
                     self._tell_places()
                     return job
-                self._change.wait()
+                self._change.wait(rest if 0.0 < rest < math.inf else None)
             return None
 
     def _line(self) -> list[Job]:

@@ -21,7 +21,8 @@ class BackgroundTask(param.Parameterized):
     """The state of one job of a session.
 
     Starting another supersedes the one before: it is left, and nothing of it lands any more, however late it comes.
-    What is told of a job is gathered and lands in one `param.update` on the session's thread.
+    What is told of a job is gathered and lands in one `param.update` on the session's thread; that it is done a moment after its
+    result, which is drawn meanwhile.
     """
 
     state = param.Selector(default=IDLE, objects=[IDLE, RUNNING, DONE, CANCELLED, FAILED])
@@ -88,8 +89,13 @@ class BackgroundTask(param.Parameterized):
     def _land(self) -> None:
         with self._lock:
             news, self._news, self._is_posted = self._news, {}, False
+            if news.get("state") == DONE and "result" in news:
+                self._news, self._is_posted = {"state": news.pop("state")}, True
+            again = self._is_posted
         if news:
             self.param.update(**news)
+        if again:
+            self.session.post(self._land)
 
 
 def _nothing() -> None:

@@ -11,7 +11,7 @@ import panel as pn
 import panel_material_ui as pmui
 from bokeh.plotting import figure
 
-from wfsobs.app.controls.fields import SOON
+from wfsobs.app.controls.field import SOON
 from wfsobs.app.controls.names import name_settings
 from wfsobs.app.controls.status import Status
 from wfsobs.app.copies import EXPLORED, CopiedTask

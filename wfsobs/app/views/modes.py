@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import panel as pn
 import panel_material_ui as pmui
 
-from wfsobs.app.controls.fields import SOON
+from wfsobs.app.controls.field import SOON
 from wfsobs.app.display import UNITS, Display, short_name
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.style import HEARD
