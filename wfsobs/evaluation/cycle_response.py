@@ -111,8 +111,9 @@ def cycle_taps(
 
 def _segments(values: Array, at: list[int], length: int, ratio: int) -> list[Array]:
     """Return what follows each impulse, without what the estimates are of nothing."""
-    rest = np.resize(values[at[0] - ratio : at[0]], values.size)  # as it was over the cycle before the first impulse
-    return [values[i : i + length] - np.roll(rest, at[0] - i)[:length] for i in at]
+    rest = values[at[0] - ratio : at[0]]  # as it was over the cycle before the first impulse
+    late = np.arange(length) - at[0]
+    return [values[i : i + length] - rest[(late + i) % ratio] for i in at]
 
 
 def _taps(segments: list[Array], ratio: int) -> CycleTaps:

@@ -196,7 +196,9 @@ class Theory:
     def _prior(self, observer: Observer, scenario: Scenario, mode: int) -> Prior:
         cheap = [part for part in observer.prior if part not in (Lines, Beams, LgsError, LgsStars)]
         prior = prior_of(scenario, None, cheap, modes=[mode])
-        if Lines in observer.prior:
+        if Beams in observer.prior:  # where its turbulence is
+            prior = replace(prior, lines=(lines_of(scenario, mode, turbulence=()),))
+        elif Lines in observer.prior:
             prior = replace(prior, lines=(self._lines(scenario, mode),))
         if Beams in observer.prior:
             prior = replace(prior, beams=(self._in_beams("beams", scenario, mode, beams_of),))
