@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs import PRESETS, run
+from wfsobs import PRESETS, observe, simulate
 
 SEEDS = range(1, 11)
 OBSERVERS = {
@@ -36,7 +36,7 @@ def errors(changes: dict[str, Any]) -> dict[tuple[int, str], float]:
     for seed in SEEDS:
         scenario = PRESETS["higher-orders"]().replace({**changes, "run.seed": seed})
         orders = {mode.name: mode.radial_order for mode in scenario.modes}
-        for score in run(scenario, observers=list(OBSERVERS)).scores:
+        for score in observe(simulate(scenario), scenario, observers=list(OBSERVERS)).scores:  # run has the bounds, too
             if score.target == "turbulence" and score.observer in OBSERVERS:
                 squares[orders[score.mode], score.observer].append((1e3 * score.rms) ** 2)
     return {key: float(np.sqrt(np.mean(values))) for key, values in squares.items()}
