@@ -80,11 +80,11 @@ class Ar3:
     def psd(self, frequency: Array) -> Array:
         """Return the one-sided power spectral density [unit^2/Hz] at `frequency` [Hz]."""
         half = np.pi * np.asarray(frequency) * self.dt
-        gain = 2.0 * self.dt * self.rms**2 * self.unit_drive_variance
+        out = np.full(half.shape, 2.0 * self.dt * self.rms**2 * self.unit_drive_variance)
         for a in self.decays:  # |1 - p q|^2 without cancellation, and without complex exponentials, which take five times as long
             within = -np.expm1(-a.real)
-            gain = gain / (within**2 + 4.0 * (1.0 - within) * np.sin(half + 0.5 * a.imag) ** 2)
-        return gain
+            out /= within**2 + 4.0 * (1.0 - within) * np.sin(half + 0.5 * a.imag) ** 2
+        return out
 
     def log_slopes(self, frequency: Array) -> Array:
         """Return the derivatives of log `psd` by log omega, logit damping, log corner and log rms, (4, n)."""
