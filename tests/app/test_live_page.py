@@ -101,7 +101,7 @@ def test_a_loop_from_start_to_the_end_of_the_session(page: LivePage, dashboard: 
 def check_controllers(page: LivePage, live: LiveLoop) -> None:
     """In the table: rms of the last seconds in nm and mas, Strehl of both modes; and a detector beside that of the star."""
     assert page.picture is not None
-    wait(lambda: not np.isnan(seen(page, live, "integrator")).any())
+    wait(lambda: (left := live.control_view(1.0)) is not None and left.first + len(left.residual("integrator")) == live.newest)
     page.draw()
     rms = seen(page, live, "integrator")
     cells = re.findall(r'data-controller="integrator".*?</tr>', page.picture.control_table.object, re.S)[0]

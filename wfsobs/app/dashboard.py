@@ -148,7 +148,7 @@ class Dashboard:
                 self.body,
             ],
         )
-        self.frame.on_drawn = lambda: self._post(self.complete)
+        self.frame.on_drawn = lambda: self._post(self._stand)
         if pn.state.curdoc is None:  # nobody will say that it has been drawn
             self.complete()
         with edit_readonly(page):
@@ -166,6 +166,11 @@ class Dashboard:
         with pn.io.hold():
             self.explore.complete()
             self.drawer[:] = [self.controls.view()]
+
+    def _stand(self) -> None:
+        """Complete a page that has been drawn."""
+        self.complete()
+        self.store.session.service.keep_page()
 
     def start(self) -> None:
         """Start the first run, unless settings from a link have brought one or would take long, or the page opens on Live."""

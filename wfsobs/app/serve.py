@@ -119,6 +119,7 @@ def serve(options: Options, live: LiveOrder | None = None) -> None:
         limits="on" if options.limits != NONE else "off",
     )
     server.start()
+    service.keep_page()
     loop.start()
     server.stop(wait=False)
     ended = service.close(SAVE_TIME if live is not None and live.record_file else 1.5)

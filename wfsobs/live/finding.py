@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,9 @@ from wfsobs.priors_from.identification import told_by
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.true_spectra import has_known_spectra
+
+Bounds = Mapping[str, Mapping[str, list[float]]]
+"""Bound -> target -> rms of every mode [um]."""
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from math import inf
+from dataclasses import dataclass, field
 from time import monotonic
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,6 +46,13 @@ class LiveView:
     dt: float
     frames: LiveFrame
     _traces: Array
+    _results: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
+
+    def once(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return what is made of these frames, and made once for all pages that want the same; key : tells what that is."""
+        if key not in self._results:
+            self._results[key] = make()
+        return self._results[key]
 
     @property
     def n(self) -> int:
@@ -87,7 +93,7 @@ class LiveView:
 
     def rms(self, observer: str, target: str) -> Array:
         """Return the rms error, (n_modes,) [um]; NaN where there is none."""
-        return rms_of_known(self.error(observer, target))
+        return self.once(("rms", observer, target), lambda: rms_of_known(self.error(observer, target)))
 
     def _of(self, observer: str) -> Array:
         width = slot_width(self.n_modes)
@@ -99,15 +105,15 @@ class SharedView:
     """The last seconds as they were read last, for pages that look one after the other: a reading takes milliseconds."""
 
     def __init__(self) -> None:
-        self._last: tuple[float, LiveView] | None = None
-        self._at = -inf
+        self._last: dict[float, tuple[float, LiveView]] = {}
 
     def look(self, read: Callable[[float], LiveView], seconds: float, *, anew: bool) -> LiveView:
         """Return the last so many seconds, up to SHARED old, or read `anew`."""
-        if anew or self._last is None or self._last[0] != seconds or monotonic() - self._at > SHARED:
-            self._at = monotonic()
-            self._last = seconds, read(seconds)
-        return self._last[1]
+        now = monotonic()
+        if anew or seconds not in self._last or now - self._last[seconds][0] > SHARED:
+            self._last = {length: one for length, one in self._last.items() if now - one[0] <= SHARED}
+            self._last[seconds] = now, read(seconds)
+        return self._last[seconds][1]
 
 
 def read_view(ring: Ring, traces: list[Rows], dt: float, seconds: float) -> LiveView:

@@ -8,7 +8,7 @@ from typing import Any
 
 from wfsobs.control.step import StepController
 from wfsobs.live.checks import check_slot, make_design
-from wfsobs.live.finding import Finding, identify_frames
+from wfsobs.live.finding import Bounds, Finding, bounds_of, identify_frames
 from wfsobs.live.processes import LiveProcesses
 from wfsobs.observers.step import StepObserver
 from wfsobs.record import Record, Sampling
@@ -36,6 +36,7 @@ class Workshop:
     def __init__(self, processes: LiveProcesses, sampling: Sampling, say: Callable[[str], None]):
         self._processes, self._sampling, self._say = processes, sampling, say
         self.finding: Finding | None = None
+        self._bounds: tuple[Scenario | None, Bounds] = (None, {})
 
     def do(self, function: Callable[..., Any], *arguments: Any, then: Callable[[Any], None]) -> None:
         """Have something computed, and then do something with the result; an error becomes a line."""
@@ -49,6 +50,18 @@ class Workshop:
                 then(future.result())
 
         self._processes.workshop.submit(function, *arguments).add_done_callback(end)
+
+    def bounds(self, scenario: Scenario) -> Bounds:
+        """Return the bounds of the present settings, as `bounds_of` does; nothing until they are known."""
+        if self._bounds[0] is not scenario:
+            self._bounds = scenario, {}
+
+            def take(bounds: Bounds) -> None:
+                if self._bounds[0] is scenario:
+                    self._bounds = scenario, bounds
+
+            self.do(bounds_of, scenario.to_dict(), then=take)
+        return self._bounds[1]
 
     def redesign(self, names: Sequence[str], scenario: Scenario) -> None:
         """Design observers and controllers; each goes on where the one before is, or begins. Raises SettingError."""

@@ -17,6 +17,7 @@ from wfsobs.app.jobs.job import FAILED, RUNNING
 from wfsobs.app.jobs.task import IDLE
 from wfsobs.app.live_order import LiveOrder
 from wfsobs.app.live_work import LiveTask, record_saves
+from wfsobs.app.pages.live_beat import Beat
 from wfsobs.app.pages.live_controls import LiveControls, Pulse
 from wfsobs.app.pages.live_room import LiveRoom
 from wfsobs.app.pages.live_table import status_line
@@ -32,8 +33,6 @@ from wfsobs.live.source import SIMULATION
 from wfsobs.live.view import LiveView
 from wfsobs.settings.errors import SettingError
 
-PERIOD = 190
-"""Between two pictures [ms]: at least five a second, with what the clock of the server adds."""
 LOOK_BACK = 120.0
 """What a recording has of the time before it [s]."""
 INTRO = (
@@ -58,7 +57,7 @@ class LivePage(PageActions):
         self.visible = False
         self.picture: LiveRoom | None = None
         self._known_loop: LiveLoop | None = None
-        self._callback = pn.state.add_periodic_callback(self.tick, PERIOD, start=False) if pn.state.curdoc else None
+        self._beat = Beat(store.session.post, self.tick) if pn.state.curdoc else None
         self._watch()
         self._say()
 
@@ -154,6 +153,7 @@ class LivePage(PageActions):
     def tick(self) -> None:
         """Draw if the browser has painted the picture before."""
         if self.pulse.is_free:
+            self.store.session.service.note_wish()  # no page of a visitor to come is made meanwhile: it takes a second
             with pn.io.hold():  # one message
                 if self.draw():
                     self.pulse.beat()
@@ -181,6 +181,7 @@ class LivePage(PageActions):
             self.picture = picture
             self.room[:] = picture.view()
             self.room.visible = True
+            self.store.session.post(self.store.session.service.keep_page)
 
     def _toggle_recording(self, loop: LiveLoop) -> None:
         """Keep every frame, and the last two minutes; or end that."""
@@ -229,11 +230,10 @@ class LivePage(PageActions):
         said = {RUNNING: waiting, FAILED: work.message}.get(work.state, "Stopped" if self.picture else "")
         if not runs:
             self.status.object = f'<p class="{"failure" if work.state == FAILED else "text"}" role="status">{escape(said)}</p>'
-        if self._callback is not None:
+        if self._beat is not None:
             self.store.session.post(self._pace)  # once the page stands: what comes before that does not reach it
 
     def _pace(self) -> None:
         """Draw again and again while there is something to see."""
-        wanted = self.visible and self.loop is not None
-        if self._callback is not None and wanted != self._callback.running:
-            (self._callback.start if wanted else self._callback.stop)()
+        if self._beat is not None:
+            (self._beat.start if self.visible and self.loop is not None else self._beat.stop)()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from bokeh.models import ColumnDataSource, Range1d, Span
@@ -10,7 +11,6 @@ from bokeh.plotting import figure
 
 from wfsobs.app.display import Display
 from wfsobs.app.pages.live_paint import Painter
-from wfsobs.app.pages.live_table import Bounds
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.lines import FigureLines
 from wfsobs.app.views.plots import new_figure
@@ -21,6 +21,7 @@ from wfsobs.evaluation.recovery import trailing_rms
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.latencies import EDGES
 from wfsobs.live.board import SLOTS, Board
+from wfsobs.live.finding import Bounds
 from wfsobs.live.view import LiveEvent, LiveView
 from wfsobs.signal.welch import welch_psd
 from wfsobs.typing import Array
@@ -87,15 +88,16 @@ class RollingTraces(LiveFigure):
         first = max(view.first, last - n)
         times = envelope_times(first, last, BINS, view.dt)
 
-        def trace(x: Array) -> tuple[Array, Array]:
+        def trace(x: Array) -> Array:
             if display.running:
                 x = trailing_rms(x, min(round(WINDOW_S / view.dt), len(x)))
-            return times, scale * envelope(x[first - view.first :, display.column], BINS)
+            return envelope(x[first - view.first :, display.column], BINS)
 
-        take = view.error if display.error else view.estimate
-        data = {name: trace(take(name, target)) for name in names}
-        if not display.error:
-            data = {TRUTH: trace(view.truth(target)), **data}
+        def drawn(name: str) -> tuple[Array, Array]:
+            key = ("trace", name, target, display.column, display.show, first)
+            return times, scale * view.once(key, lambda: trace(shown_signal(view, name, target, display)))
+
+        data = {name: drawn(name) for name in ([] if display.error else [TRUTH]) + [*names]}
         top = 1.1 * max((float(np.nanmax(np.abs(y))) for _, y in data.values() if np.isfinite(y).any()), default=1.0) or 1.0
         if display.running:
             ends = times[[0, -1]]
@@ -135,23 +137,19 @@ class RollingSpectra(LiveFigure):
         if of != self._of or last < self._last:
             self._sums, self._of, self._last = {}, of, 0
         n = min(view.n, round(1.0 / view.dt))
-        if n < 64 or last - self._last < n // 2:
+        if n < 64 or last // (n // 2) == self._last // (n // 2):  # all pages at the same time
             return
         share = 1.0 - np.exp(-(last - max(self._last, last - n)) * view.dt / MEMORY)
         self._last = last
-        take = view.error if display.error else view.estimate
-        signals = {name: take(name, target)[-n:, display.column] for name in names}
-        if not display.error:
-            signals[TRUTH] = view.truth(target)[-n:, display.column]
         data = {}
-        for name, x in signals.items():
-            if np.isnan(x).any():
+        for name in [*names, *([] if display.error else [TRUTH])]:
+            found = view.once(("spectrum", name, *of, n), partial(_last_spectrum, view, name, target, display, n))
+            if found is None:
                 continue
-            frequency, density = welch_psd(x[:, None], view.dt, 1.0 / (n * view.dt))
-            before = self._sums.get(name, density[:, 0])
-            now = self._sums[name] = (
-                before + share * (density[:, 0] - before) if before.shape == density[:, 0].shape else density[:, 0]
-            )
+            frequency: Array = found[0]
+            density: Array = found[1]
+            before = self._sums.get(name, density)
+            now = self._sums[name] = before + share * (density - before) if before.shape == density.shape else density
             of_errors = scale * cumulative_rms(frequency[1:], now[1:]) if display.cumulative else scale**2 * now[1:]
             data[name] = frequency[1:], of_errors
         self.put(data, display.dark)
@@ -161,6 +159,22 @@ class RollingSpectra(LiveFigure):
         unit = display.unit_label
         what = f"rms above, {display.mode_label} [{unit}]" if display.cumulative else f"PSD, {display.mode_label} [{unit}²/Hz]"
         self.figure.yaxis.axis_label = what
+
+
+def shown_signal(view: LiveView, name: str, target: str, display: Display) -> Array:
+    """Return what a line is of: the truth, or an observer's error or estimate, (n, n_modes) [um]."""
+    if name == TRUTH:
+        return view.truth(target)
+    return view.error(name, target) if display.error else view.estimate(name, target)
+
+
+def _last_spectrum(view: LiveView, name: str, target: str, display: Display, n: int) -> tuple[Array, Array] | None:
+    """Return frequencies [Hz] and the spectrum of the last n frames [um^2/Hz]; None where some are missing."""
+    x = shown_signal(view, name, target, display)[-n:, display.column]
+    if np.isnan(x).any():
+        return None
+    frequency, density = welch_psd(x[:, None], view.dt, 1.0 / (n * view.dt))
+    return frequency, density[:, 0]
 
 
 class LatencyHistogram(LiveFigure):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from time import monotonic
 
 import panel as pn
@@ -13,7 +12,7 @@ from wfsobs.app.pages.live_controls import LiveControls, Pulse
 from wfsobs.app.pages.live_figures import LatencyHistogram, RollingSpectra, RollingTraces
 from wfsobs.app.pages.live_paint import Painter
 from wfsobs.app.pages.live_stars import Stars
-from wfsobs.app.pages.live_table import Bounds, control_html, events_html, live_html, peaks_html
+from wfsobs.app.pages.live_table import control_html, events_html, live_html, peaks_html
 from wfsobs.app.pages.live_text import live_text
 from wfsobs.app.pages.live_waterfall import MEASUREMENT, Waterfall
 from wfsobs.app.pages.parts import WIDE, box, figure_with_caption, group, legend, line
@@ -25,13 +24,12 @@ from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.evaluation.theory import Theory
 from wfsobs.live.board import NEXT
-from wfsobs.live.finding import bounds_of
+from wfsobs.live.finding import Bounds
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.source import SIMULATION
 from wfsobs.live.view import LiveView
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
-from wfsobs.scenario import Scenario
 
 SLOW = 1.0
 """Between two tables [s]."""
@@ -52,9 +50,8 @@ class LiveRoom:
         self.table, self.control_table, self.news, self.peaks = (live_text() for _ in range(4))
         self.editor: SpectrumEditor | None = None
         self.legend = live_text()
-        self._table_time = 0.0
+        self._second = 0
         self._bounds: Bounds = {}
-        self._bounds_of: Scenario | None = None
         self._spectra_room = figure_with_caption("Spectra", self.spectra.figure)
 
     def view(self) -> list[pn.Column]:
@@ -89,15 +86,19 @@ class LiveRoom:
         active = loop.board.active()
         names = [name for name in active if name in self.controls.lines.value]
         run_in = RollingTraces.run_in(display)
-        before = loop.view(view.n * view.dt + run_in) if run_in else view
+        longer = view.n * view.dt + run_in
+        before = loop.readings.look(loop.view, longer, anew=not loop.is_playing) if run_in else view
         self.traces.draw(before, view.n, target, names, display, scale, list(loop.events), self._bounds)
         self.spectra.draw(view, target, names, display, scale)
         what = self.controls.waterfall.value
         self.waterfall.draw(view, what if what in active else MEASUREMENT, target, display, scale)
         running = [name for name in self.controls.controllers.value if name in loop.controllers]
-        self.stars.draw(view, loop.control_view(self.controls.window.value), running, loop.scenario, dark)
+        seconds = self.controls.window.value
+        left = view.once(("left", seconds), lambda: loop.control_view(seconds))
+        self.stars.draw(view, left, running, loop.scenario, dark)
         self._edit(loop, target)
-        if monotonic() - self._table_time > SLOW or not loop.is_playing:
+        if (second := int(monotonic() / SLOW)) != self._second or not loop.is_playing:  # all pages at the same time
+            self._second = second
             self._draw_tables(loop, view, target, scale)
             self.latencies.draw(loop.board, names, loop.sampling.dt, dark)
         self._painter.send()
@@ -107,13 +108,13 @@ class LiveRoom:
         return self.controls.target.value if loop.source.has_truth else NEXT
 
     def _draw_tables(self, loop: LiveLoop, view: LiveView, target: str, scale: float) -> None:
-        self._table_time = monotonic()
-        if self._bounds_of is not loop.scenario:
-            self._bounds_of, self._bounds = loop.scenario, {}
-            loop.workshop.do(bounds_of, loop.scenario.to_dict(), then=partial(setattr, self, "_bounds"))
+        self._bounds = loop.workshop.bounds(loop.scenario)
         self.legend.object = self._legend(loop, target)
-        self.table.object = live_html(loop, view, target, self.display, scale, self._bounds)
-        self.control_table.object = control_html(loop, self.controls.window.value, self.display)
+        d, seconds = self.display, self.controls.window.value
+        of = (d.column, d.unit, d.dark)
+        key = ("table", target, tuple(self._bounds), *of)
+        self.table.object = view.once(key, lambda: live_html(loop, view, target, d, scale, self._bounds))
+        self.control_table.object = view.once(("controls", seconds, *of), lambda: control_html(loop, seconds, d))
         self.news.object = events_html(loop.events, loop.sampling.dt)
         self.peaks.object = peaks_html(loop.workshop.finding, scale, self.display.unit_label)
 

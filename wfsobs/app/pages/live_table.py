@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from html import escape
 from math import inf, isnan
 
@@ -15,15 +15,13 @@ from wfsobs.app.style import look, swatch
 from wfsobs.closed_loop.run import strehl
 from wfsobs.evaluation.rows import row_label
 from wfsobs.live.board import NEXT, SCORED
-from wfsobs.live.finding import Finding
+from wfsobs.live.finding import Bounds, Finding
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.view import LiveEvent, LiveView
 from wfsobs.typing import Array
 
 SHOWN_EVENTS = 8
 QUANTITIES = {"Turbulence": "turbulence", "Vibration": "vibration", "Next measurement": NEXT}
-
-Bounds = Mapping[str, Mapping[str, list[float]]]
 
 
 def ranking(view: LiveView, names: Iterable[str], target: str, column: int) -> list[tuple[str, float]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from bokeh.models import ColorBar, ColumnDataSource, Image, LogColorMapper, Range1d
 from bokeh.palettes import Viridis256
@@ -47,7 +49,7 @@ class Waterfall:
         self._bar = ColorBar(color_mapper=self._colours, width=8, padding=4, title_text_font_style="normal")
         self.figure.add_layout(self._bar, "right")
         self.columns = np.full((ROWS, COLUMNS), np.nan)
-        self._of: tuple[object, ...] = ()
+        self._of: tuple[str, str, int] = ("", "", 0)
         self._number = 0
         self._sent_in = ("", False)
 
@@ -60,11 +62,10 @@ class Waterfall:
             self.columns[:], self._of, self._number = np.nan, of, max(0, newest - COLUMNS)
         elif newest == self._number and (display.unit, display.dark) == self._sent_in:
             return
-        signal = view.frames.z if what == MEASUREMENT else view.error(what, target)
-        self._take(signal[:, display.column], view, hop, newest)
+        self._take(view, hop, newest)
         self._send(newest * HOP, view.dt, scale, display)
 
-    def _take(self, signal: Array, view: LiveView, hop: int, newest: int) -> None:
+    def _take(self, view: LiveView, hop: int, newest: int) -> None:
         """Move the spectra to the left, and add those of which the view has all frames."""
         step = min(newest - self._number, COLUMNS)
         if step:
@@ -73,9 +74,16 @@ class Waterfall:
         self._number = newest
         for back in range(step):
             stop = (newest - back) * hop - view.first
-            if (start := stop - round(LENGTH / view.dt)) < 0:
+            if stop < round(LENGTH / view.dt):
                 return
-            self.columns[:, COLUMNS - 1 - back] = second_spectrum(signal[start:stop], view.dt)
+            spectrum = view.once(("second", stop, *self._of), partial(self._spectrum, view, stop))
+            self.columns[:, COLUMNS - 1 - back] = spectrum
+
+    def _spectrum(self, view: LiveView, stop: int) -> Array:
+        """Return the spectrum of the second before a frame of the view."""
+        what, target, column = self._of
+        signal = view.frames.z if what == MEASUREMENT else view.error(what, target)
+        return second_spectrum(signal[stop - round(LENGTH / view.dt) : stop, column], view.dt)
 
     def _send(self, end: float, dt: float, scale: float, display: Display) -> None:
         self._sent_in = display.unit, display.dark
