@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from wfsobs.app.jobs.job import FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import IDLE
 from wfsobs.app.limits import NONE
 from wfsobs.app.live_order import LiveOrder
+from wfsobs.app.live_work import record_saves
 from wfsobs.app.numbers import number
 from wfsobs.app.pages.live import LivePage
 from wfsobs.app.pages.live_table import ranking
@@ -24,11 +26,16 @@ from wfsobs.app.session import opens_on_live
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.live.loop import LiveLoop
+from wfsobs.live.recording import Recorder
+from wfsobs.live.ring import Ring
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.view import SHARED, SharedView
 from wfsobs.record import Record
+from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
+from wfsobs.stepping import sampling_of
+from wfsobs.telemetry.records import load_record
 
 
 @pytest.fixture
@@ -246,3 +253,27 @@ def test_a_record_that_is_loaded_is_played(page: LivePage, dashboard: Dashboard,
     np.testing.assert_array_equal(view.frames.z, made.z[view.first : view.first + view.n])
     assert page.draw() and page.picture is not None and "kf-multi" in page.picture.table.object
     page.work.cancel()
+
+
+@pytest.mark.parametrize("kind", ["NPZ", "AOT"])
+def test_a_recording_is_saved_as_a_record_that_is_read(kind: str, short: Scenario, tmp_path: Any) -> None:
+    """The file has the frames that the ring had, to the last digit."""
+    rows, ring = np.random.default_rng(1).normal(size=(300, 11)), Ring(2)
+    rows[:, 5:7] = 0.0
+    rows[np.arange(300) % short.sensors.exposure_ratio > 0, 3:5] = np.nan
+    for row in rows:
+        ring.send(row)
+    loop: Any = SimpleNamespace(recorder=Recorder(ring, sampling_of(short), lambda _: None, is_simulated=True))
+    loop.newest, loop.scenario = ring.count, short
+    loop.recorder.start(120.0)
+    loop.recorder.stop(short)
+    saves = record_saves(loop, 120.0)
+    for what in ("Recording", "Last two minutes"):
+        save = saves[f"{what} as {kind}"]
+        assert save is not None
+        (tmp_path / save.name).write_bytes(save.content())
+        record = load_record(tmp_path / save.name, short)
+        np.testing.assert_allclose(record.z, rows[:, 1:3], atol=1e-12)
+        if kind == "NPZ":  # an AOT has no truth
+            np.testing.assert_array_equal(record.truth("vibration"), rows[:, 9:11])
+    ring.release()

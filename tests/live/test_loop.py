@@ -301,7 +301,7 @@ def test_the_next_look_at_the_ring_is_when_a_frame_is_due(monkeypatch):
     pause.rest()
     now = 200.0
     pause.rest()
-    assert slept == pytest.approx([0.0006, POLL, 0.0019, REST], abs=1e-9)
+    assert slept == pytest.approx([0.0006 + POLL, POLL, 0.0019 + POLL, REST], abs=1e-9)
 
 
 def test_nothing_is_left_of_a_loop_whose_owner_is_killed():

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from time import sleep
 from typing import Any
 
-from wfsobs.app.downloads import Save, record_npz
+from wfsobs.app.downloads import Save, TooLarge, record_file
 from wfsobs.app.jobs.job import CLICK, Job, Tell
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.live_order import LiveOrder
@@ -15,11 +15,13 @@ from wfsobs.app.logs import event
 from wfsobs.app.service import Service
 from wfsobs.live.loop import LiveLoop
 from wfsobs.progress import Watch
-from wfsobs.record import Record
+from wfsobs.record import Record, RecordError
 from wfsobs.settings.errors import SettingError
 
 LOOK = 0.2
 """Pause between two looks whether the loop goes on [s]."""
+FORMATS = {"NPZ": ".npz", "AOT": ".aot.fits"}
+"""Of recordings: their endings."""
 ENDED = "the processes of the loop have ended"
 
 
@@ -87,16 +89,29 @@ def live_job(order: LiveOrder, service: Service) -> Job:
 
 
 def record_saves(loop: LiveLoop | None, look_back: float) -> dict[str, Save | None]:
-    """Offer the last recording of a loop, and its last so many seconds."""
+    """Offer the last recording of a loop, and its last so many seconds, in each of FORMATS."""
 
-    def save(name: str, make: Callable[[LiveLoop], Record]) -> Save | None:
-        live = loop
-        if live is None or not live.newest:
+    def save(name: str, is_there: bool, make: Callable[[LiveLoop], Record | None]) -> Save | None:
+        if (live := loop) is None or not is_there:
             return None
-        return Save(name, "application/octet-stream", lambda: record_npz(make(live), live.scenario))
+        return Save(name, "application/octet-stream", lambda: _content(name, make(live), live))
 
-    record = None if loop is None else loop.recorder.record
+    recorded = loop is not None and loop.recorder.record is not None
+    sent = loop is not None and loop.newest > 0
     return {
-        "Recording as NPZ": None if record is None else save("wfsobs-live.npz", lambda _: record),
-        "Last two minutes as NPZ": save("wfsobs-live-last.npz", lambda live: live.recorder.look_back(look_back, live.scenario)),
+        f"{what} as {kind}": save(name + end, is_there, make)
+        for what, name, is_there, make in (
+            ("Recording", "wfsobs-live", recorded, lambda live: live.recorder.record),
+            ("Last two minutes", "wfsobs-live-last", sent, lambda live: live.recorder.look_back(look_back, live.scenario)),
+        )
+        for kind, end in FORMATS.items()
     }
+
+
+def _content(name: str, record: Record | None, loop: LiveLoop) -> bytes:
+    """Return a record as a file. Raises TooLarge with one line where its format does not take it."""
+    assert record is not None
+    try:
+        return record_file(name, record, loop.scenario)
+    except RecordError as error:
+        raise TooLarge(str(error)) from None

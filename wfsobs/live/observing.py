@@ -186,8 +186,11 @@ class Pause:
         self._due, self._next = 0.0, 0.0
 
     def note(self, due: float) -> None:
-        """Note when a frame was due, on the monotonic clock [s]: the next one comes as long after it as it after the last."""
-        self._next = due + min(due - self._due, REST)
+        """Note when a frame was due, on the monotonic clock [s].
+
+        The next one is due as long after it as it after the last, and there when the source has written it.
+        """
+        self._next = due + min(due - self._due, REST) + POLL
         self._due = due
 
     def rest(self) -> None:

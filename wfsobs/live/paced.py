@@ -22,6 +22,8 @@ from wfsobs.typing import Array
 
 IDLE = 0.05
 """Pause between two looks at the commands while nothing is sent [s]."""
+LOOK = 0.01
+"""Pause between two looks at the commands while frames are sent [s]."""
 STALL = 1.0
 """Delay beyond which the frames in between are given up, and the clock starts anew [s]."""
 
@@ -130,12 +132,15 @@ def send_frames(desk: Desk, frames: PacedFrames, dt: float) -> None:
     row, rest = np.empty(1 + 5 * desk.n_modes), frames.next_row(0)
     gc.collect()
     gc.freeze()
+    look = 0.0
     while number != desk.n_frames and rest is not None:
-        while desk.inbox.poll(0 if pace.runs else IDLE):
-            command = desk.inbox.recv()
-            pace.take(command)
-            if line := frames.take(command, number):
-                desk.say(number, line)
+        if not pace.runs or monotonic() >= look:
+            while desk.inbox.poll(0 if pace.runs else IDLE):
+                command = desk.inbox.recv()
+                pace.take(command)
+                if line := frames.take(command, number):
+                    desk.say(number, line)
+            look = monotonic() + LOOK
         if not pace.runs:
             continue
         row[0] = due = pace.due()

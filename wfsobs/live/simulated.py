@@ -118,9 +118,9 @@ class SimulatedFrames:
         if self._new is not None:
             row = self._mix(row, self._new[self._new_at])
             self._new_at += 1
-        measured, truth = np.split(row, 2)
-        z, ngs = self._losses.apply(*np.split(measured, 2))
-        return np.concatenate((z, ngs, self._loop.command(z), truth))
+        m = len(row) // 4
+        z, ngs = self._losses.apply(row[:m], row[m : 2 * m])
+        return np.concatenate((z, ngs, self._loop.command(z), row[2 * m :]))
 
     def take(self, command: Command, number: int) -> str:
         """Follow "settings", for which frames of another generation are to be expected, and "losses"."""
