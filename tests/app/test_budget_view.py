@@ -45,6 +45,7 @@ def test_bars_are_as_long_as_the_scores_in_every_mode_and_unit(make_store: Any, 
                 assert mark.visible and mark.location == pytest.approx((scores[bound, target] * scale) ** 2, rel=1e-12)
             assert set(view.bars[target].bounds) == set(COMMON_BOUNDS)
             assert mode in view.bars[target].figure.xaxis.axis_label
+        assert "Online GPR" in view.line.object and "LGS KF" not in view.line.object
     view.open.value = False
     assert not view.room.visible and view.task.state == DONE
 

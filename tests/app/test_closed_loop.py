@@ -10,6 +10,7 @@ import pytest
 from wfsobs.app import loop_work
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import per_micrometre
+from wfsobs.app.jobs.job import DONE
 from wfsobs.app.pages.closed_loop import ClosedLoopPage
 from wfsobs.app.pages.loop_figures import CURVES
 from wfsobs.app.pages.pages import EXPLORE, LOOP
@@ -34,6 +35,7 @@ def done(page: ClosedLoopPage, loop: Any) -> ClosedLoopPage:
     of = page.run.result
     assert of is not None
     loop.until(lambda: page.results is not None and page.results.complete and page.results.result.scenario is of.scenario)
+    loop.until(lambda: page.work.state == DONE)
     return page
 
 

@@ -36,7 +36,7 @@ class Help(JSComponent):
     shortcuts = param.Dict(dict(SHORTCUTS), doc="Key -> what it does.")
     terms = param.Dict(dict(TERMS), doc="Word -> what it means.")
 
-    _esm = asset("help.js")
+    _esm = asset("dark.js") + asset("help.js")
     _stylesheets = [asset("help.css")]
 
     def __init__(self, **params: Any):

@@ -72,7 +72,12 @@ _COMPONENTS = {
     "MuiDrawer": {"styleOverrides": {"modal": {"@media (max-width: 599.95px)": {"visibility": "var(--wfsobs-drawer, hidden)"}}}},
     # Why a setting has no effect is to be read, though its box is grey.
     "MuiFormHelperText": {"styleOverrides": {"root": {"&.Mui-disabled": {"color": "inherit", "opacity": 0.75}}}},
-    "MuiToggleButton": {"styleOverrides": {"root": {"textTransform": "none", "whiteSpace": "nowrap"}}},
+    "MuiToggleButton": {
+        "styleOverrides": {
+            # On the grey that is under the pointer the words would be too faint.
+            "root": {"textTransform": "none", "whiteSpace": "nowrap", "&:hover:not(.Mui-selected)": {"color": "inherit"}}
+        }
+    },
 }
 
 

@@ -27,7 +27,11 @@ export function render({model, el}) {
     }))
     if (sheet.matches(":popover-open")) sheet.querySelector("button")?.focus()
   }
-  sheet.addEventListener("beforetoggle", (event) => { if (event.newState === "open") model.send_msg({open: true}) })
+  sheet.addEventListener("beforetoggle", (event) => {
+    if (event.newState !== "open") return
+    paint(sheet)
+    model.send_msg({open: true})
+  })
   sheet.addEventListener("toggle", (event) => { if (event.newState === "open") sheet.querySelector("button")?.focus() })
   model.on("items", draw)
 }

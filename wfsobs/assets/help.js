@@ -9,12 +9,6 @@ const STOPS = [ // where, what is said of it
   [["[aria-label='Share']"], "The address of the page has what you have changed: share it, save data and figures, or make a report of everything."],
 ]
 
-// Dark where the page is.
-function paint(it) {
-  const [red, green, blue] = getComputedStyle(document.body).backgroundColor.match(/\d+/g).map(Number)
-  it.classList.toggle("dark", red + green + blue < 384)
-}
-
 export function render({model, el}) {
   const make = (name, parent, properties = {}, attributes = {}) => {
     const it = Object.assign(document.createElement(name), properties)

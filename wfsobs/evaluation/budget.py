@@ -52,6 +52,9 @@ TERMS = {
 LINEAR, AVERAGED = "linear", "averaged over orders"
 """How the terms were found."""
 
+ONLY_NAMED = "only if named"
+"""End of the reason why an observer has no budget that can have one."""
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -156,7 +159,7 @@ def _without_budget(observer: Observer, by_name: bool) -> str:
         return "looks ahead"
     if "y_stars" in observer.needs:
         return "takes every LGS by itself"
-    return "" if observer.linear or by_name else "not linear, takes 16 runs: only if named"
+    return "" if observer.linear or by_name else f"not linear, takes 16 runs: {ONLY_NAMED}"
 
 
 def _of_observer(

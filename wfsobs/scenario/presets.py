@@ -218,7 +218,7 @@ def lost_frames() -> Scenario:
 
 
 def night() -> Scenario:
-    """Two minutes in which wind, a line, lasers and frames change: for `wfsobs live`, which plays them over and over.
+    """Two minutes in which wind, a line, lasers and frames change: for a live loop, which plays them over and over.
 
     As peak-jump. In the first minute the wind doubles and falls back, both lasers are out for 2 s and a tenth of the LGS frames
     is lost for 5 s. In the second the line is at 50.5 Hz, and half of the NGS frames are lost for 5 s. So the two minutes differ

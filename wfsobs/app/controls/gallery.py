@@ -19,7 +19,7 @@ class Gallery(JSComponent):
 
     items = param.List([], doc="{name, title, line, peaks: [Hz, um], events} of every preset.")
 
-    _esm = asset("gallery.js")
+    _esm = asset("dark.js") + asset("gallery.js")
     _stylesheets = [asset("gallery.css")]
 
     def __init__(self, choose: Callable[[str], None], **params: Any):

@@ -20,7 +20,7 @@ from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
 from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.pages.loop_figures import LoopSpectrum, Nyquist, Response, Trace
 from wfsobs.app.pages.loop_table import loop_html, margins_html
-from wfsobs.app.pages.parts import SMALL_LABEL, WIDE, PageActions, box, figure_with_caption, html, text
+from wfsobs.app.pages.parts import EDITED, SMALL_LABEL, TALL, WIDE, PageActions, box, figure_with_caption, html, text
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.gain_editor import GainEditor
@@ -108,7 +108,8 @@ class ClosedLoopPage(PageActions):
         return pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0, stylesheets=[SMALL_LABEL])
 
     def _edit(self, *_: object) -> None:
-        """Make the handle when it is first wanted."""
+        """Make the handle when it is first wanted, and room for what stands below the figure."""
+        self.room.stylesheets = [EDITED] if self.display.editing else TALL["stylesheets"]
         if self.display.editing and self.editor is None:
             self.editor = GainEditor(self.response.figure, self.nyquist.figure, self.store, self.display, lambda: self.results)
             for room, handle in zip((self.room, self.stability), self.editor.handles, strict=True):

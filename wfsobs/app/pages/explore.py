@@ -12,7 +12,7 @@ import panel_material_ui as pmui
 from wfsobs.app.causes import Causes
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL
 from wfsobs.app.history import History
-from wfsobs.app.pages.parts import SMALL_LABEL, TALL, WIDE, box, group
+from wfsobs.app.pages.parts import EDITED, SMALL_LABEL, TALL, WIDE, box, group
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
@@ -142,10 +142,14 @@ class Explore:
         self._later = []
 
     def _edit(self, *_: object) -> None:
-        """Make the handles when they are first wanted."""
-        if self.editors or self.seeds is None:
+        """Make the handles when they are first wanted, and room for what stands below them."""
+        if self.seeds is None:
             return
         self.complete()
+        for room in self.rooms.values():
+            room.stylesheets = [EDITED] if self.display.editing else TALL["stylesheets"]
+        if self.editors:
+            return
         frames, theory = Frames(self.seeds.store.session), Theory()
         with pn.io.hold():
             for target, room in self.rooms.items():

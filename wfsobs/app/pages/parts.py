@@ -75,6 +75,9 @@ TALL: Mapping[str, Any] = MappingProxyType(
 )
 """A figure as high as the window has room for."""
 
+EDITED = ":host { height: calc(clamp(230px, 42vh, 560px) + 120px) !important; }"
+"""The same with its handles, whose legend stands below it."""
+
 
 def figure_with_caption(title: str, fig: figure, *, tall: bool = False) -> pn.Column:
     """Lay out a figure under its caption. tall : as high as the window has room for."""

@@ -21,7 +21,7 @@ from wfsobs.app.style import BOUND_MARKS, TERM_COLOURS
 from wfsobs.app.views.plots import call
 from wfsobs.app.work import RunResults
 from wfsobs.cost import run_seconds
-from wfsobs.evaluation.budget import TERMS, Budget, error_budget
+from wfsobs.evaluation.budget import ONLY_NAMED, TERMS, Budget, error_budget
 from wfsobs.evaluation.rows import row_label
 from wfsobs.observers.base import TARGETS
 
@@ -75,6 +75,8 @@ class BudgetView:
         said = "Computing …" if busy else task.message if task.state == FAILED else ""
         if self.open.value and not busy and self.run.state == RUNNING:
             said = "After the run …"
+        if task.state == DONE:
+            said = without_bars(task.result or ())
         self.line.object = f'<p class="text">{escape(said)}</p>' if said and self.open.value else ""
 
     def _draw(self, *_: object) -> None:
@@ -151,6 +153,12 @@ class Bars:
         self.source.data = bar_data(ranked, scale, unit)  # type: ignore[assignment]
         for name, mark in self.bounds.items():
             mark.update(location=bounds.get(name, 0.0) * scale**2, visible=name in bounds)
+
+
+def without_bars(budgets: Sequence[Budget]) -> str:
+    """Say which observers have no bar, and how to see theirs: empty where all have one."""
+    names = dict.fromkeys(row_label(b.observer) for b in budgets if b.reason.endswith(ONLY_NAMED))
+    return f"No bars: {', '.join(names)}. They are not linear; wfsobs run --budget-of runs each 16 times." if names else ""
 
 
 def bar_label(budget: Budget, scale: float, unit: str) -> str:

@@ -25,7 +25,7 @@ _FILTERS = OptimalFilters(cycle_of)
 
 GP_BOTH = Observer(
     "gp-both",
-    "GP in time on both",
+    "GP on both sensors",
     TARGETS,
     _FILTERS.run,
     help="that of `gp-lgs` on both sensors; not in the paper",
