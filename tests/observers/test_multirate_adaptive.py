@@ -131,6 +131,17 @@ def test_near_the_filter_that_is_told_and_far_from_the_lgs_alone() -> None:
     assert (rms["multirate-adaptive"][0] < 0.6 * rms["kf-adaptive"][0]).all()
 
 
+def test_what_a_window_adds_to_a_width_is_taken_off_again() -> None:
+    """A first guess comes back as it was, whatever the window adds; a peak that is no wider than that keeps half of its width."""
+    lines = (Ar2(120.0, 0.01, 0.05, DT), Ar2(300.0, 1e-4, 0.02, DT))
+    z = np.random.default_rng(0).normal(size=4000)
+    start = Spectrum(1.0, DT, Ar3(20.0, 0.7, 60.0, 0.1, DT), lines)
+    back = WindowFit(z, DT, start, blur=0.05).spectrum.resonances
+    bin_ = 2.0 * np.pi * 0.05 / 4.0
+    shown = [p.damping * p.omega for p in WindowFit(z, DT, start).spectrum.resonances]
+    assert [p.damping * p.omega for p in back] == pytest.approx([shown[0], 0.5 * (shown[1] + bin_)])
+
+
 def windows_of(monkeypatch: pytest.MonkeyPatch, **changes: object) -> list[int]:
     """Lengths [steps] of the windows of one mode, 20 s of `peak-jump` after these changes."""
     seen: list[int] = []
@@ -147,7 +158,8 @@ def windows_of(monkeypatch: pytest.MonkeyPatch, **changes: object) -> list[int]:
 
 
 def test_windows_grow_while_the_record_is_still(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert windows_of(monkeypatch, events=[]) == [4000, 5000, 6500, 8000, 10_000, 13_000, 16_500]
+    """By three tenths, from twice the first length on by 0.16, in whole checks of 0.5 s."""
+    assert windows_of(monkeypatch, events=[]) == [4000, 5000, 6500, 8000, 9000, 10_000, 11_500, 13_000, 15_000, 17_000, 19_500]
 
 
 def test_a_jump_makes_the_window_short_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,8 +169,8 @@ def test_a_jump_makes_the_window_short_again(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_windows_by_hand() -> None:
-    """Shortest window 4 s, longest 30 s, checks every 0.5 s: three tenths more each time, in whole checks."""
-    assert [next_length(n, SHORT) for n in (4000, 7500, 30_000)] == [1000, 2000, 9000]
+    """Shortest window 4 s, longest 30 s, checks every 0.5 s: three tenths more, from 8 s on 0.16, in whole checks."""
+    assert [next_length(n, SHORT) for n in (4000, 7500, 8000, 30_000)] == [1000, 2000, 1000, 4500]
     assert window_start(4001, 0, SHORT) == 1 and window_start(20_001, 0, SHORT) == 1, "grows"
     assert window_start(40_001, 0, SHORT) == 10_001, "the longest"
     assert window_start(20_001, 19_501, SHORT) == 16_001, "the shortest, although some of it is before the change"

@@ -33,21 +33,25 @@ def densities(numbers: Array, dt: float, f: Array) -> tuple[Array, Array]:
     """
     omega, damping, rms = np.exp(numbers[:, :1]), expit(numbers[:, 1:2]), np.exp(numbers[:, 2:])
     damped, rest = damping * omega * dt, np.sqrt(expit(-numbers[:, 1:2]) * (1.0 + damping))  # rest = sqrt(1 - damping^2)
-    angle, r, short = rest * omega * dt, np.exp(-damped), -np.expm1(-damped)  # short = 1 - r
+    angle, r, short, lost = rest * omega * dt, np.exp(-damped), -np.expm1(-damped), -np.expm1(-2.0 * damped)  # 1 - r, 1 - r^2
 
-    def distance(sine: Array, cosine: Array) -> tuple[Array, Array, Array]:
-        """Of sine and cosine of a / 2; and the derivatives of its logarithm by r and by a."""
-        squared = sine**2
-        d = short**2 + 4.0 * r * squared
-        return d, (4.0 * squared - 2.0 * short) / d, 4.0 * r * sine * cosine / d
+    def distance(half_sine: Array, sine: Array) -> tuple[Array, Array]:
+        """Return the inverse of one, of 2 sqrt(r) sin(a / 2), and the derivative of its logarithm by a, of 2 r sin(a)."""
+        inverse = 1.0 / (short**2 + half_sine**2)
+        return inverse, sine * inverse
 
-    s, c, turned_s, turned_c = np.sin(0.5 * angle), np.cos(0.5 * angle), np.sin(np.pi * f * dt), np.cos(np.pi * f * dt)
-    ss, sc, cs, cc = s * turned_s, s * turned_c, c * turned_s, c * turned_c
-    (zero, zero_r, zero_a), (half, half_r, half_a) = distance(s, c), distance(-c, s)
-    (low, low_r, low_a), (high, high_r, high_a) = distance(sc - cs, cc + ss), distance(sc + cs, cc - ss)
-    lost = -np.expm1(-2.0 * damped)  # 1 - r^2
-    S = 2.0 * dt * rms**2 * lost / (1.0 + r**2) * zero * half / (low * high)
-    by_r = zero_r + half_r - low_r - high_r - 2.0 * r / lost - 2.0 * r / (1.0 + r**2)
-    by_angle = zero_a + half_a - low_a - high_a
-    by_logit = -(r * by_r + damping / rest * by_angle) * omega * dt * damping * (1.0 - damping)
-    return S, np.stack([angle * by_angle - damped * r * by_r, by_logit, np.full_like(S, 2.0)], axis=1)
+    # The derivative of the logarithm by r is 1 / r - (1 - r^2) / r over the distance.
+    wide, turned = 2.0 * np.sqrt(r), np.pi * f * dt
+    s, c, of_sine, of_cosine = (g(x) for x in (0.5 * angle, angle) for g in (np.sin, np.cos))
+    drive, drive_a = zip(distance(wide * s, 2.0 * r * of_sine), distance(wide * c, -2.0 * r * of_sine), strict=True)
+    sc, cs = wide * s * np.cos(turned), wide * c * np.sin(turned)
+    of_sum, of_difference = 2.0 * r * of_sine * np.cos(2.0 * turned), 2.0 * r * of_cosine * np.sin(2.0 * turned)
+    (low, low_a), (high, high_a) = distance(sc - cs, of_sum - of_difference), distance(sc + cs, of_sum + of_difference)
+    S = 2.0 * dt * rms**2 * lost / ((1.0 + r**2) * drive[0] * drive[1]) * (low * high)
+    by_r = lost / r * (low + high - drive[0] - drive[1]) - 2.0 * r / lost - 2.0 * r / (1.0 + r**2)
+    by_angle = sum(drive_a) - low_a - high_a
+    slopes = np.empty((len(numbers), 3, len(f)))
+    slopes[:, 0] = angle * by_angle - damped * r * by_r
+    slopes[:, 1] = (r * by_r + damping / rest * by_angle) * (-omega * dt * damping * (1.0 - damping))
+    slopes[:, 2] = 2.0
+    return S, slopes

@@ -29,8 +29,11 @@ SHORTEST = 100
 """Minimum samples of a window."""
 TRACKED = 0.1
 """Minimum half width of a peak that is tracked, in bins: undamped lines become sharper as the window grows."""
-COARSE = 50, 4
-"""As FINE and NEAR of `periodogram`, for long windows: their cells hold many bins."""
+BLUR = 0.05
+"""Half width that a window adds to a peak, in bins. The autocovariance that a periodogram shows falls by 1 / window per lag, too:
+an undamped line would be 1 / (2 pi) bins wide. Less than that is taken off: a frequency that is not well known takes some width."""
+COARSE, COARSER = (50, 4), (20, 3)
+"""As FINE and NEAR of `periodogram`, for windows that grow and for those that have grown long: their cells hold many bins."""
 LEFT = 0.02
 """Share of the error of a first guess by straight lines through gaps that rounds of filling and fitting leave."""
 THIRD = 4.0
@@ -63,7 +66,8 @@ def quick_spectrum(z: Array, dt: float, most: int, lowest: float = LOWEST, befor
     if np.ptp(z) == 0:
         return Spectrum(float(np.finfo(float).tiny), dt)
     fit = WindowFit(z - z.mean(), dt, _background_of(z - z.mean(), dt, before))
-    fit.background()
+    if most > 0 or before is None or before.turbulence is None:
+        fit.background()
     _add_peaks(fit, most, lowest)
     return fit.spectrum
 
@@ -96,7 +100,7 @@ def quick_spectrum_of_samples(z: Array, dt: float, most: int, lowest: float, bef
 
 
 def follow_spectrum(
-    z: Array, dt: float, most: int, lowest: float, before: Spectrum | None, extra: Ar2 | Ar3 | None = None
+    z: Array, dt: float, most: int, lowest: float, before: Spectrum | None, extra: Ar2 | Ar3 | None = None, *, long: bool = False
 ) -> Spectrum:
     """Fit noise, turbulence and up to `most` peaks to a window that begins as the one before it did, or thereabouts.
 
@@ -111,6 +115,8 @@ def follow_spectrum(
         Spectrum of the window before.
     extra : Ar2 or Ar3, optional
         A process that is in z as well and is known: it is not fitted.
+    long : bool
+        Whether the window has grown long: cells are then coarser, and new peaks are looked for once.
 
     Returns
     -------
@@ -123,10 +129,10 @@ def follow_spectrum(
     turbulence = start.turbulence
     if isinstance(turbulence, Ar2):
         turbulence = Ar3(turbulence.omega, turbulence.damping, THIRD * turbulence.omega, turbulence.rms, dt)
-    fit = WindowFit(z, dt, Spectrum(start.noise, dt, turbulence, tracked), extra, TRACKED, COARSE)
+    fit = WindowFit(z, dt, Spectrum(start.noise, dt, turbulence, tracked), extra, TRACKED, COARSER if long else COARSE, BLUR)
     if not tracked:
         fit.background()
-    _add_peaks(fit, most, lowest)
+    _add_peaks(fit, most, lowest, 1 if tracked and long else 2)
     return fit.spectrum
 
 
@@ -137,10 +143,10 @@ def _background_of(z: Array, dt: float, before: Spectrum | None) -> Spectrum:
     return Spectrum(before.noise, dt, before.turbulence)
 
 
-def _add_peaks(fit: WindowFit, most: int, lowest: float) -> None:
-    for again in (False, True):
+def _add_peaks(fit: WindowFit, most: int, lowest: float, passes: int = 2) -> None:
+    for i in range(passes):
         more = fit.add(fit.maxima(lowest, most - len(fit.resonances)))
-        if again and not more:
+        if i > 0 and not more:
             break
         fit.improve()
         fit.prune()

@@ -46,7 +46,8 @@ class WindowFit:
     """A fit: periodogram I at f, a finer one, and the parameters of the spectrum.
 
     x: log noise, then three per process, turbulence first where there is any (`densities`). Turbulence of third order is that of
-    second order behind one more pole, whose corner is a fourth. narrowest : as NARROWEST; cells : as FINE and NEAR.
+    second order behind one more pole, whose corner is a fourth. narrowest : as NARROWEST; cells : as FINE and NEAR; blur : what
+    the window adds to the half width of a peak, in bins: x has it as it is shown, `spectrum` without.
     """
 
     def __init__(
@@ -57,16 +58,18 @@ class WindowFit:
         extra: Ar2 | Ar3 | None = None,
         narrowest: float = NARROWEST,
         cells: tuple[int, int] = (FINE, NEAR),
+        blur: float = 0.0,
     ):
         n = len(z)
         self.extra, self.narrowest, self.sizes = extra, narrowest, cells
         self.dt, self.fine_f, self.fine = dt, periodogram_frequencies(n, dt, PAD), periodogram(z, dt, PAD)
         self.f, self.I = self.fine_f[PAD - 1 :: PAD], self.fine[PAD - 1 :: PAD]
         self.df = self.f[0]
+        self.blur = 2.0 * pi * blur * self.df
         processes = [] if start.turbulence is None else [start.turbulence]
         self.third = isinstance(start.turbulence, Ar3)
         self.first = 1 + 3 * len(processes) + self.third
-        self.x = np.concatenate([[log(start.noise)], *map(_numbers, [*processes, *start.resonances])])
+        self.x = np.concatenate([[log(start.noise)], *map(_numbers, [*processes, *map(self._show, start.resonances)])])
         self._last: tuple[Array, Array, tuple[Array, Array]] = (self.f[:0], self.x[:0], (self.f[:0], self.f[:0]))
         self._average()
 
@@ -85,7 +88,15 @@ class WindowFit:
         turbulence: Ar2 | Ar3 | None = found.pop(0) if self.first > 1 else None
         if self.third and isinstance(turbulence, Ar2):
             turbulence = _behind_pole(turbulence, float(np.exp(self.x[4])))
-        return Spectrum(float(np.exp(self.x[0])), self.dt, turbulence, tuple(found))
+        return Spectrum(float(np.exp(self.x[0])), self.dt, turbulence, tuple(map(self._sharpen, found)))
+
+    def _show(self, p: Ar2) -> Ar2:
+        """Return a resonance as wide as this window shows it."""
+        return replace(p, damping=min(p.damping + self.blur / p.omega, WIDEST)) if self.blur else p
+
+    def _sharpen(self, p: Ar2) -> Ar2:
+        """Return a resonance that this window shows so wide."""
+        return replace(p, damping=max(p.damping - self.blur / p.omega, 0.5 * p.damping)) if self.blur else p
 
     def _of_second_order(self, x: Array) -> Array:
         """Return the numbers of all processes as those of second order, a row each."""
@@ -105,8 +116,9 @@ class WindowFit:
         total = noise + S.sum(axis=0)
         if self.extra is not None:
             total += self.extra_density if f is self.cells.frequency else self.extra.psd(f)
-        by_numbers = (S[:, None] * slopes).reshape(-1, len(f))
-        found = total, np.vstack([2.0 * noise, by_numbers[:3], by_corner, by_numbers[3:]]) / total
+        slopes *= (S / total)[:, None]
+        by_numbers = slopes.reshape(-1, len(f))
+        found = total, np.vstack([2.0 * noise / total, by_numbers[:3], by_corner / total, by_numbers[3:]])
         self._last = f, x, found
         return found
 
@@ -159,13 +171,15 @@ class WindowFit:
     def improve(self) -> None:
         """Take Newton steps with the expected second derivatives, damped (Levenberg, Marquardt) where they lead uphill."""
         f, count, mean = self.cells.frequency, self.cells.count, self.cells.mean
+        root = np.sqrt(count)
         reach = np.full(len(self.x), REACH)
         reach[self.first :: 3] = np.minimum(0.5 * self.df / np.exp(self.resonances[:, 0]) * (2.0 * pi), REACH)
         x = self._clip_to_bounds(self.x)
         S, slopes = self.density(x, f)
         value, held = count @ (np.log(S) + mean / S), 0.3
         for _ in range(STEPS):
-            gradient, F = slopes @ (count * (1.0 - mean / S)), (slopes * count) @ slopes.T
+            weighted = slopes * root
+            gradient, F = weighted @ (root * (1.0 - mean / S)), weighted @ weighted.T
             step = np.linalg.solve(F + np.diag(held * np.diag(F) + 1e-2), -gradient)
             trial = self._clip_to_bounds(x + np.clip(step, -reach, reach))
             S_there, slopes_there = self.density(trial, f)

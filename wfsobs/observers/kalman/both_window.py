@@ -25,8 +25,10 @@ from wfsobs.typing import Array
 if TYPE_CHECKING:
     from wfsobs.observers.kalman.adaptive import Adaptive
 
-GROWS = 0.3
-"""Growth of a window to the next identification, over its length."""
+GROWS, LATER = 0.3, 0.16
+"""Growth of a window to the next identification, over its length: at first, and from where its peaks may be twice as many."""
+TWICE = 2
+"""Growth of a window from which on its peaks may be twice as many."""
 STILL = 0.7, 1.4
 """Mean square of the innovations over what the model says, within which a record is still."""
 FEWEST = 20
@@ -65,7 +67,8 @@ def check_window(settings: Adaptive, lengths: Lengths, dt: float) -> None:
 
 def next_length(window: int, lengths: Lengths) -> int:
     """Return the steps from an identification to the next one, if the record is still."""
-    return max(int(GROWS * window) // lengths.interval, 1) * lengths.interval
+    grows = GROWS if window < TWICE * lengths.window else LATER
+    return max(int(grows * window) // lengths.interval, 1) * lengths.interval
 
 
 def window_start(end: int, change: int, lengths: Lengths) -> int:
@@ -117,10 +120,11 @@ def fit_both(z: Array, error: Spectrum, ratio: int, settings: Adaptive, before: 
     share : of z that was measured; the rest is its expectation, without noise
     """
     dt, e = error.dt / ratio, error_process(error, error.dt / ratio)
-    most = settings.peak_count * (2 if len(z) * dt >= 2.0 * settings.window else 1)
+    long = len(z) * dt >= TWICE * settings.window
+    most = settings.peak_count * (2 if long else 1)
     if before is None and e:  # of about the same corner: a guess that needs no search
         before = Spectrum(error.noise, dt, replace(e[0], rms=float(z.std())))
-    spectrum = follow_spectrum(z, dt, most, settings.lowest, before, *e)
+    spectrum = follow_spectrum(z, dt, most, settings.lowest, before, *e, long=long)
     of_lgs = spectrum.noise**2 / ratio
     ngs = max(error.noise * np.sqrt(max(1.0 - of_lgs / error.noise**2, LEAST)), MIN_NOISE)
     spectrum = replace(spectrum, noise=spectrum.noise / np.sqrt(share))
