@@ -132,7 +132,7 @@ def observe(
             failures.append(item)
         else:
             estimates.append(_from(item, round(start / record.dt)))
-    least = record_bounds(scenario, record) if is_simulated else []
+    least = record_bounds(scenario, record, {e.observer for e in estimates}) if is_simulated else []
     source = IDENTIFIED if prior is not None else TRUE if is_simulated else GIVEN
     return collect(scenario, record, estimates, failures, watch, least, start, source)
 

@@ -14,13 +14,16 @@ from wfsobs.campaign.sweep import parse_axis, plan_sweep
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.bound_modes import bound_rms_of_modes
 from wfsobs.evaluation.exact_errors import exact_errors
+from wfsobs.evaluation.scores import BOUND_MODES
 from wfsobs.evaluation.theory import is_predicted
+from wfsobs.evaluation.verdict import verdict
 from wfsobs.execution import run_observer
 from wfsobs.live.checks import observers_on
 from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.coupled import INDEPENDENT, CoupledEstimator, CoupledModel
-from wfsobs.pipeline import observe
+from wfsobs.pipeline import observe, run
 from wfsobs.prior import Flow, Lines
 from wfsobs.priors_from.scenario import prior_of
 from wfsobs.priors_from.selection import has_prior, usual_observers
@@ -63,6 +66,18 @@ def test_the_bound_is_that_of_dense_algebra() -> None:
     assert bound[1] > 0.93 * dense[1]
     alone = [bound_rms(FLOW, mode)["turbulence"] for mode in modes]
     assert (bound < 0.95 * np.array(alone)).all() and bound[0] < 0.6 * alone[0]
+
+
+def test_its_bound_is_a_row_of_its_table_and_of_no_other() -> None:
+    short = SHAKEN.replace({"run.duration": 2.0, "run.warm_up": 1.0})
+    result = run(short, observers=["kf-coupled"])
+    rows = {(s.target, s.mode): s.rms for s in result.scores if s.observer == BOUND_MODES}
+    names = [mode.name for mode in short.modes]
+    bound = bound_rms_of_modes(short)
+    assert rows == {(target, name): one[target] for one, name in zip(bound, names, strict=True) for target in TARGETS}
+    assert not [s for s in run(short, observers=["zero"]).scores if s.observer == BOUND_MODES]
+    said = verdict(short, result.record, result.estimates, result.scores, "turbulence", names[0])
+    assert said is not None and "the bound of the LGS in all modes" in said.sentences()[0]
 
 
 def test_what_it_states_is_near_the_bound_and_below_the_independent_filters() -> None:

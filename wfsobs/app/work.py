@@ -20,7 +20,7 @@ from wfsobs.app.run_results import TRUTH, Array, Key, RunResults, SignalAndError
 from wfsobs.app.sources import Source
 from wfsobs.dependence import Memo, RecordMemo, digest, simulate_once
 from wfsobs.evaluation.error_spectra import spectra
-from wfsobs.evaluation.record_bounds import Bound, record_bounds
+from wfsobs.evaluation.record_bounds import Bound, joint_observers, record_bounds
 from wfsobs.execution import each_estimate
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import SLOW, TARGETS
@@ -113,15 +113,19 @@ class _Work:
                 self.tell(result=shown)
                 self._let_draw()
                 if stage == len(WEIGHTS) and self.bounds is None and self.simulation is not None:
-                    self.bounds = self.memo.put(self._name_of_bounds(record), _Bounds(record_bounds(self.simulation, record)))
+                    self.bounds = self.memo.put(self._name_of_bounds(record), _Bounds(self._bounds_of(record)))
         return self._so_far(record)
+
+    def _bounds_of(self, record: Record) -> list[Bound]:
+        assert self.simulation is not None
+        return record_bounds(self.simulation, record, self.usual)
 
     def _name_of_bounds(self, record: Record) -> str:
         """Name the bounds by what they depend on: the simulation, whatever its seed."""
         assert self.simulation is not None
         settings = record_settings(self.simulation)
         del settings["run"]["seed"]
-        return digest("bounds", settings, record.n_steps, record.n_modes)
+        return digest("bounds", settings, record.n_steps, record.n_modes, joint_observers(self.simulation, self.usual))
 
     def _left(self) -> set[str]:
         """List the observers that have not delivered everything."""

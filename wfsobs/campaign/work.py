@@ -149,7 +149,7 @@ def _observer_rows(record: Record, ready: _Ready, observers: Sequence[str]) -> l
     try:
         items = list(each_estimate(record, ready.scenario, observers=observers))
         if ready.bounds is None:
-            ready.bounds = record_bounds(ready.scenario, record)
+            ready.bounds = record_bounds(ready.scenario, record, {item.observer for item in items if isinstance(item, Estimate)})
         estimates = [item for item in items if isinstance(item, Estimate)]
         failures = [item for item in items if isinstance(item, Failure)]
         result = collect(ready.scenario, record, estimates, failures, least=ready.bounds)

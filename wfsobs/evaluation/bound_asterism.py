@@ -6,8 +6,7 @@ the past, of the LGS and of the NGS frames, beside the states of `kf-asterism`. 
 
 from __future__ import annotations
 
-import numpy as np
-
+from wfsobs.evaluation.bound_both import PeriodicError
 from wfsobs.evaluation.bound_modes import TRUE_MODEL
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import TOTAL
@@ -25,7 +24,7 @@ FINE_FRAMES = running_means([0.0, *(2.0**i for i in range(9))], TURNS)
 """Means over 1 to 256 frames."""
 
 
-def bound_rms_of_asterism(scenario: Scenario, ahead: float = 0.0) -> list[dict[str, float]]:
+def least_errors_of_asterism(scenario: Scenario, ahead: float = 0.0) -> list[dict[str, PeriodicError]]:
     """Return the minimum error of phi[k + ahead] from all modes of every LGS and all NGS frames up to step k.
 
     Parameters
@@ -38,7 +37,7 @@ def bound_rms_of_asterism(scenario: Scenario, ahead: float = 0.0) -> list[dict[s
     Returns
     -------
     list of dict
-        Per mode: target -> rms over all steps [um]; TOTAL is that of both together.
+        Per mode: target -> error; TOTAL is that of both together.
 
     Raises
     ------
@@ -48,5 +47,10 @@ def bound_rms_of_asterism(scenario: Scenario, ahead: float = 0.0) -> list[dict[s
     told = scenario.replace({**TRUE_MODEL, "multipeak.line_width": line_width(scenario)})
     prior = prior_of(told, None, (Lines, Asterism))
     model = AsterismModel(prior, told.multipeak, scenario.sensors.exposure_ratio, FINE, FINE_FRAMES)
-    found = {target: np.sqrt(np.mean(model.plan(ahead, target)[1][:-1] ** 2, axis=0)) for target in (*TARGETS, TOTAL)}
-    return [{target: float(sd[mode]) for target, sd in found.items()} for mode in range(len(scenario.modes))]
+    found = {target: model.plan(ahead, target)[1][:-1] ** 2 for target in (*TARGETS, TOTAL)}
+    return [{target: PeriodicError(of[:, mode]) for target, of in found.items()} for mode in range(len(scenario.modes))]
+
+
+def bound_rms_of_asterism(scenario: Scenario, ahead: float = 0.0) -> list[dict[str, float]]:
+    """Return target -> rms over all steps [um] of each mode, of `least_errors_of_asterism`."""
+    return [{target: error.rms for target, error in of_mode.items()} for of_mode in least_errors_of_asterism(scenario, ahead)]

@@ -9,6 +9,7 @@ preset `higher-orders` by 0.1 % at most.
 
 from __future__ import annotations
 
+from wfsobs.evaluation.bound_both import PeriodicError
 from wfsobs.observers.base import TARGETS
 from wfsobs.observers.estimates import TOTAL
 from wfsobs.observers.kalman.coupled import CoupledModel
@@ -25,7 +26,7 @@ FINE = running_means([0.0, *(1.6**i for i in range(20))], turns=(0.0, 2.0, 4.0, 
 TRUE_MODEL = {"kalman.process_noise": "matched", "kalman.measurement_noise": "matched"}
 
 
-def bound_rms_of_modes(scenario: Scenario, ahead: float = 0.0) -> list[dict[str, float]]:
+def least_errors_of_modes(scenario: Scenario, ahead: float = 0.0) -> list[dict[str, PeriodicError]]:
     """Return the minimum error of phi[k + ahead] from all modes of z[k], z[k-1], ....
 
     Parameters
@@ -38,7 +39,7 @@ def bound_rms_of_modes(scenario: Scenario, ahead: float = 0.0) -> list[dict[str,
     Returns
     -------
     list of dict
-        Per mode: target -> rms [um]; TOTAL is that of both together.
+        Per mode: target -> error, the same at all steps; TOTAL is that of both together.
 
     Raises
     ------
@@ -50,4 +51,10 @@ def bound_rms_of_modes(scenario: Scenario, ahead: float = 0.0) -> list[dict[str,
     told = scenario.replace({**TRUE_MODEL, "multipeak.line_width": line_width(scenario)})
     model = CoupledModel(prior_of(told, None, (Lines, Flow)), told.multipeak, FINE)
     found = {target: model.plan(ahead, target)[1] for target in (*TARGETS, TOTAL)}
-    return [{target: float(sd[mode]) for target, sd in found.items()} for mode in range(len(scenario.modes))]
+    modes = range(len(scenario.modes))
+    return [{target: PeriodicError(sd[mode : mode + 1] ** 2) for target, sd in found.items()} for mode in modes]
+
+
+def bound_rms_of_modes(scenario: Scenario, ahead: float = 0.0) -> list[dict[str, float]]:
+    """Return target -> rms [um] of each mode, of `least_errors_of_modes`."""
+    return [{target: error.rms for target, error in of_mode.items()} for of_mode in least_errors_of_modes(scenario, ahead)]

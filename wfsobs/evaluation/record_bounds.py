@@ -1,17 +1,25 @@
-"""The bounds of a simulated record as rows of its table: of the LGS alone, of LGS and NGS, and of every star apart."""
+"""The bounds of a simulated record as rows of its table: of the LGS alone, of LGS and NGS, of every star apart.
+
+Those of all modes together take a second and more. They are computed where an observer that they are for is in the table.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from types import MappingProxyType
 
 from wfsobs.evaluation.bound import LeastError, least_errors
+from wfsobs.evaluation.bound_asterism import least_errors_of_asterism
 from wfsobs.evaluation.bound_both import PeriodicError, least_errors_of_both
+from wfsobs.evaluation.bound_modes import least_errors_of_modes
 from wfsobs.evaluation.bound_stars import least_errors_of_stars
-from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUND_STARS, Score
+from wfsobs.evaluation.scores import BOUND, BOUND_ASTERISM, BOUND_BOTH, BOUND_MODES, BOUND_STARS, Score
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
+from wfsobs.priors_from.selection import has_prior
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import rms
@@ -19,6 +27,11 @@ from wfsobs.simulation.star_spectra import star_spectra, stars_differ
 from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
 
 Errors = dict[str, LeastError] | dict[str, PeriodicError]
+
+JOINT: Mapping[str, tuple[str, Callable[[Scenario], list[dict[str, PeriodicError]]]]] = MappingProxyType(
+    {"kf-coupled": (BOUND_MODES, least_errors_of_modes), "kf-asterism": (BOUND_ASTERISM, least_errors_of_asterism)}
+)
+"""Observer of all modes together -> row of its bound, and how to compute it."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +41,7 @@ class Bound:
     Attributes
     ----------
     row : str
-        BOUND, BOUND_BOTH or BOUND_STARS.
+        One of BOUNDS.
     target, mode : str
         Whose.
     column : int
@@ -44,17 +57,34 @@ class Bound:
     error: LeastError | PeriodicError
 
 
-def record_bounds(scenario: Scenario, record: Record) -> list[Bound]:
-    """Compute the bounds of a record that was simulated from the scenario; none where its spectra are not known."""
+def record_bounds(scenario: Scenario, record: Record, observers: Collection[str] = ()) -> list[Bound]:
+    """Compute the bounds of a record that was simulated from the scenario; none where its spectra are not known.
+
+    observers : ids of those in the table, with what they estimated; where one is of JOINT, its bound is computed, too
+    """
     if not has_known_spectra(scenario):
         return []
-    found = _least_of_modes(scenario.replace({"run.seed": 0}), record.n_modes, record.n_steps)
+    plain = scenario.replace({"run.seed": 0})
+    found = [dict(of_mode) for of_mode in _least_of_modes(plain, record.n_modes, record.n_steps)]
+    for observer in joint_observers(scenario, observers):
+        for of_mode, errors in zip(found, _least_together(plain, observer), strict=True):
+            of_mode[JOINT[observer][0]] = errors
     return [
         Bound(row, target, it.name, i, errors[target])
         for i, it in enumerate(scenario.modes[: record.n_modes])
         for row, errors in found[i].items()
         for target in TARGETS
     ]
+
+
+def joint_observers(scenario: Scenario, observers: Collection[str]) -> list[str]:
+    """Return those of JOINT among observers that a scenario has something for."""
+    return [name for name in JOINT if name in observers and has_prior(OBSERVERS[name], scenario)]
+
+
+@lru_cache(maxsize=4)
+def _least_together(scenario: Scenario, observer: str) -> list[dict[str, PeriodicError]]:
+    return JOINT[observer][1](scenario)
 
 
 @lru_cache(maxsize=4)  # no seed changes them, and they take longer than most observers
@@ -96,7 +126,7 @@ def bound_scores(bounds: Sequence[Bound], record: Record, scores: Sequence[Score
                     first * record.dt,
                     last * record.dt,
                     interval=it.error.interval(first, last) if isinstance(it.error, LeastError) else None,
-                    phases=it.error.phases if isinstance(it.error, PeriodicError) else None,
+                    phases=it.error.phases if isinstance(it.error, PeriodicError) and it.error.variance.size > 1 else None,
                 )
             )
     return out

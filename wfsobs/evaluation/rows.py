@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from wfsobs.evaluation.scores import BOUND, BOUND_BOTH, BOUND_STARS, BOUNDS, LOOP, Score
+from wfsobs.evaluation.scores import BOUND, BOUND_ASTERISM, BOUND_BOTH, BOUND_MODES, BOUND_STARS, BOUNDS, LOOP, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import SPECTRA
 from wfsobs.prior import TRUE, PriorSource
@@ -20,6 +20,8 @@ NOT_OBSERVERS = {
     BOUND: "Bound, mean of the LGS",
     BOUND_BOTH: "Bound, LGS and NGS",
     BOUND_STARS: "Bound, every LGS apart, and NGS",
+    BOUND_MODES: "Bound, mean of the LGS in all modes",
+    BOUND_ASTERISM: "Bound, every LGS in all modes, and NGS",
 }
 """Labels of rows in a table of observers that are not observers."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
 from typing import TYPE_CHECKING
@@ -14,7 +14,7 @@ from wfsobs.evaluation.budget import Budget, error_budget
 from wfsobs.evaluation.evidence import LEVEL, Evidence, differ_in_pairs, rank_observers
 from wfsobs.evaluation.known_lines import given_lines, is_near
 from wfsobs.evaluation.rows import NO_ESTIMATE, can_be_best
-from wfsobs.evaluation.scores import BOUND_BOTH, Score
+from wfsobs.evaluation.scores import BOUNDS, Score
 from wfsobs.evaluation.verdict_words import best_sentence, harm_sentences
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.estimates import Estimate
@@ -55,7 +55,7 @@ class Verdict:
 
     best  : the score with the least error of those that can be compared
     ties  : observers whose error is larger, but not significantly so on this record
-    bound : the least error possible with LGS and NGS [um], None where it is not known
+    bounds : row -> the least error possible [um], of the rows of the table
     lines : how many lines the vibration has
     harms : observers that are worse than no estimate, the worst first
     seeds : over how many records of the scenario, whose mean error is that of `best`
@@ -63,7 +63,7 @@ class Verdict:
 
     best: Score
     ties: tuple[str, ...]
-    bound: float | None
+    bounds: Mapping[str, float]
     lines: int
     harms: tuple[Harm, ...]
     seeds: int = 1
@@ -107,7 +107,7 @@ def verdict(
     found = Verdict(
         first,
         tuple(s.observer for s in ranked[1:] if not differs(errors[first.observer], errors[s.observer])),
-        next((s.rms for s in of if s.observer == BOUND_BOTH), None),
+        {s.observer: s.rms for s in of if s.observer in BOUNDS},
         len(lines),
         tuple(
             Harm(

@@ -9,6 +9,7 @@ import numpy as np
 
 from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE
 from wfsobs.evaluation.rows import row_label
+from wfsobs.evaluation.scores import BOUND_ASTERISM, BOUND_BOTH, BOUND_MODES
 from wfsobs.observers import OBSERVERS
 from wfsobs.prior import Bands, Lines, Model, Part, Training
 
@@ -23,6 +24,12 @@ TOLD: tuple[tuple[Part, str], ...] = (
 )
 """What is said of an observer by the first part of its prior that is found here."""
 
+OF_BOTH = "LGS and NGS"
+OF_MODES = {
+    "kf-coupled": (BOUND_MODES, "the LGS in all modes"),
+    "kf-asterism": (BOUND_ASTERISM, "every LGS in all modes, and NGS"),
+}
+"""Observers of all modes together: the row of their own bound, and what has it."""
 
 CAUSES = {
     NOISE: "noise of the sensors",
@@ -55,10 +62,12 @@ def best_sentence(it: Verdict, scale: float, unit: str) -> str:
 
 def _to_bound(it: Verdict) -> str:
     """Say how far the best error is from the least possible. It is a mean over records, so that one may lie below."""
-    if not it.bound:
+    own, words = OF_MODES.get(it.best.observer, (BOUND_BOTH, OF_BOTH))
+    bound = it.bounds.get(own, 0.0)
+    if not bound:
         return ""
-    percent = round(100.0 * (it.best.rms / it.bound - 1.0))
-    return f", {'at' if percent == 0 else f'{abs(percent)} % ' + ('above' if percent > 0 else 'below')} the bound of LGS and NGS"
+    percent = round(100.0 * (it.best.rms / bound - 1.0))
+    return f", {'at' if percent == 0 else f'{abs(percent)} % ' + ('above' if percent > 0 else 'below')} the bound of {words}"
 
 
 def harm_sentences(it: Verdict) -> list[str]:

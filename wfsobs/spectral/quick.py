@@ -31,7 +31,8 @@ TRACKED = 0.1
 """Minimum half width of a peak that is tracked, in bins: undamped lines become sharper as the window grows."""
 BLUR = 0.05
 """Half width that a window adds to a peak, in bins. The autocovariance that a periodogram shows falls by 1 / window per lag, too:
-an undamped line would be 1 / (2 pi) bins wide. Less than that is taken off: a frequency that is not well known takes some width."""
+an undamped line would be 1 / (2 pi) bins wide. Less than that is taken off: a frequency that is not well known takes some width.
+"""
 COARSE, COARSER = (50, 4), (20, 3)
 """As FINE and NEAR of `periodogram`, for windows that grow and for those that have grown long: their cells hold many bins."""
 LEFT = 0.02
@@ -100,7 +101,14 @@ def quick_spectrum_of_samples(z: Array, dt: float, most: int, lowest: float, bef
 
 
 def follow_spectrum(
-    z: Array, dt: float, most: int, lowest: float, before: Spectrum | None, extra: Ar2 | Ar3 | None = None, *, long: bool = False
+    z: Array,
+    dt: float,
+    most: int,
+    lowest: float,
+    before: Spectrum | None,
+    extra: Ar2 | Ar3 | None = None,
+    *,
+    long: bool = False,
 ) -> Spectrum:
     """Fit noise, turbulence and up to `most` peaks to a window that begins as the one before it did, or thereabouts.
 

@@ -29,7 +29,7 @@ from wfsobs.evaluation.rows import (
     score_rows,
     scored_interval,
 )
-from wfsobs.evaluation.scores import BOUND_STARS, BOUNDS, LOOP, RESIDUAL, Score
+from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, RESIDUAL, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.selection import is_usual
@@ -114,8 +114,9 @@ class Table:
             for name in (*observers_of(target, with_hidden=True), *BOUNDS)
             if not shown or name in BOUNDS or is_usual(OBSERVERS[name], shown.result.scenario, shown.result.record)
         }
-        if not scores[BOUND_STARS]:  # only where stars differ
-            del scores[BOUND_STARS]
+        for name in set(BOUNDS).difference(COMMON_BOUNDS):  # only where stars differ, or modes are coupled
+            if not scores[name]:
+                del scores[name]
         marks = self._marks(target, scores)
         order = list(scores.items())
         if self.display.best_first:
