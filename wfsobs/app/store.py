@@ -51,7 +51,7 @@ class Store(param.Parameterized):
         self._refusals: dict[str, Any] = {}
         self._past: list[Step] = []
         self._future: list[Step] = []
-        self.run = BackgroundTask(session)
+        self.run = BackgroundTask(session, drawn_first=True)
         self.rests = False
         """Whether runs wait until a page needs one."""
         self.run.param.watch(self._compare, "result")

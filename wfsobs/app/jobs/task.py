@@ -21,8 +21,8 @@ class BackgroundTask(param.Parameterized):
     """The state of one job of a session.
 
     Starting another supersedes the one before: it is left, and nothing of it lands any more, however late it comes.
-    What is told of a job is gathered and lands in one `param.update` on the session's thread; that it is done a moment after its
-    result, which is drawn meanwhile.
+    What is told of a job is gathered and lands in one `param.update` on the session's thread; if its result is to be `drawn_first`,
+    that it is done lands a moment later.
     """
 
     state = param.Selector(default=IDLE, objects=[IDLE, RUNNING, DONE, CANCELLED, FAILED])
@@ -32,9 +32,9 @@ class BackgroundTask(param.Parameterized):
     latest = param.Parameter(None, doc="What the work has told of itself so far.")
     result = param.Parameter(None, doc="The latest result, in parts where it comes in parts.")
 
-    def __init__(self, session: Session):
+    def __init__(self, session: Session, drawn_first: bool = False):
         super().__init__()
-        self.session = session
+        self.session, self._drawn_first = session, drawn_first
         session.tasks.append(self)
         self._lock = threading.Lock()
         self._generation = 0
@@ -89,7 +89,7 @@ class BackgroundTask(param.Parameterized):
     def _land(self) -> None:
         with self._lock:
             news, self._news, self._is_posted = self._news, {}, False
-            if news.get("state") == DONE and "result" in news:
+            if self._drawn_first and news.get("state") == DONE and "result" in news:
                 self._news, self._is_posted = {"state": news.pop("state")}, True
             again = self._is_posted
         if news:
