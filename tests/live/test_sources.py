@@ -1,9 +1,13 @@
 """Sources of a live loop beside the simulation: a record, and a stream of another program."""
 
+import itertools
+import json
 import queue
+import threading
 
 import numpy as np
 import pytest
+import zmq
 
 import wfsobs
 from wfsobs.live.attached import StreamFrames, StreamSource
@@ -99,6 +103,51 @@ def test_a_stream_is_followed_through_whatever_happens_to_it(stream):
     frames.take()
     assert ring.count == 7 and lines() == [(6, "frames again")]
     np.testing.assert_array_equal(image._values, np.arange(4.0))  # nothing is written to it
+
+
+def test_a_stream_by_network_is_followed_and_its_next_program_too():
+    """Frame k holds (k, 0, -k): rows follow each other by one, frames missing as NaN, and a counter that begins anew is told."""
+    socket = zmq.Context().socket(zmq.PUB)
+    port, is_over, counters = socket.bind_to_random_port("tcp://127.0.0.1"), threading.Event(), [itertools.count(10**6)]
+    ring, news = Ring(2), queue.Queue()
+    source = StreamSource(f"tcp://127.0.0.1:{port}", (2, 0), 1.0, 1e-3)
+
+    def publish():
+        while not is_over.wait(1e-3):
+            k = next(counters[0])
+            header = {"frame": k, "dtype": "float64", "n": 3}
+            socket.send_multipart([json.dumps(header).encode(), np.array([k, 0.0, -k]).tobytes()])
+
+    publisher = threading.Thread(target=publish)
+    publisher.start()
+    inbox = Inbox()
+    frames = StreamFrames(source, Desk(ring.name, 2, inbox, news, 1.0, None))
+    inbox.waiting.append({"play": True})
+    while frames._stream is None:
+        frames._look()
+    frames._follow_commands()
+
+    def take_until(n_rows):
+        while ring.count < n_rows:
+            if frames._stream.wait(frames._count, 1.0):
+                frames.take()
+
+    take_until(100)
+    k = ring.read_frames(0, 100).z[:, 1]
+    known = np.flatnonzero(~np.isnan(k))
+    np.testing.assert_array_equal(np.diff(k[known]), np.diff(known))
+    assert len(known) > 10 and k[known[0]] > 10**6 and news.empty()
+    np.testing.assert_array_equal(ring.read_frames(0, 100).z[:, 0], -k)
+    counters[0] = itertools.count(1)  # a program that starts anew
+    while news.empty():
+        take_until(ring.count + 1)
+    assert news.get()[1] == f"{source.path}: the counter has jumped" and news.empty()
+    is_over.set()
+    publisher.join()
+    frames._stream.close()
+    socket.context.destroy(linger=0)
+    frames._ring.release()
+    ring.release()
 
 
 @pytest.mark.parametrize(("lag", "jitter"), [(0, 0), (0, 1), (2, 1)])

@@ -33,6 +33,7 @@ from wfsobs.live.simulated import SimulatedLoop
 from wfsobs.live.source import LiveSource
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.settings.group import SettingError
+from wfsobs.streams.network import is_address
 from wfsobs.streams.shared_image import stream_path
 from wfsobs.telemetry.intake import DeclaredFormat
 from wfsobs.telemetry.records import save_record
@@ -42,7 +43,12 @@ from wfsobs.units import micrometres_per
 @click.command()
 @scenario_options
 @click.option("--replay", "replay_file", metavar="RECORD", help="Frames of a record, once: .npz, .csv, .fits or AOT.")
-@click.option("--in", "stream", metavar="STREAM", help="Frames of a running loop, in shadow (docs/streams.md).")
+@click.option(
+    "--in",
+    "stream",
+    metavar="STREAM",
+    help="Frames of a running loop, in shadow; or tcp://host:port (docs/streams.md).",
+)
 @click.option("--modes", metavar="I,J,...", help="Elements of a frame of the stream, from 0, that are its modes.")
 @ngs_options
 @record_options
@@ -151,7 +157,7 @@ def _source(
     if not stream:
         return SimulatedLoop(scenario)
     elements = stream_elements(modes, len(scenario.modes))
-    path = str(stream_path(stream))
+    path = stream if is_address(stream) else str(stream_path(stream))
     unit = micrometres_per(declaration.unit or "um", scenario.telescope.diameter)
     return StreamSource(path, elements, unit, scenario.dt)
 
@@ -160,6 +166,8 @@ def _with_ngs(source: LiveSource, scenario: Scenario, ngs: str, modes: str | Non
     """Return a stream with that of an NGS. Raises SettingError where the source is none."""
     if not isinstance(source, StreamSource):
         raise SettingError("live: --ngs is a stream beside that of --in")
+    if is_address(source.path) or is_address(ngs):
+        raise SettingError("live: --ngs: both sensors are read from shared memory alone")
     wiring = ngs_wiring(scenario, len(source.elements), modes, unit, lag)
     return replace(source, ngs_path=str(stream_path(ngs)), ngs=wiring)
 

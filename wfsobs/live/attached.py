@@ -1,4 +1,4 @@
-"""A stream of a running loop as a source: its frames when they come; nothing is written to it."""
+"""A stream of a running loop as a source, in shared memory or by ZeroMQ: its frames when they come; nothing is written to it."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from wfsobs.live.source import STREAM
 from wfsobs.record import Sampling
 from wfsobs.streams.attach import LONGEST_GAP
 from wfsobs.streams.layout import StreamError
+from wfsobs.streams.network import Subscription, is_address
 from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage
 from wfsobs.streams.wiring import STUCK, NgsWiring
@@ -34,7 +35,7 @@ class StreamSource:
     Attributes
     ----------
     path : str
-        File of the stream.
+        File of the stream, or its address, such as tcp://host:5555.
     elements : tuple of int
         Number in a frame of each mode.
     unit : float
@@ -89,7 +90,7 @@ class StreamFrames:
         self._nothing = np.full(desk.n_modes, np.nan)
         self._row = np.full(1 + 5 * desk.n_modes, np.nan)
         self._row[1 + 2 * desk.n_modes : 1 + 3 * desk.n_modes] = 0.0  # of commands nothing is known: z is all there is
-        self._stream: SharedImage | None = None
+        self._stream: SharedImage | Subscription | None = None
         self._pairs: PairedFrames | None = None
         self._count, self._alive, self._steps = 0, monotonic(), 0
         self._is_playing = self._is_stuck = self._is_garbage = False
@@ -162,13 +163,13 @@ class StreamFrames:
             was_playing = self._is_playing
             self._is_playing = command.get("play", self._is_playing)
             self._steps += command.get("step", 0)
-            if self._is_playing and not was_playing and self._stream is not None:
+            if self._is_playing and not was_playing and isinstance(self._stream, SharedImage):
                 self._count = self._stream.count  # what came meanwhile is not missing
 
     def _look(self) -> None:
         """Open the stream; say once why it cannot be opened."""
         try:
-            stream = SharedImage(self._source.path)
+            stream = self._open()
             if max(self._source.elements) >= stream.n:
                 raise StreamError(f"a frame has {stream.n} numbers, mode {max(self._source.elements)} is not among them")
             if self._source.ngs is not None and self._pairs is None:
@@ -176,11 +177,18 @@ class StreamFrames:
         except StreamError as error:
             if not self._is_stuck:
                 self._is_stuck = True
-                self._say(str(error))
+                self._say(str(error).removeprefix(f"{self._source.path}: "))
             sleep(RETRY)
             return
         self._stream, self._count = stream, stream.count
         self._begin_at()
+
+    def _open(self) -> SharedImage | Subscription:
+        """Open the stream. Raises StreamError."""
+        path = self._source.path
+        if not is_address(path):
+            return SharedImage(path)
+        return Subscription(path, lambda line: self._desk.say(self._ring.count, line), patience=RETRY)
 
     def _pair(self, wiring: NgsWiring) -> PairedFrames:
         """Open the stream of the NGS. Raises StreamError."""
