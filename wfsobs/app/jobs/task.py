@@ -21,8 +21,8 @@ class BackgroundTask(param.Parameterized):
     """The state of one job of a session.
 
     Starting another supersedes the one before: it is left, and nothing of it lands any more, however late it comes.
-    What is told of a job is gathered and lands in one `param.update` on the session's thread; if its result is to be `drawn_first`,
-    that it is done lands a moment later.
+    What is told of a job is gathered and lands in one `param.update` on the session's thread. Where its result is to be
+    `drawn_first`, that it is done lands a moment later.
     """
 
     state = param.Selector(default=IDLE, objects=[IDLE, RUNNING, DONE, CANCELLED, FAILED])
