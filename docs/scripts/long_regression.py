@@ -27,12 +27,13 @@ def main() -> None:
     scenario = PRESETS["paper"]().replace({"run.duration": duration, "loop.closed": False, "vibration.synthesis": "gaussian"})
     record, n = simulate(scenario), scenario.sensors.exposure_ratio
     assert record.y_ngs is not None and record.turbulence is not None and record.vibration is not None
+    frames = record.y_ngs
     at = np.arange((max(TAPS, FRAMES * n) // n + 1) * n, record.n_steps - n, n) + PHASE
     taught, width = round(LEARNT * len(at)), TAPS + FRAMES
     truth = np.column_stack([record.turbulence[:, 0], record.vibration[:, 0]])
 
     def inputs(k: np.ndarray) -> np.ndarray:
-        z, ngs = record.z[k[:, None] - np.arange(TAPS), 0], record.y_ngs[(k - PHASE)[:, None] - n * np.arange(FRAMES), 0]
+        z, ngs = record.z[k[:, None] - np.arange(TAPS), 0], frames[(k - PHASE)[:, None] - n * np.arange(FRAMES), 0]
         return np.hstack([z, ngs])
 
     gram, cross = np.zeros((width, width)), np.zeros((width, 2))
