@@ -7,7 +7,7 @@ from math import isnan
 from time import sleep
 from typing import Any
 
-from wfsobs.live.board import Counts
+from wfsobs.live.board import NEXT, Counts
 from wfsobs.live.checks import observers_on
 from wfsobs.live.loop import TICK, LiveLoop
 from wfsobs.live.ring import LiveFrame
@@ -58,7 +58,8 @@ def follow(
     dict
         "frames" that every observer has taken, "lost", "late_share" (an estimate came more than 1 ms after they were due),
         "late_share_sent" (the source sent them more than 1 ms after that) and "observers": id -> latency "p50_us", "p99_9_us",
-        frames "late" (longer than a frame), "rms_nm" over all targets and modes, "errors_nm" by target and mode.
+        frames "late" (longer than a frame), "rms_nm" over all targets and modes, "errors_nm" by target and mode,
+        "next_nm" of the next measurement by mode, which needs no truth.
 
     Raises
     ------
@@ -96,6 +97,7 @@ def _row(counts: Counts, targets: Sequence[str], modes: Sequence[str]) -> dict[s
         "late": int(counts.late[0]),
         "rms_nm": _nanometres(counts.total_rms(targets)),
         "errors_nm": errors,
+        "next_nm": dict(zip(modes, map(_nanometres, counts.rms(NEXT)), strict=True)),
     }
 
 
