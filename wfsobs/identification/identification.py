@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import gamma
 
+from wfsobs.identification.both_sensors import read_difference, sensor_differences
 from wfsobs.identification.one_mode import OneMode
 from wfsobs.identification.remarks import in_time, remarks
 from wfsobs.identification.result import Identification, read_mode
@@ -43,6 +44,7 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     """Identify the model of every mode of a record, from its pseudo-open-loop measurement z.
 
     White noise, turbulence and vibration peaks, each number with its standard deviation; missing samples are accounted for.
+    With enough NGS frames the noise of the NGS and the slow error of the LGS as well.
 
     Parameters
     ----------
@@ -98,6 +100,11 @@ def identify(record: Record, *, level: float = LEVEL, lowest: float = LOWEST, wa
     found = tuple(
         read_mode(name, mode, lowest, check_whiteness(mode, count)) for name, mode, count in zip(names, modes, left, strict=False)
     )
+    if (differences := sensor_differences(record)) is not None and record.ratio is not None:
+        found = tuple(
+            replace(mode, difference=read_difference(column, record.dt, record.ratio, mode.noise))
+            for mode, column in zip(found, differences.T, strict=True)
+        )
     watch.step(1.0)
     return Identification(found, record.dt, len(z), level)
 

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot, isnan, log, nan, sqrt
+from math import hypot, isnan, log, nan, pi, sqrt
 from typing import NamedTuple
+
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3
+from wfsobs.spectral.model import HIGHEST
+from wfsobs.spectral.whittle import NO_NEARER
+from wfsobs.typing import Array
 
 
 class Number(NamedTuple):
@@ -70,6 +76,27 @@ def mean(numbers: list[Number]) -> Number:
         return Number(sum(n.value for n in numbers) / len(numbers), nan)
     weights = [1.0 / max(n.std, 1e-9 * abs(n.value), 1e-300) ** 2 for n in sure]
     return Number(sum(w * n.value for w, n in zip(weights, sure, strict=True)) / sum(weights), 1.0 / sqrt(sum(weights)))
+
+
+def read_process(p: Ar2 | Ar3, std: Array) -> IdentifiedProcess:
+    """Return a process with the standard deviations of its numbers.
+
+    Those of frequency, rms and third corner are relative, the first of std. A damping at its bound has none.
+    """
+    at_bound = p.damping > HIGHEST - 1e-4
+    beyond = p.corner / p.omega - 1.0 if isinstance(p, Ar3) else 0.0
+    third = Number(1.0 + beyond, max(beyond, NO_NEARER - 1.0) * float(std[3])) if isinstance(p, Ar3) else None
+    return IdentifiedProcess(
+        with_reliable_std(scaled(Number(1.0, float(std[0])), p.omega / (2 * pi))),
+        with_reliable_std(Number(p.damping, nan if at_bound else float(std[1]))),
+        with_reliable_std(scaled(Number(1.0, float(std[2])), p.rms)),
+        third and with_reliable_std(third),
+    )
+
+
+def scaled(n: Number, factor: float) -> Number:
+    """Return a number times a factor."""
+    return Number(n.value * factor, n.std * factor)
 
 
 def merge_peaks(modes: list[tuple[IdentifiedProcess, ...]]) -> list[IdentifiedPeak]:

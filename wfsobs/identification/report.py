@@ -38,6 +38,8 @@ def identification_dict(result: Identification) -> dict[str, Any]:
                 **numbers(noise=m.noise),
                 "turbulence": None if m.turbulence is None else of(m.turbulence),
                 "background": None if m.background is None else of(m.background),
+                "ngs_noise": None if m.difference is None else numbers(rms=m.difference.noise),
+                "lgs_error": None if m.difference is None or m.difference.error is None else of(m.difference.error),
                 "broad": [of(p) for p in m.broad],
                 "peaks": [{**of(p), "pure": p.pure} for p in m.peaks],
                 "whiteness": {
@@ -62,6 +64,10 @@ def mode_rows(mode: IdentifiedMode) -> list[Row]:
             out.append(("its third corner", Number(*(x * t.frequency.value for x in third)), None, None))
     if (b := mode.background) is not None:
         out.append(("background, up to", b.frequency, None, b.rms))
+    if (d := mode.difference) is not None:
+        out.append(("white noise of an NGS frame", None, None, d.noise))
+        if (e := d.error) is not None:
+            out.append(("slow error of the LGS", e.frequency, e.damping, e.rms))
     out += [("broad, of the continuum", p.frequency, p.damping, p.rms) for p in mode.broad]
     return out + [("line" if p.pure else "resonance", p.frequency, p.damping, p.rms) for p in mode.peaks]
 

@@ -8,20 +8,27 @@ from typing import Any
 
 import numpy as np
 
+from wfsobs.identification.both_sensors import SensorDifference, error_of_a_star, without_error
 from wfsobs.identification.continuum import is_continuum
 from wfsobs.identification.one_mode import OneMode
-from wfsobs.identification.process import IdentifiedPeak, IdentifiedProcess, Number, mean, merge_peaks, with_reliable_std
+from wfsobs.identification.process import (
+    IdentifiedPeak,
+    IdentifiedProcess,
+    Number,
+    mean,
+    merge_peaks,
+    read_process,
+    scaled,
+    with_reliable_std,
+)
 from wfsobs.identification.settings import band_settings, model_settings
 from wfsobs.identification.whiteness import Whiteness
 from wfsobs.prior import Line, Lines
 from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
-from wfsobs.signal.ar3 import Ar3
-from wfsobs.simulation.layers import relative_rms
-from wfsobs.spectral.model import HIGHEST, Spectrum
-from wfsobs.spectral.whittle import NO_NEARER
-from wfsobs.typing import Array
+from wfsobs.simulation.layers import relative_cone_error, relative_rms
+from wfsobs.spectral.model import Spectrum
 
 SLOWEST = 10.0
 """Minimum periods of turbulence in a record for a standard deviation of its corner: a slower one is not resolved."""
@@ -53,6 +60,8 @@ class IdentifiedMode:
         What an observer receives of the mode.
     whiteness : Whiteness
         Tests of the residual.
+    difference : SensorDifference or None
+        What the NGS tells beside z, of a record with enough NGS frames.
     """
 
     name: str
@@ -64,6 +73,17 @@ class IdentifiedMode:
     spectrum: Spectrum
     prior: Lines
     whiteness: Whiteness
+    difference: SensorDifference | None = None
+
+    @property
+    def lgs_error(self) -> Ar2 | None:
+        """Slow error of the LGS as an observer receives it, if it is known."""
+        return None if self.difference is None else self.difference.process
+
+    @property
+    def target(self) -> Lines:
+        """`prior` without what the LGS alone see, as far as it is known."""
+        return replace(self.prior, turbulence=without_error(self.prior.turbulence, self.lgs_error))
 
 
 @dataclass(frozen=True)
@@ -131,15 +151,15 @@ class Identification:
         out = (base or Scenario()).before_events.replace(
             {"telescope.radial_order": _order(len(self.modes)), "sensors.lgs_rate": 1.0 / self.dt}
         )
-        changes: dict[str, Any] = {path: number.value for path, number in self.shared_settings(out).items()}
+        changes: dict[str, Any] = {"sensors.lgs_low_frequency_rms": 0.0}
+        changes |= {path: number.value for path, number in self.shared_settings(out).items()}
         return out.replace(
             changes
             | band_settings(out, 0.5 / self.dt)
-            | model_settings([mode.prior for mode in self.modes], out)
+            | model_settings([mode.target for mode in self.modes], out)
             | {
                 "sensors.noise_from": "nm",
                 "sensors.lgs_combination": "mean",
-                "sensors.lgs_low_frequency_rms": 0.0,
                 "sensors.tip_tilt_indetermination": False,
                 "kalman.process_noise": "matched",
                 "kalman.measurement_noise": "matched",
@@ -150,18 +170,24 @@ class Identification:
     def shared_settings(self, scenario: Scenario) -> dict[str, Number]:
         """Return dotted path -> number of the settings that all modes share, within the limits of the settings."""
         modes = [*zip(self.modes, scenario.modes, strict=False)]
-        noises = [_scale(m.noise, sqrt(scenario.sensors.lgs_count)) for m in self.modes]
+        noises = [scaled(m.noise, sqrt(scenario.sensors.lgs_count)) for m in self.modes]
         out = {"sensors.lgs_noise": _within(mean(noises), 0.0, 10.0)}
         seen = [(i, m.turbulence, mode.radial_order) for i, (m, mode) in enumerate(modes) if m.turbulence]
         if seen:
             corner = [2 * pi / turbulence_corner(1.0, scenario.telescope.diameter, order) for _, _, order in seen]
-            winds = [_scale(t.frequency, per) for (_, t, _), per in zip(seen, corner, strict=True)]
+            winds = [scaled(t.frequency, per) for (_, t, _), per in zip(seen, corner, strict=True)]
             out["turbulence.wind_speed"] = _within(mean(winds), 0.1, 100.0)
             out["turbulence.damping"] = _within(mean([t.damping for _, t, _ in seen]), 0.01, 1.0)
-            strengths = [_scale(t.rms, 1.0 / relative_rms(scenario, i)) for i, t, _ in seen]
+            strengths = [scaled(t.rms, 1.0 / relative_rms(scenario, i)) for i, t, _ in seen]
             if thirds := [t.third_corner for _, t, _ in seen if t.third_corner]:
                 out["turbulence.third_corner"] = _within(mean(thirds), 1.0, 1000.0)
             out["turbulence.rms"] = _within(mean(strengths), 0.0, LARGEST)
+        differences = [m.difference for m in self.modes if m.difference is not None]
+        if differences:
+            slow = [error_of_a_star(d, scenario.sensors.lgs_count) for d in differences]
+            slow = [scaled(e, 1.0 / relative_cone_error(scenario, i)) for i, e in enumerate(slow)]
+            out["sensors.lgs_low_frequency_rms"] = _within(mean(slow), 0.0, 10.0)
+            out["sensors.ngs_noise"] = _within(mean([d.noise for d in differences]), 0.0, 10.0)
         return out
 
 
@@ -171,8 +197,8 @@ def read_mode(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> 
     A resonance of the continuum is not a peak; an observer receives it as turbulence. lowest : minimum frequency of peaks [Hz]
     """
     std = mode.errors()
-    noise = _scale(Number(1.0, float(std[0])), mode.spectrum.noise)
-    found = [_process(p, std[start:]) for start, p in zip(mode.spectrum.starts, mode.spectrum.processes, strict=False)]
+    noise = scaled(Number(1.0, float(std[0])), mode.spectrum.noise)
+    found = [read_process(p, std[start:]) for start, p in zip(mode.spectrum.starts, mode.spectrum.processes, strict=False)]
     turbulence, background = (None if p is None else found.pop(0) for p in (mode.spectrum.turbulence, mode.spectrum.background))
     if turbulence is not None and turbulence.frequency.value < SLOWEST * mode.f[0]:
         turbulence = replace(turbulence, frequency=Number(turbulence.frequency.value, nan))
@@ -201,26 +227,6 @@ def read_mode(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> 
         tuple(Line(p.frequency.value, p.damping.value, p.rms.value) for p in peaks),
     )
     return IdentifiedMode(name, with_reliable_std(noise), turbulence, background, tuple(peaks), tuple(broad), s, prior, whiteness)
-
-
-def _process(p: Ar2 | Ar3, std: Array) -> IdentifiedProcess:
-    """Return a process with the standard deviations of its numbers.
-
-    Those of frequency, rms and third corner are relative, the first of std. A damping at its bound has none.
-    """
-    at_bound = p.damping > HIGHEST - 1e-4
-    beyond = p.corner / p.omega - 1.0 if isinstance(p, Ar3) else 0.0
-    third = Number(1.0 + beyond, max(beyond, NO_NEARER - 1.0) * float(std[3])) if isinstance(p, Ar3) else None
-    return IdentifiedProcess(
-        with_reliable_std(_scale(Number(1.0, float(std[0])), p.omega / (2 * pi))),
-        with_reliable_std(Number(p.damping, nan if at_bound else float(std[1]))),
-        with_reliable_std(_scale(Number(1.0, float(std[2])), p.rms)),
-        third and with_reliable_std(third),
-    )
-
-
-def _scale(n: Number, factor: float) -> Number:
-    return Number(n.value * factor, n.std * factor)
 
 
 def _within(n: Number, low: float, high: float) -> Number:

@@ -41,11 +41,12 @@ def prior_of(identification: Identification, parts: Iterable[Part] = KNOWN, scen
     scenario : where sensors and bands come from, which telemetry does not tell; the defaults unless given
     Raises ValueError for a part that cannot be made from an identification.
     """
-    prior, n = priors.prior_of(told_by(identification, scenario or Scenario()), None, parts), len(identification.modes)
-    lines = tuple(mode.prior for mode in identification.modes) if prior.lines else ()
+    prior, modes = priors.prior_of(told_by(identification, scenario or Scenario()), None, parts), identification.modes
+    n, errors = len(modes), [mode.lgs_error for mode in modes]
+    lines = tuple(mode.prior for mode in modes) if prior.lines else ()
+    lgs_error = tuple(LgsError(e) if e else one for one, e in zip(prior.lgs_error, errors, strict=False))
     beams = tuple(
-        replace(one, common=mode.prior.turbulence) for one, mode in zip(prior.beams, identification.modes, strict=False)
+        replace(one, common=mode.target.turbulence, lgs=(e,) if e else one.lgs)
+        for one, mode, e in zip(prior.beams, modes, errors, strict=False)
     )
-    return replace(
-        prior, model=prior.model[:n], lgs_error=prior.lgs_error[:n], lines=lines, beams=beams, spectra=prior.spectra[:n]
-    )
+    return replace(prior, model=prior.model[:n], lgs_error=lgs_error, lines=lines, beams=beams, spectra=prior.spectra[:n])
