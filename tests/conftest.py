@@ -5,16 +5,19 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
 
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
-settings.register_profile("no clock", deadline=None)  # a busy machine is no fault
-settings.load_profile("no clock")
+if find_spec("hypothesis"):  # the tests in other programs do without
+    from hypothesis import settings
+
+    settings.register_profile("no clock", deadline=None)  # a busy machine is no fault
+    settings.load_profile("no clock")
 
 FOLDER = "WFSOBS_TEST_RECORDS"
 """Environment variable: the folder of this session's records, for `tests.records`."""

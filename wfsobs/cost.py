@@ -28,7 +28,7 @@ def run_seconds(scenario: Scenario, observers: Sequence[str] | None = None) -> f
 
     >>> from wfsobs.scenario.presets import paper
     >>> round(run_seconds(paper()), 1), round(run_seconds(paper().replace({"run.duration": 300})))
-    (1.1, 44)
+    (1.2, 47)
     """
     return sum(
         seconds for part, seconds in part_seconds(scenario).items() if part == REST or observers is None or part in observers

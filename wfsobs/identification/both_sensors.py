@@ -13,7 +13,7 @@ from math import hypot, nan, sqrt
 import numpy as np
 
 from wfsobs.identification.one_mode import SETTLED, OneMode
-from wfsobs.identification.process import IdentifiedProcess, Number, read_process, scaled, with_reliable_std
+from wfsobs.identification.process import IdentifiedProcess, Number, read_process, scale_number, with_reliable_std
 from wfsobs.record import Record, hold_last, pseudo_open_loop
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
@@ -105,4 +105,4 @@ def without_error(turbulence: tuple[Ar2 | Ar3, ...], error: Ar2 | None) -> tuple
 
 def error_of_a_star(difference: SensorDifference, stars: int) -> Number:
     """Return the rms of the slow error of one of so many LGS [um], 0 where none was found."""
-    return Number(0.0, nan) if difference.error is None else scaled(difference.error.rms, sqrt(stars))
+    return Number(0.0, nan) if difference.error is None else scale_number(difference.error.rms, sqrt(stars))

@@ -18,7 +18,7 @@ from wfsobs.identification.process import (
     mean,
     merge_peaks,
     read_process,
-    scaled,
+    scale_number,
     with_reliable_std,
 )
 from wfsobs.identification.settings import band_settings, model_settings
@@ -170,22 +170,22 @@ class Identification:
     def shared_settings(self, scenario: Scenario) -> dict[str, Number]:
         """Return dotted path -> number of the settings that all modes share, within the limits of the settings."""
         modes = [*zip(self.modes, scenario.modes, strict=False)]
-        noises = [scaled(m.noise, sqrt(scenario.sensors.lgs_count)) for m in self.modes]
+        noises = [scale_number(m.noise, sqrt(scenario.sensors.lgs_count)) for m in self.modes]
         out = {"sensors.lgs_noise": _within(mean(noises), 0.0, 10.0)}
         seen = [(i, m.turbulence, mode.radial_order) for i, (m, mode) in enumerate(modes) if m.turbulence]
         if seen:
             corner = [2 * pi / turbulence_corner(1.0, scenario.telescope.diameter, order) for _, _, order in seen]
-            winds = [scaled(t.frequency, per) for (_, t, _), per in zip(seen, corner, strict=True)]
+            winds = [scale_number(t.frequency, per) for (_, t, _), per in zip(seen, corner, strict=True)]
             out["turbulence.wind_speed"] = _within(mean(winds), 0.1, 100.0)
             out["turbulence.damping"] = _within(mean([t.damping for _, t, _ in seen]), 0.01, 1.0)
-            strengths = [scaled(t.rms, 1.0 / relative_rms(scenario, i)) for i, t, _ in seen]
+            strengths = [scale_number(t.rms, 1.0 / relative_rms(scenario, i)) for i, t, _ in seen]
             if thirds := [t.third_corner for _, t, _ in seen if t.third_corner]:
                 out["turbulence.third_corner"] = _within(mean(thirds), 1.0, 1000.0)
             out["turbulence.rms"] = _within(mean(strengths), 0.0, LARGEST)
         differences = [m.difference for m in self.modes if m.difference is not None]
         if differences:
             slow = [error_of_a_star(d, scenario.sensors.lgs_count) for d in differences]
-            slow = [scaled(e, 1.0 / relative_cone_error(scenario, i)) for i, e in enumerate(slow)]
+            slow = [scale_number(e, 1.0 / relative_cone_error(scenario, i)) for i, e in enumerate(slow)]
             out["sensors.lgs_low_frequency_rms"] = _within(mean(slow), 0.0, 10.0)
             out["sensors.ngs_noise"] = _within(mean([d.noise for d in differences]), 0.0, 10.0)
         return out
@@ -197,7 +197,7 @@ def read_mode(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> 
     A resonance of the continuum is not a peak; an observer receives it as turbulence. lowest : minimum frequency of peaks [Hz]
     """
     std = mode.errors()
-    noise = scaled(Number(1.0, float(std[0])), mode.spectrum.noise)
+    noise = scale_number(Number(1.0, float(std[0])), mode.spectrum.noise)
     found = [read_process(p, std[start:]) for start, p in zip(mode.spectrum.starts, mode.spectrum.processes, strict=False)]
     turbulence, background = (None if p is None else found.pop(0) for p in (mode.spectrum.turbulence, mode.spectrum.background))
     if turbulence is not None and turbulence.frequency.value < SLOWEST * mode.f[0]:
