@@ -130,6 +130,18 @@ def test_what_is_kept_from_the_last_frame_changes_nothing() -> None:
                 np.testing.assert_allclose(kept[name].density, it.density, rtol=1e-3, atol=1e-9 * it.density.max())
 
 
+def test_a_drag_of_the_corner_ends_where_a_jump_does() -> None:
+    """The fits of the turbulence start from the last frame's; in each frame a theory without one starts from afar."""
+    theory, base, of = Theory(most=2**14, left=0.001), PRESETS["ut4"](), {"observers": ["kf-multi", "multirate-multi"]}
+    for factor in (1.0, 1.02, 1.05, 1.1, 0.9):
+        moved = base.replace({"turbulence.wind_speed": factor * base.turbulence.wind_speed})
+        kept, fresh = (predictions(moved, "turbulence", it, **of) for it in (theory, Theory(most=2**14, left=0.001)))
+        for name, it in fresh.items():
+            # fits end within a thousandth of a standard deviation; three digits are shown, and lines a hundredth apart
+            assert kept[name].rms == pytest.approx(it.rms, rel=1e-4), (factor, name)
+            np.testing.assert_allclose(kept[name].density, it.density, rtol=3e-3, atol=1e-6 * it.density.max())
+
+
 class TestSpectrum:
     def test_of_welch_is_the_mean_of_its_windows(self) -> None:
         n, dt = 64, 0.01

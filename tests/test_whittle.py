@@ -10,9 +10,10 @@ from scipy.special import expit, logit
 from wfsobs.priors_from.scenario import modelled_processes
 from wfsobs.priors_from.turbulence import measurement_noise
 from wfsobs.scenario.presets import PRESETS
-from wfsobs.signal.ar3 import TOLERANCE, Ar3, fit_ar3
+from wfsobs.signal.ar3 import TOLERANCE, Ar3, Ar3Fits, fit_ar3
 from wfsobs.signal.whittle import information, whittle_fit
 from wfsobs.simulation.true_spectra import lgs_turbulence_spectrum
+from wfsobs.simulation.turbulence_spectra import turbulence_spectra
 from wfsobs.typing import Array
 
 F = np.geomspace(1.0, 100.0, 200)
@@ -97,3 +98,17 @@ def test_the_fit_to_frozen_flow_is_at_its_minimum_from_wherever_it_starts(mode: 
         other = fit_ar3(spectrum, noise, process(vector(start) + rng.standard_normal(4), s.dt))
         # a gradient of TOLERANCE is a distance of that over the least curvature, 0.01 where corners can stand in for each other
         assert np.abs((vector(other) - vector(found)) / std).max() < 100.0 * TOLERANCE
+
+
+def test_fits_that_follow_a_corner_are_those_from_afar() -> None:
+    """Twice the wind in steps of 12 %, more than between two frames of a drag: what both see, and what the LGS alone see."""
+    s, fits, noise = PRESETS["ut4"](), Ar3Fits(), 4e-4
+    start, f = Ar3(10.0, 0.5, 40.0, 0.5, s.dt), np.fft.rfftfreq(2**14, s.dt)
+    for i in range(7):
+        moved = s.replace({"turbulence.wind_speed": s.turbulence.wind_speed * 1.12**i})
+        own, lgs, cross = turbulence_spectra(moved, 0, 2**14)[:3]
+        for name, spectrum in (("both", lgs), ("alone", np.maximum(lgs - np.real(cross) ** 2 / own, 1e-16))):
+            found = fits.fit(name, spectrum, noise, start), fit_ar3(spectrum, noise, start)
+            near, afar = (it.psd(f) / (2.0 * s.dt) + noise for it in found)
+            # TOLERANCE is a standard deviation of parameters that 8192 frequencies determine: what can be seen is 1 %
+            assert near == pytest.approx(afar, rel=2e-3), (i, name)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from math import pi
 
 import numpy as np
@@ -98,10 +99,13 @@ def target_errors(
     return {name: PeriodicError(np.maximum(variance, 0.0)) for name, variance in (*alone.items(), (TOTAL, total))}
 
 
+@lru_cache(maxsize=2)
 def exposure_response(ratio: int, size: int) -> Complex:
     """Return the response of the mean of the last `ratio` steps before the present one, at `size` frequencies from 0 to 1/2."""
     omega = pi * np.arange(size) / (size - 1)
-    return np.asarray(np.exp(-0.5j * (ratio + 1) * omega) * diric(omega, ratio), dtype=np.complex128)
+    out = np.asarray(np.exp(-0.5j * (ratio + 1) * omega) * diric(omega, ratio), dtype=np.complex128)
+    out.flags.writeable = False
+    return out
 
 
 def bound_rms_of_both(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:

@@ -10,7 +10,7 @@ frame (`cycle_response`). Those that train on a record or learn during it have n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from math import sqrt
 from typing import Any
@@ -19,6 +19,7 @@ import numpy as np
 
 from wfsobs.evaluation.cycle_response import CycleTaps, both_sensors, cycle_spectra, cycle_taps
 from wfsobs.evaluation.linear_response import SETTLED, SHORTEST, estimate_and_error, impulse_response
+from wfsobs.evaluation.memory import Identity, Memory
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
@@ -26,6 +27,8 @@ from wfsobs.prior import Beams, LgsError, LgsStars, Lines, Prior, Training
 from wfsobs.priors_from.scenario import lines_of, observer_settings, prior_of
 from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence
 from wfsobs.scenario import Scenario
+from wfsobs.signal.ar2 import Ar2
+from wfsobs.signal.ar3 import Ar3, Ar3Fits
 from wfsobs.signal.welch import expected_psd
 from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, error_spectrum, factorise
 from wfsobs.simulation.guide_stars import MEAN
@@ -66,19 +69,6 @@ def is_predicted(observer: Observer, target: str) -> bool:
     return known and target in observer.targets and Training not in observer.prior
 
 
-class Identity:
-    """An object as a key: equal to the same object only, which it keeps from being thrown away."""
-
-    def __init__(self, it: object):
-        self.it = it
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Identity) and other.it is self.it
-
-    def __hash__(self) -> int:
-        return id(self.it)
-
-
 @dataclass
 class Theory:
     """Predictions for one scenario after another; what two of them share is computed once.
@@ -89,7 +79,7 @@ class Theory:
         Resolution of the Welch estimates [Hz].
     most : int or None
         The most frequencies to compute with, a power of two; None for as many as the scenario needs. With fewer, lines that are
-        narrower than their spacing are coarse.
+        narrower than their spacing are coarse, and fits of turbulence start from those before.
     left : float
         What may be left at the end of a response, over its maximum.
     """
@@ -97,8 +87,9 @@ class Theory:
     resolution: float = 0.5
     most: int | None = None
     left: float = SETTLED
-    _memory: dict[str, tuple[Any, Any]] = field(default_factory=dict, repr=False)
+    _memory: Memory = field(default_factory=Memory, repr=False)
     _lengths: dict[tuple[str, float], int] = field(default_factory=dict, repr=False)
+    _fits: dict[int, Ar3Fits] = field(default_factory=dict, repr=False)
 
     def predict(
         self, scenario: Scenario, mode: int, target: str, observers: Iterable[str] | None = None, of_error: bool = True
@@ -131,7 +122,7 @@ class Theory:
         if not has_known_spectra(scenario):
             raise ValueError("no prediction: the spectra of this scenario are not known, or events change them")
         spectra = self.spectra(scenario, mode)
-        cross = self._keep(f"cross {target}", Identity(spectra), lambda: advance_spectrum(spectra.cross[target], 1))
+        cross = self._memory.keep(f"cross {target}", Identity(spectra), lambda: advance_spectrum(spectra.cross[target], 1))
         n_steps = scenario.n_steps - round(scenario.run.warm_up / scenario.dt)
         out = []
         for name in (TRUTH, *([*OBSERVERS, BOUND] if observers is None else observers)):
@@ -145,33 +136,26 @@ class Theory:
                 if response is None:
                     signal, error = _own(spectra, name, target)
                 elif isinstance(response, CycleTaps):
-                    both = self._keep(f"both {target}", Identity(spectra), lambda: both_sensors(spectra, target))
+                    both = self._memory.keep(f"both {target}", Identity(spectra), lambda: both_sensors(spectra, target))
                     signal, error = cycle_spectra(response, both)
                 else:
                     signal, error = estimate_and_error(response, spectra.measurement, spectra.signal[target], cross)
                 frequency, density = expected_psd(error if of_error else signal, scenario.dt, n_steps, self.resolution)
                 return Prediction(name, target, sqrt(max(circle_mean(error), 0.0)), frequency, density)
 
-            out.append(self._keep(f"{name}, {target}", made_of, make))
+            out.append(self._memory.keep(f"{name}, {target}", made_of, make))
         return out
 
     # ------------------------------------------------------------------ what is kept
 
-    def _keep(self, name: str, key: Any, make: Callable[[], Any]) -> Any:
-        """Return what was made last under a name if its key is the same, else make it."""
-        kept = self._memory.get(name)
-        if kept is None or kept[0] != key:
-            self._memory[name] = kept = key, make()
-        return kept[1]
-
     def spectra(self, scenario: Scenario, mode: int) -> TrueSpectra:
         """Return the true spectra of a mode."""
         key = mode, self.most, _groups(scenario, *AIR, "vibration")
-        return self._keep("spectra", key, lambda: true_spectra(scenario, mode, self._air(scenario, mode)))
+        return self._memory.keep("spectra", key, lambda: true_spectra(scenario, mode, self._air(scenario, mode)))
 
     def _air(self, scenario: Scenario, mode: int) -> TurbulenceSpectra:
         n = min(n_frequencies(scenario), self.most or MOST)
-        return self._keep("air", (mode, n, _groups(scenario, *AIR)), lambda: turbulence_spectra(scenario, mode, n))
+        return self._memory.keep("air", (mode, n, _groups(scenario, *AIR)), lambda: turbulence_spectra(scenario, mode, n))
 
     def _response(self, observer: Observer, scenario: Scenario, mode: int, target: str, n: int) -> Complex | CycleTaps:
         settings, prior, name = observer_settings(observer, scenario), self._prior(observer, scenario, mode), observer.id
@@ -189,9 +173,9 @@ class Theory:
             return found
 
         if "ngs" in observer.sensors:
-            return self._keep(f"response {name}", (prior, settings, n, left, ratio), over_cycle)[target]
-        h = self._keep(f"response {name}", (prior, settings, n, left), taps)[target]
-        return self._keep(f"response {name}, {target}", Identity(h), lambda: np.fft.rfft(h, n))
+            return self._memory.keep(f"response {name}", (prior, settings, n, left, ratio), over_cycle)[target]
+        h = self._memory.keep(f"response {name}", (prior, settings, n, left), taps)[target]
+        return self._memory.keep(f"response {name}, {target}", Identity(h), lambda: np.fft.rfft(h, n))
 
     def _prior(self, observer: Observer, scenario: Scenario, mode: int) -> Prior:
         cheap = [part for part in observer.prior if part not in (Lines, Beams, LgsError, LgsStars)]
@@ -201,9 +185,11 @@ class Theory:
         elif Lines in observer.prior:
             prior = replace(prior, lines=(self._lines(scenario, mode),))
         if Beams in observer.prior:
-            prior = replace(prior, beams=(self._in_beams("beams", scenario, mode, beams_of),))
+            prior = replace(prior, beams=(self._beams(scenario, mode),))
         if LgsError in observer.prior:
-            prior = replace(prior, lgs_error=(self._in_beams("LGS error", scenario, mode, _lgs_error),))
+            key = self._key_of_beams(scenario, mode)
+            error = self._memory.keep("LGS error", key, lambda: lgs_error_of(scenario, mode, scenario.dt))
+            prior = replace(prior, lgs_error=(error,))
         return prior
 
     def _lines(self, scenario: Scenario, mode: int) -> Lines:
@@ -216,20 +202,29 @@ class Theory:
             k.measurement_noise,
             k.lgs_noise,
         )
-        turbulence = self._keep("turbulence", key, lambda: lines_turbulence(scenario, mode, scenario.dt, air.measurement))
+        fits = self._start_of_fits(mode)
+
+        def make() -> tuple[Ar2 | Ar3, ...]:
+            return lines_turbulence(scenario, mode, scenario.dt, air.measurement, fits)
+
+        turbulence = self._memory.keep("turbulence", key, make)
         return lines_of(scenario, mode, turbulence=turbulence)
 
-    def _in_beams(
-        self, name: str, scenario: Scenario, mode: int, make: Callable[[Scenario, int, float, TurbulenceSpectra], Any]
-    ) -> Any:
-        """Return what an observer is told of the turbulence in the beams; best weights of the LGS depend on the vibration."""
-        air, mean = self._air(scenario, mode), scenario.sensors.lgs_combination == MEAN
-        key = Identity(air), _groups(scenario, "kalman", "multipeak", *([] if mean else ["vibration"]))
-        return self._keep(name, key, lambda: make(scenario, mode, scenario.dt, air))
+    def _beams(self, scenario: Scenario, mode: int) -> Beams:
+        air, fits = self._air(scenario, mode), self._start_of_fits(mode)
+        key = self._key_of_beams(scenario, mode)
+        return self._memory.keep("beams", key, lambda: beams_of(scenario, mode, scenario.dt, air, fits))
 
+    def _key_of_beams(self, scenario: Scenario, mode: int) -> Any:
+        """Return what the turbulence in the beams depends on: the vibration too, where it moves best weights of the LGS."""
+        mean = scenario.sensors.lgs_combination == MEAN
+        return Identity(self._air(scenario, mode)), _groups(scenario, "kalman", "multipeak", *([] if mean else ["vibration"]))
 
-def _lgs_error(scenario: Scenario, mode: int, dt: float, _air: TurbulenceSpectra) -> LgsError:
-    return lgs_error_of(scenario, mode, dt)
+    def _start_of_fits(self, mode: int) -> Ar3Fits:
+        """Return the fits of a mode to start from: none before one with all frequencies."""
+        if self.most is None:
+            self._fits.clear()
+        return self._fits.setdefault(mode, Ar3Fits())
 
 
 AIR = ("telescope", "turbulence", "sensors", "run")

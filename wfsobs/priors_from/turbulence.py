@@ -11,7 +11,7 @@ from wfsobs.observers.kalman.single import MIN_NOISE
 from wfsobs.prior import Beams, LgsError, LgsStars
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.ar3 import Ar3, fit_ar3
+from wfsobs.signal.ar3 import Ar3, Ar3Fits
 from wfsobs.signal.shared_process import SharedProcess, fit_shared_process
 from wfsobs.simulation.guide_stars import lgs_error_process, lgs_error_variance, lgs_noise_rms, lgs_weights
 from wfsobs.simulation.layers import relative_rms
@@ -55,43 +55,55 @@ def measurement_noise(scenario: Scenario, mode: int) -> tuple[float, float]:
     return max(lgs_noise_rms(scenario, mode), MIN_NOISE), max(noise_rms(scenario, "ngs")[mode], MIN_NOISE)
 
 
-def lines_turbulence(scenario: Scenario, mode: int, dt: float, spectrum: Array | None = None) -> tuple[Ar2 | Ar3, ...]:
+def lines_turbulence(
+    scenario: Scenario, mode: int, dt: float, spectrum: Array | None = None, fits: Ar3Fits | None = None
+) -> tuple[Ar2 | Ar3, ...]:
     """Return a scenario's own processes, in the strength of the model; else one process, as `modelled_turbulence`."""
     found = processes(scenario, mode, dt) if scenario.turbulence.source == "processes" else []
     if not found:
-        return (modelled_turbulence(scenario, mode, dt, spectrum),)
+        return (modelled_turbulence(scenario, mode, dt, spectrum, fits),)
     if scenario.kalman.process_noise == "matched":
         return tuple(found)
     factor = one_process(scenario, mode, dt).rms / turbulence_rms(scenario, mode)
     return tuple(replace(p, rms=factor * p.rms) for p in found)
 
 
-def modelled_turbulence(scenario: Scenario, mode: int, dt: float, spectrum: Array | None = None) -> Ar2 | Ar3:
+def modelled_turbulence(
+    scenario: Scenario, mode: int, dt: float, spectrum: Array | None = None, fits: Ar3Fits | None = None
+) -> Ar2 | Ar3:
     """Return the turbulence of the model: that of one peak, or of third order and nearest to the true spectrum of the LGS.
 
     spectrum : that of the turbulence in the LGS (`lgs_turbulence_spectrum`), where already computed
+    fits : those of similar scenarios, to start from
     """
     process = one_process(scenario, mode, dt)
     if not _is_third_order(scenario, process):
         return process
     noise, _ = measurement_noise(scenario, mode)
     spectrum = lgs_turbulence_spectrum(scenario, mode) if spectrum is None else spectrum
-    return fit_ar3(spectrum, noise**2, _third_order(process))
+    return (fits or Ar3Fits()).fit("LGS", spectrum, noise**2, _third_order(process))
 
 
-def beams_of(scenario: Scenario, mode: int, dt: float | None = None, spectra: TurbulenceSpectra | None = None) -> Beams:
+def beams_of(
+    scenario: Scenario,
+    mode: int,
+    dt: float | None = None,
+    spectra: TurbulenceSpectra | None = None,
+    fits: Ar3Fits | None = None,
+) -> Beams:
     """Return turbulence as the target has it and as the LGS see it in one mode; dt [s]: by default that of the scenario.
 
     Of third order it is fitted to the true spectra of both and to their cross spectrum, else it is the AR(2) and the slow error.
 
     spectra : the true ones, where already computed
+    fits : those of similar scenarios, to start from
     """
     dt = dt or scenario.dt
     line_gain = float(lgs_weights(scenario)[mode, :, mode].sum())
     process = one_process(scenario, mode, dt)
     if scenario.turbulence.source == "processes" or not _is_third_order(scenario, process):
         return Beams(lines_turbulence(scenario, mode, dt), lgs=(lgs_error_of(scenario, mode, dt).process,), line_gain=line_gain)
-    found = _shared_turbulence(scenario, mode, dt) if spectra is None else _fit_shared(scenario, mode, dt, spectra)
+    found = _shared_turbulence(scenario, mode, dt) if spectra is None else _fit_shared(scenario, mode, dt, spectra, fits)
     factor = process.rms / turbulence_process(scenario, mode, dt).rms  # where the strength is set by hand
     common, target, lgs = (tuple(replace(p, rms=factor * p.rms) for p in part) for part in found[1:])
     return Beams(common, target, lgs, found.gain, line_gain)
@@ -103,10 +115,12 @@ def _shared_turbulence(scenario: Scenario, mode: int, dt: float) -> SharedProces
     return _fit_shared(scenario, mode, dt, turbulence_spectra(scenario, mode, n_frequencies(scenario)))
 
 
-def _fit_shared(scenario: Scenario, mode: int, dt: float, spectra: TurbulenceSpectra) -> SharedProcess:
+def _fit_shared(
+    scenario: Scenario, mode: int, dt: float, spectra: TurbulenceSpectra, fits: Ar3Fits | None = None
+) -> SharedProcess:
     noise, _ = measurement_noise(scenario, mode)
     start = _third_order(turbulence_process(scenario, mode, dt))
-    return fit_shared_process(spectra.own, spectra.measurement, np.real(spectra.cross), noise**2, start)
+    return fit_shared_process(spectra.own, spectra.measurement, np.real(spectra.cross), noise**2, start, fits)
 
 
 def _is_third_order(scenario: Scenario, process: Ar2) -> bool:

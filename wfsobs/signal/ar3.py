@@ -6,7 +6,8 @@ with the AR(2) model takes too much of the noise for turbulence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,7 +122,28 @@ def fit_ar3(spectrum: Array, noise: float, start: Ar3) -> Ar3:
     Ar3
         The process whose spectrum is nearest.
     """
-    n, dt = 2 * (spectrum.size - 1), start.dt
+    return Ar3Fits().fit("", spectrum, noise, start)
+
+
+class Ar3Fits:
+    """Fits as `fit_ar3`, of spectra that change little by little: each starts where the two before it ended.
+
+    That takes a quarter of the steps. A minimum that comes up while both are at another one is not found.
+    """
+
+    def __init__(self) -> None:
+        self._minima: dict[str, list[Ar3]] = {}
+
+    def fit(self, name: str, spectrum: Array, noise: float, start: Ar3) -> Ar3:
+        """Fit the spectrum of that name, which starts at `start` only where there is none before it."""
+        exchanged = replace(start, omega=start.corner, corner=start.omega)
+        found = self._minima[name] = _minima(spectrum, noise, self._minima.get(name, [start, exchanged]))
+        return found[0]
+
+
+def _minima(spectrum: Array, noise: float, starts: Sequence[Ar3]) -> list[Ar3]:
+    """Return where the fits from these starts end, the lowest minimum first."""
+    n, dt = 2 * (spectrum.size - 1), starts[0].dt
     edges = np.unique(np.concatenate([[1], np.geomspace(1, n // 2 + 1, 400).astype(int)]))
     bins, count = edges[:-1], np.diff(edges)
     frequency = (bins + 0.5 * (count - 1)) / (n * dt)
@@ -139,7 +161,7 @@ def fit_ar3(spectrum: Array, noise: float, start: Ar3) -> Ar3:
     slowest = np.log(SLOWEST / dt)
     bounds = np.array([(slowest, np.log(1.0 / dt)), (-4.0, 6.0), (slowest, np.log(3.0 / dt)), (np.log(1e-6), np.log(1e3))])
     found = []
-    for omega, corner in ((start.omega, start.corner), (start.corner, start.omega)):
-        first = np.array([np.log(omega), logit(min(start.damping, 0.999)), np.log(corner), np.log(start.rms)])
+    for start in starts:
+        first = np.array([np.log(start.omega), logit(min(start.damping, 0.999)), np.log(start.corner), np.log(start.rms)])
         found.append(whittle_fit(density, log_slopes, first, bounds, mean, count, TOLERANCE, STEPS))
-    return process(min(found, key=lambda x: negative_log_likelihood(density(x), mean, count)))
+    return [process(x) for x in sorted(found, key=lambda x: negative_log_likelihood(density(x), mean, count))]

@@ -97,24 +97,24 @@ class PeriodicFilter:
 def _block_states(F: Array, drive: Array, start: Array) -> Array:
     """Return the state at the start of each block: x_0 = start, x_b+1 = F x_b + driven_b.
 
-    `drive` is (n, blocks, columns). The same method again: blocks of blocks, then one short loop.
+    `drive` is (n, blocks, columns). The same method again: blocks of blocks, then one short loop over their starts.
     """
     n, blocks, columns = drive.shape
     length = max(1, int(np.sqrt(blocks)))
     groups = -(-blocks // length)
     padded = np.zeros((n, groups * length, columns))
     padded[:, :blocks] = drive
-    padded = padded.reshape(n, groups, length, columns)
-    local = np.zeros((n, groups, length + 1, columns))  # states of every group started from zero
-    for i in range(length):
-        local[:, :, i + 1] = np.tensordot(F, local[:, :, i], 1) + padded[:, :, i]
+    padded = padded.reshape(n, groups, length, columns).transpose(2, 0, 1, 3).reshape(length, n, -1)
+    local = np.zeros((length + 1, n, groups * columns))  # states of every group started from zero
     powers = [np.eye(n)]
-    for _ in range(length):
+    for i in range(length):
+        local[i + 1] = F @ local[i] + padded[i]
         powers.append(F @ powers[-1])
-    out = np.empty((n, groups, length, columns))
+    ends = local[length].reshape(n, groups, columns)
+    starts = np.empty((n, groups, columns))
     x = start
     for g in range(groups):
-        for_group = np.einsum("lij,jc->ilc", np.array(powers), x)
-        out[:, g] = local[:, g, :length] + for_group[:, :length]
-        x = local[:, g, length] + for_group[:, length]
-    return out.reshape(n, -1, columns)[:, :blocks]
+        starts[:, g] = x
+        x = powers[length] @ x + ends[:, g]
+    out = local[:length] + (np.vstack(powers[:length]) @ starts.reshape(n, -1)).reshape(length, n, -1)
+    return out.reshape(length, n, groups, columns).transpose(1, 2, 0, 3).reshape(n, -1, columns)[:, :blocks]

@@ -11,11 +11,12 @@ negative they are taken as zero. Each is a third-order process (`ar3`) in the wh
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from wfsobs.signal.ar3 import Ar3, fit_ar3
+from wfsobs.signal.ar3 import Ar3, Ar3Fits
 from wfsobs.signal.wiener import circle_mean
 from wfsobs.typing import Array
 
@@ -35,7 +36,9 @@ class SharedProcess(NamedTuple):
     second: tuple[Ar3, ...]
 
 
-def fit_shared_process(first: Array, second: Array, cross: Array, noise: float, start: Ar3) -> SharedProcess:
+def fit_shared_process(
+    first: Array, second: Array, cross: Array, noise: float, start: Ar3, fits: Ar3Fits | None = None
+) -> SharedProcess:
     """Fit the processes of two views.
 
     Parameters
@@ -48,22 +51,26 @@ def fit_shared_process(first: Array, second: Array, cross: Array, noise: float, 
         Variance of the white noise of a measurement.
     start : Ar3
         First guess of shape; each starts with its own rms.
+    fits : Ar3Fits, optional
+        Those of similar spectra, to start from.
 
     Returns
     -------
     SharedProcess
         Gain and processes.
     """
+    fits = fits or Ar3Fits()
 
-    def fit(spectrum: Array) -> tuple[Ar3, ...]:
+    def fit(name: str, spectrum: Array) -> tuple[Ar3, ...]:
         positive = np.maximum(spectrum, FLOOR * noise)
         variance = circle_mean(positive)
         if variance <= NOTHING * noise:
             return ()
-        return (fit_ar3(positive, noise, Ar3(start.omega, start.damping, start.corner, float(np.sqrt(variance)), start.dt)),)
+        return (fits.fit(name, positive, noise, replace(start, rms=float(np.sqrt(variance)))),)
 
     strength, together = circle_mean(first), circle_mean(cross)
     gain = together / strength if strength > 0 else 0.0
     if gain <= 0.0:
-        return SharedProcess(0.0, (), fit(first), fit(second))
-    return SharedProcess(gain, fit(cross / gain), fit(first - cross / gain), fit(second - gain * cross))
+        return SharedProcess(0.0, (), fit("first", first), fit("second", second))
+    common = cross / gain
+    return SharedProcess(gain, fit("common", common), fit("first", first - common), fit("second", second - gain * cross))

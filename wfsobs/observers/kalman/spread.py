@@ -31,7 +31,8 @@ def over_record(sd: Array, n_steps: int, first: int = 0) -> Array:
     if len(sd) == 1 and first == 0:
         return np.broadcast_to(sd, (n_steps, sd.shape[1]))
     out = np.full((n_steps, sd.shape[1]), np.nan)
-    out[first:] = sd[np.arange(max(n_steps - first, 0)) % len(sd)]
+    left = max(n_steps - first, 0)
+    out[first:] = np.tile(sd, (-(-left // len(sd)), 1))[:left]
     return out
 
 

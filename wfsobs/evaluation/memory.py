@@ -1,0 +1,33 @@
+"""What was made last under a name, for computations that follow a setting which moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+
+class Identity:
+    """An object as a key: equal to the same object only, which it keeps from being thrown away."""
+
+    def __init__(self, it: object):
+        self.it = it
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Identity) and other.it is self.it
+
+    def __hash__(self) -> int:
+        return id(self.it)
+
+
+class Memory:
+    """Of one result per name, with the key that it was made for."""
+
+    def __init__(self) -> None:
+        self._results: dict[str, tuple[Any, Any]] = {}
+
+    def keep(self, name: str, key: Any, make: Callable[[], Any]) -> Any:
+        """Return what was made last under a name if its key is the same, else make it."""
+        last = self._results.get(name)
+        if last is None or last[0] != key:
+            self._results[name] = last = key, make()
+        return last[1]
