@@ -15,8 +15,9 @@ from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import advance_spectrum
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.flow_spectra import star_basis, star_flow_spectra
+from wfsobs.simulation.guide_stars import stars_differ
 from wfsobs.simulation.loop import simulate
-from wfsobs.simulation.star_spectra import StarSpectra, star_spectra, stars_differ
+from wfsobs.simulation.star_spectra import StarSpectra, star_spectra
 from wfsobs.simulation.turbulence import SOURCES
 from wfsobs.typing import Array
 
@@ -127,7 +128,7 @@ def test_regression_on_a_long_record_finds_the_same() -> None:
 def test_spectra_add_up_to_the_covariance_of_the_stars(stars: int) -> None:
     s = ASTERISM.replace({"sensors.lgs_count": stars})
     f = np.fft.rfftfreq(2**18, s.dt)
-    sums = star_flow_spectra(s, 0, f).real.sum(axis=-1) * f[1]
+    sums = star_flow_spectra(s, 0, f).matrix(range(2 + stars)).real.sum(axis=-1) * f[1]
     basis = star_basis(stars)
     assert basis[1:] @ basis[1:].T == pytest.approx(np.eye(stars - 1), abs=1e-12)
     expected = basis @ atmosphere.star_covariance(s)[1:, 0, 1:, 0] @ basis.T

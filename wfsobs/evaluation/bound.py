@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from wfsobs.scenario import Scenario
-from wfsobs.signal.wiener import advance_spectrum, circle_mean, degrees_of_freedom, error_spectrum, explained_variance, factorise
+from wfsobs.signal.wiener import advance_spectrum, circle_mean, degrees_of_freedom, error_spectrum, explained_variance
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array
 
@@ -103,7 +103,7 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
         Target -> error; TOTAL is that of both together.
     """
     past, known = min(n_steps, MOST_PAST), spectra.without_lines
-    whitener = factorise(known.measurement)
+    whitener = known.whitener
     wanted = {name: (known.signal[name], advance_spectrum(known.cross[name], 1 + ahead)) for name in known.signal}
     wanted[TOTAL] = known.total[0], advance_spectrum(known.total[1], 1 + ahead)
     lines = spectra.line_covariance(past + 1 + ahead)

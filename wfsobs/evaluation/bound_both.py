@@ -19,7 +19,7 @@ from scipy.special import diric
 from wfsobs.evaluation.bound import TOTAL
 from wfsobs.scenario import Scenario
 from wfsobs.signal.slow_sensor import SlowSensor, variance_from_frames
-from wfsobs.signal.wiener import Complex, Whitener, advance_spectrum, causal_error, factorise
+from wfsobs.signal.wiener import Complex, Whitener, advance_spectrum, causal_error
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array
 
@@ -63,7 +63,7 @@ def least_errors_of_both(spectra: TrueSpectra, ahead: int = 0) -> dict[str, Peri
         Target -> error; TOTAL is that of both together.
     """
     known = spectra.without_lines
-    ngs, whitener = known.ngs, factorise(known.measurement)
+    ngs, whitener = known.ngs, known.whitener
     frames, exposure = ngs_frames(known)
     fast = {name: advance_spectrum(cross, 1 + ahead) for name, cross in known.cross.items()}
     slow = [advance_spectrum(ngs.cross[name] * exposure.conj(), ahead) for name in fast]

@@ -12,7 +12,7 @@ import numpy as np
 from wfsobs.evaluation.bound_both import PeriodicError, ngs_frames, target_errors
 from wfsobs.scenario import Scenario
 from wfsobs.signal.sensor_array import FastSensors, variance_from_sensors
-from wfsobs.signal.wiener import advance_spectrum, factorise
+from wfsobs.signal.wiener import advance_spectrum
 from wfsobs.simulation.star_spectra import StarSpectra, star_spectra
 
 
@@ -32,7 +32,7 @@ def least_errors_of_stars(spectra: StarSpectra, ahead: int = 0) -> dict[str, Per
         Target -> error; TOTAL is that of both together.
     """
     known = spectra.mean.without_lines
-    ngs, whitener = known.ngs, factorise(known.measurement)
+    ngs, whitener = known.ngs, known.whitener
     frames, exposure = ngs_frames(known)
     others = FastSensors(spectra.differences, spectra.cross, advance_spectrum(spectra.ngs_cross * exposure, 1))
     fast = {name: advance_spectrum(cross, 1 + ahead) for name, cross in known.cross.items()}

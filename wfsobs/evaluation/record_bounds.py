@@ -23,7 +23,8 @@ from wfsobs.priors_from.selection import has_prior
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.welch import rms
-from wfsobs.simulation.star_spectra import star_spectra, stars_differ
+from wfsobs.simulation.guide_stars import MEAN, stars_differ
+from wfsobs.simulation.star_spectra import star_spectra
 from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
 
 Errors = dict[str, LeastError] | dict[str, PeriodicError]
@@ -95,7 +96,8 @@ def _least_of_modes(scenario: Scenario, n_modes: int, n_steps: int) -> list[dict
         spectra = true_spectra(scenario, mode)
         found: dict[str, Errors] = {BOUND: least_errors(spectra, n_steps=n_steps), BOUND_BOTH: least_errors_of_both(spectra)}
         if stars_differ(scenario, mode):
-            found[BOUND_STARS] = least_errors_of_stars(star_spectra(scenario, mode))
+            mean = spectra if scenario.sensors.lgs_combination == MEAN else None
+            found[BOUND_STARS] = least_errors_of_stars(star_spectra(scenario, mode, mean))
         return found
 
     with ThreadPoolExecutor(2) as pool:

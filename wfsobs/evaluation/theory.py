@@ -30,7 +30,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3, Ar3Fits
 from wfsobs.signal.welch import expected_psd
-from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, error_spectrum, factorise
+from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean, error_spectrum
 from wfsobs.simulation.guide_stars import MEAN
 from wfsobs.simulation.true_spectra import MOST, TrueSpectra, has_known_spectra, n_frequencies, true_spectra
 from wfsobs.simulation.turbulence_spectra import TurbulenceSpectra, turbulence_spectra
@@ -240,5 +240,5 @@ def _own(spectra: TrueSpectra, name: str, target: str) -> tuple[Array, Array]:
     if name == TRUTH:
         return spectra.signal[target], spectra.signal[target]
     known = spectra.without_lines
-    least = error_spectrum(known.signal[target], advance_spectrum(known.cross[target], 1), factorise(known.measurement))
+    least = error_spectrum(known.signal[target], advance_spectrum(known.cross[target], 1), known.whitener)
     return least, least

@@ -10,9 +10,8 @@ from wfsobs.prior import Asterism, Flow
 from wfsobs.priors_from.turbulence import measurement_noise, one_process
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.flow_spectra import star_basis
-from wfsobs.simulation.guide_stars import lgs_weights
+from wfsobs.simulation.guide_stars import lgs_weights, stars_differ
 from wfsobs.simulation.mode_spectra import are_coupled, beam_spectra, frequency_rule, mode_spectra
-from wfsobs.simulation.star_spectra import stars_differ
 from wfsobs.simulation.turbulence import turbulence_process
 from wfsobs.typing import Array
 

@@ -30,7 +30,7 @@ from wfsobs.typing import Array
 LONGEST = 8192
 """Maximum age of a measurement beside z [steps]."""
 
-TOLERANCE = 1e-3
+TOLERANCE = 3e-4
 """Residual of a solution over its right-hand side."""
 
 
@@ -72,24 +72,26 @@ def variance_from_sensors(
     Array
         Explained covariance of the targets, (ratio, n_targets, n_targets), p steps after a frame.
     """
-    n = whitener.n
+    n, last = whitener.n, len(fast.cross)
     cross = np.vstack([fast.cross, slow.cross])
-    rests = np.empty((len(cross), *cross.shape), dtype=np.complex128)
-    rests[:-1, :-1] = fast.spectra
-    rests[-1, :-1], rests[:-1, -1] = fast.slow, fast.slow.conj()
-    rests[-1, -1] = slow.spectrum
-    rests -= cross[:, None] * cross.conj() / whitener.spectrum
-    factors = np.array([_factor(rests[i, i].real) for i in range(len(rests) - 1)] + [_frame_factor(rests[-1, -1].real, slow, n)])
-    ahead = 1.0 / (whitener.H.conj() * np.sqrt(whitener.innovation_variance))
-    future = _of_future(cross * ahead, n) / factors.conj()
+    of_z = cross / np.sqrt(whitener.spectrum)
+    own_spectra = [*(fast.spectra[i, i].real for i in range(last)), slow.spectrum]
+    rests = [spectrum - np.abs(seen) ** 2 for spectrum, seen in zip(own_spectra, of_z, strict=True)]
+    factors = np.array([*(_factor(rest) for rest in rests[:last]), _frame_factor(rests[last], slow, n)])
+    whiten, ahead = 1.0 / factors.conj(), 1.0 / (whitener.H.conj() * np.sqrt(whitener.innovation_variance))
+    future = _of_future(cross * ahead, n) * whiten
+    shares = {}
+    for j in range(1, last + 1):
+        for i in range(j):
+            shared = fast.slow[i] if j == last else fast.spectra[i, j].conj()
+            shares[i, j] = (shared - of_z[i].conj() * of_z[j]) * whiten[i] * whiten[j].conj()
     wanted = []
-    for of_z, of_x, of_y in targets:
-        own = np.vstack([of_y, of_x]) - of_z * cross.conj() / whitener.spectrum
-        known = future * _of_future(of_z * ahead, n, first=1).conj()
-        past = fft.rfft(_past(own, n), n) / factors.conj()
-        wanted.append(fft.irfft(past + known, n)[:, : min(LONGEST, n // 2)])
-    shares = rests.conj() / (factors.conj()[:, None] * factors)
-    return _gains(_Regression(shares, future, slow.ratio, n), np.array(wanted))
+    for on_z, on_x, on_y in targets:
+        own = np.vstack([on_y, on_x]) - (on_z / np.sqrt(whitener.spectrum)) * of_z.conj()
+        found = fft.rfft(_past(own, n), n) * whiten
+        found += future * _of_future(on_z * ahead, n, first=1).conj()
+        wanted.append(fft.irfft(found, n)[:, : min(LONGEST, n // 2)])
+    return _gains(_Regression.of(shares, future, slow.ratio, n), np.array(wanted))
 
 
 def _factor(spectrum: Array) -> Complex:
@@ -122,39 +124,64 @@ def _of_future(spectrum: Complex, n: int, first: int = 0) -> Complex:
     return fft.rfft(backwards)
 
 
+@dataclass(frozen=True)
 class _Regression:
-    """I + E + K' K on the ages of each phase of the frames: x of shape (ratio, n_targets, n_sensors, n_ages)."""
+    """I + E + K' K on the ages of each phase of the frames: x of shape (ratio, n_targets, n_sensors, n_ages).
 
-    def __init__(self, shares: NDArray[np.complex128], future: Complex, ratio: int, n: int) -> None:
-        self.length = min(LONGEST, n // 2)
-        self.size = fft.next_fast_len(2 * self.length, real=True)
-        kernel = fft.irfft(shares, n)
-        near = np.zeros((*shares.shape[:2], self.size))
-        near[..., : self.length] = kernel[..., : self.length]
-        near[..., 1 - self.length :] = kernel[..., 1 - self.length :]
-        self.shares = fft.rfft(near)
-        for i in range(len(shares)):
-            self.shares[i, i] = 1.0  # they are white
-        self.hankel = fft.rfft(fft.irfft(future, n)[:, : min(self.size, n // 2)], self.size)
-        self.mask = np.ones((ratio, 1, len(shares), self.length))
-        self.mask[:, :, -1] = np.arange(self.length) % ratio == np.arange(ratio)[:, None, None]
+    shares : transform of I + E, (n_sensors, n_sensors, n);  hankel : that of K, (n_sensors, n)
+    mask : which ages are measured, (ratio, 1, n_sensors, n_ages)
+    """
+
+    shares: NDArray[np.complexfloating]
+    hankel: NDArray[np.complexfloating]
+    mask: Array
+
+    @staticmethod
+    def of(shares: dict[tuple[int, int], Complex], future: Complex, ratio: int, n: int) -> _Regression:
+        length = min(LONGEST, n // 2)
+        size = fft.next_fast_len(2 * length, real=True)
+        among = np.ones((len(future), len(future), size // 2 + 1), dtype=np.complex128)  # each of them is white
+        near = np.zeros(size)
+        for (i, j), share in shares.items():
+            kernel = fft.irfft(share, n)
+            near[:length], near[1 - length :] = kernel[:length], kernel[1 - length :]
+            among[i, j] = fft.rfft(near)
+            among[j, i] = among[i, j].conj()
+        hankel = fft.rfft(fft.irfft(future, n)[:, : min(size, n // 2)], size)
+        mask = np.ones((ratio, 1, len(future), length))
+        mask[:, :, -1] = np.arange(length) % ratio == np.arange(ratio)[:, None, None]
+        return _Regression(among, hankel, mask)
+
+    def single(self) -> _Regression:
+        """Return the same in single precision."""
+        return _Regression(self.shares.astype(np.complex64), self.hankel.astype(np.complex64), self.mask.astype(np.float32))
 
     def apply(self, x: Array) -> Array:
         """Return (I + E + K' K) x at the ages that are measured."""
-        transform = fft.rfft(x, self.size)
+        length, size = x.shape[-1], 2 * (self.hankel.shape[-1] - 1)
+        transform = fft.rfft(x, size)
         out = np.einsum("ijf,ptjf->ptif", self.shares, transform)
-        known = fft.irfft(np.einsum("if,ptif->ptf", self.hankel, transform.conj()), self.size)
-        known[..., 0] = known[..., self.length :] = 0.0
-        out += self.hankel * fft.rfft(known, self.size).conj()[:, :, None]
-        return self.mask * fft.irfft(out, self.size)[..., : self.length]
+        known = fft.irfft(np.einsum("if,ptif->ptf", self.hankel, transform.conj()), size)
+        known[..., 0] = known[..., length:] = 0.0
+        out += self.hankel * fft.rfft(known, size).conj()[:, :, None]
+        return self.mask * fft.irfft(out, size)[..., :length]
 
 
 def _gains(regression: _Regression, rest: Array) -> Array:
-    """Return b' (I + E + K' K)^-1 b of all pairs of targets at every age, by conjugate gradients. rest : b of each target."""
+    """Return b' (I + E + K' K)^-1 b of all pairs of targets at every age. rest : b of each target."""
     b = regression.mask * rest
+    single = regression.single()
+    x = np.concatenate([_solve(single, b[:, [i]].astype(np.float32)) for i in range(b.shape[1])], axis=1).astype(np.float64)
+    # Wrong by the square of the error of x, rounding and all.
+    out = np.einsum("ptia,puia->ptu", x, 2.0 * b - regression.apply(x))
+    return 0.5 * (out + out.transpose(0, 2, 1))
+
+
+def _solve(regression: _Regression, b: Array) -> Array:
+    """Solve (I + E + K' K) x = b for every age, by conjugate gradients."""
     x, residual, direction = np.zeros_like(b), b.copy(), b.copy()
     power = np.sum(b**2, axis=(-2, -1), keepdims=True)
-    enough, smallest = TOLERANCE**2 * power, np.finfo(float).tiny
+    enough, smallest = TOLERANCE**2 * power, np.finfo(b.dtype).tiny
     while (power > enough).any():
         moved = regression.apply(direction)
         step = power / np.maximum(np.sum(direction * moved, axis=(-2, -1), keepdims=True), smallest)
@@ -162,5 +189,4 @@ def _gains(regression: _Regression, rest: Array) -> Array:
         residual -= step * moved
         before, power = power, np.sum(residual**2, axis=(-2, -1), keepdims=True)
         direction = residual + (power / np.maximum(before, smallest)) * direction
-    out = np.einsum("ptia,puia->ptu", b, x)
-    return 0.5 * (out + out.transpose(0, 2, 1))
+    return x

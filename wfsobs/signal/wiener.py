@@ -18,6 +18,7 @@ mean over the whole circle is the variance.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,15 +97,24 @@ def error_spectrum(target: Array, cross: Complex, whitener: Whitener) -> Array:
     Array
         Spectrum of the error, (n // 2 + 1,).
     """
-    g = np.fft.irfft(cross / whitener.H.conj(), whitener.n)
-    g[: whitener.n // 2] = 0.0
-    anticausal = np.abs(np.fft.rfft(g)) ** 2 / whitener.innovation_variance
-    return np.maximum(target - np.abs(cross) ** 2 / whitener.spectrum, 0.0) + anticausal
+    future = np.fft.rfft(_of_future(cross, whitener), whitener.n)
+    return _two_sided(target, cross, whitener) + np.abs(future) ** 2 / whitener.innovation_variance
 
 
 def causal_error(target: Array, cross: Complex, whitener: Whitener) -> float:
     """Return the variance of the minimum error, see `error_spectrum`."""
-    return circle_mean(error_spectrum(target, cross, whitener))
+    future = _of_future(cross, whitener)
+    return circle_mean(_two_sided(target, cross, whitener)) + float(future @ future) / whitener.innovation_variance
+
+
+def _two_sided(target: Array, cross: Complex, whitener: Whitener) -> Array:
+    """Return the spectrum of the error that all of z leaves."""
+    return np.maximum(target - (cross.real**2 + cross.imag**2) / whitener.spectrum, 0.0)
+
+
+def _of_future(cross: Complex, whitener: Whitener) -> Array:
+    """Return g[n], n < 0: what the estimate of all of z takes from the innovations to come."""
+    return np.fft.irfft(cross / whitener.H.conj(), whitener.n)[whitener.n // 2 :]
 
 
 def explained_variance(autocovariance: Array, cross: Array) -> Array:
@@ -168,5 +178,11 @@ def circle_mean(spectrum: Array) -> float:
 
 def advance_spectrum(spectrum: Complex | Array, steps: int) -> Complex:
     """Return S_sz of z[k] = s[k - steps] + anything independent: the spectrum with the phase of `steps` ahead."""
-    size = spectrum.shape[-1]
-    return spectrum * np.exp(2j * np.pi * steps * np.arange(size) / (2 * (size - 1)))
+    return spectrum * _advance(steps, spectrum.shape[-1])
+
+
+@lru_cache(maxsize=4)
+def _advance(steps: int, size: int) -> Complex:
+    found = np.exp(2j * np.pi * steps * np.arange(size) / (2 * (size - 1)))
+    found.flags.writeable = False
+    return found

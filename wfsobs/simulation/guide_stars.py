@@ -29,6 +29,13 @@ MEAN = "mean"
 """The combination without a model."""
 
 
+def stars_differ(scenario: Scenario, mode: int) -> bool:
+    """Return whether the LGS see different turbulence in a mode, so that each tells something that their mean does not."""
+    s = scenario.sensors
+    blind = s.tip_tilt_indetermination and scenario.modes[mode].radial_order == 1
+    return scenario.turbulence.source == "frozen-flow" and s.lgs_count > 1 and s.lgs_radius > 0 and not blind
+
+
 def low_frequency_process(scenario: Scenario, mode: int) -> Ar2:
     """Return the AR(2) process that stands for cone effect and uplink turbulence of one LGS in one mode; zero with frozen flow.
 

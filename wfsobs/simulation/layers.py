@@ -82,8 +82,13 @@ def laser_stars(scenario: Scenario) -> list[Star]:
 
 def view(sensor: Sensor, star: Star, of: tuple[TurbulenceLayer, ...]) -> View:
     """Return a sensor and the footprints of its star's beam on the layers."""
+    return View(sensor, tuple(footprint(star, layer) for layer in of))
+
+
+def footprint(star: Star, layer: TurbulenceLayer) -> Footprint:
+    """Return where the beam of a star crosses a layer."""
     (x, y), distance = star
-    return View(sensor, tuple(Footprint(1.0 - layer.height / distance, (layer.height * x, layer.height * y)) for layer in of))
+    return Footprint(1.0 - layer.height / distance, (layer.height * x, layer.height * y))
 
 
 def ideal_sensor(scenario: Scenario) -> ZernikeProjection:

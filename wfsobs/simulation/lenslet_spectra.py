@@ -15,7 +15,8 @@ from wfsobs.atmosphere.von_karman import TurbulenceLayer
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.lenslet_fit import Kind
 from wfsobs.simulation import layers as atmosphere
-from wfsobs.simulation.flow_spectra import FlowSpectra, footprint_on, ideal_mode, of_stars, spectra_between
+from wfsobs.simulation.flow_integral import PlaneWaves, spectra_between
+from wfsobs.simulation.flow_spectra import FlowSpectra, ideal_mode, of_stars
 from wfsobs.simulation.sensor_noise import shack_hartmann
 from wfsobs.simulation.true_spectra import TrueSpectra, n_frequencies, true_spectra
 from wfsobs.simulation.turbulence_spectra import per_sample
@@ -65,7 +66,7 @@ def lenslet_flow_spectra(scenario: Scenario, mode: int, frequency: Array) -> Flo
     FlowSpectra
         Six densities, (n,) each [um^2/Hz].
     """
-    beams = [footprint_on(scenario, star, layer).scale for star in _stars(scenario) for layer in atmosphere.layers(scenario)]
+    beams = [atmosphere.footprint(star, layer).scale for star in _stars(scenario) for layer in atmosphere.layers(scenario)]
     reach = max(shack_hartmann(scenario, kind).reach for kind in ("lgs", "ngs")) / min(beams)
     shared = spectra_between(scenario, mode, frequency, _through_lenslets, reach)
     own, measurement, ngs = shared.density
@@ -76,21 +77,21 @@ def _stars(scenario: Scenario) -> list[atmosphere.Star]:
     return [atmosphere.natural_star(scenario), *atmosphere.laser_stars(scenario)]
 
 
-def _through_lenslets(scenario: Scenario, mode: int, layer: TurbulenceLayer, x: Array, y: Array) -> list[NDArray[np.complex128]]:
+def _through_lenslets(scenario: Scenario, mode: int, layer: TurbulenceLayer, waves: PlaneWaves) -> list[NDArray[np.complex128]]:
     """Return the transforms of axis, combined LGS and NGS."""
-    natural = footprint_on(scenario, atmosphere.natural_star(scenario), layer)
+    natural = atmosphere.footprint(atmosphere.natural_star(scenario), layer)
     return [
-        ideal_mode(scenario, mode, x, y, Footprint()),
-        of_stars(scenario, mode, layer, x, y, _lgs_mode),
-        _sensor_mode(scenario, "ngs", mode, x, y, natural),
+        ideal_mode(scenario, mode, waves, Footprint()),
+        of_stars(scenario, mode, layer, waves, _lgs_mode),
+        _sensor_mode(scenario, "ngs", mode, waves, natural),
     ]
 
 
-def _lgs_mode(scenario: Scenario, mode: int, x: Array, y: Array, footprint: Footprint) -> NDArray[np.complex128]:
-    return _sensor_mode(scenario, "lgs", mode, x, y, footprint)
+def _lgs_mode(scenario: Scenario, mode: int, waves: PlaneWaves, footprint: Footprint) -> NDArray[np.complex128]:
+    return _sensor_mode(scenario, "lgs", mode, waves, footprint)
 
 
-def _sensor_mode(scenario: Scenario, kind: Kind, mode: int, x: Array, y: Array, footprint: Footprint) -> NDArray[np.complex128]:
-    """Return the transform of a mode as a sensor gives it, at k_x and k_y in the pupil frame [rad/m]."""
-    seen = shack_hartmann(scenario, kind).transform(footprint.scale * x, footprint.scale * y)[mode]
-    return seen * np.exp(1j * (x * footprint.shift[0] + y * footprint.shift[1]))
+def _sensor_mode(scenario: Scenario, kind: Kind, mode: int, waves: PlaneWaves, footprint: Footprint) -> NDArray[np.complex128]:
+    """Return the transform of a mode as a sensor gives it."""
+    seen = shack_hartmann(scenario, kind).transform(footprint.scale * waves.x, footprint.scale * waves.y)[mode]
+    return seen * waves.turn(footprint)

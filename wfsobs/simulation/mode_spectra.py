@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from wfsobs.atmosphere.plane_waves import Footprint
 from wfsobs.atmosphere.von_karman import TurbulenceLayer
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.zernike import tabulated_bessel_ratio
 from wfsobs.simulation import layers as atmosphere
-from wfsobs.simulation.flow_spectra import Sight, footprint_on, spectra_between, star_basis
+from wfsobs.simulation.flow_integral import PlaneWaves, Sight, spectra_between
+from wfsobs.simulation.flow_spectra import ideal_mode, star_basis
 from wfsobs.simulation.guide_stars import lgs_weights
 from wfsobs.typing import Array
 
@@ -92,13 +92,8 @@ def beam_spectra(scenario: Scenario, frequency: Array) -> ModeSpectra:
 def _spectra(scenario: Scenario, frequency: Array, sight: Sight) -> ModeSpectra:
     found, m = spectra_between(scenario, None, frequency, sight), len(scenario.modes)
     beams = range(m, len(found.density))
-    measurement = np.empty((len(beams), len(beams), frequency.size), dtype=np.complex128)
-    for i in beams:
-        for j in range(i, beams.stop):
-            measurement[i - m, j - m] = found.pair(i, j)
-            measurement[j - m, i - m] = measurement[i - m, j - m].conj()
     cross = np.array([[found.pair(i, j) for j in beams] for i in range(m)])
-    return ModeSpectra(np.array(found.density[:m]), measurement, cross)
+    return ModeSpectra(np.array(found.density[:m]), found.matrix(beams), cross)
 
 
 def frequency_rule(scenario: Scenario) -> tuple[Array, Array]:
@@ -113,32 +108,34 @@ def frequency_rule(scenario: Scenario) -> tuple[Array, Array]:
     return np.sqrt(edges[1:] * edges[:-1]), np.diff(edges)
 
 
-def _all_modes(scenario: Scenario, _mode: None, layer: TurbulenceLayer, x: Array, y: Array) -> list[NDArray[np.complex128]]:
+def _all_modes(scenario: Scenario, _mode: None, layer: TurbulenceLayer, waves: PlaneWaves) -> list[NDArray[np.complex128]]:
     """Return the transforms of all modes on the axis, then of all modes of the combined LGS."""
-    ideal = atmosphere.ideal_sensor(scenario)
-    own = ideal.transform(x, y, Footprint(), tabulated_bessel_ratio)
+    own = _modes_in(scenario, waves, Footprint())
     weights = lgs_weights(scenario)
     if scenario.sensors.tip_tilt_indetermination:
         weights = weights * np.array([mode.radial_order != 1 for mode in scenario.modes])
     combined = np.zeros_like(own)
     for i, star in enumerate(atmosphere.laser_stars(scenario)):
-        seen = ideal.transform(x, y, footprint_on(scenario, star, layer), tabulated_bessel_ratio)
+        seen = _modes_in(scenario, waves, atmosphere.footprint(star, layer))
         combined += np.tensordot(weights[:, i], seen, axes=1)
     return [*own, *combined]
 
 
 def _all_modes_of_beams(
-    scenario: Scenario, _mode: None, layer: TurbulenceLayer, x: Array, y: Array
+    scenario: Scenario, _mode: None, layer: TurbulenceLayer, waves: PlaneWaves
 ) -> list[NDArray[np.complex128]]:
     """Return the transforms of all modes on the axis, in the mean of the LGS, in each of their differences, and in the NGS."""
-    ideal = atmosphere.ideal_sensor(scenario)
 
     def seen(star: atmosphere.Star) -> NDArray[np.complex128]:
-        return ideal.transform(x, y, footprint_on(scenario, star, layer), tabulated_bessel_ratio)
+        return _modes_in(scenario, waves, atmosphere.footprint(star, layer))
 
-    own = ideal.transform(x, y, Footprint(), tabulated_bessel_ratio)
+    own = _modes_in(scenario, waves, Footprint())
     stars = np.array([seen(star) for star in atmosphere.laser_stars(scenario)])
     if scenario.sensors.tip_tilt_indetermination:
         stars[:, [mode.radial_order == 1 for mode in scenario.modes]] = 0.0
     lgs = np.tensordot(star_basis(len(stars)), stars, axes=1)
     return [*own, *np.concatenate(lgs), *seen(atmosphere.natural_star(scenario))]
+
+
+def _modes_in(scenario: Scenario, waves: PlaneWaves, footprint: Footprint) -> NDArray[np.complex128]:
+    return np.array([ideal_mode(scenario, mode, waves, footprint) for mode in range(len(scenario.modes))])

@@ -41,21 +41,20 @@ class StarSpectra:
     ngs_cross: NDArray[np.complex128]
 
 
-def stars_differ(scenario: Scenario, mode: int) -> bool:
-    """Return whether the LGS see different turbulence in a mode, so that each tells something that their mean does not."""
-    s = scenario.sensors
-    blind = s.tip_tilt_indetermination and scenario.modes[mode].radial_order == 1
-    return scenario.turbulence.source == "frozen-flow" and s.lgs_count > 1 and s.lgs_radius > 0 and not blind
+def star_spectra(scenario: Scenario, mode: int, mean: TrueSpectra | None = None) -> StarSpectra:
+    """Compute the spectra of one mode of an asterism whose stars differ (`stars_differ`).
 
-
-def star_spectra(scenario: Scenario, mode: int) -> StarSpectra:
-    """Compute the spectra of one mode of an asterism whose stars differ (`stars_differ`)."""
+    mean : those of the plain mean, where already computed
+    """
     n = n_frequencies(scenario)
     # The notch at 0 Hz is a bin wide, as in `turbulence_spectra`.
     frequency = np.hypot(np.fft.rfftfreq(n, scenario.dt), 1.0 / (n * scenario.dt))
-    found = star_flow_spectra(scenario, mode, frequency) * (0.5 / scenario.dt)
-    differences = found[3:, 3:].copy()
+    found = star_flow_spectra(scenario, mode, frequency)
+    scale, each = 0.5 / scenario.dt, range(3, len(found.density))
+    differences = scale * found.matrix(each)
     for i in range(len(differences)):
         differences[i, i] += max(float(noise_rms(scenario, "lgs")[mode]), FLOOR) ** 2
-    plain = true_spectra(scenario.replace({"sensors.lgs_combination": MEAN}), mode)
-    return StarSpectra(plain, differences, found[3:, 2], found[0, 3:], found[1, 3:])
+    cross = np.array([found.pair(i, 2) for i in each])
+    axis, ngs = (np.array([found.pair(j, i) for i in each]) for j in (0, 1))
+    mean = mean or true_spectra(scenario.replace({"sensors.lgs_combination": MEAN}), mode)
+    return StarSpectra(mean, differences, *(scale * part for part in (cross, axis, ngs)))

@@ -8,13 +8,14 @@ a controller they are taken `line_width` wide at half maximum.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import pi
 
 import numpy as np
 
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.wiener import Complex
+from wfsobs.signal.wiener import Complex, Whitener, factorise
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.simulation.disturbance import peak_rms, pure_lines, vibration_power
 from wfsobs.simulation.guide_stars import lgs_noise_rms, lgs_weights
@@ -102,7 +103,12 @@ class TrueSpectra:
         """(signal, shared) of the whole disturbance; turbulence and vibration are independent."""
         return sum(self.signal.values(), np.zeros(1)), sum(self.cross.values(), np.zeros(1))
 
-    @property
+    @cached_property
+    def whitener(self) -> Whitener:
+        """Minimum-phase factor of the spectrum of z."""
+        return factorise(self.measurement)
+
+    @cached_property
     def without_lines(self) -> TrueSpectra:
         """The spectra once the undamped lines are known."""
         if self.lines is None:
@@ -202,7 +208,7 @@ def _decay_rates(scenario: Scenario) -> list[float]:
     elif v.source != "none":
         rates += [max(2.0 * pi * p.frequency * p.damping / SMOOTH, least) for p in v.peaks]
     if scenario.turbulence.source == "frozen-flow":
-        rates.append(min(layer.speed for layer in atmosphere.layers(scenario)) / (16.0 * scenario.turbulence.outer_scale))
+        rates.append(min(layer.speed for layer in atmosphere.layers(scenario)) / (8.0 * scenario.turbulence.outer_scale))
     elif scenario.turbulence.source == "psd":
         rates.append(least)
     return rates

@@ -1,0 +1,160 @@
+"""Spectra of a block of frozen flow between signals: what `flow_spectra` integrates, and the waves that signals are sums of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from wfsobs.atmosphere.plane_waves import Footprint
+from wfsobs.atmosphere.von_karman import CORE, TurbulenceLayer, fine_rule, nodes_across_wind, von_karman_density
+from wfsobs.scenario import Scenario
+from wfsobs.sensors.zernike import ZernikeProjection, tabulated_bessel_ratio
+from wfsobs.signal.wiener import Complex
+from wfsobs.simulation import layers as atmosphere
+from wfsobs.typing import Array
+
+LOWEST = 1e-3
+"""Frequency below which spectra are flat, over that of the wind across the outer scale."""
+
+RIPPLES = 24
+"""Spectra have ripples of width speed / diameter; up to this many they are resolved, beyond only their mean."""
+
+
+@dataclass(frozen=True)
+class SpectraBetween:
+    """Densities of signals, (n,) each, and how they are shared at the nodes, interpolated at log frequencies `at`."""
+
+    density: list[Array]
+    nodes: Array
+    at: Array
+    total: Complex
+
+    def pair(self, i: int, j: int) -> Complex:
+        """Interpolate only the share of the geometric mean: it is smooth, and never above one."""
+        share = self.total[i, j] / np.sqrt(np.maximum((self.total[i, i] * self.total[j, j]).real, 1e-300))
+        real, imaginary = (np.interp(self.at, self.nodes, part) for part in (share.real, share.imag))
+        return np.sqrt(self.density[i] * self.density[j]) * (real + 1j * imaginary)
+
+    def matrix(self, signals: Sequence[int]) -> Complex:
+        """Return the cross spectra of some signals, Hermitian, (n_signals, n_signals, n)."""
+        out = np.empty((len(signals), len(signals), self.at.size), dtype=np.complex128)
+        for a, i in enumerate(signals):
+            out[a, a] = self.density[i]
+            for b, j in enumerate(signals[a + 1 :], a + 1):
+                out[a, b] = self.pair(i, j)
+                np.conjugate(out[a, b], out=out[b, a])
+        return out
+
+
+def spectra_between(
+    scenario: Scenario, mode: int | None, frequency: Array, sight: Sight, reach: float = 0.0, weights: Array | None = None
+) -> SpectraBetween:
+    """Return the spectra [um^2/Hz] of what a sight gives of one mode, or of all (None), at frequencies from 0 on [Hz].
+
+    reach : spatial frequency up to which the sight takes waves that the modes do not have [rad/m]
+    weights : of what the sight gives in the signals, (n_signals, n_sights); by default that itself
+    """
+    f, total = _at_nodes(scenario, mode, float(frequency[-1]), sight, reach)
+    if weights is not None:
+        total = np.einsum("ai,ijf,bj->abf", weights, total, weights, optimize=True)
+    exposure = np.sinc(f * scenario.dt) ** 2
+    at, nodes = np.log(np.maximum(frequency, f[0])), np.log(f)
+    density = [np.exp(np.interp(at, nodes, np.log(np.maximum((row[i] * exposure).real, 1e-300)))) for i, row in enumerate(total)]
+    return SpectraBetween(density, nodes, at, total)
+
+
+@lru_cache(maxsize=32)
+def _at_nodes(scenario: Scenario, mode: int | None, highest: float, sight: Sight, reach: float) -> tuple[Array, Complex]:
+    """Return the nodes in frequency, and the spectra of all layers there, which take a second where there are many."""
+    found = atmosphere.layers(scenario)
+    f = _frequencies(scenario, min(layer.speed for layer in found), highest, reach)
+    total = np.sum([_layer(scenario, mode, layer, f, sight, reach) for layer in found], axis=0)
+    f.flags.writeable = total.flags.writeable = False
+    return f, total
+
+
+def _frequencies(scenario: Scenario, speed: float, highest: float, reach: float) -> Array:
+    """Return the nodes in frequency: by ratio, then by the ripple width of the slowest layer, then by ratio again."""
+    ripple = speed / scenario.telescope.diameter
+    ripples = max(RIPPLES, int(reach * scenario.telescope.diameter / (2.0 * np.pi)))
+    lowest = min(LOWEST * speed / scenario.turbulence.outer_scale, 0.01 * ripple)
+    f = np.concatenate(
+        [
+            np.geomspace(lowest, ripple / 40, 32, endpoint=False),
+            ripple / 40 * np.arange(1, 160),
+            ripple / 12 * np.arange(48, 12 * ripples),
+            np.geomspace(ripples * ripple, max(highest, 2 * ripples * ripple), 48),
+        ]
+    )
+    return f[: int(np.searchsorted(f, highest)) + 1]
+
+
+def _layer(scenario: Scenario, mode: int | None, layer: TurbulenceLayer, f: Array, sight: Sight, reach: float) -> Complex:
+    """Return the spectra of one layer between the signals, (n_signals, n_signals, n)."""
+    kx = 2.0 * np.pi * f / layer.speed
+    front = max(CORE / (0.5 * scenario.telescope.diameter), reach)
+    return np.concatenate([_block(scenario, mode, layer, kx[part], front, sight) for part in _blocks(kx, front)], axis=-1)
+
+
+def _blocks(kx: Array, front: float) -> Iterator[slice]:
+    """Yield ranges of frequencies that share their nodes across the wind."""
+    start = 0
+    while start < kx.size:
+        end = front if kx[start] < front else 1.5 * kx[start]
+        stop = max(int(np.searchsorted(kx, end)), start + 1)
+        yield slice(start, stop)
+        start = stop
+
+
+def _block(scenario: Scenario, mode: int | None, layer: TurbulenceLayer, kx: Array, front: float, sight: Sight) -> Complex:
+    diameter, q0 = scenario.telescope.diameter, 2.0 * np.pi / scenario.turbulence.outer_scale
+    if kx[0] < front:
+        ky, weight = nodes_across_wind(q0, front, *fine_rule(layer.height, diameter))
+    else:
+        ky, weight = nodes_across_wind(float(np.hypot(q0, kx[0])), 4.0 * kx[-1], np.inf, 0.25)
+    density = (
+        (4.0 * np.pi / layer.speed)
+        * weight[:, None]
+        * von_karman_density(kx**2 + ky[:, None] ** 2, layer.strength, scenario.turbulence.outer_scale)
+    )
+    signals = np.asarray(sight(scenario, mode, layer, PlaneWaves(kx, ky, layer.angle)))
+    by_kx = np.moveaxis(signals, 2, 0)
+    return np.moveaxis((by_kx.conj() * density.T[:, None]) @ by_kx.swapaxes(1, 2), 0, 2)
+
+
+class PlaneWaves:
+    """Waves of a block: along and across the wind, and `x`, `y` in the pupil frame, (n_ky, n_kx) [rad/m].
+
+    Beams of one scale differ in their shifts, which are a factor along the wind times one across it.
+    """
+
+    def __init__(self, kx: Array, ky: Array, angle: float) -> None:
+        self.kx, self.ky, self.c, self.s = kx, ky[:, None], np.cos(angle), np.sin(angle)
+        self.x, self.y = self.c * self.kx - self.s * self.ky, self.s * self.kx + self.c * self.ky
+        self._of_scale: dict[tuple[float, int, float], Complex] = {}
+        self._in_beam: dict[tuple[float, int, Footprint], Complex] = {}
+
+    def mode(self, diameter: float, noll: int, footprint: Footprint) -> Complex:
+        """Return the transform of a Zernike mode in a beam, computed once."""
+        beam, key = (diameter, noll, footprint), (diameter, noll, footprint.scale)
+        if beam in self._in_beam:
+            return self._in_beam[beam]
+        if key not in self._of_scale:
+            sensor = ZernikeProjection(diameter, (noll,))
+            self._of_scale[key] = sensor.transform(self.x, self.y, Footprint(footprint.scale), tabulated_bessel_ratio)[0]
+        self._in_beam[beam] = self._of_scale[key] * self.turn(footprint)
+        return self._in_beam[beam]
+
+    def turn(self, footprint: Footprint) -> Complex:
+        """Return exp(i k . shift)."""
+        x, y = footprint.shift
+        along, across = self.c * x + self.s * y, self.c * y - self.s * x
+        return np.exp(1j * self.kx * along) * np.exp(1j * self.ky * across)
+
+
+Sight = Callable[[Scenario, Any, TurbulenceLayer, PlaneWaves], Sequence[Complex]]
+"""(scenario, mode, layer, waves) -> transforms of the signals."""
