@@ -33,7 +33,7 @@ def stream(regression, signals, targets):
     """Predictions of a SlidingRegression fed sample by sample; the target of window k - 1 comes with sample k."""
     out = np.empty(len(signals))
     for k, sample in enumerate(signals):
-        out[k] = regression.predict(sample, targets[k - 1])
+        out[k] = regression.predict(sample[None], targets[k - 1 : k] if k else targets[-1:])[0]
         regression.update()
     return out
 
@@ -109,6 +109,24 @@ def test_no_drift_over_60000_steps(amplitude):
     steps = [depth + m - 1, n // 2, *range(n - 40, n)]
     expected, condition = split_direct(signals, targets, depth, m, kernel, steps)
     assert np.abs(got[steps] - expected).max() < 10 * max(1e-10, 100 * EPS * condition) * np.nanstd(got)
+
+
+def test_modes_side_by_side_are_those_alone_and_a_saved_state_goes_on_in_the_midst_of_waiting_columns():
+    kernel, depth, m, n = SquaredExponential(30.0, 300.0, 0.1), 6, 21, 200
+    signals = np.stack([slow_and_noisy(n, amplitude, seed) for seed, amplitude in enumerate((0.03, 3.0))], axis=1)
+    targets = np.stack([targets_of(n, seed) for seed in (1, 2)], axis=1)
+    both, later = (SlidingRegression(depth, m, 2, kernel, n_modes=2) for _ in range(2))
+    got = np.full((n, 2), np.nan)
+    for k, samples in enumerate(signals):
+        if k == 123:
+            later.load(both.save())
+            both = later
+        got[k] = both.predict(samples, targets[k - 1])
+        both.update()
+    for mode in range(2):
+        alone = stream(SlidingRegression(depth, m, 2, kernel), signals[:, mode], targets[:, mode])
+        # the same operations on each, but for the form of the covariance, which goes by the larger of the windows
+        np.testing.assert_allclose(got[:, mode], alone, rtol=0, atol=1e-9 * np.nanstd(alone))
 
 
 @pytest.mark.parametrize("length_scale", [0.1, 300.0, 1e5])

@@ -36,7 +36,7 @@ def test_it_is_the_process_without_the_points_that_have_no_target_yet(depth: int
     kernel = SquaredExponential(1.5, 3.0, 0.3)
     regression = LateRegression(depth, m, 1, kernel, late)
     for k in range(60):
-        value = regression.predict(z[k : k + 1], targets[max(k - 1 - late, 0)])
+        (value,) = regression.predict(z[k : k + 1, None], targets[[max(k - 1 - late, 0)]])
         regression.update()
         if k < depth + m - 1:
             assert np.isnan(value)

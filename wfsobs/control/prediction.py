@@ -115,7 +115,7 @@ class VibrationPredictor:
         self._band_signal[0] = self._bank.push(z)
         # of the window that ended as many steps ago as there are taps after the first
         target = self._taps[1:] @ self._band_signal[::-1]
-        value = self._regression.predict(self._inputs.step(np.array([z])), float(target))
+        value = float(self._regression.predict(self._inputs.step(np.array([z]))[None], target[None])[0])
         self._regression.update()
         self._bank.settle()
         return value

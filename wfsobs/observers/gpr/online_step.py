@@ -53,11 +53,11 @@ class OnlineEstimator:
         self.bank = FilterBank([bank_recursion(bank)] * sampling.n_modes)
         self._mean, self._sd = np.full(sampling.n_modes, np.nan), np.full(sampling.n_modes, np.nan)
         self._pending = False
-        self.regressions = self._start()
+        self.regression = self._start()
 
-    def _start(self) -> list[SlidingRegression]:
-        late = len(self.weights) - 1
-        return [LateRegression(*self._size, late) if late else SlidingRegression(*self._size) for _ in self._mean]
+    def _start(self) -> SlidingRegression:
+        late, n = len(self.weights) - 1, len(self._mean)
+        return LateRegression(*self._size, late, n) if late else SlidingRegression(*self._size, n)
 
     def advance(self, z: Array, ngs: Array | None, u: Array | None) -> None:
         """Take a frame."""
@@ -66,16 +66,14 @@ class OnlineEstimator:
         self._band_signals[-1] = self.bank.step(z[:, None])[:, 0]
         targets = self.weights @ self._band_signals
         samples = self.windows.push(z, u).reshape(len(z), -1)
-        for mode, regression in enumerate(self.regressions):
-            self._mean[mode] = regression.predict(samples[mode], float(targets[mode]))
+        self._mean[...] = self.regression.predict(samples, targets)
         self._pending = True
 
     def settle(self) -> None:
         """Learn from the last frame. Raises ConditionError where the precision is not enough."""
         if self._pending:
             self._pending = False
-            for regression in self.regressions:
-                regression.update()
+            self.regression.update()
 
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
         """Return the mean of the vibration; NaN until the training set is full."""
@@ -85,7 +83,7 @@ class OnlineEstimator:
         """Set the state back to the start."""
         self.windows.reset()
         self.bank.reset()
-        self.regressions, self._pending = self._start(), False
+        self.regression, self._pending = self._start(), False
         self._mean[...], self._band_signals[...] = np.nan, 0.0
 
     def save(self) -> Saved:
@@ -93,15 +91,13 @@ class OnlineEstimator:
         self.settle()
         parts = {"windows": self.windows, "bank": self.bank}
         own = {"mean": self._mean.copy(), "filtered": self._band_signals.copy()}
-        found = [regression.save() for regression in self.regressions]
-        return save_parts(parts) | own | {name: np.array([one[name] for one in found]) for name in found[0]}
+        return save_parts(parts) | own | self.regression.save()
 
     def load(self, state: Mapping[str, Array]) -> None:
         """Take over a state."""
         load_parts({"windows": self.windows, "bank": self.bank}, state)
         self._mean[...], self._band_signals[...], self._pending = state["mean"], state["filtered"], False
-        for mode, regression in enumerate(self.regressions):
-            regression.load({name: x[mode] for name, x in state.items() if "." not in name and name not in ("mean", "filtered")})
+        self.regression.load(state)
 
     def take_over(self, old: Any) -> None:
         """Go on from a design with the same windows, training set, kernel and horizon. Raises StepError."""

@@ -48,7 +48,8 @@ class OnlineGprStream:
         else:
             sample = np.array([u, y])
         self._now, self._pending = u, True
-        return self._regression.predict(self._streaming_inputs.step(sample), self._bank.push(z))
+        target = np.array([self._bank.push(z)])
+        return float(self._regression.predict(self._streaming_inputs.step(sample)[None], target)[0])
 
     def update(self, u: float | None = None) -> None:
         """Learn from the last sample. u: its command [um], where `estimate` was not told."""
