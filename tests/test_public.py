@@ -17,7 +17,19 @@ from wfsobs.closed_loop.run import closed_loop
 from wfsobs.evaluation.scores import BOUNDS
 from wfsobs.telemetry.records import save_record
 
-FUNCTIONS = ("close_loop", "error_budget", "export", "identify", "load", "observe", "run", "score", "simulate", "tune")
+FUNCTIONS = (
+    "close_loop",
+    "error_budget",
+    "export",
+    "fit_kernels",
+    "identify",
+    "load",
+    "observe",
+    "run",
+    "score",
+    "simulate",
+    "tune",
+)
 
 QUICK = {"run.duration": 2.0, "gpr_offline.training_size": 20, "gpr_online.training_size": 20}
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from wfsobs.evaluation.budget import error_budget
     from wfsobs.evaluation.scores import score
     from wfsobs.identification.identification import identify
+    from wfsobs.identification.kernels import fit_kernels
     from wfsobs.pipeline import observe, run
     from wfsobs.record import Record, RecordError
     from wfsobs.registry import register
@@ -38,6 +39,7 @@ _HOMES = {
     "design": "stepping",
     "error_budget": "evaluation.budget",
     "score": "evaluation.scores",
+    "fit_kernels": "identification.kernels",
     "identify": "identification.identification",
     "Result": "result",
     "observe": "pipeline",
@@ -65,6 +67,7 @@ __all__ = [
     "design",
     "error_budget",
     "export",
+    "fit_kernels",
     "identify",
     "load",
     "observe",

@@ -21,11 +21,10 @@ from wfsobs.identification.process import (
     scale_number,
     with_reliable_std,
 )
-from wfsobs.identification.settings import band_settings, model_settings
+from wfsobs.identification.settings import MATCHED, base_scenario, model_settings
 from wfsobs.identification.whiteness import Whiteness
 from wfsobs.prior import Line, Lines
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
 from wfsobs.simulation.layers import relative_cone_error, relative_rms
 from wfsobs.spectral.model import Spectrum
@@ -148,24 +147,10 @@ class Identification:
         Scenario
             The scenario.
         """
-        out = (base or Scenario()).before_events.replace(
-            {"telescope.radial_order": _order(len(self.modes)), "sensors.lgs_rate": 1.0 / self.dt}
-        )
+        out = base_scenario(len(self.modes), self.dt, base)
         changes: dict[str, Any] = {"sensors.lgs_low_frequency_rms": 0.0}
         changes |= {path: number.value for path, number in self.shared_settings(out).items()}
-        return out.replace(
-            changes
-            | band_settings(out, 0.5 / self.dt)
-            | model_settings([mode.target for mode in self.modes], out)
-            | {
-                "sensors.noise_from": "nm",
-                "sensors.lgs_combination": "mean",
-                "sensors.tip_tilt_indetermination": False,
-                "kalman.process_noise": "matched",
-                "kalman.measurement_noise": "matched",
-                "kalman.peak": "matched",
-            }
-        )
+        return out.replace(changes | model_settings([mode.target for mode in self.modes], out) | MATCHED)
 
     def shared_settings(self, scenario: Scenario) -> dict[str, Number]:
         """Return dotted path -> number of the settings that all modes share, within the limits of the settings."""
@@ -231,8 +216,3 @@ def read_mode(name: str, mode: OneMode, lowest: float, whiteness: Whiteness) -> 
 
 def _within(n: Number, low: float, high: float) -> Number:
     return Number(min(max(n.value, low), high), n.std)
-
-
-def _order(n_modes: int) -> int:
-    """Return the lowest radial order with as many modes."""
-    return next(order for order in range(1, HIGHEST_ORDER + 1) if len(modes_up_to(order)) >= n_modes)

@@ -8,12 +8,29 @@ from typing import Any
 
 from wfsobs.prior import Lines
 from wfsobs.scenario import Scenario
+from wfsobs.sensors.modes import HIGHEST_ORDER, modes_up_to
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 
 HIGHEST, LARGEST, LEAST = 50_000.0, 1e4, 1e-6
 """Limits of a scenario's settings: frequency of a peak [Hz], rms [um], minimum damping of a process."""
+MATCHED = {
+    "sensors.noise_from": "nm",
+    "sensors.lgs_combination": "mean",
+    "sensors.tip_tilt_indetermination": False,
+    "kalman.process_noise": "matched",
+    "kalman.measurement_noise": "matched",
+    "kalman.peak": "matched",
+}
+"""Settings by which filters take the models as they are told."""
 WIDTHS = ("bandwidth_offline", "bandwidth_online")
+
+
+def base_scenario(n_modes: int, dt: float, base: Scenario | None) -> Scenario:
+    """Return a scenario for telemetry of so many modes at steps of dt [s], without events, which name peaks by their number."""
+    order = next(order for order in range(1, HIGHEST_ORDER + 1) if len(modes_up_to(order)) >= n_modes)
+    out = (base or Scenario()).before_events.replace({"telescope.radial_order": order, "sensors.lgs_rate": 1.0 / dt})
+    return out.replace(band_settings(out, 0.5 / dt))
 
 
 def model_settings(priors: Sequence[Lines], scenario: Scenario) -> dict[str, Any]:

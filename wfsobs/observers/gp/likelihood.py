@@ -20,6 +20,12 @@ from wfsobs.typing import Array
 TINY = 1e-30
 """Imaginary step of a derivative."""
 
+STILL = 1e-14
+"""Move in a step, over the largest element, below which a covariance is at rest: the gain then stays as it is."""
+
+CHECKED = 16
+"""Steps from one check for that to the next."""
+
 
 class Regression(NamedTuple):
     """What the samples before say of each sample, and what it adds.
@@ -96,21 +102,43 @@ def _filter(A: Array, Q: Array, h: Array, P: Array, r: Array, z: Array) -> tuple
     """Run the filters: A, Q, P (m, n, n), h (m, n), r (m,)."""
     kind = np.result_type(A, Q, h, P, r)
     mean, variance, ahead, innovation = np.empty((4, len(z), len(r)), dtype=kind)
-    x, total, turned = np.zeros(h.shape, dtype=kind), np.zeros(len(r), dtype=kind), A.swapaxes(1, 2)
-    P = P.astype(kind)
-    for k, sample in enumerate(z):
+    x, turned = np.zeros(h.shape, dtype=kind), A.swapaxes(1, 2)
+    P, is_still, k = P.astype(kind), False, 0
+    missing = np.isnan(z)
+    known = np.where(missing, 0.0, z)
+    gaps = np.append(np.flatnonzero(missing), len(z))
+    while k < len(z):
         Ph = np.einsum("mij,mj->mi", P, h)
-        ahead[k], spread = np.sum(h * x, axis=1), np.sum(h * Ph, axis=1)
-        innovation[k] = S = spread + r
-        mean[k], variance[k] = ahead[k], spread
-        if sample == sample:
-            v = sample - ahead[k]
-            total -= 0.5 * (np.log(2.0 * np.pi * S) + v * v / S)
-            gain = Ph / S[:, None]
-            x = x + gain * v[:, None]
-            P = P - gain[:, :, None] * Ph[:, None, :]
-            mean[k], variance[k] = ahead[k] + spread / S * v, spread * r / S
-        x = np.einsum("mij,mj->mi", A, x)
-        P = A @ P @ turned + Q
-        P = 0.5 * (P + P.swapaxes(1, 2))
-    return mean, variance, ahead, innovation, total
+        spread = np.sum(h * Ph, axis=1)
+        S = spread + r
+        gain = Ph / S[:, None] * (not missing[k])
+        stop = int(gaps[np.searchsorted(gaps, k)]) if is_still and not missing[k] else k + 1
+        variance[k:stop], innovation[k:stop] = spread, S
+        x = _predict(A, h, gain, x, known[k:stop], ahead[k:stop])
+        following = A @ (P - gain[:, :, None] * Ph[:, None, :]) @ turned + Q
+        following = 0.5 * (following + following.swapaxes(1, 2))
+        is_still = not missing[k] and k % CHECKED == 0 and _is_still(P, following)
+        P, k = following, stop
+    there = ~missing
+    v, S = z[there, None] - ahead[there], innovation[there]
+    mean[:] = ahead
+    mean[there] += variance[there] / S * v
+    variance[there] *= r / S
+    return mean, variance, ahead, innovation, -0.5 * np.sum(np.log(2.0 * np.pi * S) + v * v / S, axis=0)
+
+
+def _predict(A: Array, h: Array, gain: Array, x: Array, z: Array, ahead: Array) -> Array:
+    """Write the predictions of samples, with a gain that stays as it is, and return the states after them, (m, n)."""
+    driven = (A @ gain[:, :, None])[:, :, 0]
+    step = np.concatenate([h[:, None], A - driven[:, :, None] * h[:, None]], axis=1)  # to the sample, and to the next state
+    for i, sample in enumerate(z):
+        found = (step @ x[:, :, None])[:, :, 0]
+        ahead[i], x = found[:, 0], found[:, 1:] + driven * sample
+    return x
+
+
+def _is_still(P: Array, following: Array) -> bool:
+    """Return whether the covariances, and their derivatives, have come to rest."""
+    moved = following - P
+    parts = ((np.real(moved), np.real(P)), (np.imag(moved), np.imag(P)))
+    return all(bool((np.abs(m).max(axis=(1, 2)) <= STILL * np.abs(of).max(axis=(1, 2))).all()) for m, of in parts)
