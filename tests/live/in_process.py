@@ -37,6 +37,7 @@ class LoopInProcess:
             assert frame is not None
             self.traces.write(self.crew.take(frame, self.count))
             self.count += 1
+        self.crew.count()
 
     def frames(self, seconds):
         first, stop = last_frames(self.newest, self.sampling.dt, seconds)

@@ -117,6 +117,7 @@ class Stage:
             self.ring.write(np.concatenate(([time.monotonic()], *parts)))
             self.traces.write(self.crew.take(LiveFrame(time.monotonic(), *parts), k))
             self.crew.settle()
+        self.crew.count()
         self.number += n
 
     def view(self, seconds=1.0):
@@ -259,7 +260,7 @@ def test_a_frame_is_taken_once_all_crews_have_it_and_late_by_the_last():
         now = time.monotonic()
         for due in (now - 0.5, now + 9, now - 0.5, now + 9, now + 9):
             ring.send(np.full(11, due))
-        delivery = Delivery(ring, board, lambda: [steady, learning])
+        delivery = Delivery(ring, board, lambda: [steady, learning], lambda: min(steady.count, learning.count))
         for k, delay in enumerate((0.0001, 0.0002, 0.003, 0.0001, 0.0001)):
             steady.write(np.array([k, delay, 1.0, np.nan]))
         delivery.collect()

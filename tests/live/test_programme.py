@@ -157,6 +157,7 @@ def test_live_numbers_are_those_of_the_recording():
             out.append(LiveFrame(0.0, *row))
             crew.take(out[-1], k)
             crew.settle()
+        crew.count()
         record = record_of(LiveFrame(*(np.array(part) for part in zip(*out, strict=True))), told)
         missing = np.isnan(record.z[:, 0])
         # 0.2 s without lasers, then 0.3 of 0.3 s, within 5 standard deviations of the draws; twice but for the NGS

@@ -17,6 +17,9 @@ from wfsobs.observers.step_checks import StepError
 from wfsobs.record import Sampling
 from wfsobs.typing import Array
 
+COUNTED = 64
+"""Frames that are counted together at most."""
+
 
 def trace_width(n_modes: int) -> int:
     """Return the width of a row of estimates: number of the frame, its delay [s], and what each observer has."""
@@ -77,13 +80,15 @@ class Crew:
         self._row = np.full(trace_width(m), np.nan)
         slots = self._row[2:].reshape(n, slot_width(m))
         self._times, self._estimates = slots[:, 0], slots[:, 1:].reshape(n, len(TARGETS), m)  # views of the row
-        self._next, self._errors = np.full((n, m), np.nan), np.empty((n, len(SCORED), m))
-        self._is_scored, self._running = np.zeros((n, 1, 1), dtype=bool), np.empty(0, dtype=np.intp)
+        self._rows, self._truth, self._waits = np.empty((COUNTED, *slots.shape)), np.empty((COUNTED, len(SCORED), m)), 0
+        self._next, self._running = np.full((n, m), np.nan), np.empty(0, dtype=np.intp)
         self._active: dict[str, Follower] = {}
         self._waiting: dict[str, StepObserver] = {}
 
     def take(self, frame: LiveFrame, number: int) -> Array:
         """Have every observer take a frame; return the row of their estimates. `settle` follows once that is written."""
+        if self._waits == COUNTED:
+            self.count()
         if self._waiting and number % self.ratio == 0:
             for name, observer in self._waiting.items():
                 self.start(name, observer, number)
@@ -95,7 +100,9 @@ class Crew:
             now = monotonic()
             self._times[follower.slot], before = now - before, now
         self._row[:2] = number, before - float(frame.due)
-        self._count(frame)
+        self._rows[self._waits].reshape(-1)[:], truth = self._row[2:], self._truth[self._waits]
+        truth[0], truth[1], truth[2] = frame.turbulence, frame.vibration, frame.z
+        self._waits += 1
         return self._row
 
     def settle(self) -> None:
@@ -103,33 +110,52 @@ class Crew:
         for follower in self._active.values():
             follower.observer.settle()
 
-    def _count(self, frame: LiveFrame) -> None:
-        """Count latencies and squared errors of all observers at once; what is NaN is not known."""
-        board, running, errors = self._board, self._running, self._errors
-        spent = self._times[running]
-        board.histograms[running, np.searchsorted(EDGES, spent)] += 1
-        board.late[running] += spent > self._dt
-        board.frames[running] += 1
-        for follower in self._active.values():
-            self._is_scored[follower.slot] = follower.observer.frame > self._warm_up
-        np.subtract(self._estimates[:, 0], frame.turbulence, out=errors[:, 0])
-        np.subtract(self._estimates[:, 1], frame.vibration, out=errors[:, 1])
-        np.subtract(self._next, frame.z, out=errors[:, 2])
-        np.add(self._estimates[:, 0], self._estimates[:, 1], out=self._next)
-        is_known = (errors == errors) & self._is_scored
+    def count(self) -> None:
+        """Count latencies and squared errors of the frames that wait for it; what is NaN is not known.
+
+        Each takes as long as several together do, so that it is not done with every frame.
+        """
+        board, running, n = self._board, self._running, self._waits
+        self._waits = 0
+        if n:
+            board.counted[self._place] += n
+        if not n or not len(running):
+            return
+        rows = self._rows[:n, running]
+        spent, estimates = rows[:, :, 0], rows[:, :, 1:].reshape(n, len(running), len(TARGETS), -1)
+        np.add.at(board.histograms, (running, np.searchsorted(EDGES, spent)), 1)
+        board.late[running] += (spent > self._dt).sum(axis=0)
+        board.frames[running] += n
+        errors = self._errors(estimates, self._truth[:n])
+        is_known = errors == errors
         errors[~is_known] = 0.0
-        board.squares[running] += (errors * errors)[running]  # the other crew writes its own rows
-        board.samples[running] += is_known[running]
+        board.squares[running] += (errors * errors).sum(axis=0)  # the other crew writes its own rows
+        board.samples[running] += is_known.sum(axis=0)
+
+    def _errors(self, estimates: Array, truth: Array) -> Array:
+        """Return the errors of consecutive frames, NaN during a warm-up, (n, running observers, len(SCORED), n_modes) [um]."""
+        n, running = len(truth), self._running
+        out = np.empty((n, len(running), len(SCORED), truth.shape[2]))
+        np.subtract(estimates, truth[:, None, :2], out=out[:, :, :2])
+        expected = np.concatenate((self._next[None, running], estimates.sum(axis=2)))  # of each measurement from the frame before
+        np.subtract(expected[:-1], truth[:, 2, None], out=out[:, :, 2])
+        self._next[running] = expected[-1]
+        for at, follower in enumerate(self._active.values()):
+            out[: max(0, n - max(0, follower.observer.frame - self._warm_up)), at] = np.nan
+        return out
 
     def lose(self, count: int) -> None:
         """Start anew after frames that were overwritten."""
+        self.count()
         self._board.losses[self._place] += count
+        self._board.counted[self._place] += count
         self._next[:] = np.nan
         for follower in self._active.values():
             follower.observer.reset()
 
     def follow(self, command: Command, number: int) -> None:
         """Switch an observer off, or a new design on, which goes on where the one before is."""
+        self.count()
         name, observer = command["observer"], command["design"]
         if observer is None:
             self._waiting.pop(name, None)
@@ -156,6 +182,7 @@ class Crew:
 
     def start(self, name: str, observer: StepObserver, number: int) -> None:
         """Let an observer follow from a frame on."""
+        self.count()
         counts, slot = self._board[name], SLOTS.index(name)
         counts.clear()
         counts.since[0] = number

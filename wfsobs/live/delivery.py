@@ -16,7 +16,8 @@ from wfsobs.typing import Array
 class Delivery:
     """Counts the frames of a loop.
 
-    A frame is taken once every observer has an estimate of it, and late where that is more than 1 ms after it was due.
+    A frame is taken once every observer has an estimate of it that is counted, and late where it has it more than 1 ms after the
+    frame was due.
 
     Parameters
     ----------
@@ -26,16 +27,18 @@ class Delivery:
         Where the crews count what they lose.
     traces : callable
         Returns the rows of the crews that take part.
+    count : callable
+        Returns the number of the first frame that one of them has not counted.
     """
 
-    def __init__(self, ring: Ring, board: Board, traces: Callable[[], list[Rows]]):
-        self._ring, self._board, self._traces, self._lock = ring, board, traces, Lock()
+    def __init__(self, ring: Ring, board: Board, traces: Callable[[], list[Rows]], count: Callable[[], int]):
+        self._ring, self._board, self._traces, self._count, self._lock = ring, board, traces, count, Lock()
         self._next = self._n_delays = self._n_late = 0
 
     @property
     def count(self) -> int:
         """Frames that every observer has taken, or lost."""
-        return min(rows.count for rows in self._traces())
+        return self._count()
 
     @property
     def losses(self) -> int:

@@ -146,6 +146,7 @@ def observe_frames(order: Order) -> None:
     gc.freeze()
     number = -(-ring.count // crew.ratio) * crew.ratio if order.joins_late else 0
     traces.skip_to(number)
+    board.counted[order.place] = number
     board.is_ready[order.place] = 1
     pause, look = Pause(), 0.0
     while True:
@@ -153,6 +154,7 @@ def observe_frames(order: Order) -> None:
             look = now + LOOK
             if (ring.count - number) * sampling.dt > HOPELESS:
                 go_first(0)
+            crew.count()
             while order.inbox.poll():
                 crew.follow(order.inbox.recv(), number)
         if ring.count <= number:

@@ -64,7 +64,7 @@ class LiveProcesses:
             own = tuple(name for name in observers if crew_of(name) == place)
             if own or not place:
                 self._start_crew(place, own)
-        self.delivery = Delivery(self.feed.ring, self.board, self.traces)
+        self.delivery = Delivery(self.feed.ring, self.board, self.traces, self.count)
         self.workshop = ProcessPoolExecutor(1, self._context, initializer=enter_process, initargs=(10,))
 
     def _start_crew(self, place: int, observers: tuple[str, ...], *, joins_late: bool = False) -> None:
@@ -73,6 +73,10 @@ class LiveProcesses:
     def traces(self) -> list[Rows]:
         """Return the estimates of the crews that take part."""
         return [crew.traces for crew in list(self.crews.values()) if crew.takes_part]
+
+    def count(self) -> int:
+        """Return the number of the first frame that a crew which takes part has not counted."""
+        return min(int(self.board.counted[place]) for place, crew in list(self.crews.items()) if crew.takes_part)
 
     def frames(self, seconds: float) -> tuple[int, LiveFrame]:
         """Return the number of the first of the last so many seconds of frames that the source has sent, and these frames."""
