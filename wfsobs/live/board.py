@@ -84,7 +84,7 @@ class Board:
 
     Attributes
     ----------
-    losses, is_ready, counted : Integers
+    losses, is_ready, progress : Integers
         Of the crews: frames lost, whether the observers are ready, and the number of the first frame not counted, (len(CREWS),).
     squares, samples, histograms, late, frames : array
         As in `Counts`, of all observers, in the order of SLOTS.
@@ -96,7 +96,7 @@ class Board:
         self._memory = SharedMemory(name=name, create=name is None, size=8 * size if name is None else 0)
         self._owner = name is None
         whole = np.ndarray(size, dtype=np.int64, buffer=self._memory.buf)
-        self.losses, self.is_ready, self.counted = whole[: 3 * len(CREWS)].reshape(3, -1)
+        self.losses, self.is_ready, self.progress = whole[: 3 * len(CREWS)].reshape(3, -1)
         slots, shape = whole[3 * len(CREWS) :].reshape(n, -1), (n, len(SCORED), n_modes)
         self.squares, self.samples = (
             slots[:, :scored].view(np.float64).reshape(shape),
@@ -128,7 +128,7 @@ class Board:
     def release(self) -> None:
         """Give the memory back; the counts stay as they are."""
         self._counts = {name: counts.copy() for name, counts in self._counts.items()}
-        self.losses, self.is_ready, self.counted = self.losses.copy(), self.is_ready.copy(), self.counted.copy()
+        self.losses, self.is_ready, self.progress = self.losses.copy(), self.is_ready.copy(), self.progress.copy()
         self.squares = self.samples = self.histograms = self.late = self.frames = self._since = np.empty(0, dtype=np.int64)
         self._memory.close()
         if self._owner:

@@ -118,7 +118,7 @@ class Crew:
         board, running, n = self._board, self._running, self._waits
         self._waits = 0
         if n:
-            board.counted[self._place] += n
+            board.progress[self._place] += n
         if not n or not len(running):
             return
         rows = self._rows[:n, running]
@@ -148,7 +148,7 @@ class Crew:
         """Start anew after frames that were overwritten."""
         self.count()
         self._board.losses[self._place] += count
-        self._board.counted[self._place] += count
+        self._board.progress[self._place] += count
         self._next[:] = np.nan
         for follower in self._active.values():
             follower.observer.reset()

@@ -146,7 +146,7 @@ def observe_frames(order: Order) -> None:
     gc.freeze()
     number = -(-ring.count // crew.ratio) * crew.ratio if order.joins_late else 0
     traces.skip_to(number)
-    board.counted[order.place] = number
+    board.progress[order.place] = number
     board.is_ready[order.place] = 1
     pause, look = Pause(), 0.0
     while True:

@@ -76,7 +76,7 @@ class LiveProcesses:
 
     def count(self) -> int:
         """Return the number of the first frame that a crew which takes part has not counted."""
-        return min(int(self.board.counted[place]) for place, crew in list(self.crews.items()) if crew.takes_part)
+        return min(int(self.board.progress[place]) for place, crew in list(self.crews.items()) if crew.takes_part)
 
     def frames(self, seconds: float) -> tuple[int, LiveFrame]:
         """Return the number of the first of the last so many seconds of frames that the source has sent, and these frames."""
