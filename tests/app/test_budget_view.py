@@ -9,7 +9,7 @@ import pytest
 
 from wfsobs.app.causes import Causes
 from wfsobs.app.display import Display
-from wfsobs.app.jobs.job import DONE, FAILED, RUNNING
+from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.views.budget import BudgetView, bar_data
@@ -45,7 +45,7 @@ def test_bars_are_as_long_as_the_scores_in_every_mode_and_unit(make_store: Any, 
                 assert mark.visible and mark.location == pytest.approx((scores[bound, target] * scale) ** 2, rel=1e-12)
             assert set(view.bars[target].bounds) == set(COMMON_BOUNDS)
             assert mode in view.bars[target].figure.xaxis.axis_label
-        assert "Online GPR" in view.line.object and "LGS KF" not in view.line.object
+        assert "Online GPR" in view.learners.line.object and "LGS KF" not in view.learners.line.object
     view.open.value = False
     assert not view.room.visible and view.task.state == DONE
 
@@ -62,6 +62,36 @@ def test_a_new_run_has_a_new_budget_and_a_loaded_record_none(make_store: Any, lo
     store.run_on(LoadedRecord(simulate(store.scenario), "mine", "key"), store.scenario)
     loop.until(lambda: view.task.state == FAILED)
     assert "Only for simulations" in view.line.object
+
+
+def test_learners_have_bars_by_simulation_which_can_be_stopped_and_gone_on_with(make_store: Any, loop: Any) -> None:
+    store: Store = make_store()
+    view = BudgetView(store, Display())
+    learners = view.learners
+    store.start()
+    loop.finish(store)
+    view.open.value = True
+    loop.until(lambda: view.task.state == DONE)
+    assert learners.start.visible and not learners.stop.visible and "No bars yet" in learners.line.object
+    learners.simulate()
+    loop.until(lambda: bool(learners.found))
+    learners.stop.clicks += 1
+    assert learners.task.state == CANCELLED and learners.start.visible
+    some = dict(learners.found)
+    learners.simulate()
+    loop.until(lambda: learners.task.state == DONE)
+    assert not learners.start.visible and all(learners.found[name] is found for name, found in some.items())
+    scores = {(s.observer, s.target): s.rms for s in store.run.result.result.scores if s.mode == "tip"}
+    # Shapley's shares add up to the estimate exactly, those of one that learns as well
+    expected = (scores["gpr-offline", "vibration"] * 1e3) ** 2
+    assert end(view.bars["vibration"], "Offline GPR") == pytest.approx(expected, rel=1e-6)
+    view.open.value = False
+    view.open.value = True
+    loop.until(lambda: view.task.state == DONE)
+    assert end(view.bars["vibration"], "Offline GPR") > 0.0, "they are not simulated again"
+    store.change("turbulence.wind_speed", 30.0)
+    loop.until(lambda: store.run.state == DONE and view.task.state == DONE and learners.start.visible)
+    assert not learners.found and end(view.bars["vibration"], "Offline GPR") == 0.0
 
 
 def test_negative_terms_lie_left_of_zero() -> None:

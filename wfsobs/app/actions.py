@@ -23,6 +23,7 @@ from wfsobs.app.sources import SimulatedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, labels
 from wfsobs.app.view_state import ViewState
+from wfsobs.app.views.settle import AFTERWARDS_MS, once
 from wfsobs.app.work import RunResults
 from wfsobs.settings.errors import SettingError
 
@@ -76,7 +77,7 @@ class Actions:
         self._pages: Pages | None = None
         self._view: ViewState | None = None
         self.open_history: Callable[[], None] = lambda: None
-        store.param.watch(self._refresh, ["scenario", "preset", "source"])
+        store.param.watch(once(self._refresh, AFTERWARDS_MS), ["scenario", "preset", "source"])
         store.run.param.watch(self._refresh_ready, "result")
         self._refresh()
 
@@ -118,7 +119,7 @@ class Actions:
             "history": self.open_history,
             "open": lambda: self.open_file(str(msg.get("name", "")), msg.get("text")),
             "unlinked": lambda: self._note("These settings are too long for a link: save the scenario and send the file."),
-            "dismiss": self._dismiss,
+            "dismiss": lambda: self.toolbar.param.update(notes=[]),
             "read": lambda: self._take_back(msg.get("text")),
             "view": lambda: self.open_view(str(msg.get("query", ""))),
             "report": self.make_report,
@@ -222,9 +223,6 @@ class Actions:
 
     def _note(self, line: str) -> None:
         self.toolbar.param.update(notes=[line], message="")
-
-    def _dismiss(self) -> None:
-        self.toolbar.notes = []
 
     def _take_back(self, text: object) -> None:
         """Unsay what has been read, unless something else has been said meanwhile."""

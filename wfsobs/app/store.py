@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import panel as pn
 import param
 from param.parameterized import batch_call_watchers
 
@@ -183,7 +184,7 @@ class Store(param.Parameterized):
             self._future = []
         self._refusals = refusals
         errors = {path: reason for path, reason in self.errors.items() if path in refusals}
-        with batch_call_watchers(self):
+        with pn.io.hold(), batch_call_watchers(self):  # one message to the browser
             self.param.update(
                 scenario=self.scenario if unchanged else scenario,
                 source=self.source if stays else source,

@@ -74,7 +74,7 @@ class Group(param.Parameterized):
         return settings_html(self)
 
     def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and self.to_dict() == other.to_dict()  # type: ignore[attr-defined]
+        return self is other or (type(self) is type(other) and self.to_dict() == other.to_dict())  # type: ignore[attr-defined]
 
     def __hash__(self) -> int:
         return hash(repr(self.to_dict()))
@@ -121,6 +121,8 @@ class Group(param.Parameterized):
             value = _groups(p, value, path)
         elif isinstance(value, Group):
             value = value.copy()
+        if type(value) is type(current) and value == current:
+            return  # to set it again, which most of a copy would do, takes as long as all the rest
         try:
             setattr(self, name, value)
         except (ValueError, TypeError, RecursionError) as error:  # the last of param's words for a value nested very deep

@@ -21,6 +21,7 @@ from wfsobs.app.controls.status import BAR, ON_BAR, STATUS_ON_BAR, Status, statu
 from wfsobs.app.jobs.job import RUNNING
 from wfsobs.app.store import Store
 from wfsobs.app.style import PRIMARY
+from wfsobs.app.views.settle import AFTERWARDS_MS, once
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.idle import idle_settings
 from wfsobs.scenario.presets import PRESETS
@@ -92,6 +93,7 @@ class Controls:
         self._watch()
         self._refresh_run()
         self._refresh_preset()
+        self._count_changes()
 
     def view(self) -> pn.Column:
         """Make the contents of the drawer."""
@@ -194,7 +196,8 @@ class Controls:
         self.run.on_click(lambda _event: self.store.start())
         self.cancel.on_click(lambda _event: self.store.run.cancel())
         self.accordion.param.watch(self._on_open, "active")
-        self.store.param.watch(self._refresh_preset, ["scenario", "preset", "can_undo", "can_redo"])
+        self.store.param.watch(self._refresh_preset, ["preset", "can_undo", "can_redo"])
+        self.store.param.watch(once(self._count_changes, AFTERWARDS_MS), ["scenario", "preset"])
         self.store.param.watch(self._refresh_parts, ["scenario", "source"])
         self.store.param.watch(self._refresh_run, ["errors", "waiting"])
         # Last, so that "Done" is said of what has been drawn.
@@ -210,15 +213,18 @@ class Controls:
             self.open_topic(names[index])
 
     def _refresh_preset(self, *_: object) -> None:
-        changed = self.store.changed_paths()
         self.preset.value = self.store.preset
+        self.undo.disabled, self.redo.disabled = not self.store.can_undo, not self.store.can_redo
+
+    def _count_changes(self) -> None:
+        """Say what differs from the preset, in all and by topic."""
+        changed = self.store.changed_paths()
         self.preset.helper_text = f"{len(changed)} changed: {', '.join(map(setting_name, changed))}" if changed else NO_CHANGES
         self.reset.disabled = not changed
         count = Counter(path.split(".")[0] for path in changed)
         names = [title + (f" · {count[name]} changed" if count[name] else "") for name, title in self.topics.items()]
         if names != self.accordion._names:
             self.accordion._names = names
-        self.undo.disabled, self.redo.disabled = not self.store.can_undo, not self.store.can_redo
 
     def _refresh_run(self, *_: object) -> None:
         run = self.store.run

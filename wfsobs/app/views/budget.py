@@ -18,6 +18,7 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.parts import WIDE, html
 from wfsobs.app.store import Store
 from wfsobs.app.style import BOUND_MARKS, TERM_COLOURS
+from wfsobs.app.views.learners_budget import LearnersBudget
 from wfsobs.app.views.plots import call
 from wfsobs.app.work import RunResults
 from wfsobs.cost import run_seconds
@@ -41,6 +42,7 @@ class BudgetView:
             label="Show why every error is as large as it is", value=False, size="small", margin=(0, 0, 4, 0)
         )
         self.line, self.room = html(), pn.Column(**WIDE)
+        self.learners = LearnersBudget(store, self._draw)
         self.bars: dict[str, Bars] = {}
         self._of: tuple[RunResults, str] | None = None
         self.open.param.watch(self._follow, "value")
@@ -52,7 +54,7 @@ class BudgetView:
 
     def view(self) -> list[Any]:
         """Return the contents of the box."""
-        return [self.open, self.line, self.room]
+        return [self.open, self.line, self.learners.view(), self.room]
 
     def _follow(self, *_: object) -> None:
         """Compute the budget of what is shown, while it is to be seen and complete."""
@@ -75,15 +77,17 @@ class BudgetView:
         said = "Computing …" if busy else task.message if task.state == FAILED else ""
         if self.open.value and not busy and self.run.state == RUNNING:
             said = "After the run …"
-        if task.state == DONE:
-            said = without_bars(task.result or ())
+        if self._of is not None and task.state == DONE:
+            self.learners.offer(*self._of, unseen(task.result or ()))
+        else:
+            self.learners.rest()
         self.line.object = f'<p class="text">{escape(said)}</p>' if said and self.open.value else ""
 
     def _draw(self, *_: object) -> None:
         if self.task.result is None or self._of is None:
             return
         results, mode = self._of
-        found: Sequence[Budget] = self.task.result
+        found = [*self.task.result, *self.learners.budgets(results, mode)]
         with pn.io.hold():
             if not self.bars:
                 self.bars = {target: Bars(target) for target in TARGETS}
@@ -155,10 +159,9 @@ class Bars:
             mark.update(location=bounds.get(name, 0.0) * scale**2, visible=name in bounds)
 
 
-def without_bars(budgets: Sequence[Budget]) -> str:
-    """Say which observers have no bar, and how to see theirs: empty where all have one."""
-    names = dict.fromkeys(row_label(b.observer) for b in budgets if b.reason.endswith(ONLY_NAMED))
-    return f"No bars: {', '.join(names)}. They are not linear; wfsobs run --budget-of runs each 16 times." if names else ""
+def unseen(budgets: Sequence[Budget]) -> list[str]:
+    """Return the observers that have no budget unless they are named."""
+    return [*dict.fromkeys(b.observer for b in budgets if b.reason.endswith(ONLY_NAMED))]
 
 
 def bar_label(budget: Budget, scale: float, unit: str) -> str:
