@@ -41,7 +41,7 @@ def done(page: ClosedLoopPage, loop: Any) -> ClosedLoopPage:
 
 def top(page: ClosedLoopPage) -> float:
     """How far the axis of the residuals reaches."""
-    return float(page.whole.figure.y_range.end)  # type: ignore[attr-defined]
+    return float(page.trace.figure.y_range.end)  # type: ignore[attr-defined]
 
 
 @pytest.fixture
@@ -64,6 +64,11 @@ def test_it_says_what_the_command_says(page: ClosedLoopPage, dashboard: Dashboar
     assert page.margins.object.count("data-controller") == len(CURVES)
     assert page.note.object == ""
     the_lines_are_the_results(page, dashboard)
+    page.trace.zoom(0.5)
+    middle = 0.5 * (of.scenario.run.warm_up + 2.0)
+    x = page.trace.sources["integrator"].data["x"]
+    dt = of.result.record.dt  # a sample more at either side, so that a line runs to the edge
+    assert (x[0], x[-1]) == (pytest.approx(middle - 0.25, abs=2 * dt), pytest.approx(middle + 0.25, abs=2 * dt))
 
 
 def the_lines_are_the_results(page: ClosedLoopPage, dashboard: Dashboard) -> None:
@@ -72,7 +77,7 @@ def the_lines_are_the_results(page: ClosedLoopPage, dashboard: Dashboard) -> Non
     assert shown is not None
     scale = per_micrometre("mas", 8.0)
     start = round(shown.result.scenario.run.warm_up / shown.result.record.dt)
-    for name, source in page.whole.sources.items():
+    for name, source in page.trace.sources.items():
         residual = shown.residual(name)
         assert residual is not None
         assert np.allclose(source.data["y"], scale * envelope(residual[start:, 1], 600), rtol=1e-6)
@@ -83,15 +88,15 @@ def the_lines_are_the_results(page: ClosedLoopPage, dashboard: Dashboard) -> Non
         E = 10 ** (np.array(page.response.sources[name].data["y"]) / 20)
         known = ~np.isnan(L)
         assert np.allclose(E[known], np.abs(1 / (1 + L[known])), rtol=1e-6)
-    assert page.whole.figure.yaxis.axis_label == "residual tilt [mas]"
+    assert page.trace.figure.yaxis.axis_label == "residual tilt [mas]"
 
 
 def test_the_lines_that_matter_come_first_until_others_are_chosen(page: ClosedLoopPage, dashboard: Dashboard) -> None:
     def shown() -> set[str]:
-        return {name for name, line in page.whole.lines.items() if line.visible} - {"none"}
+        return {name for name, line in page.trace.lines.items() if line.visible} - {"none"}
 
     def best(mode: str) -> set[str]:
-        rows = [r for r in page.results.rows if r["mode"] == mode and r["controller"] in page.whole.lines]
+        rows = [r for r in page.results.rows if r["mode"] == mode and r["controller"] in page.trace.lines]
         return {r["controller"] for r in sorted(rows, key=lambda r: r["residual_rms_nm"])[:2]}
 
     assert shown() == {"integrator", "lqg-kf-lgs"} | best("tip")
@@ -99,7 +104,7 @@ def test_the_lines_that_matter_come_first_until_others_are_chosen(page: ClosedLo
     assert page.spectrum.figure.y_range.end == pytest.approx(3.0 * max(np.max(y) for y in spectra)), "no room for hidden ones"
     page.cards.hidden_lines = []
     dashboard.display.mode = "tilt"
-    assert shown() == set(page.whole.lines) - {"none"}, "chosen lines stay"
+    assert shown() == set(page.trace.lines) - {"none"}, "chosen lines stay"
     page.cards._handle_msg({"main": True})
     assert shown() == {"integrator", "lqg-kf-lgs"} | best("tilt")
 
@@ -108,10 +113,10 @@ def test_marks_hiding_colours_and_reasons(page: ClosedLoopPage, dashboard: Dashb
     the_marks_lie_on_the_curves_where_the_margins_are(page)
     before = top(page)
     page.cards.hidden_lines = [name for name in CONTROLLERS if name != "lqg-multirate-multi"]
-    assert not page.whole.lines["integrator"].visible and page.whole.lines["lqg-multirate-multi"].visible
+    assert not page.trace.lines["integrator"].visible and page.trace.lines["lqg-multirate-multi"].visible
     assert top(page) < before and not len(page.nyquist.marks.data["x"])
     dashboard.display.dark = True
-    assert page.whole.lines["integrator"].glyph.line_color == look("integrator").dark
+    assert page.trace.lines["integrator"].glyph.line_color == look("integrator").dark
     page.work.refuse("the record has no truth")
     assert "No closed loop: the record has no truth" in page.note.object
 
@@ -133,7 +138,7 @@ def test_it_follows_the_settings_while_it_is_seen(page: ClosedLoopPage, dashboar
     done(page, loop)
     assert page.table.object.count("unstable</span>") == 3
     assert {c["note"] for c in page.cards.items if "integrator" in c["name"]} == {"unstable"}
-    assert not len(page.whole.sources["integrator"].data["x"])
+    assert not len(page.trace.sources["integrator"].data["x"])
     dashboard.pages.current = EXPLORE
     before = page.results
     dashboard.store.change("control.gain", 0.5)
@@ -147,7 +152,7 @@ def test_it_comes_back_as_the_switches_are_by_then(page: ClosedLoopPage, dashboa
     dashboard.pages.current = EXPLORE
     dashboard.display.param.update(mode="tilt", unit="mas")
     opened(dashboard)
-    assert page.whole.figure.yaxis.axis_label == "residual tilt [mas]"
+    assert page.trace.figure.yaxis.axis_label == "residual tilt [mas]"
 
 
 def test_more_modes_than_tip_and_tilt(page: ClosedLoopPage, dashboard: Dashboard, loop: Any) -> None:
@@ -155,8 +160,8 @@ def test_more_modes_than_tip_and_tilt(page: ClosedLoopPage, dashboard: Dashboard
     loop.finish(dashboard.store)
     done(page, loop)
     dashboard.display.mode = "defocus"
-    assert page.whole.figure.yaxis.axis_label == "residual defocus [nm]"
-    assert len(page.whole.sources["integrator"].data["x"]) > 100
+    assert page.trace.figure.yaxis.axis_label == "residual defocus [nm]"
+    assert len(page.trace.sources["integrator"].data["x"]) > 100
 
 
 def test_what_would_take_minutes_is_left_out(dashboard: Dashboard, loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:

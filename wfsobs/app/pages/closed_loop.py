@@ -20,7 +20,18 @@ from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
 from wfsobs.app.numbers import NOTHING, number
 from wfsobs.app.pages.loop_figures import LoopSpectrum, Nyquist, Response, Trace
 from wfsobs.app.pages.loop_table import loop_html, margins_html
-from wfsobs.app.pages.parts import EDITED, SMALL_LABEL, TALL, WIDE, PageActions, box, figure_with_caption, html, text
+from wfsobs.app.pages.parts import (
+    EDITED,
+    SMALL_LABEL,
+    TALL,
+    WIDE,
+    PageActions,
+    box,
+    figure_with_caption,
+    html,
+    text,
+    zoom_buttons,
+)
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.gain_editor import GainEditor
@@ -30,8 +41,8 @@ from wfsobs.control.controllers import CONTROLLERS
 REFERENCES = ("integrator", "lqg-kf-lgs")
 """Shown at first beside the best, of which there are two."""
 
-ZOOM_S = 0.5
-"""Length of the zoomed trace [s], in the middle of the record."""
+FIRST_S, ZOOM_S = 2.0, 0.5
+"""Length of the two traces at first [s], in the middle of the record."""
 
 GRID = """
 :host { display: grid !important; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 10px; }
@@ -60,14 +71,14 @@ class ClosedLoopPage(PageActions):
         terms = {STREHL: TERMS[STREHL]}
         self.cards = Cards(items=[], hidden_lines=[], terms=terms, main=MAIN, sizing_mode="stretch_width", margin=0)
         self.cards.on_main, self._main, self._is_chosen = self._show_main, list[str](), False
-        self.whole, self.zoom = Trace("whole record"), Trace("zoomed")
+        self.trace, self.zoom = Trace(FIRST_S), Trace(ZOOM_S)
         self.spectrum, self.response, self.nyquist = LoopSpectrum(), Response(), Nyquist()
         self.room = figure_with_caption("Rejection and noise transfer", self.response.figure, tall=True)
         self.stability = figure_with_caption("Loop gain L, unit circle", self.nyquist.figure)
         self.editor: GainEditor | None = None
         display.param.watch(self._edit, "editing")
         self._edit()
-        self._figures = (self.whole, self.zoom, self.spectrum, self.response, self.nyquist)
+        self._figures = (self.trace, self.zoom, self.spectrum, self.response, self.nyquist)
         self.work.param.watch(self._say, ["state", "place", "message"])
         self.work.param.watch(self._redraw, "result")
         run.param.watch(self._follow, ["result", "state"])
@@ -81,7 +92,7 @@ class ClosedLoopPage(PageActions):
             *(
                 figure_with_caption(title, drawn.figure, tall=True)
                 for title, drawn in (
-                    ("Residual, whole record", self.whole),
+                    ("Residual", self.trace),
                     ("Spectrum of the residual", self.spectrum),
                     ("Residual, zoomed", self.zoom),
                 )
@@ -104,8 +115,9 @@ class ClosedLoopPage(PageActions):
             stylesheets=[":host { gap: 10px; }"],
         )
 
-    def _switch(self) -> pmui.Checkbox:
-        return pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0, stylesheets=[SMALL_LABEL])
+    def _switch(self) -> pn.FlexBox:
+        edit = pmui.Checkbox.from_param(self.display.param.editing, size="small", margin=0, stylesheets=[SMALL_LABEL])
+        return pn.FlexBox(*zoom_buttons(self.trace.zoom, {"Whole record": None, f"{FIRST_S:g} s": FIRST_S}), edit, **WIDE)
 
     def _edit(self, *_: object) -> None:
         """Make the handle when it is first wanted, and room for what stands below the figure."""
@@ -166,15 +178,9 @@ class ClosedLoopPage(PageActions):
         if shown is None or not self.visible or self.display.column >= len(shown.result.scenario.modes):
             return
         with pn.io.hold():
-            n, dt = shown.result.record.n_steps, shown.result.record.dt
-            half = min(round(ZOOM_S / dt), n) // 2
-            begin = min(round(shown.result.scenario.run.warm_up / dt), n - 2)
-            middle = (begin + n) // 2
-            self.whole.draw(shown, self.display, begin, n)
-            self.zoom.draw(shown, self.display, max(middle - half, begin), min(middle + half, n))
-            for drawn in (self.spectrum, self.response, self.nyquist):
+            for drawn in self._figures:
                 drawn.draw(shown, self.display)
-            if shown.complete and not self._is_chosen:
+            if not self._is_chosen:
                 self._show_main()
             self._restyle()
             if self.editor is not None:
@@ -184,7 +190,7 @@ class ClosedLoopPage(PageActions):
         with pn.io.hold():
             for drawn in self._figures:
                 drawn.restyle(self.display.dark, self.cards.hidden_lines)
-            for drawn in (self.whole, self.zoom, self.spectrum):
+            for drawn in (self.trace, self.zoom, self.spectrum):
                 drawn.fit(self.cards.hidden_lines)
             if self.results is not None:
                 self.table.object = loop_html(self.results, self.display)

@@ -12,7 +12,7 @@ import panel_material_ui as pmui
 from wfsobs.app.causes import Causes
 from wfsobs.app.display import CUMULATIVE, ERROR, PSD, RUNNING_RMS, SIGNAL
 from wfsobs.app.history import History
-from wfsobs.app.pages.parts import EDITED, SMALL_LABEL, TALL, WIDE, box, group
+from wfsobs.app.pages.parts import EDITED, SMALL_LABEL, TALL, WIDE, box, group, zoom_buttons
 from wfsobs.app.render import macro
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
@@ -83,7 +83,7 @@ class Explore:
         return pn.FlexBox(
             group(self.display, "show", {"Signal": SIGNAL, "Error": ERROR, "Running rms": RUNNING_RMS}),
             group(self.display, "spectrum", {"PSD": PSD, "Cumulative rms": CUMULATIVE}),
-            self._zoom_buttons(),
+            pn.Row(*zoom_buttons(self.traces.zoom, ZOOMS), margin=0),
             self._tick("window_spectra"),
             *([self._tick("editing")] if self.seeds else []),
             *self.pinning.view(),
@@ -101,14 +101,6 @@ class Explore:
 
     def _best_first(self) -> pmui.Checkbox:
         return pmui.Checkbox.from_param(self.display.param.best_first, size="small", margin=(0, 0, 4, 0))
-
-    def _zoom_buttons(self) -> pn.Row:
-        buttons = []
-        for label, seconds in ZOOMS.items():
-            button = pmui.Button(label=label, size="small", variant="text", margin=0, description=f"Time window: {label.lower()}")
-            button.on_click(lambda _event, seconds=seconds: self.traces.zoom(seconds))
-            buttons.append(button)
-        return pn.Row(*buttons, margin=0)
 
     def _section(self, target: str) -> pn.Column:
         """Lay out the strip and the two figures of one target."""

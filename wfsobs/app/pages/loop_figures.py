@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import panel as pn
 from bokeh.models import ColumnDataSource, Range1d
 from bokeh.plotting import figure
 
@@ -11,6 +12,7 @@ from wfsobs.app.loop_work import LoopResults
 from wfsobs.app.style import look
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.plots import add_line, new_figure, restyle
+from wfsobs.app.views.settle import on_settle
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
@@ -41,33 +43,61 @@ class LoopLines:
 
 
 class Trace(LoopLines):
-    """The residual of every controller over time; that of none would dwarf the rest."""
+    """The residual of every controller over time; that of none would dwarf the rest. seconds : shown of a record at first."""
 
-    def __init__(self, what: str):
+    def __init__(self, seconds: float):
+        self.x_range = Range1d(start=0.0, end=1.0)
         super().__init__(
-            new_figure(x_range=Range1d(start=0.0, end=1.0), y_range=Range1d(start=-1.0, end=1.0)),
+            new_figure(x_range=self.x_range, y_range=Range1d(start=-1.0, end=1.0)),
             tuple(name for name in CONTROLLERS if name != NONE),
         )
-        self.what = what
+        self.seconds = seconds
+        self._shown: tuple[LoopResults, Display] | None = None
+        self._hidden: list[str] = []
         self.figure.xaxis.axis_label = "time [s]"
+        on_settle([self.x_range], self._send)
 
-    def draw(self, results: LoopResults, display: Display, first: int, last: int) -> None:
-        """Send the samples first ... last - 1 of every line."""
-        dt = results.result.record.dt
-        scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter)
-        times = envelope_times(first, last, BINS, dt)
-        for name, source in self.sources.items():
-            residual = results.residual(name)
-            source.data = (
-                {"x": [], "y": []}
-                if residual is None
-                else {"x": times, "y": (scale * envelope(residual[first:last, display.column], BINS)).astype(np.float32)}
-            )
-        self.figure.x_range.update(start=first * dt, end=last * dt, reset_start=first * dt, reset_end=last * dt)
+    def draw(self, results: LoopResults, display: Display) -> None:
+        """Draw what is in view of every line; of another record that is its middle at first."""
+        it = results.result
+        start, end = it.scenario.run.warm_up, it.record.n_steps * it.record.dt
+        self._shown = results, display
+        if (start, end) != (self.x_range.reset_start, self.x_range.reset_end):
+            self.x_range.update(reset_start=start, reset_end=end)
+            self.zoom(self.seconds)
+        self._send()
         self.figure.yaxis.axis_label = f"residual {display.mode_label} [{display.unit_label}]"
+
+    def zoom(self, seconds: float | None) -> None:
+        """Show the middle of the record, or all of it after the start."""
+        start, end = float(self.x_range.reset_start), float(self.x_range.reset_end)  # type: ignore[arg-type]
+        half = 0.5 * min(seconds or end - start, end - start)
+        self.x_range.update(start=0.5 * (start + end) - half, end=0.5 * (start + end) + half)
+
+    def _send(self) -> None:
+        """Send the samples in view, as extremes where they are many."""
+        if self._shown is None:
+            return
+        results, display = self._shown
+        record = results.result.record
+        start, end = sorted((float(self.x_range.start), float(self.x_range.end)))  # type: ignore[arg-type]
+        first = min(max(int(start / record.dt), 0), record.n_steps - 2)
+        last = min(max(int(np.ceil(end / record.dt)) + 1, first + 2), record.n_steps)
+        scale = per_micrometre(display.unit, results.result.scenario.telescope.diameter)
+        times = envelope_times(first, last, BINS, record.dt)
+        with pn.io.hold():
+            for name, source in self.sources.items():
+                residual = results.residual(name)
+                source.data = (
+                    {"x": [], "y": []}
+                    if residual is None
+                    else {"x": times, "y": (scale * envelope(residual[first:last, display.column], BINS)).astype(np.float32)}
+                )
+            self.fit(self._hidden)
 
     def fit(self, hidden_names: list[str]) -> None:
         """Have the axis hold every visible line."""
+        self._hidden = hidden_names
         lines = [np.abs(s.data["y"]) for name, s in self.sources.items() if name not in hidden_names and len(s.data["y"])]
         top = 1.1 * max((float(y.max()) for y in lines), default=1.0)
         self.figure.y_range.update(start=-top, end=top, reset_start=-top, reset_end=top)

@@ -57,6 +57,16 @@ def text(content: str) -> pn.pane.HTML:
     return html(f'<p class="text">{escape(content)}</p>')
 
 
+def zoom_buttons(zoom: Callable[[float | None], None], stretches: Mapping[str, float | None]) -> list[pmui.Button]:
+    """Make the buttons of stretches of time [s] by their names; None is all of the record."""
+    buttons = []
+    for label, seconds in stretches.items():
+        button = pmui.Button(label=label, size="small", variant="text", margin=0, description=f"Time window: {label.lower()}")
+        button.on_click(lambda _event, seconds=seconds: zoom(seconds))
+        buttons.append(button)
+    return buttons
+
+
 def box(title: str, *content: Any) -> pn.Column:
     """Lay out a part of a page under its title."""
     return pn.Column(heading(title), *content, **WIDE, stylesheets=[asset("box.css")])
