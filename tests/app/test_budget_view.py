@@ -74,13 +74,13 @@ def test_learners_have_bars_by_simulation_which_can_be_stopped_and_gone_on_with(
     loop.until(lambda: view.task.state == DONE)
     assert learners.start.visible and not learners.stop.visible and "No bars yet" in learners.line.object
     learners.simulate()
-    loop.until(lambda: bool(learners.found))
+    loop.until(lambda: bool(learners.by_observer))
     learners.stop.clicks += 1
     assert learners.task.state == CANCELLED and learners.start.visible
-    some = dict(learners.found)
+    some = dict(learners.by_observer)
     learners.simulate()
     loop.until(lambda: learners.task.state == DONE)
-    assert not learners.start.visible and all(learners.found[name] is found for name, found in some.items())
+    assert not learners.start.visible and all(learners.by_observer[name] is found for name, found in some.items())
     scores = {(s.observer, s.target): s.rms for s in store.run.result.result.scores if s.mode == "tip"}
     # Shapley's shares add up to the estimate exactly, those of one that learns as well
     expected = (scores["gpr-offline", "vibration"] * 1e3) ** 2
@@ -91,7 +91,7 @@ def test_learners_have_bars_by_simulation_which_can_be_stopped_and_gone_on_with(
     assert end(view.bars["vibration"], "Offline GPR") > 0.0, "they are not simulated again"
     store.change("turbulence.wind_speed", 30.0)
     loop.until(lambda: store.run.state == DONE and view.task.state == DONE and learners.start.visible)
-    assert not learners.found and end(view.bars["vibration"], "Offline GPR") == 0.0
+    assert not learners.by_observer and end(view.bars["vibration"], "Offline GPR") == 0.0
 
 
 def test_negative_terms_lie_left_of_zero() -> None:

@@ -113,7 +113,7 @@ class Actions:
 
     def handle(self, msg: dict[str, Any]) -> None:
         """Do what a message of the toolbar says."""
-        does: dict[str, Callable[[], None]] = {
+        does: dict[str, Callable[[], object]] = {
             "undo": self.store.undo,
             "redo": self.store.redo,
             "history": self.open_history,

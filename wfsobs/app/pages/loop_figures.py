@@ -52,8 +52,8 @@ class Trace(LoopLines):
             tuple(name for name in CONTROLLERS if name != NONE),
         )
         self.seconds = seconds
-        self._shown: tuple[LoopResults, Display] | None = None
-        self._hidden: list[str] = []
+        self._of: tuple[LoopResults, Display] | None = None
+        self._invisible_names: list[str] = []
         self.figure.xaxis.axis_label = "time [s]"
         on_settle([self.x_range], self._send)
 
@@ -61,7 +61,7 @@ class Trace(LoopLines):
         """Draw what is in view of every line; of another record that is its middle at first."""
         it = results.result
         start, end = it.scenario.run.warm_up, it.record.n_steps * it.record.dt
-        self._shown = results, display
+        self._of = results, display
         if (start, end) != (self.x_range.reset_start, self.x_range.reset_end):
             self.x_range.update(reset_start=start, reset_end=end)
             self.zoom(self.seconds)
@@ -76,9 +76,9 @@ class Trace(LoopLines):
 
     def _send(self) -> None:
         """Send the samples in view, as extremes where they are many."""
-        if self._shown is None:
+        if self._of is None:
             return
-        results, display = self._shown
+        results, display = self._of
         record = results.result.record
         start, end = sorted((float(self.x_range.start), float(self.x_range.end)))  # type: ignore[arg-type]
         first = min(max(int(start / record.dt), 0), record.n_steps - 2)
@@ -93,11 +93,11 @@ class Trace(LoopLines):
                     if residual is None
                     else {"x": times, "y": (scale * envelope(residual[first:last, display.column], BINS)).astype(np.float32)}
                 )
-            self.fit(self._hidden)
+            self.fit(self._invisible_names)
 
     def fit(self, hidden_names: list[str]) -> None:
         """Have the axis hold every visible line."""
-        self._hidden = hidden_names
+        self._invisible_names = hidden_names
         lines = [np.abs(s.data["y"]) for name, s in self.sources.items() if name not in hidden_names and len(s.data["y"])]
         top = 1.1 * max((float(y.max()) for y in lines), default=1.0)
         self.figure.y_range.update(start=-top, end=top, reset_start=-top, reset_end=top)

@@ -26,7 +26,7 @@ RUNS = 16
 LIGHT = 0.05
 """About how long those take whose time is not estimated [s]."""
 
-Found = dict[str, Sequence[Budget]]
+ByObserver = dict[str, Sequence[Budget]]
 """Observer -> budgets."""
 
 
@@ -36,7 +36,7 @@ class LearnersBudget:
     def __init__(self, store: Store, draw: Callable[[], None]):
         self.store, self.draw = store, draw
         self.task = BackgroundTask(store.session)
-        self.found: Found = {}
+        self.by_observer: ByObserver = {}
         self._of: tuple[RunResults, str] | None = None
         self._names: Sequence[str] = ()
         self.start = pmui.Button(label="By simulation", icon="add_chart", variant="outlined", size="small", margin=(0, 8, 8, 0))
@@ -56,7 +56,7 @@ class LearnersBudget:
         """Offer the budgets of these observers in one mode."""
         if not self._is_of(results, mode):
             self.task.cancel()
-            self.found, self._of = {}, (results, mode)
+            self.by_observer, self._of = {}, (results, mode)
         self._names = names
         self._say()
 
@@ -68,7 +68,7 @@ class LearnersBudget:
 
     def budgets(self, results: RunResults, mode: str) -> list[Budget]:
         """Return what has been found of these results in a mode."""
-        return [one for own in self.found.values() for one in own] if self._is_of(results, mode) else []
+        return [one for own in self.by_observer.values() for one in own] if self._is_of(results, mode) else []
 
     def _is_of(self, results: RunResults, mode: str) -> bool:
         return self._of is not None and self._of[0] is results and self._of[1] == mode
@@ -84,12 +84,12 @@ class LearnersBudget:
         except SettingError as error:
             self.task.refuse(str(error))
             return
-        work = partial(find_budgets, results, mode, left, self.found)
+        work = partial(simulate_budgets, results, mode, left, self.by_observer)
         self.task.start(Job("budget", work, cost=seconds, priority=SWEEP))
 
     @property
     def _left(self) -> list[str]:
-        return [name for name in self._names if name not in self.found]
+        return [name for name in self._names if name not in self.by_observer]
 
     def _seconds(self, names: Sequence[str]) -> float:
         assert self._of is not None
@@ -98,7 +98,7 @@ class LearnersBudget:
 
     def _take(self, *_: object) -> None:
         if self.task.latest is not None and self._of is not None:
-            self.found = self.task.latest
+            self.by_observer = self.task.latest
             self.draw()
         self._say()
 
@@ -107,8 +107,8 @@ class LearnersBudget:
         self.start.visible, self.stop.visible = bool(left) and not busy, busy
         if left and not busy:
             self.start.label = f"By simulation, about {max(self._seconds(left), 1.0):.0f} s"
-        if self.found and self._names:
-            said.append(f"By {RUNS} runs each, averaged over all orders of switching the causes on: {_labels(self.found)}.")
+        if self.by_observer and self._names:
+            said.append(f"By {RUNS} runs each, averaged over all orders of switching the causes on: {_labels(self.by_observer)}.")
         if left:
             said.append(f"No bars yet: {_labels(left)}. They are not linear.")
         if busy:
@@ -118,16 +118,18 @@ class LearnersBudget:
         self.line.object = f'<p class="text">{escape(" ".join(said))}</p>' if said else ""
 
 
-def find_budgets(results: RunResults, mode: str, names: Sequence[str], known: Found, watch: Watch, tell: Tell) -> Found:
+def simulate_budgets(
+    results: RunResults, mode: str, names: Sequence[str], before: ByObserver, watch: Watch, tell: Tell
+) -> ByObserver:
     """Compute the budgets of observers in one mode, and tell all that are known whenever there is one more."""
-    found = dict(known)
+    out = dict(before)
     for i, name in enumerate(names):
         watch.step(i / len(names))
         alone = Watch(is_cancelled=watch.is_cancelled)
-        found[name] = error_budget(results.result, observers=[name], mode=mode, watch=alone)
-        tell(latest=dict(found))
-    return found
+        out[name] = error_budget(results.result, observers=[name], mode=mode, watch=alone)
+        tell(latest=dict(out))
+    return out
 
 
-def _labels(names: Sequence[str] | Found) -> str:
+def _labels(names: Sequence[str] | ByObserver) -> str:
     return ", ".join(row_label(name) for name in names)
