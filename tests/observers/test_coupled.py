@@ -13,6 +13,7 @@ from wfsobs.campaign.plan import parse_plan
 from wfsobs.campaign.sweep import parse_axis, plan_sweep
 from wfsobs.evaluation.bound import bound_rms
 from wfsobs.evaluation.bound_modes import bound_rms_of_modes
+from wfsobs.evaluation.calibration import half_width
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.evaluation.scores import BOUND_MODES
 from wfsobs.evaluation.theory import is_predicted
@@ -25,7 +26,7 @@ from wfsobs.observers.base import TARGETS
 from wfsobs.observers.kalman.coupled import INDEPENDENT, CoupledEstimator, CoupledModel
 from wfsobs.pipeline import observe, run
 from wfsobs.prior import Flow, Lines
-from wfsobs.priors_from.scenario import prior_of
+from wfsobs.priors_from.scenario import arguments, prior_of
 from wfsobs.priors_from.selection import has_prior, usual_observers
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.loop import simulate
@@ -99,6 +100,17 @@ def test_errors_are_as_it_states() -> None:
         error = np.sqrt(np.mean((found[target] - truth)[2000:] ** 2, axis=0))
         np.testing.assert_allclose(error[:2], stated(scenario, target)[:2], rtol=0.12)
     assert (found["vibration"][:, 2:] == 0.0).all()  # tip and tilt alone vibrate
+
+
+def test_its_bands_hold_what_they_say() -> None:
+    """300 s of tip and tilt: 68 and 95 % within 2 percentage points."""
+    scenario = SHAKEN.replace({"telescope.radial_order": 1, "run.duration": 300.0})
+    record = simulate(scenario)
+    found = OBSERVERS["kf-coupled"].estimate(*arguments(OBSERVERS["kf-coupled"], record, scenario))
+    for target, values in found.items():
+        error, sd = (values - record.truth(target))[2000:], found.sd[target][2000:]
+        for share in (0.68, 0.95):
+            assert abs(np.mean(np.abs(error) <= half_width(share) * sd) - share) < 0.02, target
 
 
 @pytest.mark.parametrize("changes", [{}, {"telescope.radial_order": 3}, {"turbulence.source": "ar3"}])
