@@ -67,13 +67,15 @@ class PresentInputs:
         return np.array(weights), np.array(sd)
 
     def _select(self, present: Present) -> Selection:
-        there, n = np.flatnonzero(present), self._n_fast
-        among = np.eye(len(present))
-        if there.size < len(present):
-            mean = np.full((1, there.size), 1.0 / max(there.size, 1))
-            among = np.vstack([mean, helmert(there.size)]) @ self._to_each[there] if there.size else among[:0]
+        there, n, last = np.flatnonzero(present), self._n_fast, self._covariances[-1]
+        if there.size == len(present):
+            whole = np.eye(len(last))
+            found = [LeastVariance(one) for one in (*self._covariances, last[:n, :n])]
+            return Selection([whole] * len(self._covariances) + [whole[:n]], found)
+        mean = np.full((1, there.size), 1.0 / max(there.size, 1))
+        among = np.vstack([mean, helmert(there.size)]) @ self._to_each[there] if there.size else np.empty((0, len(present)))
         fast = np.kron(among, np.eye(n // len(present)))
         both = block_diag(fast, np.eye(len(self._covariances[0]) - n))
-        alone, last = both[: len(fast)], self._covariances[-1]
+        alone = both[: len(fast)]
         of_phases = [both @ one @ both.T for one in self._covariances] + [alone @ last @ alone.T]
         return Selection([both] * len(self._covariances) + [alone], [LeastVariance(one) for one in of_phases])
