@@ -2,7 +2,7 @@
 // and keeps what was changed meanwhile. One for the document, which outlives what is drawn of it.
 
 const TICK = 250 // [ms]; only those count in which this page gets to work, so that a busy computer is no lost connection
-const PATIENCE = 8 // with a question to the server [ticks]
+const PATIENCE = 16 // with a question to the server: to make the page of another visitor takes two seconds on a busy machine [ticks]
 const GIVEN_UP = 40 // after which another way to the server is tried [ticks]
 const PERIOD = 12 // between questions where nothing is changed [ticks]
 const TIMEOUT = 3_000 // of a question beside the connection [ms]
