@@ -25,6 +25,7 @@ from wfsobs.app.service import Service
 from wfsobs.app.session import opens_on_live
 from wfsobs.app.sources import LoadedRecord
 from wfsobs.app.store import Store
+from wfsobs.live.board import NEXT
 from wfsobs.live.loop import LiveLoop
 from wfsobs.live.recording import Recorder
 from wfsobs.live.ring import Ring
@@ -252,6 +253,9 @@ def test_a_record_that_is_loaded_is_played(page: LivePage, dashboard: Dashboard,
     view = live.view(0.1)
     np.testing.assert_array_equal(view.frames.z, made.z[view.first : view.first + view.n])
     assert page.draw() and page.picture is not None and "kf-multi" in page.picture.table.object
+    c = page.controls
+    assert [f.disabled for f in (c.lasers, c.ngs, c.losses, c.target, c.speed)] == [True, True, True, True, False]
+    assert c.target.value == NEXT
     page.work.cancel()
 
 

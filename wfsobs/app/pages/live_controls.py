@@ -14,10 +14,11 @@ from wfsobs.app.pages.live_table import QUANTITIES
 from wfsobs.app.pages.live_waterfall import MEASUREMENT
 from wfsobs.app.pages.parts import WIDE, line
 from wfsobs.app.style import asset, look
-from wfsobs.live.board import SLOTS
+from wfsobs.live.board import NEXT, SLOTS
 from wfsobs.live.checks import ADAPTIVE
 from wfsobs.live.control_crew import SEATS, USUAL
 from wfsobs.live.loop import LiveLoop
+from wfsobs.live.source import SIMULATION, STREAM, LiveSource
 from wfsobs.observers.base import TARGETS
 
 PATIENCE = 10.0
@@ -119,6 +120,18 @@ class LiveControls:
         shown = self.lines.value
         self.lines.value = [*shown, *(name for name in ADAPTIVE if name in self.running.value and name not in shown)]
         self.controllers.value = [name for name in SEATS if name in loop.controllers]
+        self._allow(loop.source)
+
+    def _allow(self, source: LiveSource) -> None:
+        """Have those alone at hand that the source has: a simulation loses frames, a stream keeps its own clock."""
+        for field in (self.lasers, self.ngs, self.losses):
+            field.disabled = source.name != SIMULATION
+        self.speed.disabled = source.name == STREAM
+        if source.has_truth and self.target.disabled:
+            self.target.value = TARGETS[0]
+        if not source.has_truth:
+            self.target.value = NEXT
+        self.target.disabled = not source.has_truth
 
     def view(self) -> list[Any]:
         """Return the rows of controls; those of the figures stand by them."""

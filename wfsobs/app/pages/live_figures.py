@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
+from bokeh.core.validation import silence
+from bokeh.core.validation.warnings import MISSING_RENDERERS
 from bokeh.models import ColumnDataSource, Range1d, Span
 from bokeh.plotting import figure
 
@@ -35,6 +37,7 @@ DECADES = 7
 COARSE = 20
 """Bins of the histogram of latencies that are drawn as one."""
 NAMES = (TRUTH, *BOUNDS, *SLOTS)
+silence(MISSING_RENDERERS)  # of figures whose lines are made when they are first shown
 
 
 class LiveFigure:
