@@ -3,7 +3,8 @@
     python scripts/measure_theory.py [PRESET ...]
 
 Every frame moves one setting a little further, as a drag does, and predicts in one mode, as coarsely as a drag does, all linear
-observers of the LGS, then each of the others. It prints the median, the 95th percentile and the maximum [ms], and the median of
+observers of the LGS, then each of the others, then all by turns, as the page does: a frame has those for which there is time, and
+the next one begins with the others. It prints the median, the 95th percentile and the maximum [ms], and the median of
 the processor's time, which does not count others at work on the machine; the first frame of a drag, which computes what the
 others share, stands by itself.
 """
@@ -12,11 +13,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from time import perf_counter, process_time
+from math import inf
+from time import monotonic, perf_counter, process_time
 
 import numpy as np
 
-from wfsobs.app.views.spectrum_editor import DRAGGED, LOOSE
+from wfsobs.app.views.spectrum_editor import DRAGGED, FRAME, LOOSE
 from wfsobs.app.work import one_blas_thread
 from wfsobs.evaluation.scores import BOUND
 from wfsobs.evaluation.theory import Theory, is_predicted
@@ -25,6 +27,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 
 FRAMES = 60
+BY_TURNS = "all, by turns"
 
 
 def moved_peak(s: Scenario, i: int) -> Scenario | None:
@@ -68,7 +71,7 @@ def main(names: list[str]) -> None:
     for name in names:
         for drag, (target, move) in DRAGS.items():
             for label, observers in groups(target).items():
-                times, busy = drag_times(name, target, move, observers)
+                times, busy = drag_times(name, target, move, observers, label == BY_TURNS)
                 if times:
                     p50, p95 = np.percentile(times[1:], [50, 95])
                     print(f"{name:10}{drag:19}{label:19}{times[0]:9.1f}{p50:9.1f}{p95:9.1f}", end="")
@@ -79,10 +82,11 @@ def groups(target: str) -> dict[str, list[str]]:
     """Return what is predicted together: the observers of the LGS and the bound, and each other one."""
     linear = [o for o in OBSERVERS.values() if is_predicted(o, target)]
     fast = [o.id for o in linear if o.sensors == ("lgs",)]
-    return {"of the LGS": [*fast, BOUND], **{o.id: [o.id] for o in linear if o.id not in fast}}
+    every = [*(o.id for o in linear), BOUND]
+    return {"of the LGS": [*fast, BOUND], **{o.id: [o.id] for o in linear if o.id not in fast}, BY_TURNS: every}
 
 
-def drag_times(name: str, target: str, move: Move, observers: list[str]) -> tuple[list[float], list[float]]:
+def drag_times(name: str, target: str, move: Move, observers: list[str], by_turns: bool) -> tuple[list[float], list[float]]:
     """Return the time and the processor's time of every frame of a drag [ms]; none where there is nothing to move."""
     theory, times, busy = Theory(most=DRAGGED, left=LOOSE), [], []
     for i in range(FRAMES + 1):
@@ -90,9 +94,11 @@ def drag_times(name: str, target: str, move: Move, observers: list[str]) -> tupl
         if scenario is None:
             break
         start, at_work = perf_counter(), process_time()
-        theory.predict(scenario, 0, target, observers)
+        found = theory.predict(scenario, 0, target, observers, until=monotonic() + FRAME if by_turns and i else inf)
+        served = {p.observer for p in found}
         times.append(1e3 * (perf_counter() - start))
         busy.append(1e3 * (process_time() - at_work))
+        observers = sorted(observers, key=lambda one: one in served)
     return times, busy
 
 

@@ -175,3 +175,11 @@ class TestSpectrum:
                 assert band_rms(frequency, density, low, high) == pytest.approx(expected, rel=0.11), (name, low)
             total = next(s.rms for s in result.scores if (s.observer, s.target, s.mode) == (name, "vibration", "tip"))
             assert total == pytest.approx(predictions(scenario, "vibration")[name].rms, rel=0.05)
+
+
+def test_observers_for_which_there_is_no_time_are_left_out_the_first_alone_never():
+    theory, names = Theory(), ["kf-multi", "kf-lgs", "bound"]
+    whole = {p.observer: p for p in theory.predict(RIGHT, 0, "vibration", names)}
+    out_of_time = Theory().predict(RIGHT, 0, "vibration", names, until=0.0)
+    assert [p.observer for p in out_of_time] == ["truth", "kf-multi"]
+    assert out_of_time[1].rms == whole["kf-multi"].rms

@@ -10,6 +10,7 @@ import pytest
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.handles import changes_of, handles_of, with_new_peak, without_peak
 from wfsobs.app.pages.pages import LOOP
+from wfsobs.app.views import spectrum_editor
 from wfsobs.app.views.frames import Frames
 from wfsobs.app.views.gain_editor import GainEditor
 from wfsobs.app.views.spectrum_editor import DRAGGED, SpectrumEditor
@@ -111,6 +112,25 @@ class TestMessages:
         trial = scenario.replace({"vibration.peaks.14.frequency": 60.0, "vibration.peaks.14.rms": [3 * 0.0079, 0.0027]})
         expected = {p.observer: p for p in Theory().predict(trial, 0, "vibration")}
         assert float(numbers(editor)["kf-multi"]) == pytest.approx(1e3 * expected["kf-multi"].rms, rel=5e-3)  # three digits
+
+    def test_a_frame_has_those_for_which_there_is_time_and_the_next_one_begins_with_the_others(
+        self, editor: SpectrumEditor, loop: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(spectrum_editor, "FRAME", -1.0)  # one observer each
+        waiting: list[set[str]] = []
+
+        def note(event: Any) -> None:
+            waiting.append({it["name"] for it in event.new["numbers"] if it["waits"]})
+
+        editor.layer.param.watch(note, "frame")
+        editor.layer._handle_msg(drag(1, frequency=60.0))
+        loop.until(lambda: bool(waiting) and not waiting[-1])
+        trial = editor.store.scenario.replace({"vibration.peaks.14.frequency": 60.0})
+        expected = {p.observer: p for p in Theory().predict(trial, 0, "vibration")}
+        assert list(numbers(editor)) == [name for name in expected if name in numbers(editor)], "in their usual order"
+        assert [len(names) for names in waiting] == list(range(len(numbers(editor)) - 1, -1, -1))
+        for name, value in numbers(editor).items():
+            assert float(value) == pytest.approx(1e3 * expected[name].rms, rel=1e-2), name  # three digits, on a coarse grid
 
     def test_letting_go_sets_and_runs_and_undo_takes_it_back(self, editor: SpectrumEditor, loop: Any) -> None:
         store, before = editor.store, numbers(editor)

@@ -229,6 +229,7 @@ export function render({model, el}) {
   const entry = (it) => {
     const span = document.createElement("span")
     span.dataset.name = it.name
+    span.classList.toggle("waits", it.waits)  // of an earlier frame: it comes with the next one
     const swatch = document.createElement("i")
     swatch.style.background = it.colour
     const value = Object.assign(document.createElement("b"), {textContent: it.value})

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from math import sqrt
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -63,10 +64,10 @@ class Prediction:
     density: Array
 
 
-def is_predicted(observer: Observer, target: str) -> bool:
-    """Return whether an observer's errors have a prediction."""
-    known = observer.linear and not observer.couples_modes and observer.causal
-    return known and target in observer.targets and Training not in observer.prior
+def is_predicted(observer: Observer | None, target: str) -> bool:
+    """Return whether an observer's errors have a prediction; None stands for the bound."""
+    known = observer is None or (observer.linear and not observer.couples_modes and observer.causal)
+    return known and (observer is None or (target in observer.targets and Training not in observer.prior))
 
 
 @dataclass
@@ -92,7 +93,13 @@ class Theory:
     _fits: dict[int, Ar3Fits] = field(default_factory=dict, repr=False)
 
     def predict(
-        self, scenario: Scenario, mode: int, target: str, observers: Iterable[str] | None = None, of_error: bool = True
+        self,
+        scenario: Scenario,
+        mode: int,
+        target: str,
+        observers: Iterable[str] | None = None,
+        of_error: bool = True,
+        until: float = np.inf,
     ) -> list[Prediction]:
         """Predict the errors of observers.
 
@@ -108,6 +115,8 @@ class Theory:
             Ids of the observers, and BOUND; by default all. Those without a prediction are left out.
         of_error : bool
             Whether densities are those of errors, else of estimates.
+        until : float
+            Time on the monotonic clock after which no more observers but the first are begun [s].
 
         Returns
         -------
@@ -127,8 +136,10 @@ class Theory:
         out = []
         for name in (TRUTH, *([*OBSERVERS, BOUND] if observers is None else observers)):
             observer = OBSERVERS.get(name)
-            if observer is not None and not is_predicted(observer, target):
+            if not is_predicted(observer, target):
                 continue
+            if len(out) > 1 and monotonic() > until:
+                break
             response = None if observer is None else self._response(observer, scenario, mode, target, spectra.n)
             made_of = Identity(spectra), Identity(response), n_steps, of_error
 
@@ -194,14 +205,8 @@ class Theory:
 
     def _lines(self, scenario: Scenario, mode: int) -> Lines:
         air, k = self._air(scenario, mode), scenario.kalman
-        key = (
-            Identity(air),
-            scenario.multipeak.turbulence_order,
-            k.process_noise,
-            k.turbulence_rms,
-            k.measurement_noise,
-            k.lgs_noise,
-        )
+        order = scenario.multipeak.turbulence_order
+        key = Identity(air), order, k.process_noise, k.turbulence_rms, k.measurement_noise, k.lgs_noise
         fits = self._start_of_fits(mode)
 
         def make() -> tuple[Ar2 | Ar3, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from math import isfinite
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,12 @@ from wfsobs.app.store import Store
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.frames import Frames
 from wfsobs.app.views.plots import ExtraLines
+from wfsobs.app.views.settle import AFTERWARDS_MS, once
 from wfsobs.evaluation.error_spectra import cumulative_rms
 from wfsobs.evaluation.linear_response import SETTLED
 from wfsobs.evaluation.scores import BOUND
-from wfsobs.evaluation.theory import TRUTH, Prediction, Theory
+from wfsobs.evaluation.theory import TRUTH, Prediction, Theory, is_predicted
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import VIBRATION
 from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
@@ -34,6 +37,9 @@ CAPTION = "Predicted rms error"
 DRAGGED, LOOSE = 65_536, 0.001
 """The most frequencies to predict with while a handle is on its way, and what may be left at the end of a response: numbers are
 within 1 % of those once it is let go, in a fraction of the time."""
+
+FRAME = 0.05
+"""Time after which a frame of a drag begins no more observers [s]: those that are left come first in the next one."""
 
 
 class HandleLayer(JSComponent):
@@ -66,6 +72,8 @@ class SpectrumEditor:
         )
         self.lines = ExtraLines(fig, "predicted", line_alpha=1.0, line_width=1.6, line_dash=[2, 2], level="glyph")
         self._number, self._moves, self._rests = 0, False, False
+        self._left, self._shown_trial = list[str](), self.trial  # observers whose last numbers are of settings before these
+        self._go_on = once(self._ask_for_those_left, AFTERWARDS_MS)
         self._was: dict[str, float] = {}
         store.param.watch(self._follow, "scenario")
         display.param.watch(self._ask, ["mode", "unit", "spectrum", "show", "hidden_lines", "dark"])
@@ -148,21 +156,33 @@ class SpectrumEditor:
             self._show(note)
             return
         hidden = self.display.hidden_lines.get(self.target, [])
-        names = (*(name for name in observers_of(self.target) if name not in hidden), BOUND)
+        shown = [*(name for name in observers_of(self.target) if name not in hidden), BOUND]
+        names = sorted(shown, key=lambda name: name not in self._left)
         trial, mode, of_error = self.trial, self.display.column, self.display.error
         most, left = (DRAGGED, LOOSE) if self._moves else (None, SETTLED)
 
         def predict() -> list[Prediction]:
             self.theory.most, self.theory.left = most, left
-            return self.theory.predict(trial, mode, self.target, names, of_error)
+            until = np.inf if most is None else monotonic() + FRAME
+            return self.theory.predict(trial, mode, self.target, names, of_error, until)
 
-        self.frames.ask(self.target, predict, partial(self._land, trial, self._number))
+        self.frames.ask(self.target, predict, partial(self._land, trial, self._number, shown))
 
-    def _land(self, trial: Scenario, reply_to: int, predictions: list[Prediction] | None, why: str) -> None:
+    def _ask_for_those_left(self) -> None:
+        if self._left:
+            self._ask()
+
+    def _land(self, trial: Scenario, reply_to: int, shown: list[str], found: list[Prediction] | None, why: str) -> None:
         if not self.is_on:
             return
-        self._last = predictions = predictions or []
-        if trial == self.store.scenario:
+        now, before = ({p.observer: p for p in part} for part in (found or [], self._last))
+        owed = self._left if trial is self._shown_trial else shown
+        self._left = [name for name in owed if found and name not in now and is_predicted(OBSERVERS.get(name), self.target)]
+        self._shown_trial = trial
+        self._last = predictions = [p for name, p in (before | now).items() if found and name in (TRUTH, *shown)]
+        if self._left:
+            self._go_on()
+        if trial == self.store.scenario and not self._left:
             self._was = {p.observer: p.rms for p in predictions}
         with pn.io.hold():
             self.lines.draw({p.observer: self._curve(p) for p in predictions}, self.display.dark)
@@ -173,10 +193,10 @@ class SpectrumEditor:
 
     def _frame(self, note: str = "", reply_to: int = 0) -> dict[str, Any]:
         """Describe all that is shown."""
-        found = self._last
+        found, of = self._last, {p.observer: p for p in self._last}
         frame: dict[str, Any] = {
             "handles": [self._entry(handle, found) for handle in handles_of(self.trial, self.target, self.display.column)],
-            "numbers": [self._number_of(p) for p in found if p.observer != TRUTH],
+            "numbers": [self._number_of(of[name]) for name in (*OBSERVERS, BOUND) if name in of],
             "note": note,
             "answered": reply_to,
             "exponent": 1.0 if self.display.cumulative else 0.5,
@@ -210,6 +230,7 @@ class SpectrumEditor:
             "value": value,
             "was": "" if before == value else before,
             "unit": self.display.unit_label,
+            "waits": p.observer in self._left,
         }
 
     def _scale(self, scenario: Scenario) -> float:
