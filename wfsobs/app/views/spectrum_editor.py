@@ -172,14 +172,14 @@ class SpectrumEditor:
         if self._left:
             self._ask()
 
-    def _land(self, trial: Scenario, reply_to: int, shown: list[str], found: list[Prediction] | None, why: str) -> None:
+    def _land(self, trial: Scenario, reply_to: int, names: list[str], predictions: list[Prediction] | None, why: str) -> None:
         if not self.is_on:
             return
-        now, before = ({p.observer: p for p in part} for part in (found or [], self._last))
-        owed = self._left if trial is self._shown_trial else shown
-        self._left = [name for name in owed if found and name not in now and is_predicted(OBSERVERS.get(name), self.target)]
+        now, before = ({p.observer: p for p in part} for part in (predictions or [], self._last))
+        owed = self._left if trial is self._shown_trial else names
+        self._left = [name for name in owed if now and name not in now and is_predicted(OBSERVERS.get(name), self.target)]
         self._shown_trial = trial
-        self._last = predictions = [p for name, p in (before | now).items() if found and name in (TRUTH, *shown)]
+        self._last = predictions = [p for name, p in (before | now).items() if now and name in (TRUTH, *names)]
         if self._left:
             self._go_on()
         if trial == self.store.scenario and not self._left:
