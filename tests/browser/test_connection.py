@@ -142,6 +142,7 @@ def test_offline_for_a_while(page: Page) -> None:
 
 
 def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> None:
+    expect(peak(page)).to_be_visible()  # the table of peaks follows the page
     page.get_by_role("button", name="Pin this run to compare others with it").click()
     expect(page.get_by_text("Compared with, faint in the figures")).to_be_visible()
     cable.cut()
@@ -163,6 +164,7 @@ def test_a_cut_line_comes_back_to_the_same_session(page: Page, cable: Cable) -> 
 
 
 def test_what_is_changed_while_the_line_comes_back_counts_once(page: Page, cable: Cable) -> None:
+    expect(peak(page)).to_be_visible()  # the table of peaks follows the page
     peaks = page.locator('input[data-cell$=".frequency"]').count()
     cable.cut()
     expect(banner(page, "connection to the server is lost")).to_be_visible()
