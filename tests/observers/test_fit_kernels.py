@@ -116,3 +116,11 @@ def test_what_cannot_be_fitted_is_refused_in_one_line() -> None:
     found = wfsobs.fit_kernels(record, turbulence=[AIR], vibration=[QuasiPeriodic(0.05, 0.02, 0.5, 1.0, 1)])
     with pytest.raises(ValueError, match="observers take"):
         found.scenario()
+
+
+def test_a_search_that_ends_short_of_the_maximum_states_no_deviation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rms, held at a tenth above a start that is five times too small; the curvature there is positive all the same."""
+    monkeypatch.setattr("wfsobs.identification.kernels.FARTHEST", 1.1)
+    (mode,) = wfsobs.fit_kernels(drawn(AIR, 400, 1, 3), turbulence=[Matern(0.06, 0.05, 3)], noise=NOISE).modes
+    rms = mode.numbers["turbulence.0.rms"]
+    assert rms.value == pytest.approx(0.066, rel=1e-6) and np.isnan(rms.std)

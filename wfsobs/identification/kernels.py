@@ -32,6 +32,8 @@ SHORTEST = 100
 """Minimum samples of a mode."""
 FARTHEST = 1e4
 """Maximum ratio of a number to its start, and of its start to it."""
+ARRIVED = 0.1
+"""Maximum distance to the maximum, over the standard deviation."""
 STEP = 1e-4
 """Of the differences between gradients that the curvature is of, in logarithms."""
 
@@ -199,13 +201,14 @@ def _fit_mode(name: str, parts: dict[str, tuple[Kernel, ...]], noise: float, dt:
 
 
 def _standard_deviations(gradient: Callable[[Array], Array], x: Array) -> Array:
-    """Return those of the logarithms, from the curvature at the minimum; NaN where it is none."""
+    """Return those of the logarithms, from the curvature at the minimum; NaN where it is none, or a step of Newton leads away."""
     steps = STEP * np.eye(len(x))
     curvature = np.array([(gradient(x + step) - gradient(x - step)) / (2.0 * STEP) for step in steps])
     curvature = 0.5 * (curvature + curvature.T)
     if np.linalg.eigvalsh(curvature).min() <= 0:
         return np.full(len(x), nan)
-    return np.sqrt(np.diag(np.linalg.inv(curvature)))
+    std = np.sqrt(np.diag(np.linalg.inv(curvature)))
+    return np.where(np.abs(np.linalg.solve(curvature, gradient(x))) < ARRIVED * std, std, nan)
 
 
 KINDS = {1: "matern-1/2", 3: "matern-3/2", 5: "matern-5/2"}
