@@ -42,6 +42,8 @@ from wfsobs.observers import OBSERVERS
 DT, LATE = 1e-3, 1e-3
 PAGE_BEHIND, PICTURES = 0.5, 5.0
 """[s], per second"""
+WEIGHED = 10.0
+"""Time between two looks at the memory [s]: each holds up the process that it is of, and on some kernels a processor."""
 SETTLED = 20
 """Pictures of every page before the measurement begins."""
 
@@ -169,7 +171,9 @@ def main() -> None:
             polls.append((time.monotonic(), sent_seconds(now)))
             while not pictures.empty():
                 told.append(pictures.get())
-            memory.append((elapsed, memory_mb(family(server.pid))))
+            if not memory or elapsed - memory[-1][0] >= WEIGHED:
+                memory.append((elapsed, memory_mb(family(server.pid))))
+        memory.append((elapsed, memory_mb(family(server.pid))))
         last, seconds = counts(url), time.monotonic() - start
         each = {pid: cpu_seconds([pid]) - before.get(pid, 0.0) for pid in {*before, *family(server.pid)}}
         used = cpu_seconds(family(server.pid)) - sum(before.values())

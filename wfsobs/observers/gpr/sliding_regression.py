@@ -17,7 +17,8 @@ the target adds. One step of refinement of r against M itself holds the error at
 number, for any length of stream: a replaced point takes its error with it, so nothing accumulates.
 
 To write all of N at every step would take longer than everything else. The columns q / sqrt(q_s) and t / sqrt(sigma) of several
-steps wait beside it, and come in together.
+steps wait beside it, and come in together, those of one mode at other steps than those of another, so that no step takes
+much longer than the others.
 """
 
 from __future__ import annotations
@@ -62,6 +63,7 @@ class SlidingRegression:
         self._lower = [N.T for N in self._N]  # of which the lower triangle is kept; column-major views, as BLAS has them
         self._columns = np.zeros((n, 2 * WAITING, m))  # N is the one above, plus those of points that came, minus those that went
         self._signs = np.repeat([1.0, -1.0], WAITING)
+        self._turns = (np.arange(n) * max(1, WAITING // n) - 1) % WAITING  # of WAITING steps: when the columns of a mode come in
         self._last_target = np.zeros(n)
 
     @property
@@ -160,8 +162,9 @@ class SlidingRegression:
         self._M[:, s] = self._M[:, :, s] = v
         self._points.norm2[:, s], self._points.delta[:, s] = self._newest.norm2[:, 0], self._newest.delta[:, 0]
         self._points = self._points._replace(largest=max(self._points.largest, self._newest.largest))
-        if place == WAITING - 1:
-            self._gather()
+        for mode in np.flatnonzero(self._turns == place).tolist():
+            self._gather(mode)
+        if place == 0:
             self._renew_products()
 
     def _remove(self, s: int, place: int) -> None:
@@ -176,12 +179,12 @@ class SlidingRegression:
         self._columns[:, :, s] = 0.0
         ab[:, :, s] = self._kappa[:, s] = 0.0
 
-    def _gather(self) -> None:
-        """Bring the columns that wait into N."""
-        come, gone = self._columns[:, :WAITING], self._columns[:, WAITING:]
-        for N, less, more in zip(self._lower, come - gone, come + gone, strict=True):  # c c' - g g' in one pass over N
-            dsyr2k(0.5, less.T, more.T, beta=1.0, c=N, lower=1, overwrite_c=1)
-        self._columns[...] = 0.0
+    def _gather(self, mode: int) -> None:
+        """Bring the columns of a mode that wait into N."""
+        come, gone = self._columns[mode, :WAITING], self._columns[mode, WAITING:]
+        # c c' - g g' in one pass over N
+        dsyr2k(0.5, (come - gone).T, (come + gone).T, beta=1.0, c=self._lower[mode], lower=1, overwrite_c=1)
+        self._columns[mode] = 0.0
 
     def _times(self, mode: int, v: Array) -> Array:
         """Return N v of a mode."""
