@@ -29,6 +29,9 @@ from wfsobs.campaign.sweep import parse_axis, plan_sweep
 from wfsobs.campaign.sweep_results import SweepResults, run_sweep
 from wfsobs.evaluation.scores import Score
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.idle import idle_settings, why_idle_at
+from wfsobs.scenario.presets import PRESETS
+from wfsobs.settings.errors import SettingError
 
 WAIT = 60.0
 """As long as one run is waited for elsewhere [s]."""
@@ -170,6 +173,59 @@ def test_settings_and_their_usual_values(page: SweepPage, dashboard: Dashboard) 
     assert page.settings[0].value == RATIO and page.values[0].value == "1,6,10,15,20"
     dashboard.controls.search._handle_msg({"over": "no.such"})
     assert page.settings[0].value == RATIO
+    dashboard.controls.search._handle_msg({"over": "vibration.peaks.0.rms.0"})  # a number of a list
+    tip = scenario.vibration.peaks[0].rms[0]
+    assert page.plan().scenario(4).vibration.peaks[0].rms[0] == pytest.approx(2.0 * tip)
+    assert page.lines == {} and "Peak 1: tip [µm]" in page.settings[0].options
+    dashboard.controls.search._handle_msg({"over": "gpr_online.length_scale"})
+    assert "gpr-online" in page.plan().observers and "kf-adaptive" not in page.plan().observers, "its own observer runs"
+
+
+def test_usual_values_go_with_the_other_settings() -> None:
+    """What is suggested of a setting can be run, unless a line says that it changes nothing."""
+    scenario = PRESETS["laser-dropout"]()
+    idle = idle_settings(scenario)
+    events = [f"events.{i}.{name}" for i in range(len(scenario.events)) for name in ("start", "duration", "lasers", "kind")]
+    others = [
+        "turbulence.source",
+        "vibration.source",
+        "sensors.lgs_count",
+        "run.duration",
+        "sensors.spots.pixels",
+        "control.gain",
+    ]
+    for path in (*events, *others, "gp.background_scale", "butterworth.frequencies", "vibration.peaks.3.rms.0"):
+        values = usual_values(scenario, path)
+        changes_nothing = bool(why_idle_at(path, idle)) or path.startswith("control.")
+        said = reason(scenario, path, values)
+        assert values and bool(said) == changes_nothing and ("changes no error" in said) == changes_nothing, (path, said)
+
+
+def reason(scenario: Scenario, path: str, values: str) -> str:
+    try:
+        plan_sweep(scenario, [parse_axis(f"{path}={values}")], 3, ["kf-lgs"])
+    except SettingError as error:
+        return str(error)
+    return ""
+
+
+def test_the_address_has_the_fields(page: SweepPage, dashboard: Dashboard) -> None:
+    page.choose("vibration.peaks.1.frequency")
+    page.values[0].value, page.seeds.value = "8:12:3:log", "3"
+    query = dashboard.view_state.query
+    assert query == (
+        "view.page=sweep&view.sweep.over=vibration.peaks.1.frequency&view.sweep.values=8:12:3:log&view.sweep.second="
+        "&view.sweep.seeds=3"
+    )
+    planned = page.plan()
+    dashboard.pages.current = EXPLORE
+    assert dashboard.view_state.query == "", "the fields of the page shown alone"
+    assert dashboard.view_state.open("view.page=sweep") == []
+    assert page.settings[0].value == WIND and page.values[1].value == "2,5,10,20"
+    assert dashboard.view_state.open(query) == [] and page.plan() == planned and dashboard.view_state.query == query
+    colour, over = dashboard.view_state.open("view.page=sweep&view.sweep.over=no.such&view.sweep.colour=red")
+    assert colour == "view.sweep.colour: there is no such part of a view"
+    assert over.startswith("view.sweep.over = no.such: takes one of telescope.diameter, ")
 
 
 def test_what_cannot_be_run_is_said_in_one_line(page: SweepPage, dashboard: Dashboard) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -75,3 +76,11 @@ def test_undecided_where_the_record_does_not_say() -> None:
     assert "delay undecided" in slow.lines()[1] and slow.lines()[1].endswith("3 are needed")
     assert command_response(Record(y[:300], u[:300], 1e-3)) is None
     assert command_response(Record(y, np.zeros_like(u), 1e-3)) is None
+
+
+def test_commands_of_another_unit_are_said_to_be() -> None:
+    record = simulate(PRESETS["paper"]().replace({"run.duration": 5.0}))
+    found = command_response(replace(record, u=1e3 * record.u))
+    assert found is not None and (found.sign, found.delay) == (1, None)
+    expected = "delay undecided: at no delay do the commands explain the measurements' jumps, as if the two had different units"
+    assert found.lines()[1] == expected

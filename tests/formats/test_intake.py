@@ -47,9 +47,14 @@ def test_units_by_statement_by_file_and_by_signal(unit: str, factor: float) -> N
         np.testing.assert_allclose(record.y_lgs, Y * factor, rtol=1e-12)
         np.testing.assert_allclose(record.u, U * factor, rtol=1e-12)
         assert (f"unit {unit}" in record.origin) == (unit != "um")
-    mixed = taken(units={"u": unit})
+    silent = taken(units={"u": unit})
+    np.testing.assert_allclose(silent.y_lgs, Y * factor, rtol=1e-12)
+    mixed = taken(units={"u": unit, "y_lgs": "um"})
     np.testing.assert_allclose(mixed.y_lgs, Y)
     np.testing.assert_allclose(mixed.u, U * factor, rtol=1e-12)
+    if unit != "um":
+        with pytest.raises(RecordError, match=r"turbulence has no unit, where others have .* and .*: give it one"):
+            taken(units={"u": unit, "y_lgs": "um"}, turbulence=Y)
 
 
 def test_100_nm_of_tip_on_8_m_are_10_3133_mas() -> None:
@@ -233,7 +238,7 @@ def test_wrong_tables(text: str, message: str) -> None:
 
 
 def test_empty_cells_are_missing_samples_and_ends() -> None:
-    text = "\ufeffu/tip,y_lgs/tip_nm,training_y/tip,training_u/tip\n1,1000,5,6\n2,,7,8\n\n3,3000,,\n4,nan,,\n"
+    text = "\ufeffu/tip_um,y_lgs/tip_nm,training_y/tip_um,training_u/tip_um\n1,1000,5,6\n2,,7,8\n\n3,3000,,\n4,nan,,\n"
     record = read_record(io.BytesIO(text.encode()), "r.csv", declaration=DeclaredFormat(rate=100.0, unit=None))
     np.testing.assert_array_equal(record.y_lgs[:, 0], [1.0, np.nan, 3.0, np.nan])
     np.testing.assert_array_equal(record.u[:, 0], [1, 2, 3, 4])

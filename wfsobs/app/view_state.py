@@ -1,4 +1,4 @@
-"""What of the page is in its address beside the settings: page, mode, unit, switches, lines, window, seeds, theme.
+"""What of the page is in its address beside the settings: page and its fields, mode, unit, switches, lines, window, seeds, theme.
 
 `view.page=tune&view.mode=tilt&view.window=1,3&view.hide.vibration=kf-lgs,truth`; only what differs from a fresh page. What cannot
 be used is named, and the rest is used.
@@ -12,9 +12,8 @@ from urllib.parse import parse_qsl, quote
 import param
 
 from wfsobs.app.display import Display
-from wfsobs.app.pages.live import LivePage
-from wfsobs.app.pages.live_controls import CONTROLLERS, OBSERVERS, SPEED
-from wfsobs.app.pages.pages import EXPLORE, LIVE, Pages
+from wfsobs.app.pages.pages import EXPLORE, Pages
+from wfsobs.app.pages.parts import PageActions
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.main_lines import MainLines
@@ -43,7 +42,7 @@ class ViewState(param.Parameterized):
         self._fresh = {name: getattr(display, name) for name in SWITCHES}
         self._theme = ""
         display.param.watch(self._refresh, [*SWITCHES, "hidden_lines"])
-        self._knows_live = False
+        self._known_pages: set[str] = set()
         pages.param.watch(self._turn, "current")
         seeds.param.watch(self._refresh, "count")
         on_settle([traces.x_range], self._refresh)
@@ -73,9 +72,11 @@ class ViewState(param.Parameterized):
         refused += self._open_lines(fields)
         refused += self._open_window(fields.get(WINDOW, ""))
         refused += self._open_seeds(fields.get(SEEDS, str(self.seeds.param["count"].default)))
-        if (live := self._live) is not None:
-            fields, of_loop = _split(fields)
-            refused += [f"{PREFIX}{line}" for line in live.open_link(of_loop)]
+        of_page = f"{self.pages.current}."
+        if (page := self._page) is not None:
+            own = {key.removeprefix(of_page): value for key, value in fields.items() if key.startswith(of_page)}
+            fields = {key: value for key, value in fields.items() if not key.startswith(of_page)}
+            refused += [f"{PREFIX}{of_page}{line}" for line in page.open_link(own)]
         known = {PAGE, WINDOW, SEEDS, *SWITCHES, *(HIDE + target for target in TARGETS)}
         refused += [f"{PREFIX}{key}: there is no such part of a view" for key in fields if key not in known]
         self._refresh()
@@ -117,16 +118,15 @@ class ViewState(param.Parameterized):
         return []
 
     @property
-    def _live(self) -> LivePage | None:
-        """The page of the live loop, once it is there."""
-        page = self.pages.by_name.get(LIVE)
-        return page if isinstance(page, LivePage) else None
+    def _page(self) -> PageActions | None:
+        """The page that is shown, if an address has something of it."""
+        page = self.pages.by_name.get(self.pages.current)
+        return page if isinstance(page, PageActions) else None
 
     def _turn(self, _event: object) -> None:
-        if (live := self._live) is not None and not self._knows_live:
-            self._knows_live = True
-            for field in live.inputs:
-                field.param.watch(self._refresh, "value")
+        if (page := self._page) is not None and self.pages.current not in self._known_pages:
+            self._known_pages.add(self.pages.current)
+            page.follow_link(self._refresh)
         self._refresh()
 
     def _refresh(self, *_: object) -> None:
@@ -135,15 +135,9 @@ class ViewState(param.Parameterized):
         fields |= {HIDE + target: ",".join(hidden) for target, hidden in self.lines.choices().items()}
         if (window := self.traces.chosen_window()) is not None:
             fields[WINDOW] = f"{window[0]:.4g},{window[1]:.4g}"
-        if (live := self._live) is not None:
-            fields |= live.link_fields()
+        if (page := self._page) is not None:
+            fields |= {f"{self.pages.current}.{name}": text for name, text in page.link_fields().items()}
         if self.seeds.count != self.seeds.param["count"].default:
             fields[SEEDS] = str(self.seeds.count)
-        parts = [f"{PREFIX}{key}={quote(value, safe=',-')}" for key, value in fields.items()]
+        parts = [f"{PREFIX}{key}={quote(value, safe=',:-')}" for key, value in fields.items()]
         self.query = "&".join([*parts, *([f"{THEME}={self._theme}"] if self._theme else [])])
-
-
-def _split(fields: Mapping[str, str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the fields that are not of the live loop, and those that are."""
-    of_loop = {key: fields[key] for key in (OBSERVERS, CONTROLLERS, SPEED) if key in fields}
-    return {key: value for key, value in fields.items() if key not in of_loop}, of_loop

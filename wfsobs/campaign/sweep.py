@@ -17,6 +17,7 @@ from wfsobs.observers import OBSERVERS
 from wfsobs.priors_from.selection import common_observers
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.grid import Variation, parse_variation
+from wfsobs.scenario.idle import idle_settings, why_idle_at
 from wfsobs.settings.errors import SettingError
 
 MOST_CELLS = 400
@@ -30,7 +31,7 @@ EACH_RUN, EACH_FLOW, EACH_STEP = 0.4, 2.2, 1e-5
 """Time of a run beside `run_seconds` [s]: whatever its length (designs of the observers, scores, bounds); for frozen flow beside;
 for every step and mode (all quick observers). Measured as processor time: `paper` of 2, 10 and 60 s, `ut4` of 2 and 10 s."""
 
-SEED = "run.seed"
+SEED, CONTROL = "run.seed", "control"
 RANGE = re.compile(r"([^:,]+):([^:,]+):([^:,]+?)(:log)?")
 
 
@@ -193,4 +194,16 @@ def plan_sweep(base: Scenario, axes: Sequence[Variation], seeds: int, observers:
         counts = " x ".join(str(len(axis.values)) for axis in axes)
         raise SettingError(f"--over: {counts} = {len(sweep.cells)} scenarios, at most {MOST_CELLS} are allowed")
     scenarios = [sweep.scenario(cell) for cell in sweep.edge]
+    _check_effect(axes, scenarios)
     return sweep if observers is not None else replace(sweep, observers=common_observers(scenarios))
+
+
+def _check_effect(axes: Sequence[Variation], scenarios: Sequence[Scenario]) -> None:
+    """Raise SettingError for a setting that changes no error in any of the scenarios."""
+    idle = [idle_settings(scenario) for scenario in scenarios]
+    for axis in axes:
+        if axis.path.startswith(f"{CONTROL}."):
+            raise SettingError(f"--over {axis.path}: changes no error of an observer; only the controllers use it")
+        reasons = [why_idle_at(axis.path, known) for known in idle]
+        if all(reasons):
+            raise SettingError(f"--over {axis.path}: changes no error here; {reasons[0][0].lower()}{reasons[0][1:]}")

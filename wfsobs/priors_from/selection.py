@@ -6,7 +6,7 @@ refuses.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
@@ -43,6 +43,9 @@ def common_observers(scenarios: Iterable[Scenario]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def quick_observers(scenario: Scenario) -> list[str]:
-    """Return the ids of `usual_observers` but for those that learn during the run."""
-    return [name for name in usual_observers(scenario) if not OBSERVERS[name].slow]
+def quick_observers(scenario: Scenario, groups: Container[str | None] = ()) -> list[str]:
+    """Return the ids of `usual_observers` but for those that learn during the run.
+
+    groups : of settings; those that learn and have one of them as their own stay
+    """
+    return [name for name in usual_observers(scenario) if not (o := OBSERVERS[name]).slow or o.group in groups]

@@ -5,7 +5,7 @@ Rules within a group are declared by the group (`Group.used_when`); here are tho
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from wfsobs.scenario.scenario import Scenario
 from wfsobs.settings.group import Group
@@ -43,12 +43,18 @@ def idle_settings(scenario: Scenario, *, is_simulated: bool = True) -> dict[str,
     Examples
     --------
     >>> idle_settings(Scenario())["gpr_online.highpass"]
-    'Used only where Inputs are is high-pass'
+    'Used only where Filter of the inputs is high-pass'
     """
     out = dict(_within(scenario, "")) | dict(_across(scenario))
     if not is_simulated:
         out |= dict.fromkeys(SIMULATION_ONLY, "Used only by a simulation; here the record is given")
     return out
+
+
+def why_idle_at(path: str, idle: Mapping[str, str]) -> str:
+    """Return why the setting of a dotted path has no effect, by `idle_settings`; empty where it has one."""
+    keys = path.split(".")
+    return next((idle[above] for i in range(len(keys)) if (above := ".".join(keys[: i + 1])) in idle), "")
 
 
 def used_settings(scenario: Scenario) -> Plain:

@@ -64,6 +64,8 @@ def record_settings(scenario: Scenario) -> Plain:
     for name in (*TOLD, *sections()):
         del tree[name]
     del tree["run"]["warm_up"]
+    if scenario.turbulence.source == "frozen-flow":
+        del tree["turbulence"]["damping"]  # of what the filters are told of it
     return tree
 
 

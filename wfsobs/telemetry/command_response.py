@@ -84,6 +84,9 @@ class CommandResponse:
             return [f"sign and delay undecided: commands do not follow the measurements (correlation {self.reply:+.2f} in a row)"]
         way = "against" if self.sign > 0 else "with"
         sign = f"sign {self.sign:+d}: commands move {way} the measurement of their row, correlation {self.reply:+.2f}"
+        if self.margin < 0:  # no commands at all explain more
+            units = ", as if the two had different units" if abs(self.scale) < 0.1 else ""
+            return [sign, f"delay undecided: at no delay do the commands explain the measurements' jumps{units}"]
         said = f"delay {self.delay}" if self.delay is not None else "delay undecided"
         peak = (
             f"{said}: commands {_steps(self.peak)} earlier explain {self._share(self.peak)} of the measurements' jumps, those "

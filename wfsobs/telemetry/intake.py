@@ -28,7 +28,7 @@ class DeclaredFormat:
     Attributes
     ----------
     unit : str or None
-        Of y_lgs, u and the rest, one of wfsobs.units.UNITS; um by default.
+        Of y_lgs, u and the rest, one of wfsobs.units.UNITS; by default that of the signals that have one, or um.
     command_sign : int or None
         +1, y = disturbance + u, or -1, y = disturbance - u.
     command_delay : int or None
@@ -119,14 +119,16 @@ def _into_micrometres(
     """Scale every signal to um; return (unit, sign and aperture as one line, sign of the commands)."""
     arrays, own = contents.arrays, contents.units
     if "unit" in arrays:
-        unit = parse_unit(str(arrays["unit"]))
-        if unit is None:
+        if (unit := parse_unit(str(arrays["unit"]))) is None:
             raise RecordError(f"unit is {str(arrays['unit'])[:40]!r}, which is no unit of a wavefront")
         own = dict.fromkeys(signals, unit) | own
     for name, unit in own.items():
         if declaration.unit is not None and unit != declaration.unit:
             raise RecordError(f"{name} is in {unit}, but {declaration.unit} is stated")
-    units = {name: own.get(name, declaration.unit or "um") for name in signals}
+    known = sorted({own[name] for name in signals if name in own})
+    if len(known) > 1 and (silent := [name for name in signals if name not in own]):
+        raise RecordError(f"{silent[0]} has no unit, where others have {' and '.join(known)}: give it one")
+    units = {name: own.get(name, declaration.unit or (known or ["um"])[0]) for name in signals}
     if set(units.values()) & set(ANGLES) and signals["y_lgs"].shape[1] > 2:
         raise RecordError("angles are units of tip and tilt alone, which are two modes")
     for name, unit in units.items():
@@ -136,10 +138,9 @@ def _into_micrometres(
     if sign not in (1, -1):
         raise RecordError(f"command_sign takes 1 or -1, not {sign}")
     said = [f"unit {unit}" for unit in dict.fromkeys(units.values()) if unit != "um"]
-    said += [f"aperture {diameter:g} m"] if set(units.values()) & set(ANGLES) else []
+    said += [f"aperture {diameter:g} m"] * bool(set(units.values()) & set(ANGLES))
     said += ["command sign -1"] if sign < 0 else []
-    before = [str(arrays["origin"])] if "origin" in arrays else []
-    return ", ".join(before + said), sign
+    return ", ".join([*([str(arrays["origin"])] if "origin" in arrays else []), *said]), sign
 
 
 def _apply_timestamps(

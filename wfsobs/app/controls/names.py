@@ -20,10 +20,11 @@ SHORT = {
     "wind_factor": "V / V₀",
     "wind_direction": "wind to",
     "frequency_shift": "shift",
+    "third_corner": "third / w₀",
 }
 """Setting -> its name above a narrow column; any other has its own."""
 
-PATH = re.compile(r"\b[a-z_]+(?:\.(?:[a-z_]+|\d+))+\b")
+PATH = re.compile(r"\b[a-z_]+(?:\.(?:[a-z_][a-z_0-9]*|\d+))+\b")
 
 
 def name_settings(line: str) -> str:
@@ -31,8 +32,8 @@ def name_settings(line: str) -> str:
 
     >>> name_settings("vibration.peaks.0.rms.1 = -1.0: takes a number from 0")
     'Peak 1: tilt = -1.0: takes a number from 0'
-    >>> name_settings("night.toml: turbulence.wind_speed = 200")
-    'night.toml: Wind speed V₀ = 200'
+    >>> name_settings("night.toml: turbulence.wind_speed = 200, turbulence.r0 = 0")
+    'night.toml: Wind speed V₀ = 200, Fried parameter r₀ = 0'
     """
     return PATH.sub(lambda match: setting_name(match[0]), line)
 

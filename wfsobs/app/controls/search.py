@@ -11,6 +11,7 @@ from panel.custom import JSComponent
 from wfsobs.app.display import label_of, unit_text
 from wfsobs.app.style import asset
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.idle import why_idle_at
 
 
 class Search(JSComponent):
@@ -42,11 +43,6 @@ class Search(JSComponent):
 
 def settings_found(idle: Mapping[str, str]) -> list[dict[str, str]]:
     """List every setting and every list of settings, with its topic in words, and why it has no effect where it has none."""
-
-    def why(path: str) -> str:
-        keys = path.split(".")
-        return next((idle[above] for i in range(len(keys)) if (above := ".".join(keys[: i + 1])) in idle), "")
-
     scenario, topics = Scenario(), Scenario.settings()
     lists = dict(scenario.lists())
     inner = tuple(f"{path}." for path in lists)
@@ -57,7 +53,7 @@ def settings_found(idle: Mapping[str, str]) -> list[dict[str, str]]:
             "label": label_of(p),
             "topic": str(topics[path.split(".")[0]].label),
             "doc": unit_text(p.doc or ""),
-            "unused": why(path),
+            "unused": why_idle_at(path, idle),
         }
         for path, p in known
     ]

@@ -18,6 +18,7 @@ from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
 from wfsobs.app.numbers import NOTHING, number
+from wfsobs.app.pages.link import LinkedLines
 from wfsobs.app.pages.loop_figures import LoopSpectrum, Nyquist, Response, Trace
 from wfsobs.app.pages.loop_table import loop_html, margins_html
 from wfsobs.app.pages.parts import (
@@ -71,6 +72,7 @@ class ClosedLoopPage(PageActions):
         terms = {STREHL: TERMS[STREHL]}
         self.cards = Cards(items=[], hidden_lines=[], terms=terms, main=MAIN, sizing_mode="stretch_width", margin=0)
         self.cards.on_main, self._main, self._is_chosen = self._show_main, list[str](), False
+        self.link = LinkedLines(self.cards, CONTROLLERS, lambda: self._is_chosen, self._show_main)
         self.trace, self.zoom = Trace(FIRST_S), Trace(ZOOM_S)
         self.spectrum, self.response, self.nyquist = LoopSpectrum(), Response(), Nyquist()
         self.room = figure_with_caption("Rejection and noise transfer", self.response.figure, tall=True)

@@ -25,6 +25,7 @@ from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.identify_figure import NAMES, SpectrumFigure
 from wfsobs.app.pages.identify_table import identification_html, verdict_html
+from wfsobs.app.pages.link import LinkedFields
 from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
 from wfsobs.app.sources import SimulatedRecord, Source
 from wfsobs.app.store import Store
@@ -67,6 +68,7 @@ class IdentifyPage(PageActions):
         )
         self.level, self.lowest = _number("Level", LEVEL), _number("Lowest peak [Hz]", LOWEST)
         self.inputs = (self.level, self.lowest)
+        self.link = LinkedFields(level=self.level, lowest=self.lowest)
         self.figure = SpectrumFigure()
         self.legend, self.table, self.verdict, self.note = html(), html(), html(), html()
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)

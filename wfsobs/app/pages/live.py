@@ -145,6 +145,11 @@ class LivePage(PageActions):
         """Choose what a link has; return a line for each field refused. A loop that runs is left alone."""
         return self.controls.open_link(fields) if self.loop is None else []
 
+    def follow_link(self, act: Callable[..., object]) -> None:
+        """Call a function after every change of what a link has."""
+        for field in self.inputs:
+            field.param.watch(act, "value")
+
     @property
     def loop(self) -> LiveLoop | None:
         """The loop while it runs."""

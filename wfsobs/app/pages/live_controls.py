@@ -30,7 +30,7 @@ FIRST = ("kf-lgs", "kf-multi", "multirate", "multirate-multi", "gpr-online")
 """Observers that run first: as many as two cores keep up with beside the page."""
 MAIN = ("kf-multi", "multirate-multi", "gpr-online")
 """Observers whose lines are shown first."""
-OBSERVERS, CONTROLLERS, SPEED = "live.observers", "live.controllers", "live.speed"
+OBSERVERS, CONTROLLERS, SPEED = "observers", "controllers", "speed"
 """Fields of a link."""
 APART: dict[str, Any] = {**WIDE, "margin": (10, 0, 4, 0)}
 """As wide as the page, its label clear of the row above."""
@@ -150,7 +150,7 @@ class LiveControls:
 
     def open_link(self, fields: Mapping[str, str]) -> list[str]:
         """Choose what a link has, or what is usual; return a line for each field refused."""
-        refused = []
+        refused = [f"{name}: there is no such part of a view" for name in fields if name not in (OBSERVERS, CONTROLLERS, SPEED)]
         for name, field, usual in ((OBSERVERS, self.running, FIRST), (CONTROLLERS, self.controllers, USUAL)):
             names, known = fields[name].split(",") if fields.get(name) else [], set(field.options.values())
             field.value = [one for one in names if one in known] if name in fields else list(usual)

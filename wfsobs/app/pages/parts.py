@@ -19,6 +19,7 @@ from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save
 from wfsobs.app.jobs.job import CANCELLED, DONE, RUNNING
 from wfsobs.app.jobs.task import IDLE, BackgroundTask
+from wfsobs.app.pages.link import LinkPart, not_known
 from wfsobs.app.style import HEARD, asset, swatch
 from wfsobs.app.views.plots import call
 
@@ -29,6 +30,9 @@ class PageActions:
     inputs: Sequence[Any] = ()
     """Fields that the task depends on."""
 
+    link: LinkPart | None = None
+    """What of the page the address has."""
+
     @property
     def task(self) -> CopiedTask:
         """What the page does with the record."""
@@ -37,6 +41,19 @@ class PageActions:
     def saves(self) -> Mapping[str, Save | None]:
         """Offer what can be saved, by its name in the menu; None where it is not there yet."""
         return {}
+
+    def link_fields(self) -> dict[str, str]:
+        """Return what of the page the address has beside the settings: name -> text."""
+        return self.link.texts() if self.link else {}
+
+    def open_link(self, fields: Mapping[str, str]) -> list[str]:
+        """Fill in what an address has, the rest as on a fresh page; return a line for each field refused."""
+        return self.link.open(fields) if self.link else not_known(fields)
+
+    def follow_link(self, act: Callable[..., object]) -> None:
+        """Call a function after every change of what the address has."""
+        if self.link:
+            self.link.watch(act)
 
 
 WIDE: Mapping[str, Any] = MappingProxyType({"sizing_mode": "stretch_width", "margin": 0})

@@ -9,16 +9,17 @@ from typing import Any
 
 import panel as pn
 import panel_material_ui as pmui
-import param
 
 from wfsobs.app.controls.fields import parse_number
 from wfsobs.app.copies import SWEEP, CopiedTask
 from wfsobs.app.display import Display
 from wfsobs.app.downloads import Save, table_csv
 from wfsobs.app.jobs.job import RUNNING
-from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
-from wfsobs.app.pages.sweep_settings import line_of, read_axis, sweep_settings, usual_values
-from wfsobs.app.pages.sweep_views import SweepMap, axis_title, legend_of_shades, line_part, map_grid
+from wfsobs.app.pages.link import LinkedFields
+from wfsobs.app.pages.parts import TALL, WIDE, PageActions, Starter, box, html, legend, line, text
+from wfsobs.app.pages.sweep_axis import NONE, AxisFields
+from wfsobs.app.pages.sweep_settings import line_of, read_axis, sweep_settings
+from wfsobs.app.pages.sweep_views import SweepMap, legend_of_shades, line_part, map_grid
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.sweep_work import SweepTask
@@ -37,7 +38,6 @@ INTRO = (
 EARLIER = "The settings in the drawer have changed since this sweep."
 FIRST = (("turbulence.wind_speed", "5:25:5"), ("sensors.exposure_ratio", "2,5,10,20"))
 SEEDS = 4
-NONE = ""
 QUICK, EVERY = "quick", "every"
 OBSERVERS_OF = {"All but those that learn": QUICK, "All": EVERY}
 REDRAW = 0.3
@@ -53,23 +53,23 @@ class SweepPage(PageActions):
         self.work = SweepTask(store.session)
         self.starter = Starter(self.work, "Run the sweep", "Progress of the sweep", self._so_far, uses=())
         names = sweep_settings(store.scenario)
-        self.settings = [
-            pmui.Select(label=label, options=options, value=path, size="small", width=290, margin=0, searchable=True)
-            for label, options, (path, _) in zip(
-                ("Error over", "and over"), (names, {"no second setting": NONE, **names}), FIRST, strict=True
-            )
-        ]
-        self.values = [
-            pmui.TextInput(label=label, value=values, size="small", width=150, margin=0)
-            for label, (_, values) in zip(("Values", "Values of the second"), FIRST, strict=True)
-        ]
+        (first, values), (second, more) = FIRST
+        self.axes = (
+            AxisFields(store, ("Error over", "Values"), names, first, values),
+            AxisFields(store, ("and over", "Values of the second"), {"no second setting": NONE, **names}, second, more),
+        )
+        self.settings, self.values = [axis.select for axis in self.axes], [axis.values for axis in self.axes]
         self.seeds = pmui.TextInput(label="Seeds of each", value=str(SEEDS), size="small", width=120, margin=0)
         self.observers = pmui.Select(label="Observers", options=OBSERVERS_OF, value=QUICK, size="small", width=290, margin=0)
         self.inputs = (*self.settings, *self.values, self.seeds, self.observers)
+        (over, second), (values, more) = self.settings, self.values
+        self.link = LinkedFields(
+            over=over, values=values, second=second, second_values=more, seeds=self.seeds, observers=self.observers
+        )
         self.estimate = html()
         self.maps = {target: SweepMap(self.load, grid={}, **WIDE) for target in TARGETS}
         self.lines: dict[str, SweepLines] = {}
-        self.panes = {target: pn.Column(**WIDE) for target in TARGETS}
+        self.panes = {target: pn.Column(**TALL) for target in TARGETS}
         self.legends = {target: html() for target in TARGETS}
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
         self.boxes = [box(target.capitalize(), self.legends[target], self.panes[target], self.maps[target]) for target in TARGETS]
@@ -81,8 +81,6 @@ class SweepPage(PageActions):
 
     def _watch(self) -> None:
         self.starter.start.on_click(lambda _event: self.start())
-        for select, values in zip(self.settings, self.values, strict=True):
-            select.param.watch(lambda event, values=values: self._suggest(event, values), "value")
         for field in self.inputs:
             field.param.watch(self._estimate, "value")
         self.work.param.watch(self._take, ["state", "result"])
@@ -109,16 +107,17 @@ class SweepPage(PageActions):
 
     def choose(self, path: str) -> None:
         """Prepare the error over one setting, by its path."""
-        first = self.settings[0]
-        if path not in first.options.values():
-            if not any(path == known for known, _, _ in self.store.scenario.walk()):
-                return
-            first.options = {**first.options, axis_title(self.store.scenario, path): path}
-        with pn.io.hold():  # what is typed then is typed after it
-            self.settings[1].value = NONE
-            if first.value == path:
-                self.values[0].value = usual_values(self.store.scenario, path)
-            first.value = path
+        first, second = self.axes
+        if first.offer(path):
+            with pn.io.hold():  # what is typed then is typed after it
+                second.choose(NONE)
+                first.choose(path)
+
+    def open_link(self, fields: Mapping[str, str]) -> list[str]:
+        """Fill in what an address has; a setting of a list is not among the choices until it is asked for."""
+        for axis, name in zip(self.axes, ("over", "second"), strict=True):
+            axis.offer(fields.get(name, NONE))
+        return super().open_link(fields)
 
     def plan(self) -> Sweep:
         """Return the sweep that the fields describe. Raises SettingError."""
@@ -136,11 +135,12 @@ class SweepPage(PageActions):
 
     def _axes(self) -> list[tuple[str, str]]:
         """Return the settings that are chosen, and their values as they were typed."""
-        return [(s.value, v.value) for s, v in zip(self.settings, self.values, strict=True) if s.value != NONE]
+        return [(axis.path, axis.values.value) for axis in self.axes if axis.path != NONE]
 
     def _observers(self) -> list[str] | None:
-        """Return the ids of the observers; None for all."""
-        return quick_observers(self.store.scenario) if self.observers.value == QUICK else None
+        """Return the ids of the observers, those whose own settings are swept among them; None for all."""
+        groups = {path.partition(".")[0] for path, _ in self._axes()}
+        return quick_observers(self.store.scenario, groups) if self.observers.value == QUICK else None
 
     def start(self) -> None:
         """Run the sweep that the fields describe, or say in one line why not."""
@@ -179,12 +179,6 @@ class SweepPage(PageActions):
         """Offer the errors of all cells, as `wfsobs sweep --csv` writes them."""
         known = self.results and self.results.rows()
         return {"Sweep as CSV": Save("wfsobs-sweep.csv", "text/csv", lambda: table_csv(known)) if known else None}
-
-    def _suggest(self, event: param.parameterized.Event, values: pmui.TextInput) -> None:
-        """Offer values of a setting that has been chosen."""
-        if event.new != NONE:
-            values.value = usual_values(self.store.scenario, event.new)
-        values.disabled = event.new == NONE
 
     def _follow(self, *_: object) -> None:
         self._compare()
@@ -239,7 +233,8 @@ class SweepPage(PageActions):
         part = line_part(results, target, self.display)
         if target not in self.lines:
             self.lines[target] = SweepLines(part)
-            self.panes[target][:] = [pn.pane.Bokeh(self.lines[target].figure, **WIDE)]
+            self.lines[target].figure.sizing_mode = "stretch_both"
+            self.panes[target][:] = [pn.pane.Bokeh(self.lines[target].figure, sizing_mode="stretch_both", margin=0)]
         lines = self.lines[target]
         lines.draw(part, self.display.dark)
         self.legends[target].object = legend({name: look(name).label for name in lines.sources}, self.display.dark)

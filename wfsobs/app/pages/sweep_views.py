@@ -19,7 +19,7 @@ from wfsobs.evaluation.evidence import FEWEST
 from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
 from wfsobs.scenario import Scenario
-from wfsobs.settings.parameters import unit_of
+from wfsobs.settings.parameters import Reals, unit_of
 
 FULL_MARGIN = 0.3
 """Margin of the best from which its colour is full: the second is 30 % worse."""
@@ -54,9 +54,17 @@ class SweepMap(JSComponent):
 
 def axis_title(scenario: Scenario, path: str) -> str:
     """Name a setting of an axis, with its unit in [brackets]."""
-    p = {known: p for known, _, p in scenario.walk()}.get(path)
+    p = parameter_of(scenario, path)
     unit = unit_text(unit_of(p)) if p is not None else ""
     return f"{setting_name(path)} [{unit}]" if unit else setting_name(path)
+
+
+def parameter_of(scenario: Scenario, path: str) -> param.Parameter | None:
+    """Return the parameter of a setting, that of the list for a number in it; None where there is no such setting."""
+    known: dict[str, param.Parameter] = {path: p for path, _, p in scenario.walk()}
+    above, _, number = path.rpartition(".")
+    p = known.get(path) or known.get(above)
+    return p if path in known or (isinstance(p, Reals) and number.isdecimal()) else None
 
 
 def map_grid(results: SweepResults, target: str, display: Display) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from wfsobs.app.downloads import Save, table_csv
 from wfsobs.app.jobs.job import RUNNING, SWEEP, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.numbers import number
+from wfsobs.app.pages.link import LinkedFields
 from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
 from wfsobs.app.pages.tune_views import LEGEND, HistoryFigure, tuning_html, unit_for
 from wfsobs.app.store import Store
@@ -70,6 +71,7 @@ class TunePage(PageActions):
         store.param.watch(self._compare, "scenario")
         display.param.watch(self._redraw, ["unit", "dark"])
         self._choose()
+        self.link = LinkedFields(observer=self.observer, target=self.target, evaluations=self.evaluations)
 
     def view(self) -> pn.Column:
         """Return the contents of the page."""

@@ -88,21 +88,27 @@ class Strip:
 
     def _compared_rows(self, name: str, results: RunResults | None) -> list[list[str]]:
         """Write letter, value and change from there in per cent of every compared run."""
-        now = self._rms(results.result.scores, name) if results else None
+        scores = results.result.scores if results else ()
+        has_truth = any(s.target == self.target for s in scores)
+        now = self._rms(scores, name, has_truth)
         rows = []
         for run in self.display.compared_runs:
-            before = self._rms(run.scores, name)
+            before = self._rms(run.scores, name, has_truth)
             scale = per_micrometre(self.display.unit, run.scenario.telescope.diameter)
             value = number(None if before is None else before * scale)
             rows.append([run.letter, value, "" if before is None else f"{change(before, now)} %"])
         return rows
 
-    def _rms(self, scores: Sequence[Score], name: str) -> float | None:
-        """Find the error of an observer, or the rms of the truth [um]; None if there is none."""
-        of = [s for s in scores if (s.target, s.mode) == (self.target, self.display.mode)]
-        if name == TRUTH:
+    def _rms(self, scores: Sequence[Score], name: str, has_truth: bool) -> float | None:
+        """Find the error of an observer, or the rms of the truth [um]; None if there is none.
+
+        has_truth : otherwise the error of the next measurement, and the residual of the recorded loop
+        """
+        target = self.target if has_truth else RESIDUAL if name == TRUTH else PREDICTION
+        of = [s for s in scores if (s.target, s.mode) == (target, self.display.mode)]
+        if name == TRUTH and has_truth:
             return next((s.truth_rms for s in of if not s.apart), None)
-        return next((s.rms for s in of if s.observer == name), None)
+        return next((s.rms for s in of if name in (s.observer, TRUTH)), None)
 
     def _observer(self, name: str, results: RunResults | None) -> dict[str, Any]:
         score = find(results, name, self.target, self.display.mode) if results else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import panel as pn
 from markupsafe import Markup
@@ -33,6 +33,7 @@ from wfsobs.evaluation.scores import BOUNDS, COMMON_BOUNDS, LOOP, RESIDUAL, Scor
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.selection import is_usual
+from wfsobs.result import Failure
 
 BEST, TIED, ABOVE = macro("tag", "best", "best"), macro("tag", "tied", "tied"), macro("tag", "above", "above truth")
 SMALLEST = macro("tag", "smallest", "smallest")
@@ -42,6 +43,14 @@ SMALLEST = macro("tag", "smallest", "smallest")
 def find(results: RunResults, observer: str, target: str, mode: str) -> Score | None:
     """Find the score of one observer, target and mode; None if there is none."""
     return next((s for s in results.result.scores if (s.observer, s.target, s.mode) == (observer, target, mode)), None)
+
+
+def lines_of_failures(failures: Iterable[Failure]) -> list[str]:
+    """Say which observers have no estimate, a line for each reason."""
+    names: dict[str, list[str]] = {}
+    for failure in failures:
+        names.setdefault(failure.reason.removeprefix(f"{failure.observer} left out: "), []).append(row_label(failure.observer))
+    return [f"{', '.join(of)} left out: {reason}" for reason, of in names.items()]
 
 
 class Table:
@@ -62,8 +71,8 @@ class Table:
         """Write the table."""
         groups = self._truthless() or [self._target(target) for target in TARGETS]
         shown = self.run.result
-        failures = [failure.reason for failure in shown.result.failures] if shown else []
-        return f"{table('RMS errors', self._columns(), groups)}{macro('texts', 'failure', failures)}"
+        left_out = lines_of_failures(shown.result.failures) if shown else []
+        return f"{table('RMS errors', self._columns(), groups)}{macro('texts', 'failure', left_out)}"
 
     def _columns(self) -> dict[str, str]:
         """Heading -> explanation."""

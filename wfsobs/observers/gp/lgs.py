@@ -62,6 +62,10 @@ class GaussianProcess(Group):
         doc="Length scale of the background [ms].",
     )
 
+    def idle(self) -> dict[str, str]:
+        """Return the settings without effect: without a background it has no scale."""
+        return {} if self.background_rms > 0 else {"background_scale": "Used only where Coloured background is above 0"}
+
 
 GP = Section("gp", "Gaussian process in time", GaussianProcess)
 

@@ -34,7 +34,7 @@ class Gpr(Group):
     inputs_filter = param.Selector(
         default="raw",
         objects=["raw", "high-pass", "standardised"],
-        label="Inputs are",
+        label="Filter of the inputs",
         doc="Processing of the inputs. raw: none (paper); high-pass: without turbulence below the corner; "
         "standardised: each channel over its standard deviation in the training record, so that l has no unit.",
     )
