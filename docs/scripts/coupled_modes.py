@@ -1,50 +1,67 @@
-"""The tables of docs/higher-orders.md on coupled modes: RMS error of turbulence by radial order, ten seeds."""
+"""The tables of docs/higher-orders.md on coupled modes: RMS error of turbulence by radial order: `[seeds] [case ...]`."""
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from wfsobs import PRESETS, observe, simulate
 from wfsobs.evaluation.bound import bound_rms
+from wfsobs.evaluation.bound_asterism import bound_rms_of_modes_of_both
+from wfsobs.evaluation.bound_both import bound_rms_of_both
 from wfsobs.evaluation.bound_modes import bound_rms_of_modes
 from wfsobs.scenario import Scenario
 
-SEEDS = range(1, 11)
-OBSERVERS = ("kf-lgs", "kf-multi", "kf-coupled")
-CASES: dict[str, dict[str, Any]] = {
-    "two LGS on the axis, their mean": {},
-    "the same in wind of 5 m/s": {"turbulence.wind_speed": 5.0},
-    "the same in wind of 30 m/s": {"turbulence.wind_speed": 30.0},
+OBSERVERS = {"of the LGS": ("kf-lgs", "kf-multi", "kf-coupled"), "of both sensors": ("multirate-multi", "multirate-coupled")}
+CASES: dict[str, tuple[str, dict[str, Any]]] = {
+    "axis": ("two LGS on the axis, their mean", {}),
+    "slow": ("the same in wind of 5 m/s", {"turbulence.wind_speed": 5.0}),
+    "fast": ("the same in wind of 30 m/s", {"turbulence.wind_speed": 30.0}),
 }
+Bounds = dict[str, tuple[Callable[[Scenario, int], dict[str, float]], Callable[[Scenario], list[dict[str, float]]]]]
+BOUNDS: Bounds = {
+    "of the LGS": (bound_rms, bound_rms_of_modes),
+    "of both sensors": (bound_rms_of_both, bound_rms_of_modes_of_both),
+}
+"""Sensors -> bound of a mode by itself, and of all modes together."""
 
 
-def errors(scenario: Scenario) -> dict[str, np.ndarray]:
+def errors(scenario: Scenario, seeds: int) -> dict[str, np.ndarray]:
     """Observer -> mean square error of each mode's turbulence over the seeds [um^2]."""
-    squares: dict[str, list[list[float]]] = {name: [] for name in OBSERVERS}
-    for seed in SEEDS:
+    names = [name for of in OBSERVERS.values() for name in of]
+    squares: dict[str, list[list[float]]] = {name: [] for name in names}
+    for seed in range(1, seeds + 1):
         one = scenario.replace({"run.seed": seed})
-        result = observe(simulate(one), one, observers=OBSERVERS)
-        for name in OBSERVERS:
+        result = observe(simulate(one), one, observers=names)
+        for name in names:
             squares[name].append([s.rms**2 for s in result.scores if (s.observer, s.target) == (name, "turbulence")])
     return {name: np.mean(values, axis=0) for name, values in squares.items()}
 
 
-def table(changes: dict[str, Any]) -> str:
-    """Errors and bounds [nm]."""
+def tables(changes: dict[str, Any], seeds: int) -> str:
+    """Errors and bounds [nm], of the LGS and of both sensors."""
     scenario = PRESETS["higher-orders"]().replace(changes)
-    columns = errors(scenario)
-    columns["Bound, each mode by itself"] = np.array(
-        [bound_rms(scenario, i)["turbulence"] ** 2 for i in range(len(scenario.modes))]
-    )
-    columns["Bound, modes together"] = np.array([one["turbulence"] ** 2 for one in bound_rms_of_modes(scenario)])
+    found, out = errors(scenario, seeds), []
     orders = np.array([mode.radial_order for mode in scenario.modes])
-    lines = [f"| {' | '.join(['Radial order', *(f'`{c}`' if c in OBSERVERS else c for c in columns)])} |", "|---" * 6 + "|"]
-    rows = {n: [f"{1e3 * np.sqrt(x[orders == n].mean()):.1f}" for x in columns.values()] for n in sorted(set(orders))}
-    return "\n".join([*lines, *(f"| {n} | {' | '.join(row)} |" for n, row in rows.items())])
+    for sensors, (alone, together) in BOUNDS.items():
+        columns = {f"`{name}`": found[name] for name in OBSERVERS[sensors]}
+        columns["Bound, each mode by itself"] = np.array([alone(scenario, i)["turbulence"] ** 2 for i in range(len(orders))])
+        columns["Bound, modes together"] = np.array([one["turbulence"] ** 2 for one in together(scenario)])
+        out += [f"| Radial order, {sensors} | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
+        for n in sorted(set(orders)):
+            out.append(f"| {n} | {' | '.join(f'{1e3 * np.sqrt(x[orders == n].mean()):.1f}' for x in columns.values())} |")
+        out.append("")
+    return "\n".join(out)
 
 
 if __name__ == "__main__":
-    for name, changes in CASES.items():
-        print(f"{name[0].upper()}{name[1:]}:\n\n{table(changes)}\n", flush=True)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("seeds", type=int, nargs="?", default=10)
+    parser.add_argument("cases", nargs="*", default=list(CASES))
+    given = parser.parse_args()
+    for case in given.cases:
+        name, changes = CASES[case]
+        print(f"{name[0].upper()}{name[1:]}:\n\n{tables(changes, given.seeds)}", flush=True)

@@ -19,7 +19,7 @@ from wfsobs.app.render import macro
 from wfsobs.app.work import TRUTH
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE
-from wfsobs.evaluation.scores import BOUND, BOUND_ASTERISM, BOUND_BOTH, BOUND_MODES, BOUND_STARS
+from wfsobs.evaluation.scores import BOUND, BOUND_ASTERISM, BOUND_BOTH, BOUND_BOTH_MODES, BOUND_MODES, BOUND_STARS
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import PLAIN, Look
 
@@ -30,6 +30,7 @@ LOOKS: Mapping[str, Look] = MappingProxyType(
         BOUND_BOTH: Look("Bound, LGS and NGS", "#202020", "#E8E8E8", (6, 2, 1, 2)),
         BOUND_STARS: Look("Bound, every LGS apart, and NGS", "#202020", "#E8E8E8", (10, 2, 1, 2, 1, 2)),
         BOUND_MODES: Look("Bound, mean of the LGS in all modes", "#202020", "#E8E8E8", (1, 4)),
+        BOUND_BOTH_MODES: Look("Bound, LGS and NGS in all modes", "#202020", "#E8E8E8", (6, 4, 1, 4)),
         BOUND_ASTERISM: Look("Bound, every LGS in all modes, and NGS", "#202020", "#E8E8E8", (14, 2, 1, 2, 1, 2)),
         "measured": Look("Measured", "#606060", "#C8C8C8"),
         "highest": Look("Highest", "#8A8A8A", "#9A9A9A"),

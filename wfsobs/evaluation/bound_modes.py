@@ -23,6 +23,9 @@ from wfsobs.simulation.synthesis import line_width
 FINE = running_means([0.0, *(1.6**i for i in range(20))], turns=(0.0, 2.0, 4.0, 6.0))
 """Means over 1 to 7600 steps."""
 
+NOT_COUPLED = "the modes of this scenario are independent: the bound of each is its own"
+"""Why there is no bound of all of them."""
+
 TRUE_MODEL = {"kalman.process_noise": "matched", "kalman.measurement_noise": "matched"}
 
 
@@ -47,7 +50,7 @@ def least_errors_of_modes(scenario: Scenario, ahead: float = 0.0) -> list[dict[s
         The modes are independent, so that each has its own bound.
     """
     if not are_coupled(scenario):
-        raise ValueError("the modes of this scenario are independent: the bound of each is its own")
+        raise ValueError(NOT_COUPLED)
     told = scenario.replace({**TRUE_MODEL, "multipeak.line_width": line_width(scenario)})
     model = CoupledModel(prior_of(told, None, (Lines, Flow)), told.multipeak, FINE)
     found = {target: model.plan(ahead, target)[1] for target in (*TARGETS, TOTAL)}

@@ -12,11 +12,11 @@ from functools import lru_cache
 from types import MappingProxyType
 
 from wfsobs.evaluation.bound import LeastError, least_errors
-from wfsobs.evaluation.bound_asterism import least_errors_of_asterism
+from wfsobs.evaluation.bound_asterism import least_errors_of_asterism, least_errors_of_modes_of_both
 from wfsobs.evaluation.bound_both import PeriodicError, least_errors_of_both
 from wfsobs.evaluation.bound_modes import least_errors_of_modes
 from wfsobs.evaluation.bound_stars import least_errors_of_stars
-from wfsobs.evaluation.scores import BOUND, BOUND_ASTERISM, BOUND_BOTH, BOUND_MODES, BOUND_STARS, Score
+from wfsobs.evaluation.scores import BOUND, BOUND_ASTERISM, BOUND_BOTH, BOUND_BOTH_MODES, BOUND_MODES, BOUND_STARS, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.selection import has_prior
@@ -29,10 +29,14 @@ from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
 
 Errors = dict[str, LeastError] | dict[str, PeriodicError]
 
-JOINT: Mapping[str, tuple[str, Callable[[Scenario], list[dict[str, PeriodicError]]]]] = MappingProxyType(
-    {"kf-coupled": (BOUND_MODES, least_errors_of_modes), "kf-asterism": (BOUND_ASTERISM, least_errors_of_asterism)}
+JOINT: Mapping[str, tuple[str, str, Callable[[Scenario], list[dict[str, PeriodicError]]]]] = MappingProxyType(
+    {
+        "kf-coupled": (BOUND_MODES, BOUND, least_errors_of_modes),
+        "multirate-coupled": (BOUND_BOTH_MODES, BOUND_BOTH, least_errors_of_modes_of_both),
+        "kf-asterism": (BOUND_ASTERISM, BOUND_STARS, least_errors_of_asterism),
+    }
 )
-"""Observer of all modes together -> row of its bound, and how to compute it."""
+"""Observer of all modes together -> row of its bound, that of each mode by itself, and how to compute it."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +72,9 @@ def record_bounds(scenario: Scenario, record: Record, observers: Collection[str]
     plain = scenario.replace({"run.seed": 0})
     found = [dict(of_mode) for of_mode in _least_of_modes(plain, record.n_modes, record.n_steps)]
     for observer in joint_observers(scenario, observers):
+        row, alone, _ = JOINT[observer]
         for of_mode, errors in zip(found, _least_together(plain, observer), strict=True):
-            of_mode[JOINT[observer][0]] = errors
+            of_mode[row] = {target: _lesser(error, of_mode.get(alone, {}).get(target)) for target, error in errors.items()}
     return [
         Bound(row, target, it.name, i, errors[target])
         for i, it in enumerate(scenario.modes[: record.n_modes])
@@ -85,7 +90,17 @@ def joint_observers(scenario: Scenario, observers: Collection[str]) -> list[str]
 
 @lru_cache(maxsize=4)
 def _least_together(scenario: Scenario, observer: str) -> list[dict[str, PeriodicError]]:
-    return JOINT[observer][1](scenario)
+    return JOINT[observer][2](scenario)
+
+
+def _lesser(together: PeriodicError, alone: LeastError | PeriodicError | None) -> PeriodicError:
+    """Return the error of the best weights of many means of all modes, or that of a mode by itself where it is smaller.
+
+    No number of means is enough for a narrow line, or for a continuum of the vibration that is told as a few processes.
+    """
+    if alone is None or together.rms <= alone.rms:
+        return together
+    return alone if isinstance(alone, PeriodicError) else PeriodicError(alone.covariance[:1])
 
 
 @lru_cache(maxsize=4)  # no seed changes them, and they take longer than most observers

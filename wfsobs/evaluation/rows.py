@@ -5,7 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from wfsobs.evaluation.scores import BOUND, BOUND_ASTERISM, BOUND_BOTH, BOUND_MODES, BOUND_STARS, BOUNDS, LOOP, Score
+from wfsobs.evaluation.scores import (
+    BOUND,
+    BOUND_ASTERISM,
+    BOUND_BOTH,
+    BOUND_BOTH_MODES,
+    BOUND_MODES,
+    BOUND_STARS,
+    BOUNDS,
+    LOOP,
+    Score,
+)
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import SPECTRA
 from wfsobs.prior import TRUE, PriorSource
@@ -21,6 +31,7 @@ NOT_OBSERVERS = {
     BOUND_BOTH: "Bound, LGS and NGS",
     BOUND_STARS: "Bound, every LGS apart, and NGS",
     BOUND_MODES: "Bound, mean of the LGS in all modes",
+    BOUND_BOTH_MODES: "Bound, LGS and NGS in all modes",
     BOUND_ASTERISM: "Bound, every LGS in all modes, and NGS",
 }
 """Labels of rows in a table of observers that are not observers."""

@@ -23,14 +23,14 @@ PREDICTION, RESIDUAL = NEXT_Z, "residual y"
 """Targets where there is no truth: the next measurement, and the residual of the loop."""
 
 LOOP, BOUND, BOUND_BOTH, BOUND_STARS = "loop", "bound", "bound-both", "bound-stars"
-BOUND_MODES, BOUND_ASTERISM = "bound-modes", "bound-asterism"
+BOUND_MODES, BOUND_BOTH_MODES, BOUND_ASTERISM = "bound-modes", "bound-both-modes", "bound-asterism"
 """Rows that are not observers: the loop that made the record, and the Wiener bounds of the LGS alone, of LGS and NGS, of both
-with every star apart, and of all modes together: of the LGS alone, and of every star apart and the NGS."""
+with every star apart, and of all modes together: of the LGS alone, of LGS and NGS, and of every star apart and the NGS."""
 
 COMMON_BOUNDS = (BOUND, BOUND_BOTH)
 """The bounds of every scenario that has any."""
 
-BOUNDS = (*COMMON_BOUNDS, BOUND_STARS, BOUND_MODES, BOUND_ASTERISM)
+BOUNDS = (*COMMON_BOUNDS, BOUND_STARS, BOUND_MODES, BOUND_BOTH_MODES, BOUND_ASTERISM)
 """The bounds, in the order of tables."""
 
 

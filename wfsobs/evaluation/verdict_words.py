@@ -9,7 +9,7 @@ import numpy as np
 
 from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE
 from wfsobs.evaluation.rows import row_label
-from wfsobs.evaluation.scores import BOUND_ASTERISM, BOUND_BOTH, BOUND_MODES
+from wfsobs.evaluation.scores import BOUND_ASTERISM, BOUND_BOTH, BOUND_BOTH_MODES, BOUND_MODES
 from wfsobs.observers import OBSERVERS
 from wfsobs.prior import Bands, Lines, Model, Part, Training
 
@@ -27,6 +27,7 @@ TOLD: tuple[tuple[Part, str], ...] = (
 OF_BOTH = "LGS and NGS"
 OF_MODES = {
     "kf-coupled": (BOUND_MODES, "the LGS in all modes"),
+    "multirate-coupled": (BOUND_BOTH_MODES, "LGS and NGS in all modes"),
     "kf-asterism": (BOUND_ASTERISM, "every LGS in all modes, and NGS"),
 }
 """Observers of all modes together: the row of their own bound, and what has it."""

@@ -16,6 +16,7 @@ from wfsobs.observers.kalman.coupled import KF_COUPLED
 from wfsobs.observers.kalman.multi import KF_MULTI
 from wfsobs.observers.kalman.multirate import MULTIRATE
 from wfsobs.observers.kalman.multirate_adaptive import MULTIRATE_ADAPTIVE
+from wfsobs.observers.kalman.multirate_coupled import MULTIRATE_COUPLED
 from wfsobs.observers.kalman.multirate_multi import MULTIRATE_MULTI
 from wfsobs.observers.kalman.multirate_optimal import MULTIRATE_OPTIMAL
 from wfsobs.observers.kalman.single import KF_LGS, KF_NGS
@@ -32,6 +33,7 @@ BUILT_IN = (
     MULTIRATE,
     MULTIRATE_OPTIMAL,
     MULTIRATE_MULTI,
+    MULTIRATE_COUPLED,
     MULTIRATE_ADAPTIVE,
     GP_LGS,
     GP_BOTH,

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from wfsobs.prior.parts import Asterism, Bands, Beams, Flow, LgsError, LgsStars, Line, Lines, Model, Spectra
+from wfsobs.prior.parts import Asterism, Bands, Beams, Flow, FlowOfBoth, LgsError, LgsStars, Line, Lines, Model, Spectra
 from wfsobs.record import Training
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "Bands",
     "Beams",
     "Flow",
+    "FlowOfBoth",
     "LgsError",
     "LgsStars",
     "Line",
@@ -46,6 +47,7 @@ Part = (
     | type[Lines]
     | type[Beams]
     | type[Flow]
+    | type[FlowOfBoth]
     | type[Asterism]
     | type[Bands]
     | type[Spectra]
@@ -60,6 +62,7 @@ _WORDS: dict[Part, tuple[str, ...]] = {
     Lines: ("model", "{source} lines"),
     Beams: ("model",),
     Flow: ("model",),
+    FlowOfBoth: ("model",),
     Asterism: ("model",),
     Bands: ("bands",),
     Spectra: ("{source} spectra",),
@@ -82,7 +85,7 @@ class Prior:
     """The parts that an observer or a controller asked for, empty or None where it did not.
 
     model, lgs_error, stars, lines, beams, spectra : one per mode
-    flow, asterism, bands : of all modes
+    flow, asterism, bands : of all modes; asterism of every LGS, or of all of them together
     training : a record to learn from
     """
 

@@ -5,9 +5,9 @@ Made from a scenario (`wfsobs.priors_from.scenario`), or from telemetry (`Identi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -188,6 +188,7 @@ class Asterism:
     noise       : rms of the white noise of one LGS in a step, (n_modes,) [um]
     ngs_noise   : that of an NGS frame, (n_modes,) [um]
     combination : weight of mode k of each LGS in mode i of z, (n_modes, n_lgs, n_modes)
+    line_gain   : of the mean of the LGS for the vibration, (n_modes,)
     ratio       : steps per NGS frame
     """
 
@@ -199,10 +200,22 @@ class Asterism:
     noise: Array
     ngs_noise: Array
     combination: Array
+    line_gain: Array
     ratio: int
 
-    def first(self, n: int) -> Asterism:
+    def first(self, n: int) -> Self:
         """Return that of the first n modes."""
-        among, noises = self.measurement[:, :n, :, :n], (self.noise[:n], self.ngs_noise[:n])
-        combination = self.combination[:n, :, :n]
-        return Asterism(self.omega, self.own[:n], among, self.cross[:n, :, :n], self.basis, *noises, combination, self.ratio)
+        return replace(
+            self,
+            own=self.own[:n],
+            measurement=self.measurement[:, :n, :, :n],
+            cross=self.cross[:n, :, :n],
+            noise=self.noise[:n],
+            ngs_noise=self.ngs_noise[:n],
+            combination=self.combination[:n, :, :n],
+            line_gain=self.line_gain[:n],
+        )
+
+
+class FlowOfBoth(Asterism):
+    """As an asterism, with what is made of all LGS together in the place of one star."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from math import sqrt
 from types import MappingProxyType
@@ -11,8 +11,23 @@ import numpy as np
 
 from wfsobs.observers.base import Observer
 from wfsobs.observers.kalman.single import steady_filter
-from wfsobs.prior import Asterism, Bands, Beams, Flow, LgsError, LgsStars, Line, Lines, Model, Part, Prior, Spectra, Training
-from wfsobs.priors_from.flow import asterism_of, flow_of
+from wfsobs.prior import (
+    Asterism,
+    Bands,
+    Beams,
+    Flow,
+    FlowOfBoth,
+    LgsError,
+    LgsStars,
+    Line,
+    Lines,
+    Model,
+    Part,
+    Prior,
+    Spectra,
+    Training,
+)
+from wfsobs.priors_from.flow import asterism_of, flow_of, flow_of_both
 from wfsobs.priors_from.turbulence import beams_of, lgs_error_of, lines_turbulence, measurement_noise, one_process, stars_of
 from wfsobs.priors_from.vibration import vibration_continuum
 from wfsobs.record import Measurements, Record, Sampling
@@ -92,11 +107,17 @@ def prior_of(
         stars=tuple(stars_of(scenario, mode, dt) for mode in modes) if LgsStars in asked else (),
         beams=tuple(beams_of(scenario, mode, dt) for mode in modes) if Beams in asked else (),
         flow=flow_of(scenario, len(modes), dt) if Flow in asked else None,
-        asterism=asterism_of(scenario, len(modes), dt) if Asterism in asked else None,
+        asterism=_asterism(asked, scenario, len(modes), dt),
         bands=bands_of(scenario) if Bands in asked else None,
         spectra=tuple(spectra or [spectra_of(scenario, mode) for mode in modes]) if Spectra in asked else (),
         training=record.training.copy() if Training in asked and record and record.training else None,
     )
+
+
+def _asterism(parts: Collection[Part], scenario: Scenario, n_modes: int, dt: float) -> Asterism | None:
+    if Asterism in parts:
+        return asterism_of(scenario, n_modes, dt)
+    return flow_of_both(scenario, n_modes, dt) if FlowOfBoth in parts else None
 
 
 def bands_of(scenario: Scenario) -> Bands:

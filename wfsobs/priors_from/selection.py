@@ -10,7 +10,7 @@ from collections.abc import Container, Iterable
 
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import Observer
-from wfsobs.prior import Asterism, Flow
+from wfsobs.prior import Asterism, Flow, FlowOfBoth
 from wfsobs.priors_from.flow import has_stars_apart
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -21,7 +21,8 @@ def has_prior(observer: Observer, scenario: Scenario, n_modes: int | None = None
     """Return whether a scenario has what an observer is told; n_modes : of the record, by default those of the scenario."""
     n = len(scenario.modes) if n_modes is None else n_modes
     is_alone = Asterism in observer.prior and not has_stars_apart(scenario)
-    return not is_alone and (Flow not in observer.prior or (are_coupled(scenario) and n > 1))
+    is_joint = not {Flow, FlowOfBoth}.isdisjoint(observer.prior)
+    return not is_alone and (not is_joint or (are_coupled(scenario) and n > 1))
 
 
 def is_usual(observer: Observer, scenario: Scenario, record: Record | None = None) -> bool:

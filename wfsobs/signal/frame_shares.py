@@ -18,7 +18,13 @@ from wfsobs.typing import Array
 
 
 def frame_shares(
-    fast: StateFilter, frames: StateFilter, ratio: int, model: DisturbanceModel, noise: float, frame_noise: float
+    fast: StateFilter,
+    frames: StateFilter,
+    ratio: int,
+    model: DisturbanceModel,
+    noise: float,
+    frame_noise: float,
+    gain: float = 1.0,
 ) -> list[OwnShare]:
     """Return the shares in the states of both filters, the fast one first, 0, 1, ..., ratio - 1 steps after a frame.
 
@@ -32,6 +38,8 @@ def frame_shares(
         The disturbance.
     noise, frame_noise : float
         White noise in a step and in a frame [um].
+    gain : float
+        Of the fast filter's measurement for the disturbance.
 
     Returns
     -------
@@ -41,7 +49,7 @@ def frame_shares(
     n, m, p = len(model.A), len(fast.F), len(frames.F)
     of_fast, at_sum, of_frames = slice(n, n + m), n + m, slice(n + m + 1, n + m + 1 + p)
     step = block_diag(model.A, fast.F, np.eye(1 + p))
-    step[of_fast, :n], step[at_sum, :n] = np.outer(fast.G, model.C), np.ravel(model.C) / ratio
+    step[of_fast, :n], step[at_sum, :n] = np.outer(fast.G, gain * model.C), np.ravel(model.C) / ratio
     read = np.eye(len(step))  # at the end of an exposure
     read[of_frames, of_frames], read[of_frames, at_sum], read[at_sum, at_sum] = frames.F, frames.G, 0.0
     drive = block_diag(model.Q, noise**2 * np.outer(fast.G, fast.G), np.zeros((1 + p, 1 + p)))

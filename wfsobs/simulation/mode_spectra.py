@@ -89,6 +89,24 @@ def beam_spectra(scenario: Scenario, frequency: Array) -> ModeSpectra:
     return _spectra(scenario, frequency, _all_modes_of_beams)
 
 
+def combined_spectra(scenario: Scenario, frequency: Array) -> ModeSpectra:
+    """Compute those of two beams: the combined LGS, and the NGS.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Settings.
+    frequency : Array
+        Frequencies from 0 on, (n,) [Hz].
+
+    Returns
+    -------
+    ModeSpectra
+        Densities.
+    """
+    return _spectra(scenario, frequency, _all_modes_of_both)
+
+
 def _spectra(scenario: Scenario, frequency: Array, sight: Sight) -> ModeSpectra:
     found, m = spectra_between(scenario, None, frequency, sight), len(scenario.modes)
     beams = range(m, len(found.density))
@@ -119,6 +137,12 @@ def _all_modes(scenario: Scenario, _mode: None, layer: TurbulenceLayer, waves: P
         seen = _modes_in(scenario, waves, atmosphere.footprint(star, layer))
         combined += np.tensordot(weights[:, i], seen, axes=1)
     return [*own, *combined]
+
+
+def _all_modes_of_both(scenario: Scenario, mode: None, layer: TurbulenceLayer, waves: PlaneWaves) -> list[NDArray[np.complex128]]:
+    """Return those of `_all_modes`, then the transforms of all modes in the NGS."""
+    natural = atmosphere.footprint(atmosphere.natural_star(scenario), layer)
+    return [*_all_modes(scenario, mode, layer, waves), *_modes_in(scenario, waves, natural)]
 
 
 def _all_modes_of_beams(

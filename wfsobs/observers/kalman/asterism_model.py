@@ -162,17 +162,16 @@ class AsterismModel:
     def _add_states(self) -> PresentInputs:
         """Compute covariances of the lines and the states in every phase, and return estimates from the latter."""
         asterism, m, stars = self._asterism, len(self._peaks), self.n_stars
-        powers = self._powers
-        n = stars * m
+        powers, n = self._powers, stars * m
         fast, slow = shared_covariance(powers[:n, :n], self._responses), shared_covariance(powers[n:, n:], self._of_frames)
         n_fast, self.n_states = len(fast), len(fast) + len(slow)
         sizes = [*(one.filter.G.size for one in self.fast)] * stars + [one.filter.G.size for one in self.slow]
         starts = np.cumsum([0, *sizes])
         self._places = [np.r_[starts[i] : starts[i + 1], starts[n + i] : starts[n + i + 1]] for i in range(m)]
-        noises = zip(asterism.noise / np.sqrt(stars), asterism.ngs_noise, strict=True)
+        own = zip(asterism.noise / np.sqrt(stars), asterism.ngs_noise, asterism.line_gain, strict=True)
         shares = [
-            frame_shares(one.filter, late.filter, self.ratio, model, *both)
-            for one, late, model, both in zip(self.fast, self.slow, self._peaks, noises, strict=True)
+            frame_shares(one.filter, late.filter, self.ratio, model, *numbers)
+            for one, late, model, numbers in zip(self.fast, self.slow, self._peaks, own, strict=True)
         ]
         self._of_lines = [[share.disturbance for share in one] for one in shares]
         of_noise = [
@@ -221,12 +220,13 @@ class AsterismModel:
         n = self.n_stars * len(self._peaks)
         cross = self._with_states(self._powers[:n] * np.exp(1j * self._asterism.omega), phase)
         for i, (model, of_lines) in enumerate(zip(self._peaks, self._of_lines, strict=True)):
-            cross[i, self._places[i]] += np.ravel(model.C @ model.A @ of_lines[phase])
+            cross[i, self._places[i]] += self._asterism.line_gain[i] * np.ravel(model.C @ model.A @ of_lines[phase])
         return cross
 
     def _measurement_covariance(self) -> Array:
         """Return that of the measurements of `_next_measurement`, without noise, (n_lgs * n_modes, n_lgs * n_modes)."""
-        n, lines = self.n_stars * len(self._peaks), [(model.C @ model.C.T).item() for model in self._peaks]
+        n = self.n_stars * len(self._peaks)
+        lines = self._asterism.line_gain**2 * [(model.C @ model.C.T).item() for model in self._peaks]
         return np.real(self._powers[:n, :n].sum(axis=2)) + np.diag(np.pad(lines, (0, n - len(lines))))
 
     def _combination(self, present: Present) -> Array:
