@@ -98,7 +98,11 @@ SMALL_LABEL = ".MuiFormControlLabel-label.MuiTypography-root { font-size: 0.8125
 """As large as that of the buttons beside it."""
 
 TALL: Mapping[str, Any] = MappingProxyType(
-    {**WIDE, "height": 230, "stylesheets": [":host { height: clamp(230px, 42vh, 560px) !important; }"]}
+    {
+        **WIDE,
+        "height": 230,
+        "stylesheets": [":host { height: clamp(230px, 42vh, 560px) !important; flex-basis: auto !important; }"],
+    }
 )
 """A figure as high as the window has room for."""
 

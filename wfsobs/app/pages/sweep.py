@@ -69,7 +69,7 @@ class SweepPage(PageActions):
         self.estimate = html()
         self.maps = {target: SweepMap(self.load, grid={}, **WIDE) for target in TARGETS}
         self.lines: dict[str, SweepLines] = {}
-        self.panes = {target: pn.Column(**TALL) for target in TARGETS}
+        self.panes = {target: pn.Column(**WIDE) for target in TARGETS}
         self.legends = {target: html() for target in TARGETS}
         self.stale = pmui.Alert(object=EARLIER, severity="warning", visible=False, **WIDE)
         self.boxes = [box(target.capitalize(), self.legends[target], self.panes[target], self.maps[target]) for target in TARGETS]
@@ -234,7 +234,9 @@ class SweepPage(PageActions):
         if target not in self.lines:
             self.lines[target] = SweepLines(part)
             self.lines[target].figure.sizing_mode = "stretch_both"
-            self.panes[target][:] = [pn.pane.Bokeh(self.lines[target].figure, sizing_mode="stretch_both", margin=0)]
+            self.panes[target][:] = [
+                pn.Column(pn.pane.Bokeh(self.lines[target].figure, sizing_mode="stretch_both", margin=0), **TALL)
+            ]
         lines = self.lines[target]
         lines.draw(part, self.display.dark)
         self.legends[target].object = legend({name: look(name).label for name in lines.sources}, self.display.dark)

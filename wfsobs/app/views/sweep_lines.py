@@ -9,20 +9,18 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColumnDataSource, FixedTicker, HoverTool, Range1d
+from bokeh.models import ColumnDataSource, FixedTicker, Range1d
 from bokeh.plotting import figure
 
 from wfsobs.app.style import look
 from wfsobs.app.views.plots import add_line, call, new_figure
 from wfsobs.typing import Array
 
-APART = 0.25
+APART = 0.12
 """Of the smallest step between values, what the lines lie apart from the first to the last."""
 
 HIGHEST = 1.5
 """Of the largest mean, where the axis ends at the most: what few seeds tell may be an interval far beyond."""
-
-TIPS = "@called: @y{0.00} (@low{0.00} – @high{0.00})"
 
 
 class SweepLines:
@@ -37,8 +35,9 @@ class SweepLines:
         x, texts = np.array(part["values"], dtype=float), part["texts"]
         low, high = float(x[0]), float(x[-1])
         self.logarithmic = logarithmic = texts is None and low > 0 and _unevenness(np.log(x)) < _unevenness(x)
-        room = 0.03 * (high - low)
-        ends = (low / 1.1, high * 1.1) if logarithmic else (low - room, high + room)
+        room = 0.03 * (high - low) + 0.5 * APART * float(np.diff(x).min())
+        ratio = 1.1 * float(np.exp(0.5 * APART * np.diff(np.log(x)).min())) if logarithmic else 1.0
+        ends = (low / ratio, high * ratio) if logarithmic else (low - room, high + room)
         self.figure: figure = new_figure(
             x_range=Range1d(start=ends[0], end=ends[1]),
             y_range=Range1d(start=0.0, end=1.0),
@@ -51,15 +50,13 @@ class SweepLines:
             self.figure.xaxis.major_label_overrides = dict(zip(x.tolist(), texts, strict=True))
         self.sources, self.glyphs = {}, {}
         for name in part["errors"]:
-            source = self.sources[name] = ColumnDataSource({column: [] for column in ("x", "at", "y", "low", "high", "called")})
+            source = self.sources[name] = ColumnDataSource({column: [] for column in ("x", "at", "y", "low", "high")})
             bar = self.figure.segment("at", "low", "at", "high", source=source, line_width=2, line_alpha=0.35, level="underlay")
             line = add_line(self.figure, name, source)
             line.glyph.x = "at"
             self.glyphs[name] = line, bar, self.figure.scatter("at", "y", source=source, size=5)
             for glyph in self.glyphs[name]:
                 glyph.name = name
-        dots = [glyphs[-1] for glyphs in self.glyphs.values()]
-        self.figure.add_tools(HoverTool(renderers=dots, tooltips=[(part["across"], "@x"), ("", TIPS)], visible=False))
 
     def draw(self, part: Mapping[str, Any], dark: bool = False) -> None:
         """Send the errors of a part with the same values, in the colours of light or dark mode."""
@@ -68,8 +65,7 @@ class SweepLines:
         drawn = [name for name, (y, _, _) in all_errors.items() if np.isfinite(y).any()]
         places = dict(zip(drawn, self._places(x, len(drawn)), strict=True))
         for name, (y, low, high) in all_errors.items():
-            called = [look(name).label] * len(x)
-            self.sources[name].data = {"x": x, "at": places.get(name, x), "y": y, "low": low, "high": high, "called": called}
+            self.sources[name].data = {"x": x, "at": places.get(name, x), "y": y, "low": low, "high": high}
         largest = max((float(np.nanmax(all_errors[name][0])) for name in drawn), default=1.0)
         above = max((float(np.nanmax(all_errors[name])) for name in drawn), default=1.0)
         top = 1.08 * min(above, HIGHEST * largest)
