@@ -440,6 +440,17 @@ def test_the_page_of_loops() -> None:
     assert np.isfinite(names["mean"]).all() and (names["sd"] > 0).all()
 
 
+def test_the_page_of_gaussian_processes() -> None:
+    """Its code runs: the line is found where it is, and an observer that is told of the kernels removes half of it."""
+    names = run_page(DOCS / "gaussian-processes.md")
+    for mode in names["fit"].modes:
+        omega = mode.numbers["vibration.0.omega"]
+        assert abs(omega.value - 2.0 * np.pi * 48.0) < 4.0 * omega.std < 10.0, mode.name
+    for name in ("gp-lgs", "gp-both"):
+        error = names["result"].estimate(name, "vibration").values - names["used_on"].vibration
+        assert error[1000:].std() < 0.5 * names["used_on"].vibration[1000:].std()
+
+
 def test_a_ratio_of_paired_errors_and_its_jackknife() -> None:
     """Of the means; its standard error is zero where errors go together, and that of a mean where the other is constant."""
     rms_ratio = script("told_nothing").rms_ratio
