@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.handles import changes_of, handles_of, with_new_peak, without_peak
+from wfsobs.app.handles import PEAK, changes_of, handles_of, highest_frequency, with_new_peak, without_peak
 from wfsobs.app.pages.pages import LOOP
 from wfsobs.app.views import spectrum_editor
 from wfsobs.app.views.frames import Frames
@@ -39,8 +39,11 @@ class TestSettings:
             to = handle.at(1.1 * handle.frequency, 1.5, 1.2)
             after = scenario.replace(changes_of(scenario, target, 0, to))
             (found,) = [h for h in handles_of(after, target, 0) if h.id == handle.id]
-            assert found.frequency == pytest.approx(1.1 * handle.frequency, rel=1e-9)
+            # Settings have four digits, so that half of the last is at most 5e-4; a corner's wind is another such number.
+            assert found.frequency == pytest.approx(1.1 * handle.frequency, rel=1e-3)
             assert (found.rms, found.damping) == (pytest.approx(to.rms), pytest.approx(to.damping))
+            written = [v for v in (found.rms, found.damping, after.turbulence.wind_speed) if v is not None]
+            assert all(v == float(f"{v:.4g}") for v in written), "as a hand would set them"
             others = [h for h in handles_of(after, target, 0) if h.id != handle.id]
             assert others == [h for h in handles_of(scenario, target, 0) if h.id != handle.id], "the others stay"
 
@@ -73,6 +76,14 @@ class TestSettings:
         assert after.replace(without_peak(after, 15)) == scenario
         with pytest.raises(SettingError, match="measured"):
             with_new_peak(PRESETS["ut4"](), 0, 30.0)
+
+    def test_there_is_no_peak_above_the_cut_off(self) -> None:
+        scenario = PRESETS["paper"]().replace({"vibration.cutoff": 60.0})
+        assert highest_frequency(scenario, PEAK) == 60.0
+        with pytest.raises(SettingError, match="60 Hz"):
+            with_new_peak(scenario, 0, 61.0)
+        free = scenario.replace({"vibration.source": "ar2"})  # no cut-off: up to Nyquist
+        assert highest_frequency(free, PEAK) == pytest.approx(500.0)
 
     def test_rms_of_a_height(self) -> None:
         assert resonance_rms(resonance_power(20.0, 1e-3, [19.9999, 20.0001])[0] / 2e-4, 20.0, 1e-3) == pytest.approx(

@@ -65,21 +65,34 @@ class Handle:
 
     def at(self, frequency: float | None = None, strength: float = 1.0, damping: float = 1.0) -> Handle:
         """Return it at another frequency [Hz], its rms and its damping times a factor; what it does not have stays."""
+        rms, own = self.rms, self.damping
         return replace(
             self,
-            frequency=self.frequency if frequency is None else frequency,
-            rms=self.rms if self.rms is None or strength == 1.0 else strength * max(self.rms, FAINTEST),
-            damping=None
-            if self.damping is None
-            else min(max(self.damping, 1e-4) * damping, 1.0)
-            if damping != 1.0
-            else self.damping,
+            frequency=self.frequency if frequency in (None, self.frequency) else rounded(frequency),
+            rms=rms if rms is None or strength == 1.0 else rounded(strength * max(rms, FAINTEST)),
+            damping=own if own is None or damping == 1.0 else min(rounded(max(own, 1e-4) * damping), 1.0),
         )
+
+
+def rounded(x: float) -> float:
+    """Return a number with the four digits that a hand can set.
+
+    >>> rounded(28.60612)
+    28.61
+    """
+    return float(f"{x:.4g}")
 
 
 def handles_of(scenario: Scenario, target: str, mode: int) -> list[Handle]:
     """List the handles of the spectrum of a target, in one mode."""
     return list((_turbulence if target == TURBULENCE else _vibration)(scenario, mode))
+
+
+def highest_frequency(scenario: Scenario, kind: str) -> float:
+    """Return how far a handle of a kind can be moved [Hz]: a peak to the cut-off, above which there is no vibration."""
+    nyquist = 0.5 / scenario.dt
+    cut_off = kind == PEAK and scenario.vibration.source == "peaks"
+    return min(scenario.vibration.cutoff, nyquist) if cut_off else nyquist
 
 
 def has_peaks(scenario: Scenario) -> bool:
@@ -119,7 +132,8 @@ def changes_of(scenario: Scenario, target: str, mode: int, to: Handle) -> dict[s
         raise SettingError(f"there is no {to.id} to move")
     if to.kind == CORNER:  # a corner goes with the wind
         t = scenario.turbulence
-        values = {"turbulence.wind_speed": t.wind_speed * to.frequency / now.frequency, "turbulence.rms": to.rms}
+        wind = t.wind_speed if to.frequency == now.frequency else rounded(t.wind_speed * to.frequency / now.frequency)
+        values = {"turbulence.wind_speed": wind, "turbulence.rms": to.rms}
         return {path: v for path, v in values.items() if v is not None}
     if to.kind == BAND:
         bands = [*scenario.butterworth.frequencies]
@@ -138,13 +152,18 @@ def changes_of(scenario: Scenario, target: str, mode: int, to: Handle) -> dict[s
 
 
 def with_new_peak(scenario: Scenario, mode: int, frequency: float, height: float | None = None) -> dict[str, Any]:
-    """Return the settings with one more peak, at a height of the spectrum [um^2/Hz]. Raises SettingError without peaks."""
+    """Return the settings with one more peak, at a height of the spectrum [um^2/Hz].
+
+    Raises SettingError where there are no peaks, and above the highest frequency of one.
+    """
     if not has_peaks(scenario):
         raise SettingError(f"vibration.source = {scenario.vibration.source} has no peaks of its own: set it to peaks")
+    if frequency > (highest := highest_frequency(scenario, PEAK)):
+        raise SettingError(f"no peak above the cut-off of the vibration, {highest:g} Hz")
     rms = NEW_RMS if height is None else resonance_rms(height, frequency, NEW_DAMPING)
     strengths = [0.0] * max(mode + 1, 2)
-    strengths[mode] = rms
-    peak = Peak.from_dict({"frequency": frequency, "damping": NEW_DAMPING, "rms": strengths})
+    strengths[mode] = rounded(rms)
+    peak = Peak.from_dict({"frequency": rounded(frequency), "damping": NEW_DAMPING, "rms": strengths})
     return {"vibration.peaks": [*(p.to_dict() for p in scenario.vibration.peaks), peak.to_dict()]}
 
 

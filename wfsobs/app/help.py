@@ -20,7 +20,7 @@ SHORTCUTS: Mapping[str, str] = MappingProxyType(
         "Ctrl+Z, Ctrl+Shift+Z": "Undo and redo a change of the settings",
         "Alt+O in a setting": "The error over this setting, on the page Sweep",
         "Enter or Space on a card": "Hide or show its line",
-        "S on a card": "Its line alone, and all lines again",
+        "S on a card": "Its line alone, and those before again",
         "Double click on a figure": "All of it again, after a zoom",
         "Arrows, Page up and down on a handle": "Move it (Shift: further), change its damping; Escape gives up",
         "Arrow keys": "Choose in a switch, go from line to line in a table",

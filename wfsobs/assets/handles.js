@@ -113,7 +113,7 @@ export function render({model, el}) {
 
   const current = (id) => model.frame.handles.find((it) => it.id === id)
   const limits = () => [view.model.x_range.start, view.model.x_range.end]
-  const within = (x) => Math.min(Math.max(x, limits()[0]), limits()[1])
+  const within = (x, handle) => Math.min(Math.max(x, limits()[0]), limits()[1], handle.highest ?? Infinity)
 
   const handleOf = (id) => {
     const it = make("div", "handle", marks)
@@ -134,7 +134,7 @@ export function render({model, el}) {
       const dx = event.clientX - start.x, dy = event.clientY - start.y, {x_scale, y_scale} = view.frame
       if (!move.changed && Math.hypot(dx, dy) < DEAD) return
       move.changed = true
-      if (Math.abs(dx) >= DEAD) move.frequency = within(x_scale.invert(start.sx + dx))
+      if (Math.abs(dx) >= DEAD) move.frequency = within(x_scale.invert(start.sx + dx), current(id))
       if (current(id).strength && Math.abs(dy) >= DEAD) {
         const at = view.frame.bbox.bottom - 50
         move.strength = (y_scale.invert(at + dy) / y_scale.invert(at)) ** model.frame.exponent
@@ -173,7 +173,7 @@ export function render({model, el}) {
       take(handle, true)
       const step = {frequency: leap ? LEAP : NUDGE, strength: leap ? STRONGER ** 4 : STRONGER, damping: BROADER}[what]
       move[what] *= step ** (sign * Math.sign(move[what]))  // to the right, also where numbers are below zero
-      if (what === "frequency") move[what] = within(move[what])
+      if (what === "frequency") move[what] = within(move[what], handle)
       move.changed = true
       place()
       wish(false)
@@ -198,7 +198,7 @@ export function render({model, el}) {
       it.setAttribute("aria-valuetext", handle.text)
       it.setAttribute("aria-valuenow", handle.frequency)
       it.setAttribute("aria-valuemin", frame.limits[0])
-      it.setAttribute("aria-valuemax", frame.limits[1])
+      it.setAttribute("aria-valuemax", handle.highest ?? frame.limits[1])
     }
     const focused = root.getRootNode().activeElement
     for (const [id, it] of elements) {
@@ -220,7 +220,7 @@ export function render({model, el}) {
     add.disabled = Boolean(frame.add)
     add.title = frame.add || "then click on the spectrum; with the keyboard: a peak in the middle, to be moved from there"
     hint.textContent = "Drag a handle, or use the arrow keys" +
-      (frame.add === undefined ? "." : "; wheel or Page up and down: damping; Delete: remove a peak.") +
+      (frame.add === undefined ? "." : `; wheel or Page up and down: damping${frame.add ? `. ${frame.add}` : "; Delete: remove a peak"}.`) +
       (frame.hint ? ` ${frame.hint}` : "")
     note.textContent = frame.note ?? ""
     numbers.replaceChildren(...(frame.numbers ?? []).map(entry))

@@ -76,7 +76,7 @@ function tour(el) {
   const end = () => { note.remove(); ring.remove(); el.querySelector(".open")?.focus() }
   const place = (target) => {
     const box = target.getBoundingClientRect()
-    Object.assign(ring.style, {left: `${box.left - 4}px`, top: `${box.top - 4}px`, width: `${box.width}px`, height: `${box.height}px`})
+    Object.assign(ring.style, {left: `${box.left - 6}px`, top: `${box.top - 6}px`, width: `${box.width + 12}px`, height: `${box.height + 12}px`})
     const below = box.bottom + 12 + note.offsetHeight < window.innerHeight
     const room = window.innerWidth - note.offsetWidth - 8
     note.style.top = `${below ? box.bottom + 12 : Math.max(8, box.top - note.offsetHeight - 12)}px`

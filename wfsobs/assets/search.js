@@ -83,15 +83,22 @@ function ranked(items, words) {
   return items.map((item) => [rank(item), item]).filter(([r]) => r > 0).sort((a, b) => b[0] - a[0]).map(([, item]) => item)
 }
 
-// Give a setting the focus, as soon as its topic has opened.
-function go(path, tries = 600) {
-  const view = [...Bokeh.index.query((it) => it.model.tags?.includes(TAG + path))].find((it) => it.el.getBoundingClientRect().height > 0)
-  const root = view?.el.shadowRoot
-  const target = root?.querySelector("input, [role=combobox], select, button")
-  if (target) {
-    view.el.scrollIntoView({block: "center"})
-    target.focus()
-    if (root.activeElement === target) return
+// Give a setting the focus, as soon as its topic has opened, unless the visitor has gone on to something else by then.
+function go(path) {
+  const over = new AbortController()
+  for (const act of ["pointerdown", "keydown"]) document.addEventListener(act, () => over.abort(), {capture: true, signal: over.signal})
+  let tries = 600
+  const look = () => {
+    if (over.signal.aborted) return
+    const view = [...Bokeh.index.query((it) => it.model.tags?.includes(TAG + path))].find((it) => it.el.getBoundingClientRect().height > 0)
+    const root = view?.el.shadowRoot
+    const target = root?.querySelector("input, [role=combobox], select, button")
+    if (target) {
+      view.el.scrollIntoView({block: "center"})
+      target.focus()
+    }
+    if ((target && root.activeElement === target) || !tries--) over.abort()
+    else requestAnimationFrame(look)
   }
-  if (tries) requestAnimationFrame(() => go(path, tries - 1))
+  look()
 }

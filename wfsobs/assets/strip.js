@@ -1,5 +1,5 @@
 // A strip of cards, one per line of the figures below it: what it is, its number, and a switch for the line.
-// A click hides or shows a line, a double click or the key S shows it alone, and once more all of them.
+// A click hides or shows a line, a double click or the key S shows it alone, and once more those that were shown before.
 // What is hidden is the server's to say: the strip asks for it by message and shows it at once. What the server sends counts
 // once it has heard the last click, so that neither undoes the other.
 
@@ -24,6 +24,7 @@ export function render({model, el}) {
 
   let hidden = model.hidden_lines
   let before = hidden  // the click: a double click is about what stood there before its first one
+  let among = []  // what is hidden again once a line is no longer alone
   let asked = model.last_arrival
 
   const hide = (names) => {
@@ -39,10 +40,11 @@ export function render({model, el}) {
     hide(others.length < hidden.length ? others : [...others, name])
   }
 
-  const solo = (name, among) => {
-    const others = model.items.map((item) => item.name).filter((it) => it !== name)
-    const alone = !among.includes(name) && others.every((it) => among.includes(it))
-    hide(alone ? [] : others)
+  const isAlone = (name, was) => model.items.every((item) => was.includes(item.name) !== (item.name === name))
+  const solo = (name, was) => {
+    if (isAlone(name, was)) return hide(among)
+    if (!model.items.some((item) => isAlone(item.name, was))) among = was
+    hide(model.items.map((item) => item.name).filter((it) => it !== name))
   }
 
   const cardOf = (item) => {

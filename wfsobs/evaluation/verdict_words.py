@@ -68,7 +68,9 @@ def _to_bound(it: Verdict) -> str:
     if not bound:
         return ""
     percent = round(100.0 * (it.best.rms / bound - 1.0))
-    return f", {'at' if percent == 0 else f'{abs(percent)} % ' + ('above' if percent > 0 else 'below')} the bound of {words}"
+    if percent < 0:
+        return f", {-percent} % below the bound of {words}, which is a mean over records"
+    return f", {f'{percent} % above' if percent else 'at'} the bound of {words}"
 
 
 def harm_sentences(it: Verdict) -> list[str]:
@@ -120,5 +122,9 @@ def _join_labels(observers: Sequence[str]) -> str:
 
 
 def _format_number(x: float) -> str:
-    """Three digits, as a person would say them."""
-    return f"{x:.3g}" if x < 1000.0 else f"{x:.0f}"
+    """Three digits, as a person would say them.
+
+    >>> _format_number(14.96), _format_number(0.5), _format_number(120.4), _format_number(1234.0)
+    ('15.0', '0.500', '120', '1234')
+    """
+    return f"{x:#.3g}".rstrip(".") if x < 999.5 else f"{x:.0f}"

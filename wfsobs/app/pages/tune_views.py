@@ -79,7 +79,7 @@ def tuning_html(result: TuningResult, display: Display, diameter: float) -> str:
         for section, found in groupby(tuning_rows(result), key=lambda row: row[0])
     ]
     columns = {"What": "", "Before": "", "After": "", "Change [%]": ""}
-    notes = [f"{line}." for line in tuning_remarks(result) if "likelihood" not in line]
+    notes = [f"{line[0].upper()}{line[1:]}." for line in tuning_remarks(result) if "likelihood" not in line]
     return f"{table('Before and after', columns, groups)}{macro('texts', 'text', notes)}"
 
 

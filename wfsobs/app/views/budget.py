@@ -116,7 +116,7 @@ def term_legend() -> pn.pane.HTML:
         for name, label in TERMS.items()
     )
     bounds = "".join(
-        f'<span class="mark" style="border-left:2px {dash} {colour}">{label}</span>'
+        f'<span class="mark" style="padding-left:6px; border-left:2px {dash} {colour}">{label}</span>'
         for colour, dash, label in BOUND_MARKS.values()
     )
     return html(f'<div class="caption legend">{marks}{bounds}</div>')

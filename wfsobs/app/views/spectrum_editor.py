@@ -15,7 +15,7 @@ from bokeh.plotting import figure
 from panel.custom import JSComponent
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.handles import PEAK, Handle, changes_of, handles_of, has_peaks, with_new_peak, without_peak
+from wfsobs.app.handles import PEAK, Handle, changes_of, handles_of, has_peaks, highest_frequency, with_new_peak, without_peak
 from wfsobs.app.numbers import number
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, look, observers_of
@@ -34,9 +34,9 @@ from wfsobs.typing import Array
 
 CAPTION = "Predicted rms error"
 
-DRAGGED, LOOSE = 65_536, 0.001
+DRAGGED, LOOSE, ROUGH = 65_536, 0.001, 0.01
 """The most frequencies to predict with while a handle is on its way, and what may be left at the end of a response: numbers are
-within 1 % of those once it is let go, in a fraction of the time."""
+within 1 % of those once it is let go, in a fraction of the time, and a change of less is none."""
 
 FRAME = 0.05
 """Time after which a frame of a drag begins no more observers [s]: those that are left come first in the next one."""
@@ -203,8 +203,8 @@ class SpectrumEditor:
             "limits": [0.01, 0.5 / self.trial.dt],
         }
         if self.target == VIBRATION:
-            frame["add"] = "" if has_peaks(self.trial) else f"vibration.source = {self.trial.vibration.source} has no peaks"
-            frame["added"] = f"{PEAK}-{len(self.trial.vibration.peaks) - 1}"
+            none = f"With Source {self.trial.vibration.source} there are no peaks to move"
+            frame |= {"add": "" if has_peaks(self.trial) else none, "added": f"{PEAK}-{len(self.trial.vibration.peaks) - 1}"}
         return frame
 
     def _entry(self, handle: Handle, predictions: list[Prediction]) -> dict[str, Any]:
@@ -215,20 +215,20 @@ class SpectrumEditor:
             "label": handle.label,
             "text": handle.text,
             "frequency": handle.frequency,
+            "highest": highest_frequency(self.trial, handle.kind),
             "y": None if truth is None else float(np.interp(handle.frequency, *truth)),
             "strength": handle.rms is not None,
             "damping": handle.damping is not None,
         }
 
     def _number_of(self, p: Prediction) -> dict[str, Any]:
-        scale, was, it = self._scale(self.trial), self._was.get(p.observer), look(p.observer)
-        value, before = number(p.rms * scale), "" if was is None else number(was * scale)
+        scale, it, was = self._scale(self.trial), look(p.observer), self._was.get(p.observer, p.rms)
         return {
             "name": p.observer,
             "label": it.label,
             "colour": it.colour(self.display.dark),
-            "value": value,
-            "was": "" if before == value else before,
+            "value": number(p.rms * scale),
+            "was": "" if abs(p.rms - was) <= ROUGH * was else number(was * scale),
             "unit": self.display.unit_label,
             "waits": p.observer in self._left,
         }
