@@ -6,11 +6,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import param
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
+from wfsobs.app.display import Display
+from wfsobs.app.jobs.job import RUNNING
 from wfsobs.app.style import observers_of
-from wfsobs.app.views.main_lines import REFERENCES, main_observers
+from wfsobs.app.views.main_lines import REFERENCES, MainLines, main_observers
 from wfsobs.app.views.traces import first_window
 from wfsobs.evaluation.rows import is_non_causal
 from wfsobs.evaluation.scores import PREDICTION, Score
@@ -73,6 +76,21 @@ class TestChoice:
         scores = dashboard.store.run.result.result.scores
         assert set(hidden(dashboard, "vibration")) == {*observers_of("vibration")} - {*main_observers(scores, "vibration", "tip")}
         assert at_first
+
+    def test_a_link_that_says_it_of_one_target_leaves_the_main_ones_of_the_other(
+        self, dashboard: Dashboard, scores: tuple[Score, ...]
+    ) -> None:
+        class Run(param.Parameterized):
+            state = param.String(RUNNING)
+            result = param.Parameter()
+
+        run, display = Run(), Display()
+        MainLines(run, display).choose("vibration", ["truth"])  # type: ignore[arg-type]
+        run.result = dashboard.store.run.result
+        assert display.hidden_lines["vibration"] == ["truth"]
+        assert set(display.hidden_lines["turbulence"]) == {*observers_of("turbulence")} - {
+            *main_observers(scores, "turbulence", "tip")
+        }
 
     def test_a_click_that_crosses_a_result_counts(self, dashboard: Dashboard) -> None:
         """The browser asks; what the page sends meanwhile does not undo it, and it hears what became of it."""

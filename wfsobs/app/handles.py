@@ -68,16 +68,16 @@ class Handle:
         rms, own = self.rms, self.damping
         return replace(
             self,
-            frequency=self.frequency if frequency in (None, self.frequency) else rounded(frequency),
-            rms=rms if rms is None or strength == 1.0 else rounded(strength * max(rms, FAINTEST)),
-            damping=own if own is None or damping == 1.0 else min(rounded(max(own, 1e-4) * damping), 1.0),
+            frequency=self.frequency if frequency in (None, self.frequency) else round_off(frequency),
+            rms=rms if rms is None or strength == 1.0 else round_off(strength * max(rms, FAINTEST)),
+            damping=own if own is None or damping == 1.0 else min(round_off(max(own, 1e-4) * damping), 1.0),
         )
 
 
-def rounded(x: float) -> float:
+def round_off(x: float) -> float:
     """Return a number with the four digits that a hand can set.
 
-    >>> rounded(28.60612)
+    >>> round_off(28.60612)
     28.61
     """
     return float(f"{x:.4g}")
@@ -132,7 +132,7 @@ def changes_of(scenario: Scenario, target: str, mode: int, to: Handle) -> dict[s
         raise SettingError(f"there is no {to.id} to move")
     if to.kind == CORNER:  # a corner goes with the wind
         t = scenario.turbulence
-        wind = t.wind_speed if to.frequency == now.frequency else rounded(t.wind_speed * to.frequency / now.frequency)
+        wind = t.wind_speed if to.frequency == now.frequency else round_off(t.wind_speed * to.frequency / now.frequency)
         values = {"turbulence.wind_speed": wind, "turbulence.rms": to.rms}
         return {path: v for path, v in values.items() if v is not None}
     if to.kind == BAND:
@@ -162,8 +162,8 @@ def with_new_peak(scenario: Scenario, mode: int, frequency: float, height: float
         raise SettingError(f"no peak above the cut-off of the vibration, {highest:g} Hz")
     rms = NEW_RMS if height is None else resonance_rms(height, frequency, NEW_DAMPING)
     strengths = [0.0] * max(mode + 1, 2)
-    strengths[mode] = rounded(rms)
-    peak = Peak.from_dict({"frequency": rounded(frequency), "damping": NEW_DAMPING, "rms": strengths})
+    strengths[mode] = round_off(rms)
+    peak = Peak.from_dict({"frequency": round_off(frequency), "damping": NEW_DAMPING, "rms": strengths})
     return {"vibration.peaks": [*(p.to_dict() for p in scenario.vibration.peaks), peak.to_dict()]}
 
 

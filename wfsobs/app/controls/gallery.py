@@ -34,13 +34,18 @@ class Gallery(JSComponent):
             self._choose(str(data["choose"]))
 
 
+def preset_line(name: str) -> str:
+    """Say in a line what a preset is: the first of its documentation."""
+    return str(PRESETS[name].__doc__).strip().partition("\n")[0]
+
+
 def presets_shown() -> list[dict[str, Any]]:
-    """Describe every preset by the first line of its documentation, the lines of its vibration, and whether it has events."""
+    """Describe every preset by a line, the lines of its vibration, and whether it has events."""
     return [
         {
             "name": name,
             "title": preset_title(name),
-            "line": str(make.__doc__).strip().partition("\n")[0],
+            "line": preset_line(name),
             "peaks": [[float(frequency), float(rms)] for frequency, _, rms in vibration_lines(scenario, 0)],
             "events": bool(scenario.events),
         }

@@ -13,7 +13,7 @@ import param
 
 from wfsobs.app.controls.field import ROOM, TAG, Field, idle_html
 from wfsobs.app.controls.fields import make_field
-from wfsobs.app.controls.gallery import Gallery
+from wfsobs.app.controls.gallery import Gallery, preset_line
 from wfsobs.app.controls.names import preset_title, setting_name
 from wfsobs.app.controls.rows import RowEditor
 from wfsobs.app.controls.search import Search
@@ -38,7 +38,6 @@ PRESET = "preset"
 """What the box of presets is called where the others are called by the paths of their settings."""
 
 
-NO_CHANGES = "Nothing changed"
 TWO_LINES = """
 .MuiFormHelperText-root {
   height: 2lh; overflow: hidden; overflow-wrap: anywhere;
@@ -62,7 +61,7 @@ class Controls:
             tags=[TAG + PRESET],
             value=store.preset,
             options={preset_title(name): name for name in PRESETS},
-            helper_text=NO_CHANGES,
+            helper_text=preset_line(store.preset),
             size="small",
             stylesheets=[TWO_LINES],
             **ROOM,
@@ -217,9 +216,10 @@ class Controls:
         self.undo.disabled, self.redo.disabled = not self.store.can_undo, not self.store.can_redo
 
     def _count_changes(self) -> None:
-        """Say what differs from the preset, in all and by topic."""
+        """Say what the preset is, or what differs from it, in all and by topic."""
         changed = self.store.changed_paths()
-        self.preset.helper_text = f"{len(changed)} changed: {', '.join(map(setting_name, changed))}" if changed else NO_CHANGES
+        told = f"{len(changed)} changed: {', '.join(map(setting_name, changed))}" if changed else preset_line(self.store.preset)
+        self.preset.helper_text = told
         self.reset.disabled = not changed
         count = Counter(path.split(".")[0] for path in changed)
         names = [title + (f" · {count[name]} changed" if count[name] else "") for name, title in self.topics.items()]

@@ -60,7 +60,7 @@ class MainLines:
         self._follow()
 
     def _on_results(self, *_: object) -> None:
-        if self.run.state != RUNNING or not self.display.hidden_lines:
+        if self.run.state != RUNNING or not self.display.hidden_lines.keys() >= set(TARGETS):  # a link may say it of one
             self._follow()
 
     def _follow(self, *_: object) -> None:
