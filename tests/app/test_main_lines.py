@@ -11,7 +11,7 @@ import pytest
 
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import Display
-from wfsobs.app.jobs.job import RUNNING
+from wfsobs.app.jobs.job import DONE, RUNNING
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.main_lines import REFERENCES, MainLines, main_observers
 from wfsobs.app.views.traces import first_window
@@ -33,6 +33,18 @@ def hidden(dashboard: Dashboard, target: str) -> list[str]:
         name for name in observers_of(target) if not lines[name].visible
     ]
     return dashboard.explore.strips[target].cards.hidden_lines
+
+
+def others_of(scores: tuple[Score, ...], target: str) -> list[str]:
+    main = main_observers(scores, target, "tip")
+    return [name for name in observers_of(target) if name not in main]
+
+
+class Run(param.Parameterized):
+    """What a run says of itself."""
+
+    state = param.String(RUNNING)
+    result = param.Parameter()
 
 
 class TestRule:
@@ -77,20 +89,25 @@ class TestChoice:
         assert set(hidden(dashboard, "vibration")) == {*observers_of("vibration")} - {*main_observers(scores, "vibration", "tip")}
         assert at_first
 
-    def test_a_link_that_says_it_of_one_target_leaves_the_main_ones_of_the_other(
-        self, dashboard: Dashboard, scores: tuple[Score, ...]
-    ) -> None:
-        class Run(param.Parameterized):
-            state = param.String(RUNNING)
-            result = param.Parameter()
-
+    def test_a_link_that_says_it_of_one_target_leaves_the_main_ones_of_the_other(self, dashboard: Dashboard) -> None:
         run, display = Run(), Display()
         MainLines(run, display).choose("vibration", ["truth"])  # type: ignore[arg-type]
         run.result = dashboard.store.run.result
         assert display.hidden_lines["vibration"] == ["truth"]
-        assert set(display.hidden_lines["turbulence"]) == {*observers_of("turbulence")} - {
-            *main_observers(scores, "turbulence", "tip")
-        }
+        assert display.hidden_lines["turbulence"] == others_of(run.result.result.scores, "turbulence")
+
+    def test_the_first_choice_of_a_run_gives_way_to_that_of_all_results(self, dashboard: Dashboard) -> None:
+        run, display = Run(), Display()
+        lines = MainLines(run, display)  # type: ignore[arg-type]
+        whole = dashboard.store.run.result
+        few = tuple(s for s in whole.result.scores if s.observer in ("kf-lgs", "kf-ngs", "multirate"))
+        run.result = replace(whole, result=replace(whole.result, scores=few))
+        assert display.hidden_lines["turbulence"] == others_of(few, "turbulence") != others_of(whole.result.scores, "turbulence")
+        run.result = whole
+        run.state = DONE
+        assert lines.choices() == {}
+        for target in TARGETS:
+            assert display.hidden_lines[target] == others_of(whole.result.scores, target)
 
     def test_a_click_that_crosses_a_result_counts(self, dashboard: Dashboard) -> None:
         """The browser asks; what the page sends meanwhile does not undo it, and it hears what became of it."""

@@ -42,7 +42,7 @@ class MainLines:
     def __init__(self, run: BackgroundTask, display: Display):
         self.run, self.display = run, display
         self._chosen_targets: set[str] = set()
-        run.param.watch(self._on_results, "result")
+        run.param.watch(self._on_results, ["result", "state"])  # the last result may come before the run is over
         display.param.watch(self._follow, "mode")
 
     def choose(self, target: str, hidden_names: list[str]) -> None:
