@@ -13,11 +13,11 @@ from math import sqrt
 import numpy as np
 
 from wfsobs import PRESETS
-from wfsobs.evaluation.bound import TOTAL
 from wfsobs.evaluation.bound_both import bound_rms_of_both
 from wfsobs.evaluation.exact_errors import exact_errors
 from wfsobs.execution import run_observer
 from wfsobs.observers import OBSERVERS
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.lenslet_spectra import true_lenslet_spectra

@@ -15,9 +15,10 @@ from wfsobs.arena.reference import TAPS, taps_error
 from wfsobs.arena.tracks import DISTURBANCE, RESIDUAL, TRACKS, Track
 from wfsobs.campaign.keys import PHYSICS_VERSION
 from wfsobs.closed_loop.design import design
-from wfsobs.evaluation.bound import TOTAL, least_errors
+from wfsobs.evaluation.bound import least_errors
 from wfsobs.evaluation.bound_both import least_errors_of_both
 from wfsobs.observers.base import Observer
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.prior import Prior
 from wfsobs.priors_from.scenario import prior_and_settings
 from wfsobs.record import Record

@@ -11,9 +11,9 @@ import numpy as np
 from wfsobs.closed_loop.design import design
 from wfsobs.control.law import Law
 from wfsobs.control.mirror import Mirror
-from wfsobs.evaluation.bound import TOTAL
 from wfsobs.evaluation.bound_both import PeriodicError
 from wfsobs.evaluation.exact_errors import variance_of
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.scenario import Scenario
 from wfsobs.simulation.true_spectra import has_known_spectra, true_spectra
 from wfsobs.typing import Array

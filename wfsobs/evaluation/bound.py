@@ -14,10 +14,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf, log
+from typing import TypeVar
 
 import numpy as np
+from scipy import fft
 from scipy.stats import chi2
 
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import advance_spectrum, circle_mean, degrees_of_freedom, error_spectrum, explained_variance
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
@@ -32,7 +35,7 @@ MOST_PAST = 4000
 The remaining gain falls with the inverse of their number, as it does for undamped lines.
 """
 
-TOTAL = "total"
+Error = TypeVar("Error")
 
 
 @dataclass(frozen=True)
@@ -103,27 +106,25 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
         Target -> error; TOTAL is that of both together.
     """
     past, known = min(n_steps, MOST_PAST), spectra.without_lines
-    whitener = known.whitener
-    wanted = {name: (known.signal[name], advance_spectrum(known.cross[name], 1 + ahead)) for name in known.signal}
-    wanted[TOTAL] = known.total[0], advance_spectrum(known.total[1], 1 + ahead)
-    lines = spectra.line_covariance(past + 1 + ahead)
-    of_lines = {"vibration": 1.0, TOTAL: 1.0}
-    cross = np.array(
-        [
-            np.fft.irfft(shared, whitener.n)[:past] + of_lines.get(name, 0.0) * spectra.gain * lines[1 + ahead :]
-            for name, (_, shared) in wanted.items()
-        ]
-    )
-    measured = np.fft.irfft(known.measurement, whitener.n)[:past] + spectra.gain**2 * lines[:past]
-    gained = np.hstack([np.zeros((len(wanted), 1)), explained_variance(measured, cross)])
-    return {
-        name: LeastError(
-            np.fft.irfft(error_spectrum(own, shared, whitener), whitener.n)[: min(n_steps, whitener.n // 2)],
-            circle_mean(own) + of_lines.get(name, 0.0) * lines[0] - gained[i],
-            len(spectra.pure),
-        )
-        for i, (name, (own, shared)) in enumerate(wanted.items())
-    }
+    whitener, parts = known.whitener, spectra.parts
+    names = [*parts, TOTAL][: 2 * len(parts) - 1]
+    wanted = [known.total if name == TOTAL else (known.signal[name], known.cross[name]) for name in names]
+    own, shared = (np.array(each) for each in zip(*wanted, strict=True))
+    shared = advance_spectrum(shared, 1 + ahead)
+    lines = np.outer([name != "turbulence" for name in names], spectra.line_covariance(past + 1 + ahead))
+    cross = fft.irfft(shared, whitener.n)[:, :past] + spectra.gain * lines[:, 1 + ahead :]
+    measured = fft.irfft(known.measurement, whitener.n)[:past] + spectra.gain**2 * spectra.line_covariance(past)
+    gained = np.hstack([np.zeros((len(names), 1)), explained_variance(measured, cross)])
+    transient = lines[:, :1] + [[circle_mean(one)] for one in own] - gained
+    covariance = fft.irfft(error_spectrum(own, shared, whitener), whitener.n)[:, : min(n_steps, whitener.n // 2)]
+    found = {name: LeastError(*each, len(spectra.pure)) for name, *each in zip(names, covariance, transient, strict=True)}
+    return of_every_target(found, spectra, LeastError(np.zeros_like(covariance[0]), np.zeros_like(transient[0])))
+
+
+def of_every_target(found: dict[str, Error], spectra: TrueSpectra, nothing: Error) -> dict[str, Error]:
+    """Return the errors of every target, and of both together, from those computed; nothing : that of a target that is zero."""
+    only = next(iter(found.values()))
+    return {name: found.get(name, nothing) for name in spectra.signal} | {TOTAL: found.get(TOTAL, only)}
 
 
 def bound_rms(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:

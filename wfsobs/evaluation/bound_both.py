@@ -16,7 +16,8 @@ from math import pi
 import numpy as np
 from scipy.special import diric
 
-from wfsobs.evaluation.bound import TOTAL
+from wfsobs.evaluation.bound import of_every_target
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.scenario import Scenario
 from wfsobs.signal.slow_sensor import SlowSensor, variance_from_frames
 from wfsobs.signal.wiener import Complex, Whitener, advance_spectrum, causal_error
@@ -65,7 +66,7 @@ def least_errors_of_both(spectra: TrueSpectra, ahead: int = 0) -> dict[str, Peri
     known = spectra.without_lines
     ngs, whitener = known.ngs, known.whitener
     frames, exposure = ngs_frames(known)
-    fast = {name: advance_spectrum(cross, 1 + ahead) for name, cross in known.cross.items()}
+    fast = {name: advance_spectrum(known.cross[name], 1 + ahead) for name in known.parts}
     slow = [advance_spectrum(ngs.cross[name] * exposure.conj(), ahead) for name in fast]
     gained = variance_from_frames(list(zip(fast.values(), slow, strict=True)), whitener, frames)
     return target_errors(known, fast, gained, whitener)
@@ -88,15 +89,18 @@ def target_errors(
     spectra : TrueSpectra
         Without the lines that are known.
     fast : mapping of str to Array
-        Target -> cross spectrum of it and z.
+        Target -> cross spectrum of it and z, of those that there are (`TrueSpectra.parts`).
     reduction : Array
         Covariance of what the other sensors tell of the targets, (ratio, targets, targets) [um^2].
     whitener : Whitener
         Minimum-phase factor of the spectrum of z.
     """
-    alone = {name: causal_error(spectra.signal[name], fast[name], whitener) - reduction[:, i, i] for i, name in enumerate(fast)}
-    total = causal_error(spectra.total[0], np.sum(list(fast.values()), axis=0), whitener) - reduction.sum(axis=(1, 2))
-    return {name: PeriodicError(np.maximum(variance, 0.0)) for name, variance in (*alone.items(), (TOTAL, total))}
+    found = {name: causal_error(spectra.signal[name], fast[name], whitener) - reduction[:, i, i] for i, name in enumerate(fast)}
+    if len(fast) > 1:
+        both = np.sum(list(fast.values()), axis=0)
+        found[TOTAL] = causal_error(spectra.total[0], both, whitener) - reduction.sum(axis=(1, 2))
+    errors = {name: PeriodicError(np.maximum(variance, 0.0)) for name, variance in found.items()}
+    return of_every_target(errors, spectra, PeriodicError(np.zeros(len(reduction))))
 
 
 @lru_cache(maxsize=2)

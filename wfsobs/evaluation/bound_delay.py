@@ -17,9 +17,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from wfsobs.evaluation.bound import TOTAL, LeastError, least_errors
+from wfsobs.evaluation.bound import LeastError, least_errors
 from wfsobs.evaluation.bound_both import PeriodicError, least_errors_of_both
 from wfsobs.evaluation.scores import BOUND, BOUND_BOTH
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.simulation.true_spectra import TrueSpectra
 
 Least = Callable[[TrueSpectra, int], Mapping[str, LeastError] | Mapping[str, PeriodicError]]

@@ -35,7 +35,7 @@ def least_errors_of_stars(spectra: StarSpectra, ahead: int = 0) -> dict[str, Per
     ngs, whitener = known.ngs, known.whitener
     frames, exposure = ngs_frames(known)
     others = FastSensors(spectra.differences, spectra.cross, advance_spectrum(spectra.ngs_cross * exposure, 1))
-    fast = {name: advance_spectrum(cross, 1 + ahead) for name, cross in known.cross.items()}
+    fast = {name: advance_spectrum(known.cross[name], 1 + ahead) for name in known.parts}
     wanted = [
         (
             of_z,

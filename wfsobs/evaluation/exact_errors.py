@@ -20,10 +20,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from wfsobs.evaluation.bound import TOTAL
 from wfsobs.evaluation.bound_both import PeriodicError, exposure_response
 from wfsobs.evaluation.linear_response import estimate_and_error, impulse_responses
 from wfsobs.observers.base import Observer
+from wfsobs.observers.estimates import TOTAL
 from wfsobs.prior import Prior
 from wfsobs.priors_from.scenario import observer_settings, prior_of
 from wfsobs.scenario import Scenario

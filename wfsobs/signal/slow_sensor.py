@@ -82,28 +82,25 @@ def variance_from_frames(targets: Sequence[tuple[Complex, Complex]], whitener: W
         Explained covariance of the targets, (ratio, n_targets, n_targets), p steps after a frame.
     """
     n, ratio = whitener.n, slow.ratio
-    frames = n // 2 // ratio
+    half = n // 2
+    frames = fft.next_fast_len(half // ratio, real=True)  # those beyond half the DFT are not kept
     whiten = 1.0 / (whitener.H.conj() * np.sqrt(whitener.innovation_variance))
-    left = slow.spectrum - np.abs(slow.cross) ** 2 / whitener.spectrum
-    noise = _frame_whitener(fft.irfft(left, n)[: frames * ratio + 1 : ratio], slow.noise)
+    of_z = slow.cross.conj() / whitener.spectrum
+    left = slow.spectrum - (of_z * slow.cross).real
+    rests = fft.irfft([left, *(frame - fast * of_z for fast, frame in targets)], n)
+    noise = _frame_whitener(rests[0, : frames * ratio + 1 : ratio], slow.noise)
+    rests[:, half:] = 0.0
 
-    ahead = _whiten_frames(_of_future(slow.cross * whiten, n), noise, ratio)  # C'
-    spectrum = fft.rfft(ahead.ravel(), n)
-    rest = np.empty((len(targets), frames, ratio))
-    for i, (fast, frame) in enumerate(targets):
-        own = fft.irfft(frame - fast * slow.cross.conj() / whitener.spectrum, n)[: n // 2]
-        future = _of_future(fast * whiten, n)
-        future[0] = 0.0
-        known = fft.irfft(spectrum * fft.rfft(future, n).conj(), n)[: frames * ratio]
-        rest[i] = _whiten_frames(own, noise, ratio) + known.reshape(frames, ratio)
-    kept = max(round(KEPT * frames), 1)
-    return _gains(ahead[:kept], rest[:, :kept])
-
-
-def _of_future(cross: Complex, n: int) -> Array:
-    """Return the coefficients of e[k], e[k+1], ..., (n // 2,)."""
-    backwards = fft.irfft(cross.conj(), n)
-    return backwards[: n // 2].copy()
+    future = fft.irfft([(cross * whiten).conj() for cross in (slow.cross, *(fast for fast, _ in targets))], n)
+    future[:, half:] = 0.0  # the coefficients of e[k], e[k+1], ...
+    ahead = _whiten_frames(future[0], noise, ratio)  # C'
+    future[1:, 0] = 0.0
+    future[0] = np.pad(ahead.ravel(), (0, n - ahead.size))
+    spectrum, *others = fft.rfft(future)
+    known = fft.irfft([spectrum * other.conj() for other in others], n)[:, : frames * ratio]
+    told = np.array([_whiten_frames(one, noise, ratio) for one in rests[1:]])
+    kept = max(round(KEPT * (half // ratio)), 1)
+    return _gains(ahead[:kept], (told + known.reshape(told.shape))[:, :kept])
 
 
 def _frame_whitener(covariance: Array, noise: float) -> Whitener:

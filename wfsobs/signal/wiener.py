@@ -22,6 +22,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from wfsobs.typing import Array
 
@@ -86,19 +87,19 @@ def error_spectrum(target: Array, cross: Complex, whitener: Whitener) -> Array:
     Parameters
     ----------
     target : Array
-        S_s, (n // 2 + 1,).
+        S_s, (..., n // 2 + 1), of one target or more.
     cross : Array
-        S_sz, the transform over n of E s[k] z[k-n], (n // 2 + 1,).
+        S_sz, the transform over n of E s[k] z[k-n], (..., n // 2 + 1).
     whitener : Whitener
         Factor of S_z.
 
     Returns
     -------
     Array
-        Spectrum of the error, (n // 2 + 1,).
+        Spectrum of the error, (..., n // 2 + 1).
     """
-    future = np.fft.rfft(_of_future(cross, whitener), whitener.n)
-    return _two_sided(target, cross, whitener) + np.abs(future) ** 2 / whitener.innovation_variance
+    future = fft.rfft(_of_future(cross, whitener), whitener.n)
+    return _two_sided(target, cross, whitener) + (future.real**2 + future.imag**2) / whitener.innovation_variance
 
 
 def causal_error(target: Array, cross: Complex, whitener: Whitener) -> float:
@@ -114,7 +115,7 @@ def _two_sided(target: Array, cross: Complex, whitener: Whitener) -> Array:
 
 def _of_future(cross: Complex, whitener: Whitener) -> Array:
     """Return g[n], n < 0: what the estimate of all of z takes from the innovations to come."""
-    return np.fft.irfft(cross / whitener.H.conj(), whitener.n)[whitener.n // 2 :]
+    return fft.irfft(cross / whitener.H.conj(), whitener.n)[..., whitener.n // 2 :]
 
 
 def explained_variance(autocovariance: Array, cross: Array) -> Array:
@@ -135,13 +136,13 @@ def explained_variance(autocovariance: Array, cross: Array) -> Array:
         Explained variance, (n_targets, n).
     """
     n = autocovariance.size
-    backwards = np.ascontiguousarray(cross[:, ::-1])
+    backwards, earlier = np.ascontiguousarray(cross[:, ::-1]), np.ascontiguousarray(autocovariance[::-1])
     predictor, error = np.zeros(n), float(autocovariance[0])
     predictor[0] = 1.0
     out = np.empty_like(backwards)
     for k in range(n):
         if k:
-            reflection = float(predictor[:k] @ autocovariance[k:0:-1]) / error
+            reflection = float(predictor[:k] @ earlier[n - 1 - k : -1]) / error
             predictor[1 : k + 1] -= reflection * predictor[k - 1 :: -1] if k > 1 else reflection
             error *= 1.0 - reflection**2
         out[:, k] = (backwards[:, n - 1 - k :] @ predictor[: k + 1]) ** 2 / error

@@ -99,6 +99,11 @@ class TrueSpectra:
         return 2 * (self.measurement.size - 1)
 
     @property
+    def parts(self) -> list[str]:
+        """Targets that are not zero throughout, one at least."""
+        return [name for name, own in self.signal.items() if own.any()] or list(self.signal)[:1]
+
+    @property
     def total(self) -> tuple[Array, Complex | Array]:
         """(signal, shared) of the whole disturbance; turbulence and vibration are independent."""
         return sum(self.signal.values(), np.zeros(1)), sum(self.cross.values(), np.zeros(1))
