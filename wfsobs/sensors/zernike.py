@@ -12,6 +12,7 @@ from functools import lru_cache
 from math import gamma
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wfsobs.atmosphere.plane_waves import Footprint, Wave
 from wfsobs.typing import Array
@@ -85,14 +86,22 @@ def transform(j: int, kx: Array, ky: Array, bessel: Callable[[int, Array], Array
     Array
         Complex, shape of k.
     """
+    (n, _), k = noll(j), np.hypot(kx, ky)
+    return amplitude(j) * bessel(n + 1, k) * azimuthal(j, (kx + 1j * ky) / np.where(k > 0, k, 1.0))
+
+
+def amplitude(j: int) -> complex:
+    """Return 2 sqrt(n + 1) (-1)^((n - m) / 2) i^m, times sqrt(2) where m > 0."""
     n, signed = noll(j)
     m = abs(signed)
-    k = np.hypot(kx, ky)
-    factor = 2.0 * math.sqrt(n + 1.0) * (-1) ** ((n - m) // 2) * 1j**m * bessel(n + 1, k)
-    if m == 0:
-        return factor
-    turn = ((kx + 1j * ky) / np.where(k > 0, k, 1.0)) ** m
-    return factor * math.sqrt(2.0) * (turn.real if signed > 0 else turn.imag)
+    return 2.0 * math.sqrt((n + 1.0) * (2.0 if m else 1.0)) * (-1) ** ((n - m) // 2) * 1j**m
+
+
+def azimuthal(j: int, direction: NDArray[np.complex128]) -> Array:
+    """Return cos or sin of m times the angle of a direction of length one."""
+    _, signed = noll(j)
+    turn = direction ** abs(signed)
+    return turn.real if signed >= 0 else turn.imag
 
 
 def noll_covariance(j: int, i: int) -> float:
@@ -216,7 +225,7 @@ class ZernikeProjection:
                     radial[n] = tabulated_bessel_ratio(n + 1, x)
                 if m not in turns:
                     turns[m] = direction**m
-                factor = 2.0 * math.sqrt((n + 1.0) * (2.0 if m else 1.0)) * (-1) ** ((n - m) // 2) * 1j**m
+                factor = amplitude(j)
                 cosine = factor * np.einsum("yx,yx->x", radial[n] * turns[m].real, even)
                 sine = factor * np.einsum("yx,yx->x", radial[n] * turns[m].imag, odd) if m else np.zeros(0)
                 pairs[n, m] = cosine, sine

@@ -12,7 +12,7 @@ import numpy as np
 from wfsobs.atmosphere.plane_waves import Footprint
 from wfsobs.atmosphere.von_karman import CORE, TurbulenceLayer, fine_rule, nodes_across_wind, von_karman_density
 from wfsobs.scenario import Scenario
-from wfsobs.sensors.zernike import ZernikeProjection, tabulated_bessel_ratio
+from wfsobs.sensors import zernike
 from wfsobs.signal.wiener import Complex
 from wfsobs.simulation import layers as atmosphere
 from wfsobs.typing import Array
@@ -111,50 +111,96 @@ def _blocks(kx: Array, front: float) -> Iterator[slice]:
 
 
 def _block(scenario: Scenario, mode: int | None, layer: TurbulenceLayer, kx: Array, front: float, sight: Sight) -> Complex:
-    diameter, q0 = scenario.telescope.diameter, 2.0 * np.pi / scenario.turbulence.outer_scale
+    diameter, outer_scale = scenario.telescope.diameter, scenario.turbulence.outer_scale
+    q0 = 2.0 * np.pi / outer_scale
     if kx[0] < front:
         ky, weight = nodes_across_wind(q0, front, *fine_rule(layer.height, diameter))
     else:
         ky, weight = nodes_across_wind(float(np.hypot(q0, kx[0])), 4.0 * kx[-1], np.inf, 0.25)
-    density = (
-        (4.0 * np.pi / layer.speed)
-        * weight[:, None]
-        * von_karman_density(kx**2 + ky[:, None] ** 2, layer.strength, scenario.turbulence.outer_scale)
-    )
-    signals = np.asarray(sight(scenario, mode, layer, PlaneWaves(kx, ky, layer.angle)))
-    by_kx = np.moveaxis(signals, 2, 0)
+    above = von_karman_density(kx**2 + ky[ky.size // 2 :, None] ** 2, layer.strength, outer_scale)
+    density = (4.0 * np.pi / layer.speed) * weight[:, None] * _mirrored(above)
+    waves = PlaneWaves(kx, ky, layer.angle)
+    signals = sight(scenario, mode, layer, waves)
+    if isinstance(signals, Beams):
+        return signals.spectra(waves, density)
+    by_kx = np.moveaxis(np.asarray(signals), 2, 0)
     return np.moveaxis((by_kx.conj() * density.T[:, None]) @ by_kx.swapaxes(1, 2), 0, 2)
+
+
+def _mirrored(above: Array) -> Array:
+    """Return what is the same on either side of the wind, from its half above."""
+    return np.concatenate([above[::-1], above])
 
 
 class PlaneWaves:
     """Waves of a block: along and across the wind, and `x`, `y` in the pupil frame, (n_ky, n_kx) [rad/m].
 
-    Beams of one scale differ in their shifts, which are a factor along the wind times one across it.
+    Those across are symmetric about 0, so that half of them have every length.
     """
 
     def __init__(self, kx: Array, ky: Array, angle: float) -> None:
         self.kx, self.ky, self.c, self.s = kx, ky[:, None], np.cos(angle), np.sin(angle)
         self.x, self.y = self.c * self.kx - self.s * self.ky, self.s * self.kx + self.c * self.ky
-        self._of_scale: dict[tuple[float, int, float], Complex] = {}
-        self._in_beam: dict[tuple[float, int, Footprint], Complex] = {}
+        self._above = np.hypot(kx, self.ky[ky.size // 2 :])
+        self._direction = (self.x + 1j * self.y) / _mirrored(self._above)
+        self._radial: dict[tuple[int, float], Array] = {}
+        self._azimuthal: dict[int, Array] = {}
 
     def mode(self, diameter: float, noll: int, footprint: Footprint) -> Complex:
-        """Return the transform of a Zernike mode in a beam, computed once."""
-        beam, key = (diameter, noll, footprint), (diameter, noll, footprint.scale)
-        if beam in self._in_beam:
-            return self._in_beam[beam]
-        if key not in self._of_scale:
-            sensor = ZernikeProjection(diameter, (noll,))
-            self._of_scale[key] = sensor.transform(self.x, self.y, Footprint(footprint.scale), tabulated_bessel_ratio)[0]
-        self._in_beam[beam] = self._of_scale[key] * self.turn(footprint)
-        return self._in_beam[beam]
+        """Return the transform of a Zernike mode in a beam."""
+        return (zernike.amplitude(noll) * self.turn(footprint)) * self.shape(diameter, noll, footprint.scale)
+
+    def shape(self, diameter: float, noll: int, scale: float) -> Array:
+        """Return that over its amplitude, in a beam of this scale without a shift: real."""
+        order, radius = zernike.noll(noll)[0] + 1, 0.5 * diameter * scale
+        if (order, radius) not in self._radial:
+            self._radial[order, radius] = _mirrored(zernike.tabulated_bessel_ratio(order, radius * self._above))
+        if noll not in self._azimuthal:
+            self._azimuthal[noll] = zernike.azimuthal(noll, self._direction)
+        return self._radial[order, radius] * self._azimuthal[noll]
+
+    def in_wind(self, footprint: Footprint) -> tuple[float, float]:
+        """Return the shift of a footprint along and across the wind [m]."""
+        x, y = footprint.shift
+        return self.c * x + self.s * y, self.c * y - self.s * x
 
     def turn(self, footprint: Footprint) -> Complex:
         """Return exp(i k . shift)."""
-        x, y = footprint.shift
-        along, across = self.c * x + self.s * y, self.c * y - self.s * x
+        along, across = self.in_wind(footprint)
         return np.exp(1j * self.kx * along) * np.exp(1j * self.ky * across)
 
 
-Sight = Callable[[Scenario, Any, TurbulenceLayer, PlaneWaves], Sequence[Complex]]
+@dataclass(frozen=True)
+class Beams:
+    """Signals each of which is a mode in a beam: (noll, footprint) of each; diameter : that of the aperture [m].
+
+    Beams of one scale differ in their shifts, which are a factor along the wind times one across it: the sum over the waves
+    across is one product of matrices for all pairs of signals of the same modes and scales.
+    """
+
+    diameter: float
+    signals: Sequence[tuple[int, Footprint]]
+
+    def spectra(self, waves: PlaneWaves, density: Array) -> Complex:
+        """Return the sums over the waves across the wind between all signals, (n_signals, n_signals, n_kx)."""
+        shifts = np.array([waves.in_wind(footprint) for _, footprint in self.signals])
+        pairs: dict[tuple[tuple[int, float], tuple[int, float]], list[tuple[int, int]]] = {}
+        for i, (noll, one) in enumerate(self.signals):
+            for j, (other_noll, other) in enumerate(self.signals):
+                first, second = (noll, one.scale), (other_noll, other.scale)
+                if first < second or (first == second and i <= j):
+                    pairs.setdefault((first, second), []).append((i, j))
+        out = np.empty((len(shifts), len(shifts), waves.kx.size), dtype=np.complex128)
+        for (first, second), among in pairs.items():
+            one, other = (waves.shape(self.diameter, *each) for each in (first, second))
+            factor = zernike.amplitude(first[0]).conjugate() * zernike.amplitude(second[0])
+            i, j = np.array(among).T
+            along, across = (shifts[j] - shifts[i]).T
+            turns, power = np.exp(1j * np.outer(across, waves.ky)), density * one * other
+            out[i, j] = factor * (turns.real @ power + 1j * (turns.imag @ power)) * np.exp(1j * np.outer(along, waves.kx))
+            out[j, i] = out[i, j].conj()
+        return out
+
+
+Sight = Callable[[Scenario, Any, TurbulenceLayer, PlaneWaves], Sequence[Complex] | Beams]
 """(scenario, mode, layer, waves) -> transforms of the signals."""

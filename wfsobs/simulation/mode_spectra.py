@@ -11,12 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from wfsobs.atmosphere.plane_waves import Footprint
 from wfsobs.atmosphere.von_karman import TurbulenceLayer
 from wfsobs.scenario import Scenario
 from wfsobs.simulation import layers as atmosphere
-from wfsobs.simulation.flow_integral import PlaneWaves, Sight, spectra_between
+from wfsobs.simulation.flow_integral import Beams, PlaneWaves, Sight, spectra_between
 from wfsobs.simulation.flow_spectra import ideal_mode, star_basis
 from wfsobs.simulation.guide_stars import lgs_weights
 from wfsobs.typing import Array
@@ -86,7 +87,7 @@ def beam_spectra(scenario: Scenario, frequency: Array) -> ModeSpectra:
     ModeSpectra
         Densities, of n_lgs + 1 beams.
     """
-    return _spectra(scenario, frequency, _all_modes_of_beams)
+    return _spectra(scenario, frequency, _all_modes_of_beams, _mean_and_differences(scenario))
 
 
 def combined_spectra(scenario: Scenario, frequency: Array) -> ModeSpectra:
@@ -107,8 +108,8 @@ def combined_spectra(scenario: Scenario, frequency: Array) -> ModeSpectra:
     return _spectra(scenario, frequency, _all_modes_of_both)
 
 
-def _spectra(scenario: Scenario, frequency: Array, sight: Sight) -> ModeSpectra:
-    found, m = spectra_between(scenario, None, frequency, sight), len(scenario.modes)
+def _spectra(scenario: Scenario, frequency: Array, sight: Sight, weights: Array | None = None) -> ModeSpectra:
+    found, m = spectra_between(scenario, None, frequency, sight, weights=weights), len(scenario.modes)
     beams = range(m, len(found.density))
     cross = np.array([[found.pair(i, j) for j in beams] for i in range(m)])
     return ModeSpectra(np.array(found.density[:m]), found.matrix(beams), cross)
@@ -145,20 +146,20 @@ def _all_modes_of_both(scenario: Scenario, mode: None, layer: TurbulenceLayer, w
     return [*_all_modes(scenario, mode, layer, waves), *_modes_in(scenario, waves, natural)]
 
 
-def _all_modes_of_beams(
-    scenario: Scenario, _mode: None, layer: TurbulenceLayer, waves: PlaneWaves
-) -> list[NDArray[np.complex128]]:
-    """Return the transforms of all modes on the axis, in the mean of the LGS, in each of their differences, and in the NGS."""
+def _all_modes_of_beams(scenario: Scenario, _mode: None, layer: TurbulenceLayer, _waves: PlaneWaves) -> Beams:
+    """Return all modes on the axis, in each LGS, and in the NGS."""
+    stars = (atmosphere.on_axis(), *atmosphere.laser_stars(scenario), atmosphere.natural_star(scenario))
+    footprints = [atmosphere.footprint(star, layer) for star in stars]
+    return Beams(scenario.telescope.diameter, [(mode.noll, each) for each in footprints for mode in scenario.modes])
 
-    def seen(star: atmosphere.Star) -> NDArray[np.complex128]:
-        return _modes_in(scenario, waves, atmosphere.footprint(star, layer))
 
-    own = _modes_in(scenario, waves, Footprint())
-    stars = np.array([seen(star) for star in atmosphere.laser_stars(scenario)])
+def _mean_and_differences(scenario: Scenario) -> Array:
+    """Return the weights of the modes of `_all_modes_of_beams` in those of axis, mean and differences of the LGS, and NGS."""
+    modes = np.eye(len(scenario.modes))
+    seen = modes.copy()
     if scenario.sensors.tip_tilt_indetermination:
-        stars[:, [mode.radial_order == 1 for mode in scenario.modes]] = 0.0
-    lgs = np.tensordot(star_basis(len(stars)), stars, axes=1)
-    return [*own, *np.concatenate(lgs), *seen(atmosphere.natural_star(scenario))]
+        seen[[mode.radial_order == 1 for mode in scenario.modes]] = 0.0
+    return block_diag(modes, np.kron(star_basis(scenario.sensors.lgs_count), seen), modes)
 
 
 def _modes_in(scenario: Scenario, waves: PlaneWaves, footprint: Footprint) -> NDArray[np.complex128]:
