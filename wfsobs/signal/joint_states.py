@@ -12,6 +12,7 @@ variance E s^2 - b' C^-1 b: no other that is linear in the states leaves less.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -90,11 +91,20 @@ def own_share(one: StateFilter, model: DisturbanceModel, gain: float, noise: flo
 
 def shared_covariance(powers: Complex, responses: Sequence[Complex]) -> Array:
     """Return the covariance of the states of all filters, of inputs of these cross powers (m, m, n_nodes)."""
-    rows = []
+    starts = np.cumsum([0, *(len(one) for one in responses)])
+    at = [slice(*ends) for ends in pairwise(starts)]
+    out = np.empty((starts[-1], starts[-1]))
     for i, one in enumerate(responses):
-        rows.append(np.hstack([np.real((one * powers[i, j]) @ other.conj().T) for j, other in enumerate(responses)]))
-    out = np.vstack(rows)
+        for j in range(i, len(responses)):
+            found = real_product(one * powers[i, j], responses[j])
+            out[at[j], at[i]], out[at[i], at[j]] = found.T, found
     return 0.5 * (out + out.T)
+
+
+def real_product(a: Complex, b: Complex) -> Array:
+    """Return the real part of a b^H, by half of the products."""
+    real, other = (np.ascontiguousarray(each).view(np.float64) for each in (a, b))
+    return real @ other.T
 
 
 class LeastVariance:

@@ -23,7 +23,7 @@ from wfsobs.prior import Asterism, Prior
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.frame_shares import frame_response, frame_shares
-from wfsobs.signal.joint_states import StateFilter, running_means, shared_covariance
+from wfsobs.signal.joint_states import StateFilter, real_product, running_means, shared_covariance
 from wfsobs.signal.present_inputs import Present, PresentInputs
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.signal.wiener import Complex
@@ -194,7 +194,7 @@ class AsterismModel:
         late = self._late(phase)
         return np.vstack(
             [
-                np.hstack([np.real((one * row[j]) @ other.conj().T) for j, other in enumerate(late)])
+                np.hstack([real_product(one * row[j], other) for j, other in enumerate(late)])
                 for one, row in zip(self._responses, powers, strict=True)
             ]
         )
@@ -239,7 +239,7 @@ class AsterismModel:
 
     def _with_states(self, powers: Complex, phase: int) -> Array:
         """Return covariances of signals and the states, from the cross powers of the signals and all inputs."""
-        return np.hstack([np.real(powers[:, i] @ one.conj().T) for i, one in enumerate([*self._responses, *self._late(phase)])])
+        return np.hstack([real_product(powers[:, i], one) for i, one in enumerate([*self._responses, *self._late(phase)])])
 
     def _of_vibration(self, frames: float, phase: int) -> tuple[Array, Array]:
         out, variances = np.zeros((len(self._peaks), self.n_states)), []

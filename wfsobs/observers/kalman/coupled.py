@@ -26,7 +26,7 @@ from wfsobs.prior import Flow, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.joint_states import LeastVariance, StateFilter, own_share, running_means, shared_covariance
+from wfsobs.signal.joint_states import LeastVariance, StateFilter, own_share, real_product, running_means, shared_covariance
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.signal.stepping import Saved
@@ -116,7 +116,7 @@ class CoupledModel:
         return self._cross_covariance(ahead), self._flow.own.sum(axis=1)
 
     def _cross_covariance(self, powers: Array) -> Array:
-        return np.hstack([np.real(powers[:, j] @ one.conj().T) for j, one in enumerate(self._responses)])
+        return np.hstack([real_product(powers[:, j], one) for j, one in enumerate(self._responses)])
 
     def _of_vibration(self, frames: float) -> tuple[Array, Array]:
         rows, variances = [], []
