@@ -58,7 +58,7 @@ def spectra_between(
     reach : spatial frequency up to which the sight takes waves that the modes do not have [rad/m]
     weights : of what the sight gives in the signals, (n_signals, n_sights); by default that itself
     """
-    f, total = _at_nodes(scenario, mode, float(frequency[-1]), sight, reach)
+    f, total = _at_nodes(_Air(scenario), mode, float(frequency[-1]), sight, reach)
     if weights is not None:
         total = np.einsum("ai,ijf,bj->abf", weights, total, weights, optimize=True)
     exposure = np.sinc(f * scenario.dt) ** 2
@@ -67,9 +67,25 @@ def spectra_between(
     return SpectraBetween(density, nodes, at, total)
 
 
+class _Air:
+    """A scenario, equal to any other of the same turbulence, sensors and vibration: no other setting changes these spectra."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        groups = scenario.telescope, scenario.turbulence, scenario.sensors, scenario.vibration
+        self._settings = scenario.n_steps, *(group.to_dict() for group in groups)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Air) and self._settings == other._settings
+
+    def __hash__(self) -> int:
+        return hash(repr(self._settings))
+
+
 @lru_cache(maxsize=32)
-def _at_nodes(scenario: Scenario, mode: int | None, highest: float, sight: Sight, reach: float) -> tuple[Array, Complex]:
-    """Return the nodes in frequency, and the spectra of all layers there, which take a second where there are many."""
+def _at_nodes(air: _Air, mode: int | None, highest: float, sight: Sight, reach: float) -> tuple[Array, Complex]:
+    """Return the nodes in frequency, and the spectra of all layers there, which take a while where there are many."""
+    scenario = air.scenario
     found = atmosphere.layers(scenario)
     f = _frequencies(scenario, min(layer.speed for layer in found), highest, reach)
     total = np.sum([_layer(scenario, mode, layer, f, sight, reach) for layer in found], axis=0)
