@@ -207,8 +207,8 @@ class ZernikeProjection:
         from the wind's direction to the pupil's axis mixes the two modes of a pair.
         """
         half = wave.ky.size // 2
-        amplitude = wave.through(footprint)
-        upper, lower = amplitude[half:], amplitude[half - 1 :: -1]
+        seen = wave.through(footprint)
+        upper, lower = seen[half:], seen[half - 1 :: -1]
         even, odd = upper + lower, upper - lower
         k = np.hypot(wave.kx, wave.ky[half:, None])
         direction = (wave.kx + 1j * wave.ky[half:, None]) / k

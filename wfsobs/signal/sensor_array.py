@@ -16,8 +16,9 @@ matrices, multiplied by the FFT. No matrix spectrum is factorised. Measurements 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,19 +80,25 @@ def variance_from_sensors(
     rests = [spectrum - np.abs(seen) ** 2 for spectrum, seen in zip(own_spectra, of_z, strict=True)]
     factors = np.array([*(_factor(rest) for rest in rests[:last]), _frame_factor(rests[last], slow, n)])
     whiten, ahead = 1.0 / factors.conj(), 1.0 / (whitener.H.conj() * np.sqrt(whitener.innovation_variance))
-    future = _of_future(cross * ahead, n) * whiten
-    shares = {}
-    for j in range(1, last + 1):
-        for i in range(j):
-            shared = fast.slow[i] if j == last else fast.spectra[i, j].conj()
-            shares[i, j] = (shared - of_z[i].conj() * of_z[j]) * whiten[i] * whiten[j].conj()
-    wanted = []
+    future = _of_future(cross * ahead, n)
+    future *= whiten
+
+    def share(i: int, j: int) -> Complex:
+        shared = fast.slow[i] if j == last else fast.spectra[i, j].conj()
+        return (shared - of_z[i].conj() * of_z[j]) * whiten[i] * whiten[j].conj()
+
+    regression = _Regression.of(share, future, slow.ratio, n)
+    length, wanted = min(LONGEST, n // 2), []
     for on_z, on_x, on_y in targets:
-        own = np.vstack([on_y, on_x]) - (on_z / np.sqrt(whitener.spectrum)) * of_z.conj()
-        found = fft.rfft(_past(own, n), n) * whiten
-        found += future * _of_future(on_z * ahead, n, first=1).conj()
-        wanted.append(fft.irfft(found, n)[:, : min(LONGEST, n // 2)])
-    return _gains(_Regression.of(shares, future, slow.ratio, n), np.array(wanted))
+        own = of_z.conj()
+        own *= -on_z / np.sqrt(whitener.spectrum)
+        own[:last] += on_y
+        own[last] += on_x
+        found = fft.rfft(_past(own, n), n)
+        found *= whiten
+        found += np.multiply(future, _of_future(on_z * ahead, n, first=1).conj(), out=own)
+        wanted.append(fft.irfft(found, n)[:, :length].copy())
+    return _gains(regression, np.array(wanted))
 
 
 def _factor(spectrum: Array) -> Complex:
@@ -137,13 +144,14 @@ class _Regression:
     mask: Array
 
     @staticmethod
-    def of(shares: dict[tuple[int, int], Complex], future: Complex, ratio: int, n: int) -> _Regression:
+    def of(share: Callable[[int, int], Complex], future: Complex, ratio: int, n: int) -> _Regression:
+        """Return that of what sensors i < j have in common, share(i, j), and the future."""
         length = min(LONGEST, n // 2)
         size = fft.next_fast_len(2 * length, real=True)
         among = np.ones((len(future), len(future), size // 2 + 1), dtype=np.complex128)  # each of them is white
         near = np.zeros(size)
-        for (i, j), share in shares.items():
-            kernel = fft.irfft(share, n)
+        for i, j in combinations(range(len(future)), 2):
+            kernel = fft.irfft(share(i, j), n)
             near[:length], near[1 - length :] = kernel[:length], kernel[1 - length :]
             among[i, j] = fft.rfft(near)
             among[j, i] = among[i, j].conj()
