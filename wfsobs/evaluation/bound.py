@@ -121,10 +121,10 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
     return of_every_target(found, spectra, LeastError(np.zeros_like(covariance[0]), np.zeros_like(transient[0])))
 
 
-def of_every_target(found: dict[str, Error], spectra: TrueSpectra, nothing: Error) -> dict[str, Error]:
+def of_every_target(errors: dict[str, Error], spectra: TrueSpectra, nothing: Error) -> dict[str, Error]:
     """Return the errors of every target, and of both together, from those computed; nothing : that of a target that is zero."""
-    only = next(iter(found.values()))
-    return {name: found.get(name, nothing) for name in spectra.signal} | {TOTAL: found.get(TOTAL, only)}
+    only = next(iter(errors.values()))
+    return {name: errors.get(name, nothing) for name in spectra.signal} | {TOTAL: errors.get(TOTAL, only)}
 
 
 def bound_rms(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:

@@ -134,16 +134,16 @@ def _block(scenario: Scenario, mode: int | None, layer: TurbulenceLayer, kx: Arr
     else:
         ky, weight = nodes_across_wind(float(np.hypot(q0, kx[0])), 4.0 * kx[-1], np.inf, 0.25)
     above = von_karman_density(kx**2 + ky[ky.size // 2 :, None] ** 2, layer.strength, outer_scale)
-    density = (4.0 * np.pi / layer.speed) * weight[:, None] * _mirrored(above)
+    density = (4.0 * np.pi / layer.speed) * weight[:, None] * _mirror(above)
     waves = PlaneWaves(kx, ky, layer.angle)
     signals = sight(scenario, mode, layer, waves)
-    if isinstance(signals, Beams):
+    if isinstance(signals, ModesInBeams):
         return signals.spectra(waves, density)
     by_kx = np.moveaxis(np.asarray(signals), 2, 0)
     return np.moveaxis((by_kx.conj() * density.T[:, None]) @ by_kx.swapaxes(1, 2), 0, 2)
 
 
-def _mirrored(above: Array) -> Array:
+def _mirror(above: Array) -> Array:
     """Return what is the same on either side of the wind, from its half above."""
     return np.concatenate([above[::-1], above])
 
@@ -158,7 +158,7 @@ class PlaneWaves:
         self.kx, self.ky, self.c, self.s = kx, ky[:, None], np.cos(angle), np.sin(angle)
         self.x, self.y = self.c * self.kx - self.s * self.ky, self.s * self.kx + self.c * self.ky
         self._above = np.hypot(kx, self.ky[ky.size // 2 :])
-        self._direction = (self.x + 1j * self.y) / _mirrored(self._above)
+        self._direction = (self.x + 1j * self.y) / _mirror(self._above)
         self._radial: dict[tuple[int, float], Array] = {}
         self._azimuthal: dict[int, Array] = {}
 
@@ -170,7 +170,7 @@ class PlaneWaves:
         """Return that over its amplitude, in a beam of this scale without a shift: real."""
         order, radius = zernike.noll(noll)[0] + 1, 0.5 * diameter * scale
         if (order, radius) not in self._radial:
-            self._radial[order, radius] = _mirrored(zernike.tabulated_bessel_ratio(order, radius * self._above))
+            self._radial[order, radius] = _mirror(zernike.tabulated_bessel_ratio(order, radius * self._above))
         if noll not in self._azimuthal:
             self._azimuthal[noll] = zernike.azimuthal(noll, self._direction)
         return self._radial[order, radius] * self._azimuthal[noll]
@@ -187,10 +187,10 @@ class PlaneWaves:
 
 
 @dataclass(frozen=True)
-class Beams:
+class ModesInBeams:
     """Signals each of which is a mode in a beam: (noll, footprint) of each; diameter : that of the aperture [m].
 
-    Beams of one scale differ in their shifts, which are a factor along the wind times one across it: the sum over the waves
+    ModesInBeams of one scale differ in their shifts, which are a factor along the wind times one across it: the sum over the waves
     across is one product of matrices for all pairs of signals of the same modes and scales.
     """
 
@@ -218,5 +218,5 @@ class Beams:
         return out
 
 
-Sight = Callable[[Scenario, Any, TurbulenceLayer, PlaneWaves], Sequence[Complex] | Beams]
+Sight = Callable[[Scenario, Any, TurbulenceLayer, PlaneWaves], Sequence[Complex] | ModesInBeams]
 """(scenario, mode, layer, waves) -> transforms of the signals."""

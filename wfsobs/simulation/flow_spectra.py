@@ -21,7 +21,7 @@ from wfsobs.atmosphere.von_karman import TurbulenceLayer
 from wfsobs.scenario import Scenario
 from wfsobs.signal.wiener import Complex
 from wfsobs.simulation import layers as atmosphere
-from wfsobs.simulation.flow_integral import Beams, PlaneWaves, SpectraBetween, spectra_between
+from wfsobs.simulation.flow_integral import ModesInBeams, PlaneWaves, SpectraBetween, spectra_between
 from wfsobs.simulation.guide_stars import MEAN, lgs_weights, stars_differ
 from wfsobs.typing import Array
 
@@ -122,11 +122,11 @@ def _stars_together(scenario: Scenario, mode: int, layer: TurbulenceLayer, waves
     return [*natural, of_stars(scenario, mode, layer, waves, ideal_mode)]
 
 
-def _beams(scenario: Scenario, mode: int, layer: TurbulenceLayer, _waves: PlaneWaves) -> Beams:
+def _beams(scenario: Scenario, mode: int, layer: TurbulenceLayer, _waves: PlaneWaves) -> ModesInBeams:
     """Return those of axis, NGS and every LGS."""
     stars = (atmosphere.on_axis(), atmosphere.natural_star(scenario), *atmosphere.laser_stars(scenario))
     noll = scenario.modes[mode].noll
-    return Beams(scenario.telescope.diameter, [(noll, atmosphere.footprint(star, layer)) for star in stars])
+    return ModesInBeams(scenario.telescope.diameter, [(noll, atmosphere.footprint(star, layer)) for star in stars])
 
 
 def of_stars(scenario: Scenario, mode: int, layer: TurbulenceLayer, waves: PlaneWaves, star_mode: ModeInBeam) -> Complex:

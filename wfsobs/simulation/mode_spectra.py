@@ -17,7 +17,7 @@ from wfsobs.atmosphere.plane_waves import Footprint
 from wfsobs.atmosphere.von_karman import TurbulenceLayer
 from wfsobs.scenario import Scenario
 from wfsobs.simulation import layers as atmosphere
-from wfsobs.simulation.flow_integral import Beams, PlaneWaves, Sight, spectra_between
+from wfsobs.simulation.flow_integral import ModesInBeams, PlaneWaves, Sight, spectra_between
 from wfsobs.simulation.flow_spectra import ideal_mode, star_basis
 from wfsobs.simulation.guide_stars import lgs_weights
 from wfsobs.typing import Array
@@ -146,11 +146,11 @@ def _all_modes_of_both(scenario: Scenario, mode: None, layer: TurbulenceLayer, w
     return [*_all_modes(scenario, mode, layer, waves), *_modes_in(scenario, waves, natural)]
 
 
-def _all_modes_of_beams(scenario: Scenario, _mode: None, layer: TurbulenceLayer, _waves: PlaneWaves) -> Beams:
+def _all_modes_of_beams(scenario: Scenario, _mode: None, layer: TurbulenceLayer, _waves: PlaneWaves) -> ModesInBeams:
     """Return all modes on the axis, in each LGS, and in the NGS."""
     stars = (atmosphere.on_axis(), *atmosphere.laser_stars(scenario), atmosphere.natural_star(scenario))
     footprints = [atmosphere.footprint(star, layer) for star in stars]
-    return Beams(scenario.telescope.diameter, [(mode.noll, each) for each in footprints for mode in scenario.modes])
+    return ModesInBeams(scenario.telescope.diameter, [(mode.noll, each) for each in footprints for mode in scenario.modes])
 
 
 def _mean_and_differences(scenario: Scenario) -> Array:
