@@ -117,7 +117,8 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
     gained = np.hstack([np.zeros((len(names), 1)), explained_variance(measured, cross)])
     transient = lines[:, :1] + [[circle_mean(one)] for one in own] - gained
     covariance = fft.irfft(error_spectrum(own, shared, whitener), whitener.n)[:, : min(n_steps, whitener.n // 2)]
-    found = {name: LeastError(*each, len(spectra.pure)) for name, *each in zip(names, covariance, transient, strict=True)}
+    n_lines = len(spectra.pure)
+    found = {name: LeastError(left, learnt, n_lines) for name, left, learnt in zip(names, covariance, transient, strict=True)}
     return of_every_target(found, spectra, LeastError(np.zeros_like(covariance[0]), np.zeros_like(transient[0])))
 
 

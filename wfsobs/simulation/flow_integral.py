@@ -140,7 +140,8 @@ def _block(scenario: Scenario, mode: int | None, layer: TurbulenceLayer, kx: Arr
     if isinstance(signals, ModesInBeams):
         return signals.spectra(waves, density)
     by_kx = np.moveaxis(np.asarray(signals), 2, 0)
-    return np.moveaxis((by_kx.conj() * density.T[:, None]) @ by_kx.swapaxes(1, 2), 0, 2)
+    between: Complex = np.matmul(by_kx.conj() * density.T[:, None], by_kx.swapaxes(1, 2))
+    return np.moveaxis(between, 0, 2)
 
 
 def _mirror(above: Array) -> Array:
@@ -190,7 +191,7 @@ class PlaneWaves:
 class ModesInBeams:
     """Signals each of which is a mode in a beam: (noll, footprint) of each; diameter : that of the aperture [m].
 
-    ModesInBeams of one scale differ in their shifts, which are a factor along the wind times one across it: the sum over the waves
+    Beams of one scale differ in their shifts, which are a factor along the wind times one across it: the sum over the waves
     across is one product of matrices for all pairs of signals of the same modes and scales.
     """
 
@@ -212,8 +213,8 @@ class ModesInBeams:
             factor = zernike.amplitude(first[0]).conjugate() * zernike.amplitude(second[0])
             i, j = np.array(among).T
             along, across = (shifts[j] - shifts[i]).T
-            turns, power = np.exp(1j * np.outer(across, waves.ky)), density * one * other
-            out[i, j] = factor * (turns.real @ power + 1j * (turns.imag @ power)) * np.exp(1j * np.outer(along, waves.kx))
+            turn, power = np.outer(across, waves.ky), density * one * other
+            out[i, j] = factor * (np.cos(turn) @ power + 1j * (np.sin(turn) @ power)) * np.exp(1j * np.outer(along, waves.kx))
             out[j, i] = out[i, j].conj()
         return out
 
