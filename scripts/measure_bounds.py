@@ -44,7 +44,7 @@ def times(scenario: Scenario, observer: str) -> tuple[float, float]:
     """Return the time that the bounds take, and the processor's [s]."""
     start, busy = perf_counter(), process_time()
     if observer:
-        JOINT[observer][1](scenario)
+        JOINT[observer][-1](scenario)
     else:
         nothing = np.zeros((scenario.n_steps, len(scenario.modes)))
         record_bounds(scenario, Record(nothing, nothing, scenario.dt))
