@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.pages.campaign import CampaignPage
 from wfsobs.app.pages.pages import CAMPAIGN, EXPLORE
 from wfsobs.app.service import Session

@@ -17,7 +17,7 @@ from wfsobs.app.jobs.task import IDLE
 from wfsobs.app.limits import NONE
 from wfsobs.app.live_order import LiveOrder
 from wfsobs.app.live_work import record_saves
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.pages.live import LivePage
 from wfsobs.app.pages.live_table import ranking
 from wfsobs.app.pages.pages import EXPLORE, LIVE

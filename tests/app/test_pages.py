@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from wfsobs.app.dashboard import Dashboard
-from wfsobs.app.numbers import short
+from wfsobs.app.numerals import short
 from wfsobs.app.pages import model
 from wfsobs.app.pages.figures import PSD_TOP_HZ, Figures
 from wfsobs.app.pages.pages import EXPLORE, FIGURES, MODEL

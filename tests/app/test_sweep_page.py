@@ -15,7 +15,7 @@ from wfsobs.app import sweep_work
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING, Job
 from wfsobs.app.limits import NONE, Limits
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.pages.pages import EXPLORE, SWEEP
 from wfsobs.app.pages.sweep import EVERY, SweepPage
 from wfsobs.app.pages.sweep_settings import sweep_settings, usual_values

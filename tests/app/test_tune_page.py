@@ -14,7 +14,7 @@ from wfsobs.app.controls.names import setting_name
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING
 from wfsobs.app.limits import Limits
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.pages.pages import TUNE
 from wfsobs.app.pages.tune import TunePage
 from wfsobs.app.pages.tune_views import unit_for

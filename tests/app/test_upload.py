@@ -14,7 +14,7 @@ import pytest
 from wfsobs.app import picker as module
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.limits import Limits
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.picker import LARGEST
 from wfsobs.app.service import Service
 from wfsobs.app.upload_fields import SILENT

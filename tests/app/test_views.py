@@ -13,7 +13,7 @@ from tests.records import ON_PAPER
 from wfsobs.app.dashboard import Dashboard
 from wfsobs.app.display import per_micrometre
 from wfsobs.app.downloads import data_csv
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.style import look
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.traces import BINS

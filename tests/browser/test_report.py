@@ -20,7 +20,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 import wfsobs
 from wfsobs.app.display import UNITS, per_micrometre
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.work import TRUTH
 from wfsobs.cli import main
 from wfsobs.evaluation.error_spectra import cumulative_rms, spectra

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.report.budget import budget_state_table
 from wfsobs.app.report.data import Report, State, state_of
 from wfsobs.app.report.packing import pack, unpack

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from wfsobs import __version__
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.report.data import Report, state_of
 from wfsobs.app.report.grid import Grid
 from wfsobs.app.report.packing import pack, unpack

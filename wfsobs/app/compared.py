@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wfsobs.app.numbers import NOTHING, change, number
+from wfsobs.app.numerals import NOTHING, change, number
 from wfsobs.app.style import observers_of
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.work import TRUTH, Key, RunResults, SignalAndError

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from math import pi
 from typing import Any
 
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.observers.base import TURBULENCE
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.groups.vibration import Peak

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import ArrayLike
 
-from wfsobs.app.numbers import number, short
+from wfsobs.app.numerals import number, short
 
 
 def render(template: str, **values: Any) -> str:

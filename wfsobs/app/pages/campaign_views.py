@@ -11,7 +11,7 @@ from bokeh.models import ColumnDataSource, FixedTicker, Range1d
 from bokeh.plotting import figure
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.numbers import NOTHING, number
+from wfsobs.app.numerals import NOTHING, number
 from wfsobs.app.pages.sweep_views import DECIDED, FULL_MARGIN, GROUNDS, OPEN, WAITING, axis_title, ink_on, mix
 from wfsobs.app.render import Row, table
 from wfsobs.app.report.text import value_of

@@ -17,7 +17,7 @@ from wfsobs.app.glossary import STREHL, TERMS
 from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.loop_work import LoopResults, compute, cost, seconds
-from wfsobs.app.numbers import NOTHING, number
+from wfsobs.app.numerals import NOTHING, number
 from wfsobs.app.pages.link import LinkedLines
 from wfsobs.app.pages.loop_figures import LoopSpectrum, Nyquist, Response, Trace
 from wfsobs.app.pages.loop_table import loop_html, margins_html

@@ -12,7 +12,7 @@ from bokeh.plotting import figure
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.style import asset, look, swatch
 from wfsobs.app.views.envelope import envelope, envelope_times
 from wfsobs.app.views.plots import call, new_figure

@@ -9,7 +9,7 @@ from math import inf, isnan
 import numpy as np
 
 from wfsobs.app.display import Display, per_micrometre
-from wfsobs.app.numbers import NOTHING, number
+from wfsobs.app.numerals import NOTHING, number
 from wfsobs.app.render import Row, table
 from wfsobs.app.style import look, swatch
 from wfsobs.closed_loop.run import strehl

@@ -9,7 +9,7 @@ from markupsafe import Markup
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.glossary import NEEDS, STREHL, TERMS
 from wfsobs.app.loop_work import LoopResults
-from wfsobs.app.numbers import NOTHING, number
+from wfsobs.app.numerals import NOTHING, number
 from wfsobs.app.render import Row, macro, table
 from wfsobs.app.style import swatch
 from wfsobs.app.views.table import BEST

@@ -5,7 +5,7 @@ from __future__ import annotations
 import panel as pn
 
 from wfsobs.app.display import Display
-from wfsobs.app.numbers import short
+from wfsobs.app.numerals import short
 from wfsobs.app.render import render
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, swatch

@@ -11,7 +11,7 @@ from panel.custom import JSComponent
 
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.display import Display, per_micrometre, unit_text
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.report.text import value_of
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.campaign.sweep_results import SweepResults

@@ -17,7 +17,7 @@ from wfsobs.app.display import UNITS, Display, per_micrometre
 from wfsobs.app.downloads import Save, table_csv
 from wfsobs.app.jobs.job import RUNNING, SWEEP, Job
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.pages.link import LinkedFields
 from wfsobs.app.pages.parts import WIDE, PageActions, Starter, box, html, legend, line, text
 from wfsobs.app.pages.tune_views import LEGEND, HistoryFigure, tuning_html, unit_for

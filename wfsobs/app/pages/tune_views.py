@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from wfsobs.app.controls.names import setting_name
 from wfsobs.app.display import NO_ANGLE, UNITS, Display, per_micrometre
-from wfsobs.app.numbers import NOTHING, change, number
+from wfsobs.app.numerals import NOTHING, change, number
 from wfsobs.app.render import Row, macro, table
 from wfsobs.app.style import look
 from wfsobs.app.tune_work import LIKELIHOOD, OTHER, SETTING, TEST, TOGETHER, VALIDATION, best_so_far, tuning_rows

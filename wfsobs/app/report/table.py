@@ -7,7 +7,7 @@ from itertools import groupby
 from typing import Any
 
 from wfsobs.app.display import IN_MOST, OVER_SEEDS, score_columns
-from wfsobs.app.numbers import NOTHING
+from wfsobs.app.numerals import NOTHING
 from wfsobs.app.report.data import State
 from wfsobs.evaluation.evidence import rank_observers
 from wfsobs.evaluation.rows import TIME, Row, can_be_best, is_non_causal, own_interval, row_label, scored_interval

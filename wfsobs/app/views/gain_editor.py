@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.loop_work import LoopResults
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.store import Store
 from wfsobs.app.style import look
 from wfsobs.app.views.frames import Frames

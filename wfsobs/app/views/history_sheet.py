@@ -16,7 +16,7 @@ from wfsobs.app.history import History
 from wfsobs.app.history_entry import HistoryEntry
 from wfsobs.app.jobs.job import DONE, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.picker import LARGEST, PART, PartialFile, file_message, too_large
 from wfsobs.app.session_file import SUFFIX, read_session, write_session
 from wfsobs.app.session_values import SessionError

@@ -16,7 +16,7 @@ from panel.custom import JSComponent
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.handles import PEAK, Handle, changes_of, handles_of, has_peaks, highest_frequency, with_new_peak, without_peak
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.frames import Frames

@@ -10,7 +10,7 @@ from bokeh.models import Range1d
 
 from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.numbers import number
+from wfsobs.app.numerals import number
 from wfsobs.app.style import asset, look, observers_of, swatch
 from wfsobs.app.views.settle import on_settle, zoom_of
 from wfsobs.app.work import TRUTH, RunResults

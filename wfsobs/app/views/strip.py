@@ -12,7 +12,7 @@ from wfsobs.app.display import Display, per_micrometre
 from wfsobs.app.glossary import RELATIVE, TERMS
 from wfsobs.app.jobs.job import RUNNING
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.numbers import NOTHING, change, number
+from wfsobs.app.numerals import NOTHING, change, number
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset, look, observers_of
 from wfsobs.app.views.table import find

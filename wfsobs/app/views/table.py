@@ -13,7 +13,7 @@ from wfsobs.app.display import IN_MOST, OVER_SEEDS, Display, per_micrometre, sco
 from wfsobs.app.glossary import BOUND as TERM_OF_BOUND
 from wfsobs.app.glossary import term
 from wfsobs.app.jobs.task import BackgroundTask
-from wfsobs.app.numbers import NOTHING, change, number
+from wfsobs.app.numerals import NOTHING, change, number
 from wfsobs.app.render import Row, macro, table
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset, observers_of, swatch
