@@ -3,8 +3,8 @@
 Of what is made of all LGS together in the place of each by itself it is the bound of the coupled modes of both sensors.
 
 It is as `bound_stars`, which takes one mode at a time, and is found as `bound_modes`: by the best weights of very many means of
-the past, of the LGS and of the NGS frames, beside the states of `kf-asterism` or
-`multirate-coupled`. Lines are as wide as those of the record at least.
+the past, of the LGS and of the NGS frames, beside the states of `kf-asterism` or `multirate-coupled`. Lines are as wide as
+those of the record at least.
 """
 
 from __future__ import annotations
