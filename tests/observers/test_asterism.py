@@ -117,12 +117,14 @@ def test_lasers_that_are_out_have_no_number_and_the_estimates_have() -> None:
     assert all(np.isfinite(values).all() for values in run_observer("kf-asterism", record, scenario.before_events).values())
 
 
-def test_shares_are_those_of_a_simulation() -> None:
-    """Of the lifted recursion, written out step by step: powers of its matrices summed over a past of 40 times its memory."""
+@pytest.mark.parametrize("lost", [0, 1, 2])
+def test_shares_are_those_of_a_simulation(lost: int) -> None:
+    """Of the lifted recursion, written out step by step: powers of its matrices summed over a past of 40 times its memory;
+    the last frames are not read, and the last of them is what the exposure has seen."""
     model = disturbance_model((), [Ar2(0.6, 0.1, 1.3, 1.0)])
     fast, slow = StateFilter(np.diag([0.0, 0.7]), np.array([1.0, 0.3])), StateFilter(np.diag([0.5]), np.array([0.5]))
     ratio, noise, frame_noise = 3, 0.4, 0.2
-    found = frame_shares(fast, slow, ratio, model, noise, frame_noise)
+    found = frame_shares(fast, slow, ratio, model, noise, frame_noise, age=lost * ratio)
     n, past = len(model.A), 600
     S = lyapunov(model.A, model.Q)
     d_covariance = [S]
@@ -130,11 +132,12 @@ def test_shares_are_those_of_a_simulation() -> None:
         d_covariance.append(model.A @ d_covariance[-1])  # E d[k + i] d[k]'
     # weights of z[k - a] in every state, and of the frames' noise
     for phase in range(ratio):
+        age = lost * ratio + phase
         weights = np.zeros((3, past))
         for a in range(past):
             weights[:2, a] = np.linalg.matrix_power(fast.F, a) @ fast.G
-            frame = (a - phase) // ratio
-            if a >= phase:
+            frame = (a - age) // ratio
+            if a >= age:
                 weights[2, a] = 0.5 * 0.5**frame / ratio
         r = np.array([(model.C @ d @ np.ravel(model.C)).item() for d in d_covariance[:past]])
         toeplitz = r[np.abs(np.subtract.outer(np.arange(past), np.arange(past)))]
@@ -146,6 +149,10 @@ def test_shares_are_those_of_a_simulation() -> None:
         cross = np.array([d_covariance[a] @ np.ravel(model.C) for a in range(past)]).T @ weights.T
         assert cross.shape == (n, 3)
         np.testing.assert_allclose(found[phase].disturbance, cross, rtol=1e-9, atol=1e-12)
+        seen = np.zeros(past)
+        seen[: ratio if lost and not phase else phase] = 1.0 / ratio
+        mixed = seen @ toeplitz @ weights.T
+        np.testing.assert_allclose(found[phase].exposure, mixed, rtol=1e-9, atol=1e-12)
 
 
 def test_what_it_states_is_near_the_bounds_and_below_that_of_the_mean() -> None:

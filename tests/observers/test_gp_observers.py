@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 import wfsobs
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.gp.lgs import GaussianProcess, kernels_of
 from wfsobs.prior import Lines
 from wfsobs.priors_from.scenario import prior_of
+from wfsobs.signal.statespace import disturbance_model
 
 SHORT = {"run.duration": 3.0, "run.warm_up": 1.0}
 ONE_PEAK = {"vibration.source": "ar2", "vibration.peaks": [{"frequency": 47.5, "damping": 0.03, "rms": [0.015, 0.015]}]}
@@ -53,6 +55,44 @@ def test_the_estimate_is_that_of_the_dense_regression(kernel: str, background: f
         # the filter's start, at rest with the steady gain, has faded to 1e-4 of an error after 1.5 s
         assert abs(estimate.values[k, 0] - value) < 1e-3 * estimate.sd[k, 0]
         assert estimate.sd[k, 0] == pytest.approx(np.sqrt(covariance[0] - own @ covariance[1:]), rel=1e-3)
+
+
+FAST = {"turbulence.wind_speed": 100.0, "turbulence.rms": 0.05, "vibration.peaks.0.damping": 0.2, "sensors.lgs_noise": 0.005}
+"""Processes and noises with which a filter at rest has forgotten its start to 1e-11 after a second."""
+
+
+@pytest.mark.parametrize("kernel", ["as told", "matern-1/2", "matern-3/2", "matern-5/2"])
+def test_of_both_sensors_it_is_the_dense_regression_with_frames_as_means(kernel: str) -> None:
+    """On 1000 measurements of the LGS and the 200 NGS frames among them, in three phases: the estimates to 1e-10 of the rms of
+    what is estimated, the variances to 1e-10 of its variance. Slow error of the LGS and background are in z alone."""
+    s = scenario({"gp.turbulence": kernel, "gp.background_rms": 0.01, **ONE_PEAK}).replace(FAST)
+    record = wfsobs.simulate(s)
+    found = wfsobs.observe(record, s, observers=["gp-both"])
+    prior, n, ratio = prior_of(s, record, OBSERVERS["gp-both"].prior), 1000, s.sensors.exposure_ratio
+    lines = prior.lines[0]
+    kernels = kernels_of(lines, GaussianProcess(turbulence=kernel, background_rms=0.01))
+    lags = np.abs(np.subtract.outer(np.arange(-1, n), np.arange(-1, n)))  # of the disturbance now, and as z has it
+    turbulence, vibration, colour = (one.state_space().covariance(s.dt * np.arange(n + 1))[lags] for one in kernels)
+    error = disturbance_model([prior.lgs_error[0].process], ())
+    slow = [np.ravel(error.C) @ np.linalg.matrix_power(error.A, i) @ np.ravel(error.C) for i in range(n + 1)]
+    for k in (990, 992, 994):
+        ages = np.arange(k + 1)  # of z[k], z[k-1], ..., the place behind that of the disturbance now
+        ends = np.arange(k % ratio, k - ratio + 1, ratio)
+        exposure = np.zeros((len(ends), n + 1))
+        for row, end in zip(exposure, ends, strict=True):
+            row[end + 1 : end + 1 + ratio] = 1.0 / ratio
+        seen = np.vstack([np.eye(n + 1)[ages + 1], exposure])
+        K = seen @ (turbulence + vibration) @ seen.T + np.diag(
+            [lines.noise**2] * (k + 1) + [prior.model[0].ngs_noise ** 2] * len(ends)
+        )
+        K[: k + 1, : k + 1] += colour[: k + 1, : k + 1] + np.array(slow)[lags[: k + 1, : k + 1]]
+        measured = np.concatenate([record.z[k::-1, 0], record.z_ngs[k - ends, 0]])
+        cross = seen @ np.array([turbulence[0], vibration[0]]).T
+        weights = np.linalg.solve(K, cross)
+        for i, target in enumerate(("turbulence", "vibration")):
+            estimate, variance = found.estimate("gp-both", target), (turbulence, vibration)[i][0, 0]
+            assert abs(estimate.values[k, 0] - weights[:, i] @ measured) < 1e-10 * np.sqrt(variance)
+            assert abs(estimate.sd[k, 0] ** 2 - (variance - weights[:, i] @ cross[:, i])) < 1e-10 * variance
 
 
 def test_a_background_is_of_neither_target() -> None:

@@ -136,6 +136,30 @@ def test_without_the_lgs_it_goes_on_with_the_ngs() -> None:
     assert step_difference(OBSERVER, *arguments(OBSERVER, lossy, short)) <= 1e-12
 
 
+def test_with_ngs_frames_lost_it_is_as_sure_as_it_says() -> None:
+    """Half of them at random, then ten in a row: errors are as stated to 10 %, whatever the number that are lost in a row up to
+    four; ten in a row leave no more than a tenth above what the LGS alone do."""
+    record, ratio = simulate(LONG), LONG.sensors.exposure_ratio
+    due = np.arange(ratio, record.n_steps, ratio)
+    at, rng = np.arange(due.size), np.random.default_rng(5)
+    lost = np.where(at < due.size // 2, rng.random(due.size) < 0.5, at % 40 >= 30)
+    frames, in_a_row = record.y_ngs.copy(), np.zeros(record.n_steps, dtype=int)
+    frames[due[lost]] = np.nan
+    for k, is_lost in zip(due, lost, strict=True):
+        in_a_row[k : k + ratio] = in_a_row[k - 1] + 1 if is_lost else 0
+    lossy = replace(record, y_ngs=frames)
+    found = OBSERVER.estimate(*arguments(OBSERVER, lossy, LONG))
+    alone = OBSERVERS["kf-coupled"].estimate(*arguments(OBSERVERS["kf-coupled"], record, LONG))["turbulence"]
+    for n in (0, 1, 2, 3, 4):
+        steps = np.flatnonzero(in_a_row == n)[300:]
+        for target, values in found.items():
+            error, sd = (values - record.truth(target))[steps], found.sd[target][steps]
+            np.testing.assert_allclose(np.sqrt(np.mean(error**2, axis=0)), np.sqrt(np.mean(sd**2, axis=0)), rtol=0.1)
+    steps = np.flatnonzero(in_a_row == 10)
+    late, without = (np.sqrt(np.mean((x - record.turbulence)[steps] ** 2)) for x in (found["turbulence"], alone))
+    assert late < 1.1 * without
+
+
 def test_where_modes_are_independent_it_refuses_and_runs_only_if_named() -> None:
     scenario = wfsobs.PRESETS["paper"]().replace({"run.duration": 1.0, "run.warm_up": 0.1})
     (line,) = observe(simulate(scenario), scenario, observers=[OBSERVER.id]).failures

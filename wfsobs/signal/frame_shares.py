@@ -7,14 +7,29 @@ every n steps; its covariance is that of a Lyapunov equation of one cycle.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.linalg import block_diag
 
 from wfsobs.signal.filter_covariance import lyapunov
-from wfsobs.signal.joint_states import OwnShare, StateFilter
+from wfsobs.signal.joint_states import StateFilter
 from wfsobs.signal.statespace import DisturbanceModel
 from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
+
+
+class FrameShare(NamedTuple):
+    """What the disturbance of one mode alone, and noise, bring into the states of both filters: covariances [um^2].
+
+    states      : of the states, (n, n)
+    disturbance : of the disturbance's state and those, (n_disturbance, n)
+    exposure    : of what the running frame has seen so far and those, (n,)
+    """
+
+    states: Array
+    disturbance: Array
+    exposure: Array
 
 
 def frame_shares(
@@ -25,8 +40,9 @@ def frame_shares(
     noise: float,
     frame_noise: float,
     gain: float = 1.0,
-) -> list[OwnShare]:
-    """Return the shares in the states of both filters, the fast one first, 0, 1, ..., ratio - 1 steps after a frame.
+    age: int = 0,
+) -> list[FrameShare]:
+    """Return the shares in the states of both filters, the fast one first, in `ratio` steps one after the other.
 
     Parameters
     ----------
@@ -40,11 +56,13 @@ def frame_shares(
         White noise in a step and in a frame [um].
     gain : float
         Of the fast filter's measurement for the disturbance.
+    age : int
+        Steps between the last frame that was read and the first of these steps, a multiple of `ratio`.
 
     Returns
     -------
-    list of OwnShare
-        Covariances [um^2].
+    list of FrameShare
+        Covariances, `age`, `age` + 1, ... steps after the last frame.
     """
     n, m, p = len(model.A), len(fast.F), len(frames.F)
     of_fast, at_sum, of_frames = slice(n, n + m), n + m, slice(n + m + 1, n + m + 1 + p)
@@ -53,22 +71,27 @@ def frame_shares(
     read = np.eye(len(step))  # at the end of an exposure
     read[of_frames, of_frames], read[of_frames, at_sum], read[at_sum, at_sum] = frames.F, frames.G, 0.0
     drive = block_diag(model.Q, noise**2 * np.outer(fast.G, fast.G), np.zeros((1 + p, 1 + p)))
-    maps = [read @ step, *[step] * (ratio - 1)]  # to 0, 1, ... steps after a frame
-    drives = [read @ drive @ read.T, *[drive] * (ratio - 1)]
-    drives[0][of_frames, of_frames] += frame_noise**2 * np.outer(frames.G, frames.G)
+    frame = (read @ step, read @ drive @ read.T)
+    frame[1][of_frames, of_frames] += frame_noise**2 * np.outer(frames.G, frames.G)
+    between = [(step, drive)] * (ratio - 1)
     F, W = np.eye(len(step)), np.zeros_like(step)
-    for one, more in zip([*maps[1:], maps[0]], [*drives[1:], drives[0]], strict=True):
+    for one, more in (*between, frame):
         F, W = one @ F, one @ W @ one.T + more
-    S, kept = lyapunov(F, W), np.r_[of_fast, of_frames]
-    out = [OwnShare(S[np.ix_(kept, kept)], np.empty((n, m + p)))]
-    for one, more in zip([*maps[1:], maps[0]], [*drives[1:], drives[0]], strict=True):
-        cross = (S[:n] @ one.T)[:, kept]
+    S, kept, out = lyapunov(F, W), np.r_[of_fast, of_frames], list[FrameShare]()  # S: in a step with a frame
+    anew = step @ np.diag(np.arange(len(step)) != at_sum)  # after the end of an exposure that was not read
+    unread = [(step if i % ratio else anew, drive) for i in range(age + ratio - 1)]
+    for one, more in unread if age else (*between, frame):
+        cross = S[:n] @ one.T
         S = one @ S @ one.T + more
-        out.append(OwnShare(S[np.ix_(kept, kept)], cross))
-    return [out[-1], *out[1:-1]]
+        out.append(FrameShare(S[np.ix_(kept, kept)], cross[:, kept], S[at_sum, kept]))
+    return out[-ratio:] if age else [out[-1], *out[:-1]]
+
+
+def frame_mean_response(ratio: int, omega: Array) -> Complex:
+    """Return the response of a frame to the measurements of every step, in the last of these, (len(omega),)."""
+    return np.exp(-1j * np.outer(np.arange(ratio), omega)).mean(axis=0)
 
 
 def frame_response(frames: StateFilter, ratio: int, omega: Array) -> Complex:
     """Return the response of the filter of frames to the measurements of every step, in a step with a frame, (p, len(omega))."""
-    exposure = np.exp(-1j * np.outer(np.arange(ratio), omega)).mean(axis=0)
-    return frames.response(ratio * omega) * exposure
+    return frames.response(ratio * omega) * frame_mean_response(ratio, omega)

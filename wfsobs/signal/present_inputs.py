@@ -56,10 +56,10 @@ class PresentInputs:
     def estimate(self, targets: Sequence[tuple[Array, Array]], present: Present) -> tuple[Array, Array]:
         """Return weights of all states and standard deviations, (n_phases, n_targets, n_states) and (n_phases, n_targets).
 
-        targets : covariances of targets and states, and variances of the targets, of every phase
+        targets : covariances of targets and states, and variances of the targets, of every phase or the first of them
         """
         weights, sd = [], []
-        for (cross, variance), states, least in zip(targets, *self.selection(present), strict=True):
+        for (cross, variance), states, least in zip(targets, *self.selection(present), strict=False):
             of_states = cross @ states.T
             found = least.weights(of_states) if least.size else of_states
             weights.append(found @ states)

@@ -7,22 +7,20 @@ states of the others alone (`signal.present_inputs`).
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
 from wfsobs.observers.estimates import TOTAL
-from wfsobs.observers.kalman.mode_filter import ModeFilter
+from wfsobs.observers.kalman.asterism_filters import frame_filters, with_means
 from wfsobs.observers.kalman.multi import MultiPeak, independent_filters
-from wfsobs.observers.kalman.single import steady_mode
 from wfsobs.observers.kalman.step import matrix_power
-from wfsobs.prior import Asterism, Prior
+from wfsobs.prior import Prior
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.filter_covariance import lyapunov
-from wfsobs.signal.frame_shares import frame_response, frame_shares
+from wfsobs.signal.frame_shares import frame_mean_response, frame_response, frame_shares
 from wfsobs.signal.joint_states import StateFilter, real_product, running_means, shared_covariance
 from wfsobs.signal.present_inputs import Present, PresentInputs
 from wfsobs.signal.statespace import disturbance_model
@@ -37,33 +35,6 @@ FRAME_MEANS = running_means((0.0, 1.0, 3.0, 9.0, 27.0, 81.0))
 
 ALIKE = "all LGS see the same: `multirate-multi` takes their mean and the NGS"
 """Why there is no filter of the asterism."""
-
-
-class Beginning(NamedTuple):
-    """A filter, and its state where the first measurement is 1: (n,)."""
-
-    filter: StateFilter
-    first: Array
-
-
-def frame_filters(prior: Prior, settings: MultiPeak, asterism: Asterism) -> list[ModeFilter]:
-    """Return a filter of the NGS frames of each mode, with its lines, as if frames were samples."""
-    found = []
-    for one, noise in zip(prior.lines, asterism.ngs_noise, strict=True):
-        step = asterism.ratio * one.dt
-        peaks = [peak.at(step) for peak in one.vibration(settings.line_width)]
-        turbulence = [replace(process, dt=step) for process in one.turbulence]
-        found.append(steady_mode(disturbance_model(turbulence, peaks), float(noise)))
-    return found
-
-
-def _with_means(one: ModeFilter, means: StateFilter) -> Beginning:
-    """Return a filter and means of the same measurement, of which the means begin as if it had always been what it is first."""
-    step = one.gains.steps[0]
-    reduced = (np.eye(len(step.A)) - step.L @ step.C) @ step.A
-    whole = StateFilter(block_diag(reduced, means.F), np.concatenate([step.L[:, 0], means.G]))
-    at_rest = np.linalg.solve(np.eye(len(means.F)) - means.F, means.G)
-    return Beginning(whole, np.concatenate([np.zeros(len(reduced)), at_rest]))
 
 
 class AsterismModel:
@@ -86,6 +57,8 @@ class AsterismModel:
         Steps per NGS frame.
     means, frame_means : StateFilter
         Running means of every LGS measurement, and of every NGS frame.
+    age : int
+        Steps between the last NGS frame and the first for which there are weights: so many frames, which are lost.
 
     Raises
     ------
@@ -100,15 +73,18 @@ class AsterismModel:
         ratio: int | None,
         means: StateFilter = MEANS,
         frame_means: StateFilter = FRAME_MEANS,
+        age: int = 0,
     ):
         asterism = prior.asterism
         if asterism is None:
             raise ValueError(ALIKE)
         if ratio != asterism.ratio:
             raise ValueError(f"the prior has an NGS frame every {asterism.ratio} steps, the loop every {ratio}")
+        self._again = partial(AsterismModel, prior, settings, ratio, means, frame_means)
         self.basis, self.ratio, self._asterism = asterism.basis, asterism.ratio, asterism
-        self.fast = [_with_means(one, means) for one in independent_filters(prior, settings)]
-        self.slow = [_with_means(one, frame_means) for one in frame_filters(prior, settings, asterism)]
+        self._age, self._steps = age, range(age, age + asterism.ratio)
+        self.fast = [with_means(one, means) for one in independent_filters(prior, settings)]
+        self.slow = [with_means(one, frame_means) for one in frame_filters(prior, settings, asterism)]
         silent = Ar2(1.0, 1.0, 0.0, prior.lines[0].dt)
         self._peaks = [disturbance_model((), one.vibration(settings.line_width) or [silent]) for one in prior.lines]
         self._responses = [one.filter.response(asterism.omega) for one in self.fast] * self.n_stars
@@ -122,6 +98,10 @@ class AsterismModel:
         """Number of LGS."""
         return len(self.basis)
 
+    def late(self, n_lost: int) -> AsterismModel:
+        """Return the model of the same states while the last so many NGS frames are lost."""
+        return self._again(age=n_lost * self.ratio)
+
     def plan(self, frames: float, target: str, present: Present | None = None) -> tuple[Array, Array]:
         """Return weights and standard deviations of a target, or TOTAL, so many frames ahead.
 
@@ -130,20 +110,29 @@ class AsterismModel:
         Returns
         -------
         weights : Array
-            0, 1, ... steps after an NGS frame, and at last before the first, (ratio + 1, n_modes, n_states).
+            0, 1, ... steps after an NGS frame was due, and at last before the first, (ratio + 1, n_modes, n_states).
         sd : Array
             (ratio + 1, n_modes) [um].
         """
-        found = [self._target(frames, target, phase) for phase in range(self.ratio)]
+        found = [self._target(frames, target, phase) for phase in self._steps]
         return self._estimates.estimate([*found, found[-1]], present or (True,) * self.n_stars)
 
     def stand_ins(self, present: Present) -> Array:
         """Return weights that predict the next measurement of every LGS, in all modes, (ratio + 1, n_lgs, n_modes, n_states)."""
         variance = np.diag(self._measurement_covariance())
-        found = [(self._next_measurement(phase), variance) for phase in range(self.ratio)]
+        found = [(self._next_measurement(phase), variance) for phase in self._steps]
         weights = self._estimates.estimate([*found, found[-1]], present)[0]
         stars = weights.reshape(self.ratio + 1, self.n_stars, -1)
         return (np.linalg.inv(self.basis) @ stars).reshape(self.ratio + 1, self.n_stars, len(self._peaks), -1)
+
+    def frame(self, present: Present) -> Array:
+        """Return weights that tell the NGS frame that is due in the first of the steps, and lost, (n_modes, n_states)."""
+        n = self.n_stars * len(self._peaks)
+        cross = self._with_states(self._powers[n:] * frame_mean_response(self.ratio, self._asterism.omega), self._age)
+        for row, places, exposure in zip(cross, self._places, self._exposures, strict=True):
+            row[places] += exposure
+        found = (cross, np.zeros(len(cross)))
+        return self._estimates.estimate([found], present)[0][0]
 
     def next_z_sd(self, present: Present) -> Array:
         """Return the standard deviations of the next z less the sum of both estimates, (ratio + 1, n_modes) [um].
@@ -154,8 +143,8 @@ class AsterismModel:
         rows = np.einsum("isk,sb->ibk", combination, np.linalg.inv(self.basis)).reshape(len(noise), -1)
         seen = np.sum((rows @ self._measurement_covariance()) * rows, axis=1) + np.sum((combination * noise) ** 2, axis=(1, 2))
         weights, sd = self.plan(0.0, TOTAL, present)
-        ahead = [rows @ self._next_measurement(phase) for phase in range(self.ratio)]
-        told = self._target(0.0, TOTAL, 0)[1] - sd**2  # the variance of the estimate
+        ahead = [rows @ self._next_measurement(phase) for phase in self._steps]
+        told = self._target(0.0, TOTAL, self._age)[1] - sd**2  # the variance of the estimate
         variance = seen + told - 2.0 * np.sum(weights * np.array([*ahead, ahead[-1]]), axis=2)
         return np.sqrt(np.maximum(variance, 0.0))
 
@@ -170,10 +159,11 @@ class AsterismModel:
         self._places = [np.r_[starts[i] : starts[i + 1], starts[n + i] : starts[n + i + 1]] for i in range(m)]
         own = zip(asterism.noise / np.sqrt(stars), asterism.ngs_noise, asterism.line_gain, strict=True)
         shares = [
-            frame_shares(one.filter, late.filter, self.ratio, model, *numbers)
+            frame_shares(one.filter, late.filter, self.ratio, model, *numbers, age=self._age)
             for one, late, model, numbers in zip(self.fast, self.slow, self._peaks, own, strict=True)
         ]
         self._of_lines = [[share.disturbance for share in one] for one in shares]
+        self._exposures = [one[0].exposure for one in shares]
         of_noise = [
             lyapunov(one.filter.F, np.outer(one.filter.G, noise**2 * one.filter.G))
             for one, noise in zip(self.fast, asterism.noise, strict=True)
@@ -181,11 +171,11 @@ class AsterismModel:
         first = starts[m]
         fast[first:, first:] += block_diag(*of_noise * (stars - 1))
         covariances, seen_by_ngs = [], powers[:n, n:]
-        for phase in range(self.ratio):
+        for phase in self._steps:
             between = self._between(seen_by_ngs, phase)
             covariance = np.block([[fast, between], [between.T, slow]])
             for places, one in zip(self._places, shares, strict=True):
-                covariance[np.ix_(places, places)] += one[phase].states
+                covariance[np.ix_(places, places)] += one[phase - self._age].states
             covariances.append(covariance)
         return PresentInputs(covariances, self.basis, n_fast)
 
@@ -220,7 +210,7 @@ class AsterismModel:
         n = self.n_stars * len(self._peaks)
         cross = self._with_states(self._powers[:n] * np.exp(1j * self._asterism.omega), phase)
         for i, (model, of_lines) in enumerate(zip(self._peaks, self._of_lines, strict=True)):
-            cross[i, self._places[i]] += self._asterism.line_gain[i] * np.ravel(model.C @ model.A @ of_lines[phase])
+            cross[i, self._places[i]] += self._asterism.line_gain[i] * np.ravel(model.C @ model.A @ of_lines[phase - self._age])
         return cross
 
     def _measurement_covariance(self) -> Array:
@@ -245,6 +235,6 @@ class AsterismModel:
         out, variances = np.zeros((len(self._peaks), self.n_states)), []
         for i, (model, cross) in enumerate(zip(self._peaks, self._of_lines, strict=True)):
             now = model.outputs[VIBRATION]
-            out[i, self._places[i]] = now @ matrix_power(model.A, frames) @ cross[phase]
+            out[i, self._places[i]] = now @ matrix_power(model.A, frames) @ cross[phase - self._age]
             variances.append(now @ now)  # the states have unit variance
         return out, np.array(variances)

@@ -6,7 +6,8 @@ import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates
-from wfsobs.observers.kalman.asterism_model import AsterismModel, Beginning
+from wfsobs.observers.kalman.asterism_filters import Beginning
+from wfsobs.observers.kalman.asterism_model import AsterismModel
 from wfsobs.observers.kalman.joint_step import JointEstimator
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements

@@ -2,7 +2,8 @@
 
 The weights are those of the LGS that are there, of the NGS alone where none is, and what is stated of the errors is by them. They
 are made when a set of LGS first occurs. The states of one that is out go on with the measurements that the others predict for it,
-so that it can come back at any time. One of which a mode is missing is out. An NGS frame that is lost is the one before.
+so that it can come back at any time. One of which a mode is missing is out. While an NGS frame is lost the weights are those of
+the frames before it; when the next comes, or after several, the filter of the frames takes for it what all states told of it.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from wfsobs.observers.kalman.asterism_model import AsterismModel, Beginning
+from wfsobs.observers.kalman.asterism_filters import Beginning
+from wfsobs.observers.kalman.asterism_model import AsterismModel
 from wfsobs.observers.step_checks import StepError
 from wfsobs.signal.present_inputs import Present
 from wfsobs.signal.stepping import Saved
@@ -21,6 +23,9 @@ from wfsobs.typing import Array
 
 PLANS = 64
 """Weights that are kept, of a target, a horizon and a set of LGS each; others are computed anew."""
+
+AWAITED = 4
+"""NGS frames that may be lost in a row until what was told of the first of them is taken for it."""
 
 FIRST, WITHOUT = -2, -1
 """Phases of the filter before its first step, and before its first NGS frame."""
@@ -58,10 +63,10 @@ class JointEstimator:
         States of the NGS, (n_modes, n).
     present : tuple of bool
         Which LGS are in the last measurement, (n_lgs,).
-    last : Array
-        The last NGS frame, (n_modes,) [um].
+    stand_in_frames : Array
+        What the states tell of the last NGS frames, where these are lost, the first of them first, (AWAITED, n_modes) [um].
     phase : int
-        Steps since an NGS frame; WITHOUT before the first of them, FIRST before the first step.
+        Steps since the last NGS frame, or what stands for one; WITHOUT before the first that came, FIRST before the first step.
     """
 
     horizon: float | None = None
@@ -71,9 +76,13 @@ class JointEstimator:
         self.model = model
         self._fast, self._slow = _Bank(model.fast), _Bank(model.slow)
         self.x = np.zeros((model.n_stars, *self._slow.first.shape[:1], self._fast.first.shape[1]))
-        self.frames, self.last = np.zeros(self._slow.first.shape), np.zeros(len(self._slow.first))
-        self._plan, self._stand_ins = lru_cache(PLANS)(model.plan), lru_cache(PLANS)(model.stand_ins)
-        self._next_z_sd = lru_cache(PLANS)(model.next_z_sd)
+        self.frames, self.stand_in_frames = np.zeros(self._slow.first.shape), np.zeros((AWAITED, len(self._slow.first)))
+        late = lru_cache(AWAITED)(model.late)
+
+        def compute(n_lost: int, name: str, *details: Any) -> Any:
+            return getattr(late(n_lost) if n_lost else model, name)(*details)
+
+        self._of_model = lru_cache(PLANS)(compute)
         self.present: Present = ()
         self.reset()
 
@@ -87,12 +96,37 @@ class JointEstimator:
             self.x, self.phase = self._fast.begin(seen), WITHOUT
         else:
             self.x = self._fast.advance(self.x, seen)
-        if ngs is not None and (self.phase >= 0 or not np.isnan(ngs).any()):
-            self.last = np.where(np.isnan(ngs), self.last, ngs)
-            begin = self.phase < 0
-            self.frames, self.phase = self._slow.begin(self.last) if begin else self._slow.advance(self.frames, self.last), 0
+        if ngs is not None:
+            self._take_frame(ngs)
         elif self.phase >= 0:
-            self.phase = (self.phase + 1) % self.model.ratio
+            self.phase += 1
+
+    def _take_frame(self, ngs: Array) -> None:
+        """Take the NGS frame that is due, (n_modes,) [um]."""
+        is_lost = bool(np.isnan(ngs).any())
+        if self.phase < 0:
+            if not is_lost:
+                self.frames, self.phase = self._slow.begin(ngs), 0
+            return
+        given_up = max(self.n_lost - AWAITED + 1, 0) if is_lost else self.n_lost
+        for one in self.stand_in_frames[:given_up]:
+            self.frames = self._slow.advance(self.frames, one)
+        if is_lost:
+            n, self.stand_in_frames = self.n_lost - given_up, np.roll(self.stand_in_frames, -given_up, axis=0)
+            self.stand_in_frames[n] = self._of_model(n + 1, "frame", self.present) @ self.state()
+            self.phase = (n + 1) * self.model.ratio
+        else:
+            self.frames, self.phase = self._slow.advance(self.frames, ngs), 0
+
+    @property
+    def n_lost(self) -> int:
+        """Number of NGS frames that were due last are awaited, none of which came."""
+        return max(self.phase, 0) // self.model.ratio
+
+    def _now(self, name: str, *details: Any) -> Any:
+        """Return what the model has of that name in this step, for the LGS that are there."""
+        found, at = self._of_model(self.n_lost, name, *details, self.present), self.phase - self.n_lost * self.model.ratio
+        return (found[0][at], found[1][at]) if isinstance(found, tuple) else found[at]
 
     def _complete(self, each: Array, missing: Array) -> Array:
         """Return the measurements with what the last frame predicts in the place of those that are missing.
@@ -102,17 +136,16 @@ class JointEstimator:
         if self.phase == FIRST:
             there = np.maximum(np.count_nonzero(~missing, axis=0), 1)
             return np.where(missing, np.where(missing, 0.0, each).sum(axis=0) / there, each)
-        weights = self._stand_ins(self.present)[self.phase]
-        return np.where(missing, weights @ self.state(), each)
+        return np.where(missing, self._now("stand_ins") @ self.state(), each)
 
     def predict(self, frames: float, target: str) -> tuple[Array, Array]:
         """Return (mean, sd) of the target."""
-        weights, sd = self._plan(frames, target, self.present)
-        return weights[self.phase] @ self.state(), sd[self.phase]
+        weights, sd = self._now("plan", frames, target)
+        return weights @ self.state(), sd
 
     def next_z_sd(self) -> Array:
         """Return the standard deviation of the next z less the sum of both estimates, (n_modes,) [um]."""
-        return self._next_z_sd(self.present)[self.phase]
+        return self._now("next_z_sd")
 
     def state(self) -> Array:
         """Return all states in the order of the weights, (n_states,)."""
@@ -123,7 +156,7 @@ class JointEstimator:
 
     def reset(self) -> None:
         """Set the state back to rest."""
-        self.x[...], self.frames[...], self.last[...], self.phase = 0.0, 0.0, 0.0, FIRST
+        self.x[...], self.frames[...], self.stand_in_frames[...], self.phase = 0.0, 0.0, 0.0, FIRST
         self.present = (True,) * self.model.n_stars
 
     def save(self) -> Saved:
@@ -131,14 +164,14 @@ class JointEstimator:
         return {
             "x": self.x.copy(),
             "frames": self.frames.copy(),
-            "last": self.last.copy(),
+            "stand_in_frames": self.stand_in_frames.copy(),
             "phase": np.array(self.phase),
             "present": np.array(self.present, dtype=float),
         }
 
     def load(self, state: Mapping[str, Array]) -> None:
         """Take over a state."""
-        self.x[...], self.frames[...], self.last[...] = state["x"], state["frames"], state["last"]
+        self.x[...], self.frames[...], self.stand_in_frames[...] = state["x"], state["frames"], state["stand_in_frames"]
         self.phase, self.present = int(state["phase"]), _as_set(state["present"][:, None] == 0.0)
 
     def take_over(self, old: Any) -> None:

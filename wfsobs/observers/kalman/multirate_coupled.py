@@ -4,8 +4,7 @@ It is the filter of `kalman.asterism` with the mean of the LGS, or what `sensors
 single star: for LGS that see the same, and where a record or a loop has them together alone. Where modes tell nothing of one
 another there is nothing to couple, and the observer refuses.
 
-A measurement of which a mode is missing is none: the weights are those of the NGS alone until the next. An NGS frame that is lost
-is the one before.
+A measurement of which a mode is missing is none: the weights are those of the NGS alone until the next. So is an NGS frame.
 """
 
 from __future__ import annotations
