@@ -12,12 +12,12 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
 ROOT = Path(__file__).parents[2]
 FLAGS = [
@@ -133,8 +133,33 @@ def with_seeds(url: str, seeds: int) -> str:
     return url if not seeds or SEEDS in url else f"{url}{'&' if '?' in url else '?'}{SEEDS}{seeds}"
 
 
+Contexts = Callable[..., BrowserContext]
+
+
+@pytest.fixture(scope="session")
+def contexts(browser: Browser) -> Contexts:
+    """A function that gives the one browsing context of some options: what a page has loaded, the next need not compile again."""
+    made: dict[str, BrowserContext] = {}
+
+    def context(**options: Any) -> BrowserContext:
+        named = repr(sorted(options.items()))
+        if named not in made:
+            made[named] = browser.new_context(**options)
+        return made[named]
+
+    return context
+
+
+def leave(page: Page) -> None:
+    """Close a page, and leave nothing of it to the next one of its context."""
+    page.context.set_offline(False)
+    if page.url.startswith("http"):
+        page.evaluate("() => { localStorage.clear(); sessionStorage.clear() }")
+    page.close()
+
+
 @pytest.fixture
-def open_page(server: Server, browser: Browser) -> Iterator[Any]:
+def open_page(server: Server, contexts: Contexts) -> Iterator[Any]:
     """A function that opens the dashboard in a window of some size and waits for the first result.
 
     It has one seed, so that nothing runs on in idle time and takes the processor from the next test; 0: as many as a visitor has.
@@ -143,7 +168,8 @@ def open_page(server: Server, browser: Browser) -> Iterator[Any]:
     opened: list[tuple[Page, Watched]] = []
 
     def open_it(width: int = 1400, height: int = 1000, url: str = "", wait: bool = True, seeds: int = 1, **options: Any) -> Page:
-        page = browser.new_page(viewport={"width": width, "height": height}, **options)
+        page = contexts(**options).new_page()
+        page.set_viewport_size({"width": width, "height": height})
         page.set_default_timeout(120_000)
         opened.append((page, Watched(page)))
         page.goto(with_seeds(url or server.url, seeds))
@@ -154,7 +180,7 @@ def open_page(server: Server, browser: Browser) -> Iterator[Any]:
     yield open_it
     faults = [fault for _, watched in opened for fault in watched.faults]
     for page, _ in opened:
-        page.close()
+        leave(page)
     assert faults == []
     errors = server.errors(start)
     assert not errors, "\n".join(errors)

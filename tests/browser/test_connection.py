@@ -5,10 +5,13 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Page, expect
+
+from tests.browser.conftest import finished, leave
 
 QUICK = (
     "?run.duration=2&run.warm_up=0.5&gpr_online.training_size=40&gpr_offline.training_size=40&adaptive.window=0.5&view.seeds=1"
@@ -71,7 +74,7 @@ class Cable:
         self.whole = True
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def cable() -> Iterator[Cable]:
     cable = Cable()
     yield cable
@@ -79,33 +82,42 @@ def cable() -> Iterator[Cable]:
     cable.cut()
 
 
+class Host:
+    """The server at the far end of the cable; it can be killed and started again where it was."""
+
+    def __init__(self, make_server: Any, cable: Cable, folder: Path):
+        self.make, self.cable, self.folder, self.started = make_server, cable, folder, 0
+        self.start()
+
+    def start(self) -> None:
+        self.started += 1
+        command = ["-m", "wfsobs", "serve", "--local", "--port", "{port}", "--origin", f"localhost:{self.cable.port}"]
+        self.server = self.make(command, self.folder / f"log{self.started}", "/", port=self.cable.to)
+        self.cable.to = self.server.port
+
+    def kill(self) -> None:
+        self.server.process.kill()
+        self.server.process.wait(20)
+
+
+@pytest.fixture(scope="module")
+def host(make_server: Any, cable: Cable, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Host]:
+    host = Host(make_server, cable, tmp_path_factory.mktemp("host"))
+    yield host
+    host.server.close()
+    assert host.server.errors(0) == []
+
+
 @pytest.fixture
-def serve(make_server: Any, cable: Cable, tmp_path: Any) -> Iterator[Any]:
-    """A function that starts the server, or starts it again where it was."""
-    started: list[Any] = []
-
-    def start(name: str = "log") -> Any:
-        command = ["-m", "wfsobs", "serve", "--local", "--port", "{port}", "--origin", f"localhost:{cable.port}"]
-        started.append(make_server(command, tmp_path / name, "/", port=cable.to))
-        cable.to = started[-1].port
-        return started[-1]
-
-    yield start
-    started[-1].close()
-    assert started[-1].errors(0) == []
-
-
-@pytest.fixture
-def page(browser: Browser, cable: Cable, serve: Any) -> Iterator[Page]:
+def page(contexts: Any, cable: Cable, host: Host) -> Iterator[Page]:
     """The page at the end of the cable, its first run over."""
-    context = browser.new_context(viewport={"width": 1400, "height": 1000})
-    page = context.new_page()
+    page = contexts().new_page()
+    page.set_viewport_size({"width": 1400, "height": 1000})
     page.set_default_timeout(120_000)
-    page.server = serve()  # type: ignore[attr-defined]
     page.goto(f"http://localhost:{cable.port}/{QUICK}")
-    done(page)
+    finished(page)
     yield page
-    context.close()
+    leave(page)
 
 
 def done(page: Page) -> None:
@@ -183,16 +195,15 @@ def test_what_is_changed_while_the_line_comes_back_counts_once(page: Page, cable
     done(page)
 
 
-def test_a_server_that_was_started_again(page: Page, cable: Cable, serve: Any) -> None:
+def test_a_server_that_was_started_again(page: Page, host: Host) -> None:
     speed(page, "22")
     page.wait_for_function("() => location.search.includes('turbulence.wind_speed=22')")
-    page.server.process.kill()  # type: ignore[attr-defined]
-    page.server.process.wait(20)  # type: ignore[attr-defined]
+    host.kill()
     expect(banner(page, "connection to the server is lost")).to_be_visible()
     speed(page, "200")
     peak(page).fill("7.5")
     peak(page).press("Enter")
-    serve("again")
+    host.start()
     again = page.get_by_role("button", name="Start again with these settings")
     expect(again).to_be_visible(timeout=120_000)
     again.click()

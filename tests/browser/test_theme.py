@@ -43,6 +43,7 @@ TURNED = f"""([before, without]) => {{
 WITHOUT = ("Tune", "Sweep", "Live", "Model")
 """Pages that have no figure before something is run, or none."""
 SOME = ["Explore", "Closed loop", "Model"]
+"""Where the theme comes from is asked once for all pages: those that show it are seen from one side."""
 
 
 @pytest.fixture(scope="module")
@@ -68,14 +69,14 @@ def all_in(page: Page, dark: bool, titles: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("system", "asked", "dark"),
-    [("light", "dark", True), ("dark", "light", False), ("dark", "", True), ("light", "", False)],
+    ("system", "asked", "titles"),
+    [("light", "dark", [*TITLES]), ("dark", "light", SOME), ("dark", "", SOME), ("light", "", SOME)],
     ids=["dark by address", "light by address", "dark by system", "light by system"],
 )
-def test_every_page_has_the_theme(open_page: Any, server: Any, system: str, asked: str, dark: bool) -> None:
+def test_every_page_has_the_theme(open_page: Any, server: Any, system: str, asked: str, titles: list[str]) -> None:
+    dark = (asked or system) == "dark"
     query = "&".join(f"{path}={value}" for path, value in SHORT.items())
     page = open_page(url=f"{server.url}?{query}" + f"&theme={asked}" * bool(asked), color_scheme=system)
-    titles = list(TITLES) if asked else SOME  # what the system wants is asked once, for all pages
     all_in(page, dark, titles)
     page.get_by_role("button", name=re.compile("theme", re.I)).click()
     all_in(page, not dark, titles[::-1])
