@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_toeplitz
 
-from wfsobs.evaluation.bound import bound_rms
+from wfsobs.evaluation.bound import bound_rms, least_errors
 from wfsobs.observers.base import TARGETS
 from wfsobs.priors_from.scenario import kalman_model
 from wfsobs.priors_from.turbulence import measurement_noise
@@ -16,9 +16,10 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
 from wfsobs.signal.riccati import steady_state
-from wfsobs.signal.wiener import advance_spectrum, causal_error, circle_mean, factorise
+from wfsobs.signal.wiener import advance_spectrum, causal_error, circle_mean, explained_variance, factorise
 from wfsobs.simulation.disturbance import vibration_variance
 from wfsobs.simulation.true_spectra import TrueSpectra, line_width, n_frequencies, true_spectra
+from wfsobs.simulation.turbulence_spectra import turbulence_spectra
 from wfsobs.typing import Array
 
 # The loop of one 530 nm turbulence, one 50 nm line at 47.5 Hz, 20 nm of noise.
@@ -124,6 +125,26 @@ def fir_error(spectra: TrueSpectra, taps: int, ahead: int) -> float:
     r, c, s = autocovariance(spectra.measurement), autocovariance(shared), autocovariance(signal)
     wanted = c[1 + ahead : 1 + ahead + taps]
     return float(np.sqrt(s[0] - wanted @ solve_toeplitz(r[:taps], wanted)))
+
+
+def test_measurements_are_counted_until_they_are_enough() -> None:
+    spectra = true_spectra(MATCHED, 0)
+    r, c = autocovariance(spectra.measurement)[:1000], autocovariance(spectra.total[1])[None, 1:1001]
+    every = explained_variance(r, c)
+    few = explained_variance(r, c, 0.999 * every[:, -1])
+    assert few.shape[1] < 500 and (few == every[:, : few.shape[1]]).all()
+    assert 0.999 < few[0, -1] / every[0, -1] < 1.0
+
+
+def test_modes_that_forget_soon_have_a_short_dft_and_the_same_bound() -> None:
+    scenario = PRESETS["higher-orders"]()
+    lengths = [n_frequencies(scenario, mode) for mode in range(len(scenario.modes))]
+    # Lines of tip and tilt are narrow; these others are zero along y, across the wind, and their spectrum is so at 0 Hz.
+    slow = [mode.radial_order == 1 or mode.noll in (5, 8, 10, 13, 15) for mode in scenario.modes]
+    assert [n == max(lengths) for n in lengths] == slow
+    for mode in (2, 4):
+        long = true_spectra(scenario, mode, turbulence_spectra(scenario, mode, max(lengths)))
+        assert bound_rms(scenario, mode)["total"] == pytest.approx(least_errors(long)["total"].rms, rel=1e-4)
 
 
 def test_thirty_taps_of_the_two_frame_loop() -> None:

@@ -35,6 +35,9 @@ MOST_PAST = 4000
 The remaining gain falls with the inverse of their number, as it does for undamped lines.
 """
 
+LEARNT = 5e-3
+"""Share of the minimum error; where more measurements bring no more than this, nothing is left to learn."""
+
 Error = TypeVar("Error")
 
 
@@ -47,7 +50,7 @@ class LeastError:
     covariance : Array
         Autocovariance after an infinitely long record, (n_lags,) [um^2].
     transient : Array
-        Variance after 0, 1, 2, ... measurements, (n_past,) [um^2].
+        Variance after 0, 1, 2, ... measurements, as far as it falls by more than LEARNT, (n_past,) [um^2].
     n_lines : int
         Number of undamped lines, whose phases and amplitudes are learnt from the record.
     """
@@ -114,9 +117,10 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
     lines = np.outer([name != "turbulence" for name in names], spectra.line_covariance(past + 1 + ahead))
     cross = fft.irfft(shared, whitener.n)[:, :past] + spectra.gain * lines[:, 1 + ahead :]
     measured = fft.irfft(known.measurement, whitener.n)[:past] + spectra.gain**2 * spectra.line_covariance(past)
-    gained = np.hstack([np.zeros((len(names), 1)), explained_variance(measured, cross)])
-    transient = lines[:, :1] + [[circle_mean(one)] for one in own] - gained
     covariance = fft.irfft(error_spectrum(own, shared, whitener), whitener.n)[:, : min(n_steps, whitener.n // 2)]
+    variance = lines[:, 0] + [circle_mean(one) for one in own]
+    gained = explained_variance(measured, cross, variance - (1.0 + LEARNT) * covariance[:, 0])
+    transient = variance[:, None] - np.hstack([np.zeros((len(names), 1)), gained])
     n_lines = len(spectra.pure)
     found = {name: LeastError(left, learnt, n_lines) for name, left, learnt in zip(names, covariance, transient, strict=True)}
     return of_every_target(found, spectra, LeastError(np.zeros_like(covariance[0]), np.zeros_like(transient[0])))

@@ -73,7 +73,7 @@ def errors_under(
 ) -> list[dict[str, PeriodicError]]:
     """Compute the errors of an observer under these spectra, whatever it is told; dt [s]. Else as `exact_errors`."""
     ratio = spectra[0].ngs.ratio
-    length = spectra[0].measurement.size // ratio * ratio
+    length = max(known.measurement.size for known in spectra) // ratio * ratio
     responses = impulse_responses(observer, prior, settings, dt, len(spectra), ratio, length)
     out = []
     for mode, known in enumerate(spectra):

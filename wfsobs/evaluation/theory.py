@@ -165,7 +165,7 @@ class Theory:
         return self._memory.keep("spectra", key, lambda: true_spectra(scenario, mode, self._air(scenario, mode)))
 
     def _air(self, scenario: Scenario, mode: int) -> TurbulenceSpectra:
-        n = min(n_frequencies(scenario), self.most or MOST)
+        n = min(n_frequencies(scenario, mode), self.most or MOST)
         return self._memory.keep("air", (mode, n, _groups(scenario, *AIR)), lambda: turbulence_spectra(scenario, mode, n))
 
     def _response(self, observer: Observer, scenario: Scenario, mode: int, target: str, n: int) -> Complex | CycleTaps:

@@ -112,7 +112,7 @@ def beams_of(
 @lru_cache(maxsize=32)
 def _shared_turbulence(scenario: Scenario, mode: int, dt: float) -> SharedProcess:
     """Return the fit to the spectra, which takes a while."""
-    return _fit_shared(scenario, mode, dt, turbulence_spectra(scenario, mode, n_frequencies(scenario)))
+    return _fit_shared(scenario, mode, dt, turbulence_spectra(scenario, mode, n_frequencies(scenario, mode)))
 
 
 def _fit_shared(

@@ -25,7 +25,7 @@ def vibration_continuum(scenario: Scenario, mode: int) -> tuple[Ar2, ...]:
 
     Fitted beside turbulence and noise of the LGS, at the step of the scenario.
     """
-    n = n_frequencies(scenario)
+    n = n_frequencies(scenario, mode)
     power = continuum_power(scenario, mode, n)
     if not power.any():
         return ()

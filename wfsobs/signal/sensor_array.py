@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ from wfsobs.typing import Array
 LONGEST = 8192
 """Maximum age of a measurement beside z [steps]."""
 
-TOLERANCE = 3e-4
+TOLERANCE = 2e-4
 """Residual of a solution over its right-hand side."""
 
 
@@ -168,8 +168,10 @@ class _Regression:
         """Return (I + E + K' K) x at the ages that are measured."""
         length, size = x.shape[-1], 2 * (self.hankel.shape[-1] - 1)
         transform = fft.rfft(x, size)
-        out = np.einsum("ijf,ptjf->ptif", self.shares, transform)
-        known = fft.irfft(np.einsum("if,ptif->ptf", self.hankel, transform.conj()), size)
+        out = transform.copy()
+        for i, j in permutations(range(len(self.hankel)), 2):
+            out[:, :, i] += self.shares[i, j] * transform[:, :, j]
+        known = fft.irfft(np.sum(self.hankel.conj() * transform, axis=2).conj(), size)
         known[..., 0] = known[..., length:] = 0.0
         out += self.hankel * fft.rfft(known, size).conj()[:, :, None]
         return self.mask * fft.irfft(out, size)[..., :length]

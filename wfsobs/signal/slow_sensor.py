@@ -27,6 +27,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
 from wfsobs.signal.wiener import Complex, Whitener, factorise
@@ -124,20 +125,22 @@ def _gains(ahead: Array, rest: Array) -> Array:
     """
     length = min(len(ahead), LONGEST)
     near = rest[:, :length].transpose(2, 0, 1)
-    out = near @ _solve(ahead, near, length).transpose(0, 2, 1)
+    out = near @ _solve(ahead.astype(np.float32), near, length).transpose(0, 2, 1)
     out += np.einsum("aip,bip->pab", rest[:, length:], rest[:, length:])
     return 0.5 * (out + out.transpose(0, 2, 1))
 
 
-def _solve(ahead: Array, b: Array, length: int) -> Array:
-    """Solve (I + K' K) x = b for every age, (ratio, n_targets, length), by conjugate gradients."""
+def _solve(ahead: NDArray[np.float32], rest: Array, length: int) -> Array:
+    """Solve (I + K' K) x = rest for every age, (ratio, n_targets, length), by conjugate gradients in single precision."""
+    scale = np.sqrt(np.sum(rest**2, axis=-1, keepdims=True))
+    b = (rest / np.where(scale > 0.0, scale, 1.0)).astype(np.float32)
     ratio = ahead.shape[1]
     size = fft.next_fast_len(2 * length, real=True)
     common = fft.rfft(ahead[1 : 2 * length + 1].T, size)
     # Of the innovations in the present cycle, those after the step are not known.
     first = ahead[:length] * (np.arange(ratio)[:, None, None] < np.arange(ratio))
 
-    def apply(x: Array) -> Array:
+    def apply(x: NDArray[np.float32]) -> NDArray[np.float32]:
         reversed_x = fft.rfft(x, size).conj()
         out = x + (x @ first) @ first.transpose(0, 2, 1)
         total = np.zeros_like(reversed_x)
@@ -148,12 +151,12 @@ def _solve(ahead: Array, b: Array, length: int) -> Array:
 
     x, residual = np.zeros_like(b), b.copy()
     direction, power = b.copy(), np.sum(b**2, axis=-1)
-    wanted, smallest = TOLERANCE**2 * power, np.finfo(float).tiny
-    while (power > wanted).any():
+    smallest = np.finfo(b.dtype).tiny
+    while (power > TOLERANCE**2).any():
         moved = apply(direction)
         step = power / np.maximum(np.sum(direction * moved, axis=-1), smallest)
         x += step[..., None] * direction
         residual -= step[..., None] * moved
         before, power = power, np.sum(residual**2, axis=-1)
         direction = residual + (power / np.maximum(before, smallest))[..., None] * direction
-    return x
+    return scale * x

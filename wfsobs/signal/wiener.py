@@ -28,6 +28,9 @@ from wfsobs.typing import Array
 
 Complex = NDArray[np.complex128]
 
+LOOK = 64
+"""Measurements after which is looked whether their explained variance is enough."""
+
 
 @dataclass(frozen=True)
 class Whitener:
@@ -118,7 +121,7 @@ def _of_future(cross: Complex, whitener: Whitener) -> Array:
     return fft.irfft(cross / whitener.H.conj(), whitener.n)[..., whitener.n // 2 :]
 
 
-def explained_variance(autocovariance: Array, cross: Array) -> Array:
+def explained_variance(autocovariance: Array, cross: Array, enough: Array | float = np.inf) -> Array:
     """Return the variance of targets s[k] that n = 1, 2, ... measurements z[k], ..., z[k-n+1] explain.
 
     Levinson's recursion: the errors of predicting each earlier measurement from the later ones are orthogonal.
@@ -129,24 +132,29 @@ def explained_variance(autocovariance: Array, cross: Array) -> Array:
         Autocovariance of z at the lags 0 ... n - 1, (n,).
     cross : Array
         E s[k] z[k-j], j = 0 ... n - 1, (n_targets, n).
+    enough : Array or float
+        Explained variance of each target, (n_targets,); measurements after all have it are left out.
 
     Returns
     -------
     Array
-        Explained variance, (n_targets, n).
+        Explained variance, (n_targets, n), or of fewer measurements.
     """
     n = autocovariance.size
     backwards, earlier = np.ascontiguousarray(cross[:, ::-1]), np.ascontiguousarray(autocovariance[::-1])
     predictor, error = np.zeros(n), float(autocovariance[0])
     predictor[0] = 1.0
-    out = np.empty_like(backwards)
+    out, so_far = np.empty_like(backwards), np.zeros(len(cross))
     for k in range(n):
         if k:
             reflection = float(predictor[:k] @ earlier[n - 1 - k : -1]) / error
             predictor[1 : k + 1] -= reflection * predictor[k - 1 :: -1] if k > 1 else reflection
             error *= 1.0 - reflection**2
-        out[:, k] = (backwards[:, n - 1 - k :] @ predictor[: k + 1]) ** 2 / error
-    return np.cumsum(out, axis=1)
+        so_far += (backwards[:, n - 1 - k :] @ predictor[: k + 1]) ** 2 / error
+        out[:, k] = so_far
+        if k % LOOK == 0 and (so_far >= enough).all():
+            return out[:, : k + 1]
+    return out
 
 
 def degrees_of_freedom(covariance: Array, n_steps: int) -> float:

@@ -198,7 +198,7 @@ def _bin_power(scenario: Scenario, mode: int, n: int, width: float, without: Col
     return power
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _measured_power(name: str, part: str, mode: int, cutoff: float, n: int, dt: float, width: float) -> Array:
     """Return the variance [um^2] of a measured spectrum in each DFT bin; read-only."""
     spectrum, power = measured_spectrum(name), np.zeros(n // 2 + 1)
@@ -211,7 +211,7 @@ def _measured_power(name: str, part: str, mode: int, cutoff: float, n: int, dt: 
 
 def _widen(power: Array, cutoff: float, n: int, dt: float, width: float) -> Array:
     """Return the power with nothing narrower than `width` [Hz], none of it above the cut-off."""
-    if width > 0:
+    if width > 0 and power.any():
         power = widen_lines(power, width * dt)
         power[bin_frequencies(n, dt) > cutoff] = 0.0
     return power

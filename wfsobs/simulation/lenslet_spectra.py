@@ -45,7 +45,7 @@ def true_lenslet_spectra(scenario: Scenario, mode: int) -> TrueSpectra:
     """
     if scenario.turbulence.source != "frozen-flow":
         raise ValueError(f"turbulence.source = {scenario.turbulence.source}: aliasing is that of frozen flow")
-    air = per_sample(scenario, n_frequencies(scenario), lambda frequency: lenslet_flow_spectra(scenario, mode, frequency))
+    air = per_sample(scenario, n_frequencies(scenario, mode), lambda frequency: lenslet_flow_spectra(scenario, mode, frequency))
     return true_spectra(scenario, mode, air)
 
 

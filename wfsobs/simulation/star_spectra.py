@@ -46,7 +46,7 @@ def star_spectra(scenario: Scenario, mode: int, mean: TrueSpectra | None = None)
 
     mean : those of the plain mean, where already computed
     """
-    n = n_frequencies(scenario)
+    n = n_frequencies(scenario, mode)
     # The notch at 0 Hz is a bin wide, as in `turbulence_spectra`.
     frequency = np.hypot(np.fft.rfftfreq(n, scenario.dt), 1.0 / (n * scenario.dt))
     found = star_flow_spectra(scenario, mode, frequency)

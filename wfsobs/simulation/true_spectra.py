@@ -16,23 +16,13 @@ import numpy as np
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.wiener import Complex, Whitener, factorise
-from wfsobs.simulation import layers as atmosphere
+from wfsobs.simulation.dft_length import MOST, n_frequencies, wanted_frequencies
 from wfsobs.simulation.disturbance import peak_rms, pure_lines, vibration_power
 from wfsobs.simulation.guide_stars import lgs_noise_rms, lgs_weights
 from wfsobs.simulation.sensor_noise import noise_rms
 from wfsobs.simulation.synthesis import damping_for_width, line_width, widen_lines
-from wfsobs.simulation.turbulence import processes, turbulence_process
 from wfsobs.simulation.turbulence_spectra import TURBULENCE_SPECTRA, TurbulenceSpectra, density, turbulence_spectra
 from wfsobs.typing import Array
-
-DECAYED = 2.5
-"""Decay of correlations after half the DFT, as an exponent; a line that wraps around by then brings nothing new."""
-
-SMOOTH = 5.0
-"""The same for processes of a known width, whose correlations must not wrap around: exp(-12.5) of them does."""
-
-MOST = 2**20
-"""Maximum length of the DFT: an AR(2) that decays more slowly wraps around, which changes the bound by little."""
 
 FLOOR = 1e-6
 """Minimum noise of a measurement [um]."""
@@ -153,7 +143,7 @@ def true_spectra(scenario: Scenario, mode: int, air: TurbulenceSpectra | None = 
     TrueSpectra
         Spectra.
     """
-    air = air or turbulence_spectra(scenario, mode, n_frequencies(scenario))
+    air = air or turbulence_spectra(scenario, mode, n_frequencies(scenario, mode))
     n = 2 * (air.own.size - 1)
     vibration, gain = _vibration(scenario, mode, n), lgs_weights(scenario)[mode, :, mode].sum()
     lines = _pure_lines(scenario, mode, n)
@@ -178,12 +168,7 @@ def true_spectra(scenario: Scenario, mode: int, air: TurbulenceSpectra | None = 
 
 def lgs_turbulence_spectrum(scenario: Scenario, mode: int) -> Array:
     """Return the spectrum of the turbulence in the combined LGS, on the frequencies of `true_spectra`."""
-    return turbulence_spectra(scenario, mode, n_frequencies(scenario)).measurement
-
-
-def n_frequencies(scenario: Scenario) -> int:
-    """Return the length of the DFT, a power of two: the slowest correlation has decayed by its half."""
-    return min(_wanted_frequencies(scenario), MOST)
+    return turbulence_spectra(scenario, mode, n_frequencies(scenario, mode)).measurement
 
 
 def has_known_spectra(scenario: Scenario) -> bool:
@@ -194,29 +179,8 @@ def has_known_spectra(scenario: Scenario) -> bool:
     source = scenario.turbulence.source
     if scenario.events:
         return False
-    return source in TURBULENCE_SPECTRA and (source != "frozen-flow" or _wanted_frequencies(scenario) <= 2 * MOST)
-
-
-def _wanted_frequencies(scenario: Scenario) -> int:
-    return 2 ** int(np.ceil(np.log2(2.0 * DECAYED / (min(_decay_rates(scenario)) * scenario.dt))))
-
-
-def _decay_rates(scenario: Scenario) -> list[float]:
-    """Return the decay rates of the correlations of the disturbances [1/s], xi w, with the margin of smooth spectra."""
-    v, least = scenario.vibration, pi * line_width(scenario)
-    smooth = [turbulence_process(scenario, 0, scenario.dt)]
-    if scenario.turbulence.source == "processes":
-        smooth = [p for mode in range(len(scenario.modes)) for p in processes(scenario, mode, scenario.dt)]
-    rates = [2.0, *(p.omega * p.damping / SMOOTH for p in smooth)]
-    if v.source in ("psd", "measured"):
-        rates.append(least)
-    elif v.source != "none":
-        rates += [max(2.0 * pi * p.frequency * p.damping / SMOOTH, least) for p in v.peaks]
-    if scenario.turbulence.source == "frozen-flow":
-        rates.append(min(layer.speed for layer in atmosphere.layers(scenario)) / (8.0 * scenario.turbulence.outer_scale))
-    elif scenario.turbulence.source == "psd":
-        rates.append(least)
-    return rates
+    longest = max(wanted_frequencies(scenario, mode) for mode in range(len(scenario.modes)))
+    return source in TURBULENCE_SPECTRA and (source != "frozen-flow" or longest <= 2 * MOST)
 
 
 def _vibration(scenario: Scenario, mode: int, n: int) -> Array:
