@@ -128,7 +128,7 @@ def seen(page: LivePage, live: LiveLoop, controller: str) -> Any:
 
 
 def test_pages_share_what_was_read_a_moment_ago(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the same window, while the loop plays."""
+    """Of the same window, while the loop plays, until the next picture is due."""
     now, shared = [5.0], SharedView()
     read: list[float] = []
     monkeypatch.setattr("wfsobs.live.view.monotonic", lambda: now[0])
@@ -141,10 +141,11 @@ def test_pages_share_what_was_read_a_moment_ago(monkeypatch: pytest.MonkeyPatch)
     assert [look(2.0), look(2.0)] == [1, 1]
     assert look(5.0) == 2 and read[-1] == 5.0, "another window"
     assert look(5.0, anew=True) == 3
-    now[0] += 0.5 * SHARED
-    assert look(5.0) == 3
-    now[0] += SHARED
-    assert look(5.0) == 4
+    end = SHARED * (now[0] // SHARED + 1)
+    now[0] = end - 1e-3
+    assert look(5.0) == 3, "pages that are late with this picture"
+    now[0] = end + 1e-3
+    assert look(5.0) == 4 and look(5.0) == 4
 
 
 def test_pictures_wait_for_the_browser(page: LivePage, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,8 +159,11 @@ def test_pictures_wait_for_the_browser(page: LivePage, monkeypatch: pytest.Monke
     page.tick()
     assert len(drawn) == 1 and page.pulse.picture == 1, "a page that sleeps is sent nothing more"
     page.pulse._handle_msg({"painted": 1})
+    assert len(drawn) == 2 and page.pulse.picture == 2, "the one that has waited for the answer"
+    page.pulse._handle_msg({"painted": 2})
+    assert len(drawn) == 2, "none has waited"
     page.tick()
-    assert len(drawn) == 2
+    assert len(drawn) == 3
     page.pulse._handle_msg({"painted": "x"})
     assert not page.pulse.is_free
 

@@ -17,8 +17,8 @@ from wfsobs.live.rows import Rows
 from wfsobs.observers.base import TARGETS
 from wfsobs.typing import Array
 
-SHARED = 0.1
-"""How old what pages share may be [s]."""
+SHARED = 0.16
+"""For how long pages share what is read of a loop: from a multiple of it to the next one [s]."""
 
 
 class LiveEvent(NamedTuple):
@@ -105,15 +105,15 @@ class SharedView:
     """The last seconds as they were read last, for pages that look one after the other: a reading takes milliseconds."""
 
     def __init__(self) -> None:
-        self._last: dict[float, tuple[float, LiveView]] = {}
+        self._turn, self._views = 0, dict[float, LiveView]()
 
     def look(self, read: Callable[[float], LiveView], seconds: float, *, anew: bool) -> LiveView:
-        """Return the last so many seconds, up to SHARED old, or read `anew`."""
-        now = monotonic()
-        if anew or seconds not in self._last or now - self._last[seconds][0] > SHARED:
-            self._last = {length: one for length, one in self._last.items() if now - one[0] <= SHARED}
-            self._last[seconds] = now, read(seconds)
-        return self._last[seconds][1]
+        """Return the last so many seconds as they were read since the last multiple of SHARED, or read `anew`."""
+        if (turn := int(monotonic() / SHARED)) != self._turn:
+            self._turn, self._views = turn, {}
+        if anew or seconds not in self._views:
+            self._views[seconds] = read(seconds)
+        return self._views[seconds]
 
 
 def read_view(ring: Ring, traces: list[Rows], dt: float, seconds: float) -> LiveView:

@@ -156,12 +156,14 @@ class LivePage(PageActions):
         return self.work.latest if self.work.state == RUNNING else None
 
     def tick(self) -> None:
-        """Draw if the browser has painted the picture before."""
-        if self.pulse.is_free:
-            self.store.session.service.note_wish()  # no page of a visitor to come is made meanwhile: it takes a second
-            with pn.io.hold():  # one message
-                if self.draw():
-                    self.pulse.beat()
+        """Draw when the browser has painted the picture before."""
+        self.pulse.when_free(self._send)
+
+    def _send(self) -> None:
+        self.store.session.service.note_wish()  # no page of a visitor to come is made meanwhile: it takes a second
+        with pn.io.hold():  # one message
+            if self.draw():
+                self.pulse.beat()
 
     def draw(self) -> bool:
         """Send the present; return whether there was something to send."""

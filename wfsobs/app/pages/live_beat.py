@@ -6,9 +6,10 @@ import asyncio
 from collections.abc import Callable
 
 from wfsobs.app.service import Post
+from wfsobs.live.view import SHARED
 
-PERIOD = 0.18
-"""Between two pictures [s]: five a second, and one in ten may be missed."""
+PERIOD = SHARED
+"""Between two pictures [s]: of pages that are late with one, those up to the next one still share a reading."""
 
 
 class Beat:
@@ -63,7 +64,7 @@ class Beat:
 def next_due(due: float, now: float) -> float:
     """Return the multiple of PERIOD that follows `due`, or the last one before `now` if that is later [s].
 
-    >>> round(next_due(0.36, 0.40), 2), round(next_due(0.36, 0.60), 2), round(next_due(0.36, 1.0), 2)
-    (0.54, 0.54, 0.9)
+    >>> round(next_due(0.32, 0.36), 2), round(next_due(0.32, 0.52), 2), round(next_due(0.32, 0.9), 2)
+    (0.48, 0.48, 0.8)
     """
     return PERIOD * max(round(due / PERIOD) + 1, int(now / PERIOD))

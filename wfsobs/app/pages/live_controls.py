@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from time import monotonic
 from typing import Any
 
@@ -55,6 +55,7 @@ class Pulse(JSComponent):
 
     def __init__(self, **params: Any):
         self.answer, self._time = -1, 0.0
+        self._waiting: Callable[[], None] | None = None
         super().__init__(**params)
 
     def _update_model(self, events: Any, msg: dict[str, Any], root: Any, model: Any, doc: Any, comm: Any) -> None:
@@ -72,6 +73,8 @@ class Pulse(JSComponent):
     def _handle_msg(self, data: object) -> None:
         if isinstance(data, dict) and isinstance(number := data.get("painted"), int):
             self.answer = number
+            if self._waiting is not None and self.is_free:
+                self.when_free(self._waiting)
 
     @property
     def is_seen(self) -> bool:
@@ -82,6 +85,12 @@ class Pulse(JSComponent):
     def is_free(self) -> bool:
         """Whether the browser is ready for another; for the first once it has drawn the page."""
         return self.answer >= self.picture or (self.answer >= 0 and monotonic() - self._time > PATIENCE)
+
+    def when_free(self, act: Callable[[], None]) -> None:
+        """Do something, or have it done as soon as the browser is ready: else a picture that it is a little late for is lost."""
+        self._waiting = None if self.is_free else act
+        if self._waiting is None:
+            act()
 
     def beat(self) -> None:
         """Ask for an answer to the picture that has been sent."""
