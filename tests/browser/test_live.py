@@ -129,3 +129,25 @@ def test_a_page_that_opens_on_live_runs_nothing_until_another_page_needs_it(open
     page.get_by_role("button", name="Explore", exact=True).click()
     finished(page)
     expect(page.get_by_role("button", name="Tilt", exact=True)).to_have_attribute("aria-pressed", "true")
+
+
+MARKS = """() => Bokeh.documents.flatMap((it) => [...it._all_models.values()])
+  .filter((it) => it.type === "ColumnDataSource" && "line" in it.data).flatMap((it) => [...it.data.line])"""
+
+
+def test_one_observer_is_identified_anew_while_the_loop_runs(open_page: Any, server: Any) -> None:
+    """And then designed anew for the settings of the drawer; the others keep their designs."""
+    page = open_page(url=server.url + QUICK, wait=False)
+    begin(page)
+    page.get_by_role("combobox", name="New design of").click()
+    page.get_by_role("option", name="Multi-rate, all peaks", exact=True).click()
+    page.get_by_role("button", name="Identify", exact=True).last.click()  # the first one leads to the page of that name
+    events = page.get_by_role("list", name="Events")
+    expect(events).to_contain_text("identified for multirate-multi", timeout=LONG)
+    expect(events).to_contain_text("multirate-multi has a new design", timeout=LONG)
+    page.wait_for_function(f"({MARKS})().includes('multirate-multi has a new design')", timeout=LONG)
+    assert re.findall(r"(\S+) has a new design", events.inner_text()) == ["multirate-multi"]
+    page.get_by_role("button", name="Design anew", exact=True).click()
+    expect(events).to_have_text(re.compile("(multirate-multi has a new design.*){2}", re.S), timeout=LONG)
+    assert set(re.findall(r"(\S+) has a new design", events.inner_text())) == {"multirate-multi"}
+    expect(page.get_by_text(re.compile("^Running at 1 × real time"))).to_be_visible()

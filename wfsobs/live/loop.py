@@ -191,9 +191,10 @@ class LiveLoop:
         """
         self.workshop.redesign(self.running_ids() if names is None else names, scenario or self.scenario)
 
-    def identify(self, seconds: float = MINUTE) -> None:
-        """Identify the last so many seconds beside the loop, and design all for it. Raises SettingError."""
-        self.workshop.identify(self.recorder.look_back(seconds, self.scenario), self.scenario, self.running_ids())
+    def identify(self, names: Sequence[str] | None = None, *, seconds: float = MINUTE) -> None:
+        """Identify the last so many seconds beside the loop, and design all that run for it, or `names`. Raises SettingError."""
+        record = self.recorder.look_back(seconds, self.scenario)
+        self.workshop.identify(record, self.scenario, self.running_ids() if names is None else names)
 
     def running_ids(self) -> list[str]:
         """Return the ids of the observers and controllers that run."""

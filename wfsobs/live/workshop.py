@@ -73,14 +73,16 @@ class Workshop:
 
     def identify(self, record: Record, scenario: Scenario, names: Sequence[str]) -> None:
         """Identify a record, and design observers and controllers for what is found."""
+        whose = f" for {names[0]}" if len(names) == 1 else ""
 
         def take(finding: Finding) -> None:
             self.finding = finding
             peaks = ", ".join(f"{p.frequency:.1f} Hz" for p in finding.peaks)
-            self._say(f"identified: {len(finding.peaks)} peaks" + (f" at {peaks}" if peaks else ""))
+            self._say(f"identified{whose}: {len(finding.peaks)} peaks" + (f" at {peaks}" if peaks else ""))
             if names:
                 self.redesign(names, Scenario.from_dict(finding.settings))
 
+        self._say(f"identifying the last {record.n_steps * record.dt:.0f} s{whose}")
         self.do(identify_frames, record, scenario.to_dict(), then=take)
 
     def _deliver(self, design: StepObserver | StepController) -> None:

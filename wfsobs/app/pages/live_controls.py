@@ -25,6 +25,8 @@ PATIENCE = 10.0
 """Time after which a picture that the browser has not answered is given up [s]."""
 SPEEDS = {f"{speed:g} ×": speed for speed in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)}
 WINDOWS = {f"{seconds:g} s": seconds for seconds in (2.0, 5.0, 10.0)}
+ALL = "all"
+"""Stands for all that run."""
 LOSSES = {"no frame": 0.0, "1 % of frames": 0.01, "5 % of frames": 0.05, "20 % of frames": 0.2}
 FIRST = ("kf-lgs", "kf-multi", "multirate", "multirate-multi", "gpr-online")
 """Observers that run first: as many as two cores keep up with beside the page."""
@@ -119,6 +121,10 @@ class LiveControls:
         self.controllers = pmui.MultiChoice(
             label="Controllers", options={look(name).label: name for name in SEATS}, value=list(USUAL), **APART
         )
+        self.whose = pmui.Select(label="New design of", options={"All that run": ALL}, value=ALL, width=230, **select)
+        for field in (self.running, self.controllers):
+            field.param.watch(self._offer, "value")
+        self._offer()
         waterfall = {"the measurement": MEASUREMENT} | {f"error of {label}": name for label, name in self.running.options.items()}
         self.waterfall = pmui.Select(label="Waterfall of", options=waterfall, value=MEASUREMENT, width=230, **select)
         self.lines = pmui.MultiChoice(label="Lines", options=self.running.options, value=list(MAIN), **APART)
@@ -130,6 +136,18 @@ class LiveControls:
         self.lines.value = [*shown, *(name for name in ADAPTIVE if name in self.running.value and name not in shown)]
         self.controllers.value = [name for name in SEATS if name in loop.controllers]
         self._allow(loop.source)
+
+    @property
+    def chosen(self) -> list[str] | None:
+        """Whose designs are made anew; None: of all that run."""
+        return None if self.whose.value == ALL else [self.whose.value]
+
+    def _offer(self, *_: object) -> None:
+        """Have those at hand that run, for a new design."""
+        names = [*self.running.value, *self.controllers.value]
+        if self.whose.value not in names:
+            self.whose.value = ALL
+        self.whose.options = {"All that run": ALL} | {look(name).label: name for name in names}
 
     def _allow(self, source: LiveSource) -> None:
         """Have those alone at hand that the source has: a simulation loses frames, a stream keeps its own clock."""
@@ -147,7 +165,8 @@ class LiveControls:
         b = self.buttons
         return [
             line(b["Start"], b["Pause"], b["Step"], self.speed, b["Stop"]),
-            line(self.lasers, self.ngs, self.losses, b["Design anew"], b["Identify"], b["Record"]),
+            line(self.lasers, self.ngs, self.losses, b["Record"]),
+            line(self.whose, b["Design anew"], b["Identify"]),
             self.running,
         ]
 
