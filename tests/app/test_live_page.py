@@ -113,7 +113,7 @@ def check_controllers(page: LivePage, live: LiveLoop) -> None:
     page.draw()
     rms = seen(page, live, "integrator")
     page.controls.whose.value = "none"
-    assert page.controls.chosen == ["none"]
+    assert page.controls.names_to_design == ["none"]
     cells = re.findall(r'data-controller="integrator".*?</tr>', page.picture.control_table.object, re.S)[0]
     mas = 4e-6 / 8.0 * np.degrees(1.0) * 3.6e6  # per micrometre of a Noll tip on 8 m
     lost = (2 * np.pi / 2.2) ** 2 * np.sum(rms**2)
@@ -121,7 +121,7 @@ def check_controllers(page: LivePage, live: LiveLoop) -> None:
         assert f"<td>{value}</td>" in cells
     assert len(page.picture.stars.row) == 2 and set(live.controllers) == {"none", "integrator"}
     page.controls.controllers.value = ["integrator"]
-    assert live.controllers == {"integrator"} and page.controls.chosen is None, "who runs no more is not designed anew"
+    assert live.controllers == {"integrator"} and page.controls.names_to_design is None, "who runs no more is not designed anew"
 
 
 def seen(page: LivePage, live: LiveLoop, controller: str) -> Any:

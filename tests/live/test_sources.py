@@ -150,6 +150,75 @@ def test_a_stream_by_network_is_followed_and_its_next_program_too():
     ring.release()
 
 
+class Publisher:
+    """One sensor's program on a network, written here with zmq alone, and the subscription that has heard its first frame."""
+
+    def __init__(self, context):
+        self._socket = context.socket(zmq.PUB)
+        self.address = f"tcp://127.0.0.1:{self._socket.bind_to_random_port('tcp://127.0.0.1')}"
+        self._is_heard = threading.Event()
+        self._first = threading.Thread(target=self._begin)
+        self._first.start()
+
+    def _begin(self):
+        while not self._is_heard.wait(1e-2):
+            self.send(1, np.full(2, np.nan), 0)
+
+    def send(self, count, values, when):
+        header = {"frame": count, "dtype": "float64", "n": 2} | ({"time_ns": when} if when else {})
+        self._socket.send_multipart([json.dumps(header).encode(), values.tobytes()])
+
+    def heard_by(self, stream):
+        self._is_heard.set()
+        self._first.join()
+        self._stream = stream
+
+    def wait_until_there(self, count):
+        while self._stream.count != count:
+            assert self._stream.wait(0, 10.0)
+
+
+@pytest.mark.parametrize("is_late_to_look", [False, True])
+def test_two_streams_by_network_are_the_rows_of_the_record(is_late_to_look):
+    """Who looks at an LGS frame once the next NGS frame has come goes by the times that both programs say."""
+    record, context = wfsobs.simulate(paper().replace({"run.duration": 0.4, "run.warm_up": 0.1})), zmq.Context()
+    lgs, ngs = Publisher(context), Publisher(context)
+    ring, inbox, news = Ring(2), Inbox(), queue.Queue()
+    source = StreamSource(lgs.address, (0, 1), 1.0, 1e-3, ngs.address, NgsWiring((0, 1), 1.0, 5, 0, stuck=60.0))
+    frames = StreamFrames(source, Desk(ring.name, 2, inbox, news, 1.0, None))
+    while frames._stream is None:
+        frames._look()
+    lgs.heard_by(frames._stream)
+    ngs.heard_by(frames._pairs._ngs._stream)
+    inbox.waiting.append({"play": True})
+    frames._follow_commands()
+
+    def send_ngs(row):
+        if row and row % 5 == 0:
+            ngs.send(1 + row // 5, record.z_ngs[row], 10**6 * row - 1)
+            ngs.wait_until_there(1 + row // 5)
+
+    for row in range(2, 399):
+        if not is_late_to_look:
+            send_ngs(row)
+        lgs.send(row, record.z[row], is_late_to_look * 10**6 * row)
+        lgs.wait_until_there(row)
+        if is_late_to_look:
+            send_ngs(row + 1)
+        frames.take()
+    sent = ring.read_frames(0, ring.count)
+    start = np.flatnonzero((sent.z == record.z[200]).all(axis=1))[0]
+    n = ring.count - start
+    assert start % 5 == 0 and n > 190
+    np.testing.assert_array_equal(sent.z[start:], record.z[200 : 200 + n])
+    np.testing.assert_array_equal(sent.ngs[start:], record.z_ngs[200 : 200 + n])
+    for stream in (frames._stream, frames._pairs._ngs._stream):
+        stream.close()
+    context.destroy(linger=0)
+    frames._ring.release()
+    ring.release()
+
+
 @pytest.mark.parametrize(("lag", "jitter"), [(0, 0), (0, 1), (2, 1)])
 def test_two_streams_are_the_rows_of_the_record(tmp_path, lag, jitter):
     """Once the NGS frames have found their place each is in its row, a multiple of the ratio; frames that are missing as well."""

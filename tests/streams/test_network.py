@@ -276,7 +276,7 @@ def newest(source: Subscription, is_wanted: Callable[[np.ndarray], bool]) -> tup
     ("options", "reason"),
     [
         (["--in", "tcp://nowhere", "--shadow"], "tcp://nowhere: Invalid argument"),
-        (["--in", "tcp://127.0.0.1:1", "--shadow", "--ngs", "aol2"], "both sensors are read from shared memory alone"),
+        (["--in", "SHM", "--shadow", "--ngs", "tcp://nowhere", "--observer", "gp-both"], "tcp://nowhere: Invalid argument"),
         (["--in", "SHM", "--out", "tcp://nowhere"], "tcp://nowhere: Invalid argument"),
     ],
 )

@@ -107,7 +107,7 @@ def attach(
     elements = stream_elements(modes, len(scenario.modes))
     per_unit = micrometres_per(unit, scenario.telescope.diameter)
     try:
-        given = _open_source(source, ngs)
+        given = _open_source(source)
         taken = None if sink is None else _open_sink(sink, given, ngs)
         observer, noise = _design(name, scenario, len(elements), delay - 1, ngs is not None)
         warm_up = max(round(scenario.run.warm_up / scenario.dt), 1)
@@ -116,9 +116,8 @@ def attach(
         wiring = Wiring(elements, per_unit, delay, noise, limits, warm_up, stuck, semaphore)
         second = None
         if ngs is not None:
-            second = NgsStream(
-                SharedImage(stream_path(ngs)), ngs_wiring(scenario, len(elements), ngs_modes, unit, ngs_lag, stuck), _say
-            )
+            ngs_is = ngs_wiring(scenario, len(elements), ngs_modes, unit, ngs_lag, stuck)
+            second = NgsStream(_open_source(ngs), ngs_is, _say)
         attachment = Attachment(given, taken, observer, wiring, _say, second)
         with _stop_signals() as stop:
             attachment.run(seconds or np.inf, report=_say, stop=stop)
@@ -133,11 +132,9 @@ def _say(line: str) -> None:
     click.echo(f"wfsobs: attach: {line}", err=True)
 
 
-def _open_source(name: str, ngs: str | None) -> SharedImage | Subscription:
+def _open_source(name: str) -> SharedImage | Subscription:
     if not is_address(name):
         return SharedImage(stream_path(name))
-    if ngs is not None:
-        raise SettingError("--ngs: both sensors are read from shared memory alone")
     return click.get_current_context().with_resource(closing(Subscription(name, _say)))
 
 

@@ -157,19 +157,21 @@ def _source(
     if not stream:
         return SimulatedLoop(scenario)
     elements = stream_elements(modes, len(scenario.modes))
-    path = stream if is_address(stream) else str(stream_path(stream))
     unit = micrometres_per(declaration.unit or "um", scenario.telescope.diameter)
-    return StreamSource(path, elements, unit, scenario.dt)
+    return StreamSource(_place(stream), elements, unit, scenario.dt)
 
 
 def _with_ngs(source: LiveSource, scenario: Scenario, ngs: str, modes: str | None, unit: str, lag: int) -> StreamSource:
     """Return a stream with that of an NGS. Raises SettingError where the source is none."""
     if not isinstance(source, StreamSource):
         raise SettingError("live: --ngs is a stream beside that of --in")
-    if is_address(source.path) or is_address(ngs):
-        raise SettingError("live: --ngs: both sensors are read from shared memory alone")
     wiring = ngs_wiring(scenario, len(source.elements), modes, unit, lag)
-    return replace(source, ngs_path=str(stream_path(ngs)), ngs=wiring)
+    return replace(source, ngs_path=_place(ngs), ngs=wiring)
+
+
+def _place(stream: str) -> str:
+    """Return the address of a stream, or its file."""
+    return stream if is_address(stream) else str(stream_path(stream))
 
 
 def _run_headless(

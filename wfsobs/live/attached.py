@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from collections.abc import Sequence
 from dataclasses import dataclass
 from multiprocessing.context import SpawnContext
 from time import monotonic, sleep
@@ -19,7 +20,7 @@ from wfsobs.streams.layout import StreamError
 from wfsobs.streams.network import Subscription, is_address
 from wfsobs.streams.ngs_frames import NgsStream
 from wfsobs.streams.shared_image import SharedImage
-from wfsobs.streams.wiring import STUCK, NgsWiring
+from wfsobs.streams.wiring import STUCK, NgsWiring, check_elements
 from wfsobs.typing import Array
 
 TICK = 0.05
@@ -43,7 +44,7 @@ class StreamSource:
     dt : float
         Time between two frames by the design of the observers [s].
     ngs_path : str
-        File of the stream of the NGS, "" for none.
+        File or address of the stream of the NGS, "" for none.
     ngs : NgsWiring, optional
         How that is read.
     """
@@ -169,30 +170,36 @@ class StreamFrames:
     def _look(self) -> None:
         """Open the stream; say once why it cannot be opened."""
         try:
-            stream = self._open()
-            if max(self._source.elements) >= stream.n:
-                raise StreamError(f"a frame has {stream.n} numbers, mode {max(self._source.elements)} is not among them")
             if self._source.ngs is not None and self._pairs is None:
                 self._pairs = self._pair(self._source.ngs)
+            stream = self._open(self._source.path, self._source.elements)
         except StreamError as error:
             if not self._is_stuck:
                 self._is_stuck = True
-                self._say(str(error).removeprefix(f"{self._source.path}: "))
+                self._desk.say(self._ring.count, str(error))
             sleep(RETRY)
             return
         self._stream, self._count = stream, stream.count
         self._begin_at()
 
-    def _open(self) -> SharedImage | Subscription:
-        """Open the stream. Raises StreamError."""
-        path = self._source.path
+    def _open(self, path: str, elements: Sequence[int]) -> SharedImage | Subscription:
+        """Open a stream that has these elements. Raises StreamError."""
         if not is_address(path):
-            return SharedImage(path)
-        return Subscription(path, lambda line: self._desk.say(self._ring.count, line), patience=RETRY)
+            stream = SharedImage(path)
+            check_elements(stream, elements)
+            return stream
+        stream = Subscription(path, lambda line: self._desk.say(self._ring.count, line), patience=RETRY)
+        try:
+            check_elements(stream, elements)
+        except StreamError:
+            stream.close()
+            raise
+        return stream
 
     def _pair(self, wiring: NgsWiring) -> PairedFrames:
         """Open the stream of the NGS. Raises StreamError."""
-        ngs = NgsStream(SharedImage(self._source.ngs_path), wiring, lambda line: self._desk.say(self._ring.count, line))
+        stream = self._open(self._source.ngs_path, wiring.elements)
+        ngs = NgsStream(stream, wiring, lambda line: self._desk.say(self._ring.count, line))
         return PairedFrames(ngs, self._desk.n_modes, wiring.lag)
 
     def _stand_still(self) -> None:

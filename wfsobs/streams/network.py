@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections import deque
 from collections.abc import Callable
@@ -12,15 +11,13 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from wfsobs.streams.layout import StreamError
+from wfsobs.streams.message import DTYPES, parse_frame, written_frame
 from wfsobs.typing import Array
 
 if TYPE_CHECKING:
     import zmq
 
 SCHEME = "tcp://"
-DTYPES = {"float32": np.dtype("<f4"), "float64": np.dtype("<f8")}
-HEADER = 256
-"""Longest header [bytes]."""
 LARGEST = 2**20
 """Largest part of a message [bytes]; who sends a larger one is disconnected."""
 RECONNECT = 1.0
@@ -63,19 +60,17 @@ class Subscription:
         Numbers of a frame, all as long as the first one, and their type.
     n_refused : int
         Messages that were no frames.
-    write_time : int
-        0: unknown.
     is_current : bool
         True: ZeroMQ connects again by itself.
     """
 
-    write_time = 0
     is_current = True
 
     def __init__(self, path: str, say: Callable[[str], None], patience: float = FIRST):
         self.path, self._say = path, say
         self.n, self.dtype, self.n_refused, self._newest = 0, "", 0, -1
-        self._waiting: deque[tuple[int, Array]] = deque()
+        self._waiting: deque[tuple[int, Array, int]] = deque()
+        self._time = 0
         self._socket, self._alive = _open_socket(path, "SUB"), time.monotonic()
         if not self.wait(-1, patience):
             self.close()
@@ -88,6 +83,12 @@ class Subscription:
         """Counter of the newest frame that has come."""
         self._receive()
         return self._newest
+
+    @property
+    def write_time(self) -> int:
+        """When the next frame was sent, or the last one where none waits, as its header says [ns]; 0: it does not."""
+        self._receive()
+        return self._waiting[0][2] if self._waiting else self._time
 
     def wait(self, after: int, seconds: float, semaphore: object = None) -> bool:
         """Wait for a frame, at most so long [s]; return whether there is one. All that have come are new, whatever `after` is."""
@@ -104,7 +105,10 @@ class Subscription:
     def read(self, patience: float = 0.0) -> tuple[int, Array] | None:
         """Return the counter and the numbers of the next frame, (n,); None where there is none."""
         self._receive()
-        return self._waiting.popleft() if self._waiting else None
+        if not self._waiting:
+            return None
+        count, values, self._time = self._waiting.popleft()
+        return count, values
 
     def reopen(self) -> Self:
         """Return this stream."""
@@ -155,7 +159,7 @@ class Subscription:
             self._waiting = deque([self._waiting[-1]])
 
     def _accept(self, parts: list[bytes]) -> None:
-        count, values = parse_frame(parts)
+        count, values, sent = parse_frame(parts)
         if not self.n:
             self.n, self.dtype = values.size, values.dtype.name
         if values.size != self.n:
@@ -163,7 +167,7 @@ class Subscription:
         if count == self._newest:
             raise ValueError(f"the counter stays {count}")
         self._newest = count
-        self._waiting.append((count, values.astype(float)))
+        self._waiting.append((count, values.astype(float), sent))
 
 
 class Publication:
@@ -187,7 +191,7 @@ class Publication:
     def __init__(self, path: str, n: int, dtype: str = "float32"):
         self._socket = _open_socket(path, "PUB")
         self.path = self._socket.get_string(_zmq(path).LAST_ENDPOINT)
-        self._values, self._count, self._dtype = np.zeros(n, DTYPES[dtype]), 0, dtype
+        self._values, self._count = np.zeros(n, DTYPES[dtype]), 0
 
     @property
     def n(self) -> int:
@@ -198,31 +202,11 @@ class Publication:
         """Send a frame with these elements, the others as they were, and a counter that has risen by one."""
         self._values[elements] = values
         self._count += 1
-        header = {"frame": self._count, "dtype": self._dtype, "n": self.n}
-        self._socket.send_multipart([json.dumps(header).encode(), self._values.tobytes()])
+        self._socket.send_multipart(written_frame(self._count, self._values))
 
     def close(self) -> None:
         """End it, once what was sent is on its way, in a second at most."""
         self._socket.context.destroy(linger=1000)
-
-
-def parse_frame(parts: list[bytes]) -> tuple[int, Array]:
-    """Return counter and numbers, (n,), of the parts of a message. Raises ValueError where it is no frame."""
-    if len(parts) != 2:
-        raise ValueError(f"it has {len(parts)} part{'s' * (len(parts) != 1)}, not 2")
-    if len(parts[0]) > HEADER:
-        raise ValueError(f"its header has {len(parts[0])} bytes, {HEADER} at most")
-    try:
-        header = json.loads(parts[0])
-        count, dtype, n = header["frame"], DTYPES[header["dtype"]], header["n"]
-        is_header = type(count) is type(n) is int and 0 <= count < 2**64 and n > 0
-    except (ValueError, KeyError, TypeError):
-        is_header = False
-    if not is_header:
-        raise ValueError('its header is not {"frame": counter, "dtype": "float32" or "float64", "n": how many numbers}')
-    if len(parts[1]) != n * dtype.itemsize:
-        raise ValueError(f"{len(parts[1])} bytes are not the {dtype.name} numbers that its header says")
-    return count, np.frombuffer(parts[1], dtype)
 
 
 def _open_socket(path: str, kind: str) -> zmq.Socket[bytes]:

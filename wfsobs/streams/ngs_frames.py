@@ -83,10 +83,10 @@ class NgsStream:
             How many LGS frames ago the one was that it belongs to, 0 to ratio - 1, and its measurement, (n_modes,) [um], NaN
             where it is not finite. None where there is none, or where its place is not known.
         """
+        says_when, self._write_time = write_time > self._write_time > 0, write_time
         if self._stream.count == self._count:
             self._check_alive()
             return None
-        says_when, self._write_time = write_time > self._write_time > 0, write_time
         if says_when and self._stream.write_time > write_time:
             return None
         if (frame := self._stream.read(0.0)) is None:  # it is being written: the next LGS frame finds it

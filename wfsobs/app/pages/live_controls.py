@@ -138,7 +138,7 @@ class LiveControls:
         self._allow(loop.source)
 
     @property
-    def chosen(self) -> list[str] | None:
+    def names_to_design(self) -> list[str] | None:
         """Whose designs are made anew; None: of all that run."""
         return None if self.whose.value == ALL else [self.whose.value]
 
