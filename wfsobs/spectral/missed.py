@@ -51,6 +51,11 @@ def missed_variance(lines: Spectrum, z: Array, lowest: float = LOWEST) -> float:
     return float(np.sum(expected_above_zero(excess[spread > 0], spread[spread > 0], scale)))
 
 
+def missed_rms(lines: Spectrum, z: Array, lowest: float = LOWEST) -> float:
+    """Compute the root of `missed_variance` [um] for a window of any mean."""
+    return sqrt(missed_variance(lines, z - z.mean(), lowest))
+
+
 def expected_above_zero(estimate: Array, spread: Array, scale: float) -> Array:
     """Return the expectation of a number above zero of exponential prior of mean `scale`, estimated with a normal error."""
     mean = estimate - spread**2 / scale

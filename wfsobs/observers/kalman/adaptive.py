@@ -120,7 +120,7 @@ def adapt(z: Array, dt: float, settings: Adaptive, tell: Callable[[float], None]
             estimate = found.filter.run((z[start:stop] - mean)[:, None, None])
             out[now:stop] = estimate[window - 1 :, :, 0] + [mean, 0.0]
             if found.mode is not None:
-                sd[now:stop] = target_sd(found.mode.model.output_rows(TARGETS), found.mode.posterior)
+                sd[now:stop] = np.hypot(target_sd(found.mode.model.output_rows(TARGETS), found.mode.posterior), found.hidden_rms)
     return np.array([out, sd])
 
 

@@ -112,7 +112,8 @@ class AdaptiveEstimator:
         for mode, (kalman, mean) in enumerate(zip(self.filters, self.means, strict=True)):
             moving, sd[mode] = 0.0, np.nan
             if kalman is not None:
-                (moving,), (sd[mode],) = kalman.predict(frames, target)
+                (moving,), (spread,) = kalman.predict(frames, target)
+                sd[mode] = np.hypot(spread, self.models[mode].hidden_rms)
             out[mode] = moving + (mean if target == TURBULENCE else 0.0 * mean)
         return out, sd
 
@@ -142,6 +143,7 @@ class AdaptiveEstimator:
             "window": window,
             "spectra": np.array(spectra),
             "means": self.means.copy(),
+            "hidden_rms": np.array([found.hidden_rms for found in self.models]),
             "states": states,
             "near": near,
             "covariance": covariance,
@@ -160,7 +162,8 @@ class AdaptiveEstimator:
         saved = (state[name] for name in ("spectra", "states", "near", "covariance"))
         for mode, (packed, x, near, covariance) in enumerate(zip(*saved, strict=True)):
             fit, spectrum = (unpack_spectrum(one, self.sampling.dt) for one in packed)
-            self.models[mode] = WindowModel(fit, spectrum, None if spectrum is None else mode_of(spectrum))
+            one = None if spectrum is None else mode_of(spectrum)
+            self.models[mode] = WindowModel(fit, spectrum, one, float(state["hidden_rms"][mode]))
             self._start(mode)
             kalman = self.filters[mode]
             if kalman is not None:

@@ -18,6 +18,7 @@ from wfsobs.observers.kalman.single import MIN_NOISE
 from wfsobs.prior import Beams
 from wfsobs.record import RecordError
 from wfsobs.signal.ar2 import Ar2
+from wfsobs.spectral.missed import missed_rms
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.quick import SHORTEST, follow_spectrum, quick_spectrum
 from wfsobs.typing import Array
@@ -91,12 +92,14 @@ class BothModel(NamedTuple):
     spectrum : of z without the error; error : spectrum of the difference of the sensors, per frame
     ngs      : rms of the noise of a frame [um]
     cycle    : the filter in charge; None before the first, and where nothing moves
+    hidden_rms : rms of the vibration that may be in the window and in none of its lines [um]
     """
 
     spectrum: Spectrum | None = None
     error: Spectrum | None = None
     ngs: float = 0.0
     cycle: Cycle | None = None
+    hidden_rms: float = 0.0
 
 
 def identify_both(z: Array, frames: Array, dt: float, settings: Adaptive, last: BothModel) -> BothModel:
@@ -128,7 +131,8 @@ def fit_both(z: Array, error: Spectrum, ratio: int, settings: Adaptive, before: 
     of_lgs = spectrum.noise**2 / ratio
     ngs = max(error.noise * np.sqrt(max(1.0 - of_lgs / error.noise**2, LEAST)), MIN_NOISE)
     spectrum = replace(spectrum, noise=spectrum.noise / np.sqrt(share))
-    return BothModel(spectrum, error, ngs, model_cycle(spectrum, error, ngs, ratio))
+    hidden = missed_rms(spectrum, z, settings.lowest)
+    return BothModel(spectrum, error, ngs, model_cycle(spectrum, error, ngs, ratio), hidden)
 
 
 def error_process(error: Spectrum, dt: float) -> tuple[Ar2, ...]:

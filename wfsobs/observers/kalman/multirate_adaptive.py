@@ -71,7 +71,7 @@ def _adapt(v: Array, dt: float, lengths: Lengths, settings: Adaptive, tell: Call
         found = identify_both(v[start:end, 0], v[start + ratio - 1 : end : ratio, 1], dt, settings, found)
         due = end + next_length(end - start, lengths)
         if found.cycle is not None:
-            run = run_window(found.cycle, v[start : min(due, n)], end - start)
+            run = run_window(found.cycle, v[start : min(due, n)], end - start, found.hidden_rms)
             for stop in range(end + lengths.interval, min(due, n) + 1, lengths.interval):
                 if not is_still(run.surprise[stop - lengths.interval - end : stop - end]):
                     changed, due = stop - lengths.interval, stop
@@ -93,8 +93,11 @@ class WindowRun(NamedTuple):
     surprise: Array
 
 
-def run_window(cycle: Cycle, v: Array, size: int) -> WindowRun:
-    """Run the filter of a cycle over v (n, 2) from its first step on; size : steps of its window, which come first."""
+def run_window(cycle: Cycle, v: Array, size: int, hidden_rms: float) -> WindowRun:
+    """Run the filter of a cycle over v (n, 2) from its first step on.
+
+    size : steps of its window, which come first;  hidden_rms : rms of what may be in none of its lines [um]
+    """
     frames = len(cycle.steps)
     means = np.array([v[:size, 0].mean(), v[frames - 1 : size : frames, 1].mean()])
     A, C, _, R = cycle.steps[0]
@@ -103,7 +106,7 @@ def run_window(cycle: Cycle, v: Array, size: int) -> WindowRun:
     innovations = v[size:, 0] - means[0] - found[:-1, 2]
     phase = np.arange(size - 1, len(v)) % frames
     variance = np.array([C[0] @ s.P @ C[0] + R[0, 0] for s in states])[phase[1:]]
-    sd = target_sd(cycle.rows, [s.posterior for s in states])[phase]
+    sd = np.hypot(target_sd(cycle.rows, [s.posterior for s in states]), hidden_rms)[phase]
     return WindowRun(np.array([found[:, :2] + [means[1], 0.0], sd]), innovations**2 / variance)
 
 

@@ -171,7 +171,8 @@ class BothEstimator:
         for mode, window in enumerate(self.windows):
             out[mode] = sd[mode] = np.nan
             if window.kalman is not None:
-                (moving,), (sd[mode],) = window.kalman.predict(frames, target)
+                (moving,), (spread,) = window.kalman.predict(frames, target)
+                sd[mode] = np.hypot(spread, window.model.hidden_rms)
                 out[mode] = moving + (window.means[1] if target == TURBULENCE else 0.0)
         return out, sd
 
@@ -205,6 +206,7 @@ class BothEstimator:
             "times": np.array([[w.due, w.began, w.last_change, w.size] for w in self.windows]),
             "found": np.array(found),
             "ngs": np.array([w.model.ngs for w in self.windows]),
+            "hidden_rms": np.array([w.model.hidden_rms for w in self.windows]),
             "means": np.array([w.means for w in self.windows]),
             "surprise": np.array([w.surprise for w in self.windows]),
             "states": states,
@@ -225,7 +227,8 @@ class BothEstimator:
             window.model, window.kalman = BothModel(), None
             if spectrum is not None and error is not None:
                 ngs = float(state["ngs"][mode])
-                window.model = BothModel(spectrum, error, ngs, model_cycle(spectrum, error, ngs, self.lengths.ratio))
+                cycle = model_cycle(spectrum, error, ngs, self.lengths.ratio)
+                window.model = BothModel(spectrum, error, ngs, cycle, float(state["hidden_rms"][mode]))
                 kalman = window.start()
                 n, one = kalman.bank.x.shape[1], {name: state[name][mode, None] for name in ("states", "near", "covariance")}
                 at = {"x": one["states"][:, :n], "near": one["near"], "covariance": one["covariance"][:, :n, :n]}

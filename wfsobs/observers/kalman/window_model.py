@@ -14,6 +14,7 @@ from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import disturbance_model
+from wfsobs.spectral.missed import missed_rms
 from wfsobs.spectral.model import Spectrum
 from wfsobs.spectral.quick import SHORTEST, quick_spectrum, quick_spectrum_of_samples
 from wfsobs.typing import Array
@@ -41,12 +42,14 @@ def lengths(settings: Adaptive, dt: float) -> tuple[int, int]:
 class WindowModel(NamedTuple):
     """What has been identified last: the newest fit, and the spectrum that the filter in charge is of; None before the first.
 
-    mode : that filter; None where nothing moves
+    mode   : that filter; None where nothing moves
+    hidden_rms : rms of the vibration that may be in the window and in none of its lines [um]
     """
 
     fit: Spectrum | None
     spectrum: Spectrum | None
     mode: ModeFilter | None
+    hidden_rms: float = 0.0
 
     @property
     def filter(self) -> PeriodicFilter:
@@ -63,9 +66,9 @@ def identify_window(z: Array, dt: float, settings: Adaptive, last: WindowModel) 
     try:
         with np.errstate(divide="raise", over="raise", invalid="raise"):
             fit = quick_spectrum(z, dt, settings.peak_count, settings.lowest, fit)
-            return WindowModel(fit, fit, mode_of(fit))
+            return WindowModel(fit, fit, mode_of(fit), missed_rms(fit, z, settings.lowest))
     except (ValueError, ArithmeticError):
-        return WindowModel(fit, last.spectrum, last.mode)
+        return WindowModel(fit, last.spectrum, last.mode, last.hidden_rms)
 
 
 def identify_with_gaps(z: Array, dt: float, settings: Adaptive, last: WindowModel) -> tuple[WindowModel, Array] | None:
@@ -83,7 +86,7 @@ def identify_with_gaps(z: Array, dt: float, settings: Adaptive, last: WindowMode
     try:
         with np.errstate(divide="raise", over="raise", invalid="raise"):
             fit, whole = quick_spectrum_of_samples(z, dt, settings.peak_count, settings.lowest, last.fit)
-            return WindowModel(fit, fit, mode_of(fit)), whole
+            return WindowModel(fit, fit, mode_of(fit), missed_rms(fit, whole, settings.lowest)), whole
     except (ValueError, ArithmeticError):
         return None
 
