@@ -59,7 +59,7 @@ def test_it_says_what_the_command_says(page: ClosedLoopPage, dashboard: Dashboar
     for row in (r for r in expected if r["mode"] == "tip" and r["controller"] not in BOUNDS):
         assert float(cards[row["controller"]]["value"]) == pytest.approx(row["residual_rms_nm"], rel=5e-3)
         assert f'data-controller="{row["controller"]}"' in page.table.object
-    assert page.table.object.count("best</span>") == 1
+    assert page.table.object.count("smallest</span>") == 1
     assert all(f'data-controller="{name}"' in page.table.object for name in COMMON_BOUNDS)
     assert page.margins.object.count("data-controller") == len(CURVES)
     assert page.note.object == ""

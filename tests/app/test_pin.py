@@ -123,6 +123,19 @@ class TestWords:
         assert name_of_difference(one, one.copy()) == "the same settings"
         assert "Peaks changed" in differences(PRESETS["paper"](), PRESETS["ut4"]())
 
+    def test_differences_of_one_peak(self) -> None:
+        one = PRESETS["paper"]()
+        peaks = [peak.to_dict() for peak in one.vibration.peaks]
+        moved = [*peaks[:6], {**peaks[6], "frequency": 18.5, "rms": [0.01, peaks[6]["rms"][1]]}, *peaks[7:]]
+        for others, words in (
+            ([*peaks, {**peaks[0], "frequency": 70.0}], ["Peak 16 added"]),
+            ([*peaks[:3], *peaks[4:]], ["Peak 4 removed"]),
+            (moved, ["Peak 7: f 17.25 → 18.5 Hz", "Peak 7: tip 0.0074 → 0.01 µm"]),
+            (moved[1:], ["Peaks changed"]),
+            ([{**peaks[0], "damping": 0.5}, *moved[1:]], ["Peaks changed"]),
+        ):
+            assert differences(one, one.replace({"vibration.peaks": others})) == words
+
     def test_change(self) -> None:
         assert change(20.0, 25.0) == "+25.0" and change(20.0, None) == change(0.0, 1.0) == "–"
 

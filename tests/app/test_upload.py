@@ -22,6 +22,7 @@ from wfsobs.pipeline import observe
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import paper
 from wfsobs.simulation.loop import simulate
+from wfsobs.telemetry.examples import TEMPLATE
 from wfsobs.telemetry.formats import format_of
 from wfsobs.telemetry.records import read_record, record_arrays
 
@@ -84,10 +85,19 @@ def test_a_record_takes_the_place_of_the_simulation(dashboard: Dashboard, loop: 
     assert re.fullmatch(r"\d\.\d\d × z, next z", notes["kf-lgs"]) and notes["gpr-online"] == "no truth"
     assert notes["butterworth-ol"] in ("no result", "no truth")
     dashboard.display.show = "error"  # there is none, and nothing breaks
+    stated = {s.observer: number(1e3 * s.calibration.sd) for s in expected.scores if s.mode == "tip" and s.calibration}
+    said = dict(re.findall(r'<tr data-observer="([^"]*)".*?<td>([^<]*)</td></tr>', pinned))
+    assert len(stated) > 2 and stated.items() <= said.items()
+    assert "The record has no truth" in dashboard.explore.verdicts["vibration"].pane.object
+    faint = [
+        figures["vibration"].faint.source for figures in (dashboard.explore.traces.traces, dashboard.explore.spectra.spectra)
+    ]
+    assert all(len(source.data["xs"]) for source in faint), "signals beside signals"
 
     dashboard.upload.handle({"action": "simulate"})
     loop.finish(dashboard.store)
     assert dashboard.store.run.result.result.record.turbulence is not None and dashboard.upload.picker.source_title == ""
+    assert not any(len(source.data["xs"]) for source in faint), "and none beside errors"
 
 
 def test_settings_change_what_runs_on_the_record(dashboard: Dashboard, loop: Any, short: Scenario) -> None:
@@ -274,6 +284,15 @@ def test_what_is_no_record(dashboard: Dashboard, loop: Any) -> None:
         assert "<b>.exe" not in dashboard.upload.content.text.object
         dashboard.upload.confirm()
         assert dashboard.store.source is None and dashboard.store.run.result is before
+
+
+def test_a_record_that_is_too_short_cannot_be_used(dashboard: Dashboard, loop: Any) -> None:
+    """The template as it is: six steps."""
+    previewed(dashboard, loop, TEMPLATE.encode(), "template.csv")
+    upload = dashboard.upload
+    assert upload.use.disabled and "Duration = 0.006: takes a number from 0.1" in upload.missing.object
+    upload.confirm()
+    assert dashboard.store.source is None
 
 
 def test_parts_that_make_no_sense(dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:

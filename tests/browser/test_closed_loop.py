@@ -20,7 +20,7 @@ def test_controllers_side_by_side(open_page: Any, server: Any) -> None:
     for name in ("integrator+gpr-online", "lqg-multirate-multi", "integrator", "none"):
         expect(page.locator(f'tr[data-controller="{name}"] td').first).to_have_text(re.compile(r"\d$"), timeout=SLOW)
     best = page.locator('tr[data-controller="lqg-multirate-multi"]')
-    expect(best.locator(".best")).to_be_visible(timeout=SLOW)
+    expect(best.locator(".smallest")).to_be_visible(timeout=SLOW)
     values = rows.evaluate_all("rows => Object.fromEntries(rows.map(it => [it.dataset.controller, it.cells[1].innerText]))")
     residual = {name: float(text.split()[-1]) for name, text in values.items()}
     assert residual["lqg-multirate-multi"] < residual["integrator"] < residual["none"]

@@ -21,6 +21,13 @@ def test_a_setting_is_found_and_gets_the_focus(open_page: Any) -> None:
     page.keyboard.press("Enter")
     expect(page.get_by_role("combobox", name="Process noise Q")).to_be_focused()
     box.focus()
+    page.keyboard.type("outer scale")
+    page.keyboard.press("Enter")
+    page.wait_for_function(
+        "() => [...Bokeh.index.query((it) => it.model.tags?.some((tag) => tag.includes('outer_scale')))]"
+        ".some((it) => it.el.matches(':focus'))"
+    )
+    box.focus()
     page.keyboard.type("no such thing")
     expect(page.get_by_text("No setting of that name")).to_be_visible()
     page.keyboard.press("Escape")

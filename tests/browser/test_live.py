@@ -54,7 +54,7 @@ def test_a_peak_that_is_moved_in_the_live_spectrum(open_page: Any, server: Any) 
     peak.press("Shift+ArrowUp")
     peak.press("Enter")
     events = page.get_by_role("list", name="Events")
-    expect(events).to_contain_text("Peaks changed", timeout=LONG)
+    expect(events).to_contain_text("Peak 15: tip 0.0079 → 0.00997", timeout=LONG)
     # 1.06^4 in rms
     expect(peak).to_have_attribute("aria-valuetext", "47.44 Hz, 9.97 nm rms, damping 0.004", timeout=LONG)
     controllers = page.get_by_role("region", name="Controllers of the live loop")

@@ -19,7 +19,7 @@ from wfsobs.app.picker import file_message
 from wfsobs.app.report.maker import LIMIT, ReportError, make
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.share import FILE, Link, from_file, from_query, to_file, to_query
-from wfsobs.app.sources import SimulatedRecord
+from wfsobs.app.sources import LoadedRecord, SimulatedRecord
 from wfsobs.app.store import Store
 from wfsobs.app.style import asset, labels
 from wfsobs.app.view_state import ViewState
@@ -39,6 +39,7 @@ class Toolbar(JSComponent):
     query = param.String("", doc="What a link to the settings has after its ?.")
     view = param.String("", doc="What the address has beside the settings, of the view.")
     has_link = param.Boolean(True, doc="Whether the settings are short enough for a link.")
+    record = param.String("", doc="The loaded record, which a link does not have.")
     command = param.String("", doc="The settings as a command line.")
     python = param.String("", doc="The settings as Python.")
     ready = param.Boolean(False, doc="Whether there are results to save.")
@@ -236,6 +237,7 @@ class Actions:
         self.toolbar.param.update(
             has_link=query is not None,
             query=query or "",
+            record=source.name if isinstance(source, LoadedRecord) else "",
             command=to_command(scenario, preset, source, task),
             python=to_python(scenario, preset, source, task),
         )

@@ -8,11 +8,11 @@ from typing import Any
 
 import param
 
-from wfsobs.app.controls.names import preset_title
+from wfsobs.app.controls.names import preset_title, setting_name
 from wfsobs.app.sources import LoadedRecord, Source, Step, give_same_record
 from wfsobs.scenario import Scenario
 from wfsobs.scenario.configfile import reference_preset
-from wfsobs.settings.group import Group
+from wfsobs.settings.group import Group, holds_groups
 from wfsobs.settings.parameters import unit_of
 
 NAMED = 3
@@ -49,22 +49,59 @@ def differences(before: Scenario, now: Scenario) -> list[str]:
 
     >>> differences(Scenario(), Scenario().replace({"turbulence.wind_speed": 20}))
     ['Wind speed V₀ 15 → 20 m/s']
+    >>> peaks = Scenario().vibration.peaks
+    >>> differences(Scenario(), Scenario().replace({"vibration.peaks": peaks[1:]}))
+    ['Peak 1 removed']
     """
     tree = now.difference(before)
     labels = Counter(str(p.label) for _, _, p in now.walk())
-    return _differences(before, now, tree, labels, "")
+    return _differences(before, now, tree, labels)
 
 
-def _differences(before: Group, now: Group, tree: Mapping[str, Any], labels: Counter[str], above: str) -> list[str]:
+def _differences(
+    before: Group, now: Group, tree: Mapping[str, Any], labels: Counter[str], path: str = "", above: str = ""
+) -> list[str]:
     out: list[str] = []
     for name in tree:
         p, old, new = now.settings()[name], getattr(before, name), getattr(now, name)
         if isinstance(new, Group):
-            out += _differences(old, new, tree[name], labels, str(p.label))
+            out += _differences(old, new, tree[name], labels, f"{path}{name}.", str(p.label))
+            continue
+        if isinstance(p, param.List) and holds_groups(p):
+            out += _item_changes(f"{path}{name}", str(p.label), old, new)
             continue
         label = f"{above}: {p.label}" if labels[str(p.label)] > 1 else str(p.label)
         out.append(f"{label} {_change(p, old, new)}")
     return out
+
+
+def _item_changes(path: str, label: str, old: list[Group], new: list[Group]) -> list[str]:
+    """Name the one item of a list that came, went or changed, and its settings that did; else only that the list changed."""
+    items = [[item.to_dict() for item in of] for of in (old, new)]
+    longer, shorter = sorted(items, key=len, reverse=True)
+    if len(longer) == len(shorter) + 1:
+        at = next((i for i in range(len(longer)) if [*longer[:i], *longer[i + 1 :]] == shorter), None)
+        if at is not None:
+            return [f"{setting_name(f'{path}.{at}')} {'added' if len(new) > len(old) else 'removed'}"]
+    elsewhere = [i for i, (a, b) in enumerate(zip(*items, strict=False)) if a != b]
+    if len(longer) != len(shorter) or len(elsewhere) != 1:
+        return [f"{label} changed"]
+    at = elsewhere[0]
+    was, is_now, settings = _flat(items[0][at]), _flat(items[1][at]), new[at].settings()
+    return [
+        f"{setting_name(f'{path}.{at}.{key}')} {_change(settings[key.partition('.')[0]], was[key], is_now[key])}"
+        for key in was
+        if key in is_now and was[key] != is_now[key]
+    ] or [f"{label} changed"]
+
+
+def _flat(item: Mapping[str, Any]) -> dict[str, Any]:
+    """Spread lists of numbers over keys of their own, rms.0 and so on."""
+    return {
+        (f"{key}.{i}" if isinstance(value, list) else key): part
+        for key, value in item.items()
+        for i, part in enumerate(value if isinstance(value, list) else [value])
+    }
 
 
 def _change(p: param.Parameter, old: Any, new: Any) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from wfsobs.app.cache import key_of
 from wfsobs.app.limits import Limits
 from wfsobs.dependence import Memo, digest, simulate_once
+from wfsobs.pipeline import as_stated
 from wfsobs.progress import Watch
 from wfsobs.record import Record
 from wfsobs.scenario import Scenario
@@ -87,3 +88,15 @@ def record_key(record: Record) -> str:
 def give_same_record(one: Source | None, other: Source | None) -> bool:
     """Whether two give the same record; None is the simulation of the settings."""
     return one is other or (one is not None and other is not None and one.key == other.key)
+
+
+def fit_to_record(record: Record, scenario: Scenario) -> Scenario:
+    """Set the rate, ratio, length and modes of a scenario to those of a record. Raises SettingError."""
+    order = next((n for n in range(1, 7) if (n + 1) * (n + 2) // 2 - 1 >= record.n_modes), 6)
+    duration = record.n_steps * record.dt
+    changes = {
+        "telescope.radial_order": order,
+        "run.duration": duration,
+        "run.warm_up": min(scenario.run.warm_up, 0.2 * duration),
+    }
+    return as_stated(record, scenario).replace(changes)

@@ -14,18 +14,17 @@ import panel as pn
 import panel_material_ui as pmui
 
 from wfsobs.app.column_form import ColumnForm
+from wfsobs.app.controls.names import name_settings
 from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING, Job, Tell
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.picker import PartialFile, Picker, too_large
 from wfsobs.app.session_file import SUFFIX
-from wfsobs.app.sources import LoadedRecord, record_key
+from wfsobs.app.sources import LoadedRecord, fit_to_record, record_key
 from wfsobs.app.store import Store
 from wfsobs.app.upload_fields import UploadFields, differs_from_proposals
 from wfsobs.app.upload_preview import PreviewView
-from wfsobs.pipeline import as_stated
 from wfsobs.progress import Watch
 from wfsobs.record import RecordError
-from wfsobs.scenario import Scenario
 from wfsobs.settings.errors import SettingError
 from wfsobs.telemetry.examples import TEMPLATE, sample_csv
 from wfsobs.telemetry.intake import DeclaredFormat
@@ -165,12 +164,20 @@ class Upload:
         self._preview = None if isinstance(preview, RecordError) else preview
         self.use.label = "Use this spectrum" if isinstance(preview, SpectrumPreview) else "Use this record"
         self.picker.message = "" if self._preview else str(preview)
-        missing = preview.reading.missing if isinstance(preview, Preview) else ""
+        missing = self._obstacle(preview) if isinstance(preview, Preview) else ""
         self.missing.object = missing and f'<span role="status">{missing}</span>'
         self.use.disabled = self._preview is None or bool(missing)
         self.content.show(self._name, preview)
         self.take.visible = isinstance(preview, Preview) and differs_from_proposals(preview)
         self._lay_out()
+
+    def _obstacle(self, preview: Preview) -> str:
+        """Say why a record cannot be used as it is, or nothing."""
+        try:
+            fit_to_record(preview.record, self.store.scenario)
+        except SettingError as error:
+            return name_settings(str(error))
+        return preview.reading.missing
 
     def _ask(self, preview: ColumnsPreview) -> None:
         """Ask which column is what; read the file at once if its names tell enough."""
@@ -198,7 +205,7 @@ class Upload:
         """Let the record take the place of the simulation, the settings of rate, ratio and length with it."""
         if isinstance(found := self._preview, SpectrumPreview):
             self._vibrate(found)
-        if not isinstance(found, Preview) or found.reading.missing:
+        if not isinstance(found, Preview) or self._obstacle(found):
             return
         record, stated, digest = found.record, self.read_fields(), hashlib.sha256(self._content).hexdigest()
         try:
@@ -236,15 +243,3 @@ class Upload:
 
     def _say(self, line: str) -> None:
         self.picker.message = line
-
-
-def fit_to_record(record: Any, scenario: Scenario) -> Scenario:
-    """Set the rate, ratio, length and modes of a scenario to those of a record. Raises SettingError."""
-    order = next((n for n in range(1, 7) if (n + 1) * (n + 2) // 2 - 1 >= record.n_modes), 6)
-    duration = record.n_steps * record.dt
-    changes = {
-        "telescope.radial_order": order,
-        "run.duration": duration,
-        "run.warm_up": min(scenario.run.warm_up, 0.2 * duration),
-    }
-    return as_stated(record, scenario).replace(changes)

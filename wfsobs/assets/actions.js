@@ -215,7 +215,7 @@ export function render({model, view, el}) {
     const query = [model.query, model.view].filter(Boolean).join("&")
     return location.origin + location.pathname + (query ? `?${query}` : "")
   }
-  const copyLink = () => model.has_link ? copy(here(), "link") : model.send_msg({action: "unlinked"})
+  const copyLink = () => model.has_link ? copy(here(), model.record ? `link, which is without ${model.record}` : "link") : model.send_msg({action: "unlinked"})
   const ask = (message) => () => {
     dismiss()
     say("Preparing the file …")

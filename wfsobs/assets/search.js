@@ -1,6 +1,7 @@
 // A box that finds settings by their name, their meaning or their path; choosing one opens its topic and goes to it.
 
 const MOST = 8 // of what is found
+const SETTLED = 20 // frames in which a topic opens and moves what is in it
 
 export function render({model, el}) {
   const box = document.createElement("input")
@@ -87,17 +88,22 @@ function ranked(items, words) {
 function go(path) {
   const over = new AbortController()
   for (const act of ["pointerdown", "keydown"]) document.addEventListener(act, () => over.abort(), {capture: true, signal: over.signal})
-  let tries = 600
+  let tries = 600, still = 0
   const look = () => {
     if (over.signal.aborted) return
     const view = [...Bokeh.index.query((it) => it.model.tags?.includes(TAG + path))].find((it) => it.el.getBoundingClientRect().height > 0)
     const root = view?.el.shadowRoot
-    const target = root?.querySelector("input, [role=combobox], select, button")
+    const control = root?.querySelector("input, [role=combobox], select, button")
+    const target = control?.matches(":disabled, [aria-disabled=true]") ? view.el : control // a grey one takes no focus itself
+    const there = target?.matches(":focus")
+    if (still && !there) return over.abort()
     if (target) {
+      if (target === view.el) view.el.tabIndex = -1
       view.el.scrollIntoView({block: "center"})
-      target.focus()
+      if (!there) target.focus()
+      still += target.matches(":focus")
     }
-    if ((target && root.activeElement === target) || !tries--) over.abort()
+    if (still > SETTLED || !tries--) over.abort()
     else requestAnimationFrame(look)
   }
   look()

@@ -159,9 +159,9 @@ class RollingSpectra(LiveFigure):
         top = 3.0 * max((float(y.max()) for _, y in data.values()), default=1.0) or 1.0
         self.figure.x_range.update(start=1.0, end=0.5 / view.dt)
         self.figure.y_range.update(start=top * 10.0 ** -(DECADES / 2 if display.cumulative else DECADES), end=top)
-        unit = display.unit_label
-        what = f"rms above, {display.mode_label} [{unit}]" if display.cumulative else f"PSD, {display.mode_label} [{unit}²/Hz]"
-        self.figure.yaxis.axis_label = what
+        of, unit = " of error" if display.error else "", display.unit_label
+        what = (f"cumulative rms{of}", unit) if display.cumulative else (f"PSD{of}", f"{unit}²/Hz")
+        self.figure.yaxis.axis_label = f"{what[0]}, {display.mode_label} [{what[1]}]"
 
 
 def shown_signal(view: LiveView, name: str, target: str, display: Display) -> Array:

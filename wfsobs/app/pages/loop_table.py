@@ -12,7 +12,7 @@ from wfsobs.app.loop_work import LoopResults
 from wfsobs.app.numerals import NOTHING, number
 from wfsobs.app.render import Row, macro, table
 from wfsobs.app.style import swatch
-from wfsobs.app.views.table import BEST
+from wfsobs.app.views.table import SMALLEST
 from wfsobs.closed_loop.rows import LIMITED, NOT_APPLICABLE, label
 from wfsobs.evaluation.rows import Row as Score
 from wfsobs.evaluation.scores import BOUNDS
@@ -39,9 +39,9 @@ def loop_html(results: LoopResults, display: Display) -> str:
         "Needs": TERMS[NEEDS],
     }
     rows = of_mode(results, display)
-    best = next((r["controller"] for r in rows if r["controller"] not in BOUNDS and r["residual_rms_nm"] is not None), None)
+    smallest = next((r["controller"] for r in rows if r["controller"] not in BOUNDS and r["residual_rms_nm"] is not None), None)
     scale = 1e-3 * per_micrometre(display.unit, results.result.scenario.telescope.diameter)
-    body = [_row(r, display, scale, r["controller"] == best) for r in rows]
+    body = [_row(r, display, scale, r["controller"] == smallest) for r in rows]
     notes = {r["note"]: label(r["controller"]) for r in reversed(rows) if r["note"] and not r["limited"]}
     failures = macro("texts", "failure", [f"{name}: {note}" for note, name in notes.items()])
     return f"{table('Controllers', columns, [('', body)])}{limits_note(rows)}{failures}"
@@ -57,13 +57,13 @@ def linear_text(row: Score, value: str) -> str:
     return Markup('<span title="{}">{}</span>').format(LIMITED, NOT_APPLICABLE) if row["limited"] else value
 
 
-def _row(row: Score, display: Display, scale: float, best: bool) -> Row:
+def _row(row: Score, display: Display, scale: float, smallest: bool) -> Row:
     def scaled(key: str) -> str:
         return NOTHING if row[key] is None else number(row[key] * scale)
 
     residual = UNSTABLE if row["stable"] is False else scaled("residual_rms_nm")
     cells = [
-        (BEST if best else "") + residual,
+        (SMALLEST if smallest else "") + residual,
         linear_text(row, scaled("predicted_rms_nm")),
         NOTHING if row["strehl"] is None else f"{row['strehl']:.4f}",
         number(row["gain"]),

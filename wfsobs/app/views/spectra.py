@@ -88,7 +88,7 @@ class _Spectrum:
             send(source, {"x": spectrum.frequency[1:], "y": y})
             if self.lines[name].visible:
                 drawn.append(y)
-        self._fit(drawn + self.draw_compared(display), display.cumulative)
+        self._fit(drawn + self._draw_compared(display, error), display.cumulative)
         of = " of error" if error else ""
         what, unit = (
             (f"cumulative rms{of}", display.unit_label) if display.cumulative else (f"PSD{of}", f"{display.unit_label}²/Hz")
@@ -97,15 +97,15 @@ class _Spectrum:
         if self.target == VIBRATION:
             self._draw_marks(results)
 
-    def draw_compared(self, display: Display) -> list[Array]:
-        """Send the compared runs' visible lines; what was sent."""
+    def _draw_compared(self, display: Display, error: bool) -> list[Array]:
+        """Send the compared runs' visible lines, errors beside errors alone; what was sent."""
         lines: list[tuple[str, str, Array, Array]] = []
         for run, kept in display.runs_drawn:
             for name, line in self.lines.items():
                 spectrum = kept.spectra.get((name, self.target))
-                if line.visible and spectrum is not None:
-                    error = display.error and name != TRUTH and np.isfinite(spectrum.error).all()
-                    y = _curve(spectrum, bool(error), display, run.scenario.telescope.diameter)
+                of_error = error and name != TRUTH
+                if line.visible and spectrum is not None and (not of_error or np.isfinite(spectrum.error).all()):
+                    y = _curve(spectrum, of_error, display, run.scenario.telescope.diameter)
                     lines.append((run.letter, name, spectrum.frequency[1:], y))
         self.faint.draw_runs(lines, display.dark)
         return [y for *_, y in lines]

@@ -109,7 +109,7 @@ class Table:
                 row_needs(score.observer, source=shown.result.prior_source),
                 NOTHING,
                 *_times(score, shown.result.record.dt),
-                NOTHING,
+                _own_sd(score, scale),
             ]
             head = "Recorded loop, residual" if score.observer == LOOP else self._head(score.observer) + _own(score)
             found.append(Row(head, cells, {"observer": score.observer, "target": score.target}))
@@ -167,7 +167,7 @@ class Table:
                 needs,
                 NOTHING if score.lag is None else f"{1e3 * score.lag:z.2f}".replace("-", "−"),
                 *_times(score, shown.result.record.dt),
-                NOTHING if score.calibration is None else number(score.calibration.sd * scale),
+                _own_sd(score, scale),
             ]
         head = self._head(name) + macro("note", "looks ahead" if is_non_causal(name) else "") + _own(score)
         return Row(head, cells, {"observer": name, "target": target})
@@ -202,6 +202,11 @@ def _own(score: Score | None) -> Markup:
 def _interval(interval: Sequence[float] | None, scale: float) -> Markup:
     """Write the interval of a bound, to stand before it."""
     return macro("interval", *(number(x * scale) for x in interval), IN_MOST) if interval else Markup()
+
+
+def _own_sd(score: Score, scale: float) -> str:
+    """Write the standard deviation that an observer states, where it states one."""
+    return NOTHING if score.calibration is None else number(score.calibration.sd * scale)
 
 
 def _times(score: Score, dt: float) -> list[str]:

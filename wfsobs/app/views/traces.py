@@ -73,7 +73,7 @@ class Traces(TargetFigures):
 
     def open_window(self, window: tuple[float, float] | None) -> None:
         """Show a stretch of the record [s], that of a fresh page if None; with the first results where there are none yet."""
-        if self.run.result is None:
+        if self.run.result is None or not self.length:
             self._wanted_window = window
         else:
             start, end = window or first_window(self.run.result)
@@ -81,7 +81,7 @@ class Traces(TargetFigures):
 
     def chosen_window(self) -> tuple[float, float] | None:
         """Return the stretch in view [s]; None where it is that of a fresh page."""
-        if self.run.result is None:
+        if self.run.result is None or not self.length:  # nothing has been drawn yet
             return self._wanted_window
         start, end = float(self.x_range.start), float(self.x_range.end)  # type: ignore[arg-type]
         first = first_window(self.run.result)
@@ -149,10 +149,10 @@ class _Trace:
         warm_up = results.scenario.run.warm_up
         self.warm_up.right = warm_up
         settled = warm_up + WINDOW_S * display.running
-        extra = self._draw_compared(display, data["x"]) + self._draw_band(results, display, first, last, data["x"])
+        error = shows_error(results, self.target, display)
+        extra = self._draw_compared(display, error, data["x"]) + self._draw_band(results, display, first, last, data["x"])
         self._fit(data, settled, extra, room(results))
         self.events.draw(results, display.dark)
-        error = shows_error(results, self.target, display)
         what = f"{'running rms of ' if error and display.running else ''}{'error of ' if error else ''}{display.mode_label}"
         self.figure.yaxis.axis_label = f"{what} [{display.unit_label}]"
 
@@ -171,8 +171,8 @@ class _Trace:
         self.band.draw(times, low, high, look(shown[0]).colour(display.dark))
         return [(times, low), (times, high)]
 
-    def _draw_compared(self, display: Display, times: Array) -> list[tuple[Array, Array]]:
-        """Send the compared runs' visible lines between the first and the last of the times; what was sent."""
+    def _draw_compared(self, display: Display, error: bool, times: Array) -> list[tuple[Array, Array]]:
+        """Send the compared runs' visible lines, errors beside errors, from the first to the last of the times; what was sent."""
         lines: list[tuple[str, str, Array, Array]] = []
         for run, kept in display.runs_drawn if not display.running else []:  # what is kept are extremes, of which there is no rms
             first, last = np.searchsorted(kept.times, [times[0], times[-1]])
@@ -180,7 +180,7 @@ class _Trace:
             x = _times_of_envelope(kept.times[cut])
             scale = per_micrometre(display.unit, run.scenario.telescope.diameter)
             for name, line in self.lines.items():
-                values = (kept.errors if display.error else kept.signals).get((name, self.target))
+                values = (kept.errors if error else kept.signals).get((name, self.target))
                 if line.visible and values is not None:
                     lines.append((run.letter, name, x, scale * envelope(values[cut, display.column].astype(np.float64), BINS)))
         self.faint.draw_runs(lines, display.dark)

@@ -13,7 +13,13 @@ from wfsobs.app.jobs.job import DONE, RUNNING
 from wfsobs.app.jobs.task import IDLE, BackgroundTask
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.style import asset
+from wfsobs.app.work import TRUTH
 from wfsobs.evaluation.verdict import verdict
+
+NO_TRUTH = (
+    "The record has no truth: the figures show the estimates instead of their errors, and the RMS errors are those of predicting "
+    "the next measurement."
+)
 
 
 class VerdictLine:
@@ -41,7 +47,7 @@ class VerdictLine:
         self.pane.object = self.html()
 
     def html(self) -> str:
-        """Return the sentences; while observers are at work those before, dimmed; empty where there is no truth."""
+        """Return the sentences; while observers are at work those before, dimmed; without a truth what there is instead."""
         shown, of = self.run.result, (self.display.mode, self.display.unit)
         if self.run.state in (IDLE, RUNNING):
             before, text = self._sentence
@@ -49,6 +55,8 @@ class VerdictLine:
         if shown is None or self.run.state != DONE:
             return ""
         it = shown.result
+        if shown.values(TRUTH, self.target) is None:
+            return _paragraph(NO_TRUTH, "verdict")
         found = verdict(
             it.scenario,
             it.record,
