@@ -171,12 +171,17 @@ def test_what_is_known_is_what_a_whole_run_gives() -> None:
 
 
 CASES = {
-    "multipeak.line_width": {"kf-multi", "multirate-multi"},
-    "multirate.model_lgs_error": {"multirate", "multirate-optimal"},
+    "multipeak.line_width": set(),
+    "multipeak.turbulence_order": {"kf-multi", "multirate-multi", "gp-lgs", "gp-both"},
+    "kalman.frequency": {"kf-lgs", "kf-ngs", "multirate", "multirate-optimal"},
+    "butterworth.bandwidth_offline": {"butterworth-ol", "gpr-offline", "ridge", "ridge-30"},
+    "butterworth.bandwidth_online": {"butterworth-cl", "gpr-online"},
+    "multirate.model_lgs_error": {"multirate-optimal"},
     "kalman.ngs_between_frames": {"kf-ngs"},
     "gpr_online.length_scale": {"gpr-online"},
     "gpr_offline.length_scale": {"gpr-offline", "ridge"},
     "adaptive.peak_count": {"kf-adaptive", "multirate-adaptive", "gpr-adaptive"},
+    "adaptive.depth": {"gpr-adaptive"},
     "sensors.spots.lgs_photons": set(),
     "gpr_online.highpass": set(),
     "kalman.lgs_noise": set(),
@@ -204,6 +209,30 @@ class TestReuse:
         assert now is record
         found = list(each_estimate(now, changed, memo=RecordMemo(memo, now)))
         assert {e.observer for e in found if not any(e is old for old in kept)} == CASES[path]
+
+    @pytest.mark.parametrize("path", ["sensors.ngs_noise", "sensors.exposure_ratio"])
+    def test_what_only_the_ngs_sees_runs_its_observers_alone(self, path: str, before: tuple[Memo, Record, list[Any]]) -> None:
+        memo, record, kept = before
+        changed = changes_of(BASE, [path])[path]
+        now = simulate_once(changed, memo)
+        assert now is not record and np.array_equal(now.y_lgs, record.y_lgs)
+        known = RecordMemo(memo, now)
+        found = list(each_estimate(now, changed, memo=known))
+        ran = {e.observer for e in found if not any(e is old for old in kept)}
+        assert ran == {name for name in ON_PAPER if "ngs" in OBSERVERS[name].sensors}
+        assert known.known_observers == set(ON_PAPER) - ran
+
+    def test_what_follows_from_an_estimate_is_of_the_truth_too(self, before: tuple[Memo, Record, list[Any]]) -> None:
+        memo, record, kept = before
+        assert record.turbulence is not None
+        other = Record(**{**vars(record), "turbulence": record.turbulence + 1.0})
+        made = [[], []]
+        for of, list_of in zip((record, other), made, strict=True):
+            known = RecordMemo(memo, of)
+            (estimate,) = (e for e in each_estimate(of, BASE, observers=["persistence"], memo=known))
+            assert any(estimate is old for old in kept)
+            list_of.append(known.derive(estimate, "offset", lambda of=of: Failure("persistence", str(of.turbulence[0, 0]))))
+        assert made[0][0].reason != made[1][0].reason
 
     def test_other_training_data_leave_the_record(self, before: tuple[Memo, Record, list[Any]]) -> None:
         memo, record, _ = before

@@ -1,7 +1,8 @@
 """What results depend on, by name: a record on the settings that its simulation reads, an estimate on what its observer receives.
 
-The name of an estimate is a digest of the record, of the observer's prior as it was built and of its own settings as they count:
-what changed nothing of these changes nothing of the estimate. So there is no list of which setting reaches which observer.
+The name of an estimate is a digest of the signals that its observer receives, of its prior as it was built and of its own
+settings as they count: what changed nothing of these changes nothing of the estimate. So there is no list of which setting
+reaches which observer.
 """
 
 from __future__ import annotations
@@ -137,14 +138,20 @@ class RecordMemo:
     def __init__(self, memo: Memo, record: Record):
         self.memo, self.record = memo, record_digest(record)
         self.known_observers: set[str] = set()
+        self._of = record
         self._names: dict[tuple[str, str], str] = {}
+        self._signals: dict[frozenset[str], str] = {}
+
+    def name(self, observer: Observer, prior: Prior, own: Plain | None) -> str:
+        """Return the name of an observer's estimates; own : its settings that have an effect."""
+        key = frozenset((*observer.sensors, *observer.needs))
+        if key not in self._signals:
+            self._signals[key] = digest(observer.measurements(self._of))
+        return digest(observer.id, self._signals[key], prior, own)
 
     def find(self, observer: Observer, prior: Prior, own: Plain | None) -> tuple[str, list[Estimate]]:
-        """Return the name of an observer's estimates, and the estimates, one per target; none unless all are known.
-
-        own : its settings that have an effect
-        """
-        name = digest(observer.id, self.record, prior, own)
+        """Return the name of an observer's estimates, and the estimates, one per target; none unless all are known."""
+        name = self.name(observer, prior, own)
         found = [self.memo.get(f"{name} {target}") for target in observer.targets]
         if any(e is None for e in found):
             return name, []
@@ -165,7 +172,7 @@ class RecordMemo:
         of = self._names.get((estimate.observer, estimate.target))
         if of is None:
             return make()
-        name = f"{what} of {of} {estimate.target}"
+        name = f"{what} of {of} {estimate.target} in {self.record}"
         if (known := self.memo.get(name)) is not None:
             return known
         made = make()

@@ -103,7 +103,8 @@ def _recall(
     if observer.missing(record):
         return "", []
     try:
-        return memo.find(observer, prior_and_settings(observer, record, scenario, parts)[0], own)
+        prior, settings = prior_and_settings(observer, record, scenario, parts)
+        return memo.find(observer, prior, own if observer.counts is None else observer.counts(prior, settings))
     except ValueError:
         return "", []
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -12,6 +13,9 @@ from wfsobs.typing import Array
 
 DELAY = 2
 """The paper's delay: a command is computed once y_lgs[k] is known, acts during step k + 1, and is seen at k + 2."""
+
+SENSORS = ("lgs", "ngs")
+"""Whose measurements a record has."""
 
 
 class RecordError(ValueError):
@@ -177,24 +181,32 @@ class Record(Signals):
             ("missing", str(self.missing)),
         ]
 
-    def measurements(self, open_loop: bool = False) -> Measurements:
-        """Return copies of the signals alone: no array is a view of another; open_loop : with the open-loop measurement."""
-        y_ngs, twin = self.y_ngs, self.open_loop_y if open_loop else None
+    def measurements(self, open_loop: bool = False, sensors: Collection[str] = SENSORS) -> Measurements:
+        """Return copies of the signals alone: no array is a view of another.
+
+        open_loop : with the open-loop measurement
+        sensors   : whose measurements; there is nothing of the NGS without them, and zeros for those of the LGS
+        """
+        lgs, ngs = "lgs" in sensors, "ngs" in sensors
         return Measurements(
-            _own(self.y_lgs),
+            _own(self.y_lgs) if lgs else np.zeros_like(self.y_lgs),
             _own(self.u),
             self.dt,
-            None if y_ngs is None else _own(y_ngs),
-            self.ratio,
-            None if twin is None else _own(twin),
+            _copy(self.y_ngs) if ngs else None,
+            self.ratio if ngs else None,
+            _copy(self.open_loop_y) if open_loop else None,
             self.delay,
-            lgs_stars=None if self.lgs_stars is None else self.lgs_stars.copy(),
-            y_stars=None if self.y_stars is None else _own(self.y_stars),
+            lgs_stars=None if self.lgs_stars is None or not lgs else self.lgs_stars.copy(),
+            y_stars=_copy(self.y_stars) if lgs else None,
         )
 
     def truth(self, target: str) -> Array | None:
         """Return the true signal of `target` ("turbulence" or "vibration"), or None."""
         return {"turbulence": self.turbulence, "vibration": self.vibration}[target]
+
+
+def _copy(x: Array | None) -> Array | None:
+    return None if x is None else _own(x)
 
 
 def _own(x: Array) -> Array:

@@ -87,7 +87,7 @@ def design(
     if name in OBSERVERS:
         observer = OBSERVERS[name]
         own = observer_settings(observer, settings)
-        given = prior_in(name, told, (*observer.prior, *observer.asks(own)), settings, sampling, train)
+        given = prior_in(name, told, observer.parts(own), settings, sampling, train)
         return observer.design(given, own, sampling, horizon)
     if horizon:
         raise StepError(f"{name}: a controller has the horizon of its mirror, control.delay; leave horizon out")
@@ -129,7 +129,7 @@ def sampling_of(scenario: Scenario) -> Sampling:
 
 def _of_modes(prior: Prior, name: str, n: int) -> Prior:
     """Return the prior of the first n modes. Raises StepError where it has fewer."""
-    parts = {part: getattr(prior, part) for part in ("model", "lgs_error", "lines", "beams", "spectra")}
+    parts = {part: getattr(prior, part) for part in ("model", "noise", "lgs_error", "lines", "beams", "spectra")}
     for part, given in parts.items():
         if given and len(given) < n:
             raise StepError(f"{name}: the prior has {part} of {len(given)} modes, the loop has {n}")

@@ -19,7 +19,7 @@ from wfsobs.observers.gp.lgs import kernels_of, measured_late, sampled_model
 from wfsobs.observers.kalman.multirate import multirate_noise
 from wfsobs.observers.kalman.multirate_multi import every_peak_model
 from wfsobs.observers.kalman.multirate_optimal import optimal_model
-from wfsobs.priors_from.scenario import arguments, prior_of
+from wfsobs.priors_from.scenario import arguments, observer_settings, prior_of
 from wfsobs.record import Measurements, Record
 from wfsobs.scenario import Scenario
 from wfsobs.signal.riccati import Step
@@ -38,9 +38,9 @@ class Model(NamedTuple):
 
 def model_of(name: str, scenario: Scenario, record: Record, mode: int) -> Model:
     """The model of an observer, of one mode."""
-    prior = prior_of(scenario, record, OBSERVERS[name].prior)
+    prior = prior_of(scenario, record, OBSERVERS[name].parts(observer_settings(OBSERVERS[name], scenario)))
     if name in ("kf-lgs", "multirate"):
-        model, noises = prior.model[mode].disturbance(), multirate_noise(scenario.multirate, prior.model[mode])
+        model, noises = prior.model[mode].disturbance(), multirate_noise(scenario.multirate, prior.noise_of(mode))
         if name == "kf-lgs":
             return Model([(model.A, model.C[None], model.Q, np.diag(noises[:1]) ** 2)], model.output_rows(TARGETS))
         C, R = np.array([model.C, model.C]), np.diag(noises) ** 2

@@ -20,7 +20,7 @@ from wfsobs.observers.gpr.kernels import SquaredExponential
 from wfsobs.observers.gpr.online import predict_sliding
 from wfsobs.observers.gpr.trained import HELD, train
 from wfsobs.observers.kalman.multi import MultiPeak
-from wfsobs.prior import LgsError, Prior
+from wfsobs.prior import LgsError, Noise, Prior
 from wfsobs.priors_from.scenario import observer_settings, prior_of
 from wfsobs.record import Measurements
 from wfsobs.signal.ar2 import Ar2
@@ -36,11 +36,12 @@ def told(name: str, between: str) -> tuple[Prior, object]:
     """The prior of one mode of the paper's preset, as often as there are records, and the settings."""
     scenario = wfsobs.PRESETS["paper"]().replace({"kalman.ngs_between_frames": between})
     observer = OBSERVERS[name]
-    one = prior_of(scenario, None, observer.prior)
+    one = prior_of(scenario, None, (*observer.parts(observer_settings(observer, scenario)), Noise))
     slow = Ar2(2 * pi * 2.0, 0.9, 0.03, scenario.dt)  # of 2 Hz, so that a record of seconds holds many of its times
     prior = replace(
         one,
         model=one.model[:1] * RECORDS,
+        noise=one.noise[:1] * RECORDS,
         lgs_error=(LgsError(slow),) * RECORDS if one.lgs_error else (),
         stars=one.stars[:1] * RECORDS,
         lines=one.lines[:1] * RECORDS,
@@ -62,7 +63,7 @@ def own_record(name: str, prior: Prior, rng: np.random.Generator) -> tuple[Measu
         truth = {"turbulence": sum(draw(p) for p in lines.turbulence), "vibration": sum(draw(p) for p in peaks)}
     else:
         truth = {"turbulence": draw(prior.model[0].turbulence), "vibration": draw(prior.model[0].vibration)}
-    lgs, ngs = (prior.model[0].lgs_noise, prior.model[0].ngs_noise) if prior.model else (prior.lines[0].noise, 0.01)
+    lgs, ngs = prior.noise[0]
     total = truth["turbulence"] + truth["vibration"]
     late = np.vstack([np.zeros((1, RECORDS)), total[:-1]])
     y = late + lgs * rng.standard_normal(late.shape)

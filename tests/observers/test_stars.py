@@ -20,7 +20,7 @@ from wfsobs.observers.gp.lgs import kernels_of, measured_late, sampled_model
 from wfsobs.observers.kalman.multirate_multi import beam_model
 from wfsobs.prior import Prior
 from wfsobs.priors_from.controllers import controller_arguments, own_settings, plant_of, prior_for
-from wfsobs.priors_from.scenario import arguments, prior_of
+from wfsobs.priors_from.scenario import arguments, observer_settings, prior_of
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
 from wfsobs.signal.statespace import disturbance_model
@@ -59,7 +59,7 @@ STRETCHES = {name: slice(*x) for name, x in {"two": (4000, 4500), "one": (4500, 
 
 
 def told(scenario: Scenario, record: Record, name: str) -> Prior:
-    return prior_of(scenario, record, OBSERVERS[name].prior)
+    return prior_of(scenario, record, OBSERVERS[name].parts(observer_settings(OBSERVERS[name], scenario)))
 
 
 def star_by_star(name: str, scenario: Scenario, record: Record, mode: int) -> list[Model]:
@@ -83,7 +83,7 @@ def star_by_star(name: str, scenario: Scenario, record: Record, mode: int) -> li
     out = []
     for s in range(1, STARS + 1):
         lgs = np.concatenate([seen.C, *[error.C / s] * s, np.zeros(e * (STARS - s) + 1)])
-        R = np.diag([noise_rms(scenario, "lgs")[mode] ** 2 / s, prior.model[mode].ngs_noise ** 2])
+        R = np.diag([noise_rms(scenario, "lgs")[mode] ** 2 / s, prior.noise_of(mode).ngs_noise ** 2])
         cycle = []
         for j in range(1, RATIO + 1):
             A = block_diag(A0, [[0.0 if j == RATIO else 1.0]])

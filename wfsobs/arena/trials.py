@@ -90,7 +90,7 @@ def try_record(
 def _observer_inputs(observer: Observer, case: Case, record: Record) -> tuple[Any, ...]:
     if missing := observer.missing(record):
         raise EntryError(f"the record has no {', '.join(missing)}")
-    return record.measurements("open_loop_y" in observer.needs), *case.prior_and_settings(observer, record)
+    return observer.measurements(record), *case.prior_and_settings(observer, record)
 
 
 def _controller_inputs(controller: Controller, case: Case, record: Record) -> tuple[Any, ...]:

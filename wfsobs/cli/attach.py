@@ -159,7 +159,7 @@ def _design(name: str, scenario: Scenario, n_modes: int, horizon: float, has_ngs
     if name not in OBSERVERS:
         raise SettingError(f"observer {name!r}: no such observer; there are {', '.join(OBSERVERS)}")
     declared = OBSERVERS[name]
-    if Training in (*declared.prior, *declared.asks(observer_settings(declared, scenario))):
+    if Training in declared.parts(observer_settings(declared, scenario)):
         raise StepError(f"{name}: learns from a record beforehand; takes an observer with a model, such as kf-multi")
     if "y_stars" in declared.needs:
         raise StepError(f"{name}: takes every LGS by itself; the stream is of them together")

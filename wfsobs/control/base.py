@@ -28,7 +28,7 @@ from wfsobs.observers.base import NOTHING, PLAIN, Look
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
 from wfsobs.observers.step_checks import StepError
-from wfsobs.prior import TRUE, Bands, Part, Prior, PriorSource, words_for
+from wfsobs.prior import TRUE, Bands, Part, Prior, PriorSource, asks_for, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, hold_last
 from wfsobs.settings import Section
@@ -102,7 +102,7 @@ class Controller:
     step_predict: StepPredict | None = None
 
     def __post_init__(self) -> None:
-        if self.predict is not None and Bands not in self.prior:
+        if self.predict is not None and not asks_for(Bands, self.prior):
             raise ValueError(f"controller {self.id!r}: with a prediction it needs Bands in its prior")
 
     @property

@@ -12,7 +12,21 @@ from wfsobs.control.lqg import lqg_kf_lgs, lqg_kf_multi, lqg_multirate, lqg_mult
 from wfsobs.control.mirror import Plant
 from wfsobs.control.prediction import gpr_offline_ahead, gpr_online_ahead, step_gpr_offline_ahead, step_gpr_online_ahead
 from wfsobs.observers.base import Look
-from wfsobs.prior import Bands, Beams, LgsError, LgsStars, Lines, Model, Part, Prior, Spectra, Training
+from wfsobs.observers.kalman.multirate import matched_noise
+from wfsobs.prior import (
+    Bands,
+    Beams,
+    LgsError,
+    LgsModel,
+    LgsStars,
+    Lines,
+    NoiselessModel,
+    OnlineBands,
+    Part,
+    Prior,
+    Spectra,
+    Training,
+)
 from wfsobs.registry import Registry
 
 
@@ -32,6 +46,11 @@ def _gain_and_scale(settings: Any) -> tuple[Part, ...]:
     """Beside the gain, standardised inputs are divided by the deviations of a training record."""
     scale = (Training,) if settings.gpr_online.inputs_filter == "standardised" else ()
     return (*_gain(settings), *scale)
+
+
+def _matched_noise(settings: Any) -> tuple[Part, ...]:
+    """Return the noise of both sensors, where it is not that of the settings."""
+    return matched_noise(settings.multirate)
 
 
 def _online_seconds(settings: Any, n_steps: int, n_modes: int) -> float:
@@ -60,7 +79,7 @@ CONTROLLERS = Registry(
             "LQG, LGS KF",
             lqg_kf_lgs,
             help="minus what the LGS Kalman filter predicts",
-            prior=(Model, LgsStars),
+            prior=(LgsModel, LgsStars),
             look=Look("LQG LGS KF", "#FF6600", "#FF8533"),
         ),
         Controller(
@@ -77,7 +96,8 @@ CONTROLLERS = Registry(
             "LQG, multi-rate KF",
             lqg_multirate,
             help="minus what the paper's multi-rate filter predicts",
-            prior=(Model, LgsStars),
+            prior=(NoiselessModel, LgsStars),
+            asks=_matched_noise,
             settings=("multirate",),
             ngs=True,
             look=Look("LQG multi-rate", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
@@ -87,7 +107,8 @@ CONTROLLERS = Registry(
             "LQG, optimal multi-rate KF",
             lqg_multirate_optimal,
             help="minus what the optimal multi-rate filter predicts",
-            prior=(Model, LgsError, LgsStars),
+            prior=(NoiselessModel, LgsError, LgsStars),
+            asks=_matched_noise,
             settings=("multirate",),
             ngs=True,
             look=Look("LQG optimal", "#7A1FA2", "#C9A0FF", (3, 2)),
@@ -97,7 +118,8 @@ CONTROLLERS = Registry(
             "LQG, multi-rate multi-peak KF",
             lqg_multirate_multi,
             help="minus what the optimal multi-rate filter of every peak predicts",
-            prior=(Model, LgsStars, Lines, Beams),
+            prior=(LgsStars, Lines, Beams),
+            asks=_matched_noise,
             settings=("multirate", "multipeak"),
             ngs=True,
             look=Look("LQG opt. peaks", "#B40000", "#FF7A70", (8, 3)),
@@ -122,7 +144,7 @@ CONTROLLERS = Registry(
             predict=gpr_online_ahead,
             step_predict=step_gpr_online_ahead,
             help="the same with the online GPR, one sample at a time",
-            prior=(Bands,),
+            prior=(OnlineBands,),
             settings=("control", "gpr_online"),
             asks=_gain_and_scale,
             weight=200.0,

@@ -67,7 +67,7 @@ def lqg_kf_multi(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
 def lqg_multirate(prior: Prior, mode: int, plant: Plant, settings: Any) -> Law:
     """With the paper's multi-rate filter. Raises UnstableCycle."""
     known = prior.model[mode]
-    model, noise = known.disturbance(), multirate_noise(settings.multirate, known)
+    model, noise = known.disturbance(), multirate_noise(settings.multirate, prior.noise_of(mode))
     found = multirate_mode(model, plant.ratio, *noise)._replace(mean=lgs_mean(prior, mode))
     return _two_sensors(found, _rows_of(model, plant.mirror))
 

@@ -58,7 +58,7 @@ def exact_errors(
         The observer is not of that kind, or the scenario has no such prior.
     """
     settings = observer_settings(observer, scenario)
-    parts = (*observer.prior, *observer.asks(settings))
+    parts = observer.parts(settings)
     if not observer.linear or observer.couples_modes or not observer.causal or "training" in observer.needs:
         raise ValueError(
             f"{observer.id}: the exact error is that of an observer that is linear, causal and needs no training record, "

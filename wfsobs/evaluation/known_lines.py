@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from wfsobs.observers import OBSERVERS
-from wfsobs.prior import Bands, Lines, Model
+from wfsobs.prior import Bands, Lines, Model, asks_for
 from wfsobs.priors_from.scenario import modelled_peak
 from wfsobs.scenario import Scenario
 from wfsobs.typing import Array
@@ -21,9 +21,9 @@ def given_lines(scenario: Scenario, observer: str, column: int, lines: Sequence[
     prior = OBSERVERS[observer].prior
     if Lines in prior or not lines:
         return lines
-    if Model in prior:
+    if asks_for(Model, prior):
         return [modelled_peak(scenario, column)[0]]
-    return scenario.butterworth.frequencies if Bands in prior else ()
+    return scenario.butterworth.frequencies if asks_for(Bands, prior) else ()
 
 
 def is_near(frequency: Array, lines: Sequence[float]) -> Array:

@@ -189,7 +189,8 @@ class Theory:
         return self._memory.keep(f"response {name}, {target}", Identity(h), lambda: np.fft.rfft(h, n))
 
     def _prior(self, observer: Observer, scenario: Scenario, mode: int) -> Prior:
-        cheap = [part for part in observer.prior if part not in (Lines, Beams, LgsError, LgsStars)]
+        parts = observer.parts(observer_settings(observer, scenario))
+        cheap = [part for part in parts if part not in (Lines, Beams, LgsError, LgsStars)]
         prior = prior_of(scenario, None, cheap, modes=[mode])
         if Beams in observer.prior:  # where its turbulence is
             prior = replace(prior, lines=(lines_of(scenario, mode, turbulence=()),))

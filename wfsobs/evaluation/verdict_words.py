@@ -11,7 +11,7 @@ from wfsobs.evaluation.budget import CONE, LAG, LINES, MISMATCH, NOISE
 from wfsobs.evaluation.rows import row_label
 from wfsobs.evaluation.scores import BOUND_ASTERISM, BOUND_BOTH, BOUND_BOTH_MODES, BOUND_MODES
 from wfsobs.observers import OBSERVERS
-from wfsobs.prior import Bands, Lines, Model, Part, Training
+from wfsobs.prior import Bands, Lines, Model, Part, Training, asks_for
 
 if TYPE_CHECKING:
     from wfsobs.evaluation.verdict import Harm, Verdict
@@ -45,7 +45,7 @@ CAUSES = {
 def told_of(observer: str, lines: int) -> str:
     """Return what an observer is told, as a phrase."""
     prior = OBSERVERS[observer].prior
-    words = next((words for part, words in TOLD if part in prior), "nothing")
+    words = next((words for part, words in TOLD if asks_for(part, prior)), "nothing")
     return words.format(n=lines).replace("all 1 lines", "the one line").replace("all 0 lines", "a model")
 
 

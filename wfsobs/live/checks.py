@@ -68,7 +68,7 @@ def can_run(observer: str, source: LiveSource, scenario: Scenario) -> bool:
 
 def learns_beforehand(observer: Observer, scenario: Scenario) -> bool:
     """Return whether an observer is made from a training record."""
-    return Training in (*observer.prior, *observer.asks(observer_settings(observer, scenario)))
+    return Training in observer.parts(observer_settings(observer, scenario))
 
 
 def check_speed(speed: float) -> float:

@@ -75,10 +75,6 @@ PLAIN = Look(dash=(4, 2))
 """Default look."""
 
 
-def _nothing(_settings: Group | None) -> tuple[Part, ...]:
-    return ()
-
-
 @dataclass(frozen=True)
 class Observer:
     """An observer in the registry.
@@ -123,6 +119,8 @@ class Observer:
         Line in figures.
     step : callable or None
         (prior, settings, sampling, horizon) -> its estimator, one frame at a time (`wfsobs.observers.step`); None without one.
+    counts : callable or None
+        (prior, settings) -> what of its settings its estimates depend on, as plain values; None for all that have an effect.
     """
 
     id: str
@@ -134,7 +132,7 @@ class Observer:
     prior: tuple[Part, ...] = ()
     settings: Section | str | None = None
     needs: tuple[str, ...] = ()
-    asks: Callable[[Any], tuple[Part, ...]] = _nothing
+    asks: Callable[[Any], tuple[Part, ...]] = lambda _settings: ()
     causal: bool = True
     linear: bool = False
     couples_modes: bool = False
@@ -145,6 +143,16 @@ class Observer:
     seconds: Callable[[Any, int, int, float], float] | None = None
     look: Look = PLAIN
     step: MakeEstimator | None = None
+    counts: Callable[[Prior, Any], Any] | None = None
+
+    def parts(self, settings: Any) -> tuple[Part, ...]:
+        """Return what it needs beside measurements for these settings."""
+        return (*self.prior, *self.asks(settings))
+
+    def measurements(self, record: Record) -> Measurements:
+        """Return copies of what it receives of a record: the measurements of its sensors, and what it needs besides."""
+        sensors = (*self.sensors, "ngs") if "y_ngs" in self.needs else self.sensors
+        return record.measurements("open_loop_y" in self.needs, sensors)
 
     def missing(self, record: Record) -> tuple[str, ...]:
         """Return the needed fields that a record does not have."""

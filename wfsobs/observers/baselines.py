@@ -14,7 +14,7 @@ import numpy as np
 
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.step_checks import StepError
-from wfsobs.prior import Bands, Prior
+from wfsobs.prior import Bands, OfflineBands, OnlineBands, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.bandpass import bandpass_bank, bank_recursion, filter_causal, filter_zero_phase
@@ -162,7 +162,7 @@ BUTTERWORTH_OL = Observer(
     (VIBRATION,),
     butterworth_ol,
     help="band-passes forward and backward: a reference, looks ahead",
-    prior=(Bands,),
+    prior=(OfflineBands,),
     needs=("open_loop_y",),
     causal=False,
     linear=True,
@@ -176,7 +176,7 @@ BUTTERWORTH_CL = Observer(
     (VIBRATION,),
     butterworth_cl,
     help="the same bands, causal",
-    prior=(Bands,),
+    prior=(OnlineBands,),
     linear=True,
     tunable=Tunable(("butterworth.bandwidth_online",), ("butterworth.order",)),
     look=Look("Butterworth CL", "#B40000", "#FF7A70", (8, 3)),

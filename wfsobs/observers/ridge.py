@@ -18,7 +18,7 @@ from wfsobs.observers.gpr.offline import OFFLINE, OfflineGpr, training_targets
 from wfsobs.observers.per_mode import over_modes
 from wfsobs.observers.step_checks import whole_frames
 from wfsobs.observers.windows import LinearPredictor, Windows
-from wfsobs.prior import Bands, Prior, Training
+from wfsobs.prior import OfflineBands, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, pseudo_open_loop
 from wfsobs.signal.linalg import eliminate, solve_rows
@@ -140,7 +140,7 @@ RIDGE = Observer(
     (VIBRATION,),
     ridge,
     help="linear limit of the offline GPR: what its kernel becomes for a long length scale",
-    prior=(Training, Bands),
+    prior=(Training, OfflineBands),
     settings=OFFLINE,
     needs=("training",),
     linear=True,
@@ -160,7 +160,7 @@ RIDGE_30 = Observer(
     (VIBRATION,),
     ridge_30,
     help="plain least squares on 30 measurements z: the honest baseline",
-    prior=(Training, Bands),
+    prior=(Training, OfflineBands),
     needs=("training",),
     linear=True,
     tunable=Tunable(("butterworth.bandwidth_offline",), ("butterworth.order",)),

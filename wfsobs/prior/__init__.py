@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from wfsobs.prior.parts import Asterism, Bands, Beams, Flow, FlowOfBoth, LgsError, LgsStars, Line, Lines, Model, Spectra
+from wfsobs.prior.parts import Asterism, Beams, Flow, FlowOfBoth, LgsError, LgsStars, Line, Lines, Spectra
+from wfsobs.prior.shares import Bands, LgsModel, Model, NgsModel, Noise, NoiselessModel, OfflineBands, OnlineBands
 from wfsobs.record import Training
 
 __all__ = [
@@ -19,15 +20,22 @@ __all__ = [
     "Flow",
     "FlowOfBoth",
     "LgsError",
+    "LgsModel",
     "LgsStars",
     "Line",
     "Lines",
     "Model",
+    "NgsModel",
+    "Noise",
+    "NoiselessModel",
+    "OfflineBands",
+    "OnlineBands",
     "Part",
     "Prior",
     "PriorSource",
     "Spectra",
     "Training",
+    "asks_for",
     "words_for",
 ]
 
@@ -42,6 +50,7 @@ GIVEN: PriorSource = "given"
 
 Part = (
     type[Model]
+    | type[Noise]
     | type[LgsError]
     | type[LgsStars]
     | type[Lines]
@@ -57,6 +66,10 @@ Part = (
 
 _WORDS: dict[Part, tuple[str, ...]] = {
     Model: ("model",),
+    LgsModel: ("model",),
+    NgsModel: ("model",),
+    NoiselessModel: ("model",),
+    Noise: ("model",),
     LgsError: ("model",),
     LgsStars: (),
     Lines: ("model", "{source} lines"),
@@ -65,6 +78,8 @@ _WORDS: dict[Part, tuple[str, ...]] = {
     FlowOfBoth: ("model",),
     Asterism: ("model",),
     Bands: ("bands",),
+    OfflineBands: ("bands",),
+    OnlineBands: ("bands",),
     Spectra: ("{source} spectra",),
     Training: ("training data",),
 }
@@ -80,11 +95,20 @@ def words_for(parts: Iterable[Part], *, source: PriorSource = TRUE) -> tuple[str
     return tuple(dict.fromkeys(word.format(source=source) for part in parts for word in _WORDS[part]))
 
 
+def asks_for(part: Part, parts: Iterable[Part]) -> bool:
+    """Return whether a part is among others, whole or as much of it as somebody needs.
+
+    >>> asks_for(Model, (Lines, LgsModel)), asks_for(LgsModel, (Model,))
+    (True, False)
+    """
+    return any(issubclass(one, part) for one in parts)
+
+
 @dataclass(frozen=True)
 class Prior:
     """The parts that an observer or a controller asked for, empty or None where it did not.
 
-    model, lgs_error, stars, lines, beams, spectra : one per mode
+    model, noise, lgs_error, stars, lines, beams, spectra : one per mode
     flow, asterism, bands : of all modes; asterism of every LGS, or of all of them together
     training : a record to learn from
     """
@@ -99,3 +123,8 @@ class Prior:
     bands: Bands | None = None
     spectra: tuple[Spectra, ...] = ()
     training: Training | None = None
+    noise: tuple[Noise, ...] = ()
+
+    def noise_of(self, mode: int) -> Noise | Model:
+        """Return what tells the noise of one mode: the noise alone, or the model."""
+        return (self.noise or self.model)[mode]

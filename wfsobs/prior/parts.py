@@ -19,28 +19,6 @@ from wfsobs.signal.wiener import Complex
 from wfsobs.typing import Array
 
 
-@dataclass(frozen=True)
-class Model:
-    """The model of one mode with one vibration peak (paper, eq. 1, 2 and 7).
-
-    turbulence, vibration : the processes, sampled at the fast step unless moved by `at`
-    lgs_noise, ngs_noise  : rms of the white noise of the LGS together in a step, and of an NGS frame [um]
-    """
-
-    turbulence: Ar2
-    vibration: Ar2
-    lgs_noise: float
-    ngs_noise: float
-
-    def at(self, dt: float) -> Model:
-        """Return the same processes sampled every `dt` [s]."""
-        return Model(self.turbulence.at(dt), self.vibration.at(dt), self.lgs_noise, self.ngs_noise)
-
-    def disturbance(self) -> DisturbanceModel:
-        """Return the state-space model of the two processes."""
-        return disturbance_model([self.turbulence], [self.vibration])
-
-
 class LgsError(NamedTuple):
     """The slow error of the LGS together in one mode, as a process at the fast step."""
 
@@ -121,20 +99,6 @@ class Beams:
     lgs: tuple[Ar2 | Ar3, ...] = ()
     gain: float = 1.0
     line_gain: float = 1.0
-
-
-@dataclass(frozen=True)
-class Bands:
-    """Where the vibration of every mode is: the Butterworth bank of the paper (section 2.3).
-
-    frequencies : centres [Hz]; bandwidth_offline, bandwidth_online : widths on open-loop and closed-loop data [Hz]
-    order       : of each band-pass
-    """
-
-    frequencies: tuple[float, ...]
-    bandwidth_offline: float
-    bandwidth_online: float
-    order: int
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from wfsobs.prior import Bands, Beams, LgsError, Lines, Model, Part, Prior
+from wfsobs.prior import Bands, Beams, LgsError, Lines, Model, Noise, Part, Prior
 from wfsobs.priors_from import scenario as priors
 from wfsobs.scenario import Scenario
 
@@ -31,7 +31,7 @@ def told_by(model: Scenario | Identification, scenario: Scenario) -> Scenario:
     return out
 
 
-KNOWN: tuple[Part, ...] = (Model, LgsError, Lines, Beams, Bands)
+KNOWN: tuple[Part, ...] = (Model, Noise, LgsError, Lines, Beams, Bands)
 """What an identification tells."""
 
 
@@ -49,4 +49,5 @@ def prior_of(identification: Identification, parts: Iterable[Part] = KNOWN, scen
         replace(one, common=mode.target.turbulence, lgs=(e,) if e else one.lgs)
         for one, mode, e in zip(prior.beams, modes, errors, strict=False)
     )
-    return replace(prior, model=prior.model[:n], lgs_error=lgs_error, lines=lines, beams=beams, spectra=prior.spectra[:n])
+    whole = {part: getattr(prior, part)[:n] for part in ("model", "noise", "spectra")}
+    return replace(prior, lgs_error=lgs_error, lines=lines, beams=beams, **whole)

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from math import sqrt
 from types import MappingProxyType
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,10 +19,16 @@ from wfsobs.prior import (
     Flow,
     FlowOfBoth,
     LgsError,
+    LgsModel,
     LgsStars,
     Line,
     Lines,
     Model,
+    NgsModel,
+    Noise,
+    NoiselessModel,
+    OfflineBands,
+    OnlineBands,
     Part,
     Prior,
     Spectra,
@@ -39,6 +46,8 @@ from wfsobs.signal.statespace import MIN_MODEL_DAMPING, DisturbanceModel
 from wfsobs.simulation.disturbance import vibration_lines, vibration_variance
 from wfsobs.simulation.true_spectra import TrueSpectra, has_known_spectra, true_spectra
 
+T = TypeVar("T", Model, Bands)
+
 PriorParts = dict[Part, Prior]
 """Parts of a prior that several observers of one record and scenario are told; they cannot be changed."""
 
@@ -50,8 +59,7 @@ def arguments(
 
     known_parts : as in `prior_and_settings`. Raises ValueError where the scenario has no such prior.
     """
-    measurements = record.measurements(open_loop="open_loop_y" in observer.needs)
-    return measurements, *prior_and_settings(observer, record, scenario, known_parts)
+    return observer.measurements(record), *prior_and_settings(observer, record, scenario, known_parts)
 
 
 def prior_and_settings(
@@ -64,7 +72,7 @@ def prior_and_settings(
     Raises ValueError where the scenario has no such prior.
     """
     settings = observer_settings(observer, scenario)
-    parts = (*observer.prior, *observer.asks(settings))
+    parts = observer.parts(settings)
     if known_parts is None:
         return prior_of(scenario, record, parts), settings
     for part in parts:
@@ -75,7 +83,15 @@ def prior_and_settings(
 
 
 SHARED: Mapping[Part, str] = MappingProxyType(
-    {Model: "model", LgsError: "lgs_error", Lines: "lines", Beams: "beams", Bands: "bands", LgsStars: "stars"}
+    {
+        **dict.fromkeys((Model, LgsModel, NgsModel, NoiselessModel), "model"),
+        **dict.fromkeys((Bands, OfflineBands, OnlineBands), "bands"),
+        Noise: "noise",
+        LgsError: "lgs_error",
+        Lines: "lines",
+        Beams: "beams",
+        LgsStars: "stars",
+    }
 )
 """Parts that hold no arrays -> where they stand in a prior."""
 
@@ -100,15 +116,17 @@ def prior_of(
     if modes is None:
         modes = range(record.n_modes if record else len(scenario.modes))
     dt = record.dt if record else scenario.dt
+    model, bands = _most_of(Model, asked), _most_of(Bands, asked)
     return Prior(
-        model=tuple(model_of(scenario, mode, dt) for mode in modes) if Model in asked else (),
+        model=tuple(model_of(scenario, mode, dt, model) for mode in modes) if model else (),
+        noise=tuple(Noise(*measurement_noise(scenario, mode)) for mode in modes) if Noise in asked else (),
         lgs_error=tuple(lgs_error_of(scenario, mode, dt) for mode in modes) if LgsError in asked else (),
         lines=tuple(lines_of(scenario, mode, dt) for mode in modes) if Lines in asked else (),
         stars=tuple(stars_of(scenario, mode, dt) for mode in modes) if LgsStars in asked else (),
         beams=tuple(beams_of(scenario, mode, dt) for mode in modes) if Beams in asked else (),
         flow=flow_of(scenario, len(modes), dt) if Flow in asked else None,
         asterism=_asterism(asked, scenario, len(modes), dt),
-        bands=bands_of(scenario) if Bands in asked else None,
+        bands=bands_of(scenario, bands) if bands else None,
         spectra=tuple(spectra or [spectra_of(scenario, mode) for mode in modes]) if Spectra in asked else (),
         training=record.training.copy() if Training in asked and record and record.training else None,
     )
@@ -120,10 +138,16 @@ def _asterism(parts: Collection[Part], scenario: Scenario, n_modes: int, dt: flo
     return flow_of_both(scenario, n_modes, dt) if FlowOfBoth in parts else None
 
 
-def bands_of(scenario: Scenario) -> Bands:
-    """Return the bands of the vibration."""
+def _most_of(kind: type[T], parts: Collection[Part]) -> type[T] | None:
+    """Return what is asked of a kind of part: the whole, where two ask for different shares of it."""
+    found = [part for part in parts if issubclass(part, kind)]
+    return found[0] if len(found) == 1 else kind if found else None
+
+
+def bands_of(scenario: Scenario, kind: type[Bands] = Bands) -> Bands:
+    """Return the bands of the vibration; kind : as much of them."""
     b = scenario.butterworth
-    return Bands(tuple(b.frequencies), b.bandwidth_offline, b.bandwidth_online, b.order)
+    return kind(tuple(b.frequencies), b.bandwidth_offline, b.bandwidth_online, b.order)
 
 
 def spectra_of(scenario: Scenario, mode: int) -> Spectra:
@@ -145,9 +169,9 @@ def told_spectra(spectra: TrueSpectra) -> Spectra:
 # ---------------------------------------------------------------------- one vibration peak
 
 
-def model_of(scenario: Scenario, mode: int, dt: float | None = None) -> Model:
-    """Return the model of one mode with one peak; dt [s]: by default that of the scenario."""
-    return Model(*modelled_processes(scenario, mode, dt or scenario.dt), *measurement_noise(scenario, mode))
+def model_of(scenario: Scenario, mode: int, dt: float | None = None, kind: type[Model] = Model) -> Model:
+    """Return the model of one mode with one peak; dt [s]: by default that of the scenario; kind : as much of it."""
+    return kind(*modelled_processes(scenario, mode, dt or scenario.dt), *measurement_noise(scenario, mode))
 
 
 def modelled_processes(scenario: Scenario, mode: int, dt: float) -> tuple[Ar2, Ar2]:

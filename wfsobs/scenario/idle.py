@@ -96,6 +96,8 @@ def _across(scenario: Scenario) -> Iterator[tuple[str, str]]:
         yield "sensors.lgs_low_frequency_rms", "Used only where Source of turbulence is not frozen-flow"
         if s.lgs_radius == 0:
             yield "sensors.lgs_angle", "Used only where LGS asterism, radius is above 0"
+    if scenario.turbulence.source == "none":
+        yield "sensors.tip_tilt_indetermination", "Used only where there is turbulence"
     if s.noise_from == "nm" and not (flow and s.kind == "shack-hartmann"):
         yield "sensors.lenslets", "Used only by Shack-Hartmann sensors in frozen flow, and for noise from photons"
     if scenario.kalman.peak == "matched" and _every_mode_has_a_line(scenario):

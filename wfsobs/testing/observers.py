@@ -56,7 +56,7 @@ def check_observer(observer: Observer, scenario: Scenario | None = None, alone: 
     _check_shapes(observer, base, given[0])
     again = arguments(observer, record, s)
     _compare(observer, observer.estimate(*again), base, "run twice on the same measurements it gives two results", exact=True)
-    _check_untouched(observer, given[0], record.measurements("open_loop_y" in observer.needs))
+    _check_untouched(observer, given[0], observer.measurements(record))
     if observer.causal:
         _check_causal(observer, given, base)
     _check_gaps(observer, given)

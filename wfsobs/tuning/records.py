@@ -120,7 +120,7 @@ def cut_record(record: Record, scenario: Scenario, observer: str, target: str) -
     """
     target, against = judged_by(record, observer, target)
     entry = OBSERVERS[observer]
-    learns = Training in (*entry.prior, *entry.asks(observer_settings(entry, scenario)))
+    learns = Training in entry.parts(observer_settings(entry, scenario))
     cuts = _cuts(record, scenario, learns and record.training is None)
     training, validation, test = (piece(record, start, stop) for start, stop in cuts)
     known = record.training or (Training(training.y_lgs, training.u, training.open_loop_y) if learns else None)

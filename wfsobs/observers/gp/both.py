@@ -11,7 +11,7 @@ from wfsobs.observers.gp.lgs import GP, GaussianProcess, kernels_of, measured_la
 from wfsobs.observers.kalman.multirate import MultiRate
 from wfsobs.observers.kalman.multirate_optimal import Cycle, OptimalFilters, optimal_model
 from wfsobs.observers.kalman.single import NGS
-from wfsobs.prior import LgsError, LgsStars, Lines, Model, Prior
+from wfsobs.prior import LgsError, LgsStars, Lines, Noise, Prior
 
 
 def cycle_of(settings: GaussianProcess, prior: Prior, mode: int, ratio: int) -> Cycle:
@@ -29,7 +29,7 @@ GP_BOTH = Observer(
     TARGETS,
     _FILTERS.run,
     help="that of `gp-lgs` on both sensors; not in the paper",
-    prior=(Model, LgsError, LgsStars, Lines),
+    prior=(Noise, LgsError, LgsStars, Lines),
     settings=GP,
     needs=NGS,
     linear=True,

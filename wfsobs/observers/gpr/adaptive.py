@@ -16,7 +16,7 @@ from wfsobs.observers.base import VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.gpr.adaptive_step import AdaptiveGprEstimator, Schedule, schedule_of
 from wfsobs.observers.gpr.learning import learn, nothing_learnt
-from wfsobs.observers.kalman.adaptive import ADAPTIVE, Adaptive
+from wfsobs.observers.kalman.adaptive import ADAPTIVE, Adaptive, identification_settings
 from wfsobs.observers.step_checks import whole_frames
 from wfsobs.prior import Prior
 from wfsobs.progress import Watch
@@ -85,4 +85,5 @@ GPR_ADAPTIVE = Observer(
     seconds=seconds,
     look=Look("Adaptive GPR", "#3D6B00", "#B7F06A", (20, 2, 2, 2), width=1.8),
     step=step_gpr_adaptive,
+    counts=lambda prior, settings: (*identification_settings(prior, settings), settings.depth),
 )

@@ -20,7 +20,7 @@ from wfsobs.observers.gpr.trained import TrainedGpr, train
 from wfsobs.observers.per_mode import over_modes, turns
 from wfsobs.observers.step_checks import whole_frames
 from wfsobs.observers.windows import Windows
-from wfsobs.prior import Bands, Prior
+from wfsobs.prior import Bands, OfflineBands, Prior
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import DELAY, Measurements, RecordError, Sampling, Training, pseudo_open_loop
 from wfsobs.settings import Section
@@ -136,7 +136,7 @@ GPR_OFFLINE = Observer(
     (VIBRATION,),
     gpr_offline,
     help="Gaussian process regression trained on another record",
-    prior=(Training, Bands),
+    prior=(Training, OfflineBands),
     settings=OFFLINE,
     needs=("training",),
     # The mean depends on sigma_n / sigma_SE and l only: sigma_SE stays.

@@ -20,7 +20,7 @@ from wfsobs.observers.gpr.sliding import finish, run_lengths, slide
 from wfsobs.observers.per_mode import over_modes, turns
 from wfsobs.observers.step_checks import whole_frames
 from wfsobs.observers.windows import Windows
-from wfsobs.prior import Bands, Part, Prior, Training
+from wfsobs.prior import Bands, OnlineBands, Part, Prior, Training
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, Signals
 from wfsobs.settings import Real, Section, Whole
@@ -176,7 +176,7 @@ GPR_ONLINE = Observer(
     (VIBRATION,),
     gpr_online,
     help="trained anew at every step on the last windows",
-    prior=(Bands,),
+    prior=(OnlineBands,),
     settings=Section("gpr_online", "Online GPR", OnlineGpr),
     asks=standardised_parts,
     # Its targets are what the causal band-passes make of turbulence, too.

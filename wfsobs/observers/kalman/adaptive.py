@@ -142,6 +142,12 @@ def seconds(settings: Adaptive, n_steps: int, n_modes: int, dt: float) -> float:
 
 ADAPTIVE = Section("adaptive", "Adaptive Kalman filter", Adaptive)
 
+
+def identification_settings(_prior: Prior, settings: Adaptive) -> tuple[float, ...]:
+    """Return what identifications of windows depend on."""
+    return settings.window, settings.interval, settings.peak_count, settings.lowest
+
+
 KF_ADAPTIVE = Observer(
     "kf-adaptive",
     "Adaptive KF",
@@ -155,4 +161,5 @@ KF_ADAPTIVE = Observer(
     seconds=seconds,
     look=Look("Adaptive KF", "#E0006E", "#FF7AB8", (20, 2), width=1.8),
     step=step_kf_adaptive,
+    counts=identification_settings,
 )

@@ -15,7 +15,7 @@ from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.asterism_model import AsterismModel
 from wfsobs.observers.kalman.joint_run import run_joint
 from wfsobs.observers.kalman.joint_step import JointEstimator
-from wfsobs.observers.kalman.multi import PEAKS, MultiPeak
+from wfsobs.observers.kalman.multi import PEAKS, MultiPeak, vibration_used
 from wfsobs.prior import Asterism, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
@@ -69,4 +69,5 @@ KF_ASTERISM = Observer(
     tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
     look=Look("Asterism", "#4E342E", "#BCAAA4", (8, 2, 2, 2), in_figures=False),
     step=step_kf_asterism,
+    counts=vibration_used,
 )

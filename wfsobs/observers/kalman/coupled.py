@@ -20,7 +20,7 @@ from scipy.linalg import block_diag
 from wfsobs.observers.base import TARGETS, TURBULENCE, VIBRATION, Look, Observer, Tunable
 from wfsobs.observers.estimates import NEXT_Z, TOTAL, Estimates
 from wfsobs.observers.kalman.mode_filter import ModeFilter
-from wfsobs.observers.kalman.multi import PEAKS, MultiPeak, independent_filters
+from wfsobs.observers.kalman.multi import PEAKS, MultiPeak, independent_filters, vibration_used
 from wfsobs.observers.kalman.step import KalmanEstimator, matrix_power
 from wfsobs.prior import Flow, Lines, Prior
 from wfsobs.progress import Watch
@@ -241,4 +241,5 @@ KF_COUPLED = Observer(
     tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
     look=Look("Coupled", "#004D40", "#80CBC4", (10, 2, 2, 2), in_figures=False),
     step=step_kf_coupled,
+    counts=vibration_used,
 )

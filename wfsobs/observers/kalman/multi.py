@@ -14,6 +14,7 @@ from wfsobs.prior import LgsStars, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.settings import Group, Real, Section, Whole
+from wfsobs.signal.ar2 import Ar2
 
 
 class MultiPeak(Group):
@@ -45,6 +46,11 @@ def independent_filters(prior: Prior, settings: MultiPeak) -> list[ModeFilter]:
     return [one._replace(mean=lgs_mean(prior, mode)) for mode, one in enumerate(found)]
 
 
+def vibration_used(prior: Prior, settings: MultiPeak) -> list[list[Ar2]]:
+    """Return the vibration of every mode as it is modelled: a minimum below the width of every line is none."""
+    return [one.vibration(settings.line_width) for one in prior.lines]
+
+
 def step_kf_multi(prior: Prior, settings: MultiPeak, _sampling: Sampling, _horizon: float) -> KalmanEstimator:
     """Return the filters of all modes, one frame at a time."""
     return KalmanEstimator(independent_filters(prior, settings))
@@ -65,4 +71,5 @@ KF_MULTI = Observer(
     tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
     look=Look("Multi-peak", "#00707F", "#4DD0E1", (14, 3)),
     step=step_kf_multi,
+    counts=vibration_used,
 )

@@ -24,7 +24,7 @@ from wfsobs.observers.kalman.single import MODEL, NGS
 from wfsobs.observers.kalman.spread import by_target
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.kalman.with_gaps import run_frames
-from wfsobs.prior import LgsStars, Model, Prior
+from wfsobs.prior import LgsStars, Model, Noise, NoiselessModel, Part, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.settings import Group, Real, Section
@@ -80,10 +80,15 @@ class UnstableCycle(ValueError):
     """Two gains, each stable, that make an unstable cycle."""
 
 
-def multirate_noise(settings: MultiRate, model: Model) -> tuple[float, float]:
-    """Square roots of r_LGS and r_NGS [um] in one mode: those of the settings, or of the model."""
+def multirate_noise(settings: MultiRate, noise: Model | Noise) -> tuple[float, float]:
+    """Square roots of r_LGS and r_NGS [um] in one mode: those of the settings, or as told."""
     own = settings.measurement_noise == "manual"
-    return (settings.lgs_noise, settings.ngs_noise) if own else (model.lgs_noise, model.ngs_noise)
+    return (settings.lgs_noise, settings.ngs_noise) if own else (noise.lgs_noise, noise.ngs_noise)
+
+
+def matched_noise(settings: MultiRate) -> tuple[Part, ...]:
+    """Return the noise, where it is not that of the settings."""
+    return () if settings.measurement_noise == "manual" else (Noise,)
 
 
 @dataclass(frozen=True)
@@ -168,7 +173,8 @@ def multirate(measurements: Measurements, prior: Prior, settings: MultiRate, wat
 
 def _filters(prior: Prior, settings: MultiRate, ratio: int) -> list[ModeFilter]:
     """Return the filters of all modes."""
-    found = [multirate_mode(known.disturbance(), ratio, *multirate_noise(settings, known)) for known in prior.model]
+    noises = noise_used(prior, settings)
+    found = [multirate_mode(one.disturbance(), ratio, *noise) for one, noise in zip(prior.model, noises, strict=True)]
     return [one._replace(mean=lgs_mean(prior, mode)) for mode, one in enumerate(found)]
 
 
@@ -183,6 +189,11 @@ def multirate_mode(model: DisturbanceModel, ratio: int, lgs_noise: float, ngs_no
     return ModeFilter(model, gains, tuple(multirate_posteriors(model, gains, lgs_noise, ngs_noise)), cycle)
 
 
+def noise_used(prior: Prior, settings: MultiRate) -> list[tuple[float, float]]:
+    """Return the noise of both sensors in every mode."""
+    return [multirate_noise(settings, prior.noise_of(mode)) for mode in range(len(prior.model))]
+
+
 def step_multirate(prior: Prior, settings: MultiRate, sampling: Sampling, _horizon: float) -> KalmanEstimator:
     """Return the filters of all modes, one frame at a time."""
     assert sampling.ratio is not None
@@ -195,7 +206,8 @@ MULTIRATE = Observer(
     (TURBULENCE,),
     multirate,
     help="LGS at every step, NGS at every n-th, two gains",
-    prior=(Model, LgsStars),
+    prior=(NoiselessModel, LgsStars),
+    asks=matched_noise,
     settings=RATES,
     needs=NGS,
     linear=True,
@@ -204,4 +216,5 @@ MULTIRATE = Observer(
     tunable=TUNABLE,
     look=Look("Multi-rate KF", "#E31FFF", "#F08BFF", (10, 2, 2, 2)),
     step=step_multirate,
+    counts=noise_used,
 )

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, Estimates, Look, Observer, Tunable
-from wfsobs.observers.kalman.adaptive import ADAPTIVE, Adaptive
+from wfsobs.observers.kalman.adaptive import ADAPTIVE, Adaptive, identification_settings
 from wfsobs.observers.kalman.both_window import (
     BothModel,
     Lengths,
@@ -141,4 +141,5 @@ MULTIRATE_ADAPTIVE = Observer(
     seconds=seconds,
     look=Look("Adaptive multi-rate", "#9A0048", "#FF9FC4", (20, 2, 3, 2), width=1.8),
     step=step_multirate_adaptive,
+    counts=lambda prior, settings: (*identification_settings(prior, settings), settings.longest),
 )

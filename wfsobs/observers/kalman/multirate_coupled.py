@@ -14,7 +14,7 @@ from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.kalman.asterism_model import AsterismModel
 from wfsobs.observers.kalman.joint_run import run_joint
 from wfsobs.observers.kalman.joint_step import JointEstimator
-from wfsobs.observers.kalman.multi import PEAKS, MultiPeak
+from wfsobs.observers.kalman.multi import PEAKS, MultiPeak, vibration_used
 from wfsobs.observers.kalman.single import NGS
 from wfsobs.prior import FlowOfBoth, Lines, Prior
 from wfsobs.progress import Watch
@@ -68,4 +68,5 @@ MULTIRATE_COUPLED = Observer(
     tunable=Tunable(("multipeak.line_width", "kalman.lgs_noise"), ("multipeak.turbulence_order", "kalman.turbulence_rms")),
     look=Look("Coupled, both", "#33691E", "#AED581", (10, 2, 4, 2), in_figures=False),
     step=step_multirate_coupled,
+    counts=vibration_used,
 )

@@ -14,11 +14,11 @@ from functools import partial
 import numpy as np
 
 from wfsobs.observers.base import TARGETS, Look, Observer, Tunable
-from wfsobs.observers.kalman.multi import PEAKS, MultiPeak
+from wfsobs.observers.kalman.multi import PEAKS, MultiPeak, vibration_used
 from wfsobs.observers.kalman.multirate import MultiRate, multirate_noise
 from wfsobs.observers.kalman.multirate_optimal import Cycle, OptimalFilters, estimated_cycle
 from wfsobs.observers.kalman.single import NGS
-from wfsobs.prior import Beams, LgsStars, Lines, Model, Prior
+from wfsobs.prior import Beams, LgsStars, Lines, Noise, Prior
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.ar3 import Ar3
 from wfsobs.signal.statespace import DisturbanceModel, disturbance_model
@@ -28,7 +28,7 @@ def every_peak_model(rates: MultiRate, peaks: MultiPeak, prior: Prior, mode: int
     """Return the cycle of one mode with every peak of the vibration in its model."""
     beams = prior.beams[mode]
     error = beams.lgs if rates.model_lgs_error else ()
-    noises = multirate_noise(rates, prior.model[mode])
+    noises = multirate_noise(rates, prior.noise_of(mode))
     return estimated_cycle(beam_model(beams, prior.lines[mode].vibration(peaks.line_width)), ratio, *noises, error)
 
 
@@ -49,7 +49,7 @@ MULTIRATE_MULTI = Observer(
     TARGETS,
     _FILTERS.run,
     help="both sensors, every line of the scenario in the model; not in the paper",
-    prior=(Model, LgsStars, Lines, Beams),
+    prior=(Noise, LgsStars, Lines, Beams),
     settings=PEAKS,
     needs=NGS,
     linear=True,
@@ -61,4 +61,5 @@ MULTIRATE_MULTI = Observer(
     ),
     look=Look("Multi-rate, all peaks", "#8C1D00", "#FFB59A", (16, 3, 3, 3)),
     step=_FILTERS.step,
+    counts=vibration_used,
 )

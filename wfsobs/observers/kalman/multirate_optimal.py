@@ -24,12 +24,13 @@ from wfsobs.observers.kalman.multirate import (
     MultiRate,
     MultiRateFilter,
     filter_of_gains,
+    matched_noise,
     multirate_noise,
     run_modes,
 )
 from wfsobs.observers.kalman.single import NGS
 from wfsobs.observers.kalman.step import KalmanEstimator
-from wfsobs.prior import LgsError, LgsStars, Model, Prior
+from wfsobs.prior import LgsError, LgsStars, NoiselessModel, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.ar2 import Ar2
@@ -110,7 +111,7 @@ def optimal_model(settings: MultiRate, prior: Prior, mode: int, ratio: int, mode
     """Return the cycle of one mode; model: of the disturbance, by default that of one peak."""
     model = model or prior.model[mode].disturbance()
     error = [prior.lgs_error[mode].process] if settings.model_lgs_error else []
-    return estimated_cycle(model, ratio, *multirate_noise(settings, prior.model[mode]), error)
+    return estimated_cycle(model, ratio, *multirate_noise(settings, prior.noise_of(mode)), error)
 
 
 def estimated_cycle(
@@ -149,7 +150,8 @@ MULTIRATE_OPTIMAL = Observer(
     TARGETS,
     _FILTERS.run,
     help="periodic gains, frames as the means that they are; not in the paper",
-    prior=(Model, LgsError, LgsStars),
+    prior=(NoiselessModel, LgsError, LgsStars),
+    asks=matched_noise,
     settings=RATES,
     needs=NGS,
     linear=True,

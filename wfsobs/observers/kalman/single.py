@@ -21,7 +21,7 @@ from wfsobs.observers.kalman.mode_filter import ModeFilter, lgs_mean
 from wfsobs.observers.kalman.spread import FrameErrors, by_target
 from wfsobs.observers.kalman.step import KalmanEstimator
 from wfsobs.observers.kalman.with_gaps import run_frames
-from wfsobs.prior import LgsStars, Model, Prior
+from wfsobs.prior import LgsModel, LgsStars, Model, NgsModel, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
 from wfsobs.signal.ar2 import Ar2
@@ -167,13 +167,18 @@ def between_frames(process: Ar2, n: int, how: str, steps: int | None = None) -> 
     return np.linalg.lstsq(between, cross.T, rcond=1e-14)[0].T
 
 
+def way_between(_prior: Prior, settings: Kalman) -> str:
+    """Return what of the settings the filter of the NGS has beside its prior."""
+    return settings.ngs_between_frames
+
+
 KF_LGS = Observer(
     "kf-lgs",
     "LGS KF",
     TARGETS,
     kf_lgs,
     help="steady-state Kalman filter, one vibration peak in its model",
-    prior=(Model, LgsStars),
+    prior=(LgsModel, LgsStars),
     linear=True,
     takes_missing=True,
     # The gain depends on the ratios of turbulence, vibration and noise. Turbulence tuned for vibration would be no turbulence.
@@ -188,7 +193,7 @@ KF_NGS = Observer(
     (TURBULENCE,),
     kf_ngs,
     help="that of `kf-lgs` on NGS frames, held or spread between them",
-    prior=(Model,),
+    prior=(NgsModel,),
     settings="kalman",
     needs=NGS,
     linear=True,
@@ -197,4 +202,5 @@ KF_NGS = Observer(
     tunable=Tunable(("kalman.turbulence_rms", "kalman.vibration_rms"), (*MODEL[:2], "kalman.ngs_noise")),
     look=Look("NGS KF", "#003DE6", "#7AA2FF", (8, 2)),
     step=step_kf_ngs,
+    counts=way_between,
 )
