@@ -83,7 +83,7 @@ def test_of_both_sensors_it_is_the_dense_regression_with_frames_as_means(kernel:
             row[end + 1 : end + 1 + ratio] = 1.0 / ratio
         seen = np.vstack([np.eye(n + 1)[ages + 1], exposure])
         K = seen @ (turbulence + vibration) @ seen.T + np.diag(
-            [lines.noise**2] * (k + 1) + [prior.model[0].ngs_noise ** 2] * len(ends)
+            [lines.noise**2] * (k + 1) + [prior.noise_of(0).ngs_noise ** 2] * len(ends)
         )
         K[: k + 1, : k + 1] += colour[: k + 1, : k + 1] + np.array(slow)[lags[: k + 1, : k + 1]]
         measured = np.concatenate([record.z[k::-1, 0], record.z_ngs[k - ends, 0]])

@@ -28,7 +28,7 @@ from wfsobs.observers.base import NOTHING, PLAIN, Look
 from wfsobs.observers.baselines import online_reference
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
 from wfsobs.observers.step_checks import StepError
-from wfsobs.prior import TRUE, Bands, Part, Prior, PriorSource, asks_for, words_for
+from wfsobs.prior import TRUE, Bands, Part, Prior, PriorSource, ask_nothing, asks_for, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, RecordError, Sampling, hold_last
 from wfsobs.settings import Section
@@ -43,10 +43,6 @@ MakeLaw = Callable[[Prior, int, Plant, Any], Law]
 Predict = Callable[[Measurements, Prior, Plant, Any, Watch], Array]
 """(measurements without gaps, prior, plant, settings, watch) -> vibration while u[k] acts, (n_steps, n_modes) [um], NaN where it
 is not known yet."""
-
-
-def _nothing(_settings: Settings) -> tuple[Part, ...]:
-    return ()
 
 
 @dataclass(frozen=True)
@@ -94,7 +90,7 @@ class Controller:
     help: str = ""
     prior: tuple[Part, ...] = ()
     settings: tuple[Section | str, ...] = ()
-    asks: Callable[[Any], tuple[Part, ...]] = _nothing
+    asks: Callable[[Any], tuple[Part, ...]] = ask_nothing
     ngs: bool = False
     weight: float = 1.0
     seconds: Callable[[Any, int, int], float] | None = None

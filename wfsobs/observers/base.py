@@ -14,7 +14,7 @@ from wfsobs.observers.estimates import Estimates
 from wfsobs.observers.missing import LINE_WIDTH, bridges, fill_missing
 from wfsobs.observers.step import MakeEstimator, StepObserver
 from wfsobs.observers.step_checks import StepError
-from wfsobs.prior import TRUE, Part, Prior, PriorSource, words_for
+from wfsobs.prior import TRUE, Part, Prior, PriorSource, ask_nothing, words_for
 from wfsobs.progress import QUIET, Watch
 from wfsobs.record import Measurements, Record, Sampling, hold_last
 from wfsobs.settings import Group, Section
@@ -132,7 +132,7 @@ class Observer:
     prior: tuple[Part, ...] = ()
     settings: Section | str | None = None
     needs: tuple[str, ...] = ()
-    asks: Callable[[Any], tuple[Part, ...]] = lambda _settings: ()
+    asks: Callable[[Any], tuple[Part, ...]] = ask_nothing
     causal: bool = True
     linear: bool = False
     couples_modes: bool = False

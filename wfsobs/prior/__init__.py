@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from wfsobs.prior.parts import Asterism, Beams, Flow, FlowOfBoth, LgsError, LgsStars, Line, Lines, Spectra
 from wfsobs.prior.shares import Bands, LgsModel, Model, NgsModel, Noise, NoiselessModel, OfflineBands, OnlineBands
@@ -35,6 +35,7 @@ __all__ = [
     "PriorSource",
     "Spectra",
     "Training",
+    "ask_nothing",
     "asks_for",
     "words_for",
 ]
@@ -93,6 +94,11 @@ def words_for(parts: Iterable[Part], *, source: PriorSource = TRUE) -> tuple[str
     ('model', 'identified lines')
     """
     return tuple(dict.fromkeys(word.format(source=source) for part in parts for word in _WORDS[part]))
+
+
+def ask_nothing(_settings: Any) -> tuple[Part, ...]:
+    """Return the parts that are needed for some settings alone: none."""
+    return ()
 
 
 def asks_for(part: Part, parts: Iterable[Part]) -> bool:

@@ -73,6 +73,10 @@ def seconds(settings: Adaptive, n_steps: int, n_modes: int, dt: float) -> float:
     return n_modes * sum(2e-3 + 3.2e-6 * min(end, schedule.longest) for end in ends)
 
 
+def _settings_used(prior: Prior, settings: Adaptive) -> tuple[float, ...]:
+    return *identification_settings(prior, settings), settings.depth
+
+
 GPR_ADAPTIVE = Observer(
     "gpr-adaptive",
     "Adaptive GPR",
@@ -85,5 +89,5 @@ GPR_ADAPTIVE = Observer(
     seconds=seconds,
     look=Look("Adaptive GPR", "#3D6B00", "#B7F06A", (20, 2, 2, 2), width=1.8),
     step=step_gpr_adaptive,
-    counts=lambda prior, settings: (*identification_settings(prior, settings), settings.depth),
+    counts=_settings_used,
 )

@@ -126,6 +126,10 @@ def seconds(settings: Adaptive, n_steps: int, n_modes: int, dt: float) -> float:
     return n_modes * out
 
 
+def _settings_used(prior: Prior, settings: Adaptive) -> tuple[float, ...]:
+    return *identification_settings(prior, settings), settings.longest
+
+
 MULTIRATE_ADAPTIVE = Observer(
     "multirate-adaptive",
     "Adaptive multi-rate KF",
@@ -141,5 +145,5 @@ MULTIRATE_ADAPTIVE = Observer(
     seconds=seconds,
     look=Look("Adaptive multi-rate", "#9A0048", "#FF9FC4", (20, 2, 3, 2), width=1.8),
     step=step_multirate_adaptive,
-    counts=lambda prior, settings: (*identification_settings(prior, settings), settings.longest),
+    counts=_settings_used,
 )
