@@ -13,6 +13,7 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.live_order import LiveOrder
 from wfsobs.app.logs import event
 from wfsobs.app.service import Service
+from wfsobs.live.follow import why_ended
 from wfsobs.live.loop import LiveLoop
 from wfsobs.progress import Watch
 from wfsobs.record import Record, RecordError
@@ -22,7 +23,6 @@ LOOK = 0.2
 """Pause between two looks whether the loop goes on [s]."""
 FORMATS = {"NPZ": ".npz", "AOT": ".aot.fits"}
 """Of recordings: their endings."""
-ENDED = "the processes of the loop have ended"
 
 
 def compute(order: LiveOrder, service: Service, watch: Watch, tell: Tell) -> None:
@@ -36,7 +36,7 @@ def compute(order: LiveOrder, service: Service, watch: Watch, tell: Tell) -> Non
             watch.check()
             if not loop.observers_are_alive:
                 loop.tend()
-                raise SettingError(loop.events[-1].line if loop.events else ENDED)
+                raise SettingError(why_ended(loop))
             sleep(LOOK)
     finally:
         order.end(loop)

@@ -174,6 +174,10 @@ def _place(stream: str) -> str:
     return stream if is_address(stream) else str(stream_path(stream))
 
 
+def _say(line: str) -> None:
+    click.echo(f"wfsobs: live: {line}", err=True)
+
+
 def _run_headless(
     source: LiveSource,
     scenario: Scenario,
@@ -197,6 +201,7 @@ def _run_headless(
             speed=speed,
             keep=kept.append if record_file else None,
             report=update,
+            say=_say if isinstance(source, StreamSource) else lambda _: None,
             log_file=log_file or "",
         )
     if record_file and kept:

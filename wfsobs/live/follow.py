@@ -7,7 +7,7 @@ from math import isnan
 from time import sleep
 from typing import Any
 
-from wfsobs.live.board import NEXT, Counts
+from wfsobs.live.board import NEXT, SLOTS, Counts
 from wfsobs.live.checks import observers_on
 from wfsobs.live.loop import TICK, LiveLoop
 from wfsobs.live.ring import LiveFrame
@@ -30,6 +30,7 @@ def follow(
     speed: float = 1.0,
     keep: Callable[[LiveFrame], None] | None = None,
     report: Callable[[float], None] = lambda _: None,
+    say: Callable[[str], None] = lambda _: None,
     log_file: str = "",
 ) -> dict[str, Any]:
     """Let observers follow a source in real time.
@@ -50,6 +51,8 @@ def follow(
         Receives every frame.
     report : callable
         Receives the share that is done, about once a second.
+    say : callable
+        Receives a line about whatever happens.
     log_file : str
         Raise alarms, and append them and what else happens to this file.
 
@@ -74,7 +77,7 @@ def follow(
     try:
         _await_observers(loop)
         loop.play()
-        _drain(loop, n_frames, keep, report)
+        _drain(loop, n_frames, keep, report, say)
     finally:
         loop.stop()
     board, delivery = loop.board, loop.delivery
@@ -110,12 +113,25 @@ def _await_observers(loop: LiveLoop) -> None:
     while not loop.is_ready:
         if not loop.observers_are_alive:
             sleep(2.0 * TICK)  # the line may still be on its way
-            raise SettingError(loop.events[-1].line if loop.events else "the process of the observers has ended")
+            raise SettingError(why_ended(loop))
         sleep(PAUSE)
 
 
-def _drain(loop: LiveLoop, n_frames: int, keep: Callable[[LiveFrame], None] | None, report: Callable[[float], None]) -> None:
-    """Keep every frame, until all have been taken or no more come."""
+def why_ended(loop: LiveLoop) -> str:
+    """Return the line of the observer that could not be designed, or else the last one."""
+    lines = [event.line for event in loop.events]
+    of_observers = [line for line in lines if line.split(":")[0] in SLOTS]
+    return next(iter((*of_observers, *lines[-1:])), "the processes of the loop have ended")
+
+
+def _drain(
+    loop: LiveLoop,
+    n_frames: int,
+    keep: Callable[[LiveFrame], None] | None,
+    report: Callable[[float], None],
+    say: Callable[[str], None],
+) -> None:
+    """Keep every frame and say what happens, until all have been taken or no more come."""
     kept = reported = 0
     is_over = False
     while not is_over:
@@ -123,6 +139,8 @@ def _drain(loop: LiveLoop, n_frames: int, keep: Callable[[LiveFrame], None] | No
         is_over = loop.count >= n_frames or not may_go_on
         if not is_over:
             sleep(PAUSE)
+        while loop.events:
+            say(loop.events.popleft().line)
         for number in range(kept, loop.count if keep else 0):
             if keep is not None and (frame := loop.feed.ring.read(number)) is not None:
                 keep(frame)

@@ -24,6 +24,8 @@ ALL = slice(None)
 """Every number of a frame."""
 WRITING = 2e-3
 """Time after which a frame that is still being written is given up [s]."""
+YIELD = 1e-6
+"""Pause while a frame is being written [s]: its writer may need this processor, which who goes first keeps otherwise."""
 POLL = 5e-5
 """Pause between two looks at the counter where there is no semaphore [s]."""
 
@@ -147,7 +149,7 @@ class SharedImage:
                     return before, values
             if time.monotonic() > until:
                 return None
-            time.sleep(0)
+            time.sleep(YIELD)
 
     def write(self, values: Array, elements: Array | slice = ALL) -> None:
         """Write a frame, (n,), or these elements of it, raise the counter and wake who waits."""

@@ -1,0 +1,31 @@
+"""Why a loop has ended, and what is said of one without a page."""
+
+from collections import deque
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from wfsobs.live.follow import _drain, why_ended
+from wfsobs.live.view import LiveEvent
+
+
+@pytest.mark.parametrize(
+    ("lines", "reason"),
+    [
+        (["kf-ngs: needs NGS frames", "/dev/shm/a.im.shm: no frame for 0.1 s"], "kf-ngs: needs NGS frames"),
+        (["recording on", "the record has ended"], "the record has ended"),
+        ([], "the processes of the loop have ended"),
+    ],
+)
+def test_the_reason_is_that_of_an_observer_whatever_a_source_says_afterwards(lines, reason):
+    loop: Any = SimpleNamespace(events=deque(LiveEvent(0, line) for line in lines))
+    assert why_ended(loop) == reason
+
+
+def test_what_happens_is_said_once_each_also_what_comes_last():
+    said: list[str] = []
+    events = deque([LiveEvent(0, "no frame for 0.1 s"), LiveEvent(7, "frames again")])
+    loop: Any = SimpleNamespace(events=events, observers_are_alive=False, count=0)
+    _drain(loop, 10, None, lambda _: None, said.append)
+    assert said == ["no frame for 0.1 s", "frames again"] and not events
