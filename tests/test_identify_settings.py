@@ -17,11 +17,12 @@ from wfsobs.evaluation.bound import bound_rms
 from wfsobs.identification import Identification, identify
 from wfsobs.identification.process import IdentifiedProcess, Number, merge_peaks
 from wfsobs.identification.report import identification_toml
+from wfsobs.observers import OBSERVERS
 from wfsobs.observers.kalman.single import steady_filter
 from wfsobs.pipeline import observe, run
 from wfsobs.prior import Lines
-from wfsobs.priors_from.scenario import lines_of, modelled_peak
-from wfsobs.record import Record
+from wfsobs.priors_from.scenario import lines_of, modelled_peak, observer_settings, prior_of
+from wfsobs.record import Record, Sampling
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2
@@ -79,6 +80,32 @@ def test_the_file_tells_the_filters_what_was_found(found: Identification, saved:
         # A product and a quotient each: a few units in the last place.
         assert numbers(lines_of(saved, i, DT)) == pytest.approx(numbers(mode.prior), rel=1e-14)
     assert [len(m.prior.turbulence) for m in found.modes] == [1, 2]  # the second has a background
+
+
+def poles(p: Ar2 | Ar3) -> Array:
+    """Of the sampled process: of two poles, and of a third where there is one."""
+    root = np.sqrt(complex(1.0 - p.damping**2))
+    two = [np.exp((-p.damping + sign * 1j * root) * p.omega * p.dt) for sign in (1.0, -1.0)]
+    return np.array([*two, np.exp(-p.corner * p.dt)] if isinstance(p, Ar3) else two)
+
+
+@pytest.mark.parametrize("name", ["kf-multi", "gp-lgs", "lqg-kf-multi", "lqg-multirate-multi"])
+def test_filters_of_the_file_keep_the_background(found: Identification, saved: Scenario, name: str) -> None:
+    """The poles of all that the identification found on tilt, its coloured background too, are those of the filter's model. To
+    1e-6: near a double pole, as of turbulence of damping 0.9, rounding is rooted."""
+    kept = found.modes[1].prior.turbulence
+    assert len(kept) == 2 and kept[1].omega > 20.0 * kept[0].omega
+    if name.startswith("lqg"):
+        law = design(saved, [name]).laws[name][1].law
+        assert law is not None and law.filter is not None
+        model = law.filter.model
+    else:
+        prior, sampling = prior_of(saved, None, OBSERVERS[name].prior), Sampling(2, DT)
+        model = OBSERVERS[name].step(prior, observer_settings(OBSERVERS[name], saved), sampling, 0.0).modes[1].model
+    has = np.linalg.eigvals(model.A)
+    for process in kept:
+        for pole in poles(process):
+            assert np.abs(has - pole).min() < 1e-6
 
 
 def test_the_file_predicts_a_new_record_as_what_was_found_does(found: Identification, saved: Scenario) -> None:

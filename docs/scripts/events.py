@@ -1,4 +1,4 @@
-"""The tables of docs/events.md: `docs/scripts/events.py [seeds] [preset, bridged, loop, stars ...] [--observers ID,ID...]`."""
+"""The tables of docs/events.md: `events.py [seeds] [preset, bridged, filled, loop, stars ...] [--observers ID,ID...]`."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.evaluation.rows import row_label
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
+from wfsobs.observers.missing import fill_missing
 from wfsobs.pipeline import run
-from wfsobs.priors_from.scenario import arguments
+from wfsobs.priors_from.scenario import arguments, prior_of
+from wfsobs.record import hold_last
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.simulation.loop import simulate
+from wfsobs.telemetry.bridged import without_bridged
 from wfsobs.typing import Array
 
 CASES = {
@@ -131,12 +134,46 @@ def stars(seeds: int, names: Sequence[str] | None) -> str:
     return "\n".join(out)
 
 
+AFTER = {"first frame": 1e-3, "0.2 s": 0.2, "2 s": 2.0}
+"""Stretches after both lasers are back [s]."""
+
+
+def filled(seeds: int, names: Sequence[str] | None) -> str:
+    """Errors after both lasers are back, of missing frames that were filled in, over those of observers that are told."""
+    names = names or ("kf-lgs", "kf-multi", "gp-lgs", "multirate", "multirate-optimal", "multirate-multi", "gp-both")
+    scenario, squares = PRESETS["laser-dropout"](), dict[str, dict[str, list[list[float]]]]()
+    settings, back = scenario.before_events, 16.0
+    for seed in range(1, seeds + 1):
+        record = simulate(scenario.replace({"run.seed": seed}))
+        prior = prior_of(settings, record, OBSERVERS["kf-multi"].prior)
+        bridges = {"held": hold_last(record.y_lgs), "predicted": fill_missing(record, prior).y_lgs}
+        records = {"told": record}
+        for name, y in bridges.items():
+            records[name] = without_bridged(replace(record, y_lgs=y, lgs_stars=None))
+            records[f"{name}, taken for measured"] = replace(record, y_lgs=y, lgs_stars=None)
+        for how, one in records.items():
+            for name in names:
+                found = OBSERVERS[name].estimate(*arguments(OBSERVERS[name], one, settings))
+                for target in OBSERVERS[name].targets:
+                    error = found[target] - record.truth(target)
+                    cuts = [slice(round(back / scenario.dt), round((back + length) / scenario.dt)) for length in AFTER.values()]
+                    row = squares.setdefault(f"{target}, {row_label(name)}", {})
+                    row.setdefault(how, []).append([float(np.mean(error[cut] ** 2)) for cut in cuts])
+    hows = [how for how in records if how != "told"]
+    out = [f"| {', '.join(AFTER)} after | {' | '.join(hows)} |\n|---|{'---|' * len(hows)}"]
+    for row, of in sorted(squares.items()):
+        told = np.mean(of["told"], axis=0)
+        cells = (", ".join(f"{x:.3f}" for x in np.sqrt(np.mean(of[how], axis=0) / told)) for how in hows)
+        out.append(f"| {row} | {' | '.join(cells)} |")
+    return "\n".join(out)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("seeds", type=int, nargs="?", default=20)
-    parser.add_argument("what", nargs="*", default=[*CASES, "bridged", "loop", "stars"])
+    parser.add_argument("what", nargs="*", default=[*CASES, "bridged", "filled", "loop", "stars"])
     parser.add_argument("--observers", type=lambda text: text.split(","), help="these alone; all unless told")
     given = parser.parse_args()
     for one in given.what:
-        make = {"bridged": bridged, "loop": loop, "stars": stars}.get(one) or partial(tables, one)
+        make = {"bridged": bridged, "filled": filled, "loop": loop, "stars": stars}.get(one) or partial(tables, one)
         print(make(given.seeds, given.observers))
