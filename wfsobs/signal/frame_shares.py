@@ -90,8 +90,3 @@ def frame_shares(
 def frame_mean_response(ratio: int, omega: Array) -> Complex:
     """Return the response of a frame to the measurements of every step, in the last of these, (len(omega),)."""
     return np.exp(-1j * np.outer(np.arange(ratio), omega)).mean(axis=0)
-
-
-def frame_response(frames: StateFilter, ratio: int, omega: Array) -> Complex:
-    """Return the response of the filter of frames to the measurements of every step, in a step with a frame, (p, len(omega))."""
-    return frames.response(ratio * omega) * frame_mean_response(ratio, omega)

@@ -11,12 +11,13 @@ variance E s^2 - b' C^-1 b: no other that is linear in the states leaves less.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.linalg import block_diag, cho_factor, cho_solve, schur
+from scipy.linalg import block_diag, cho_solve, schur
 
 from wfsobs.signal.filter_covariance import lyapunov
 from wfsobs.signal.statespace import DisturbanceModel
@@ -25,6 +26,10 @@ from wfsobs.typing import Array
 
 RIDGE = 1e-10
 """Added to the covariance of the states, over that: rounding must not make it indefinite."""
+
+
+Item = TypeVar("Item")
+Found = TypeVar("Found")
 
 
 class StateFilter(NamedTuple):
@@ -41,6 +46,18 @@ class StateFilter(NamedTuple):
         for i in reversed(range(len(T))):
             out[i] = (into[i] + late * (T[i, i + 1 :] @ out[i + 1 :])) / (1.0 - late * T[i, i])
         return Z @ out
+
+
+def responses(filters: Sequence[StateFilter], common: StateFilter, omega: Array) -> list[Complex]:
+    """Return the responses of filters whose last states are those of one that all have in common."""
+    of_common, n = common.response(omega), common.G.size
+    return [np.vstack([StateFilter(one.F[:-n, :-n], one.G[:-n]).response(omega), of_common]) for one in filters]
+
+
+def in_two_threads(function: Callable[[Item], Found], items: Iterable[Item]) -> list[Found]:
+    """Return what a function makes of every item: products and factors of matrices leave the interpreter to others."""
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(function, items))
 
 
 def running_means(spans: Sequence[float], turns: Sequence[float] = (0.0,)) -> StateFilter:
@@ -94,10 +111,13 @@ def shared_covariance(powers: Complex, responses: Sequence[Complex]) -> Array:
     starts = np.cumsum([0, *(len(one) for one in responses)])
     at = [slice(*ends) for ends in pairwise(starts)]
     out = np.empty((starts[-1], starts[-1]))
-    for i, one in enumerate(responses):
+
+    def fill(i: int) -> None:
         for j in range(i, len(responses)):
-            found = real_product(one * powers[i, j], responses[j])
+            found = real_product(responses[i] * powers[i, j], responses[j])
             out[at[j], at[i]], out[at[i], at[j]] = found.T, found
+
+    in_two_threads(fill, range(len(responses)))
     return 0.5 * (out + out.T)
 
 
@@ -114,8 +134,9 @@ class LeastVariance:
         variance, self.size = np.diag(covariance), len(covariance)
         self._scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
         correlation = covariance / np.outer(self._scale, self._scale)
-        self._factor = cho_factor(correlation + RIDGE * np.eye(len(correlation)))
+        correlation[np.diag_indices_from(correlation)] += RIDGE
+        self._factor = np.linalg.cholesky(correlation)
 
     def weights(self, cross: Array) -> Array:
         """Return the weights of the states, for targets of these covariances with them, both (n_targets, n)."""
-        return np.asarray(cho_solve(self._factor, (cross / self._scale).T)).T / self._scale
+        return np.asarray(cho_solve((self._factor, True), (cross / self._scale).T)).T / self._scale

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag, helmert
 
-from wfsobs.signal.joint_states import LeastVariance
+from wfsobs.signal.joint_states import LeastVariance, in_two_threads
 from wfsobs.typing import Array
 
 SETS = 16
@@ -70,7 +70,7 @@ class PresentInputs:
         there, n, last = np.flatnonzero(present), self._n_fast, self._covariances[-1]
         if there.size == len(present):
             whole = np.eye(len(last))
-            found = [LeastVariance(one) for one in (*self._covariances, last[:n, :n])]
+            found = in_two_threads(LeastVariance, (*self._covariances, last[:n, :n]))
             return Selection([whole] * len(self._covariances) + [whole[:n]], found)
         mean = np.full((1, there.size), 1.0 / max(there.size, 1))
         among = np.vstack([mean, helmert(there.size)]) @ self._to_each[there] if there.size else np.empty((0, len(present)))
@@ -78,4 +78,4 @@ class PresentInputs:
         both = block_diag(fast, np.eye(len(self._covariances[0]) - n))
         alone = both[: len(fast)]
         of_phases = [both @ one @ both.T for one in self._covariances] + [alone @ last @ alone.T]
-        return Selection([both] * len(self._covariances) + [alone], [LeastVariance(one) for one in of_phases])
+        return Selection([both] * len(self._covariances) + [alone], in_two_threads(LeastVariance, of_phases))

@@ -17,16 +17,23 @@ from wfsobs.atmosphere.plane_waves import Footprint
 from wfsobs.atmosphere.von_karman import TurbulenceLayer
 from wfsobs.scenario import Scenario
 from wfsobs.simulation import layers as atmosphere
+from wfsobs.simulation.disturbance import vibration_lines
 from wfsobs.simulation.flow_integral import ModesInBeams, PlaneWaves, Sight, spectra_between
 from wfsobs.simulation.flow_spectra import ideal_mode, star_basis
 from wfsobs.simulation.guide_stars import lgs_weights
 from wfsobs.typing import Array
 
-PER_DECADE = 250
-"""Nodes of the sums over frequency."""
+PER_DECADE, PER_SMOOTH_DECADE = 200, 40
+"""Nodes of the sums over frequency, and those where spectra have no ripples."""
+
+SMOOTH = 0.1
+"""Frequency below which they have none, over the share of the aperture that the slowest wind crosses in a second."""
+
+ABOUT_LINES = np.geomspace(0.012, 0.6, 6)
+"""Nodes on either side of a line [Hz]: filters that know of it respond there to little else."""
 
 SLOWEST = 1e-4
-"""Minimum frequency of those nodes, over the share of the aperture that the slowest wind crosses in a second."""
+"""Minimum frequency of the nodes, over the same."""
 
 
 @dataclass(frozen=True)
@@ -120,10 +127,15 @@ def frequency_rule(scenario: Scenario) -> tuple[Array, Array]:
 
     All weights are positive, so that covariances of such sums are those of a process.
     """
-    layers = atmosphere.layers(scenario)
-    lowest = SLOWEST * min(layer.speed for layer in layers) / scenario.telescope.diameter
+    crossing = min(layer.speed for layer in atmosphere.layers(scenario)) / scenario.telescope.diameter
     highest = 0.5 / scenario.dt
-    edges = np.geomspace(lowest, highest, int(PER_DECADE * np.log10(highest / lowest)) + 1)
+    first, middle = (min(share * crossing, share * highest) for share in (SLOWEST, SMOOTH))
+    parts = [(first, middle, PER_SMOOTH_DECADE), (middle, highest, PER_DECADE)]
+    smooth = np.concatenate([np.geomspace(low, high, int(per * np.log10(high / low)) + 1) for low, high, per in parts])
+    every = [line for mode in range(len(scenario.modes)) for line in vibration_lines(scenario, mode)]
+    lines = np.unique([round(frequency, 2) for frequency, _, _ in every])
+    near = np.ravel(lines[:, None] + np.concatenate([-ABOUT_LINES[::-1], ABOUT_LINES]))
+    edges = np.unique(np.concatenate([smooth, near[(near > first) & (near < highest)]]))
     return np.sqrt(edges[1:] * edges[:-1]), np.diff(edges)
 
 

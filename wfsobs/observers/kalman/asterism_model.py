@@ -20,8 +20,8 @@ from wfsobs.observers.kalman.step import matrix_power
 from wfsobs.prior import Prior
 from wfsobs.signal.ar2 import Ar2
 from wfsobs.signal.filter_covariance import lyapunov
-from wfsobs.signal.frame_shares import frame_mean_response, frame_response, frame_shares
-from wfsobs.signal.joint_states import StateFilter, real_product, running_means, shared_covariance
+from wfsobs.signal.frame_shares import frame_mean_response, frame_shares
+from wfsobs.signal.joint_states import StateFilter, in_two_threads, real_product, responses, running_means, shared_covariance
 from wfsobs.signal.present_inputs import Present, PresentInputs
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.signal.wiener import Complex
@@ -87,8 +87,10 @@ class AsterismModel:
         self.slow = [with_means(one, frame_means) for one in frame_filters(prior, settings, asterism)]
         silent = Ar2(1.0, 1.0, 0.0, prior.lines[0].dt)
         self._peaks = [disturbance_model((), one.vibration(settings.line_width) or [silent]) for one in prior.lines]
-        self._responses = [one.filter.response(asterism.omega) for one in self.fast] * self.n_stars
-        self._of_frames = [frame_response(one.filter, asterism.ratio, asterism.omega) for one in self.slow]
+        omega = asterism.omega
+        self._responses = responses([one.filter for one in self.fast], means, omega) * self.n_stars
+        of_frames = responses([one.filter for one in self.slow], frame_means, asterism.ratio * omega)
+        self._of_frames = [one * frame_mean_response(asterism.ratio, omega) for one in of_frames]
         n_inputs = (self.n_stars + 1) * len(self._peaks)
         self._powers = asterism.measurement.reshape(n_inputs, n_inputs, -1)
         self._estimates = self._add_states()
@@ -114,13 +116,13 @@ class AsterismModel:
         sd : Array
             (ratio + 1, n_modes) [um].
         """
-        found = [self._target(frames, target, phase) for phase in self._steps]
+        found = self._target(frames, target)
         return self._estimates.estimate([*found, found[-1]], present or (True,) * self.n_stars)
 
     def stand_ins(self, present: Present) -> Array:
         """Return weights that predict the next measurement of every LGS, in all modes, (ratio + 1, n_lgs, n_modes, n_states)."""
         variance = np.diag(self._measurement_covariance())
-        found = [(self._next_measurement(phase), variance) for phase in self._steps]
+        found = [(cross, variance) for cross in self._next_measurement()]
         weights = self._estimates.estimate([*found, found[-1]], present)[0]
         stars = weights.reshape(self.ratio + 1, self.n_stars, -1)
         return (np.linalg.inv(self.basis) @ stars).reshape(self.ratio + 1, self.n_stars, len(self._peaks), -1)
@@ -128,7 +130,7 @@ class AsterismModel:
     def frame(self, present: Present) -> Array:
         """Return weights that tell the NGS frame that is due in the first of the steps, and lost, (n_modes, n_states)."""
         n = self.n_stars * len(self._peaks)
-        cross = self._with_states(self._powers[n:] * frame_mean_response(self.ratio, self._asterism.omega), self._age)
+        cross = self._with_states(self._powers[n:] * frame_mean_response(self.ratio, self._asterism.omega))[0]
         for row, places, exposure in zip(cross, self._places, self._exposures, strict=True):
             row[places] += exposure
         found = (cross, np.zeros(len(cross)))
@@ -143,8 +145,8 @@ class AsterismModel:
         rows = np.einsum("isk,sb->ibk", combination, np.linalg.inv(self.basis)).reshape(len(noise), -1)
         seen = np.sum((rows @ self._measurement_covariance()) * rows, axis=1) + np.sum((combination * noise) ** 2, axis=(1, 2))
         weights, sd = self.plan(0.0, TOTAL, present)
-        ahead = [rows @ self._next_measurement(phase) for phase in self._steps]
-        told = self._target(0.0, TOTAL, self._age)[1] - sd**2  # the variance of the estimate
+        ahead = [rows @ cross for cross in self._next_measurement()]
+        told = self._target(0.0, TOTAL)[0][1] - sd**2  # the variance of the estimate
         variance = seen + told - 2.0 * np.sum(weights * np.array([*ahead, ahead[-1]]), axis=2)
         return np.sqrt(np.maximum(variance, 0.0))
 
@@ -158,10 +160,10 @@ class AsterismModel:
         starts = np.cumsum([0, *sizes])
         self._places = [np.r_[starts[i] : starts[i + 1], starts[n + i] : starts[n + i + 1]] for i in range(m)]
         own = zip(asterism.noise / np.sqrt(stars), asterism.ngs_noise, asterism.line_gain, strict=True)
-        shares = [
-            frame_shares(one.filter, late.filter, self.ratio, model, *numbers, age=self._age)
-            for one, late, model, numbers in zip(self.fast, self.slow, self._peaks, own, strict=True)
-        ]
+        known = zip(self.fast, self.slow, self._peaks, own, strict=True)
+        shares = in_two_threads(
+            lambda of: frame_shares(of[0].filter, of[1].filter, self.ratio, of[2], *of[3], age=self._age), known
+        )
         self._of_lines = [[share.disturbance for share in one] for one in shares]
         self._exposures = [one[0].exposure for one in shares]
         of_noise = [
@@ -170,48 +172,48 @@ class AsterismModel:
         ]
         first = starts[m]
         fast[first:, first:] += block_diag(*of_noise * (stars - 1))
-        covariances, seen_by_ngs = [], powers[:n, n:]
-        for phase in self._steps:
-            between = self._between(seen_by_ngs, phase)
+        covariances = []
+        for phase, between in enumerate(self._between(powers[:n, n:])):
             covariance = np.block([[fast, between], [between.T, slow]])
             for places, one in zip(self._places, shares, strict=True):
-                covariance[np.ix_(places, places)] += one[phase - self._age].states
+                covariance[np.ix_(places, places)] += one[phase].states
             covariances.append(covariance)
         return PresentInputs(covariances, self.basis, n_fast)
 
-    def _between(self, powers: Complex, phase: int) -> Array:
-        """Return the covariance of the states of the LGS and of the NGS, so many steps after a frame."""
-        late = self._late(phase)
-        return np.vstack(
-            [
-                np.hstack([real_product(one * row[j], other) for j, other in enumerate(late)])
-                for one, row in zip(self._responses, powers, strict=True)
-            ]
-        )
+    def _between(self, powers: Complex) -> list[Array]:
+        """Return the covariances of the states of the LGS and of the NGS in every step after a frame."""
+        late = [np.concatenate(parts) for parts in zip(*(self._late(phase) for phase in self._steps), strict=True)]
+
+        def row(i: int) -> list[Array]:
+            found = [real_product(self._responses[i] * powers[i, j], each) for j, each in enumerate(late)]
+            return [np.hstack(parts) for parts in zip(*(np.split(one, self.ratio, axis=1) for one in found), strict=True)]
+
+        return [np.vstack(parts) for parts in zip(*in_two_threads(row, range(len(powers))), strict=True)]
 
     def _late(self, phase: int) -> list[Complex]:
         """Return the responses of the states of the NGS so many steps after a frame."""
         return [one * np.exp(-1j * phase * self._asterism.omega) for one in self._of_frames]
 
-    def _target(self, frames: float, target: str, phase: int) -> tuple[Array, Array]:
-        """Return covariances of the target and the states, and its variance."""
+    def _target(self, frames: float, target: str) -> list[tuple[Array, Array]]:
+        """Return covariances of the target and the states, and its variance, in every step after a frame."""
         if target == TOTAL:
-            (one, own), (other, more) = (self._target(frames, part, phase) for part in TARGETS)
-            return one + other, own + more
-        return self._of_turbulence(frames, phase) if target == TURBULENCE else self._of_vibration(frames, phase)
+            parts = zip(*(self._target(frames, part) for part in TARGETS), strict=True)
+            return [(one + other, own + more) for (one, own), (other, more) in parts]
+        return self._of_turbulence(frames) if target == TURBULENCE else self._of_vibration(frames)
 
-    def _of_turbulence(self, frames: float, phase: int) -> tuple[Array, Array]:
+    def _of_turbulence(self, frames: float) -> list[tuple[Array, Array]]:
         asterism, m = self._asterism, len(self._peaks)
         ahead = (asterism.cross * np.exp(1j * asterism.omega * (1.0 + frames))).reshape(m, (self.n_stars + 1) * m, -1)
-        return self._with_states(ahead, phase), asterism.own.sum(axis=1)
+        return [(cross, asterism.own.sum(axis=1)) for cross in self._with_states(ahead)]
 
-    def _next_measurement(self, phase: int) -> Array:
+    def _next_measurement(self) -> list[Array]:
         """Return those of the next measurement and the states: of the mean of the LGS, then each difference, in all modes."""
         n = self.n_stars * len(self._peaks)
-        cross = self._with_states(self._powers[:n] * np.exp(1j * self._asterism.omega), phase)
+        found = self._with_states(self._powers[:n] * np.exp(1j * self._asterism.omega))
         for i, (model, of_lines) in enumerate(zip(self._peaks, self._of_lines, strict=True)):
-            cross[i, self._places[i]] += self._asterism.line_gain[i] * np.ravel(model.C @ model.A @ of_lines[phase - self._age])
-        return cross
+            for cross, seen in zip(found, of_lines, strict=True):
+                cross[i, self._places[i]] += self._asterism.line_gain[i] * np.ravel(model.C @ model.A @ seen)
+        return found
 
     def _measurement_covariance(self) -> Array:
         """Return that of the measurements of `_next_measurement`, without noise, (n_lgs * n_modes, n_lgs * n_modes)."""
@@ -227,14 +229,20 @@ class AsterismModel:
         is_mean = np.allclose(own, np.eye(len(own))[:, None] / self.n_stars)
         return own * (there * self.n_stars / there.sum())[:, None] if is_mean else np.full_like(own, np.nan)
 
-    def _with_states(self, powers: Complex, phase: int) -> Array:
-        """Return covariances of signals and the states, from the cross powers of the signals and all inputs."""
-        return np.hstack([real_product(powers[:, i], one) for i, one in enumerate([*self._responses, *self._late(phase)])])
+    def _with_states(self, powers: Complex) -> list[Array]:
+        """Return covariances of signals and the states in every step, from the cross powers of the signals and all inputs."""
+        n = len(self._responses)
+        fast = [real_product(powers[:, i], one) for i, one in enumerate(self._responses)]
+        late = [[real_product(powers[:, i], one) for i, one in enumerate(self._late(phase), n)] for phase in self._steps]
+        return [np.hstack([*fast, *slow]) for slow in late]
 
-    def _of_vibration(self, frames: float, phase: int) -> tuple[Array, Array]:
-        out, variances = np.zeros((len(self._peaks), self.n_states)), []
-        for i, (model, cross) in enumerate(zip(self._peaks, self._of_lines, strict=True)):
-            now = model.outputs[VIBRATION]
-            out[i, self._places[i]] = now @ matrix_power(model.A, frames) @ cross[phase - self._age]
-            variances.append(now @ now)  # the states have unit variance
-        return out, np.array(variances)
+    def _of_vibration(self, frames: float) -> list[tuple[Array, Array]]:
+        found = []
+        for phase in range(self.ratio):
+            out, variances = np.zeros((len(self._peaks), self.n_states)), []
+            for i, (model, cross) in enumerate(zip(self._peaks, self._of_lines, strict=True)):
+                now = model.outputs[VIBRATION]
+                out[i, self._places[i]] = now @ matrix_power(model.A, frames) @ cross[phase]
+                variances.append(now @ now)  # the states have unit variance
+            found.append((out, np.array(variances)))
+        return found

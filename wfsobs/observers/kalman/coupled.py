@@ -25,8 +25,9 @@ from wfsobs.observers.kalman.step import KalmanEstimator, matrix_power
 from wfsobs.prior import Flow, Lines, Prior
 from wfsobs.progress import Watch
 from wfsobs.record import Measurements, Sampling
+from wfsobs.signal import joint_states as joint
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.joint_states import LeastVariance, StateFilter, own_share, real_product, running_means, shared_covariance
+from wfsobs.signal.joint_states import LeastVariance, StateFilter, real_product, running_means, shared_covariance
 from wfsobs.signal.periodic import PeriodicFilter
 from wfsobs.signal.statespace import disturbance_model
 from wfsobs.signal.stepping import Saved
@@ -76,8 +77,9 @@ class CoupledModel:
         self._peaks = [disturbance_model((), one.vibration(settings.line_width) or [silent]) for one in prior.lines]
         self._noise = np.array([one.noise for one in prior.lines])
         states = [_with_means(one, means) for one in self.filters]
-        own = [own_share(*parts) for parts in zip(states, self._peaks, self._flow.line_gain, self._noise, strict=True)]
-        self._responses = [one.response(self._flow.omega) for one in states]
+        known = zip(states, self._peaks, self._flow.line_gain, self._noise, strict=True)
+        own = joint.in_two_threads(lambda parts: joint.own_share(*parts), known)
+        self._responses = joint.responses(states, means, self._flow.omega)
         self._of_lines = [share.disturbance for share in own]
         covariance = shared_covariance(self._flow.measurement, self._responses) + block_diag(*(share.states for share in own))
         self._order = self._order_of_states()
