@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 from weakref import WeakValueDictionary
 
@@ -54,7 +55,7 @@ class Memo:
 
 
 def digest(*values: Any) -> str:
-    """Return a digest of numbers, texts, arrays and what is made of these.
+    """Return a digest of numbers, texts, arrays and what is made of these, with functions that are bound to them.
 
     Raises TypeError for anything else, which has no value to compare.
 
@@ -82,6 +83,9 @@ def _parts(value: Any) -> Iterator[Any]:
             yield from _parts(item)
     elif isinstance(value, Mapping):
         yield from _parts(sorted(value.items()))
+    elif isinstance(value, partial):
+        yield f"partial {value.func.__module__}.{value.func.__qualname__}".encode()
+        yield from _parts((value.args, value.keywords))
     elif is_dataclass(value):
         yield type(value).__name__.encode()
         for field in fields(value):

@@ -13,6 +13,7 @@ from wfsobs.closed_loop.rows import Row, rows
 from wfsobs.closed_loop.run import ClosedLoop, each_outcome
 from wfsobs.control.controllers import CONTROLLERS
 from wfsobs.control.curves import Curves, curves
+from wfsobs.dependence import Memo
 from wfsobs.priors_from.controllers import own_settings
 from wfsobs.progress import Watch
 from wfsobs.scenario import Scenario
@@ -43,8 +44,11 @@ class LoopResults:
         return next((o.residual for o in self.result.outcomes if o.controller == controller), None)
 
 
-def compute(of: RunResults, watch: Watch, tell: Tell) -> LoopResults | None:
-    """Run every controller on the record shown; tell what is done once the quick ones are, and after each of the others."""
+def compute(of: RunResults, watch: Watch, tell: Tell, memo: Memo | None = None) -> LoopResults | None:
+    """Run every controller on the record shown; tell what is done once the quick ones are, and after each of the others.
+
+    memo : a controller whose outcome is known in it by what it depends on does not run
+    """
     record, shown = of.result.record, None
     plan = design(of.scenario, [name for name in CONTROLLERS if seconds(name, of.scenario) <= PATIENCE])
     linear = {
@@ -57,7 +61,7 @@ def compute(of: RunResults, watch: Watch, tell: Tell) -> LoopResults | None:
     start = round(of.scenario.run.warm_up / record.dt)
     names = list(plan.laws)
     quick = [name for name in names if CONTROLLERS[name].predict is None]
-    for outcome in each_outcome(record, plan, watch):
+    for outcome in each_outcome(record, plan, watch, memo=memo):
         outcomes.append(outcome)
         if outcome.residual is not None:
             spectra[outcome.controller] = welch_psd(outcome.residual[start:], record.dt)

@@ -16,11 +16,13 @@ import numpy as np
 from wfsobs.closed_loop.design import Design, LawDesign, design
 from wfsobs.control.base import Controller
 from wfsobs.control.controllers import CONTROLLERS
+from wfsobs.dependence import Memo, digest
 from wfsobs.pipeline import as_stated
 from wfsobs.priors_from.controllers import controller_arguments, own_settings
 from wfsobs.progress import QUIET, Watch, detach_watch
 from wfsobs.record import Record, RecordError
 from wfsobs.scenario import Scenario
+from wfsobs.scenario.idle import used_settings
 from wfsobs.signal.welch import rms
 from wfsobs.simulation.loop import simulate
 from wfsobs.typing import Array
@@ -108,11 +110,12 @@ def closed_loop(record: Record, plan: Design, watch: Watch = QUIET) -> ClosedLoo
 
 
 def each_outcome(
-    record: Record, plan: Design, watch: Watch = QUIET, controllers: Sequence[str] | None = None
+    record: Record, plan: Design, watch: Watch = QUIET, controllers: Sequence[str] | None = None, memo: Memo | None = None
 ) -> Iterator[Outcome]:
     """Run the controllers of a design (all unless named) and yield each one's outcome as soon as it is done.
 
-    Each receives measurements, its prior and its settings: neither record nor scenario.
+    Each receives measurements, its prior and its settings: neither record nor scenario. One whose outcome is known in the memo
+    by what it depends on does not run.
     """
     disturbance = truth(record)
     if as_stated(record, plan.scenario) is not plan.scenario:
@@ -122,7 +125,13 @@ def each_outcome(
     for name, designed in plan.laws.items():
         if controllers is None or name in controllers:
             watch.check()
-            yield _outcome(CONTROLLERS[name], designed, record, disturbance, plan, watch)
+            known_by = _name(CONTROLLERS[name], designed, record, plan) if memo is not None else ""
+            found = memo.get(known_by) if memo is not None and known_by else None
+            if found is None:
+                found = _outcome(CONTROLLERS[name], designed, record, disturbance, plan, watch)
+                if memo is not None and known_by:
+                    memo.put(known_by, found)
+            yield found
 
 
 def truth(record: Record) -> Array:
@@ -130,6 +139,19 @@ def truth(record: Record) -> Array:
     if record.turbulence is None or record.vibration is None:
         raise RecordError("the record has no truth, from which the residual of another controller is computed")
     return record.turbulence + record.vibration
+
+
+def _name(controller: Controller, designs: Sequence[LawDesign], record: Record, plan: Design) -> str:
+    """Return the name of an outcome: what it depends on; empty where a law or a prior has no value to compare."""
+    used = used_settings(plan.scenario)
+    own = [used.get(name) for name in controller.groups]
+    laws = [(d.law, d.stable, d.note) for d in designs]
+    settings = own_settings(controller, plan.scenario)
+    try:
+        measured, prior = controller_arguments(controller, record, settings, plan.priors[controller.id])
+        return digest("outcome", controller.id, laws, own, measured, prior, plan.plant, plan.start, truth(record))
+    except (TypeError, ValueError):
+        return ""
 
 
 def _outcome(

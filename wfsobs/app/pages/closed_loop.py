@@ -162,7 +162,7 @@ class ClosedLoopPage(PageActions):
         if of is None or self.run.state == RUNNING or of is self._of:
             return
         self._of = of
-        self.work.start(Job("loop", partial(compute, of), cost=cost(of.scenario)))
+        self.work.start(Job("loop", partial(compute, of, memo=self.store.session.service.memo), cost=cost(of.scenario)))
 
     @property
     def results(self) -> LoopResults | None:
