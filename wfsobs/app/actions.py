@@ -16,6 +16,7 @@ from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.pages.pages import Pages
 from wfsobs.app.pages.parts import PageActions
 from wfsobs.app.picker import file_message
+from wfsobs.app.record_link import name_record
 from wfsobs.app.report.maker import LIMIT, ReportError, make
 from wfsobs.app.seeds import SeedRuns
 from wfsobs.app.share import FILE, Link, from_file, from_query, to_file, to_query
@@ -39,7 +40,7 @@ class Toolbar(JSComponent):
     query = param.String("", doc="What a link to the settings has after its ?.")
     view = param.String("", doc="What the address has beside the settings, of the view.")
     has_link = param.Boolean(True, doc="Whether the settings are short enough for a link.")
-    record = param.String("", doc="The loaded record, which a link does not have.")
+    record = param.String("", doc="The loaded record, where a link cannot name it.")
     command = param.String("", doc="The settings as a command line.")
     python = param.String("", doc="The settings as Python.")
     ready = param.Boolean(False, doc="Whether there are results to save.")
@@ -78,8 +79,8 @@ class Actions:
         self._pages: Pages | None = None
         self._view: ViewState | None = None
         self.open_history: Callable[[], None] = lambda: None
-        store.param.watch(once(self._refresh, AFTERWARDS_MS), ["scenario", "preset", "source"])
-        store.run.param.watch(self._refresh_ready, "result")
+        store.param.watch(once(self._refresh, AFTERWARDS_MS), ["scenario", "preset", "source", "wanted_record"])
+        store.run.param.watch(lambda event: self.toolbar.param.update(ready=event.new is not None), "result")
         self._refresh()
 
     def attach(self, pages: Pages, seeds: SeedRuns) -> None:
@@ -137,6 +138,7 @@ class Actions:
         link = from_query(query, self.store.validate)
         kept = SimulatedRecord(link.simulation) if link.simulation and link.simulation != link.scenario else None
         self.store.load(link.scenario, link.preset, kept)
+        self.store.wanted_record = link.record
         self.toolbar.notes = [f"Not used from the link: {line}" for line in link.errors]
 
     def open_file(self, name: str, text: object) -> None:
@@ -232,18 +234,16 @@ class Actions:
 
     def _refresh(self, *_: object) -> None:
         scenario, preset, source = self.store.scenario, self.store.preset, self.store.source
-        query = to_query(scenario, preset, source.simulation if source else None)
+        named = name_record(source) or self.store.wanted_record
+        query = to_query(scenario, preset, source.simulation if source else None, named)
         task = self._offers.task if self._offers else EXPLORED
         self.toolbar.param.update(
             has_link=query is not None,
             query=query or "",
-            record=source.name if isinstance(source, LoadedRecord) else "",
+            record=source.name if isinstance(source, LoadedRecord) and named is None else "",
             command=to_command(scenario, preset, source, task),
             python=to_python(scenario, preset, source, task),
         )
-
-    def _refresh_ready(self, *_: object) -> None:
-        self.toolbar.ready = self.store.run.result is not None
 
 
 def _reason(text: str) -> str:

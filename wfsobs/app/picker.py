@@ -25,6 +25,7 @@ class Picker(JSComponent):
 
     message = param.String("", doc="What there is to say, in one line.")
     source_title = param.String("", doc="What takes the place of the simulation.")
+    back = param.String("Back to the simulation", doc="What the button is called that ends it.")
     largest = param.Integer(LARGEST, doc="The largest file that is sent [bytes].")
     part = param.Integer(PART, doc="How much is sent at a time [bytes].")
 

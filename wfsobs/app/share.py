@@ -2,8 +2,8 @@
 
 A link's query is `preset=ut4&turbulence.wind_speed=20&vibration.peaks=45,0.03,0.01,0.01;...`: lists with commas, a
 peak as frequency, damping and its rms per mode, a layer likewise, peaks and layers with semicolons. A simulation
-that is kept has its settings after `simulation.`, on top of the same preset. Whatever of a
-query cannot be used is named, and the rest is used. Nothing of it is ever opened or evaluated.
+that is kept has its settings after `simulation.`, on top of the same preset, a record that was loaded its name after `record.`.
+Whatever of a query cannot be used is named, and the rest is used. Nothing of it is ever opened or evaluated.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from urllib.parse import parse_qsl, quote
 import param
 
 from wfsobs.app.controls.fields import parse_number
+from wfsobs.app.record_link import PREFIX as RECORD
+from wfsobs.app.record_link import NamedRecord, read_record_fields, record_fields
 from wfsobs.scenario import Scenario, configfile
 from wfsobs.scenario.configfile import from_toml, parse_toml, reference_preset, to_toml
 from wfsobs.scenario.presets import PRESETS
@@ -49,12 +51,14 @@ class Link:
     """What a query asks for.
 
     errors : a line for every field that could not be used;  simulation : of other settings, which is kept
+    record : the one that the results are of, whose file is asked for
     """
 
     scenario: Scenario
     preset: str
     errors: tuple[str, ...] = field(default=())
     simulation: Scenario | None = None
+    record: NamedRecord | None = None
 
 
 def changes(scenario: Scenario, preset: str) -> dict[str, Any]:
@@ -65,16 +69,20 @@ def changes(scenario: Scenario, preset: str) -> dict[str, Any]:
 # ---------------------------------------------------------------------- links
 
 
-def to_query(scenario: Scenario, preset: str, simulation: Scenario | None = None) -> str | None:
+def to_query(
+    scenario: Scenario, preset: str, simulation: Scenario | None = None, record: NamedRecord | None = None
+) -> str | None:
     """Write the query of a link to these settings, without "?"; None where it would be too long.
 
-    simulation : of other settings, which is kept
+    simulation : of other settings, which is kept;  record : one that was loaded
     """
     changed = changes(scenario, preset)
-    parts = [f"preset={preset}"] if preset != SHORTEST_NAME or changed or simulation else []
+    parts = [f"preset={preset}"] if preset != SHORTEST_NAME or changed or simulation or record else []
     parts += _fields(changed)
     if simulation is not None:
         parts += [KEPT, *_fields(changes(simulation, preset), f"{KEPT}.")]
+    if record is not None:
+        parts += [f"{key}={quote(text, safe=',:-./')}" for key, text in record_fields(record).items()]
     query = "&".join(parts)
     return query if len(query) <= LONGEST else None
 
@@ -102,10 +110,13 @@ def from_query(query: str, check: Check = Scenario.validate) -> Link:
         rejected.append(_line("preset", name, f"takes one of {', '.join(PRESETS)}"))
         name = SHORTEST_NAME
     kept = {key.removeprefix(f"{KEPT}."): text for key, text in fields.items() if key.startswith(f"{KEPT}.")}
+    named = {key: fields.pop(key) for key in list(fields) if key.startswith(RECORD)}
     told = {key: text for key, text in fields.items() if key != KEPT and not key.startswith(f"{KEPT}.")}
     scenario, refused = _apply(PRESETS[name](), told, check)
     simulation, more = _apply(PRESETS[name](), kept, check) if kept or KEPT in fields else (None, [])
-    return Link(scenario, name, (*rejected, *refused, *more), simulation)
+    record, why = read_record_fields(named) if named else (None, {})
+    unread = [_line(key, named.get(key, ""), reason) for key, reason in why.items()]
+    return Link(scenario, name, (*rejected, *refused, *more, *unread), simulation, record)
 
 
 def has_settings(query: str) -> bool:

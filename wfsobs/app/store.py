@@ -14,6 +14,7 @@ from param.parameterized import batch_call_watchers
 
 from wfsobs.app.jobs.job import DONE
 from wfsobs.app.jobs.task import IDLE, BackgroundTask
+from wfsobs.app.record_link import NamedRecord
 from wfsobs.app.service import Post, Session
 from wfsobs.app.sources import LoadedRecord, SimulatedRecord, Source, Step, give_same_record
 from wfsobs.cost import rerun_seconds, run_seconds
@@ -36,6 +37,9 @@ class Store(param.Parameterized):
     errors = param.Dict({}, doc="Dotted path of a refused setting -> why, in one line.")
     preset = param.Selector(default=next(iter(PRESETS)), objects=list(PRESETS), doc="Where the settings started.")
     source: Source | None = param.Parameter(None, doc="What the observers run on; None for the simulation of the settings.")  # type: ignore
+    wanted_record: NamedRecord | None = param.Parameter(
+        None, doc="The record of the link that was opened, until its file is given."
+    )  # type: ignore
     stale = param.Boolean(False, doc="Whether the results shown are not those of the settings.")
     waiting = param.Number(0.0, doc="How long the run would take that waits to be asked for [s]; 0 where none does.")
     can_undo = param.Boolean(False, doc="Whether there is a change to undo.")
@@ -188,6 +192,7 @@ class Store(param.Parameterized):
             self.param.update(
                 scenario=self.scenario if unchanged else scenario,
                 source=self.source if stays else source,
+                wanted_record=None if isinstance(source, LoadedRecord) else self.wanted_record,
                 errors=errors,
                 preset=preset,
                 can_undo=bool(self._past),

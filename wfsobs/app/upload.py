@@ -15,23 +15,22 @@ import panel_material_ui as pmui
 
 from wfsobs.app.column_form import ColumnForm
 from wfsobs.app.controls.names import name_settings
-from wfsobs.app.jobs.job import CANCELLED, DONE, FAILED, RUNNING, Job, Tell
+from wfsobs.app.jobs.job import CANCELLED, FAILED, RUNNING, Job
 from wfsobs.app.jobs.task import BackgroundTask
 from wfsobs.app.picker import PartialFile, Picker, too_large
+from wfsobs.app.record_place import RecordPlace
+from wfsobs.app.sample_files import Examples
 from wfsobs.app.session_file import SUFFIX
-from wfsobs.app.sources import LoadedRecord, fit_to_record, record_key
+from wfsobs.app.sources import fit_to_record
 from wfsobs.app.store import Store
 from wfsobs.app.upload_fields import UploadFields, differs_from_proposals
-from wfsobs.app.upload_preview import PreviewView
-from wfsobs.progress import Watch
+from wfsobs.app.upload_preview import AnyPreview, PreviewView, read_stranger
 from wfsobs.record import RecordError
 from wfsobs.settings.errors import SettingError
-from wfsobs.telemetry.examples import TEMPLATE, sample_csv
 from wfsobs.telemetry.intake import DeclaredFormat
-from wfsobs.telemetry.preview import ColumnsPreview, Preview, SpectrumPreview, preview_any, safe_name
+from wfsobs.telemetry.preview import ColumnsPreview, Preview, SpectrumPreview, safe_name
 
-AnyPreview = Preview | SpectrumPreview | ColumnsPreview
-TEMPLATE_NAME, SAMPLE_NAME = "wfsobs-template.csv", "wfsobs-sample.csv"
+BACK, STAY = "Back to the simulation", "Stay with the simulation"
 
 
 class Upload:
@@ -50,13 +49,13 @@ class Upload:
             label="Take the proposed sign and delay", variant="outlined", size="small", margin=4, visible=False
         )
         self.take.on_click(lambda _event: self.take_proposals())
-        self.saving = BackgroundTask(store.session)
-        self.saving.param.watch(self._save, ["state", "place"])
+        self.place = RecordPlace(store)
+        self.examples = Examples(store, self.picker, self._say)
         self.open_scenario: Callable[[str, object], None] = lambda _name, _text: None
         self.open_session: Callable[[str, bytes], None] = lambda _name, _content: None
         self.room = pn.Column(visible=False, sizing_mode="stretch_width", margin=0)
         self._parcel = PartialFile()
-        self._name, self._content = "", b""
+        self._name, self._content, self._digest = "", b"", ""
         self._preview: AnyPreview | None = None
         self.reading = BackgroundTask(store.session)
         self.reading.param.watch(self._read, ["state", "place", "message"])
@@ -65,7 +64,7 @@ class Upload:
         self.fields = UploadFields(self.look)
         self._diameter = store.scenario.telescope.diameter
         store.param.watch(self._follow, "scenario")
-        store.param.watch(self._entitle, "source")
+        store.param.watch(self._entitle, ["source", "wanted_record"])
 
     def _follow(self, _event: object) -> None:
         diameter = self.store.scenario.telescope.diameter
@@ -73,8 +72,12 @@ class Upload:
             self._diameter = diameter
             self.look()
 
-    def _entitle(self, _event: object) -> None:
-        self.picker.source_title = self.store.source.title if self.store.source else ""
+    def _entitle(self, *_: object) -> None:
+        source, wanted = self.store.source, self.store.wanted_record
+        title = source.title if source else ""
+        if wanted is not None:
+            title = wanted.line(self._name, self._digest) if self._content and not self._is_wanted else wanted.line()
+        self.picker.param.update(source_title=title, back=STAY if wanted else BACK)
 
     # ------------------------------------------------------------------ the file
 
@@ -82,23 +85,17 @@ class Upload:
         """Do what a message of the browser says; one that makes no sense is a file that cannot be read."""
         action = msg.get("action")
         if action == "simulate":
-            self.simulate()
+            self.place.give_back()
         elif action == "large":
             self._say(too_large(safe_name(str(msg.get("name", "")))))
         elif action == "part":
             self._take(msg)
         elif action == "template":
-            self.picker.save(TEMPLATE_NAME, "text/csv", TEMPLATE.encode())
+            self.examples.send_template()
         elif action == "sample":
-            self.saving.start(Job("save", lambda watch, _tell: sample_csv(watch)))
+            self.examples.send_sample()
         elif action == "scenario":
             self.open_scenario(str(msg.get("name", "")), msg.get("text"))
-
-    def _save(self, *_: object) -> None:
-        task = self.saving
-        self._say("" if task.state == DONE else task.message if task.state == FAILED else task.line("Simulating a sample"))
-        if task.state == DONE:
-            self.picker.save(SAMPLE_NAME, "text/csv", task.result)
 
     def _take(self, msg: dict[str, Any]) -> None:
         if msg.get("index") == 0:
@@ -113,14 +110,22 @@ class Upload:
             if name.endswith(SUFFIX):
                 self.open_session(name, content)
             else:
-                self._name, self._content = name, content
+                self._name, self._content, self._digest = name, content, hashlib.sha256(content).hexdigest()
                 self._say("" if content else f"{name}: is empty")
+                self._entitle()
                 self.look()
 
     # ------------------------------------------------------------------ the preview
 
+    @property
+    def _is_wanted(self) -> bool:
+        """Whether the file is that of the link that was opened."""
+        return self.store.wanted_record is not None and self.store.wanted_record.sha256 == self._digest
+
     def read_fields(self) -> DeclaredFormat:
-        """Read the fields. Raises RecordError where one holds no number."""
+        """Read the fields, or what the link says of its file. Raises RecordError where one holds no number."""
+        if self.store.wanted_record is not None and self._is_wanted:
+            return self.store.wanted_record.declaration
         return self.fields.read(self.form.roles if self.form is not None else {})
 
     def take_proposals(self) -> None:
@@ -140,22 +145,26 @@ class Upload:
             self.reading.refuse(str(error))
             return
 
-        def read(_watch: Watch, _tell: Tell) -> AnyPreview:
-            try:
-                return preview_any(content, name, scenario, stated)
-            except RecordError:
-                raise
-            except Exception:  # whatever a stranger's file may do
-                raise RecordError(f"{name}: cannot be read") from None
-
-        self.reading.start(Job("upload", read))
+        self.reading.start(Job("upload", lambda _watch, _tell: read_stranger(content, name, scenario, stated)))
 
     def _read(self, *_: object) -> None:
         task = self.reading
         if task.state == RUNNING:
             self._say(task.line() if task.place else f"Reading {self._name} …")
         elif self._content and task.state != CANCELLED:
-            self._show(RecordError(task.message) if task.state == FAILED else task.result)
+            found = RecordError(task.message) if task.state == FAILED else task.result
+            if self._is_wanted:
+                self._use_wanted(found)
+            else:
+                self._show(found)
+
+    def _use_wanted(self, preview: AnyPreview | RecordError) -> None:
+        """Use the file of a link at once; look at it as at any other where that cannot be."""
+        self._preview = preview if isinstance(preview, Preview) else None
+        self.confirm()
+        if self.store.wanted_record is not None:
+            self.store.wanted_record = None
+            self.look()
 
     def _show(self, preview: AnyPreview | RecordError) -> None:
         if isinstance(preview, ColumnsPreview):
@@ -207,10 +216,8 @@ class Upload:
             self._vibrate(found)
         if not isinstance(found, Preview) or self._obstacle(found):
             return
-        record, stated, digest = found.record, self.read_fields(), hashlib.sha256(self._content).hexdigest()
         try:
-            scenario = fit_to_record(record, self.store.scenario)
-            self.store.run_on(LoadedRecord(record, found.name, record_key(record), found.lines()[0], stated, digest), scenario)
+            self.place.take(found, self.read_fields(), self._digest)
         except SettingError as error:
             self._say(f"{found.name}: {error}")
         else:
@@ -225,15 +232,11 @@ class Upload:
         else:
             self.discard(f"The vibration has the spectrum of {preview.name}.")
 
-    def simulate(self) -> None:
-        """Go back to the simulation; to the settings of one that was kept."""
-        if (source := self.store.source) is not None:
-            self.store.run_on(None, source.simulation or self.store.scenario)
-
     def discard(self, why: str = "") -> None:
         """Forget the file that is being looked at."""
-        self._content, self._preview = b"", None
+        self._content, self._digest, self._preview = b"", "", None
         self._parcel.drop()
+        self._entitle()
         if self.form is not None:
             self.form.visible = False
             self.form.show({}, {})

@@ -11,9 +11,12 @@ from bokeh.models import ColumnDataSource
 
 from wfsobs.app.views.plots import new_figure, send
 from wfsobs.record import RecordError
+from wfsobs.scenario import Scenario
 from wfsobs.sensors.modes import TIP_TILT
-from wfsobs.telemetry.preview import Preview, SpectrumPreview
+from wfsobs.telemetry.intake import DeclaredFormat
+from wfsobs.telemetry.preview import ColumnsPreview, Preview, SpectrumPreview, preview_any
 
+AnyPreview = Preview | SpectrumPreview | ColumnsPreview
 COLOURS = ("#0B4F6C", "#FF6600")
 NOTHING = np.empty(0)
 
@@ -46,3 +49,13 @@ class PreviewView:
 
 def _list(lines: Sequence[str]) -> str:
     return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
+
+
+def read_stranger(content: bytes, name: str, scenario: Scenario, declaration: DeclaredFormat) -> AnyPreview:
+    """Read a file that may be anything. Raises RecordError, one line."""
+    try:
+        return preview_any(content, name, scenario, declaration)
+    except RecordError:
+        raise
+    except Exception:  # whatever a stranger's file may do
+        raise RecordError(f"{name}: cannot be read") from None

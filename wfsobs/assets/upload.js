@@ -53,7 +53,7 @@ export function render({model, el}) {
   const open = Object.assign(document.createElement("button"), {type: "button", textContent: "Load data"})
   open.title = "A record of telemetry in place of the simulation, or a vibration spectrum: .npz, .csv, .fits"
   open.onclick = () => input.click()
-  const back = Object.assign(document.createElement("button"), {type: "button", textContent: "Back to the simulation"})
+  const back = Object.assign(document.createElement("button"), {type: "button"})
   back.onclick = () => model.send_msg({action: "simulate"})
   const loaded = document.createElement("span")
   const said = Object.assign(document.createElement("span"), {className: "said"})
@@ -70,9 +70,11 @@ export function render({model, el}) {
   const draw = () => {
     loaded.textContent = model.source_title
     back.hidden = !model.source_title
+    back.textContent = model.back
     said.textContent = model.message
   }
   model.on("source_title", draw)
+  model.on("back", draw)
   model.on("message", draw)
   draw()
 }
