@@ -119,6 +119,7 @@ def test_marks_hiding_colours_and_reasons(page: ClosedLoopPage, dashboard: Dashb
     assert page.trace.lines["integrator"].glyph.line_color == look("integrator").dark
     page.work.refuse("the record has no truth")
     assert "No closed loop: the record has no truth" in page.note.object
+    assert not page.cards.visible and page.results is None, "those of other results"
 
 
 def the_marks_lie_on_the_curves_where_the_margins_are(page: ClosedLoopPage) -> None:

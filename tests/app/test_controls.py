@@ -287,6 +287,13 @@ class TestPeaks:
         assert controls.store.run.result is not before
         assert controls.store.run.result.scenario == controls.store.scenario
 
+    def test_a_long_number_fits_its_cell(self, controls: Controls) -> None:
+        """What is kept has all digits."""
+        peak = {"frequency": 17.25123, "damping": 0.0123456, "rms": [0.0084123, 0.02]}
+        controls.store.replace({PATH: [peak]})
+        assert controls.lists[PATH].table.rows == [["17.25", "0.01235", "0.00841", "0.02"]]
+        assert controls.store.value(PATH)[0].to_dict() == peak
+
     @pytest.mark.parametrize(
         ("key", "text", "says"),
         [

@@ -19,6 +19,9 @@ from wfsobs.sensors.modes import TIP_TILT
 from wfsobs.settings.group import Group
 from wfsobs.settings.parameters import Reals, unit_of
 
+ROOM = 7
+"""Characters that a cell has room for."""
+
 
 class RowTable(JSComponent):
     """The table in the browser: texts down, messages {action, row, key, text} up."""
@@ -132,4 +135,7 @@ def _cell(item: Group, key: str) -> str:
     value = getattr(item, name)
     if mode:
         value = value[int(mode)] if int(mode) < len(value) else 0.0
-    return value if isinstance(value, str) else number_text(value)
+    if isinstance(value, str):
+        return value
+    texts = [number_text(value), *(number_text(float(f"{value:.{digits}g}")) for digits in (4, 3))]
+    return next((text for text in texts if len(text) <= ROOM), texts[-1])

@@ -68,6 +68,7 @@ class ClosedLoopPage(PageActions):
         run = store.run
         self.work = BackgroundTask(store.session)
         self.visible, self._of = False, object()
+        self._rooms = list[pn.viewable.Viewable]()
         self.note, self.table, self.margins = html(), html(), html()
         terms = {STREHL: TERMS[STREHL]}
         self.cards = Cards(items=[], hidden_lines=[], terms=terms, main=MAIN, sizing_mode="stretch_width", margin=0)
@@ -109,10 +110,11 @@ class ClosedLoopPage(PageActions):
             **WIDE,
             stylesheets=[GRID],
         )
+        self._rooms = [self._switch(), figures, box("Controllers", self.table), box("Stability", stability)]
+        self._rooms = [pn.Column(room, **WIDE) for room in self._rooms]  # which have styles of their own for what is to be seen
         return pn.Column(
-            box("Residual in closed loop", text(INTRO), self.note, self.cards, self._switch(), figures),
-            box("Controllers", self.table),
-            box("Stability", stability),
+            box("Residual in closed loop", text(INTRO), self.note, self.cards, *self._rooms[:2]),
+            *self._rooms[2:],
             **WIDE,
             stylesheets=[":host { gap: 10px; }"],
         )
@@ -166,14 +168,16 @@ class ClosedLoopPage(PageActions):
 
     @property
     def results(self) -> LoopResults | None:
-        """What the loop has given so far, or the one before."""
-        return self.work.result
+        """What the loop has given so far, or the one before; None where there cannot be one."""
+        return None if self.work.state == FAILED else self.work.result
 
     def _say(self, *_: object) -> None:
         work = self.work
         doing = work.line() if work.place else "computing …"
         said = {RUNNING: doing, FAILED: f"No closed loop: {work.message}"}.get(work.state, "")
         self.note.object = f'<p class="text" role="status">{escape(said)}</p>' if said else ""
+        for room in (self.cards, *self._rooms):  # of other results
+            room.visible = work.state != FAILED
 
     def _redraw(self, *_: object) -> None:
         shown = self.results

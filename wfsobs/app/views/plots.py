@@ -39,6 +39,7 @@ def new_figure(**options: Any) -> figure:
         min_border_left=70,
         **options,
     )
+    fig.outline_line_color = None  # of which a theme has its own idea, the dark one alone
     fig.toolbar.logo = None
     fig.toolbar.autohide = True
     return fig
