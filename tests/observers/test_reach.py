@@ -87,7 +87,7 @@ def test_arguments_have_memory_of_their_own(name: str, record: Record) -> None:
     observer = OBSERVERS[name]
     measured, prior, settings = door.arguments(observer, record, scenario())
     arrays = [x for x in walk_references(measured, prior, settings) if isinstance(x, np.ndarray)]
-    assert len(arrays) >= 3
+    assert len(arrays) >= 2  # measurements of a sensor, and commands
     assert all(x.base is None and x.flags.owndata and x.flags.c_contiguous for x in arrays)
     assert (measured.open_loop_y is None) == ("open_loop_y" not in observer.needs)
     assert (prior.training is None) == ("training" not in observer.needs)

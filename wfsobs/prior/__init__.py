@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from math import nan
 from typing import Any, Literal
 
 from wfsobs.prior.parts import Asterism, Beams, Flow, FlowOfBoth, LgsError, LgsStars, Line, Lines, Spectra
@@ -132,5 +133,6 @@ class Prior:
     noise: tuple[Noise, ...] = ()
 
     def noise_of(self, mode: int) -> Noise | Model:
-        """Return what tells the noise of one mode: the noise alone, or the model."""
-        return (self.noise or self.model)[mode]
+        """Return what tells the noise of one mode: the noise alone, or the model; NaN where neither was asked for."""
+        told = self.noise or self.model
+        return told[mode] if told else Noise(nan, nan)
