@@ -19,7 +19,8 @@ import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
 MARKER = re.compile(
-    r"^<!-- (\w+)\.py(?: ([\w -]+?)(?: --[\w ,=-]+)?)?: (seeds \d+ to \d+|no random numbers), (\d{4}-\d\d-\d\d)(?:, checked to ([\d.]+) %)? -->$",
+    r"^<!-- (\w+)\.py(?: ([\w -]+?)(?: --[\w ,=-]+)?)?: (seeds \d+ to \d+|no random numbers), (\d{4}-\d\d-\d\d)"
+    r"(?:, checked to ([\d.]+) %)? -->$",
     re.M,
 )
 NUMBER = re.compile(r"([\d.]+)(?: \(.*\))?")
