@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Collection
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -197,6 +198,19 @@ def before() -> tuple[Memo, Record, list[Any]]:
     memo = Memo()
     record = simulate_once(BASE, memo)
     return memo, record, list(each_estimate(record, BASE, memo=RecordMemo(memo, record)))
+
+
+def double(x: float, y: float = 0.0) -> float:
+    return 2.0 * x + y
+
+
+def test_a_function_counts_with_what_is_bound_to_it_and_one_that_may_hold_more_has_no_digest() -> None:
+    names = {digest(bound) for bound in (partial(double), partial(double, 1.0), partial(double, 2.0), partial(double, y=1.0))}
+    assert len(names) == 4 and digest(partial(double, 1.0)) in names
+    held = 1.0
+    for function in (lambda x: x, lambda x: x + held, Memo().get):
+        with pytest.raises(TypeError, match="a partial has no digest"):
+            digest(partial(function, 1.0))
 
 
 class TestReuse:

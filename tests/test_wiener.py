@@ -131,7 +131,7 @@ def test_measurements_are_counted_until_they_are_enough() -> None:
     spectra = true_spectra(MATCHED, 0)
     r, c = autocovariance(spectra.measurement)[:1000], autocovariance(spectra.total[1])[None, 1:1001]
     every = explained_variance(r, c)
-    few = explained_variance(r, c, 0.999 * every[:, -1])
+    few = explained_variance(r, c, enough=0.999 * every[:, -1])
     assert few.shape[1] < 500 and (few == every[:, : few.shape[1]]).all()
     assert 0.999 < few[0, -1] / every[0, -1] < 1.0
 

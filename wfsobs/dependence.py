@@ -11,6 +11,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from functools import partial
+from types import FunctionType
 from typing import Any, TypeVar
 from weakref import WeakValueDictionary
 
@@ -50,12 +51,19 @@ class Memo:
         self._values[name] = value
         return value
 
+    def keep(self, name: str, make: Callable[[], T]) -> T:
+        """Return the value of a name, made where it is not known; None, which nobody can hold, is made every time."""
+        if (known := self.get(name)) is not None:
+            return known
+        made = make()
+        return made if made is None else self.put(name, made)
+
     def __len__(self) -> int:
         return len(self._values)
 
 
 def digest(*values: Any) -> str:
-    """Return a digest of numbers, texts, arrays and what is made of these, with functions that are bound to them.
+    """Return a digest of numbers, texts, arrays, and what is made of these, functions of modules that are bound to them too.
 
     Raises TypeError for anything else, which has no value to compare.
 
@@ -83,8 +91,8 @@ def _parts(value: Any) -> Iterator[Any]:
             yield from _parts(item)
     elif isinstance(value, Mapping):
         yield from _parts(sorted(value.items()))
-    elif isinstance(value, partial):
-        yield f"partial {value.func.__module__}.{value.func.__qualname__}".encode()
+    elif isinstance(value, partial) and _is_of_module(value.func):
+        yield f"partial {value.func.__module__}.{value.func.__name__}".encode()
         yield from _parts((value.args, value.keywords))
     elif is_dataclass(value):
         yield type(value).__name__.encode()
@@ -92,6 +100,11 @@ def _parts(value: Any) -> Iterator[Any]:
             yield from _parts(getattr(value, field.name))
     else:
         raise TypeError(f"a {type(value).__name__} has no digest")
+
+
+def _is_of_module(function: Any) -> bool:
+    """Return whether a function is all that its name says: one made within another may hold values of it."""
+    return isinstance(function, FunctionType) and function.__qualname__ == function.__name__ != "<lambda>"
 
 
 def record_digest(record: Record) -> str:
@@ -176,8 +189,4 @@ class RecordMemo:
         of = self._names.get((estimate.observer, estimate.target))
         if of is None:
             return make()
-        name = f"{what} of {of} {estimate.target} in {self.record}"
-        if (known := self.memo.get(name)) is not None:
-            return known
-        made = make()
-        return made if made is None else self.memo.put(name, made)
+        return self.memo.keep(f"{what} of {of} {estimate.target} in {self.record}", make)

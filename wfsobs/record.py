@@ -181,7 +181,7 @@ class Record(Signals):
             ("missing", str(self.missing)),
         ]
 
-    def measurements(self, open_loop: bool = False, sensors: Collection[str] = SENSORS) -> Measurements:
+    def measurements(self, open_loop: bool = False, *, sensors: Collection[str] = SENSORS) -> Measurements:
         """Return copies of the signals alone: no array is a view of another.
 
         open_loop : with the open-loop measurement

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from math import pi
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from wfsobs.closed_loop.design import Design, LawDesign, design
 from wfsobs.control.base import Controller
 from wfsobs.control.controllers import CONTROLLERS
-from wfsobs.dependence import Memo, digest
+from wfsobs.dependence import Memo, digest, record_digest
 from wfsobs.pipeline import as_stated
 from wfsobs.priors_from.controllers import controller_arguments, own_settings
 from wfsobs.progress import QUIET, Watch, detach_watch
@@ -110,7 +111,7 @@ def closed_loop(record: Record, plan: Design, watch: Watch = QUIET) -> ClosedLoo
 
 
 def each_outcome(
-    record: Record, plan: Design, watch: Watch = QUIET, controllers: Sequence[str] | None = None, memo: Memo | None = None
+    record: Record, plan: Design, watch: Watch = QUIET, controllers: Sequence[str] | None = None, *, memo: Memo | None = None
 ) -> Iterator[Outcome]:
     """Run the controllers of a design (all unless named) and yield each one's outcome as soon as it is done.
 
@@ -125,13 +126,9 @@ def each_outcome(
     for name, designed in plan.laws.items():
         if controllers is None or name in controllers:
             watch.check()
+            run = partial(_outcome, CONTROLLERS[name], designed, record, disturbance, plan, watch)
             known_by = _name(CONTROLLERS[name], designed, record, plan) if memo is not None else ""
-            found = memo.get(known_by) if memo is not None and known_by else None
-            if found is None:
-                found = _outcome(CONTROLLERS[name], designed, record, disturbance, plan, watch)
-                if memo is not None and known_by:
-                    memo.put(known_by, found)
-            yield found
+            yield memo.keep(known_by, run) if memo is not None and known_by else run()
 
 
 def truth(record: Record) -> Array:
@@ -143,13 +140,11 @@ def truth(record: Record) -> Array:
 
 def _name(controller: Controller, designs: Sequence[LawDesign], record: Record, plan: Design) -> str:
     """Return the name of an outcome: what it depends on; empty where a law or a prior has no value to compare."""
-    used = used_settings(plan.scenario)
-    own = [used.get(name) for name in controller.groups]
-    laws = [(d.law, d.stable, d.note) for d in designs]
-    settings = own_settings(controller, plan.scenario)
+    used, settings = used_settings(plan.scenario), own_settings(controller, plan.scenario)
+    own, laws = [used.get(name) for name in controller.groups], [(d.law, d.stable, d.note) for d in designs]
     try:
-        measured, prior = controller_arguments(controller, record, settings, plan.priors[controller.id])
-        return digest("outcome", controller.id, laws, own, measured, prior, plan.plant, plan.start, truth(record))
+        _, prior = controller_arguments(controller, record, settings, plan.priors[controller.id])
+        return digest("outcome", controller.id, laws, own, record_digest(record), prior, plan.plant, plan.start)
     except (TypeError, ValueError):
         return ""
 

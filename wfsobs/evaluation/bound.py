@@ -119,7 +119,7 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
     measured = fft.irfft(known.measurement, whitener.n)[:past] + spectra.gain**2 * spectra.line_covariance(past)
     covariance = fft.irfft(error_spectrum(own, shared, whitener), whitener.n)[:, : min(n_steps, whitener.n // 2)]
     variance = lines[:, 0] + [circle_mean(one) for one in own]
-    gained = explained_variance(measured, cross, variance - (1.0 + LEARNT) * covariance[:, 0])
+    gained = explained_variance(measured, cross, enough=variance - (1.0 + LEARNT) * covariance[:, 0])
     transient = variance[:, None] - np.hstack([np.zeros((len(names), 1)), gained])
     n_lines = len(spectra.pure)
     found = {name: LeastError(left, learnt, n_lines) for name, left, learnt in zip(names, covariance, transient, strict=True)}

@@ -152,7 +152,7 @@ class Observer:
     def measurements(self, record: Record) -> Measurements:
         """Return copies of what it receives of a record: the measurements of its sensors, and what it needs besides."""
         sensors = (*self.sensors, "ngs") if "y_ngs" in self.needs else self.sensors
-        return record.measurements("open_loop_y" in self.needs, sensors)
+        return record.measurements("open_loop_y" in self.needs, sensors=sensors)
 
     def missing(self, record: Record) -> tuple[str, ...]:
         """Return the needed fields that a record does not have."""

@@ -40,6 +40,7 @@ def frame_shares(
     noise: float,
     frame_noise: float,
     gain: float = 1.0,
+    *,
     age: int = 0,
 ) -> list[FrameShare]:
     """Return the shares in the states of both filters, the fast one first, in `ratio` steps one after the other.

@@ -121,7 +121,7 @@ def _of_future(cross: Complex, whitener: Whitener) -> Array:
     return fft.irfft(cross / whitener.H.conj(), whitener.n)[..., whitener.n // 2 :]
 
 
-def explained_variance(autocovariance: Array, cross: Array, enough: Array | float = np.inf) -> Array:
+def explained_variance(autocovariance: Array, cross: Array, *, enough: Array | float = np.inf) -> Array:
     """Return the variance of targets s[k] that n = 1, 2, ... measurements z[k], ..., z[k-n+1] explain.
 
     Levinson's recursion: the errors of predicting each earlier measurement from the later ones are orthogonal.

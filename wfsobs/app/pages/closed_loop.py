@@ -110,8 +110,8 @@ class ClosedLoopPage(PageActions):
             **WIDE,
             stylesheets=[GRID],
         )
-        self._rooms = [self._switch(), figures, box("Controllers", self.table), box("Stability", stability)]
-        self._rooms = [pn.Column(room, **WIDE) for room in self._rooms]  # which have styles of their own for what is to be seen
+        parts = (self._switch(), figures, box("Controllers", self.table), box("Stability", stability))
+        self._rooms = [pn.Column(part, **WIDE) for part in parts]  # a grid by its own style is shown even where it is not visible
         return pn.Column(
             box("Residual in closed loop", text(INTRO), self.note, self.cards, *self._rooms[:2]),
             *self._rooms[2:],

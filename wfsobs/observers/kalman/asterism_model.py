@@ -73,6 +73,7 @@ class AsterismModel:
         ratio: int | None,
         means: StateFilter = MEANS,
         frame_means: StateFilter = FRAME_MEANS,
+        *,
         age: int = 0,
     ):
         asterism = prior.asterism

@@ -120,7 +120,7 @@ class JointEstimator:
 
     @property
     def n_lost(self) -> int:
-        """Number of NGS frames that were due last are awaited, none of which came."""
+        """Number of NGS frames that were due last and did not come, and for which nothing has been taken yet."""
         return max(self.phase, 0) // self.model.ratio
 
     def _now(self, name: str, *details: Any) -> Any:
