@@ -13,6 +13,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -158,19 +159,23 @@ def leave(page: Page) -> None:
     page.close()
 
 
-@pytest.fixture
-def open_page(server: Server, contexts: Contexts) -> Iterator[Any]:
-    """A function that opens the dashboard in a window of some size and waits for the first result.
+@contextmanager
+def opening(server: Server, contexts: Contexts) -> Iterator[Any]:
+    """A function that opens the dashboard in a window of some size and waits for the first result; in the end they close.
 
     It has one seed, so that nothing runs on in idle time and takes the processor from the next test; 0: as many as a visitor has.
     """
     start = len(server.log.read_text())
     opened: list[tuple[Page, Watched]] = []
 
-    def open_it(width: int = 1400, height: int = 1000, url: str = "", wait: bool = True, seeds: int = 1, **options: Any) -> Page:
+    def open_it(
+        width: int = 1400, height: int = 1000, url: str = "", wait: bool = True, seeds: int = 1, script: str = "", **options: Any
+    ) -> Page:
         page = contexts(**options).new_page()
         page.set_viewport_size({"width": width, "height": height})
         page.set_default_timeout(120_000)
+        if script:
+            page.add_init_script(script)
         opened.append((page, Watched(page)))
         page.goto(with_seeds(url or server.url, seeds))
         if wait:
@@ -184,6 +189,20 @@ def open_page(server: Server, contexts: Contexts) -> Iterator[Any]:
     assert faults == []
     errors = server.errors(start)
     assert not errors, "\n".join(errors)
+
+
+@pytest.fixture
+def open_page(server: Server, contexts: Contexts) -> Iterator[Any]:
+    """As `opening`, for the pages of one test."""
+    with opening(server, contexts) as open_it:
+        yield open_it
+
+
+@pytest.fixture(scope="module")
+def open_shared(server: Server, contexts: Contexts) -> Iterator[Any]:
+    """As `opening`, for pages that several tests of a module look at: a page takes longer to open than most tests to look."""
+    with opening(server, contexts) as open_it:
+        yield open_it
 
 
 DONE = """() => [...(window.Bokeh?.index?.roots?.[0]?.model.document._all_models.values() ?? [])]

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import with_seeds
 from wfsobs.app.style import observers_of
 from wfsobs.observers.base import TARGETS
 from wfsobs.scenario.presets import PRESETS
@@ -50,8 +49,67 @@ def shot(page: Page, directory: Path, name: str) -> None:
     assert path.stat().st_size > 20_000, "a page with something on it"
 
 
-def test_first_paint(open_page: Any, tmp_path: Path) -> None:
-    page = open_page()
+DRAWER = """() => {
+  window.drawerSeen = 0
+  const find = (root) => {
+    for (const it of root.querySelectorAll("*")) {
+      const found = it.matches(".sidebar") ? it : it.shadowRoot && find(it.shadowRoot)
+      if (found) return found
+    }
+  }
+  const look = () => {
+    const it = find(document)
+    if (it && it.checkVisibility({visibilityProperty: true}) && it.getBoundingClientRect().right > 0) window.drawerSeen += 1
+    if (!window.drawerTold) requestAnimationFrame(look)
+  }
+  look()
+}"""
+"""Counts the frames in which the drawer is seen, from the first on, until that is told."""
+
+
+@pytest.fixture(scope="module")
+def wide(open_shared: Any) -> Page:
+    """A page that is looked at by the tests below, in this order."""
+    return open_shared(script=f"({DRAWER})()")
+
+
+@pytest.fixture(scope="module")
+def phone(open_shared: Any) -> Page:
+    """As `wide`."""
+    return open_shared(390, 844, script=f"({DRAWER})()")
+
+
+@pytest.mark.parametrize(("name", "seen"), [("phone", False), ("wide", True)])
+def test_the_drawer_of_a_phone_is_closed_from_the_first_frame_on(request: pytest.FixtureRequest, name: str, seen: bool) -> None:
+    page = request.getfixturevalue(name)
+    assert bool(page.evaluate("() => { window.drawerTold = true; return window.drawerSeen }")) == seen
+
+
+NAMES = """() => {
+  const found = (root) => [...root.querySelectorAll("*")].flatMap((it) => [
+    ...it.matches(".card .name") ? [it] : [], ...it.shadowRoot ? found(it.shadowRoot) : []])
+  return found(document).filter((it) => it.offsetParent).map((it) => [it.textContent, it.scrollWidth - it.clientWidth])
+}"""
+
+
+@pytest.mark.parametrize("name", ["wide", "phone"])
+def test_the_name_on_every_card_is_readable(request: pytest.FixtureRequest, name: str) -> None:
+    names = request.getfixturevalue(name).evaluate(NAMES)
+    assert len(names) > 15 and [name for name, beyond in names if beyond > 0] == []
+
+
+def test_phone(phone: Page, tmp_path: Path) -> None:
+    page = phone
+    expect(page.get_by_role("button", name="Open drawer")).to_be_visible()
+    still(page)
+    page.wait_for_function("() => document.documentElement.scrollWidth <= 390")
+    shot(page, tmp_path, "phone")
+    page.get_by_role("button", name="Open drawer").click()
+    expect(wind(page)).to_be_visible()
+
+
+def test_first_paint(wide: Page, tmp_path: Path) -> None:
+    page = wide
     for observer, target in (
         ("kf-lgs", "turbulence"),
         ("multirate", "turbulence"),
@@ -70,6 +128,91 @@ def test_first_paint(open_page: Any, tmp_path: Path) -> None:
     drawn = f"n => {{ const all = ({POINTS})(); return all.length === n && Math.min(...all) > 300 }}"
     page.wait_for_function(drawn, arg=2 * lines)  # every line that the cards show has points, in both figures
     shot(page, tmp_path, "light")
+
+
+def test_a_bad_value_shows_inline_and_leaves_the_result(wide: Page) -> None:
+    page = wide
+    before = rms(page)
+    box = page.get_by_role("textbox", name="m/s")
+    box.fill("200")
+    box.press("Enter")
+    message = "takes a number from 0.1 to 100 m/s"
+    expect(page.get_by_role("alert").filter(has_text=message).first).to_be_visible()
+    expect(box).to_have_value("200")
+    expect(box).to_have_attribute("aria-invalid", "true")
+    assert rms(page) == before
+    box.fill("15")
+    box.press("Enter")
+    expect(page.get_by_role("alert").filter(has_text=message)).to_have_count(0)
+
+    cell = page.locator('input[data-cell="0.frequency"]')
+    value = cell.input_value()
+    cell.fill("fast")
+    cell.press("Enter")
+    expect(page.get_by_role("alert").filter(has_text="Peak 1: f = 'fast'").first).to_be_visible()
+    expect(cell).to_have_attribute("aria-invalid", "true")
+    assert rms(page) == before
+    cell.fill(value)
+    cell.press("Enter")
+    expect(page.get_by_role("alert").filter(has_text="Peak 1: f = 'fast'")).to_have_count(0)
+
+
+def test_signal_and_error(wide: Page) -> None:
+    page = wide
+    label = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
+        .filter(m => m.type === "LinearAxis").map(m => m.axis_label).join()"""
+    page.wait_for_function(f"({label})().includes('error of tip [nm]')")
+    page.get_by_role("button", name="Signal", exact=True).click()
+    page.wait_for_function(f"!({label})().includes('error')")
+    page.get_by_role("button", name="Error", exact=True).click()
+    page.wait_for_function(f"({label})().includes('error of tip [nm]')")
+    page.get_by_role("button", name="mas", exact=True).click()
+    page.get_by_role("button", name="Tilt", exact=True).click()
+    page.wait_for_function(f"({label})().includes('error of tilt [mas]')")
+    expect(page.get_by_text("RMS error [mas]")).to_be_visible()
+
+
+def test_a_zoom_fetches_more_samples(wide: Page) -> None:
+    page = wide
+    step = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
+        .filter(m => m.type === "ColumnDataSource" && m.data["kf-ngs"]).map(m => m.data.x[1] - m.data.x[0])[0]"""
+    page.get_by_role("button", name="Time window: whole record").click()
+    page.wait_for_function(f"({step})() > 5e-3")
+    page.get_by_role("button", name="Time window: 0.2 s").click()
+    page.wait_for_function(f"Math.abs(({step})() - 1e-3) < 1e-9")
+
+
+def test_cards_hide_lines(wide: Page) -> None:
+    page = wide
+    card = page.locator(".card[data-name=gpr-online]")  # always among those that are shown at first
+    expect(card).to_have_attribute("aria-pressed", "true")
+    card.click()
+    expect(card).to_have_attribute("aria-pressed", "false")
+    visible = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
+        .filter(m => m.type === "GlyphRenderer" && m.name === "gpr-online").map(m => m.visible)"""
+    page.wait_for_function(f"({visible})().every(v => !v)")
+
+
+def test_figures_take_the_height_of_the_window(wide: Page) -> None:
+    page = wide
+    figure = page.get_by_role("figure", name="Turbulence time trace")
+    height = "box => box.getBoundingClientRect().height"
+    # 42 % of the window, of which a line of text is the caption's
+    page.wait_for_function(f"([it]) => Math.abs(({height})(it) - 400) < 30", arg=[figure.element_handle()])
+    page.set_viewport_size({"width": 1400, "height": 700})
+    page.wait_for_function(f"([it]) => Math.abs(({height})(it) - 274) < 30", arg=[figure.element_handle()])
+    page.set_viewport_size({"width": 1400, "height": 1000})
+
+
+def test_dark(wide: Page, tmp_path: Path) -> None:
+    page = wide
+    page.get_by_role("button", name=re.compile("theme", re.I)).click()
+    colour = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
+        .filter(m => m.type === "GlyphRenderer" && m.name === "gpr-online").map(m => m.glyph.line_color.value)"""
+    page.wait_for_function(f"({colour})().every(c => c === '#A6E3A6')")
+    page.wait_for_function("() => getComputedStyle(document.body).backgroundColor !== 'rgb(255, 255, 255)'")
+    still(page)
+    shot(page, tmp_path, "dark")
 
 
 def test_the_wind_speed_slider_runs_again(open_page: Any) -> None:
@@ -103,29 +246,6 @@ def test_peaks_are_added_removed_and_edited(open_page: Any) -> None:
     finished(page)
 
 
-def test_a_bad_value_shows_inline_and_leaves_the_result(open_page: Any) -> None:
-    page = open_page()
-    before = rms(page)
-    box = page.get_by_role("textbox", name="m/s")
-    box.fill("200")
-    box.press("Enter")
-    message = "takes a number from 0.1 to 100 m/s"
-    expect(page.get_by_role("alert").filter(has_text=message).first).to_be_visible()
-    expect(box).to_have_value("200")
-    expect(box).to_have_attribute("aria-invalid", "true")
-    assert rms(page) == before
-    box.fill("15")
-    box.press("Enter")
-    expect(page.get_by_role("alert").filter(has_text=message)).to_have_count(0)
-
-    cell = page.locator('input[data-cell="0.frequency"]')
-    cell.fill("fast")
-    cell.press("Enter")
-    expect(page.get_by_role("alert").filter(has_text="Peak 1: f = 'fast'").first).to_be_visible()
-    expect(cell).to_have_attribute("aria-invalid", "true")
-    assert rms(page) == before
-
-
 def test_choosing_a_preset(open_page: Any) -> None:
     page = open_page()
     page.get_by_role("combobox", name="Preset").click()
@@ -134,42 +254,6 @@ def test_choosing_a_preset(open_page: Any) -> None:
     expect(page.get_by_role("combobox", name="Preset")).to_have_text("UT4")
     expect(page.locator('tr[data-observer="kf-lgs"][data-target="vibration"] td').first).not_to_have_text("–")
     finished(page)
-
-
-def test_signal_and_error(open_page: Any) -> None:
-    page = open_page()
-    label = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
-        .filter(m => m.type === "LinearAxis").map(m => m.axis_label).join()"""
-    page.wait_for_function(f"({label})().includes('error of tip [nm]')")
-    page.get_by_role("button", name="Signal", exact=True).click()
-    page.wait_for_function(f"!({label})().includes('error')")
-    page.get_by_role("button", name="Error", exact=True).click()
-    page.wait_for_function(f"({label})().includes('error of tip [nm]')")
-    page.get_by_role("button", name="mas", exact=True).click()
-    page.get_by_role("button", name="Tilt", exact=True).click()
-    page.wait_for_function(f"({label})().includes('error of tilt [mas]')")
-    expect(page.get_by_text("RMS error [mas]")).to_be_visible()
-
-
-def test_a_zoom_fetches_more_samples(open_page: Any) -> None:
-    page = open_page()
-    step = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
-        .filter(m => m.type === "ColumnDataSource" && m.data["kf-ngs"]).map(m => m.data.x[1] - m.data.x[0])[0]"""
-    page.get_by_role("button", name="Time window: whole record").click()
-    page.wait_for_function(f"({step})() > 5e-3")
-    page.get_by_role("button", name="Time window: 0.2 s").click()
-    page.wait_for_function(f"Math.abs(({step})() - 1e-3) < 1e-9")
-
-
-def test_cards_hide_lines(open_page: Any) -> None:
-    page = open_page()
-    card = page.locator(".card[data-name=gpr-online]")  # always among those that are shown at first
-    expect(card).to_have_attribute("aria-pressed", "true")
-    card.click()
-    expect(card).to_have_attribute("aria-pressed", "false")
-    visible = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
-        .filter(m => m.type === "GlyphRenderer" && m.name === "gpr-online").map(m => m.visible)"""
-    page.wait_for_function(f"({visible})().every(v => !v)")
 
 
 VISIBLE = """() => [...new Set([...Bokeh.index.roots[0].model.document._all_models.values()]
@@ -203,16 +287,6 @@ def test_a_double_click_shows_a_line_alone(open_page: Any) -> None:
     page.wait_for_function(f"few => ({VISIBLE})().join() === few.join()", arg=few)
 
 
-def test_figures_take_the_height_of_the_window(open_page: Any) -> None:
-    page = open_page(1400, 1000)
-    figure = page.get_by_role("figure", name="Turbulence time trace")
-    height = "box => box.getBoundingClientRect().height"
-    # 42 % of the window, of which a line of text is the caption's
-    page.wait_for_function(f"([it]) => Math.abs(({height})(it) - 400) < 30", arg=[figure.element_handle()])
-    page.set_viewport_size({"width": 1400, "height": 700})
-    page.wait_for_function(f"([it]) => Math.abs(({height})(it) - 274) < 30", arg=[figure.element_handle()])
-
-
 def test_cancel(open_page: Any, server: Any) -> None:
     # Long enough not to be over before the click, whatever the browser takes to draw the page.
     page = open_page(url=f"{server.url}?run.duration=100&run.seed=77", wait=False)
@@ -225,68 +299,6 @@ def test_cancel(open_page: Any, server: Any) -> None:
     expect(cancel).to_be_disabled()
     page.get_by_role("button", name="Reset", exact=True).click()
     finished(page)
-
-
-DRAWER = """() => {
-  window.drawerSeen = 0
-  const find = (root) => {
-    for (const it of root.querySelectorAll("*")) {
-      const found = it.matches(".sidebar") ? it : it.shadowRoot && find(it.shadowRoot)
-      if (found) return found
-    }
-  }
-  const look = () => {
-    const it = find(document)
-    if (it && it.checkVisibility({visibilityProperty: true}) && it.getBoundingClientRect().right > 0) window.drawerSeen += 1
-    requestAnimationFrame(look)
-  }
-  look()
-}"""
-"""Counts the frames in which the drawer is seen, from the first on."""
-
-
-@pytest.mark.parametrize(("width", "seen"), [(390, False), (1400, True)], ids=["phone", "wide"])
-def test_the_drawer_of_a_phone_is_closed_from_the_first_frame_on(browser: Browser, server: Any, width: int, seen: bool) -> None:
-    page = browser.new_page(viewport={"width": width, "height": 844})
-    page.add_init_script(f"({DRAWER})()")
-    page.goto(with_seeds(server.url, 1))
-    finished(page)
-    assert bool(page.evaluate("() => window.drawerSeen")) == seen
-    page.close()
-
-
-NAMES = """() => {
-  const found = (root) => [...root.querySelectorAll("*")].flatMap((it) => [
-    ...it.matches(".card .name") ? [it] : [], ...it.shadowRoot ? found(it.shadowRoot) : []])
-  return found(document).filter((it) => it.offsetParent).map((it) => [it.textContent, it.scrollWidth - it.clientWidth])
-}"""
-
-
-@pytest.mark.parametrize("width", [1400, 390], ids=["wide", "phone"])
-def test_the_name_on_every_card_is_readable(open_page: Any, width: int) -> None:
-    names = open_page(width, 844).evaluate(NAMES)
-    assert len(names) > 15 and [name for name, beyond in names if beyond > 0] == []
-
-
-def test_phone(open_page: Any, tmp_path: Path) -> None:
-    page = open_page(390, 844)
-    expect(page.get_by_role("button", name="Open drawer")).to_be_visible()
-    still(page)
-    page.wait_for_function("() => document.documentElement.scrollWidth <= 390")
-    shot(page, tmp_path, "phone")
-    page.get_by_role("button", name="Open drawer").click()
-    expect(wind(page)).to_be_visible()
-
-
-def test_dark(open_page: Any, tmp_path: Path) -> None:
-    page = open_page()
-    page.get_by_role("button", name=re.compile("theme", re.I)).click()
-    colour = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
-        .filter(m => m.type === "GlyphRenderer" && m.name === "gpr-online").map(m => m.glyph.line_color.value)"""
-    page.wait_for_function(f"({colour})().every(c => c === '#A6E3A6')")
-    page.wait_for_function("() => getComputedStyle(document.body).backgroundColor !== 'rgb(255, 255, 255)'")
-    still(page)
-    shot(page, tmp_path, "dark")
 
 
 def test_two_sessions_do_not_see_each_other(open_page: Any) -> None:
