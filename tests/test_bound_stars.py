@@ -47,9 +47,10 @@ def exact_errors(stars: StarSpectra, n_steps: int, phase: int, ahead: int) -> di
     known, n = stars.mean.without_lines, stars.mean.ngs.ratio
     exposure = exposure_response(n, known.measurement.size)
     # The signals are the mean and the differences, then the frame. A measurement is a step later than what it measures.
-    cross = np.vstack([known.measurement[None] + 0j, stars.cross])
-    among = np.concatenate([cross.conj()[None], np.concatenate([stars.cross[:, None], stars.differences], axis=1)])
-    frames = np.vstack([known.ngs.measurement_cross[None] + 0j, stars.ngs_cross]) * exposure
+    each = range(stars.n_differences)
+    cross = np.array([known.measurement + 0j, *(stars.with_z(i) for i in each)])
+    among = np.array([cross.conj(), *([cross[1 + i], *(stars.between(i, j) for j in each)] for i in each)])
+    frames = np.array([known.ngs.measurement_cross + 0j, *(stars.with_ngs(i) for i in each)]) * exposure
     back = np.linalg.inv(star_basis(len(among)))
     among = np.einsum("ai,ijf,bj->abf", back, among, back)
     by_star = np.einsum("ai,if->af", back, advance_spectrum(frames, 1))
@@ -66,7 +67,7 @@ def exact_errors(stars: StarSpectra, n_steps: int, phase: int, ahead: int) -> di
     measured = np.block([*([*row, beside[i].T] for i, row in enumerate(blocks)), [*beside, own]])
     wanted = []
     for name in known.signal:
-        axis = np.vstack([known.cross[name][None] + 0j, stars.axis_cross * (name == "turbulence")])
+        axis = np.array([known.cross[name] + 0j, *(stars.with_axis(i) * (name == "turbulence") for i in each)])
         stars_of = np.einsum("ai,if->af", back, advance_spectrum(axis, 1 + ahead))
         frame = covariance(advance_spectrum(known.ngs.cross[name] * exposure.conj(), ahead))[slow]
         wanted.append(np.concatenate([*(covariance(star)[fast] for star in stars_of), frame]))

@@ -16,7 +16,7 @@ from wfsobs.scenario import Scenario
 from wfsobs.scenario.presets import PRESETS
 from wfsobs.signal.ar2 import Ar2, turbulence_corner
 from wfsobs.signal.riccati import steady_state
-from wfsobs.signal.wiener import advance_spectrum, causal_error, circle_mean, explained_variance, factorise
+from wfsobs.signal.wiener import advance_spectrum, circle_mean, error_spectrum, explained_variance, factorise
 from wfsobs.simulation.disturbance import vibration_variance
 from wfsobs.simulation.true_spectra import TrueSpectra, line_width, n_frequencies, true_spectra
 from wfsobs.simulation.turbulence_spectra import turbulence_spectra
@@ -54,8 +54,9 @@ def test_an_ar1_signal_in_white_noise_has_the_textbook_error() -> None:
     P = 0.5 * (b + np.sqrt(b**2 + 4 * q * R))
     whitener = factorise(spectrum + R)
     assert whitener.innovation_variance == pytest.approx(P + R, rel=1e-12)  # 0.9^4096 is nothing: rounding alone
-    assert causal_error(spectrum, advance_spectrum(spectrum, 1), whitener) == pytest.approx(P, rel=1e-12)
-    assert causal_error(spectrum, advance_spectrum(spectrum, 0), whitener) == pytest.approx(P * R / (P + R), rel=1e-12)
+    for steps, expected in ((1, P), (0, P * R / (P + R))):
+        error = error_spectrum(spectrum, advance_spectrum(spectrum, steps), whitener)
+        assert circle_mean(error) == pytest.approx(expected, rel=1e-12)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -66,9 +67,9 @@ def test_the_factor_is_causal_and_gives_the_spectrum(seed: int) -> None:
     taps = np.real(np.poly(np.concatenate([zeros, zeros.conj()])))
     spectrum = np.abs(np.fft.rfft(taps, n)) ** 2 * (1.0 + rng.random())
     whitener = factorise(spectrum)
-    assert np.abs(whitener.H) ** 2 * whitener.innovation_variance == pytest.approx(spectrum, rel=1e-10)
+    assert np.abs(whitener.factor) ** 2 * whitener.innovation_variance == pytest.approx(spectrum, rel=1e-10)
     # Zeros within 0.8 of the circle's radius: the minimum-phase factor is the polynomial itself, 0.8^(n/2) off by wrapping.
-    assert np.fft.irfft(whitener.H, n)[: taps.size] == pytest.approx(taps, abs=1e-10)
+    assert np.fft.irfft(whitener.factor, n)[: taps.size] == pytest.approx(taps, abs=1e-10)
 
 
 def test_a_spectrum_without_noise_is_refused() -> None:

@@ -22,7 +22,7 @@ from scipy.stats import chi2
 
 from wfsobs.observers.estimates import TOTAL
 from wfsobs.scenario import Scenario
-from wfsobs.signal.wiener import advance_spectrum, circle_mean, degrees_of_freedom, error_spectrum, explained_variance
+from wfsobs.signal.wiener import circle_mean, degrees_of_freedom, explained_variance
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array
 
@@ -111,14 +111,12 @@ def least_errors(spectra: TrueSpectra, ahead: int = 0, n_steps: int = 1) -> dict
     past, known = min(n_steps, MOST_PAST), spectra.without_lines
     whitener, parts = known.whitener, spectra.parts
     names = [*parts, TOTAL][: 2 * len(parts) - 1]
-    wanted = [known.total if name == TOTAL else (known.signal[name], known.cross[name]) for name in names]
-    own, shared = (np.array(each) for each in zip(*wanted, strict=True))
-    shared = advance_spectrum(shared, 1 + ahead)
+    best = [known.estimate(*(parts if name == TOTAL else [name]), ahead=ahead) for name in names]
     lines = np.outer([name != "turbulence" for name in names], spectra.line_covariance(past + 1 + ahead))
-    cross = fft.irfft(shared, whitener.n)[:, :past] + spectra.gain * lines[:, 1 + ahead :]
+    cross = np.array([fft.irfft(one.cross, whitener.n)[:past] for one in best]) + spectra.gain * lines[:, 1 + ahead :]
     measured = fft.irfft(known.measurement, whitener.n)[:past] + spectra.gain**2 * spectra.line_covariance(past)
-    covariance = fft.irfft(error_spectrum(own, shared, whitener), whitener.n)[:, : min(n_steps, whitener.n // 2)]
-    variance = lines[:, 0] + [circle_mean(one) for one in own]
+    covariance = np.array([fft.irfft(one.error, whitener.n)[: min(n_steps, whitener.n // 2)] for one in best])
+    variance = lines[:, 0] + [sum(circle_mean(known.signal[part]) for part in parts if name in (part, TOTAL)) for name in names]
     gained = explained_variance(measured, cross, enough=variance - (1.0 + LEARNT) * covariance[:, 0])
     transient = variance[:, None] - np.hstack([np.zeros((len(names), 1)), gained])
     n_lines = len(spectra.pure)

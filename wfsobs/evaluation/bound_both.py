@@ -8,7 +8,6 @@ turbulence.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from math import pi
@@ -19,8 +18,8 @@ from scipy.special import diric
 from wfsobs.evaluation.bound import of_every_target
 from wfsobs.observers.estimates import TOTAL
 from wfsobs.scenario import Scenario
-from wfsobs.signal.slow_sensor import SlowSensor, variance_from_frames
-from wfsobs.signal.wiener import Complex, Whitener, advance_spectrum, causal_error
+from wfsobs.signal.slow_sensor import SlowSensor, SlowTarget, variance_from_frames
+from wfsobs.signal.wiener import Complex, advance_spectrum, circle_mean
 from wfsobs.simulation.true_spectra import TrueSpectra, true_spectra
 from wfsobs.typing import Array
 
@@ -66,10 +65,11 @@ def least_errors_of_both(spectra: TrueSpectra, ahead: int = 0) -> dict[str, Peri
     known = spectra.without_lines
     ngs, whitener = known.ngs, known.whitener
     frames, exposure = ngs_frames(known)
-    fast = {name: advance_spectrum(known.cross[name], 1 + ahead) for name in known.parts}
-    slow = [advance_spectrum(ngs.cross[name] * exposure.conj(), ahead) for name in fast]
-    gained = variance_from_frames(list(zip(fast.values(), slow, strict=True)), whitener, frames)
-    return target_errors(known, fast, gained, whitener)
+    wanted = [
+        SlowTarget(*known.estimate(name, ahead=ahead)[:2], advance_spectrum(ngs.cross[name] * exposure.conj(), ahead))
+        for name in known.parts
+    ]
+    return target_errors(known, ahead, variance_from_frames(wanted, whitener, frames))
 
 
 def ngs_frames(spectra: TrueSpectra) -> tuple[SlowSensor, Complex]:
@@ -79,26 +79,22 @@ def ngs_frames(spectra: TrueSpectra) -> tuple[SlowSensor, Complex]:
     return SlowSensor(ngs.signal * np.abs(exposure) ** 2, cross, ngs.noise, ngs.ratio), exposure
 
 
-def target_errors(
-    spectra: TrueSpectra, fast: Mapping[str, Complex], reduction: Array, whitener: Whitener
-) -> dict[str, PeriodicError]:
+def target_errors(spectra: TrueSpectra, ahead: int, reduction: Array) -> dict[str, PeriodicError]:
     """Return the minimum error of each target, and of both together.
 
     Parameters
     ----------
     spectra : TrueSpectra
         Without the lines that are known.
-    fast : mapping of str to Array
-        Target -> cross spectrum of it and z, of those that there are (`TrueSpectra.parts`).
+    ahead : int
+        Steps of prediction.
     reduction : Array
         Covariance of what the other sensors tell of the targets, (ratio, targets, targets) [um^2].
-    whitener : Whitener
-        Minimum-phase factor of the spectrum of z.
     """
-    found = {name: causal_error(spectra.signal[name], fast[name], whitener) - reduction[:, i, i] for i, name in enumerate(fast)}
-    if len(fast) > 1:
-        both = np.sum(list(fast.values()), axis=0)
-        found[TOTAL] = causal_error(spectra.total[0], both, whitener) - reduction.sum(axis=(1, 2))
+    parts = spectra.parts
+    found = {name: circle_mean(spectra.estimate(name, ahead=ahead).error) - reduction[:, i, i] for i, name in enumerate(parts)}
+    if len(parts) > 1:
+        found[TOTAL] = circle_mean(spectra.estimate(*parts, ahead=ahead).error) - reduction.sum(axis=(1, 2))
     errors = {name: PeriodicError(np.maximum(variance, 0.0)) for name, variance in found.items()}
     return of_every_target(errors, spectra, PeriodicError(np.zeros(len(reduction))))
 

@@ -7,12 +7,12 @@ that is estimated and no other.
 
 from __future__ import annotations
 
-import numpy as np
-
 from wfsobs.evaluation.bound_both import PeriodicError, ngs_frames, target_errors
+from wfsobs.observers.base import TURBULENCE
 from wfsobs.scenario import Scenario
 from wfsobs.signal.sensor_array import FastSensors, variance_from_sensors
-from wfsobs.signal.wiener import advance_spectrum
+from wfsobs.signal.slow_sensor import SlowTarget
+from wfsobs.signal.wiener import Complex, advance_spectrum
 from wfsobs.simulation.star_spectra import StarSpectra, star_spectra
 
 
@@ -32,19 +32,21 @@ def least_errors_of_stars(spectra: StarSpectra, ahead: int = 0) -> dict[str, Per
         Target -> error; TOTAL is that of both together.
     """
     known = spectra.mean.without_lines
-    ngs, whitener = known.ngs, known.whitener
+    ngs = known.ngs
     frames, exposure = ngs_frames(known)
-    others = FastSensors(spectra.differences, spectra.cross, advance_spectrum(spectra.ngs_cross * exposure, 1))
-    fast = {name: advance_spectrum(known.cross[name], 1 + ahead) for name in known.parts}
+    others = FastSensors(
+        spectra.n_differences, spectra.between, spectra.with_z, lambda i: advance_spectrum(spectra.with_ngs(i) * exposure, 1)
+    )
     wanted = [
-        (
-            of_z,
-            advance_spectrum(ngs.cross[name] * exposure.conj(), ahead),
-            advance_spectrum(spectra.axis_cross, 1 + ahead) if name == "turbulence" else np.zeros_like(spectra.cross),
-        )
-        for name, of_z in fast.items()
+        SlowTarget(*known.estimate(name, ahead=ahead)[:2], advance_spectrum(ngs.cross[name] * exposure.conj(), ahead))
+        for name in known.parts
     ]
-    return target_errors(known, fast, variance_from_sensors(wanted, whitener, others, frames), whitener)
+
+    def of_stars(i: int) -> Complex:
+        return advance_spectrum(spectra.with_axis(i), 1 + ahead)
+
+    targets = [(one, of_stars if name == TURBULENCE else None) for name, one in zip(known.parts, wanted, strict=True)]
+    return target_errors(known, ahead, variance_from_sensors(targets, known.whitener, others, frames))
 
 
 def bound_rms_of_stars(scenario: Scenario, mode: int, ahead: int = 0) -> dict[str, float]:

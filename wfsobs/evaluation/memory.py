@@ -1,9 +1,23 @@
-"""What was made last under a name, for computations that follow a setting which moves."""
+"""Memory of computations: what was made last under a name, where a setting moves; and that of arrays that are freed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
+
+import numpy as np
+
+FREED = 31 * 2**20
+"""Size of the largest array whose memory is used again; the C library of Linux allows 32 MiB [bytes]."""
+
+
+def keep_freed_memory() -> None:
+    """Have arrays up to FREED take the memory of those before them.
+
+    The C library of Linux returns every array to the system that is larger than any freed before. One of a few MB after the
+    other is then cleared page by page, which takes as long as what is done with them.
+    """
+    np.empty(FREED, dtype=np.uint8)
 
 
 class Identity:

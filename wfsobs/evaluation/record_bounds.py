@@ -16,6 +16,7 @@ from wfsobs.evaluation.bound_asterism import least_errors_of_asterism, least_err
 from wfsobs.evaluation.bound_both import PeriodicError, least_errors_of_both
 from wfsobs.evaluation.bound_modes import least_errors_of_modes
 from wfsobs.evaluation.bound_stars import least_errors_of_stars
+from wfsobs.evaluation.memory import keep_freed_memory
 from wfsobs.evaluation.scores import BOUND, BOUND_ASTERISM, BOUND_BOTH, BOUND_BOTH_MODES, BOUND_MODES, BOUND_STARS, Score
 from wfsobs.observers import OBSERVERS
 from wfsobs.observers.base import TARGETS
@@ -90,6 +91,7 @@ def joint_observers(scenario: Scenario, observers: Collection[str]) -> list[str]
 
 @lru_cache(maxsize=4)
 def _least_together(scenario: Scenario, observer: str) -> list[dict[str, PeriodicError]]:
+    keep_freed_memory()
     return JOINT[observer][2](scenario)
 
 
@@ -106,6 +108,7 @@ def _lesser(together: PeriodicError, alone: LeastError | PeriodicError | None) -
 @lru_cache(maxsize=4)  # no seed changes them, and they take longer than most observers
 def _least_of_modes(scenario: Scenario, n_modes: int, n_steps: int) -> list[dict[str, Errors]]:
     """Compute row -> target -> error of the first modes of a scenario."""
+    keep_freed_memory()
 
     def of_mode(mode: int) -> dict[str, Errors]:
         spectra = true_spectra(scenario, mode)

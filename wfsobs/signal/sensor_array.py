@@ -18,14 +18,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import combinations, permutations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from wfsobs.signal.slow_sensor import SlowSensor
-from wfsobs.signal.wiener import Complex, Whitener, factorise
+from wfsobs.signal.slow_sensor import SlowSensor, SlowTarget
+from wfsobs.signal.wiener import Complex, Whitener, factorise, innovations_to_come, square
 from wfsobs.typing import Array
 
 LONGEST = 8192
@@ -39,30 +40,36 @@ TOLERANCE = 2e-4
 class FastSensors:
     """m fast sensors beside z.
 
+    Their spectra, (n // 2 + 1,) each, are asked for one at a time: together they are more than the processor's cache holds.
+
     Attributes
     ----------
-    spectra : Array
-        Cross spectra of their measurements, the transform over n of E y_i[k] y_j[k-n], noise included, (m, m, n // 2 + 1).
-    cross : Array
-        Those with z, E y_i[k] z[k-n], (m, n // 2 + 1).
-    slow : Array
-        Those with the slow sensor, E x[k] y_i[k-n], (m, n // 2 + 1).
+    count : int
+        m.
+    between : callable
+        (i, j) -> cross spectrum of two measurements, the transform over n of E y_i[k] y_j[k-n], noise included.
+    with_z : callable
+        i -> that with z, of E y_i[k] z[k-n].
+    with_slow : callable
+        i -> that with the slow sensor, of E x[k] y_i[k-n].
     """
 
-    spectra: NDArray[np.complex128]
-    cross: NDArray[np.complex128]
-    slow: NDArray[np.complex128]
+    count: int
+    between: Callable[[int, int], Complex]
+    with_z: Callable[[int], Complex]
+    with_slow: Callable[[int], Complex]
 
 
 def variance_from_sensors(
-    targets: Sequence[tuple[Complex, Complex, NDArray[np.complex128]]], whitener: Whitener, fast: FastSensors, slow: SlowSensor
+    targets: Sequence[tuple[SlowTarget, Callable[[int], Complex] | None]], whitener: Whitener, fast: FastSensors, slow: SlowSensor
 ) -> Array:
     """Return how much the other sensors lower the variance of the minimum error of z alone.
 
     Parameters
     ----------
     targets : sequence of tuple
-        (S_sz, S_sx, S_sy) of each target, as in `variance_from_frames`, and those with the fast sensors, (m, n // 2 + 1).
+        Each target as in `variance_from_frames`, and i -> cross spectrum of it and a fast sensor; None where they have nothing
+        in common.
     whitener : Whitener
         Factor of the spectrum of z.
     fast, slow : FastSensors, SlowSensor
@@ -73,37 +80,32 @@ def variance_from_sensors(
     Array
         Explained covariance of the targets, (ratio, n_targets, n_targets), p steps after a frame.
     """
-    n, last = whitener.n, len(fast.cross)
-    cross = np.vstack([fast.cross, slow.cross])
-    of_z = cross / np.sqrt(whitener.spectrum)
-    own_spectra = [*(fast.spectra[i, i].real for i in range(last)), slow.spectrum]
-    rests = [spectrum - np.abs(seen) ** 2 for spectrum, seen in zip(own_spectra, of_z, strict=True)]
-    factors = np.array([*(_factor(rest) for rest in rests[:last]), _frame_factor(rests[last], slow, n)])
-    whiten, ahead = 1.0 / factors.conj(), 1.0 / (whitener.H.conj() * np.sqrt(whitener.innovation_variance))
-    future = _of_future(cross * ahead, n)
-    future *= whiten
+    n, root = whitener.n, 1.0 / np.sqrt(whitener.spectrum)
+    of_z, whiten, future = list[Complex](), list[Complex](), list[Complex]()
+    for i in range(fast.count + 1):
+        is_slow = i == fast.count
+        cross = slow.cross if is_slow else fast.with_z(i)
+        of_z.append(cross * root)
+        own = (slow.spectrum if is_slow else fast.between(i, i).real) - square(of_z[i])
+        whiten.append(1.0 / _frame_factor(own, slow, n).conj() if is_slow else factorise(own).backwards)
+        future.append(innovations_to_come(cross, whitener, first=0) * whiten[i])
 
     def share(i: int, j: int) -> Complex:
-        shared = fast.slow[i] if j == last else fast.spectra[i, j].conj()
-        return (shared - of_z[i].conj() * of_z[j]) * whiten[i] * whiten[j].conj()
+        shared = fast.with_slow(i) if j == fast.count else fast.between(i, j).conj()
+        return (shared - of_z[i].conj() * of_z[j]) * (whiten[i] * whiten[j].conj())
 
-    regression = _Regression.of(share, future, slow.ratio, n)
-    length, wanted = min(LONGEST, n // 2), []
-    for on_z, on_x, on_y in targets:
-        own = of_z.conj()
-        own *= -on_z / np.sqrt(whitener.spectrum)
-        own[:last] += on_y
-        own[last] += on_x
-        found = fft.rfft(_past(own, n), n)
-        found *= whiten
-        found += np.multiply(future, _of_future(on_z * ahead, n, first=1).conj(), out=own)
-        wanted.append(fft.irfft(found, n)[:, :length].copy())
-    return _gains(regression, np.array(wanted))
+    def rest(i: int, target: SlowTarget, with_fast: Callable[[int], Complex] | None) -> Array:
+        past = of_z[i].conj() * (target.of_z * -root)
+        if i == fast.count:
+            past += target.of_x
+        elif with_fast is not None:
+            past += with_fast(i)
+        by_age = fft.irfft(past, n)
+        by_age[n // 2 :] = 0.0
+        return fft.irfft(fft.rfft(by_age) * whiten[i] + future[i] * target.to_come.conj(), n)[: min(LONGEST, n // 2)].copy()
 
-
-def _factor(spectrum: Array) -> Complex:
-    found = factorise(spectrum)
-    return found.H * np.sqrt(found.innovation_variance)
+    wanted = np.array([[rest(i, *target) for i in range(fast.count + 1)] for target in targets])
+    return _gains(_Regression.of(share, future, slow.ratio, n), wanted)
 
 
 def _frame_factor(spectrum: Array, slow: SlowSensor, n: int) -> Complex:
@@ -111,32 +113,18 @@ def _frame_factor(spectrum: Array, slow: SlowSensor, n: int) -> Complex:
     frames = n // 2 // slow.ratio
     covariance = fft.irfft(spectrum, n)[: frames * slow.ratio + 1 : slow.ratio]
     circle = np.concatenate([covariance, covariance[-2:0:-1]])
-    factor = _factor(np.maximum(fft.rfft(circle).real, 0.0) + slow.noise)
+    found = factorise(np.maximum(fft.rfft(circle).real, 0.0) + slow.noise)
     spread = np.zeros(n)
-    spread[: frames * slow.ratio : slow.ratio] = fft.irfft(factor, 2 * frames)[:frames]
+    spread[: frames * slow.ratio : slow.ratio] = fft.irfft(found.factor * np.sqrt(found.innovation_variance), 2 * frames)[:frames]
     return fft.rfft(spread)
-
-
-def _past(spectrum: Complex, n: int) -> Array:
-    """Return the coefficients at the ages from 0 on, of E s[k] y[k - age]."""
-    out = fft.irfft(spectrum, n)
-    out[..., n // 2 :] = 0.0
-    return out
-
-
-def _of_future(spectrum: Complex, n: int, first: int = 0) -> Complex:
-    """Return the transform of the coefficients of e[k + first], e[k + first + 1], ..., in that order."""
-    backwards = _past(spectrum.conj(), n)
-    backwards[..., :first] = 0.0
-    return fft.rfft(backwards)
 
 
 @dataclass(frozen=True)
 class _Regression:
-    """I + E + K' K on the ages of each phase of the frames: x of shape (ratio, n_targets, n_sensors, n_ages).
+    """I + E + K' K on the ages of each phase of the frames: x of shape (n_sensors, ratio, n_ages).
 
     shares : transform of I + E, (n_sensors, n_sensors, n);  hankel : that of K, (n_sensors, n)
-    mask : which ages are measured, (ratio, 1, n_sensors, n_ages)
+    mask : which ages are measured, as x
     """
 
     shares: NDArray[np.complexfloating]
@@ -144,7 +132,7 @@ class _Regression:
     mask: Array
 
     @staticmethod
-    def of(share: Callable[[int, int], Complex], future: Complex, ratio: int, n: int) -> _Regression:
+    def of(share: Callable[[int, int], Complex], future: Sequence[Complex], ratio: int, n: int) -> _Regression:
         """Return that of what sensors i < j have in common, share(i, j), and the future."""
         length = min(LONGEST, n // 2)
         size = fft.next_fast_len(2 * length, real=True)
@@ -155,9 +143,9 @@ class _Regression:
             near[:length], near[1 - length :] = kernel[:length], kernel[1 - length :]
             among[i, j] = fft.rfft(near)
             among[j, i] = among[i, j].conj()
-        hankel = fft.rfft(fft.irfft(future, n)[:, : min(size, n // 2)], size)
-        mask = np.ones((ratio, 1, len(future), length))
-        mask[:, :, -1] = np.arange(length) % ratio == np.arange(ratio)[:, None, None]
+        hankel = np.array([fft.rfft(fft.irfft(one, n)[: min(size, n // 2)], size) for one in future])
+        mask = np.ones((len(future), ratio, length))
+        mask[-1] = np.arange(length) % ratio == np.arange(ratio)[:, None]
         return _Regression(among, hankel, mask)
 
     def single(self) -> _Regression:
@@ -169,34 +157,39 @@ class _Regression:
         length, size = x.shape[-1], 2 * (self.hankel.shape[-1] - 1)
         transform = fft.rfft(x, size)
         out = transform.copy()
-        for i, j in permutations(range(len(self.hankel)), 2):
-            out[:, :, i] += self.shares[i, j] * transform[:, :, j]
-        known = fft.irfft(np.sum(self.hankel.conj() * transform, axis=2).conj(), size)
-        known[..., 0] = known[..., length:] = 0.0
-        out += self.hankel * fft.rfft(known, size).conj()[:, :, None]
+        for i, j in permutations(range(len(out)), 2):
+            out[i] += self.shares[i, j] * transform[j]
+        known = reduce(np.add, [hankel * seen.conj() for hankel, seen in zip(self.hankel, transform, strict=True)])
+        future = fft.irfft(known, size)
+        future[:, 0] = future[:, length:] = 0.0
+        known = fft.rfft(future, size).conj()
+        for i, hankel in enumerate(self.hankel):
+            out[i] += hankel * known
         return self.mask * fft.irfft(out, size)[..., :length]
 
 
 def _gains(regression: _Regression, rest: Array) -> Array:
-    """Return b' (I + E + K' K)^-1 b of all pairs of targets at every age. rest : b of each target."""
-    b = regression.mask * rest
-    single = regression.single()
-    x = np.concatenate([_solve(single, b[:, [i]].astype(np.float32)) for i in range(b.shape[1])], axis=1).astype(np.float64)
+    """Return b' (I + E + K' K)^-1 b of all pairs of targets at every age.
+
+    rest : b of each target, (n_targets, n_sensors, n_ages)
+    """
+    b, single = regression.mask * rest[:, :, None], regression.single()
+    x = [_solve(single, one.astype(np.float32)).astype(np.float64) for one in b]
     # Wrong by the square of the error of x, rounding and all.
-    out = np.einsum("ptia,puia->ptu", x, 2.0 * b - regression.apply(x))
+    out = np.einsum("tipa,uipa->ptu", x, [2.0 * one - regression.apply(of) for one, of in zip(b, x, strict=True)])
     return 0.5 * (out + out.transpose(0, 2, 1))
 
 
 def _solve(regression: _Regression, b: Array) -> Array:
     """Solve (I + E + K' K) x = b for every age, by conjugate gradients."""
     x, residual, direction = np.zeros_like(b), b.copy(), b.copy()
-    power = np.sum(b**2, axis=(-2, -1), keepdims=True)
+    power = np.sum(b**2, axis=(0, 2), keepdims=True)
     enough, smallest = TOLERANCE**2 * power, np.finfo(b.dtype).tiny
     while (power > enough).any():
         moved = regression.apply(direction)
-        step = power / np.maximum(np.sum(direction * moved, axis=(-2, -1), keepdims=True), smallest)
+        step = power / np.maximum(np.sum(direction * moved, axis=(0, 2), keepdims=True), smallest)
         x += step * direction
         residual -= step * moved
-        before, power = power, np.sum(residual**2, axis=(-2, -1), keepdims=True)
+        before, power = power, np.sum(residual**2, axis=(0, 2), keepdims=True)
         direction = residual + (power / np.maximum(before, smallest)) * direction
     return x

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,13 +66,26 @@ class SlowSensor:
     ratio: int
 
 
-def variance_from_frames(targets: Sequence[tuple[Complex, Complex]], whitener: Whitener, slow: SlowSensor) -> Array:
+class SlowTarget(NamedTuple):
+    """What z and the slow sensor tell of a target, all (n // 2 + 1,).
+
+    of_z    : S_sz, the transform over n of E s[k] z[k-n]
+    to_come : `wiener.innovations_to_come` of it
+    of_x    : S_sx, the transform over n of E s[k] x[k-n]
+    """
+
+    of_z: Complex
+    to_come: Complex
+    of_x: Complex
+
+
+def variance_from_frames(targets: Sequence[SlowTarget], whitener: Whitener, slow: SlowSensor) -> Array:
     """Return how much the frames lower the variance of the minimum error of z alone.
 
     Parameters
     ----------
-    targets : sequence of tuple
-        (S_sz, S_sx) of each target, the transforms over n of E s[k] z[k-n] and E s[k] x[k-n], (n // 2 + 1,).
+    targets : sequence of SlowTarget
+        The targets.
     whitener : Whitener
         Factor of the spectrum of z.
     slow : SlowSensor
@@ -85,23 +99,23 @@ def variance_from_frames(targets: Sequence[tuple[Complex, Complex]], whitener: W
     n, ratio = whitener.n, slow.ratio
     half = n // 2
     frames = fft.next_fast_len(half // ratio, real=True)  # those beyond half the DFT are not kept
-    whiten = 1.0 / (whitener.H.conj() * np.sqrt(whitener.innovation_variance))
-    of_z = slow.cross.conj() / whitener.spectrum
-    left = slow.spectrum - (of_z * slow.cross).real
-    rests = fft.irfft([left, *(frame - fast * of_z for fast, frame in targets)], n)
-    noise = _frame_whitener(rests[0, : frames * ratio + 1 : ratio], slow.noise)
-    rests[:, half:] = 0.0
+    of_z = slow.cross.conj() * (1.0 / whitener.spectrum)
+    noise = _frame_whitener(fft.irfft(slow.spectrum - (of_z * slow.cross).real, n)[: frames * ratio + 1 : ratio], slow.noise)
 
-    future = fft.irfft([(cross * whiten).conj() for cross in (slow.cross, *(fast for fast, _ in targets))], n)
-    future[:, half:] = 0.0  # the coefficients of e[k], e[k+1], ...
-    ahead = _whiten_frames(future[0], noise, ratio)  # C'
-    future[1:, 0] = 0.0
-    future[0] = np.pad(ahead.ravel(), (0, n - ahead.size))
-    spectrum, *others = fft.rfft(future)
-    known = fft.irfft([spectrum * other.conj() for other in others], n)[:, : frames * ratio]
-    told = np.array([_whiten_frames(one, noise, ratio) for one in rests[1:]])
+    def by_age(spectrum: Complex) -> Array:
+        """Return the coefficients of e[k], e[k+1], ..., or E s' y'[k], E s' y'[k-1], ..., with the frames whitened."""
+        found = fft.irfft(spectrum, n)
+        found[half:] = 0.0
+        return _whiten_frames(found, noise, ratio)
+
+    ahead = by_age((slow.cross * whitener.backwards).conj())  # C'
+    of_frame = fft.rfft(ahead.ravel(), n)
+    rests = []
+    for target in targets:
+        known = fft.irfft(of_frame * target.to_come.conj(), n)[: frames * ratio]
+        rests.append(by_age(target.of_x - target.of_z * of_z) + known.reshape(ahead.shape))
     kept = max(round(KEPT * (half // ratio)), 1)
-    return _gains(ahead[:kept], (told + known.reshape(told.shape))[:, :kept])
+    return _gains(ahead[:kept], np.array(rests)[:, :kept])
 
 
 def _frame_whitener(covariance: Array, noise: float) -> Whitener:
@@ -114,8 +128,7 @@ def _whiten_frames(x: Array, noise: Whitener, ratio: int) -> Array:
     """Return F^-1 x for every age up to `ratio`, (frames, ratio), where F is the factor of the covariance of y' by age."""
     frames = noise.n // 2
     by_age = x[: frames * ratio].reshape(frames, ratio)
-    response = 1.0 / (noise.H.conj() * np.sqrt(noise.innovation_variance))
-    return fft.irfft(fft.rfft(by_age, noise.n, axis=0) * response[:, None], noise.n, axis=0)[:frames]
+    return fft.irfft(fft.rfft(by_age, noise.n, axis=0) * noise.backwards[:, None], noise.n, axis=0)[:frames]
 
 
 def _gains(ahead: Array, rest: Array) -> Array:

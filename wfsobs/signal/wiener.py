@@ -18,7 +18,7 @@ mean over the whole circle is the variance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,20 +40,30 @@ class Whitener:
     ----------
     spectrum : Array
         S_z, (n // 2 + 1,).
-    H : Array
-        Complex factor, (n // 2 + 1,).
+    turn : Array
+        H / |H|, complex, (n // 2 + 1,).
     innovation_variance : float
         Variance of the innovations.
     """
 
     spectrum: Array
-    H: Complex
+    turn: Complex
     innovation_variance: float
 
     @property
     def n(self) -> int:
         """Length of the DFT."""
         return 2 * (self.spectrum.size - 1)
+
+    @property
+    def factor(self) -> Complex:
+        """H, (n // 2 + 1,)."""
+        return np.sqrt(self.spectrum / self.innovation_variance) * self.turn
+
+    @cached_property
+    def backwards(self) -> Complex:
+        """1 / (sigma H*), (n // 2 + 1,): what makes of a cross spectrum with z that with its innovations, of variance one."""
+        return self.turn * (1.0 / np.sqrt(self.spectrum))
 
 
 def factorise(spectrum: Array) -> Whitener:
@@ -77,48 +87,63 @@ def factorise(spectrum: Array) -> Whitener:
     if not (np.isfinite(spectrum).all() and (spectrum > 0).all()):
         raise ValueError("the measurement's spectrum must be above 0 at every frequency: it needs some noise")
     n = 2 * (spectrum.size - 1)
-    cepstrum = np.fft.irfft(np.log(spectrum), n)
-    causal = np.zeros(n)
-    causal[1 : n // 2] = cepstrum[1 : n // 2]
-    causal[n // 2] = 0.5 * cepstrum[n // 2]
-    return Whitener(spectrum, np.exp(np.fft.rfft(causal)), float(np.exp(cepstrum[0])))
+    cepstrum = fft.irfft(np.log(spectrum), n)
+    variance = float(np.exp(cepstrum[0]))
+    cepstrum[0] = cepstrum[n // 2 :] = 0.0  # |H| is that of the spectrum: only the angle is to be found
+    angle, turn = fft.rfft(cepstrum).imag, np.empty(spectrum.size, dtype=np.complex128)
+    np.cos(angle, out=turn.real)
+    np.sin(angle, out=turn.imag)
+    return Whitener(spectrum, turn, variance)
 
 
-def error_spectrum(target: Array, cross: Complex, whitener: Whitener) -> Array:
+def innovations_to_come(cross: Complex, whitener: Whitener, first: int = 1) -> Complex:
+    """Return what an estimate from all of z takes from the innovations of later steps, of variance one.
+
+    Parameters
+    ----------
+    cross : Array
+        S_sz, the transform over n of E s[k] z[k-n], (n // 2 + 1,).
+    whitener : Whitener
+        Factor of S_z.
+    first : int
+        Steps from k to the first innovation.
+
+    Returns
+    -------
+    Array
+        Transform over t of the weight of e[k+t], (n // 2 + 1,).
+    """
+    weights = fft.irfft((cross * whitener.backwards).conj(), whitener.n)
+    weights[:first] = weights[whitener.n // 2 :] = 0.0
+    return fft.rfft(weights)
+
+
+def error_spectrum(target: Array, cross: Complex, whitener: Whitener, to_come: Complex | None = None) -> Array:
     """Return the spectrum of the minimum error of s[k] from z[k], z[k-1], ....
 
     Parameters
     ----------
     target : Array
-        S_s, (..., n // 2 + 1), of one target or more.
+        S_s, (n // 2 + 1,).
     cross : Array
-        S_sz, the transform over n of E s[k] z[k-n], (..., n // 2 + 1).
+        S_sz, as for `innovations_to_come`.
     whitener : Whitener
         Factor of S_z.
+    to_come : Array, optional
+        What `innovations_to_come` returns, where already computed.
 
     Returns
     -------
     Array
-        Spectrum of the error, (..., n // 2 + 1).
+        Spectrum of the error, (n // 2 + 1,).
     """
-    future = fft.rfft(_of_future(cross, whitener), whitener.n)
-    return _two_sided(target, cross, whitener) + (future.real**2 + future.imag**2) / whitener.innovation_variance
+    future = innovations_to_come(cross, whitener) if to_come is None else to_come
+    return np.maximum(target - square(cross) / whitener.spectrum, 0.0) + square(future)
 
 
-def causal_error(target: Array, cross: Complex, whitener: Whitener) -> float:
-    """Return the variance of the minimum error, see `error_spectrum`."""
-    future = _of_future(cross, whitener)
-    return circle_mean(_two_sided(target, cross, whitener)) + float(future @ future) / whitener.innovation_variance
-
-
-def _two_sided(target: Array, cross: Complex, whitener: Whitener) -> Array:
-    """Return the spectrum of the error that all of z leaves."""
-    return np.maximum(target - (cross.real**2 + cross.imag**2) / whitener.spectrum, 0.0)
-
-
-def _of_future(cross: Complex, whitener: Whitener) -> Array:
-    """Return g[n], n < 0: what the estimate of all of z takes from the innovations to come."""
-    return fft.irfft(cross / whitener.H.conj(), whitener.n)[..., whitener.n // 2 :]
+def square(z: Complex) -> Array:
+    """Return |z|^2."""
+    return np.asarray(z.real**2 + z.imag**2)
 
 
 def explained_variance(autocovariance: Array, cross: Array, *, enough: Array | float = np.inf) -> Array:
@@ -140,20 +165,25 @@ def explained_variance(autocovariance: Array, cross: Array, *, enough: Array | f
     Array
         Explained variance, (n_targets, n), or of fewer measurements.
     """
-    n = autocovariance.size
-    backwards, earlier = np.ascontiguousarray(cross[:, ::-1]), np.ascontiguousarray(autocovariance[::-1])
-    predictor, error = np.zeros(n), float(autocovariance[0])
-    predictor[0] = 1.0
-    out, so_far = np.empty_like(backwards), np.zeros(len(cross))
-    for k in range(n):
-        if k:
-            reflection = float(predictor[:k] @ earlier[n - 1 - k : -1]) / error
-            predictor[1 : k + 1] -= reflection * predictor[k - 1 :: -1] if k > 1 else reflection
+    n, error = autocovariance.size, float(autocovariance[0])
+    last, rows = np.zeros(n), np.zeros((LOOK, n))  # weights of the newest measurement first, as in `cross`
+    out, so_far = np.empty_like(cross), np.zeros((len(cross), 1))
+    for start in range(1 - LOOK, n, LOOK):
+        orders, errors = range(max(start, 0), min(start + LOOK, n)), []
+        for row, k in zip(rows, orders, strict=False):
+            reflection = float(last[:k] @ autocovariance[1 : k + 1]) / error
             error *= 1.0 - reflection**2
-        so_far += (backwards[:, n - 1 - k :] @ predictor[: k + 1]) ** 2 / error
-        out[:, k] = so_far
-        if k % LOOK == 0 and (so_far >= enough).all():
-            return out[:, : k + 1]
+            np.multiply(last[k - 1 :: -1] if k else last[:0], -reflection, out=row[:k])
+            row[1 : k + 1] += last[:k]
+            row[k] = 1.0
+            last = row
+            errors.append(error)
+        last = last.copy()
+        some = slice(orders.start, orders.stop)
+        out[:, some] = so_far + np.cumsum((cross @ rows[: len(orders)].T) ** 2 / errors, axis=1)
+        so_far = out[:, orders.stop - 1 : orders.stop]
+        if (so_far[:, 0] >= enough).all():
+            return out[:, : orders.stop]
     return out
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -36,8 +36,14 @@ class SpectraBetween:
     def pair(self, i: int, j: int) -> Complex:
         """Interpolate only the share of the geometric mean: it is smooth, and never above one."""
         share = self.total[i, j] / np.sqrt(np.maximum((self.total[i, i] * self.total[j, j]).real, 1e-300))
-        real, imaginary = (np.interp(self.at, self.nodes, part) for part in (share.real, share.imag))
-        return np.sqrt(self.density[i] * self.density[j]) * (real + 1j * imaginary)
+        out = np.asarray(np.interp(self.at, self.nodes, share), dtype=np.complex128)
+        out *= self._roots[i]
+        out *= self._roots[j]
+        return out
+
+    @cached_property
+    def _roots(self) -> list[Array]:
+        return [np.sqrt(one) for one in self.density]
 
     def matrix(self, signals: Sequence[int]) -> Complex:
         """Return the cross spectra of some signals, Hermitian, (n_signals, n_signals, n)."""
@@ -134,47 +140,60 @@ def _block(scenario: Scenario, mode: int | None, layer: TurbulenceLayer, kx: Arr
     else:
         ky, weight = nodes_across_wind(float(np.hypot(q0, kx[0])), 4.0 * kx[-1], np.inf, 0.25)
     above = von_karman_density(kx**2 + ky[ky.size // 2 :, None] ** 2, layer.strength, outer_scale)
-    density = (4.0 * np.pi / layer.speed) * weight[:, None] * _mirror(above)
+    above *= (4.0 * np.pi / layer.speed) * weight[ky.size // 2 :, None]
     waves = PlaneWaves(kx, ky, layer.angle)
     signals = sight(scenario, mode, layer, waves)
     if isinstance(signals, ModesInBeams):
-        return signals.spectra(waves, density)
+        return signals.spectra(waves, above)
     by_kx = np.moveaxis(np.asarray(signals), 2, 0)
-    between: Complex = np.matmul(by_kx.conj() * density.T[:, None], by_kx.swapaxes(1, 2))
+    between: Complex = np.matmul(by_kx.conj() * _mirror(above).T[:, None], by_kx.swapaxes(1, 2))
     return np.moveaxis(between, 0, 2)
 
 
-def _mirror(above: Array) -> Array:
-    """Return what is the same on either side of the wind, from its half above."""
-    return np.concatenate([above[::-1], above])
+def _mirror(above: Array, below: Array | None = None) -> Array:
+    """Return what is on either side of the wind, from its halves; below : the same as above unless given."""
+    return np.concatenate([(above if below is None else below)[::-1], above])
 
 
 class PlaneWaves:
-    """Waves of a block: along and across the wind, and `x`, `y` in the pupil frame, (n_ky, n_kx) [rad/m].
-
-    Those across are symmetric about 0, so that half of them have every length.
-    """
+    """Waves of a block, `kx` along and `ky` across the wind, (n_kx,) and (n_ky, 1) [rad/m]; the latter symmetric about 0."""
 
     def __init__(self, kx: Array, ky: Array, angle: float) -> None:
         self.kx, self.ky, self.c, self.s = kx, ky[:, None], np.cos(angle), np.sin(angle)
-        self.x, self.y = self.c * self.kx - self.s * self.ky, self.s * self.kx + self.c * self.ky
-        self._above = np.hypot(kx, self.ky[ky.size // 2 :])
-        self._direction = (self.x + 1j * self.y) / _mirror(self._above)
+        self.above = self.ky[ky.size // 2 :]
+        self._length = np.hypot(kx, self.above)
         self._radial: dict[tuple[int, float], Array] = {}
-        self._azimuthal: dict[int, Array] = {}
+        self._azimuthal: dict[int, tuple[Array, Array]] = {}
+
+    @property
+    def x(self) -> Array:
+        """Along x of the pupil, (n_ky, n_kx) [rad/m]."""
+        return self.c * self.kx - self.s * self.ky
+
+    @property
+    def y(self) -> Array:
+        """Along y of the pupil, (n_ky, n_kx) [rad/m]."""
+        return self.s * self.kx + self.c * self.ky
 
     def mode(self, diameter: float, noll: int, footprint: Footprint) -> Complex:
         """Return the transform of a Zernike mode in a beam."""
-        return (zernike.amplitude(noll) * self.turn(footprint)) * self.shape(diameter, noll, footprint.scale)
+        radial, angular = self.radial(diameter, noll, footprint.scale), self.azimuthal(noll)
+        return (zernike.amplitude(noll) * self.turn(footprint)) * _mirror(*(radial * each for each in angular))
 
-    def shape(self, diameter: float, noll: int, scale: float) -> Array:
-        """Return that over its amplitude, in a beam of this scale without a shift: real."""
+    def radial(self, diameter: float, noll: int, scale: float) -> Array:
+        """Return the radial factor of a mode in a beam of this scale, of the waves with ky above 0."""
         order, radius = zernike.noll(noll)[0] + 1, 0.5 * diameter * scale
         if (order, radius) not in self._radial:
-            self._radial[order, radius] = _mirror(zernike.tabulated_bessel_ratio(order, radius * self._above))
+            self._radial[order, radius] = zernike.tabulated_bessel_ratio(order, radius * self._length)
+        return self._radial[order, radius]
+
+    def azimuthal(self, noll: int) -> tuple[Array, Array]:
+        """Return the angular factor of a mode, of the waves with ky above 0 and of those below, from 0 on."""
         if noll not in self._azimuthal:
-            self._azimuthal[noll] = zernike.azimuthal(noll, self._direction)
-        return self._radial[order, radius] * self._azimuthal[noll]
+            along, angle = (self.kx + 1j * self.above) / self._length, self.c + 1j * self.s
+            above, below = (zernike.azimuthal(noll, each * angle) for each in (along, along.conj()))
+            self._azimuthal[noll] = above, below
+        return self._azimuthal[noll]
 
     def in_wind(self, footprint: Footprint) -> tuple[float, float]:
         """Return the shift of a footprint along and across the wind [m]."""
@@ -192,14 +211,17 @@ class ModesInBeams:
     """Signals each of which is a mode in a beam: (noll, footprint) of each; diameter : that of the aperture [m].
 
     Beams of one scale differ in their shifts, which are a factor along the wind times one across it: the sum over the waves
-    across is one product of matrices for all pairs of signals of the same modes and scales.
+    across is a product of matrices for all pairs of signals of the same modes and scales, of its even and of its odd part.
     """
 
     diameter: float
     signals: Sequence[tuple[int, Footprint]]
 
     def spectra(self, waves: PlaneWaves, density: Array) -> Complex:
-        """Return the sums over the waves across the wind between all signals, (n_signals, n_signals, n_kx)."""
+        """Return the sums over the waves across the wind between all signals, (n_signals, n_signals, n_kx).
+
+        density : of the waves with ky above 0, (n_ky // 2, n_kx)
+        """
         shifts = np.array([waves.in_wind(footprint) for _, footprint in self.signals])
         pairs: dict[tuple[tuple[int, float], tuple[int, float]], list[tuple[int, int]]] = {}
         for i, (noll, one) in enumerate(self.signals):
@@ -209,12 +231,15 @@ class ModesInBeams:
                     pairs.setdefault((first, second), []).append((i, j))
         out = np.empty((len(shifts), len(shifts), waves.kx.size), dtype=np.complex128)
         for (first, second), among in pairs.items():
-            one, other = (waves.shape(self.diameter, *each) for each in (first, second))
+            radial = density * waves.radial(self.diameter, *first) * waves.radial(self.diameter, *second)
+            sides = zip(waves.azimuthal(first[0]), waves.azimuthal(second[0]), strict=True)
+            above, below = (one * other for one, other in sides)
             factor = zernike.amplitude(first[0]).conjugate() * zernike.amplitude(second[0])
             i, j = np.array(among).T
             along, across = (shifts[j] - shifts[i]).T
-            turn, power = np.outer(across, waves.ky), density * one * other
-            out[i, j] = factor * (np.cos(turn) @ power + 1j * (np.sin(turn) @ power)) * np.exp(1j * np.outer(along, waves.kx))
+            turn = np.outer(across, waves.above)
+            between = np.cos(turn) @ (radial * (above + below)) + 1j * (np.sin(turn) @ (radial * (above - below)))
+            out[i, j] = factor * between * np.exp(1j * np.outer(along, waves.kx))
             out[j, i] = out[i, j].conj()
         return out
 

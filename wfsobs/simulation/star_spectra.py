@@ -9,36 +9,65 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wfsobs.scenario import Scenario
+from wfsobs.signal.wiener import Complex
+from wfsobs.simulation.flow_integral import SpectraBetween
 from wfsobs.simulation.flow_spectra import star_flow_spectra
 from wfsobs.simulation.guide_stars import MEAN
 from wfsobs.simulation.sensor_noise import noise_rms
 from wfsobs.simulation.true_spectra import FLOOR, TrueSpectra, n_frequencies, true_spectra
 
+AXIS, NGS, LGS, FIRST = range(4)
+"""Places of the signals in `star_flow_spectra`: the axis, the NGS, the mean of the LGS, and the first of the differences."""
+
 
 @dataclass(frozen=True)
 class StarSpectra:
-    """Spectra of one mode of a scenario, on the frequencies of `wiener` [um^2 per sample].
+    """Spectra of one mode of a scenario, on the frequencies of `wiener`; those between signals are computed when asked for.
 
     Attributes
     ----------
     mean : TrueSpectra
         Those of the plain mean of the LGS.
-    differences : Array
-        Cross spectra of the measured differences, with noise, (n_lgs - 1, n_lgs - 1, n // 2 + 1).
-    cross : Array
-        Those of the differences and z, at the same step, (n_lgs - 1, n // 2 + 1).
-    axis_cross, ngs_cross : Array
-        Those of the turbulence at step k, on the axis and in the beam of the NGS, and the differences measured at k + 1.
+    flow : SpectraBetween
+        Those of `star_flow_spectra` [um^2/Hz].
+    dt : float
+        Step [s].
+    noise : float
+        Variance of the noise of a measured difference [um^2].
     """
 
     mean: TrueSpectra
-    differences: NDArray[np.complex128]
-    cross: NDArray[np.complex128]
-    axis_cross: NDArray[np.complex128]
-    ngs_cross: NDArray[np.complex128]
+    flow: SpectraBetween
+    dt: float
+    noise: float
+
+    @property
+    def n_differences(self) -> int:
+        """Number of differences."""
+        return len(self.flow.density) - FIRST
+
+    def between(self, i: int, j: int) -> Complex:
+        """Return the cross spectrum of two of the measured differences, with noise, (n // 2 + 1,) [um^2 per sample]."""
+        return self._pair(FIRST + i, FIRST + j) + (self.noise if i == j else 0.0)
+
+    def with_z(self, i: int) -> Complex:
+        """Return that of a difference and z, at the same step."""
+        return self._pair(FIRST + i, LGS)
+
+    def with_axis(self, i: int) -> Complex:
+        """Return that of the turbulence on the axis at step k, and a difference measured at k + 1."""
+        return self._pair(AXIS, FIRST + i)
+
+    def with_ngs(self, i: int) -> Complex:
+        """Return that of the turbulence in the beam of the NGS at step k, and a difference measured at k + 1."""
+        return self._pair(NGS, FIRST + i)
+
+    def _pair(self, i: int, j: int) -> Complex:
+        found = self.flow.pair(i, j)
+        found *= 0.5 / self.dt
+        return found
 
 
 def star_spectra(scenario: Scenario, mode: int, mean: TrueSpectra | None = None) -> StarSpectra:
@@ -49,12 +78,6 @@ def star_spectra(scenario: Scenario, mode: int, mean: TrueSpectra | None = None)
     n = n_frequencies(scenario, mode)
     # The notch at 0 Hz is a bin wide, as in `turbulence_spectra`.
     frequency = np.hypot(np.fft.rfftfreq(n, scenario.dt), 1.0 / (n * scenario.dt))
-    found = star_flow_spectra(scenario, mode, frequency)
-    scale, each = 0.5 / scenario.dt, range(3, len(found.density))
-    differences = scale * found.matrix(each)
-    for i in range(len(differences)):
-        differences[i, i] += max(float(noise_rms(scenario, "lgs")[mode]), FLOOR) ** 2
-    cross = np.array([found.pair(i, 2) for i in each])
-    axis, ngs = (np.array([found.pair(j, i) for i in each]) for j in (0, 1))
+    noise = max(float(noise_rms(scenario, "lgs")[mode]), FLOOR) ** 2
     mean = mean or true_spectra(scenario.replace({"sensors.lgs_combination": MEAN}), mode)
-    return StarSpectra(mean, differences, *(scale * part for part in (cross, axis, ngs)))
+    return StarSpectra(mean, star_flow_spectra(scenario, mode, frequency), scenario.dt, noise)

@@ -8,14 +8,15 @@ a controller they are taken `line_width` wide at half maximum.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from math import pi
+from typing import NamedTuple
 
 import numpy as np
 
 from wfsobs.scenario import Scenario
 from wfsobs.signal.ar2 import Ar2
-from wfsobs.signal.wiener import Complex, Whitener, factorise
+from wfsobs.signal.wiener import Complex, Whitener, advance_spectrum, error_spectrum, factorise, innovations_to_come
 from wfsobs.simulation.dft_length import MOST, n_frequencies, wanted_frequencies
 from wfsobs.simulation.disturbance import peak_rms, pure_lines, vibration_power
 from wfsobs.simulation.guide_stars import lgs_noise_rms, lgs_weights
@@ -51,6 +52,19 @@ class NgsSpectra:
     cross: dict[str, Complex | Array]
     noise: float
     ratio: int
+
+
+class CausalEstimate(NamedTuple):
+    """The best estimate of a target from z[k], z[k-1], ....
+
+    cross   : spectrum of the target and z, the transform over n of E s[k] z[k-n]
+    to_come : `wiener.innovations_to_come`
+    error   : `wiener.error_spectrum`
+    """
+
+    cross: Complex
+    to_come: Complex
+    error: Array
 
 
 @dataclass(frozen=True)
@@ -119,6 +133,21 @@ class TrueSpectra:
                 cross=self.ngs.cross | {"vibration": self.ngs.cross["vibration"] - self.lines},
             ),
         )
+
+    @cached_property
+    def _estimates(self) -> dict[tuple[tuple[str, ...], int], CausalEstimate]:
+        return {}
+
+    def estimate(self, *targets: str, ahead: int = 0) -> CausalEstimate:
+        """Return the best estimate of s[k + ahead], of a target or the sum of several; kept."""
+        asked = targets, ahead
+        if asked not in self._estimates:
+            each = [self.estimate(name, ahead=ahead) for name in targets] if len(targets) > 1 else []
+            cross = advance_spectrum(reduce(np.add, [self.cross[name] for name in targets]), 1 + ahead)
+            to_come = reduce(np.add, [one.to_come for one in each]) if each else innovations_to_come(cross, self.whitener)
+            own = reduce(np.add, [self.signal[name] for name in targets])
+            self._estimates[asked] = CausalEstimate(cross, to_come, error_spectrum(own, cross, self.whitener, to_come))
+        return self._estimates[asked]
 
     def line_covariance(self, n: int) -> Array:
         """Return the autocovariance of the undamped lines at the lags 0 to n - 1, (n,)."""
