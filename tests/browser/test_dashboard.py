@@ -206,13 +206,17 @@ def test_figures_take_the_height_of_the_window(wide: Page) -> None:
 
 def test_dark(wide: Page, tmp_path: Path) -> None:
     page = wide
-    page.get_by_role("button", name=re.compile("theme", re.I)).click()
+    button = page.get_by_role("button", name=re.compile("theme", re.I))
+    ground = page.evaluate("() => getComputedStyle(document.body).backgroundColor")
+    button.click()
     colour = """() => [...Bokeh.index.roots[0].model.document._all_models.values()]
         .filter(m => m.type === "GlyphRenderer" && m.name === "gpr-online").map(m => m.glyph.line_color.value)"""
     page.wait_for_function(f"({colour})().every(c => c === '#A6E3A6')")
-    page.wait_for_function("() => getComputedStyle(document.body).backgroundColor !== 'rgb(255, 255, 255)'")
+    page.wait_for_function("before => getComputedStyle(document.body).backgroundColor !== before", arg=ground)
     still(page)
     shot(page, tmp_path, "dark")
+    button.click()  # the browser keeps what is chosen, and other pages are light
+    page.wait_for_function("before => getComputedStyle(document.body).backgroundColor === before", arg=ground)
 
 
 def test_the_wind_speed_slider_runs_again(open_page: Any) -> None:
