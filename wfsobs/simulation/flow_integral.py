@@ -222,10 +222,11 @@ class ModesInBeams:
 
         density : of the waves with ky above 0, (n_ky // 2, n_kx)
         """
-        shifts = np.array([waves.in_wind(footprint) for _, footprint in self.signals])
+        once = list(dict.fromkeys(self.signals))  # an NGS on the axis sees what is there
+        shifts = np.array([waves.in_wind(footprint) for _, footprint in once])
         pairs: dict[tuple[tuple[int, float], tuple[int, float]], list[tuple[int, int]]] = {}
-        for i, (noll, one) in enumerate(self.signals):
-            for j, (other_noll, other) in enumerate(self.signals):
+        for i, (noll, one) in enumerate(once):
+            for j, (other_noll, other) in enumerate(once):
                 first, second = (noll, one.scale), (other_noll, other.scale)
                 if first < second or (first == second and i <= j):
                     pairs.setdefault((first, second), []).append((i, j))
@@ -241,7 +242,8 @@ class ModesInBeams:
             between = np.cos(turn) @ (radial * (above + below)) + 1j * (np.sin(turn) @ (radial * (above - below)))
             out[i, j] = factor * between * np.exp(1j * np.outer(along, waves.kx))
             out[j, i] = out[i, j].conj()
-        return out
+        places = [once.index(signal) for signal in self.signals]
+        return out[np.ix_(places, places)]
 
 
 Sight = Callable[[Scenario, Any, TurbulenceLayer, PlaneWaves], Sequence[Complex] | ModesInBeams]

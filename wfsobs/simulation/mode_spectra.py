@@ -7,6 +7,7 @@ spectra S(f), Hermitian and positive semidefinite, that `flow_spectra` has the d
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,12 +113,18 @@ def combined_spectra(scenario: Scenario, frequency: Array) -> ModeSpectra:
     ModeSpectra
         Densities.
     """
+    m = len(scenario.modes)
+    if atmosphere.natural_star(scenario) == atmosphere.on_axis():
+        return _spectra(scenario, frequency, _all_modes, beams=[*range(m, 2 * m), *range(m)])
     return _spectra(scenario, frequency, _all_modes_of_both)
 
 
-def _spectra(scenario: Scenario, frequency: Array, sight: Sight, weights: Array | None = None) -> ModeSpectra:
+def _spectra(
+    scenario: Scenario, frequency: Array, sight: Sight, weights: Array | None = None, beams: Sequence[int] | None = None
+) -> ModeSpectra:
+    """Return those of what a sight gives, the axis first; beams : places of the signals of beams, by default all others."""
     found, m = spectra_between(scenario, None, frequency, sight, weights=weights), len(scenario.modes)
-    beams = range(m, len(found.density))
+    beams = range(m, len(found.density)) if beams is None else beams
     cross = np.array([[found.pair(i, j) for j in beams] for i in range(m)])
     return ModeSpectra(np.array(found.density[:m]), found.matrix(beams), cross)
 
